@@ -1,0 +1,246 @@
+"""The corridor flight as a Gymnasium environment, single and vectorised (appendix D.1).
+
+The vehicle moves at constant speed, one of three directions a step, while its camera keeps
+looking along +y. What ends a step early is decided along the flown segment: the vehicle
+stops where it first touches an obstacle or a wall, or at the goal line, whichever comes
+first; both at the same place is a collision, and so is a start in contact.
+
+Time and way are counted in whole steps, so neither drifts. Each episode draws from streams
+of its own, made of (split, seed, episode): a corridor of one split never occurs in another.
+"""
+
+import dataclasses
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from envs import flight
+from envs.config import EnvConfig
+from envs.observations import observation_space, observe, picture
+from envs.scene import make_scene
+from envs.sensor import Sensor
+
+
+class CorridorEnv(gymnasium.Env):
+    """One flight from y = 0 to the goal line; `observation` is as `envs.observations` says.
+
+    Actions: 0 forward, 1 left 45 degrees, 2 right 45 degrees. Reward (appendix D.1.1):
+    metres of progress along y, +100 at the goal line, -100 at a collision; both terminate.
+    Past `time_limit_s` the episode is truncated.
+
+    Attributes:
+        config: The settings, `EnvConfig`.
+        scene: The corridor of this episode.
+        events: EVENT array of the last step, faults included.
+        luminance: float32 (H, W), the last render.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012 - Gymnasium's name
+
+    def __init__(self, config: EnvConfig | None = None, render_mode: Any = None, **fields: Any) -> None:
+        """Make the environment from a config (default `EnvConfig()`) and fields of it to replace.
+
+        Raises:
+            ValueError: A setting or the render mode is refused.
+        """
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f'render_mode must be None or "rgb_array"; got {render_mode!r}.')
+        self.config = dataclasses.replace(config or EnvConfig(), **fields)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": self.config.control_hz}
+        self.action_space = spaces.Discrete(flight.NUM_ACTIONS)
+        self.observation_space = observation_space(self.config)
+        self._sensor = Sensor(self.config)
+        self._seed: int | None = None
+        self._episode = 0
+        self._done = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; its first render makes no events.
+
+        Args:
+            seed: Starts a series of episodes, of which this is number 0. Without it, the
+                next episode of the series starts.
+            options: {"episode": number} starts that episode of the series.
+
+        Raises:
+            ValueError: An unknown option, or an episode that is no integer >= 0.
+        """
+        super().reset(seed=seed)
+        if seed is None and self._seed is None:
+            seed = int(self.np_random.integers(flight.SEED_STRIDE))
+        self._episode = flight.choose_episode(0 if seed is not None else self._episode + 1, options or {})
+        self._seed = self._seed if seed is None else int(seed)
+        split = self.config.split
+        scene_rng, spawn_rng, faults_rng = flight.random_streams(split, self._seed or 0, self._episode)
+        self.scene = make_scene(self.config.scene, scene_rng, **self.config.layout)
+        self._spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
+        self._moves = [0] * flight.NUM_ACTIONS
+        self._place = (self._spawn_x, 0.0)
+        self._sensor.reset(self.scene, self._place, faults_rng)
+        self._done = False
+        observation, lost = self._observe(0, flight.clock_us(1, self.config.control_hz))
+        return observation, self._info(lost)
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Fly one control step.
+
+        Raises:
+            ResetNeeded: The episode is over, or has not begun.
+            ValueError: The action is not in the action space; or a number became NaN or
+                infinite, with the episode, step and seed named.
+        """
+        if self._done:
+            raise ResetNeeded("The episode is over or has not begun; call reset() before step().")
+        if not self.action_space.contains(action):
+            raise ValueError(f"action must be an integer in [0, {flight.NUM_ACTIONS - 1}]; got {action!r}.")
+        start_us = self._sensor.t_us
+        self._done = True  # an error below leaves the episode unusable
+        self._moves[int(action)] += 1
+        try:
+            outcome = self._fly()
+            observation, lost = self._observe(start_us, self._sensor.t_us)
+        except ValueError as error:
+            where = f"episode {self._episode}, step {sum(self._moves)}, seed {self._seed}"
+            raise ValueError(f"{where}: {error}") from error
+        terminated = outcome.success or outcome.collision
+        truncated = not terminated and self._sensor.t_us >= self.config.time_limit_s * 1e6
+        self._done = terminated or truncated
+        return observation, outcome.reward, terminated, truncated, self._info(lost, outcome)
+
+    def render(self) -> Any:
+        """Luminance beside the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
+        return None if self.render_mode is None else picture(self.events, self.luminance)
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._sensor.close()
+
+    def camera_pose(self) -> tuple[float, float, float, float]:
+        """Where the camera is: x, y, z [m] and yaw [rad]."""
+        return (*self._place, self.config.camera_height_m, 0.0)
+
+    def _fly(self) -> flight.Outcome:
+        """Move and sense."""
+        config, start = self.config, self._place
+        planned = flight.planned_position(self._spawn_x, self._moves, config)
+        outcome = flight.fly(self.scene, start, planned, config.vehicle_radius_m)
+        self._sensor.step(start, outcome, flight.clock_us(sum(self._moves), config.control_hz))
+        self._place = outcome.end
+        return outcome
+
+    def _observe(self, start_us: int, end_us: int) -> tuple[np.ndarray, int]:
+        """Observation, and the events lost to the camera's cap or the window's capacity."""
+        self.events, self.luminance = self._sensor.events, self._sensor.luminance
+        observation, excess = observe(self.config, self.events, self.luminance, start_us, end_us)
+        return observation, self._sensor.dropped + excess
+
+    def _info(self, lost: int, outcome: flight.Outcome | None = None) -> dict[str, Any]:
+        return {
+            "episode_seed": self._seed,
+            "episode": self._episode,
+            "x_m": self._place[0],
+            "y_m": self._place[1],
+            "distance_m": self._place[1],
+            "success": outcome is not None and outcome.success,
+            "collision": outcome is not None and outcome.collision,
+            "num_events": self.events.size,
+            "dropped_events": lost,
+            "t_us": self._sensor.t_us,
+        }
+
+
+class CorridorVectorEnv(VectorEnv):
+    """Several flights at once, each with the bytes that `CorridorEnv` gives for the same seed.
+
+    An episode that is over is reset by the next step (AutoresetMode.NEXT_STEP), whose
+    action is ignored and whose reward is 0. All returned arrays are fresh.
+    """
+
+    metadata = {**CorridorEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self, num_envs: int = 1, config: EnvConfig | None = None, render_mode: Any = None, **fields: Any
+    ) -> None:
+        """Make `num_envs` environments alike; the other arguments are those of `CorridorEnv`.
+
+        Raises:
+            ValueError: A setting is refused, or `num_envs` is below 1.
+        """
+        self.envs: list[CorridorEnv] = []  # first, because Gymnasium closes what failed to start
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be >= 1; got {num_envs}.")
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.envs = [CorridorEnv(config, render_mode, **fields) for _ in range(num_envs)]
+        self.metadata = {**self.metadata, "render_fps": self.envs[0].metadata["render_fps"]}
+        self.single_observation_space = self.envs[0].observation_space
+        self.single_action_space = self.envs[0].action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._over = np.zeros(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset all environments.
+
+        Args:
+            seed: One per environment, or one number, see `envs.flight.spread_seeds`.
+            options: As for `CorridorEnv.reset`, for all.
+
+        Raises:
+            ValueError: The number of seeds is not that of environments.
+        """
+        seeds = flight.spread_seeds(seed, self.num_envs)
+        self._over[:] = False
+        results = [env.reset(seed=s, options=options) for env, s in zip(self.envs, seeds, strict=True)]
+        return self._batch([r[0] for r in results]), _stack_infos([r[1] for r in results])
+
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step all environments, or reset those that were over.
+
+        Raises:
+            ValueError: The number of actions is not that of environments, or one is refused.
+        """
+        if len(actions) != self.num_envs:
+            raise ValueError(f"actions must number {self.num_envs}; got {len(actions)}.")
+        results = []
+        for env, action, over in zip(self.envs, actions, self._over, strict=True):
+            if over:
+                observation, info = env.reset()
+                results.append((observation, 0.0, False, False, info))
+            else:
+                results.append(env.step(action))
+        observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
+        ends = np.array(terminated), np.array(truncated)
+        self._over = ends[0] | ends[1]
+        return self._batch(observations), np.array(rewards), *ends, _stack_infos(infos)
+
+    def render(self) -> Any:
+        """One picture per environment, as `CorridorEnv.render`."""
+        return tuple(env.render() for env in self.envs)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the renderers."""
+        for env in self.envs:
+            env.close()
+
+    def _batch(self, observations: Any) -> Any:
+        """Observations as one fresh array; event sequences differ in length and stay a tuple."""
+        if isinstance(self.single_observation_space, spaces.Sequence):
+            return tuple(observations)
+        return np.stack(observations)
+
+
+def _stack_infos(infos: Any) -> dict[str, Any]:
+    """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
+    stacked: dict[str, Any] = {key: np.array([info[key] for info in infos]) for key in infos[0]}
+    mask = np.ones(len(infos), bool)
+    return stacked | {f"_{key}": mask for key in infos[0]}

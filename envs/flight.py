@@ -1,0 +1,118 @@
+"""Kinematics, clock, reward and random streams of a corridor flight, without its sensor (appendix D.1)."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from envs.config import EnvConfig
+from envs.scene import Scene
+
+SPLITS = ("train", "validation", "eval")
+NUM_ACTIONS = 3  # forward, left 45 degrees, right 45 degrees
+DIAGONAL = math.sqrt(0.5)
+GOAL_REWARD, COLLISION_REWARD = 100.0, -100.0
+SEED_STRIDE = 2**32
+
+Point = tuple[float, float]
+
+
+class Outcome(NamedTuple):
+    """What one control step came to.
+
+    Attributes:
+        end: Where the vehicle is after it, x and y [m].
+        flown: Fraction of the step that it flew.
+        reward: Metres of progress along y, with the bonus or the penalty.
+        success, collision: What ended the episode; at most one of them.
+    """
+
+    end: Point
+    flown: float
+    reward: float
+    success: bool
+    collision: bool
+
+
+def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Generator, ...]:
+    """Generators of an episode: for its scene, its spawn and its faults.
+
+    The split comes first in their entropy, so no seed makes a corridor of another split.
+    """
+    streams = np.random.SeedSequence([SPLITS.index(split), seed, episode]).spawn(3)
+    return tuple(np.random.default_rng(stream) for stream in streams)
+
+
+def choose_episode(following: int, options: dict[str, Any]) -> int:
+    """The episode that reset `options` ask for, or the `following` one.
+
+    Raises:
+        ValueError: An unknown option, or an episode that is no integer >= 0.
+    """
+    episode = options.get("episode", following)
+    if options.keys() - {"episode"} or not isinstance(episode, int | np.integer) or episode < 0:
+        raise ValueError(f'options may hold {{"episode": integer >= 0}} alone; got {options}.')
+    return int(episode)
+
+
+def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """One seed for each of `count` environments.
+
+    One number makes seed + i * 2**32 for environment i: workers with neighbouring seeds
+    then never fly the same corridors, as they would with seed + i.
+
+    Raises:
+        ValueError: There are several seeds, but not `count`.
+    """
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + i * SEED_STRIDE for i in range(count)]
+    if len(seed) != count:
+        raise ValueError(f"seed must be one number or {count} of them; got {len(seed)}.")
+    return list(seed)
+
+
+def clock_us(step: int, control_hz: float) -> int:
+    """Simulated time at the end of a control step [us], from the count: it does not drift."""
+    return round(step * 1e6 / control_hz)
+
+
+def planned_position(spawn_x_m: float, moves: list[int], config: EnvConfig) -> Point:
+    """Where all moves so far lead, x and y [m].
+
+    One product of whole counts, so that no error adds up: 1000 steps of 0.1 m are 100 m.
+
+    Args:
+        spawn_x_m: Where the flight began; y was 0 [m].
+        moves: How often each action was taken.
+        config: For speed and rate.
+    """
+    forward, left, right = moves
+    x = (right - left) * DIAGONAL * config.speed_mps / config.control_hz
+    return spawn_x_m + x, (forward + (left + right) * DIAGONAL) * config.speed_mps / config.control_hz
+
+
+def fly(scene: Scene, start: Point, planned: Point, radius_m: float) -> Outcome:
+    """Fly from `start` towards `planned` until the first contact or the goal line (appendix D.1.1).
+
+    Contact and goal at the same place is a collision; so is a start in contact.
+
+    Raises:
+        ValueError: The reward is not finite.
+    """
+    contact = scene.first_contact(start, planned, radius_m)
+    goal = (scene.length_m - start[1]) / (planned[1] - start[1])
+    flown = min(contact, goal, 1.0)
+    collision = contact <= flown
+    success = not collision and goal <= 1.0
+    end = planned
+    if flown < 1.0:
+        end = (start[0] + flown * (planned[0] - start[0]), start[1] + flown * (planned[1] - start[1]))
+    if success:
+        end = (end[0], scene.length_m)
+    reward = end[1] - start[1] + GOAL_REWARD * success + COLLISION_REWARD * collision
+    if not math.isfinite(reward):
+        raise ValueError(f"the reward must be finite; got {reward} on the way from {start} to {planned}.")
+    return Outcome(end, flown, reward, success, collision)

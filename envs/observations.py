@@ -1,0 +1,68 @@
+"""What a policy, or a person, gets to see of a flight."""
+
+import numpy as np
+from gymnasium import spaces
+
+from envs.config import EnvConfig
+from envs.events import EVENT
+from envs.windows import OFF, ON, event_image, pack_window
+
+ZOOM = 4
+
+
+def observation_space(config: EnvConfig) -> spaces.Space:
+    """The space of what `config.observation` names.
+
+    Returns:
+        "window": int32 (capacity + 1, 4), see `envs.windows.pack_window`; "event_image":
+        uint8 (H, W); "luminance": float32 (H, W); "events": rows [t [us], x, y, p], int64.
+    """
+    shape = (config.camera.height, config.camera.width)
+    if config.observation == "window":
+        return spaces.Box(-1, np.iinfo(np.int32).max, (config.window_capacity + 1, 4), np.int32)
+    if config.observation == "event_image":
+        return spaces.Box(0, 255, shape, np.uint8)
+    if config.observation == "luminance":
+        return spaces.Box(0.0, np.inf, shape, np.float32)
+    return spaces.Sequence(spaces.Box(-1, 2**53, (4,), np.int64), stack=True)
+
+
+def observe(
+    config: EnvConfig, events: np.ndarray, luminance: np.ndarray, start_us: int, end_us: int
+) -> tuple[np.ndarray, int]:
+    """The observation of one control step, as a fresh array, and how many events it could not hold.
+
+    Args:
+        config: Says which.
+        events: EVENT of (start_us, end_us].
+        luminance: float32 (H, W), the last render.
+        start_us: Start of the step [us].
+        end_us: Its end [us].
+    """
+    if config.observation == "window":
+        window = pack_window(events, start_us, end_us - start_us, config.window_capacity)
+        return window, int(window[0, 1])
+    if config.observation == "event_image":
+        return event_image(events, config.camera.width, config.camera.height), 0
+    if config.observation == "luminance":
+        return luminance.copy(), 0
+    return np.stack([events[name].astype(np.int64) for name in EVENT.fields or ()], axis=1), 0
+
+
+def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
+    """Luminance beside the events, ON red and OFF blue, four times enlarged.
+
+    Args:
+        events: EVENT in time order.
+        luminance: float32 (H, W); 1 is white.
+
+    Returns:
+        uint8 (4 H, 8 W, 3).
+    """
+    height, width = luminance.shape
+    grey = np.clip(255.0 * np.sqrt(luminance), 0, 255).astype(np.uint8)
+    polarity = event_image(events, width, height)
+    image = np.repeat(np.concatenate((grey, np.zeros_like(polarity)), axis=1)[:, :, None], 3, axis=2)
+    image[:, width:][polarity == ON] = (255, 80, 40)
+    image[:, width:][polarity == OFF] = (40, 120, 255)
+    return image.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)

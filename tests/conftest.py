@@ -1,0 +1,11 @@
+import os
+
+for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+import platform  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+# Started as `pytest`, the standard library's module is loaded before the repository's.
+if not hasattr(platform, "__path__"):
+    platform.__path__ = [str(Path(__file__).resolve().parents[1] / "platform")]
