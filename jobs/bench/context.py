@@ -1,0 +1,78 @@
+"""Training step of the event VAE: fused context network against the plain formula.
+
+Run `OMP_NUM_THREADS=1 python -m jobs.bench.context [repeats]` from the repository root; it prints
+CPU seconds per training step of both forms, measured in turn in one process, and their ratio, as
+JSON. The plain form's tensors of 400 MB are otherwise fetched page by page from the system in
+every step, which doubles its time; to give it reused memory, set also `MALLOC_MMAP_MAX_=0
+MALLOC_TRIM_THRESHOLD_=100000000000 MALLOC_TOP_PAD_=1000000000` (glibc).
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from models.batch import EventBatch
+from models.evae import EventVAE, event_targets, train_step
+
+
+def random_batch(evae: EventVAE, windows: int, events: int, rng: np.random.Generator) -> EventBatch:
+    """`windows` windows of `events` uniform events each, sorted by time."""
+    grid, total = evae.grid, windows * events
+    code = rng.integers(0, 2 * grid.width * grid.height, total, dtype=np.int32)
+    bins = np.sort(rng.integers(0, grid.time_bins, (windows, events), dtype=np.int32)).ravel()
+    return EventBatch(grid, code, bins, np.arange(windows + 1, dtype=np.int64) * events)
+
+
+def compare(variant: str, windows: int = 50, events: int = 2000, repeats: int = 3) -> dict[str, float]:
+    """CPU seconds of one update, both forms, at the appendix's batch (B.2: 50 x 2000) and one thread.
+
+    Args:
+        variant: "brp_full" or "brp_xy".
+        windows: Windows per batch.
+        events: Events per window.
+        repeats: Timed updates of the plain form; the fused form gets five times as many.
+
+    Returns:
+        plain_s, fused_s (medians), ratio of the medians, ratio_of_minima.
+    """
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    evae = EventVAE(variant)
+    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3, fused=True)
+    batch = random_batch(evae, windows, events, rng)
+    targets = event_targets(batch, evae.target)
+
+    def step() -> None:
+        train_step(evae, optimizer, batch, targets, 1e-5, rng)
+
+    step()
+    fused, plain = [], []
+    for _ in range(repeats):
+        fused += [seconds(step) for _ in range(5)]
+        evae.ecn.forward = evae.ecn.plain  # type: ignore[method-assign]
+        plain.append(seconds(step))
+        del evae.ecn.forward
+    return {
+        "plain_s": float(np.median(plain)),
+        "fused_s": float(np.median(fused)),
+        "ratio": float(np.median(plain) / np.median(fused)),
+        "ratio_of_minima": min(plain) / min(fused),
+    }
+
+
+def seconds(call: Callable[[], None]) -> float:
+    """CPU time of one call (user and system), which other processes disturb least."""
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 3
+    figures = {variant: compare(variant, repeats=repeats) for variant in ("brp_full", "brp_xy")}
+    sys.stdout.write(json.dumps(figures, indent=2) + "\n")

@@ -1,0 +1,1 @@
+"""From events to actions: embedding, event VAE, lookup table, encoder files, policies."""

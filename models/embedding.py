@@ -1,0 +1,61 @@
+"""The time of an event, as the network sees it: a bin of its window, embedded by sines and cosines.
+
+Time is normalised by the fixed window, t = (t_us - start_us) / window_us in (0, 1], newest
+near 1 (appendix A.3), and then quantised to the centre of one of `time_bins` bins. The grid
+is part of the model: a table with one row per bin is therefore the model exactly.
+"""
+
+import functools
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+
+def temporal_embedding(t: npt.ArrayLike, context: int) -> np.ndarray:
+    """Embed normalised times: [sin(w t) | cos(w t)] with w_i = 100 / 1000^(i / context).
+
+    Args:
+        t: Times in [0, 1], any shape (...,).
+        context: Even number of features.
+
+    Returns:
+        float64 (..., context), values in [-1, 1].
+
+    Raises:
+        ValueError: `context` is odd or below 2, or a time is outside [0, 1] or not finite.
+
+    Source: paper equation 1 and appendix A.2, with the constants of the published code:
+    i = 0 .. context/2 - 1, from 15.9 down to 0.51 cycles per window.
+    """
+    if context < 2 or context % 2:
+        raise ValueError(f"context must be even and at least 2 (a sine and a cosine each), got {context}")
+    times = np.asarray(t, np.float64)
+    if not np.all((times >= 0) & (times <= 1)):
+        raise ValueError("t must lie in [0, 1]: subtract the start of the window and divide by its length")
+    phase = times[..., None] * (100.0 / 1000.0 ** (np.arange(context // 2) / context))
+    return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
+
+
+@functools.lru_cache(maxsize=4)
+def embedding_table(time_bins: int, context: int, dtype: str = "float32") -> np.ndarray:
+    """Read-only `dtype` (time_bins, context): the embedding at each bin's centre (i + 1/2) / time_bins.
+
+    It is computed in float64 and rounded once. Centres, because left edges triple the error
+    of the quantisation in the latent.
+    """
+    table = temporal_embedding((np.arange(time_bins) + 0.5) / time_bins, context).astype(dtype)
+    table.setflags(write=False)
+    return table
+
+
+@numba.njit(cache=True, error_model="numpy")
+def time_bin(t_us: int, start_us: int, window_us: int, time_bins: int) -> int:
+    """Bin of an event: clip(floor(time_bins (t_us - start_us) / window_us), 0, time_bins - 1).
+
+    Exact, in integers: a float32 clock would lose microseconds after 17 s. An event outside
+    its window takes the nearest bin. Assumes window_us in [1, 2^46] and time_bins <= 65536,
+    so that nothing overflows.
+    """
+    offset_us = min(max(t_us, start_us), start_us + window_us) - start_us
+    return min(offset_us * time_bins // window_us, time_bins - 1)

@@ -1,0 +1,229 @@
+"""The event variational autoencoder (appendix A.1, B.2): events -> context -> latent -> event picture.
+
+Loss of one batch, both terms on a stated scale:
+
+    loss = mean over windows and pixels of the reconstruction error
+         + beta * mean over windows of KL( q(z | events) || N(0, 1) ), summed over the latent
+
+The mean over pixels is 1 / (H W) of the sum in an evidence lower bound, so `beta` here weighs
+H W times more than the same number in front of a summed error: the appendix's schedule
+(`appendix_beta`) on this scale drives the latent of the full variant to the prior within 1,500
+iterations. A weight near 1e-5 keeps it alive.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from models.batch import EventBatch, Grid
+from models.context import EventContextNetwork
+
+VARIANTS = ("brp_full", "brp_xy")
+NORMS = ("batch", "none")
+TARGETS = ("signed", "occupancy")
+LIMITS = {"width": 4096, "height": 4096, "context": 8192, "latent": 256, "time_bins": 65536}
+LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
+ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)
+
+
+class EventVAE(nn.Module):
+    """Event context network, encoder 1024-256-(mu, logvar) and decoder latent-256-1024-H W.
+
+    Args:
+        variant: "brp_full" sees t, x, y, p; "brp_xy" sees x, y alone.
+        width, height: Pixels of the sensor.
+        context: Features of the context vector, even.
+        latent: Size of z.
+        norm: "batch" or "none": normalisation of the context network.
+        target: What is reconstructed: "signed" (Tanh, smooth L1) or "occupancy" (Sigmoid,
+            binary cross entropy); see `event_targets`.
+        time_bins: Resolution of time within a window, part of the model.
+
+    Raises:
+        ValueError: A setting outside its range; the message names it.
+    """
+
+    def __init__(
+        self,
+        variant: str = "brp_full",
+        width: int = 64,
+        height: int = 64,
+        context: int = 1024,
+        latent: int = 8,
+        norm: str = "batch",
+        target: str = "signed",
+        time_bins: int = 1024,
+    ) -> None:
+        super().__init__()
+        self.settings: dict[str, Any] = {
+            "variant": variant, "width": width, "height": height, "context": context,
+            "latent": latent, "norm": norm, "target": target, "time_bins": time_bins,
+        }  # fmt: skip
+        check_settings(self.settings)
+        self.grid = Grid(width, height, time_bins)
+        self.target = target
+        self.ecn = EventContextNetwork(self.grid, variant, context, norm)
+        self.encoder = nn.Sequential(nn.Linear(context, 256), nn.ReLU(), nn.Linear(256, 2 * latent))
+        self.decoder = nn.Sequential(
+            nn.Linear(latent, 256),
+            nn.ReLU(),
+            nn.Linear(256, 1024),
+            nn.ReLU(),
+            nn.Linear(1024, width * height),
+        )
+
+    def forward(self, batch: EventBatch, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Reconstruct a batch of windows.
+
+        Args:
+            batch: Windows, made with this model's `grid`.
+            noise: Standard normal (B, latent) for z = mu + noise exp(logvar / 2); None: z = mu.
+
+        Returns:
+            Logits (B, H W) before Tanh or Sigmoid, mu (B, latent), logvar (B, latent).
+        """
+        mu, logvar = self.encoder(self.ecn(batch)).chunk(2, dim=-1)
+        z = mu if noise is None else mu + noise * torch.exp(0.5 * logvar.clamp(-30.0, LOGVAR_LIMIT))
+        return self.decoder(z), mu, logvar
+
+    def freeze(self) -> "EventVAE":
+        """Eval mode, and no parameter or running statistic moves any more; returns self."""
+        return self.eval().requires_grad_(False)
+
+
+def check_settings(settings: dict[str, Any]) -> None:
+    """Check the arguments of `EventVAE`.
+
+    Raises:
+        ValueError: Names the setting, the value and the rule.
+    """
+    for name, allowed in (("variant", VARIANTS), ("norm", NORMS), ("target", TARGETS)):
+        if settings[name] not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {settings[name]!r}")
+    for name, limit in LIMITS.items():
+        value = settings[name]
+        if type(value) is not int or not 1 <= value <= limit:
+            raise ValueError(f"{name} must be an integer in 1..{limit}, got {value!r}")
+    if settings["context"] % 2:
+        raise ValueError(f"context must be even (sines and cosines), got {settings['context']}")
+
+
+def event_targets(batch: EventBatch, target: str) -> Tensor:
+    """Pictures that the decoder learns, float32 (B, H W), row-major.
+
+    "signed": polarity of each pixel's last event, -1, 0 or +1. "occupancy": 1 where the pixel
+    had any event, else 0. Both follow from the set of events alone, as the context does: an
+    event that occurs twice counts once. Events of a window are taken in their given (time) order.
+    """
+    pixels = batch.grid.width * batch.grid.height
+    picture = np.zeros((len(batch), pixels), np.float32)
+    _draw(batch.code, batch.offsets, target == "signed", picture)
+    return torch.from_numpy(picture)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _draw(code, offsets, signed, picture) -> None:  # type: ignore[no-untyped-def]
+    pixels = picture.shape[1]
+    for b in range(picture.shape[0]):
+        for n in range(offsets[b], offsets[b + 1]):
+            picture[b, code[n] % pixels] = 1.0 if not signed or code[n] >= pixels else -1.0
+
+
+def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
+    """Mean over windows and pixels: smooth L1 of tanh(logits), or binary cross entropy of the logits.
+
+    The cross entropy takes logits because sigmoid followed by log is infinite from 17 on.
+    """
+    if target == "signed":
+        return functional.smooth_l1_loss(torch.tanh(logits), targets)
+    return functional.binary_cross_entropy_with_logits(logits, targets)
+
+
+def reconstruct(logits: Tensor, target: str) -> Tensor:
+    """Picture from logits: Tanh in [-1, 1] or Sigmoid in [0, 1] (appendix A.1)."""
+    return torch.tanh(logits) if target == "signed" else torch.sigmoid(logits)
+
+
+def kl_divergence(mu: Tensor, logvar: Tensor) -> Tensor:
+    """KL( N(mu, exp(logvar)) || N(0, 1) ) of each window, summed over the latent: (B,).
+
+    0.5 (mu^2 + expm1(logvar) - logvar), which keeps small values that 1 + logvar - exp(logvar)
+    cancels. Above logvar 10 exp continues along its tangent, so that value and gradient stay
+    finite and point back.
+    """
+    bounded = logvar.clamp_max(LOGVAR_LIMIT)
+    exp_minus_1 = torch.expm1(bounded) + torch.exp(bounded.detach()) * (logvar - bounded)
+    return 0.5 * (mu.square() + exp_minus_1 - logvar).sum(dim=-1)
+
+
+def appendix_beta(iteration: int) -> float:
+    """The appendix's KL weight (B.2): 0 up to iteration 1000, then 1e-3 * iteration / 10000.
+
+    The appendix leaves iteration 1000 open; it is 0 here.
+    """
+    return 0.0 if iteration <= 1000 else 1e-3 * iteration / 10_000
+
+
+def train_step(
+    evae: EventVAE, optimizer: torch.optim.Optimizer, batch: EventBatch, targets: Tensor, beta: float,
+    rng: np.random.Generator, max_norm: float = 1.0,
+) -> dict[str, float]:  # fmt: skip
+    """One update of the model on one batch.
+
+    Args:
+        evae: Model in train mode.
+        optimizer: Over its parameters.
+        batch: Windows, at least two events together.
+        targets: From `event_targets`, on the model's device.
+        beta: KL weight on the scale of this module's loss.
+        rng: Draws the noise of the latent.
+        max_norm: The gradient's norm is clipped to this.
+
+    Returns:
+        loss, reconstruction, kl (mean over windows), active_units, gradient_norm (before the clip).
+
+    Raises:
+        RuntimeError: The gradient is not finite; no parameter has been changed.
+    """
+    parameter = evae.decoder[0].weight
+    noise = torch.from_numpy(rng.standard_normal((len(batch), evae.settings["latent"]))).to(parameter)
+    logits, mu, logvar = evae(batch, noise)
+    reconstruction, kl = reconstruction_loss(logits, targets, evae.target), kl_divergence(mu, logvar).mean()
+    loss = reconstruction + beta * kl
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    norm = nn.utils.clip_grad_norm_(evae.parameters(), max_norm, error_if_nonfinite=True)
+    optimizer.step()
+    figures = {"loss": loss, "reconstruction": reconstruction, "kl": kl, "gradient_norm": norm}
+    return {name: value.item() for name, value in figures.items()} | {"active_units": active_units(mu)}
+
+
+@torch.no_grad()
+def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, float]:
+    """Figures of the model on held-out windows, z = mu; the model must be in eval mode.
+
+    Returns:
+        reconstruction, mean_picture (the same error for the targets' own mean picture: a model
+        that is not below it has learnt nothing of the single window), kl, active_units.
+    """
+    logits, mu, logvar = evae(batch)
+    mean = targets.mean(0).expand_as(targets)
+    if evae.target == "signed":
+        baseline = functional.smooth_l1_loss(mean, targets)
+    else:
+        baseline = functional.binary_cross_entropy(mean, targets)
+    return {
+        "reconstruction": reconstruction_loss(logits, targets, evae.target).item(),
+        "mean_picture": baseline.item(),
+        "kl": kl_divergence(mu, logvar).mean().item(),
+        "active_units": active_units(mu),
+    }
+
+
+def active_units(mu: Tensor) -> float:
+    """Number of latent units whose mean varies by more than 0.01 over the windows of `mu` (B, latent)."""
+    return float((mu.detach().var(0, correction=0) > ACTIVE_VARIANCE).sum())

@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+
+from models.batch import EventBatch, Grid, batch_packed, batch_windows
+
+EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+GRID = Grid(width=5, height=3, time_bins=10)
+
+
+def events(*rows):
+    return np.array(list(rows), EVENT)
+
+
+def packed(capacity, window_us, rows):
+    window = np.zeros((capacity + 1, 4), np.int32)
+    window[0] = [len(rows), 0, window_us, 0]
+    window[1 : len(rows) + 1] = np.array(rows, np.int32).reshape(-1, 4)
+    return window
+
+
+def test_an_address_holds_polarity_row_column_and_time_bin():
+    batch = batch_windows([(events((101, 4, 2, 1), (150, 0, 0, -1), (200, 1, 1, -1)), 100, 100)], GRID)
+    assert batch.code.tolist() == [15 + 2 * 5 + 4, 0, 6]
+    assert batch.bin.tolist() == [0, 5, 9]
+    assert batch.offsets.tolist() == [0, 3]
+
+
+def test_empty_windows_keep_their_place_among_others():
+    window = events((1, 0, 0, 1))
+    batch = batch_windows([(window[:0], 0, 10), (window, 0, 10), (window[:0], 0, 10)], GRID)
+    assert len(batch) == 3
+    assert batch.offsets.tolist() == [0, 0, 1, 1]
+
+
+def test_packed_windows_have_the_addresses_of_their_events():
+    rows = [(3, 1, 2, -1), (7, 4, 0, 1)]
+    structured = batch_windows([(events(*rows), 0, 10), (events(), 0, 10)], GRID)
+    from_packed = batch_packed(np.stack([packed(4, 10, rows), packed(4, 10, [])]), GRID)
+    for name in ("code", "bin", "offsets"):
+        assert np.array_equal(getattr(structured, name), getattr(from_packed, name))
+
+
+def test_a_packed_window_of_zeros_is_an_empty_window():
+    assert batch_packed(np.zeros((2, 5, 4), np.int32), GRID).offsets.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("count", [-1, 5])
+def test_a_packed_window_cannot_announce_more_than_it_holds(count):
+    window = packed(4, 10, [])
+    window[0, 0] = count
+    with pytest.raises(ValueError, match="capacity is 4"):
+        batch_packed(window[None], GRID)
+
+
+@pytest.mark.parametrize("row", [(1, 5, 0, 1), (1, 0, 3, 1), (1, 65535, 0, 1), (1, 0, 0, 0), (1, 0, 0, 2)])
+def test_an_event_off_the_sensor_or_without_polarity_is_refused_by_its_index(row):
+    with pytest.raises(ValueError, match=f"event 1 has x={row[1]}, y={row[2]}, p={row[3]}"):
+        batch_windows([(events((1, 0, 0, 1), row), 0, 10)], GRID)
+
+
+def test_negative_coordinates_of_a_packed_window_are_refused():
+    with pytest.raises(ValueError, match="x=-1"):
+        batch_packed(packed(4, 10, [(1, -1, 0, 1)])[None], GRID)
+
+
+def test_a_time_that_is_not_a_number_is_refused():
+    floats = np.zeros(2, np.dtype([("t", "f8"), ("x", "u2"), ("y", "u2"), ("p", "i1")]))
+    floats["t"], floats["p"] = np.nan, 1
+    with pytest.raises(ValueError, match="field t must hold integers"):
+        batch_windows([(floats, 0, 10)], GRID)
+
+
+@pytest.mark.parametrize("window_us", [0, -5, 2**60])
+def test_a_window_without_a_usable_length_is_refused(window_us):
+    with pytest.raises(ValueError, match="window_us must be"):
+        batch_windows([(events((1, 0, 0, 1)), 0, window_us)], GRID)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"code": np.array([30], np.int32)}, "code must lie in 0..29"),
+        ({"code": np.array([-1], np.int32)}, "code must lie in"),
+        ({"bin": np.array([10], np.int32)}, "bin must lie in 0..9"),
+        ({"bin": np.array([1, 2], np.int32)}, "one per event"),
+        ({"code": np.array([1.0])}, "must be int32"),
+        ({"offsets": np.array([0, 2])}, "from 0 to 1 events"),
+        ({"offsets": np.array([0, 1, 0, 1])}, "must not decrease"),
+    ],
+)
+def test_addresses_outside_of_the_tables_are_refused(changes, message):
+    fields = {"code": np.array([3], np.int32), "bin": np.array([2], np.int32), "offsets": np.array([0, 1])}
+    with pytest.raises(ValueError, match=message):
+        EventBatch(GRID, **{**fields, **changes})

@@ -1,0 +1,164 @@
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from models.batch import batch_windows
+from models.evae import EventVAE
+from models.table import EncoderTable
+
+EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+WINDOW_US = 5000
+
+
+def make_evae(variant="brp_full", dtype=torch.float32, **settings):
+    """A model whose running statistics are not the initial ones."""
+    torch.manual_seed(2)
+    evae = EventVAE(
+        **{"variant": variant, "width": 16, "height": 12, "context": 128, "time_bins": 64} | settings
+    )
+    for _ in range(20):
+        evae.ecn(batch_windows([(make_events(400, seed), 0, WINDOW_US) for seed in range(2)], evae.grid))
+    return evae.to(dtype).freeze()
+
+
+def make_events(count, seed=0, start_us=0):
+    rng = np.random.default_rng(seed)
+    events = np.zeros(count, EVENT)
+    events["t"] = start_us + np.sort(rng.integers(1, WINDOW_US + 1, count))
+    events["x"], events["y"] = rng.integers(0, 16, count), rng.integers(0, 12, count)
+    events["p"] = rng.choice([-1, 1], count)
+    return events
+
+
+def pack(events, capacity):
+    window = np.zeros((capacity + 1, 4), np.int32)
+    window[0] = [len(events), 0, WINDOW_US, 0]
+    for column, name in enumerate("txyp"):
+        window[1 : len(events) + 1, column] = events[name]
+    return window
+
+
+def module_mu(evae, events, form="plain"):
+    context = getattr(evae.ecn, form)(batch_windows([(events, 0, WINDOW_US)], evae.grid))
+    return context[0].numpy(), evae.encoder(context).chunk(2, dim=-1)[0][0].numpy()
+
+
+@pytest.fixture(params=["brp_full", "brp_xy"])
+def evae(request):
+    return make_evae(request.param)
+
+
+@pytest.fixture
+def table(evae):
+    return EncoderTable.from_evae(evae)
+
+
+@pytest.mark.parametrize("variant", ["brp_full", "brp_xy"])
+@pytest.mark.parametrize("norm", ["batch", "none"])
+@pytest.mark.parametrize(
+    ("dtype", "context_bound", "mu_bound"), [("float64", 1e-12, 1e-13), ("float32", 1e-5, 2e-6)]
+)
+def test_the_table_is_the_module(variant, norm, dtype, context_bound, mu_bound):
+    evae = make_evae(variant, getattr(torch, dtype), norm=norm)
+    table = EncoderTable.from_evae(evae)
+    for count in (0, 1, 2, 300):
+        events = make_events(count, seed=count)
+        context, mu = module_mu(evae, events)
+        updated = table.update(table.empty(), events, 0, WINDOW_US)
+        latent = table.encode(events, 0, WINDOW_US)
+        assert updated.dtype == latent.dtype == np.dtype(dtype)
+        assert np.abs(updated - context).max() <= context_bound
+        assert np.abs(latent - mu).max() <= mu_bound
+
+
+def test_making_a_table_leaves_the_model_as_it_was(evae):
+    before = {name: value.clone() for name, value in evae.state_dict().items()}
+    EncoderTable.from_evae(evae)
+    assert all(torch.equal(before[name], value) for name, value in evae.state_dict().items())
+    assert not evae.training
+
+
+def test_a_table_of_a_model_in_training_uses_its_running_statistics():
+    evae = make_evae()
+    frozen = EncoderTable.from_evae(evae)
+    training = EncoderTable.from_evae(evae.requires_grad_(True).train())
+    assert np.array_equal(frozen.features, training.features)
+
+
+@pytest.mark.parametrize("chunks", [2, 3, 7, 50, 300])
+def test_any_chunks_of_a_window_give_the_same_context_bit_for_bit(table, chunks):
+    events = make_events(300, seed=4)
+    whole = table.update(table.empty(), events, 0, WINDOW_US)
+    cuts = np.sort(np.random.default_rng(chunks).integers(0, 301, chunks - 1))
+    context = table.empty()
+    for part in np.split(events, cuts):
+        context = table.update(context, part, 0, WINDOW_US)
+    assert np.array_equal(context, whole)
+    assert np.array_equal(table.latent(context), table.encode(events, 0, WINDOW_US))
+
+
+def test_the_order_of_events_does_not_matter_bit_for_bit(table):
+    events = make_events(300, seed=5)
+    shuffled = np.random.default_rng(0).permutation(events)
+    assert np.array_equal(table.encode(events, 0, WINDOW_US), table.encode(shuffled, 0, WINDOW_US))
+
+
+def test_an_event_2000_times_is_the_event_once_bit_for_bit(table):
+    event = make_events(1)
+    assert np.array_equal(table.encode(event, 0, WINDOW_US), table.encode(event.repeat(2000), 0, WINDOW_US))
+
+
+def test_equal_times_are_defined(table):
+    events = make_events(50)
+    events["t"] = 17
+    assert np.isfinite(table.encode(events, 0, WINDOW_US)).all()
+
+
+def test_only_the_time_within_the_window_counts(table):
+    here, there = make_events(100, start_us=0), make_events(100, start_us=10**15)
+    assert np.array_equal(table.encode(here, 0, WINDOW_US), table.encode(there, 10**15, WINDOW_US))
+
+
+def test_an_update_leaves_its_context_as_it_was(table):
+    context = table.empty()
+    assert table.update(context, make_events(10), 0, WINDOW_US).any()
+    assert not context.any()
+
+
+def test_an_empty_window_is_the_encoder_at_the_zero_context(evae, table):
+    expected = evae.encoder(torch.zeros(1, 128))[0, :8].numpy()
+    assert np.allclose(table.encode(make_events(0), 0, WINDOW_US), expected, atol=1e-6)
+    assert np.allclose(table.encode_windows(np.zeros((1, 5, 4), np.int32))[0], expected, atol=1e-6)
+
+
+def test_packed_windows_have_the_latents_of_their_events_bit_for_bit(table):
+    windows = [make_events(count, seed=count) for count in (0, 1, 40, 300)]
+    latents = table.encode_windows(np.stack([pack(events, 300) for events in windows]))
+    assert latents.dtype == np.float32
+    for events, latent in zip(windows, latents, strict=True):
+        assert np.array_equal(latent, table.encode(events, 0, WINDOW_US))
+
+
+@pytest.mark.parametrize(("field", "value"), [("x", 16), ("y", 12), ("p", 0), ("x", 65535)])
+def test_an_event_off_the_sensor_is_refused(table, field, value):
+    events = make_events(3)
+    events[field][1] = value
+    with pytest.raises(ValueError, match=f"event 1 has .*{field}={value}"):
+        table.encode(events, 0, WINDOW_US)
+    with pytest.raises(ValueError, match="event 1 has"):
+        table.encode_windows(pack(events, 5)[None])
+
+
+def test_a_context_of_another_table_is_refused(table):
+    with pytest.raises(ValueError, match="start from empty"):
+        table.update(np.zeros(64, np.float32), make_events(1), 0, WINDOW_US)
+
+
+def test_the_table_cannot_be_written_and_survives_pickling(table):
+    with pytest.raises(ValueError, match="read-only"):
+        table.features[0, 0] = 1
+    events = make_events(20)
+    copied = pickle.loads(pickle.dumps(table))
+    assert np.array_equal(copied.encode(events, 0, WINDOW_US), table.encode(events, 0, WINDOW_US))
