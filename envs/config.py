@@ -113,7 +113,8 @@ class EnvConfig:
 
 def sensor_settings(config: EnvConfig) -> dict[str, Any]:
     """The settings that give an event its meaning: data, encoder and policy must share them."""
-    return {**dataclasses.asdict(config.camera), "control_hz": config.control_hz, "speed_mps": config.speed_mps}
+    flight = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
+    return {**dataclasses.asdict(config.camera), **flight, "max_step_m": config.renderer.max_step_m}
 
 
 def settings_hash(settings: dict[str, Any]) -> str:

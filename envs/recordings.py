@@ -53,6 +53,7 @@ def write_recording(path: Path, recording: Recording) -> None:
     if np.any(np.diff(events["t"]) < 0):
         first = int(np.argmax(np.diff(events["t"]) < 0))
         raise ValueError(f"events must be sorted by t; event {first + 1} is older than the one before it")
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     pack = hdf5plugin.Blosc2(cname="zstd", clevel=3)
     offset = int(events["t"][0]) if len(events) else 0
@@ -62,8 +63,9 @@ def write_recording(path: Path, recording: Recording) -> None:
             file.create_dataset(f"events/{name}", data=values, **pack)
         file["t_offset"] = np.int64(offset)
         file["ms_to_idx"] = milliseconds_to_index(events["t"] - offset)
+        index = file.create_group("index")
         for name, values in recording.index.items():
-            file.create_dataset(f"index/{name}", data=values, **pack)
+            index.create_dataset(name, data=values, **pack)
         file.attrs["about"] = json.dumps(recording.about, allow_nan=False)
     part.replace(path)
 

@@ -1,0 +1,74 @@
+# Evade's commands; `make` or `make help` lists them.
+
+PYTHON ?= python3.11
+VENV ?= .venv
+ARGS ?=
+
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
+LAUNCH := $(BIN)/python -m platform.launch
+# Locally nothing is computed by the dashboard, and nothing is sent away.
+MLFLOW_ENV := MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true \
+	MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false
+
+export OMP_NUM_THREADS ?= 1
+export NUMBA_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.PHONY: help setup system-libraries bytestream sweep-robustness mlflow test lint check bench lock clean
+
+help: ## list these commands
+	@echo "make TARGET [ARGS=\"key=value ...\"]"
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-17s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this one
+
+$(INSTALLED): requirements.lock pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $@
+
+system-libraries: # OpenGL without a screen, for renderer=pyrender
+	@$(PYTHON) -c 'import ctypes; ctypes.CDLL("libEGL.so.1"); ctypes.CDLL("libGL.so.1")' 2>/dev/null \
+	|| if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update && apt-get install --yes --no-install-recommends $(GL_PACKAGES); \
+	else \
+	    echo "renderer=pyrender needs OpenGL; install it with:"; \
+	    echo "    sudo apt-get install --no-install-recommends $(GL_PACKAGES)"; \
+	fi
+
+bytestream: setup ## from nothing to an evaluated policy (about 45 minutes; ARGS="budget=smoke": two)
+	$(LAUNCH) +exp=bytestream $(ARGS)
+
+sweep-robustness: setup ## fly the trained policy at other rates, thresholds and with sensor faults
+	$(LAUNCH) +exp=robustness $(ARGS)
+
+mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine only
+	$(MLFLOW_ENV) $(BIN)/mlflow server --workers 1 --host 127.0.0.1 --port 5000 \
+	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
+
+test: setup ## the quick tests (ARGS="-m slow" for the slow ones)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: setup ## style, format, types, and who imports whom
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+check: lint test ## what must pass before a change is merged
+
+bench: setup ## measure the speed of the parts
+	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
+
+lock: setup ## write requirements.lock anew (ARGS=--upgrade: with the newest versions)
+	$(BIN)/pip-compile --quiet --extra dev,docs --strip-extras --allow-unsafe \
+	    --no-annotate --no-header --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+	    --output-file requirements.lock $(ARGS) pyproject.toml
+	sed -i 's/+cpu$$//' requirements.lock # a CPU wheel at hand serves the same pin
+
+clean: ## remove what tools left behind; .venv, runs and results stay
+	rm -rf build dist *.egg-info .benchmarks .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +

@@ -1,0 +1,172 @@
+"""Steps per second of every station from the scene to the training loop, in one run.
+
+Run: python -m jobs.bench.throughput
+Expect: a table in about three minutes on one core. Rows of the second part hold everything
+that the rows above them do; "of the loop" is their time as a share of the training loop's.
+"""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+import yaml
+from rich.table import Table
+
+from envs.config import EnvConfig, RendererConfig, sensor_settings, settings_hash
+from envs.corridor import CorridorEnv, CorridorVectorEnv
+from envs.events import EventCamera
+from envs.rasterize import PyrenderRenderer
+from envs.raycast import RaycastRenderer
+from envs.scene import Scene, make_scene
+from jobs.config import Config, parse
+from jobs.progress import console
+from models.evae import EventVAE
+from models.table import EncoderTable
+from models.weights import save_encoder
+
+ROUNDS = 5
+NUM_ENVS = 16
+CONFIG = EnvConfig()
+
+
+def main() -> None:
+    """Measure and print both tables."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    evae = EventVAE().freeze()
+    parts = [*frame_rows(), *step_rows(evae)]
+    with TemporaryDirectory() as folder:
+        loops = loop_rows(evae, Path(folder))
+    table = Table(title="One core, 64x64, scene poles, 200 Hz; medians of interleaved rounds")
+    for heading in ("station", "us", "per second", "of the loop"):
+        table.add_column(heading, justify="left" if heading == "station" else "right")
+    whole = loops[0][1]
+    for name, seconds in [*parts, *loops]:
+        table.add_row(name, f"{1e6 * seconds:,.0f}", f"{1 / seconds:,.0f}", f"{seconds / whole:.1%}")
+    console.print(table)
+
+
+def frame_rows() -> list[tuple[str, float]]:
+    """Seconds per frame of each renderer, and per step of the event camera alone."""
+    scene = make_scene("poles", np.random.default_rng(0))
+    ways = np.linspace(0.0, 90.0, 200)
+    raycast = RaycastRenderer(scene, 64, 64)
+    frames = [raycast.render(0.0, 0.1 * step, 2.0).copy() for step in range(200)]
+    camera = EventCamera(64, 64)
+    clock_us = iter(range(5000, 2**60, 5000))
+
+    def watch() -> None:
+        camera.reset(frames[0], next(clock_us))
+        for frame in frames[1:]:
+            camera.step(frame, next(clock_us))
+
+    work: dict[str, Callable[[], object]] = {
+        "render: raycast": lambda: [raycast.render(0.0, y, 2.0) for y in ways],
+        "event camera": watch,
+    }
+    pyrender = _pyrender(scene)
+    if pyrender is not None:
+        work["render: pyrender"] = lambda: [pyrender.render(0.0, y, 2.0) for y in ways]
+    return [(name, seconds / len(ways)) for name, seconds in interleaved(work).items()]
+
+
+def _pyrender(scene: Scene) -> PyrenderRenderer | None:
+    """The OpenGL renderer, or None (and a line that says why) where it cannot run."""
+    try:
+        return PyrenderRenderer(scene, 64, 64)
+    except RuntimeError as error:
+        console.print(str(error), markup=False)
+        return None
+
+
+def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
+    """Seconds per environment step: alone, with pyrender, as a vector, with the encoder."""
+    table = EncoderTable.from_evae(evae)
+    steps, batches = 400, 400 // NUM_ENVS
+    rng = np.random.default_rng(0)
+    single = CorridorEnv(CONFIG)
+    drawn = CorridorEnv(CONFIG, renderer=RendererConfig(name="pyrender"))
+    several = CorridorVectorEnv(NUM_ENVS, CONFIG)
+    several.reset(seed=0)
+
+    def fly(env: CorridorEnv) -> None:
+        env.reset(seed=0)
+        over = False
+        for _ in range(steps):
+            over = any(env.step(int(rng.integers(3)))[2:4])
+            if over:
+                env.reset()
+
+    def fly_several(encode: bool) -> None:
+        for _ in range(batches):
+            windows = several.step(rng.integers(3, size=NUM_ENVS))[0]
+            if encode:
+                table.encode_windows(windows)
+
+    work: dict[str, Callable[[], object]] = {
+        "env step: raycast": lambda: fly(single),
+        f"env step: raycast, {NUM_ENVS} as a vector": lambda: fly_several(False),
+        f"env step: raycast, {NUM_ENVS} as a vector, encoded": lambda: fly_several(True),
+    }
+    try:
+        drawn.reset(seed=0)
+        work["env step: pyrender"] = lambda: fly(drawn)
+    except RuntimeError as error:
+        console.print(str(error), markup=False)
+    return [(name, seconds / steps) for name, seconds in interleaved(work).items()]
+
+
+def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
+    """Seconds per environment step of RLlib's sampling, and of whole PPO iterations."""
+    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+
+    from jobs.cluster import start_ray
+    from jobs.ppo import build_ppo
+
+    sensor = sensor_settings(CONFIG)
+    path = folder / "encoder.safetensors"
+    save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
+    config = _composed()
+    size = config.algo.train_batch_size_per_learner
+    start_ray(config.cluster, folder)
+    ppo = {
+        minibatch: build_ppo(replace(config, algo=replace(config.algo, minibatch_size=minibatch)), path)
+        for minibatch in (32, 256)
+    }
+    runner = SingleAgentEnvRunner(config=ppo[32], worker_index=0)
+    algorithms = {minibatch: settings.build_algo() for minibatch, settings in ppo.items()}
+    work: dict[str, Callable[[], object]] = {
+        "training loop, the paper's minibatch of 32": algorithms[32].train,
+        "training loop, minibatch of 256": algorithms[256].train,
+        "sampling in RLlib": lambda: runner.sample(num_timesteps=size),
+    }
+    return [(name, seconds / size) for name, seconds in interleaved(work).items()]
+
+
+def _composed() -> Config:
+    """The default experiment, as the launcher composes it."""
+    command = [sys.executable, "-m", "platform.launch", "+exp=train", "--cfg", "job"]
+    return parse(yaml.safe_load(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+
+
+def interleaved(work: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """Median seconds of each piece of work; the pieces take turns, so that a slow minute hits all."""
+    for piece in work.values():
+        piece()
+    taken: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(ROUNDS):
+        for name, piece in work.items():
+            start = time.perf_counter()
+            piece()
+            taken[name].append(time.perf_counter() - start)
+    return {name: float(np.median(seconds)) for name, seconds in taken.items()}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Start or join Ray: quietly, authenticated, one thread per worker."""
+
+import logging
+import os
+import secrets
+from pathlib import Path
+
+from jobs.config import ClusterConfig, ConfigError
+
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "LP_NUM_THREADS": "0",
+}
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_DEDUP_LOGS": "1",
+    "RAY_AIR_NEW_OUTPUT": "0",
+    "TUNE_GLOBAL_CHECKPOINT_S": "1",
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
+}
+
+
+def start_ray(cluster: ClusterConfig, folder: Path) -> None:
+    """Start Ray on this machine, or join the cluster named; do nothing if that is done.
+
+    A local Ray asks every client for a token, which lies in a file that its owner alone can
+    read; the home folder is not touched. Workers run one thread each: two threads beside
+    other busy processes are slower than one.
+
+    Args:
+        cluster: Where Ray runs.
+        folder: Where the token of a local Ray is kept.
+
+    Raises:
+        ConfigError: If the cluster cannot be joined.
+    """
+    os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
+    if cluster.name == "local":
+        use_token(folder / ".ray" / "token")
+    import ray
+
+    if ray.is_initialized():
+        return
+    for name in ("ray", "ray.rllib", "ray.tune"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    settings = {
+        "runtime_env": {"env_vars": ONE_THREAD},
+        "log_to_driver": False,
+        "logging_level": logging.ERROR,
+        "configure_logging": True,
+    }
+    if cluster.name == "local":
+        ray.init(address="local", num_cpus=cluster.num_cpus, include_dashboard=False, **settings)
+        return
+    try:
+        ray.init(address=cluster.address or "auto", **settings)
+    except (ConnectionError, ray.exceptions.RayError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
+
+
+def use_token(file: Path) -> None:
+    """Let this process's Ray authenticate by the token in a private file, made if missing.
+
+    A token that the environment already names is kept. RAY_AUTH_MODE stays as it is: a Ray
+    that starts without it turns authentication on, whereas a Ray that is already imported
+    would not notice it.
+    """
+    if os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH"):
+        return
+    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    try:
+        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        pass
+    else:
+        with os.fdopen(handle, "w") as stream:
+            stream.write(secrets.token_hex(32))
+    os.environ["RAY_AUTH_TOKEN_PATH"] = str(file)

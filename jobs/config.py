@@ -1,0 +1,250 @@
+"""Every setting of an experiment: names, units and ranges; the values are in conf/.
+
+`parse` turns the composed configuration into one frozen `Config`, or raises one
+`ConfigError` that lists each refused key with its value and the rule. Nothing has been
+started or written by then.
+"""
+
+import dataclasses
+import typing
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, Fraction, Positive, RendererConfig
+from jobs.refusals import explain
+
+Count = Annotated[int, Field(ge=1)]
+NonNegative = Annotated[float, Field(ge=0)]
+Name = Annotated[str, Field(min_length=1)]
+
+
+class ConfigError(ValueError):
+    """A configuration that was refused; the message names key, value and rule."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class ModelConfig:
+    """The policy's representation and network (appendix A.1, D.1.2)."""
+
+    name: Literal["brp_full", "brp_xy"]
+    context: Annotated[int, Field(ge=8, le=8192, multiple_of=2)]
+    latent: Annotated[int, Field(ge=1, le=256)]
+    norm: Literal["batch", "none"]
+    target: Literal["signed", "occupancy"]
+    time_bins: Annotated[int, Field(ge=2, le=65536)]
+    stack: Annotated[int, Field(ge=1, le=32)]
+    hidden: list[Count]
+
+
+@dataclass(frozen=True, config=STRICT)
+class AlgoConfig:
+    """PPO, each word as RLlib spells it (appendix D.1.2)."""
+
+    lr: Positive
+    gamma: Fraction
+    lambda_: Fraction
+    clip_param: Positive
+    num_epochs: Count
+    minibatch_size: Count
+    train_batch_size_per_learner: Count
+    vf_loss_coeff: NonNegative
+    entropy_coeff: NonNegative
+    grad_clip: Positive
+    reward_scale: Positive
+    num_envs_per_env_runner: Count
+    num_env_runners: Annotated[int, Field(ge=0, le=10_000)]
+
+    @pydantic.model_validator(mode="after")
+    def _minibatch_fits(self) -> "AlgoConfig":
+        if self.minibatch_size > self.train_batch_size_per_learner:
+            raise ValueError("minibatch_size must not exceed train_batch_size_per_learner")
+        return self
+
+
+@dataclass(frozen=True, config=STRICT)
+class CollectConfig:
+    """Which flights fill the data set of the event VAE."""
+
+    scenes: Annotated[list[Name], Field(min_length=1)]
+    num_steps: Count
+    num_validation_steps: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class PretrainConfig:
+    """How the event VAE is trained (appendix B.2)."""
+
+    iterations: Count
+    batch_windows: Count
+    window_events: Count
+    windows: Literal["mixed", "count"]
+    lr: Positive
+    weight_decay: NonNegative
+    beta: NonNegative
+    beta_start: Annotated[int, Field(ge=0)]
+    beta_schedule: Literal["appendix", "constant"]
+    validate_every: Count
+    checkpoint_every: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class TrainConfig:
+    """How long the policy is trained and how often it is saved."""
+
+    env_steps: Count
+    checkpoint_every: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class EvaluateConfig:
+    """On how many held-out corridors, and drawn by which renderers."""
+
+    episodes: Count
+    renderers: Annotated[list[Literal["raycast", "pyrender"]], Field(min_length=1)]
+    pyrender_episodes: Count
+    action: Literal["deterministic", "stochastic"]
+    video: bool
+
+
+@dataclass(frozen=True, config=STRICT)
+class SweepConfig:
+    """The axes of the robustness sweep: configuration key -> values, each flown `trials` times."""
+
+    scene: Name
+    axes: dict[str, Annotated[list[float], Field(min_length=1)]]
+    trials: Count
+    policy: str | None
+
+
+@dataclass(frozen=True, config=STRICT)
+class ClusterConfig:
+    """Where Ray runs."""
+
+    name: Literal["local", "ray"]
+    address: str | None
+    num_cpus: Count | None
+
+
+@dataclass(frozen=True, config=STRICT)
+class TrackingConfig:
+    """Where results are recorded."""
+
+    uri: Name
+    experiment: Name
+
+
+@dataclass(frozen=True, config=STRICT)
+class Config:
+    """One experiment, checked."""
+
+    job: Literal["bytestream", "collect", "pretrain", "train", "evaluate", "sweep"]
+    exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+    budget: Literal["smoke", "short", "paper"]
+    seed: Annotated[int, Field(ge=0, lt=2**31)]
+    resume: str | None
+    runs_dir: Name
+    env: dict[str, Any]
+    camera: CameraConfig
+    faults: FaultsConfig
+    renderer: RendererConfig
+    model: ModelConfig
+    algo: AlgoConfig
+    collect: CollectConfig
+    pretrain: PretrainConfig
+    train: TrainConfig
+    evaluate: EvaluateConfig
+    sweep: SweepConfig
+    cluster: ClusterConfig
+    tracking: TrackingConfig
+
+    def env_config(self, **changes: Any) -> EnvConfig:
+        """The simulation that this experiment flies, with some of its fields replaced."""
+        parts = {name: getattr(self, name) for name in ENV_PARTS}
+        return EnvConfig(**{**self.env, **parts, **changes})
+
+
+ENV_PARTS = ("camera", "faults", "renderer")
+SECTIONS = {
+    part.name: part.type for part in dataclasses.fields(Config) if dataclasses.is_dataclass(part.type)
+}
+
+
+def parse(values: Mapping[str, Any]) -> Config:
+    """Check a composed configuration.
+
+    Args:
+        values: Plain containers, as `conf/` composes them or `as_dict` returns them.
+
+    Raises:
+        ConfigError: With one line per refused key: the key, the rule, the value received.
+    """
+    refused: list[str] = []
+    parts = {name: _build(section, values.get(name), name, refused) for name, section in SECTIONS.items()}
+    parts["env"] = world = _build(EnvConfig, values.get("env"), "env", refused)
+    if world is not None:  # 100 and 100.0 become the same setting, so that they name the same run
+        own = [part.name for part in dataclasses.fields(world) if part.name not in ENV_PARTS]
+        parts["env"] = {name: getattr(world, name) for name in own}
+        overlap = [name for name in ENV_PARTS if name in values["env"]]
+        refused += [f"env.{name}: no such key; {name} is a group of its own" for name in overlap]
+    refused_parts = [name for name, part in parts.items() if part is None]
+    config = _build(Config, {**values, **parts}, "", refused, refused_parts)
+    if not refused:
+        refused = _refused_axes(config)
+    if refused:
+        raise ConfigError("\n".join(refused))
+    return typing.cast(Config, config)
+
+
+def env_with(config: EnvConfig, key: str, value: Any) -> EnvConfig:
+    """The simulation with one setting replaced, such as `camera.memory` or `env.control_hz`.
+
+    Raises:
+        pydantic.ValidationError: If the setting is unknown or refuses the value.
+    """
+    section, _, name = key.rpartition(".")
+    if section in ENV_PARTS:
+        name, value = section, dataclasses.replace(getattr(config, section), **{name: value})
+    elif section != "env":
+        name = key
+    return dataclasses.replace(config, **{name: value})
+
+
+def known_keys() -> list[str]:
+    """Every key that a configuration may have."""
+    keys = [field.name for field in dataclasses.fields(Config)]
+    for name, section in {**SECTIONS, "env": EnvConfig}.items():
+        fields = [field.name for field in dataclasses.fields(typing.cast(Any, section))]
+        keys += [f"{name}.{field}" for field in fields if name != "env" or field not in ENV_PARTS]
+    return keys
+
+
+def as_dict(config: Config) -> dict[str, Any]:
+    """The configuration as plain containers, for files and trackers."""
+    return dataclasses.asdict(typing.cast(Any, config))
+
+
+def _build(section: Any, values: Any, name: str, refused: list[str], skip: Collection[str] = ()) -> Any:
+    """The section made of its values, or None, with the reasons added to `refused`."""
+    if not isinstance(values, Mapping):
+        refused.append(f"{name}: must be a group of settings, got {values!r}")
+        return None
+    try:
+        return section(**{str(key): value for key, value in values.items()})
+    except pydantic.ValidationError as error:
+        refused += [line for line in explain(error, name, known_keys()) if line.partition(":")[0] not in skip]
+        return None
+
+
+def _refused_axes(config: Config) -> list[str]:
+    """What the simulation would refuse of a sweep, hours later."""
+    refused = []
+    for key, value in [(key, value) for key, axis in config.sweep.axes.items() for value in axis]:
+        try:
+            env_with(config.env_config(), key, value)
+        except pydantic.ValidationError as error:
+            refused += [f"sweep.axes: {key}={value!r}: {problem['msg']}" for problem in error.errors()]
+    return refused

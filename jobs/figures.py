@@ -1,0 +1,187 @@
+"""Figures of results: one axis of a sweep, ways seen from above, event pictures and their copies."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse
+
+from envs.scene import Scene
+from jobs.report import Summary
+
+OFF_COLOUR, NONE_COLOUR, ON_COLOUR = "#f97316", "#15181f", "#60a5fa"
+EVENT_COLOURS = LinearSegmentedColormap.from_list("events", [OFF_COLOUR, NONE_COLOUR, ON_COLOUR])
+INK, MUTED, GRID = "#1f2430", "#6b7280", "#e5e7eb"
+POLICY, ORACLE, STRAIGHT = "#2563eb", "#059669", "#b45309"
+PILOT_COLOURS = {"oracle": ORACLE, "straight": STRAIGHT}
+OUTCOMES = {"goal": POLICY, "collision": "#dc2626", "time limit": STRAIGHT}
+AXES = {
+    "env.control_hz": ("Control rate [Hz]", "log"),
+    "env.speed_mps": ("Speed [m/s]", "linear"),
+    "camera.contrast_threshold": ("Contrast threshold [log intensity]", "log"),
+    "faults.sparsity": ("Dead pixels [fraction]", "linear"),
+    "faults.background_activity": ("Background activity [fraction of true events]", "linear"),
+    "faults.background_activity_hz": ("Background activity [Hz per pixel]", "linear"),
+}
+Measure = Callable[[Summary], tuple[float, float, float]]
+
+
+def axis_figure(
+    axis: str,
+    values: Sequence[int | float | str],
+    rows: Sequence[Summary],
+    bounds: Mapping[str, Summary],
+    trained: int | float | str | None,
+) -> Figure:
+    """How success and distance change along one axis of the sweep.
+
+    Args:
+        axis: Configuration key, such as "camera.contrast_threshold".
+        values: Value of each row, shape (n,): ascending numbers, or words.
+        rows: The policy's summaries, one per value.
+        bounds: Summaries of pilots that bound the policy, by name; drawn as levels.
+        trained: The value the policy was trained at, or None.
+    """
+    label, scale = AXES.get(axis, (axis, "linear"))
+    words = any(isinstance(value, str) for value in values)
+    places = list(range(len(values))) if words else list(values)
+    names = [value if isinstance(value, str) else f"{value:g}" for value in values]
+    figure = Figure(figsize=(9.6, 3.9), layout="constrained")
+    success, distance = figure.subplots(1, 2)
+    for panel, measure in ((success, _success_percent), (distance, _distance_m)):
+        _draw_bounds(panel, bounds, measure)
+        points = np.array([measure(row) for row in rows])
+        spread = np.abs(points[:, 1:] - points[:, :1]).T
+        style = {"color": POLICY, "lw": 1.8, "marker": "o", "ms": 6, "capsize": 4}
+        panel.errorbar(places, points[:, 0], yerr=spread, label="policy", **style)
+        panel.set_xscale(scale)
+        panel.set_xticks(places, names)
+        panel.set_xticks([], minor=True)
+        panel.margins(x=0.12)
+        panel.set_xlabel(label)
+        panel.grid(axis="y", color=GRID)
+        panel.spines[["top", "right"]].set_visible(False)
+        if trained in values:
+            panel.axvline(
+                places[values.index(trained)], color=MUTED, lw=1, ls=":", zorder=0, label="trained here"
+            )
+    success.set(ylim=(-3, 103), ylabel="Flights that reached the goal [%]")
+    distance.set(ylim=(0, None), ylabel="Mean distance without collision [m]")
+    handles, entries = success.get_legend_handles_labels()
+    figure.legend(handles, entries, loc="outside upper center", ncols=len(entries), frameon=False)
+    trials = " to ".join(f"{count}" for count in sorted({row.episodes for row in rows}))
+    figure.supxlabel(f"{trials} flights each, 95 % intervals", x=0.995, ha="right", fontsize=7, color=MUTED)
+    return figure
+
+
+def _draw_bounds(panel: Axes, bounds: Mapping[str, Summary], measure: Measure) -> None:
+    """A dashed level with its interval for each pilot that bounds the policy."""
+    for name, row in bounds.items():
+        colour = PILOT_COLOURS.get(name, MUTED)
+        middle, low, high = measure(row)
+        panel.axhspan(low, high, color=colour, alpha=0.10, lw=0)
+        panel.axhline(middle, color=colour, lw=1.4, ls="--", label=name)
+
+
+def _success_percent(row: Summary) -> tuple[float, float, float]:
+    return 100 * row.success, 100 * row.success_interval[0], 100 * row.success_interval[1]
+
+
+def _distance_m(row: Summary) -> tuple[float, float, float]:
+    return row.distance_m, *(row.distance_interval or (row.distance_m, row.distance_m))
+
+
+def reconstruction_figure(targets: np.ndarray, pictures: np.ndarray) -> Figure:
+    """Event pictures above what the event VAE made of them.
+
+    Args:
+        targets: Event pictures, shape (N, H, W), in [-1, 1] or [0, 1].
+        pictures: Their reconstructions, same shape.
+
+    Raises:
+        ValueError: If the shapes differ or there is nothing to show.
+    """
+    if targets.shape != pictures.shape or targets.ndim != 3 or len(targets) == 0:
+        raise ValueError(f"pictures must be (N, H, W) as targets, got {pictures.shape} and {targets.shape}")
+    across = min(8, len(targets))
+    down = -(-len(targets) // across)
+    figure = Figure(figsize=(1.35 * across + 0.5, 2.9 * down), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03)  # type: ignore[union-attr, call-arg]
+    panels = np.atleast_2d(figure.subplots(2 * down, across, squeeze=False))
+    for panel in panels.flat:
+        panel.set(xticks=[], yticks=[])
+        panel.spines[:].set_color(GRID)
+        panel.set_visible(False)
+    for place, pair in enumerate(zip(targets, pictures, strict=True)):
+        row, column = 2 * (place // across), place % across
+        for below, (picture, name) in enumerate(zip(pair, ("events", "decoded"), strict=True)):
+            panel = panels[row + below, column]
+            panel.set_visible(True)
+            panel.imshow(picture, cmap=EVENT_COLOURS, vmin=-1, vmax=1, interpolation="nearest")
+            if column == 0:
+                panel.set_ylabel(name, color=INK, fontsize=9)
+    return figure
+
+
+@dataclass(frozen=True)
+class Track:
+    """The way of one flight, float64 (T, 2): x and y [m]."""
+
+    pilot: str
+    seed: int
+    scene: Scene
+    way_m: np.ndarray
+    outcome: str  # a key of OUTCOMES
+
+
+def trajectory_figure(tracks: Sequence[Track]) -> Figure:
+    """Ways from above, one corridor per seed; the policy's ways have the colour of their outcome."""
+    seeds = list(dict.fromkeys(track.seed for track in tracks))
+    widest = max(track.scene.width_m for track in tracks)
+    across = min(2, len(seeds))
+    down = -(-len(seeds) // across)
+    height = 0.6 + down * (0.4 + 6.0 * (widest + 2) / 104)
+    figure = Figure(figsize=(6.6 * across, height), layout="constrained")
+    grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    for panel, seed in zip(grid.flat, seeds, strict=False):
+        flown = [track for track in tracks if track.seed == seed]
+        _draw_scene(panel, flown[0].scene)
+        for track in flown:
+            _draw_way(panel, track)
+        ends = ", ".join(f"{track.pilot} {track.way_m[-1, 1]:.0f} m" for track in flown)
+        panel.set_title(f"corridor {seed}: {ends}", loc="left", fontsize=8.5, color=INK)
+        panel.tick_params(labelsize=8)
+    for panel in grid.flat[len(seeds) :]:
+        panel.set_visible(False)
+    figure.supxlabel("y, along the corridor [m]", fontsize=8)
+    figure.supylabel("x, to the right [m]", fontsize=8)
+    keys = [Line2D([], [], color=colour, lw=2, label=f"ends: {name}") for name, colour in OUTCOMES.items()]
+    keys.append(Line2D([], [], color=ORACLE, lw=1.2, ls="--", label="oracle"))
+    figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_scene(panel: Axes, scene: Scene) -> None:
+    """Walls, goal line and obstacles; right of the flight is down, as seen by the pilot."""
+    half = scene.width_m / 2
+    discs = [Ellipse((item["y"], item["x"]), 2 * item["ry"], 2 * item["rx"]) for item in scene.obstacles]
+    panel.add_collection(PatchCollection(discs, facecolor="#6b7280", edgecolor="none", zorder=2))
+    panel.hlines([-half, half], 0, scene.length_m, color=INK, lw=2)
+    panel.vlines(scene.length_m, -half, half, color=ORACLE, lw=1.5, ls=":")
+    panel.set(xlim=(-2, scene.length_m + 2), ylim=(half + 1, -half - 1), aspect="equal", facecolor="#fafafa")
+    panel.spines[:].set_visible(False)
+
+
+def _draw_way(panel: Axes, track: Track) -> None:
+    bound = track.pilot == "oracle"
+    colour = ORACLE if bound else OUTCOMES[track.outcome]
+    x_m, y_m = track.way_m.T
+    panel.plot(y_m, x_m, color=colour, lw=1.2 if bound else 2.0, ls="--" if bound else "-", zorder=3)
+    panel.plot(y_m[0], x_m[0], "o", color=colour, ms=4, zorder=4)
+    if track.outcome == "collision":
+        panel.plot(y_m[-1], x_m[-1], "X", color=OUTCOMES["collision"], ms=10, mec="white", mew=1, zorder=5)

@@ -1,0 +1,173 @@
+"""Flights: one episode per held-out corridor, several at once, and what is kept of them."""
+
+import csv
+import dataclasses
+import io
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs.config import EnvConfig, sensor_settings
+from envs.corridor import CorridorEnv
+from jobs.figures import Track
+from jobs.pilots import Pilot
+from jobs.runs import write_atomic
+
+EPISODE = np.dtype(
+    [
+        ("seed", "i8"),
+        ("success", "?"),
+        ("collision", "?"),
+        ("truncated", "?"),
+        ("distance_m", "f8"),
+        ("return", "f8"),
+        ("steps", "i8"),
+        ("events_per_step", "f8"),
+        ("dropped", "i8"),
+    ]
+)
+
+Advance = Callable[[int], None]
+Watch = Callable[[CorridorEnv, int, np.ndarray, Mapping[str, Any]], None]
+
+
+def fly(
+    pilot: Pilot,
+    config: EnvConfig,
+    seeds: Sequence[int],
+    num_envs: int = 8,
+    watch: Watch | None = None,
+    advance: Advance | None = None,
+) -> np.ndarray:
+    """Fly one episode per seed, several in lock-step so that the pilot chooses in batches.
+
+    An episode depends on its seed, not on the others of its batch.
+
+    Args:
+        pilot: Chooses the actions.
+        config: The simulation; its observation is taken as "window".
+        seeds: One corridor each, shape (n,).
+        num_envs: Most episodes at once.
+        watch: Called after each step with the environment, the seed, the window and the info.
+        advance: Told 1 at the end of each episode.
+
+    Returns:
+        EPISODE (n,), in the order of the seeds. `distance_m` is the way along y without
+        collision [m], `dropped` what neither pixel nor window could hold.
+    """
+    config = dataclasses.replace(config, observation="window")
+    envs = [CorridorEnv(config) for _ in range(min(num_envs, len(seeds)))]
+    parts = [np.empty(0, EPISODE)]
+    try:
+        for first in range(0, len(seeds), num_envs):
+            batch = [int(seed) for seed in seeds[first : first + num_envs]]
+            parts.append(_fly_batch(pilot, envs[: len(batch)], batch, watch or _ignore, advance or _ignore))
+    finally:
+        for env in envs:
+            env.close()
+    return np.concatenate(parts)
+
+
+def _ignore(*values: Any) -> None:
+    """Watch nothing."""
+
+
+def _fly_batch(
+    pilot: Pilot, envs: Sequence[CorridorEnv], seeds: Sequence[int], watch: Watch, advance: Advance
+) -> np.ndarray:
+    """One episode per environment, until the last one ends."""
+    started = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
+    windows = np.stack([window for window, _ in started])
+    infos = [info for _, info in started]
+    pilot.reset(envs, seeds)
+    episodes = np.zeros(len(envs), EPISODE)
+    episodes["seed"] = seeds
+    flying = list(range(len(envs)))
+    while flying:
+        actions = pilot(windows, infos)
+        for row in tuple(flying):
+            window, reward, terminated, truncated, info = envs[row].step(int(actions[row]))
+            windows[row], infos[row] = window, info
+            _count(episodes, row, reward, truncated, info)
+            watch(envs[row], seeds[row], window, info)
+            if terminated or truncated:
+                advance(1)
+                flying.remove(row)
+                windows[row] = 0  # an empty window costs the pilot nothing
+    episodes["events_per_step"] /= episodes["steps"]
+    return episodes
+
+
+def _count(episodes: np.ndarray, row: int, reward: float, truncated: bool, info: Mapping[str, Any]) -> None:
+    """Add one step to an episode; `events_per_step` holds the sum until the end."""
+    episode = episodes[row]
+    for name in ("success", "collision", "distance_m"):
+        episode[name] = info[name]
+    episode["truncated"] = truncated
+    episode["return"] += reward
+    episode["steps"] += 1
+    episode["events_per_step"] += info["num_events"]
+    episode["dropped"] += info["dropped_events"]
+
+
+def check_sensor(
+    manifest: Mapping[str, Any], config: EnvConfig, allow_mismatch: bool = False
+) -> dict[str, tuple[Any, Any]]:
+    """Compare the sensor that a policy was trained with to the environment's.
+
+    Returns:
+        Setting -> (policy's value, environment's value), where they differ.
+
+    Raises:
+        ValueError: If they differ and that is not allowed; both values are named.
+    """
+    theirs, ours = manifest["sensor"], sensor_settings(config)
+    pairs = {key: (theirs.get(key), ours.get(key)) for key in {**theirs, **ours}}
+    differ = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+    if differ and not allow_mismatch:
+        got = "; ".join(f"{key} = {ours!r} instead of {theirs!r}" for key, (theirs, ours) in differ.items())
+        raise ValueError(f"the sensor must be the policy's, got {got}; the sweep job flies such changes")
+    return differ
+
+
+class Ways:
+    """Collects the ways of flights while they are flown."""
+
+    def __init__(self, seeds: Collection[int]) -> None:
+        """Collect those of the given seeds."""
+        self.seeds = seeds
+        self.points: dict[int, list[tuple[float, float]]] = defaultdict(list)
+        self.scenes: dict[int, Any] = {}
+
+    def add(self, env: CorridorEnv, seed: int, window: np.ndarray, info: Mapping[str, Any]) -> None:
+        """Note where a flight is now."""
+        if seed in self.seeds:
+            self.points[seed].append((info["x_m"], info["y_m"]))
+            self.scenes[seed] = env.scene
+
+    def tracks(self, pilot: str, episodes: np.ndarray) -> list[Track]:
+        """The ways with their outcomes."""
+        outcome = {int(episode["seed"]): _outcome(episode) for episode in episodes}
+        return [
+            Track(pilot, seed, self.scenes[seed], np.array(points), outcome[seed])
+            for seed, points in self.points.items()
+        ]
+
+
+def _outcome(episode: np.void) -> str:
+    if episode["success"]:
+        return "goal"
+    return "collision" if episode["collision"] else "time limit"
+
+
+def write_episodes(path: Path, labels: Sequence[str], flown: Mapping[Any, np.ndarray]) -> None:
+    """Every episode as one row of a CSV file, behind what was flown: one word per label."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*labels, *(EPISODE.names or ())])
+    for label, episodes in flown.items():
+        writer.writerows([*label, *episode.item()] for episode in episodes)
+    write_atomic(path, text.getvalue())

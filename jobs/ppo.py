@@ -1,0 +1,139 @@
+"""PPO as appendix D.1.2 states it, in RLlib's words; what the learner is told and what it counts."""
+
+import dataclasses
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.callbacks.callbacks import RLlibCallback
+from ray.tune.registry import register_env
+
+from envs.config import sensor_settings, settings_hash
+from envs.corridor import CorridorVectorEnv
+from jobs.config import Config, ConfigError
+from models.rllib import EncodeWindows, ScaleRewards, module_spec
+from models.weights import load_encoder
+
+ENV = "evade-corridors"
+NUM_ACTIONS = 3
+EPISODES = 100  # that a rate is averaged over
+MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
+
+
+class FlightMetrics(RLlibCallback):
+    """What flights look like, read off the environments' infos; rewards are the true ones."""
+
+    def on_sample_end(self, *, metrics_logger: Any, samples: Any, **kwargs: Any) -> None:
+        """Count the events of each step and the outcome of each flight that ended."""
+        infos = [info for chunk in samples for info in chunk.get_infos()[1:]]
+        for name, key in (("events_per_step", "num_events"), ("dropped_events", "dropped_events")):
+            metrics_logger.log_value(name, float(np.mean([info[key] for info in infos])), window=1)
+        outcomes = {"success_rate": "success", "collision_rate": "collision", "distance_m": "distance_m"}
+        for info in (chunk.get_infos(-1) for chunk in samples if chunk.is_done):
+            for name, key in outcomes.items():
+                metrics_logger.log_value(name, float(info[key]), window=EPISODES)
+
+
+def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
+    """The algorithm of an experiment; every default of RLlib that differs from the paper's is set.
+
+    `vf_clip_param` is infinite because RLlib clips the squared error, which with rewards of
+    +-100 would leave the value network without a gradient.
+
+    Args:
+        config: The experiment.
+        encoder_path: The frozen encoder's file.
+
+    Raises:
+        ConfigError: If the encoder was made for another sensor.
+    """
+    _, about = load_encoder(encoder_path)
+    check_sensor(config, about)
+    algo, model = config.algo, config.model
+    register_env(ENV, make_corridors)
+    return (
+        PPOConfig()
+        .environment(ENV, env_config={"config": config.env_config()}, disable_env_checking=True)
+        .framework("torch")
+        .env_runners(
+            num_env_runners=algo.num_env_runners,
+            num_envs_per_env_runner=algo.num_envs_per_env_runner,
+            gym_env_vectorize_mode="vector_entry_point",
+            env_to_module_connector=partial(make_encode_windows, stack=model.stack, latent=model.latent),
+        )
+        .learners(num_learners=0, learner_connector=partial(make_scale_rewards, scale=algo.reward_scale))
+        .training(
+            lr=algo.lr,
+            gamma=algo.gamma,
+            lambda_=algo.lambda_,
+            clip_param=algo.clip_param,
+            num_epochs=algo.num_epochs,
+            minibatch_size=algo.minibatch_size,
+            train_batch_size_per_learner=algo.train_batch_size_per_learner,
+            vf_loss_coeff=algo.vf_loss_coeff,
+            vf_clip_param=math.inf,
+            use_kl_loss=False,
+            kl_coeff=0.0,
+            entropy_coeff=algo.entropy_coeff,
+            grad_clip=algo.grad_clip,
+            grad_clip_by="global_norm",
+        )
+        .rl_module(rl_module_spec=module_spec(encoder_path, about, network_settings(config), config.seed))
+        .callbacks(FlightMetrics)
+        .reporting(metrics_num_episodes_for_smoothing=EPISODES)
+        .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
+        .debugging(seed=config.seed, log_level="ERROR")
+    )
+
+
+def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
+    """The environments of one env runner."""
+    return CorridorVectorEnv(context["num_envs"], context["config"])
+
+
+def make_encode_windows(env: Any, spaces: Any, device: Any, *, stack: int, latent: int) -> EncodeWindows:
+    """RLlib's way to ask for the env-to-module connector."""
+    return EncodeWindows(stack=stack, latent=latent)
+
+
+def make_scale_rewards(observation_space: Any, action_space: Any, *, scale: float) -> ScaleRewards:
+    """RLlib's way to ask for the learner connector."""
+    return ScaleRewards(scale=scale)
+
+
+def network_settings(config: Config) -> dict[str, Any]:
+    """What the policy's networks are built from."""
+    model = config.model
+    sizes = {"stack": model.stack, "latent": model.latent, "hidden": list(model.hidden)}
+    return {**sizes, "num_actions": NUM_ACTIONS}
+
+
+def policy_settings(config: Config) -> dict[str, Any]:
+    """What a policy must be flown with, for its manifest."""
+    sensor = sensor_settings(config.env_config())
+    return {
+        "name": config.model.name,
+        "observation": config.env_config().observation,
+        "window_capacity": config.env_config().window_capacity,
+        "sensor": sensor,
+        "sensor_hash": settings_hash(sensor),
+        "seed": config.seed,
+        **network_settings(config),
+        "ppo": dataclasses.asdict(config.algo),
+    }
+
+
+def check_sensor(config: Config, about: dict[str, Any]) -> None:
+    """Refuse an encoder that was made for another sensor."""
+    here, there = sensor_settings(config.env_config()), about["sensor"]
+    if settings_hash(here) == about["sensor_hash"]:
+        return
+    names = sorted(name for name in {*here, *there} if here.get(name) != there.get(name))
+    values = ", ".join(f"{name}: {there.get(name)!r} there, {here.get(name)!r} here" for name in names)
+    raise ConfigError(
+        f"encoder: was made for another sensor (hash {about['sensor_hash']}, here {settings_hash(here)}): "
+        f"{values}; use its settings, or pretrain an encoder for these"
+    )

@@ -1,0 +1,239 @@
+"""Train the event VAE on collected flights and freeze its encoder (appendix B).
+
+Run: python -m platform.launch +exp=pretrain
+Expect: about 0.1 s per iteration of 50 windows on one core; `encoder/encoder.safetensors`
+with its manifest, and `encoder/reconstructions.png`, in the run folder. A killed run
+continues from its last checkpoint.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from envs.recordings import Recording, read_recording
+from jobs.collect import collect, data_file
+from jobs.config import Config, ModelConfig, PretrainConfig
+from jobs.figures import reconstruction_figure
+from jobs.progress import progress
+from jobs.runs import Run, finish, finished, open_run
+from jobs.tracking import Tracker, open_tracker
+from models.batch import EventBatch, Grid, batch_windows
+from models.evae import EventVAE, appendix_beta, event_targets, reconstruct, train_step, validate
+from models.weights import save_encoder
+
+Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
+
+SHORTEST_STEPS, LONGEST_STEPS = 0.5, 8.0
+VALIDATION_WINDOWS = 200
+PICTURE_WINDOWS = 8
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Collect if there is no data yet, then train the event VAE; return its figures."""
+    folder = open_run(config)
+    with open_tracker(config, folder) as tracker:
+        collect(config, folder)
+        return pretrain(config, folder, tracker)
+
+
+def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
+    """Train an event VAE on the run's recordings and write its encoder file."""
+    done = finished(folder, "pretrain")
+    if done is not None:
+        return done
+    settings = config.pretrain
+    train = read_recording(data_file(folder, "train"))
+    validation = read_recording(data_file(folder, "validation"))
+    torch.manual_seed(config.seed)
+    evae = build_evae(config.model, train.about["sensor"])
+    optimizer = torch.optim.Adam(
+        evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
+    )
+    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 2]))
+    held_out = held_out_windows(validation, settings, evae.grid)
+    checkpoint = folder.encoder / "checkpoint.pt"
+    first = restore(checkpoint, evae, optimizer, rng)
+    best: dict[str, float] = {}
+    with progress("Pretrain the event VAE", settings.iterations, "iterations", done=first) as advance:
+        for iteration in range(first, settings.iterations):
+            evae.train()
+            batch = batch_windows(sample_windows(train, settings, settings.batch_windows, rng), evae.grid)
+            targets = event_targets(batch, evae.target)
+            losses = train_step(evae, optimizer, batch, targets, beta(settings, iteration), rng)
+            last = iteration + 1 == settings.iterations
+            if last or (iteration + 1) % settings.validate_every == 0:
+                best = held_out_figures(evae, held_out)
+                tracker.log(
+                    iteration + 1, {f"evae/{name}": value for name, value in {**losses, **best}.items()}
+                )
+            if last or (iteration + 1) % settings.checkpoint_every == 0:
+                save_checkpoint(checkpoint, evae, optimizer, rng, iteration + 1)
+            explained = best.get("explained_step", 0.0)
+            advance(1, note=f"loss {losses['loss']:.4f}, held out {explained:.0%} explained")
+    return freeze(config, folder, tracker, evae, train.about, held_out, best)
+
+
+def build_evae(model: ModelConfig, sensor: dict[str, Any]) -> EventVAE:
+    """The untrained event VAE that a model configuration and a sensor ask for."""
+    return EventVAE(
+        variant=model.name,
+        width=sensor["width"],
+        height=sensor["height"],
+        context=model.context,
+        latent=model.latent,
+        norm=model.norm,
+        target=model.target,
+        time_bins=model.time_bins,
+    )
+
+
+def beta(settings: PretrainConfig, iteration: int) -> float:
+    """Weight of the KL divergence at an iteration (appendix B.2, or a constant after a start)."""
+    if settings.beta_schedule == "appendix":
+        return appendix_beta(iteration)
+    return settings.beta if iteration >= settings.beta_start else 0.0
+
+
+def sample_windows(
+    recording: Recording, settings: PretrainConfig, count: int, rng: np.random.Generator
+) -> list[Window]:
+    """Draw event windows that never cross from one flight into the next.
+
+    "count" windows hold `window_events` events from a random index on (appendix B.2). "mixed"
+    windows last between half a control step and eight, so that the encoder knows the short,
+    sparse and empty windows of control at any rate as well as long ones.
+
+    Returns:
+        (events, start_us, window_us) each; every event has start_us < t <= start_us + window_us.
+    """
+    draw = _window_by_count if settings.windows == "count" else _window_by_time
+    return [draw(recording, settings.window_events, rng) for _ in range(count)]
+
+
+def _window_by_time(recording: Recording, most_events: int, rng: np.random.Generator) -> Window:
+    start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    step = int(rng.integers(len(start)))
+    period_us = int(end[step] - start[step])
+    ratio = np.exp(rng.uniform(np.log(SHORTEST_STEPS), np.log(LONGEST_STEPS)))
+    window_us = max(1, round(period_us * ratio))
+    last = int(np.searchsorted(flight, flight[step], side="right")) - 1
+    start_us = int(start[step]) + int(rng.integers(period_us))
+    start_us = min(start_us, int(end[last]) - window_us)
+    first = int(np.searchsorted(flight, flight[step]))
+    start_us = max(start_us, int(start[first]))
+    return cut_window(recording, start_us, window_us, most_events)
+
+
+def _window_by_count(recording: Recording, num_events: int, rng: np.random.Generator) -> Window:
+    t_us, start, flight = recording.t_us, recording.index["step_t_us"], recording.index["step_flight"]
+    first = int(rng.integers(len(t_us)))
+    step = int(np.searchsorted(start, t_us[first], side="left")) - 1
+    last_step = int(np.searchsorted(flight, flight[step], side="right")) - 1
+    flight_end = int(np.searchsorted(t_us, recording.index["step_end_us"][last_step], side="right"))
+    stop = min(first + num_events, flight_end)
+    start_us = int(t_us[first]) - 1
+    return recording.events[first:stop], start_us, int(t_us[stop - 1]) - start_us
+
+
+def cut_window(recording: Recording, start_us: int, window_us: int, most_events: int) -> Window:
+    """The newest `most_events` of the events with start_us < t <= start_us + window_us."""
+    first, stop = np.searchsorted(recording.t_us, [start_us, start_us + window_us], side="right")
+    return recording.events[max(first, stop - most_events) : stop], start_us, window_us
+
+
+def held_out_windows(recording: Recording, settings: PretrainConfig, grid: Grid) -> dict[str, EventBatch]:
+    """Fixed windows of unseen flights: one control step long, and four."""
+    rng = np.random.default_rng(0)
+    start, end = recording.index["step_t_us"], recording.index["step_end_us"]
+    windows: dict[str, EventBatch] = {}
+    for name, steps in (("step", 1), ("four_steps", 4)):
+        chosen = rng.choice(len(start), VALIDATION_WINDOWS)
+        spans = [(int(start[step]), steps * int(end[step] - start[step])) for step in chosen]
+        cut = [cut_window(recording, begin, span, settings.window_events) for begin, span in spans]
+        windows[name] = batch_windows(cut, grid)
+    return windows
+
+
+def held_out_figures(evae: EventVAE, held_out: dict[str, EventBatch]) -> dict[str, float]:
+    """Figures of `models.evae.validate` for each window length, and the error explained.
+
+    `explained` is 1 - reconstruction error / error of the mean picture: 0 for a model that has
+    learnt nothing of the single window, 1 for a perfect one.
+    """
+    evae.eval()
+    figures: dict[str, float] = {}
+    for name, batch in held_out.items():
+        values = validate(evae, batch, event_targets(batch, evae.target))
+        values["explained"] = 1.0 - values["reconstruction"] / values.pop("mean_picture")
+        figures |= {f"{key}_{name}": value for key, value in values.items()}
+    return figures
+
+
+def freeze(
+    config: Config,
+    folder: Run,
+    tracker: Tracker,
+    evae: EventVAE,
+    about: dict[str, Any],
+    held_out: dict[str, EventBatch],
+    figures: dict[str, float],
+) -> dict[str, Any]:
+    """Write the encoder file and a picture of its reconstructions."""
+    evae.eval()
+    manifest = {
+        "sensor": about["sensor"],
+        "sensor_hash": about["sensor_hash"],
+        "scenes": about["scenes"],
+        "iterations": config.pretrain.iterations,
+        "figures": figures,
+    }
+    save_encoder(encoder_file(folder), evae, manifest)
+    tracker.artifact(encoder_file(folder).with_suffix(".json"), "encoder")
+    figure = reconstruction_figure(*example_pictures(evae, held_out))
+    tracker.figure("evae/reconstructions.png", figure)
+    return finish(folder, "pretrain", figures)
+
+
+@torch.no_grad()
+def example_pictures(evae: EventVAE, held_out: dict[str, EventBatch]) -> tuple[np.ndarray, np.ndarray]:
+    """Target pictures and their reconstructions, the first few of each length: (K, H, W) each."""
+    targets = [event_targets(batch, evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
+    drawn = [reconstruct(evae(batch)[0], evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
+    shape = (-1, evae.grid.height, evae.grid.width)
+    return torch.cat(targets).reshape(shape).numpy(), torch.cat(drawn).reshape(shape).numpy()
+
+
+def encoder_file(folder: Run) -> Path:
+    """Where the frozen encoder lives in a run folder."""
+    return folder.encoder / "encoder.safetensors"
+
+
+def save_checkpoint(
+    path: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator, iteration: int
+) -> None:
+    """Write everything that a killed training needs to go on; whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    state = {
+        "evae": evae.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "rng": rng.bit_generator.state,
+        "torch_rng": torch.get_rng_state(),
+        "iteration": iteration,
+    }
+    torch.save(state, part)
+    part.replace(path)
+
+
+def restore(path: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator) -> int:
+    """Load a checkpoint if there is one; return the number of iterations already done."""
+    if not path.exists():
+        return 0
+    state = torch.load(path, weights_only=True)
+    evae.load_state_dict(state["evae"])
+    optimizer.load_state_dict(state["optimizer"])
+    rng.bit_generator.state = state["rng"]
+    torch.set_rng_state(state["torch_rng"])
+    return int(state["iteration"])

@@ -1,0 +1,90 @@
+"""Progress that a person can read: a bar in a terminal, a plain line now and then elsewhere."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+PLAIN_LINE_EVERY_S = 10.0
+
+console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
+
+
+@contextlib.contextmanager
+def progress(title: str, total: int, unit: str, done: int = 0) -> Iterator[Callable[..., None]]:
+    """Show how far a job is, how fast, and how long it will still take.
+
+    Args:
+        title: What is being done.
+        total: How many units there are in all.
+        unit: What is counted, in the plural.
+        done: How many were done by an earlier run that this one continues.
+
+    Yields:
+        `advance(count, note="")`: tell that `count` more units are done; the note (such as
+        the current loss) stands behind them.
+    """
+    if console.is_terminal:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:,.0f}/{task.total:,.0f} " + unit),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+        )
+        with Progress(*columns, console=console) as bar:
+            task = bar.add_task(title, total=total, completed=done, note="")
+            yield lambda count, note="": _advance_bar(bar, task, count, note)
+    else:
+        lines = _PlainLines(title, total, unit, done)
+        lines.show("")
+        yield lines.advance
+        lines.show("", final=True)
+
+
+def _advance_bar(bar: Progress, task: TaskID, count: int, note: str) -> None:
+    bar.advance(task, count)
+    if note:
+        bar.update(task, note=note)
+
+
+class _PlainLines:
+    """The same for a log file: one line every few seconds, and one at the end."""
+
+    def __init__(self, title: str, total: int, unit: str, done: int) -> None:
+        self.title, self.total, self.unit = title, total, unit
+        self.done, self.first = done, done
+        self.started = self.shown = time.monotonic()
+        self.note = ""
+
+    def advance(self, count: int, note: str = "") -> None:
+        self.done += count
+        self.note = note or self.note
+        if time.monotonic() - self.shown >= PLAIN_LINE_EVERY_S and self.done < self.total:
+            self.show(self.note)
+
+    def show(self, note: str, final: bool = False) -> None:
+        self.shown = time.monotonic()
+        elapsed = self.shown - self.started
+        rate = (self.done - self.first) / elapsed if elapsed > 0 else 0.0
+        parts = [f"{self.title}: {self.done:,}/{self.total:,} {self.unit}"]
+        if final:
+            parts.append(f"in {clock(elapsed)}")
+        elif rate > 0:
+            parts.append(f"{rate:,.0f}/s, {clock((self.total - self.done) / rate)} left")
+        if note or final:
+            parts.append(note or self.note)
+        console.print(" · ".join(part for part in parts if part))
+
+
+def clock(seconds: float) -> str:
+    """A duration as a person writes it: 45 s, 3 min 20 s, 2 h 05 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -1,0 +1,160 @@
+"""Numbers with their intervals, as tables; no number stands without one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+from scipy.stats import binomtest
+
+from jobs.progress import console
+
+CONFIDENCE = 0.95
+RESAMPLES = 10_000
+FILE_WIDTH = 120
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a pilot achieved over the episodes of one condition.
+
+    Attributes:
+        label: What was flown, one word per heading of the table.
+        episodes: Number of episodes [-].
+        success: Fraction that reached the goal line, with its Wilson interval.
+        distance_m: Mean forward distance without collision [m], with its bootstrap interval
+            (None for a single episode).
+        events_per_step: Mean events of a control step [-].
+        dropped: Events that did not fit into a window or a pixel, all episodes [-].
+    """
+
+    label: tuple[str, ...]
+    episodes: int
+    success: float
+    success_interval: Interval
+    distance_m: float
+    distance_interval: Interval | None
+    events_per_step: float
+    dropped: int
+
+
+def wilson_interval(successes: int, trials: int) -> Interval:
+    """95 % interval of a success rate (Wilson 1927); it also holds at 0 and at all of them.
+
+    Raises:
+        ValueError: If there are no trials, or more successes than trials.
+    """
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"need 0 <= successes <= trials and a trial, got {successes} of {trials}; fly first")
+    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval | None:
+    """95 % percentile bootstrap interval of the mean; None for a single value.
+
+    Args:
+        values: One number per episode, shape (n,).
+        rng: Draws the resamples.
+
+    Raises:
+        ValueError: If there is no value, or one is NaN or infinite.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
+        raise ValueError(f"values must be a list of finite numbers, got {values!r}; leave out what failed")
+    if values.size == 1:
+        return None
+    means = values[rng.integers(values.size, size=(RESAMPLES, values.size))].mean(axis=1)
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def summarise(label: Sequence[str], episodes: np.ndarray) -> Summary:
+    """Rates, means and intervals of the episodes (dtype `jobs.evaluate.EPISODE`) of one condition.
+
+    The resamples are drawn from a fixed seed: the same episodes give the same interval.
+    """
+    distance_m = episodes["distance_m"].astype(np.float64)
+    interval = bootstrap_interval(distance_m, np.random.default_rng(0))
+    return Summary(
+        label=tuple(label),
+        episodes=len(episodes),
+        success=float(episodes["success"].mean()),
+        success_interval=wilson_interval(int(episodes["success"].sum()), len(episodes)),
+        distance_m=float(distance_m.mean()),
+        distance_interval=interval,
+        events_per_step=float(episodes["events_per_step"].mean()),
+        dropped=int(episodes["dropped"].sum()),
+    )
+
+
+def cells(row: Summary) -> tuple[str, ...]:
+    """A row of the table as text."""
+    low, high = row.success_interval
+    near, far = row.distance_interval or (None, None)
+    distance = f"{row.distance_m:.1f}" + ("" if near is None else f" [{near:.1f}, {far:.1f}]")
+    success = f"{100 * row.success:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
+    return (*row.label, str(row.episodes), success, distance, f"{row.events_per_step:.0f}", str(row.dropped))
+
+
+def headings(names: Sequence[str]) -> tuple[str, ...]:
+    """The table's headings after those of the labels; intervals are 95 %."""
+    return (*names, "Episodes", "Success [%]", "Distance [m]", "Events/step", "Dropped")
+
+
+def table(title: str, names: Sequence[str], rows: Sequence[Summary]) -> Table:
+    """The rows as a table for a terminal."""
+    caption = "In brackets 95 % intervals: Wilson for success, bootstrap for distance"
+    result = Table(title=title, caption=caption, title_justify="left")
+    for place, name in enumerate(headings(names)):
+        result.add_column(escape(name), justify="left" if place < len(names) else "right", overflow="fold")
+    for row in rows:
+        result.add_row(*map(escape, cells(row)))
+    return result
+
+
+def show(results: Table) -> None:
+    """Print a table; whole, where there is no terminal to fit into."""
+    console.print(results, width=None if console.is_terminal else FILE_WIDTH, soft_wrap=False)
+
+
+def markdown(names: Sequence[str], rows: Sequence[Summary]) -> str:
+    """The rows as a Markdown table."""
+    head = headings(names)
+    lines = [head, ["---" if place < len(names) else "---:" for place in range(len(head))], *map(cells, rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def columns(names: Sequence[str], rows: Sequence[Summary]) -> dict[str, list[str | float]]:
+    """The rows as columns for a tracker; the first, all labels joined, is unique."""
+    low_high = [row.distance_interval or (row.distance_m, row.distance_m) for row in rows]
+    return {
+        " · ".join(names): [" · ".join(row.label) for row in rows],
+        "success_rate": [row.success for row in rows],
+        "success_low": [row.success_interval[0] for row in rows],
+        "success_high": [row.success_interval[1] for row in rows],
+        "distance_m": [row.distance_m for row in rows],
+        "distance_low_m": [low for low, _ in low_high],
+        "distance_high_m": [high for _, high in low_high],
+        "episodes": [row.episodes for row in rows],
+    }
+
+
+def metrics(row: Summary, suffix: str = "") -> dict[str, float]:
+    """The figures of a row under the names that trackers and tables share."""
+    low, high = row.distance_interval or (float("nan"), float("nan"))
+    values = {
+        "eval/success_rate": row.success,
+        "eval/success_rate_low": row.success_interval[0],
+        "eval/success_rate_high": row.success_interval[1],
+        "eval/distance_m": row.distance_m,
+        "eval/distance_m_low": low,
+        "eval/distance_m_high": high,
+        "sim/events_per_step": row.events_per_step,
+        "sim/dropped_events": float(row.dropped),
+    }
+    return {f"{name}{suffix}": value for name, value in values.items()}

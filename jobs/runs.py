@@ -1,0 +1,146 @@
+"""Run folders: where one experiment keeps everything it made, and how it is found again.
+
+A folder is named after the configuration that fills it, so that the same command finds
+the same folder and continues there. Each finished stage leaves a marker with its figures.
+"""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from envs.config import settings_hash
+from jobs.config import Config, ConfigError, as_dict, parse
+
+# What a run is called or where it is computed and written down does not change what it is.
+UNNAMED = ("job", "resume", "runs_dir", "cluster", "tracking")
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run folder and the configuration that fills it."""
+
+    path: Path
+    config: Config
+
+    @property
+    def data(self) -> Path:
+        """Recordings."""
+        return self.path / "data"
+
+    @property
+    def encoder(self) -> Path:
+        """The frozen encoder, its manifest and checkpoints."""
+        return self.path / "encoder"
+
+    @property
+    def train(self) -> Path:
+        """Checkpoints of the policy's training."""
+        return self.path / "train"
+
+    @property
+    def policy(self) -> Path:
+        """The trained policy, ready to fly."""
+        return self.path / "policy"
+
+    @property
+    def evaluation(self) -> Path:
+        """Episodes, tables, figures and videos."""
+        return self.path / "eval"
+
+
+def open_run(config: Config) -> Run:
+    """The folder of a configuration: the one it names, the one to resume, or a new one.
+
+    Raises:
+        ConfigError: If `resume` names no run folder.
+    """
+    if config.resume is not None:
+        return reopen(Path(config.resume), config)
+    path = Path(config.runs_dir).resolve() / run_name(config)
+    values = as_dict(config)
+    if not (path / "config.json").exists():
+        write_atomic(path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
+        write_json(path / "config.json", values)
+    return Run(path, config)
+
+
+def reopen(path: Path, config: Config) -> Run:
+    """An existing run folder with its own stored configuration, computed where `config` says."""
+    stored = path.resolve() / "config.json"
+    if not stored.is_file():
+        raise ConfigError(
+            f"resume: must be a run folder (one that holds config.json), got {str(path)!r}; "
+            f"run folders are in {str(Path(config.runs_dir).resolve())!r}"
+        )
+    here = {name: getattr(config, name) for name in UNNAMED}
+    return Run(stored.parent, dataclasses.replace(parse(json.loads(stored.read_text())), **here))
+
+
+def run_name(config: Config) -> str:
+    """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change a result."""
+    settings = {name: value for name, value in as_dict(config).items() if name not in UNNAMED}
+    return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
+
+
+def finished(run: Run, stage: str) -> dict[str, Any] | None:
+    """The figures of a finished stage, or None while it is not finished."""
+    marker = run.path / "stages" / f"{stage}.json"
+    return json.loads(marker.read_text())["figures"] if marker.is_file() else None
+
+
+def finish(run: Run, stage: str, figures: dict[str, Any]) -> dict[str, Any]:
+    """Mark a stage as finished, with its figures; return them."""
+    write_json(run.path / "stages" / f"{stage}.json", {"figures": figures, **provenance()})
+    return figures
+
+
+def latest_policy(runs_dir: str | Path) -> Path | None:
+    """The policy folder that was finished last, or None if there is none."""
+    manifests = Path(runs_dir).resolve().glob("*/policy/policy.json")
+    newest = max(manifests, key=lambda path: path.stat().st_mtime_ns, default=None)
+    return None if newest is None else newest.parent
+
+
+def provenance() -> dict[str, Any]:
+    """Commit and machine: what to name beside a figure so that it can be trusted."""
+    python = ".".join(map(str, sys.version_info[:3]))
+    return {"commit": git_commit(), "host": os.uname().nodename, "cpus": os.cpu_count(), "python": python}
+
+
+def git_commit() -> str:
+    """The repository's commit, with "-dirty" behind it if files differ from it; or "unknown"."""
+    commit = _git("rev-parse", "HEAD")
+    if commit is None:
+        return "unknown"
+    return f"{commit}-dirty" if _git("status", "--porcelain", "--untracked-files=no") else commit
+
+
+def _git(*arguments: str) -> str | None:
+    """What git prints, or None when there is no git or no repository."""
+    try:
+        command = ["git", "-C", str(REPOSITORY), *arguments]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip()
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Write plain containers as JSON, whole or not at all; NaN and infinity are refused."""
+    write_atomic(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+
+
+def write_atomic(path: Path, text: str) -> None:
+    """Write a file so that a reader sees the old content or the new one, never a part."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.write_text(text)
+    part.replace(path)

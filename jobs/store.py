@@ -1,0 +1,67 @@
+"""Where the tracking store is, and what may be written to it; plain values, no tracker needed."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jobs.config import Config, ConfigError
+
+SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep")
+MOST_METRICS = 40  # of one call; a page with hundreds of charts cannot be read, nor drawn
+MOST_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
+LOCAL_PAGE = "http://127.0.0.1:5000"
+
+
+def store_uri(config: Config) -> str:
+    """The store's address; a relative SQLite file lies in the folder that holds `runs_dir`.
+
+    Raises:
+        ConfigError: If the address is of a kind that MLflow does not keep runs in.
+    """
+    uri = config.tracking.uri
+    if uri.startswith("sqlite:///"):
+        return f"sqlite:///{Path(config.runs_dir).resolve().parent / uri.removeprefix('sqlite:///')}"
+    if uri.startswith(("http://", "https://", "postgresql", "mysql")):
+        return uri
+    raise ConfigError(f"tracking.uri: must begin with sqlite:/// or http:// or https://, got {uri!r}")
+
+
+def page(uri: str) -> str:
+    """Where a browser finds a tracking store."""
+    return uri.rstrip("/") if uri.startswith("http") else LOCAL_PAGE
+
+
+def dashboard_command(uri: str) -> str:
+    """The command that serves a store to browsers of this machine only."""
+    lean = "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true"
+    return f"{lean} mlflow server --workers 1 --host 127.0.0.1 --port 5000 --backend-store-uri {uri}"
+
+
+def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
+    """The metrics as floats; `jobs.tracking.Tracker.log` says what is refused."""
+    values = {name: float(value) for name, value in metrics.items()}
+    infinite = [f"{name} = {value}" for name, value in values.items() if math.isinf(value)]
+    if infinite:
+        raise ValueError(f"metrics must be finite, got {', '.join(infinite)}; leave out the unmeasured")
+    stray = [name for name in values if name.partition("/")[0] not in SECTIONS or "/" not in name]
+    if stray:
+        raise ValueError(f"metric names must be section/name with a section of {SECTIONS}, got {stray}")
+    if len(values) > MOST_METRICS:
+        raise ValueError(f"metrics must be at most {MOST_METRICS} a call, got {len(values)}; choose some")
+    return values
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested settings as `outer.inner` -> text; a text that MLflow would cut is refused."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            flat.update(flatten(value, f"{name}."))
+            continue
+        text = str(value)
+        if len(text) > MOST_PARAM_CHARACTERS:
+            raise ValueError(f"{name} must be at most {MOST_PARAM_CHARACTERS} characters, got {len(text)}")
+        flat[name] = text
+    return flat

@@ -1,0 +1,212 @@
+"""What happened, written to MLflow; the only file that talks to it.
+
+One process creates the store (two at once break an SQLite file for good), the driver alone
+writes, and it writes in batches: hundreds of single writes cost seconds, a batch a few
+hundredths of one.
+"""
+
+import base64
+import contextlib
+import fcntl
+import json
+import logging
+import math
+import os
+import time
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from jobs.config import Config, as_dict
+from jobs.runs import Run, provenance, write_json
+from jobs.store import check_metrics, dashboard_command, flatten, page, store_uri
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from mlflow import MlflowClient
+
+BATCH = 100  # MLflow's limit on parameters and on tags of one call
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """One MLflow run that is being written."""
+
+    client: "MlflowClient"
+    uri: str
+    experiment_id: str
+    run_id: str
+
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Write metrics of one step in one batch.
+
+        Args:
+            step: Position on the run's own axis, such as environment steps [-].
+            metrics: `section/name` -> value. NaN means "not measured": it is left out, and
+                the tag `not_measured` names it.
+
+        Raises:
+            ValueError: If a value is infinite (MLflow would store 1.8e308 without a word),
+                a name is in no known section, or there are more than `jobs.store.MOST_METRICS`.
+        """
+        from mlflow.entities import Metric, RunTag
+
+        values = check_metrics(metrics)
+        now_ms = int(time.time() * 1000)
+        missing = sorted(name for name, value in values.items() if math.isnan(value))
+        written = [Metric(name, value, now_ms, step) for name, value in values.items() if name not in missing]
+        tags = [RunTag("not_measured", f"step {step}: {', '.join(missing)}")] if missing else []
+        self.client.log_batch(self.run_id, metrics=written, tags=tags)
+
+    def params(self, values: Mapping[str, Any]) -> None:
+        """Write settings that the run does not have yet, nested mappings as `outer.inner`."""
+        from mlflow.entities import Param
+
+        known = self.client.get_run(self.run_id).data.params
+        new = [Param(key, text) for key, text in flatten(values).items() if key not in known]
+        for first in range(0, len(new), BATCH):
+            self.client.log_batch(self.run_id, params=new[first : first + BATCH])
+
+    def tags(self, values: Mapping[str, Any]) -> None:
+        """Write tags; a tag that exists takes the new value."""
+        from mlflow.entities import RunTag
+
+        self.client.log_batch(self.run_id, tags=[RunTag(key, str(value)) for key, value in values.items()])
+
+    def describe(self, markdown: str) -> None:
+        """Write the text that stands at the top of the run's page."""
+        self.tags({"mlflow.note.content": markdown})
+
+    def figure(self, name: str, figure: "Figure") -> None:
+        """Write a figure as a picture file called `name`."""
+        self.client.log_figure(self.run_id, figure, name, save_kwargs={"dpi": 120})
+
+    def text(self, name: str, text: str) -> None:
+        """Write a text file called `name`."""
+        self.client.log_text(self.run_id, text, name)
+
+    def table(self, name: str, columns: Mapping[str, Sequence[Any]]) -> None:
+        """Write a table as `name`.json; the values of its first column must be unique."""
+        self.client.log_table(self.run_id, dict(columns), f"{name}.json")
+
+    def artifact(self, path: Path, folder: str | None = None) -> None:
+        """Write a file, as it is, into a folder of the run's artifacts."""
+        self.client.log_artifact(self.run_id, str(path), folder)
+
+    def link(self) -> str:
+        """Address of the run's page."""
+        return f"{page(self.uri)}/#/experiments/{self.experiment_id}/runs/{self.run_id}"
+
+    def save_view(self, key: str, name: str, columns: Sequence[str], search: str = "") -> str:
+        """Store a view of the experiment's runs under "Views", and return its address.
+
+        Args:
+            key: Identity of the view; the same key replaces it.
+            name: What the menu calls it.
+            columns: Shown columns, such as "metrics.`eval/success_rate`"; the first orders the rows.
+            search: Filter, such as "tags.kind = 'condition'".
+        """
+        order = {"orderByKey": columns[0], "orderByAsc": False}
+        state = {"searchFilter": search, **order, "selectedColumns": list(columns)}
+        now_ms = int(time.time() * 1000)
+        packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
+        view = {"name": name, "createdAt": now_ms, "updatedAt": now_ms, "state": packed}
+        self.client.set_experiment_tag(self.experiment_id, f"mlflow.sharedViewState.{key}", json.dumps(view))
+        return f"{experiment_page(self)}&viewStateShareKey={quote(key)}"
+
+    def dashboard(self) -> str:
+        """The command that opens the dashboard, and the addresses to open in it."""
+        lines = [] if page(self.uri) == self.uri else [f"Dashboard: {dashboard_command(self.uri)}"]
+        return "\n".join([*lines, f"This run:  {self.link()}", f"All runs:  {experiment_page(self)}"])
+
+
+def experiment_page(tracker: Tracker) -> str:
+    """Address of the table of runs; unless it names the workflow, MLflow opens a page for chat models."""
+    return f"{page(tracker.uri)}/#/experiments/{tracker.experiment_id}/runs?workflowType=machine_learning"
+
+
+@contextlib.contextmanager
+def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Tracker]:
+    """Write to the MLflow run of a run folder: the one it had before, or a new one.
+
+    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C.
+
+    Args:
+        config: Names the store and the experiment; its settings become parameters.
+        folder: The run folder; it remembers the MLflow run's id.
+        key: Which of the folder's MLflow runs.
+    """
+    uri = store_uri(config)
+    client, experiment_id = open_store(uri, config.tracking.experiment)
+    name = folder.path.name if key == "run" else f"{folder.path.name} {key}"
+    facts = {"run_folder": folder.path, "job": config.job, **provenance()}
+    tracker = _continue_or_create(Tracker(client, uri, experiment_id, ""), folder, key, name, {"kind": key})
+    with _ended(tracker):
+        tracker.params(as_dict(folder.config))
+        tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
+        yield tracker
+
+
+@contextlib.contextmanager
+def open_child(parent: Tracker, folder: Run, key: str, name: str, kind: str) -> Iterator[Tracker]:
+    """Write to a run below `parent`; the same key continues the same run."""
+    tags = {"kind": kind, "mlflow.parentRunId": parent.run_id}
+    child = _continue_or_create(parent, folder, key, name, tags)
+    with _ended(child):
+        yield child
+
+
+@contextlib.contextmanager
+def _ended(tracker: Tracker) -> Iterator[None]:
+    """End the run as what its block turned out to be."""
+    status = "FAILED"
+    try:
+        yield
+        status = "FINISHED"
+    except KeyboardInterrupt:
+        status = "KILLED"
+        raise
+    finally:
+        tracker.client.set_terminated(tracker.run_id, status)
+
+
+def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
+    """The MLflow run that the folder remembers under `key`, or a new one that it will remember."""
+    from mlflow.exceptions import MlflowException
+
+    file = folder.path / "tracking.json"
+    known = json.loads(file.read_text()) if file.is_file() else {}
+    slot = f"{near.uri} {near.experiment_id} {key}"
+    run_id = known.get(slot)
+    if run_id is not None:
+        with contextlib.suppress(MlflowException):  # the run was deleted: begin a new one
+            near.client.update_run(run_id, status="RUNNING")
+            near.client.log_batch(run_id, tags=[])
+            return Tracker(near.client, near.uri, near.experiment_id, run_id)
+    run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
+    write_json(file, {**known, slot: run.info.run_id})
+    return Tracker(near.client, near.uri, near.experiment_id, run.info.run_id)
+
+
+def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
+    """A client of the store and the id of the experiment; both are created if they are not there."""
+    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+    os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
+    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+    from mlflow import MlflowClient
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    location = None
+    with contextlib.ExitStack() as stack:
+        if uri.startswith("sqlite:///"):
+            file = Path(uri.removeprefix("sqlite:///"))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            location = (file.parent / "mlartifacts" / quote(experiment, safe="")).as_uri()
+            lock = stack.enter_context(file.with_suffix(".lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        client = MlflowClient(tracking_uri=uri)
+        known = client.get_experiment_by_name(experiment)
+        return client, known.experiment_id if known else client.create_experiment(experiment, location)

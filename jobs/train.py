@@ -1,0 +1,237 @@
+"""Train the policy by PPO on the frozen encoder (appendix D.1).
+
+Run: python -m platform.launch +exp=train
+Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
+`train/results.jsonl`. A stopped run continues from its last checkpoint when the same command
+is given again; an environment step that was reported once is not reported twice.
+"""
+
+import contextlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import ray
+import torch
+from ray import tune
+from ray.rllib.algorithms.ppo import PPO
+from ray.rllib.core.rl_module.rl_module import RLModule
+
+from jobs.cluster import start_ray
+from jobs.collect import collect
+from jobs.config import Config, ConfigError
+from jobs.ppo import build_ppo, policy_settings
+from jobs.pretrain import encoder_file, pretrain
+from jobs.progress import progress
+from jobs.runs import Run, finish, finished, open_run
+from jobs.tracking import open_tracker
+from models.policy import save_policy
+from models.weights import load_encoder
+
+OnResult = Callable[[int, Mapping[str, float]], None]
+
+# Name in the tracker -> where RLlib's result has it.
+METRICS = {
+    "train/episode_return": ("env_runners", "episode_return_mean"),
+    "train/episodes": ("env_runners", "num_episodes_lifetime"),
+    "train/success_rate": ("env_runners", "success_rate"),
+    "train/collision_rate": ("env_runners", "collision_rate"),
+    "train/distance_m": ("env_runners", "distance_m"),
+    "train/policy_loss": ("learners", "default_policy", "policy_loss"),
+    "train/value_loss": ("learners", "default_policy", "vf_loss"),
+    "train/explained_variance": ("learners", "default_policy", "vf_explained_var"),
+    "train/entropy": ("learners", "default_policy", "entropy"),
+    "train/gradient_norm": ("learners", "default_policy", "gradients_default_optimizer_global_norm"),
+    "sim/events_per_step": ("env_runners", "events_per_step"),
+    "sim/dropped_events": ("env_runners", "dropped_events"),
+    "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
+}
+ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
+ENV_STEPS = "num_env_steps_sampled_lifetime"
+MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
+MAX_FAILURES = 2
+
+_LISTENERS: dict[str, Callable[[Mapping[str, Any]], None]] = {}
+
+
+class TrainingError(RuntimeError):
+    """Training stopped; the message says why in one line and how to go on."""
+
+
+class Relay(tune.Callback):
+    """Hands results to the listener that this process has registered under a name.
+
+    Tune pickles its callbacks into the experiment's state, and neither a tracker nor a
+    progress bar can be pickled: the callback carries the name alone.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Remember the name."""
+        self.name = name
+
+    def on_trial_result(
+        self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
+    ) -> None:
+        """Pass one result on."""
+        _LISTENERS[self.name](result)
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Collect and pretrain if that is still to be done, then train; return the figures."""
+    folder = open_run(config)
+    with open_tracker(config, folder) as tracker:
+        collect(config, folder)
+        pretrain(config, folder, tracker)
+        train(config, folder, encoder_file(folder), tracker.log)
+    return finished(folder, "train") or {}
+
+
+def train(config: Config, folder: Run, encoder_path: Path, on_result: OnResult) -> Path:
+    """Train until `train.env_steps`, from the newest checkpoint if there is one; export the policy.
+
+    Args:
+        config: The experiment.
+        folder: The run folder.
+        encoder_path: The frozen encoder's file.
+        on_result: Called with (environment steps, metrics) after each PPO iteration, in this
+            process; a metric that was not measured is NaN.
+
+    Returns:
+        The policy folder, sufficient alone.
+
+    Raises:
+        TrainingError: If training failed or a loss is not finite.
+    """
+    if finished(folder, "train") is not None:
+        return folder.policy
+    start_ray(config.cluster, folder.path)
+    check_cpus(config)
+    algorithm = build_ppo(config, encoder_path)
+    with _listening(config, folder, on_result) as last:
+        results = _tuner(config, folder, algorithm).fit()
+    if results.errors:
+        reason = str(results.errors[0]).strip().splitlines()[-1]
+        raise TrainingError(f"training stopped: {reason}; the same command continues from its checkpoint")
+    figures = {name: value for name, value in last.items() if math.isfinite(value)}
+    export_policy(config, Path(results[0].checkpoint.path), encoder_path, folder.policy, figures)
+    finish(folder, "train", figures)
+    return folder.policy
+
+
+def check_cpus(config: Config) -> None:
+    """Refuse more env runners than a local Ray has CPUs for: Tune would wait for them forever."""
+    needed, cpus = 1 + config.algo.num_env_runners, int(ray.cluster_resources().get("CPU", 0))
+    if config.cluster.name == "local" and needed > cpus:
+        rule = f"needs {needed} CPUs, one of them to learn, and Ray has {cpus}"
+        raise ConfigError(f"algo.num_env_runners: {rule}, got {config.algo.num_env_runners}")
+
+
+def export_policy(
+    config: Config, checkpoint: Path, encoder_path: Path, target: Path, figures: dict[str, float]
+) -> None:
+    """Write the policy folder of a checkpoint of this run.
+
+    Raises:
+        TrainingError: If the checkpoint's encoder is not the one in the file.
+    """
+    module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
+    evae, _ = load_encoder(encoder_path)
+    frozen = evae.state_dict()
+    if not all(torch.equal(value, frozen[name]) for name, value in module.encoder.state_dict().items()):
+        raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
+    manifest = {**policy_settings(config), "figures": figures}
+    save_policy(target, evae, {"pi": module.pi, "vf": module.vf}, manifest)
+
+
+def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
+    """The experiment in the run folder: continued if it is there, else new."""
+    path = folder.train
+    if tune.Tuner.can_restore(path):
+        return tune.Tuner.restore(str(path), PPO, resume_errored=True, param_space=algorithm)
+    return tune.Tuner(
+        PPO,
+        param_space=algorithm,
+        run_config=tune.RunConfig(
+            name=path.name,
+            storage_path=str(path.parent),
+            stop={ENV_STEPS: config.train.env_steps},
+            verbose=0,
+            callbacks=[Relay(str(path))],
+            failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
+            checkpoint_config=tune.CheckpointConfig(
+                checkpoint_frequency=config.train.checkpoint_every, num_to_keep=2, checkpoint_at_end=True
+            ),
+        ),
+    )
+
+
+@contextlib.contextmanager
+def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
+    """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
+    file = folder.train / "results.jsonl"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    reported = reported_steps(file)
+    last: dict[str, float] = {}
+    total = config.train.env_steps
+    with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
+
+        def listen(result: Mapping[str, Any]) -> None:
+            nonlocal reported
+            env_steps = int(result[ENV_STEPS])
+            last.update(read_metrics(result))
+            if env_steps <= reported:
+                return
+            row = {name: value if math.isfinite(value) else None for name, value in last.items()}
+            lines.write(json.dumps({"env_steps": env_steps, **row}) + "\n")
+            lines.flush()
+            on_result(env_steps, dict(last))
+            advance(env_steps - reported, note=_note(last))
+            reported = env_steps
+
+        _LISTENERS[str(folder.train)] = listen
+        try:
+            yield last
+        finally:
+            del _LISTENERS[str(folder.train)]
+
+
+def reported_steps(file: Path) -> int:
+    """Environment steps of the last whole line of a results file; 0 if there is none."""
+    text = file.read_text() if file.exists() else ""
+    whole = text[: text.rfind("\n") + 1].splitlines()
+    return int(json.loads(whole[-1])["env_steps"]) if whole else 0
+
+
+def read_metrics(result: Mapping[str, Any]) -> dict[str, float]:
+    """The metrics worth keeping of an RLlib result; NaN where nothing was measured.
+
+    Raises:
+        TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
+    """
+    metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
+    seconds = float(result["time_this_iter_s"])
+    steps = _lookup(result, ("env_runners", "num_env_steps_sampled"))
+    metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
+    bad = [f"{name} = {metrics[name]}" for name in ALWAYS_FINITE if not math.isfinite(metrics[name])]
+    if bad:
+        where = f"at environment step {result[ENV_STEPS]}"
+        raise TrainingError(f"losses must be finite, got {', '.join(bad)} {where}")
+    return metrics
+
+
+def _lookup(result: Mapping[str, Any], path: tuple[str, ...]) -> float:
+    value: Any = result
+    for key in path:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return math.nan if value is None else float(value)
+
+
+def _note(metrics: Mapping[str, float]) -> str:
+    """The figures that a person watches."""
+    parts = [f"{metrics['perf/env_steps_per_second']:,.0f} steps/s"]
+    if not math.isnan(metrics["train/episode_return"]):
+        parts.append(f"return {metrics['train/episode_return']:.1f}")
+        parts.append(f"success {metrics['train/success_rate']:.0%}")
+    return ", ".join(parts)

@@ -1,0 +1,188 @@
+"""Compose conf/ and the command line into one checked configuration, and run the job it names.
+
+Run: python -m platform.launch +exp=NAME [group=file] [key=value]
+Expect: exit status 0 when the job is done, 2 with one message when a value is refused, 1
+when the job fails, 130 after Ctrl+C.
+"""
+
+import importlib
+import os
+import re
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+CONF = ROOT / "conf"
+
+JOBS = {
+    "bytestream": "jobs.bytestream",
+    "collect": "jobs.collect",
+    "pretrain": "jobs.pretrain",
+    "train": "jobs.train",
+    "evaluate": "jobs.evaluate",
+    "sweep": "jobs.sweep",
+}
+
+# Two threads beside other busy processes ran ten times slower than one.
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "LP_NUM_THREADS": "0",
+}
+
+SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
+OPEN_GROUPS = ("env.layout", "sweep.axes")  # take entries that conf/ does not have
+DONE, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
+
+
+def main() -> int:
+    """Do what the command line says; return the exit status."""
+    for name, value in ONE_THREAD.items():
+        os.environ.setdefault(name, value)
+    try:
+        values = compose(sys.argv[1:])
+        if values is not None:
+            run(values)
+    except KeyboardInterrupt:
+        print("evade: interrupted; the same command continues where it stopped", file=sys.stderr)
+        return INTERRUPTED
+    except Exception as error:
+        return report(error)
+    return DONE
+
+
+def compose(words: list[str]) -> dict[str, Any] | None:
+    """The composed configuration as plain containers; None if Hydra only answered a question.
+
+    Args:
+        words: The command line.
+
+    Raises:
+        ConfigError: If the command line cannot be composed with conf/.
+    """
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from jobs.config import ConfigError
+
+    reasons = refused_words(words)
+    if reasons:
+        raise ConfigError("\n".join(reasons))
+    composed = []
+
+    def keep(config: Any) -> None:
+        composed.append(OmegaConf.to_container(config, resolve=False))
+
+    verbose = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing and leaving
+    try:
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(keep)()
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        raise ConfigError(explain(error, words)) from error
+    finally:
+        os.environ.pop("HYDRA_FULL_ERROR")
+        if verbose is not None:
+            os.environ["HYDRA_FULL_ERROR"] = verbose
+    return composed[0] if composed else None
+
+
+def refused_words(words: list[str]) -> list[str]:
+    """Reasons against what Hydra would take and this launcher does not do."""
+    if not (CONF / "config.yaml").is_file():
+        return [f"conf/config.yaml: not found in {str(ROOT)!r}; install from a clone with `pip install -e .`"]
+    reasons = []
+    for word in words:
+        if word in ("-m", "--multirun") or re.match(r"\+*hydra\.(mode|sweep)", word):
+            reasons.append(f"{word}: {SWEEP}")
+        elif re.match(r"[+~]*hydra[./=@]|--experimental-rerun", word):
+            reasons.append(f"{word}: Hydra's own settings are fixed; results go to runs_dir")
+    return reasons
+
+
+def explain(error: Exception, words: list[str]) -> str:
+    """What Hydra says against a command line, in one line with the nearest key or the choices."""
+    from jobs.config import known_keys
+    from jobs.refusals import nearest
+
+    text = str(error)
+    unknown = re.match(r"Could not override '([^']+)'\.\nTo append to your config use \+(.*)", text)
+    if unknown and not unknown[1].startswith(OPEN_GROUPS):
+        cause = re.search(r"full_key: (\S+)", str(error.__cause__))
+        key = cause[1] if cause else unknown[1]
+        return f"{key}: no such key, got {unknown[2]}{nearest(key, known_keys())}"
+    choice = re.match(
+        r"In '.+': Could not find '([^'/]+)/([^']*)'\n\nAvailable options in .+:\n((\t.+\n)+)", text
+    )
+    if choice:
+        return f"{choice[1]}: must be one of {', '.join(choice[3].split())}, got {choice[2]!r}"
+    if text.startswith("Ambiguous value"):
+        return f"{text.splitlines()[0]}: write [a,b] for a list; {SWEEP}"
+    lines = [line.strip() for line in text.split("\nConfig search path")[0].splitlines()]
+    message = " ".join(line for line in lines if line and not line.startswith("See https"))
+    return message if any(word in message for word in words) else f"{' '.join(words)}: {message}"
+
+
+def run(values: dict[str, Any]) -> None:
+    """Check a composed configuration and run its job.
+
+    Raises:
+        ConfigError: If a value is refused; nothing has been started or written by then.
+    """
+    from jobs.config import ConfigError, parse
+
+    reasons = dict.fromkeys(refused_values(values))
+    if reasons:
+        raise ConfigError("\n".join(reasons))
+    config = parse(values)
+    importlib.import_module(JOBS[config.job]).run(config)
+
+
+def refused_values(values: Any, key: str = "") -> Iterator[str]:
+    """Reasons against whatever in a configuration is missing, or is not a plain value."""
+    if isinstance(values, dict | list):
+        for name, value in values.items() if isinstance(values, dict) else enumerate(values):
+            inner = f"{key}.{name}" if key else str(name)
+            if re.fullmatch(r"_\w+_", str(name)):
+                yield f"{inner}: such keys make Hydra call code; name a job with +exp=NAME, got {value!r}"
+            else:
+                yield from refused_values(value, inner)
+    elif values == "???":
+        names = sorted(path.stem for path in (CONF / "exp").glob("*.yaml"))
+        yield f"exp: not given; name an experiment with +exp=NAME, one of {', '.join(names)}"
+    elif isinstance(values, str) and "${" in values:
+        yield f"{key}: must be the value itself, not a reference to another, got {values!r}"
+
+
+def report(error: Exception) -> int:
+    """Say what went wrong, with a traceback where it helps; return the exit status.
+
+    A ValueError that this repository raises is a refused value, a RuntimeError a documented
+    failure: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback of those too.
+    """
+    ours = raised_here(error)
+    refused = isinstance(error, ValueError) and ours
+    documented = refused or (isinstance(error, RuntimeError) and ours)
+    if "HYDRA_FULL_ERROR" in os.environ or not documented:
+        traceback.print_exception(error)
+    message = str(error) if documented else f"{type(error).__name__}: {error}"
+    message = "\n  ".join(["", *message.splitlines()]) if "\n" in message else f" {message}"
+    print(f"evade: {'refused' if refused else 'failed'}:{message}", file=sys.stderr)
+    return REFUSED if refused else FAILED
+
+
+def raised_here(error: Exception) -> bool:
+    """Whether the statement that raised stands in this repository's own rooms."""
+    frames = traceback.extract_tb(error.__traceback__)
+    rooms = [ROOT / room for room in ("envs", "models", "jobs", "platform")]
+    return bool(frames) and any(Path(frames[-1].filename).is_relative_to(room) for room in rooms)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

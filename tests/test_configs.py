@@ -1,0 +1,169 @@
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from envs.config import EnvConfig
+from jobs.config import ENV_PARTS, SECTIONS, Config, ConfigError, as_dict, env_with, known_keys, parse
+from jobs.runs import run_name
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
+CHOICES = [f"{group}={option}" for group in GROUPS if group != "exp" for option in options(group)]
+
+
+@pytest.fixture(scope="module")
+def composed():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield lambda *words: OmegaConf.to_container(compose("config", list(words)))
+
+
+@pytest.fixture(scope="module")
+def values(composed):
+    return composed("+exp=bytestream")
+
+
+def changed(values: dict, key: str, value: object) -> dict:
+    section, _, name = key.rpartition(".")
+    return {**values, section: {**values[section], name: value}} if section else {**values, name: value}
+
+
+@pytest.mark.parametrize("budget", options("budget"))
+@pytest.mark.parametrize("exp", options("exp"))
+def test_every_experiment_is_accepted_with_every_budget(composed, exp, budget):
+    config = parse(composed(f"+exp={exp}", f"budget={budget}"))
+    assert config.budget == budget
+    assert config.job == ("sweep" if exp == "robustness" else exp)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_file_of_every_group_is_accepted(composed, choice):
+    parse(composed("+exp=bytestream", choice))
+
+
+def test_the_yaml_of_the_world_says_what_its_dataclasses_say(values):
+    defaults = dataclasses.asdict(EnvConfig())
+    assert {**values["env"], **{part: values[part] for part in ENV_PARTS}} == defaults
+
+
+@pytest.mark.parametrize("section", [*SECTIONS, ""])
+def test_no_key_is_given_without_being_checked_nor_checked_without_being_given(values, section):
+    fields = {field.name for field in dataclasses.fields(SECTIONS.get(section, Config))}
+    assert set(values[section] if section else values) == fields
+
+
+@pytest.mark.parametrize(
+    "file", sorted(path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help"))
+)
+def test_every_value_says_its_unit_or_source_in_a_comment(file):
+    lines = file.read_text().splitlines()
+    assert lines[0].startswith("#")
+    if file.parent != CONF and file.parent.name != "budget":
+        assert [line for line in lines[1:] if ": " in line and "#" not in line and "name:" not in line] == []
+
+
+def test_ppo_is_the_papers(composed):
+    algo = parse(composed("+exp=bytestream", "budget=paper")).algo
+    assert dataclasses.asdict(algo) == {
+        "lr": 3e-4,
+        "gamma": 0.99,
+        "lambda_": 0.95,
+        "clip_param": 0.2,
+        "num_epochs": 10,
+        "minibatch_size": 32,
+        "train_batch_size_per_learner": 2048,
+        "vf_loss_coeff": 0.5,
+        "entropy_coeff": 0.0,
+        "grad_clip": 0.5,
+        "reward_scale": 1.0,
+        "num_env_runners": 0,
+        "num_envs_per_env_runner": 16,
+    }
+
+
+def test_the_stages_of_an_experiment_share_its_run_folder(composed):
+    stages = ("bytestream", "collect", "pretrain", "train", "evaluate")
+    assert len({run_name(parse(composed(f"+exp={stage}"))) for stage in stages}) == 1
+
+
+def test_a_whole_number_names_the_same_run_as_its_float(composed):
+    words = ("env.control_hz=100", "env.control_hz=100.0")
+    assert len({run_name(parse(composed("+exp=bytestream", word))) for word in words}) == 1
+
+
+def test_a_configuration_survives_being_written_and_read(values):
+    config = parse(values)
+    assert parse(yaml.safe_load(yaml.safe_dump(as_dict(config)))) == config
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), "fast", True, None, [1.0], {}])
+@pytest.mark.parametrize("key", ["algo.lr", "env.control_hz", "camera.contrast_threshold", "faults.sparsity"])
+def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
+    with pytest.raises(ConfigError, match=f"^{key}: "):
+        parse(changed(values, key, value))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "rule"),
+    [
+        ("env.control_hz", -1, "greater than or equal to 0.1, got -1"),
+        ("env.speed_mps", 0, "greater than 0, got 0"),
+        ("camera.width", 4097, "less than or equal to 4096, got 4097"),
+        ("camera.memory", "none", "'reference' or 'frame', got 'none'"),
+        ("faults.sparsity", 1.2, "less than or equal to 1, got 1.2"),
+        ("algo.minibatch_size", 4096, "must not exceed train_batch_size_per_learner"),
+        ("algo.minibatch_size", 0, "greater than or equal to 1, got 0"),
+        ("seed", -1, "greater than or equal to 0, got -1"),
+        ("seed", 1.5, "valid integer, got 1.5"),
+        ("seed", 2**31, "less than 2147483648, got 2147483648"),
+        ("job", "os.system", "got 'os.system'"),
+        ("exp", "../up", "got '../up'"),
+        ("evaluate.renderers", [], "at least 1 item"),
+        ("sweep.axes", {"env.control_hz": [100.0, 0.0]}, "env.control_hz=0.0: Input should be greater"),
+        ("sweep.axes", {"algo.lr": [1.0]}, "algo.lr=1.0: "),
+        ("env.camera", {"width": 64}, "env.camera: "),
+        ("camera", 64, "must be a group of settings, got 64"),
+        ("env", None, "must be a group of settings, got None"),
+        ("env.contrast_treshold", 0.2, "no such key, got 0.2; did you mean camera.contrast_threshold?"),
+        ("sed", 1, "no such key, got 1; did you mean seed?"),
+    ],
+)
+def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule):
+    with pytest.raises(ConfigError) as refusal:
+        parse(changed(values, key, value))
+    assert str(refusal.value).startswith(key.partition(".")[0])
+    assert rule in str(refusal.value)
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_all_refusals_come_at_once(values):
+    with pytest.raises(ConfigError) as refusal:
+        parse(changed(changed(changed(values, "seed", -1), "algo.lr", -1.0), "env.control_hz", -1.0))
+    assert [line.partition(":")[0] for line in str(refusal.value).splitlines()] == [
+        "algo.lr",
+        "env.control_hz",
+        "seed",
+    ]
+
+
+def test_one_setting_of_the_world_can_be_replaced_by_its_key():
+    assert env_with(EnvConfig(), "env.control_hz", 45.0).control_hz == 45.0
+    assert env_with(EnvConfig(), "camera.memory", "frame").camera.memory == "frame"
+    assert env_with(EnvConfig(), "camera.memory", "frame").camera.width == 64
+
+
+def test_every_known_key_can_be_replaced(values):
+    keys = known_keys()
+    assert {"seed", "env.control_hz", "camera.memory", "algo.lambda_"} <= set(keys)
+    for key in keys:
+        section, _, name = key.rpartition(".")
+        assert name in (values[section] if section else values)

@@ -1,0 +1,185 @@
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+
+from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
+from envs.corridor import CorridorEnv
+from jobs.config import ConfigError
+from jobs.evaluate import evaluate, film_seed, find_policy, tasks, tracked_figures
+from jobs.flights import EPISODE, Ways, check_sensor, fly
+from jobs.pilots import PolicyPilot, make_pilot
+from jobs.report import summarise
+from jobs.runs import finish, open_run, write_json
+from jobs.tracking import open_tracker
+from models.evae import EventVAE
+from models.policy import build_heads, load_policy, save_policy
+from tests.test_runs import small_config
+
+HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
+
+
+def save_untrained(path, env_config=HELD_OUT):
+    """A policy folder with random weights; large ones, so that its actions differ."""
+    settings = {"stack": 3, "latent": 8, "hidden": [16], "num_actions": 3}
+    sensor = sensor_settings(env_config)
+    manifest = {**settings, "sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {}}
+    heads = build_heads(manifest, seed=3)
+    heads["pi"][-1].weight.data *= 1000.0
+    return save_policy(path, EventVAE(context=64).freeze(), heads, manifest)
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    return save_untrained(tmp_path_factory.mktemp("flown") / "policy")
+
+
+@pytest.mark.parametrize("action", ["deterministic", "stochastic"])
+def test_an_episode_does_not_depend_on_how_many_fly_beside_it(policy, action):
+    flown = [fly(make_pilot(str(policy), action), HELD_OUT, range(5), num_envs) for num_envs in (1, 2, 5)]
+    np.testing.assert_array_equal(flown[0], flown[1])
+    np.testing.assert_array_equal(flown[0], flown[2])
+
+
+def test_episodes_stand_in_the_order_of_their_seeds_and_depend_on_nothing_else():
+    some = fly(make_pilot("straight"), HELD_OUT, [7, 3])
+    np.testing.assert_array_equal(some["seed"], [7, 3])
+    np.testing.assert_array_equal(some[::-1], fly(make_pilot("straight"), HELD_OUT, [3, 7], num_envs=1))
+
+
+def test_random_flights_differ_from_each_other_and_repeat():
+    first, again = (fly(make_pilot("random"), HELD_OUT, range(3)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(np.unique(first["distance_m"])) == 3
+
+
+def test_the_oracle_comes_through_where_flying_straight_does_not():
+    oracle = fly(make_pilot("oracle"), HELD_OUT, range(20), num_envs=20)
+    straight = fly(make_pilot("straight"), HELD_OUT, range(20), num_envs=20)
+    assert oracle["success"].mean() >= 0.9
+    assert straight["success"].mean() <= 0.3
+    assert straight["collision"].sum() + straight["success"].sum() == 20
+
+
+def test_the_oracle_also_comes_through_at_the_slowest_control():
+    slow = dataclasses.replace(HELD_OUT, control_hz=45.0)
+    assert fly(make_pilot("oracle"), slow, range(10), num_envs=10)["success"].mean() >= 0.9
+
+
+def test_an_episode_ends_as_success_collision_or_truncation_and_counts_its_way():
+    short = dataclasses.replace(HELD_OUT, time_limit_s=0.5)
+    flown = fly(make_pilot("straight"), short, range(4))
+    assert flown["truncated"].all()
+    assert not (flown["success"] | flown["collision"]).any()
+    np.testing.assert_array_equal(flown["steps"], 100)
+    np.testing.assert_allclose(flown["distance_m"], 10.0)
+    np.testing.assert_allclose(flown["return"], 10.0)
+    assert (flown["events_per_step"] > 1).all()
+
+
+def test_conditions_fly_the_same_corridors():
+    noisy = dataclasses.replace(HELD_OUT, control_hz=100.0, camera=CameraConfig(contrast_threshold=0.05))
+    scenes = []
+    for config in (HELD_OUT, noisy):
+        env = CorridorEnv(config)
+        env.reset(seed=11)
+        scenes.append((env.scene.obstacles, env.camera_pose()))
+    np.testing.assert_array_equal(scenes[0][0], scenes[1][0])
+    assert scenes[0][1] == scenes[1][1]
+
+
+def test_another_sensor_than_the_policys_is_refused_with_both_values():
+    manifest = {"sensor": sensor_settings(HELD_OUT)}
+    other = dataclasses.replace(HELD_OUT, camera=CameraConfig(contrast_threshold=0.05))
+    assert check_sensor(manifest, HELD_OUT) == {}
+    with pytest.raises(ValueError, match=r"contrast_threshold = 0\.05 instead of 0\.2"):
+        check_sensor(manifest, other)
+    assert check_sensor(manifest, other, allow_mismatch=True) == {"contrast_threshold": (0.2, 0.05)}
+
+
+def test_without_a_policy_the_message_says_how_to_get_one(tmp_path):
+    config = small_config(tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"no trained policy in .*run python -m platform.launch \+exp=bytestream"
+    ):
+        find_policy(config, open_run(config))
+
+
+def test_a_runs_own_policy_comes_before_a_newer_one(tmp_path):
+    config = small_config(tmp_path)
+    run = open_run(config)
+    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {})
+    assert find_policy(config, run) == tmp_path / "runs" / "other" / "policy"
+    write_json(run.policy / "policy.json", {})
+    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {})
+    assert find_policy(config, run) == run.policy
+
+
+def test_ways_end_where_the_episode_did():
+    ways = Ways([1])
+    flown = fly(make_pilot("straight"), HELD_OUT, range(2), watch=ways.add)
+    (track,) = ways.tracks("straight", flown)
+    assert track.seed == 1
+    assert track.way_m[-1, 1] == flown["distance_m"][1]
+    assert track.outcome == ("collision" if flown["collision"][1] else "goal")
+
+
+def test_the_film_shows_a_success_if_there_is_one_else_the_longest_flight():
+    flown = np.zeros(3, EPISODE)
+    flown["seed"], flown["distance_m"] = [4, 5, 6], [30.0, 60.0, 20.0]
+    assert film_seed(flown) == 5
+    flown["success"][2] = True
+    assert film_seed(flown) == 6
+
+
+def test_the_tracked_figures_name_pilot_scene_and_renderer(tmp_path):
+    plan = tasks(small_config(tmp_path))
+    rows = [summarise(task.label, fly(make_pilot("straight"), HELD_OUT, [0, 1])) for task in plan[:1]] * len(
+        plan
+    )
+    rows = [dataclasses.replace(row, label=task.label) for row, task in zip(rows, plan, strict=True)]
+    figures = tracked_figures(rows)
+    assert {
+        "eval/success_rate",
+        "eval/success_rate_poles",
+        "eval/success_rate_pyrender",
+        "eval/success_rate_oracle",
+        "eval/distance_m_straight",
+        "sim/events_per_step",
+    } <= set(figures)
+    assert len(figures) <= 40
+
+
+def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path):
+    config = small_config(tmp_path)
+    settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)
+    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.6})
+    run = open_run(config)
+    save_untrained(run.policy, config.env_config())
+    with open_tracker(config, run) as tracker:
+        figures = evaluate(config, run, tracker)
+        assert evaluate(config, run, tracker) == figures
+    with (run.evaluation / "episodes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 4 * 2  # scenes, pilots, corridors
+    assert {row["Pilot"] for row in rows} == {"policy", "straight", "random", "oracle"}
+    assert (run.evaluation / "trajectories.png").stat().st_size > 10_000
+    assert (run.evaluation / "episode.mp4").stat().st_size > 5_000
+    assert not list(run.evaluation.glob(".*"))
+    assert (
+        tracker.client.get_run(tracker.run_id).data.metrics["eval/distance_m"] == figures["eval/distance_m"]
+    )
+    assert finish(run, "evaluate", figures) == figures
+
+
+def test_a_policy_flies_as_its_own_networks_say(policy):
+    pilot = PolicyPilot(load_policy(policy))
+    env = CorridorEnv(HELD_OUT)
+    window, info = env.reset(seed=0)
+    pilot.reset([env], [0])
+    alone = load_policy(policy)
+    for _ in range(20):
+        action = pilot(window[None], [info])
+        np.testing.assert_array_equal(action, alone(window[None]))
+        window, _, _, _, info = env.step(int(action[0]))

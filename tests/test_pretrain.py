@@ -1,0 +1,112 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from envs.config import EnvConfig
+from jobs.collect import record
+from jobs.config import PretrainConfig
+from jobs.pretrain import (
+    beta,
+    cut_window,
+    held_out_figures,
+    held_out_windows,
+    restore,
+    sample_windows,
+    save_checkpoint,
+)
+from models.batch import batch_windows
+from models.evae import EventVAE, event_targets, train_step
+
+SETTINGS = PretrainConfig(
+    iterations=100,
+    batch_windows=8,
+    window_events=500,
+    windows="mixed",
+    lr=1e-3,
+    weight_decay=0.0,
+    beta=1e-5,
+    beta_start=10,
+    beta_schedule="constant",
+    validate_every=10,
+    checkpoint_every=10,
+)
+COUNT = dataclasses.replace(SETTINGS, windows="count")
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return record([(EnvConfig(observation="events"), 900)], 0, lambda count: None)
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, COUNT], ids=["mixed", "count"])
+def test_windows_hold_what_they_say_and_stay_in_one_flight(recording, settings):
+    start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    for events, start_us, window_us in sample_windows(recording, settings, 200, np.random.default_rng(1)):
+        assert len(events) <= 500
+        assert np.all((events["t"] > start_us) & (events["t"] <= start_us + window_us))
+        first = int(np.searchsorted(start, start_us, side="right")) - 1
+        last = int(np.searchsorted(end, start_us + window_us, side="left"))
+        assert flight[max(first, 0)] == flight[last]
+
+
+def test_mixed_windows_last_from_half_a_step_to_eight_steps(recording):
+    windows = sample_windows(recording, SETTINGS, 500, np.random.default_rng(2))
+    lengths = np.array([window_us for _, _, window_us in windows]) / 5000
+    assert lengths.min() < 0.7
+    assert lengths.max() > 6
+    assert np.all((lengths >= 0.499) & (lengths <= 8.001))
+
+
+def test_count_windows_hold_the_asked_number_of_events(recording):
+    sizes = [len(events) for events, _, _ in sample_windows(recording, COUNT, 100, np.random.default_rng(3))]
+    assert np.median(sizes) == 500  # fewer only where a flight ends
+
+
+def test_an_overfull_window_keeps_the_newest_events(recording):
+    start_us, end_us = int(recording.index["step_t_us"][0]), int(recording.index["step_end_us"][200])
+    everything = cut_window(recording, start_us, end_us - start_us, 10**9)[0]
+    kept = cut_window(recording, start_us, end_us - start_us, 100)[0]
+    assert len(everything) > 100
+    assert np.array_equal(kept, everything[-100:])
+
+
+def test_beta_follows_its_schedule():
+    assert [beta(SETTINGS, iteration) for iteration in (0, 9, 10, 99)] == [0.0, 0.0, 1e-5, 1e-5]
+    appendix = dataclasses.replace(SETTINGS, beta_schedule="appendix")
+    assert beta(appendix, 1000) == 0.0
+    assert beta(appendix, 20_000) == pytest.approx(2e-3)
+
+
+def training(recording, iterations, checkpoint=None):
+    """An event VAE after some iterations, interrupted and continued at `checkpoint` if given."""
+    torch.manual_seed(0)
+    evae = EventVAE(context=64, target="occupancy")
+    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3)
+    rng = np.random.default_rng(0)
+    first = 0 if checkpoint is None else restore(checkpoint, evae, optimizer, rng)
+    for _ in range(first, iterations):
+        batch = batch_windows(sample_windows(recording, SETTINGS, 8, rng), evae.grid)
+        train_step(evae, optimizer, batch, event_targets(batch, evae.target), 1e-5, rng)
+    return evae, optimizer, rng
+
+
+def test_an_interrupted_training_ends_with_the_same_weights(recording, tmp_path):
+    whole = training(recording, 20)[0]
+    evae, optimizer, rng = training(recording, 12)
+    save_checkpoint(tmp_path / "checkpoint.pt", evae, optimizer, rng, 12)
+    continued = training(recording, 20, tmp_path / "checkpoint.pt")[0]
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, continued.state_dict()[name]), name
+
+
+def test_training_explains_windows_of_flights_that_it_never_saw(recording):
+    unseen = record([(EnvConfig(observation="events", split="validation"), 300)], 0, lambda count: None)
+    torch.manual_seed(0)
+    untrained = EventVAE(context=64, target="occupancy")
+    held_out = held_out_windows(unseen, SETTINGS, untrained.grid)
+    before = held_out_figures(untrained, held_out)
+    after = held_out_figures(training(recording, 150)[0], held_out)
+    assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]
+    assert after["explained_four_steps"] > before["explained_four_steps"]

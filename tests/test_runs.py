@@ -1,0 +1,102 @@
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from jobs.config import Config, ConfigError
+from jobs.runs import finish, finished, git_commit, latest_policy, open_run, run_name, write_json
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    return small_config(tmp_path)
+
+
+def small_config(tmp_path: Path, **changes: object) -> Config:
+    """A checked configuration whose runs lie in a folder of the test's own."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+
+    from jobs.config import parse
+
+    conf = Path(__file__).resolve().parents[1] / "conf"
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        composed = compose("config", ["+exp=bytestream", "budget=smoke"])
+    values = OmegaConf.to_container(composed, resolve=True)
+    return parse({**values, "runs_dir": str(tmp_path / "runs"), **changes})
+
+
+def test_the_same_settings_find_the_same_folder_whatever_job_tracker_or_cluster(config):
+    elsewhere = dataclasses.replace(
+        config,
+        job="evaluate",
+        tracking=dataclasses.replace(config.tracking, uri="http://localhost:1"),
+        cluster=dataclasses.replace(config.cluster, num_cpus=7),
+    )
+    assert open_run(config).path == open_run(elsewhere).path
+    assert open_run(config).path.name.startswith("bytestream-smoke-s0-")
+
+
+def test_every_setting_that_changes_results_changes_the_folder(config):
+    names = {
+        run_name(config),
+        run_name(dataclasses.replace(config, seed=1)),
+        run_name(dataclasses.replace(config, algo=dataclasses.replace(config.algo, lr=1e-5))),
+        run_name(dataclasses.replace(config, faults=dataclasses.replace(config.faults, sparsity=0.1))),
+    }
+    assert len(names) == 4
+
+
+def test_resume_flies_the_stored_settings_under_the_job_that_is_asked_for(config):
+    stored = open_run(config)
+    other = dataclasses.replace(config, seed=5, job="evaluate", resume=str(stored.path))
+    run = open_run(other)
+    assert run.path == stored.path
+    assert (run.config.seed, run.config.job) == (config.seed, "evaluate")
+    assert run.config.algo == config.algo
+
+
+def test_resume_of_a_folder_without_a_run_says_what_a_run_folder_is(config, tmp_path):
+    with pytest.raises(ConfigError, match=r"resume: must be a run folder \(one that holds config.json\)"):
+        open_run(dataclasses.replace(config, resume=str(tmp_path)))
+
+
+def test_a_stage_is_finished_once_its_figures_are_written(config):
+    run = open_run(config)
+    assert finished(run, "train") is None
+    finish(run, "train", {"eval/success_rate": 0.5})
+    assert finished(run, "train") == {"eval/success_rate": 0.5}
+    assert finished(run, "collect") is None
+
+
+def test_a_marker_with_nan_is_refused_and_leaves_no_file(config):
+    run = open_run(config)
+    with pytest.raises(ValueError, match="JSON compliant"):
+        finish(run, "train", {"loss": float("nan")})
+    assert finished(run, "train") is None
+    assert not list(run.path.glob("stages/*"))
+
+
+def test_the_latest_policy_is_the_one_finished_last(tmp_path):
+    assert latest_policy(tmp_path) is None
+    for name in ("a", "c", "b"):
+        write_json(tmp_path / name / "policy" / "policy.json", {})
+        time.sleep(0.01)
+    (tmp_path / "d" / "policy").mkdir(parents=True)
+    assert latest_policy(tmp_path) == tmp_path / "b" / "policy"
+
+
+def test_the_stored_configuration_is_readable_as_yaml_and_json(config):
+    import yaml
+
+    run = open_run(config)
+    assert yaml.safe_load((run.path / "config.yaml").read_text()) == json.loads(
+        (run.path / "config.json").read_text()
+    )
+
+
+def test_without_git_the_commit_is_unknown(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert git_commit() == "unknown"

@@ -1,0 +1,127 @@
+import dataclasses
+import math
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from jobs.config import ConfigError
+from jobs.runs import Run, open_run
+from jobs.store import check_metrics, flatten, store_uri
+from jobs.tracking import open_child, open_store, open_tracker
+from tests.test_runs import small_config
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return open_run(small_config(tmp_path_factory.mktemp("tracking")))
+
+
+def test_what_is_logged_can_be_read_back(folder, tmp_path):
+    (tmp_path / "note.txt").write_text("hello")
+    with open_tracker(folder.config, folder) as tracker:
+        tracker.log(3, {"eval/success_rate": 0.25, "eval/distance_m": math.nan})
+        tracker.text("eval/table.md", "| a |")
+        tracker.table("eval/results", {"pilot": ["policy", "oracle"], "success_rate": [0.2, 1.0]})
+        tracker.artifact(tmp_path / "note.txt", "eval")
+        tracker.describe("**what** it is")
+    run = tracker.client.get_run(tracker.run_id)
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name == folder.path.name
+    assert run.data.metrics == {"eval/success_rate": 0.25}
+    assert [
+        (m.step, m.value) for m in tracker.client.get_metric_history(tracker.run_id, "eval/success_rate")
+    ] == [(3, 0.25)]
+    assert run.data.params["camera.contrast_threshold"] == "0.2"
+    assert run.data.tags["run_folder"] == str(folder.path)
+    assert run.data.tags["mlflow.note.content"] == "**what** it is"
+    assert "eval/distance_m" in run.data.tags["not_measured"]
+    assert {file.path for file in tracker.client.list_artifacts(tracker.run_id, "eval")} == {
+        "eval/table.md", "eval/results.json", "eval/note.txt"
+    }  # fmt: skip
+
+
+def test_reopening_continues_the_same_run(folder):
+    with open_tracker(folder.config, folder) as first:
+        first.log(1, {"train/episode_return": 1.0})
+    with open_tracker(folder.config, folder) as second:
+        assert first.client.get_run(second.run_id).info.status == "RUNNING"
+        second.log(2, {"train/episode_return": 2.0})
+    assert second.run_id == first.run_id
+    assert len(second.client.get_metric_history(second.run_id, "train/episode_return")) == 2
+
+
+def test_a_run_that_raises_ends_as_failed(folder):
+    with pytest.raises(ZeroDivisionError), open_tracker(folder.config, folder, key="broken") as tracker:
+        raise ZeroDivisionError
+    assert tracker.client.get_run(tracker.run_id).info.status == "FAILED"
+
+
+def test_children_name_their_parent_and_are_continued(folder):
+    with open_tracker(folder.config, folder, key="sweep") as parent:
+        for _ in range(2):
+            with open_child(parent, folder, "child 1", "faults.sparsity=0.2", "condition") as child:
+                child.log(0, {"eval/success_rate": 1.0})
+        found = parent.client.search_runs(
+            [parent.experiment_id], f"tags.`mlflow.parentRunId` = '{parent.run_id}'"
+        )
+    assert [run.info.run_id for run in found] == [child.run_id]
+    assert found[0].info.status == "FINISHED"
+
+
+def test_a_saved_view_stands_in_the_experiments_tags(folder):
+    with open_tracker(folder.config, folder) as tracker:
+        address = tracker.save_view("results", "Results", ["metrics.`eval/success_rate`"])
+    experiment = tracker.client.get_experiment(tracker.experiment_id)
+    assert '"name": "Results"' in experiment.tags["mlflow.sharedViewState.results"]
+    assert "workflowType=machine_learning" in address
+    assert address.endswith("viewStateShareKey=results")
+
+
+def test_the_store_lies_beside_the_runs_folder_whatever_the_working_folder(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    base = Path(folder.config.runs_dir).parent
+    assert store_uri(folder.config) == f"sqlite:///{base}/mlflow.db"
+    with open_tracker(folder.config, folder) as tracker:
+        location = tracker.client.get_run(tracker.run_id).info.artifact_uri
+    assert location.startswith(f"file://{base}/mlartifacts/")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_address_that_mlflow_keeps_no_runs_in_is_refused(folder):
+    tracking = dataclasses.replace(folder.config.tracking, uri="file:///tmp/mlruns")
+    with pytest.raises(ConfigError, match=r"tracking.uri: must begin with .* got 'file:///tmp/mlruns'"):
+        store_uri(dataclasses.replace(folder.config, tracking=tracking))
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf])
+def test_infinite_metrics_are_refused_by_name(value):
+    with pytest.raises(ValueError, match=f"metrics must be finite, got eval/distance_m = {value}"):
+        check_metrics({"eval/distance_m": value, "eval/success_rate": 1.0})
+
+
+def test_metrics_outside_the_known_sections_are_refused():
+    with pytest.raises(ValueError, match="got \\['learners/x', 'plain'\\]"):
+        check_metrics({"learners/x": 1.0, "plain": 1.0, "eval/success_rate": 1.0})
+
+
+def test_a_flood_of_metrics_is_refused():
+    with pytest.raises(ValueError, match="at most 40 a call, got 41"):
+        check_metrics({f"eval/{number}": 1.0 for number in range(41)})
+
+
+def test_settings_that_mlflow_would_cut_are_refused():
+    assert flatten({"a": {"b": 1, "c": {}}}) == {"a.b": "1", "a.c": "{}"}
+    with pytest.raises(ValueError, match=r"a\.b must be at most 6000 characters, got 6001"):
+        flatten({"a": {"b": "x" * 6001}})
+
+
+def open_new_store(uri: str) -> str:
+    return open_store(uri, "evade")[1]
+
+
+@pytest.mark.slow
+def test_processes_that_start_together_make_one_store(tmp_path):
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    with ProcessPoolExecutor(3) as pool:
+        assert len(set(pool.map(open_new_store, [uri] * 3))) == 1
