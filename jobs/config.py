@@ -45,6 +45,7 @@ class AlgoConfig:
     """PPO, each word as RLlib spells it (appendix D.1.2)."""
 
     lr: Positive
+    lr_schedule: Literal["constant", "linear"]
     gamma: Fraction
     lambda_: Fraction
     clip_param: Positive

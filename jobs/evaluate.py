@@ -27,7 +27,7 @@ from jobs.runs import Run, finish, finished, latest_policy, open_run, write_atom
 from jobs.tracking import Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import reconstruct
-from models.policy import ENCODER, load_policy
+from models.policy import ENCODER, Policy, load_policy
 from models.weights import load_encoder
 
 HELD_OUT_SCENE = "poles_eval"
@@ -35,10 +35,14 @@ LABELS = ("Pilot", "Scene", "Renderer")
 SHOWN_CORRIDORS = range(4)
 VIEW_COLUMNS = ("eval/success_rate", "eval/success_rate_low", "eval/success_rate_high", "eval/distance_m")
 Renderer = Literal["raycast", "pyrender"]
+ACTIONS = ("deterministic", "stochastic")  # the likeliest action, or one drawn as in training
 
 
 class Task(NamedTuple):
-    """One pilot through the first corridors of one scene, drawn by one renderer."""
+    """One pilot through the first corridors of one scene, drawn by one renderer.
+
+    The pilot is a bound, or the policy with its choice of action: "policy deterministic".
+    """
 
     pilot: str
     scene: str
@@ -49,6 +53,11 @@ class Task(NamedTuple):
     def label(self) -> tuple[str, str, str]:
         """What was flown, as in `LABELS`."""
         return self.pilot, self.scene, self.renderer
+
+    @property
+    def of_policy(self) -> bool:
+        """Whether the policy flies."""
+        return self.pilot.startswith("policy")
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -68,8 +77,8 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
         console.print((folder.evaluation / "table.md").read_text(), markup=False)
         return done
     path = find_policy(config, folder)
-    pilot = PolicyPilot(load_policy(path), config.evaluate.action == "stochastic")
-    check_sensor(pilot.policy.manifest, config.env_config())
+    policy = load_policy(path)
+    check_sensor(policy.manifest, config.env_config())
     plan = tasks(config)
     flown: dict[Task, np.ndarray] = {}
     tracks: list[Track] = []
@@ -77,10 +86,10 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
         for task in plan:
             ways = Ways(SHOWN_CORRIDORS if shown(task, plan) else ())
             note = " ".join(task.label)
-            episodes = fly_task(task, config, pilot, ways.add, functools.partial(advance, note=note))
+            episodes = fly_task(task, config, policy, ways.add, functools.partial(advance, note=note))
             if episodes is not None:
                 flown[task] = episodes
-                tracks += ways.tracks(task.pilot, episodes)
+                tracks += ways.tracks(task.pilot.partition(" ")[0], episodes)
     rows = [summarise(task.label, episodes) for task, episodes in flown.items()]
     write_episodes(folder.evaluation / "episodes.csv", LABELS, {task.label: flown[task] for task in flown})
     publish(folder, tracker, rows, tracks)
@@ -88,18 +97,24 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     tracker.log(config.train.env_steps, figures)
     if config.evaluate.video:
         seed = film_seed(flown[plan[0]])
-        tracker.artifact(film(config, pilot, path, seed, folder.evaluation / "episode.mp4"), "eval")
+        tracker.artifact(film(config, policy, path, seed, folder.evaluation / "episode.mp4"), "eval")
     return finish(folder, "evaluate", figures)
 
 
 def tasks(config: Config) -> list[Task]:
-    """The held-out scene and the training scene; all pilots with the first renderer, the policy with all."""
+    """The held-out scene and the training scene; all pilots with the first renderer, the policy with all.
+
+    The policy flies with both choices of action, because they can differ by tens of points;
+    the configured one comes first and is the one that figures without a suffix belong to.
+    """
     first, *others = config.evaluate.renderers
     scenes = dict.fromkeys((HELD_OUT_SCENE, config.env_config().scene))
-    pairs = [(pilot, scene) for scene in scenes for pilot in ("policy", *BOUNDS)]
+    actions = sorted(ACTIONS, key=lambda action: action != config.evaluate.action)
+    policies = [f"policy {action}" for action in actions]
+    pairs = [(pilot, scene) for scene in scenes for pilot in (*policies, *BOUNDS)]
     return [
         *(Task(pilot, scene, first, _episodes(config, first)) for pilot, scene in pairs),
-        *(Task("policy", HELD_OUT_SCENE, other, _episodes(config, other)) for other in others),
+        *(Task(policies[0], HELD_OUT_SCENE, other, _episodes(config, other)) for other in others),
     ]
 
 
@@ -109,14 +124,13 @@ def _episodes(config: Config, renderer: str) -> int:
 
 def shown(task: Task, plan: Sequence[Task]) -> bool:
     """Whether the ways of a task are drawn: policy and oracle, in the scene flown first."""
-    return task.pilot in ("policy", "oracle") and task.label[1:] == plan[0].label[1:]
+    return task.pilot in (plan[0].pilot, "oracle") and task.label[1:] == plan[0].label[1:]
 
 
-def fly_task(
-    task: Task, config: Config, policy: PolicyPilot, watch: Watch, advance: Advance
-) -> np.ndarray | None:
+def fly_task(task: Task, config: Config, policy: Policy, watch: Watch, advance: Advance) -> np.ndarray | None:
     """The episodes of a task, or None (and a line that says why) where a second renderer cannot run."""
-    pilot = policy if task.pilot == "policy" else make_pilot(task.pilot)
+    stochastic = task.pilot.endswith("stochastic")
+    pilot = PolicyPilot(policy, stochastic) if task.of_policy else make_pilot(task.pilot)
     renderer = dataclasses.replace(config.renderer, name=task.renderer)
     env_config = config.env_config(scene=task.scene, split="eval", renderer=renderer)
     try:
@@ -157,18 +171,16 @@ def publish(folder: Run, tracker: Tracker, rows: Sequence[Summary], tracks: Sequ
 
 
 def tracked_figures(rows: Sequence[Summary]) -> dict[str, float]:
-    """The policy's figures on the held-out scene under their plain names, the rest with a suffix."""
+    """The figures of the first row under their plain names; those of others say what differs."""
     figures: dict[str, float] = {}
-    first = rows[0]
+    first = rows[0].label
     for row in rows:
-        pilot, scene, renderer = row.label
-        if row is first:
+        words = [word for word, usual in zip(row.label, first, strict=True) if word != usual]
+        if not words:
             figures |= metrics(row)
-        elif pilot == "policy":
-            suffix = f"_{scene}" if renderer == first.label[2] else f"_{renderer}"
-            figures |= {f"{name}{suffix}": metrics(row)[name] for name in VIEW_COLUMNS}
-        elif scene == first.label[1]:
-            figures |= {f"{name}_{pilot}": metrics(row)[name] for name in VIEW_COLUMNS[::3]}
+        elif row.label[0] == first[0] or row.label[1] == first[1]:
+            suffix = "_".join(words).removeprefix("policy ")
+            figures |= {f"{name}_{suffix}": metrics(row)[name] for name in VIEW_COLUMNS[::3]}
     return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
@@ -178,9 +190,10 @@ def film_seed(episodes: np.ndarray) -> int:
     return int(episodes["seed"][order[0]])
 
 
-def film(config: Config, pilot: PolicyPilot, policy: Path, seed: int, path: Path) -> Path:
-    """Film the policy's flight through one corridor of the held-out scene; return the file."""
-    evae, _ = load_encoder(policy / ENCODER)
+def film(config: Config, policy: Policy, source: Path, seed: int, path: Path) -> Path:
+    """Film the flight of the policy in `source` through one held-out corridor; return the file."""
+    evae, _ = load_encoder(source / ENCODER)
+    pilot = PolicyPilot(policy, config.evaluate.action == "stochastic")
     env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
 
     @torch.no_grad()

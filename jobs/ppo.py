@@ -66,7 +66,7 @@ def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
         )
         .learners(num_learners=0, learner_connector=partial(make_scale_rewards, scale=algo.reward_scale))
         .training(
-            lr=algo.lr,
+            lr=learning_rate(config),
             gamma=algo.gamma,
             lambda_=algo.lambda_,
             clip_param=algo.clip_param,
@@ -87,6 +87,13 @@ def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
         .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
         .debugging(seed=config.seed, log_level="ERROR")
     )
+
+
+def learning_rate(config: Config) -> float | list[list[float]]:
+    """Adam's step size: one number, or (environment step, value) pairs between which RLlib interpolates."""
+    if config.algo.lr_schedule == "constant":
+        return config.algo.lr
+    return [[0, config.algo.lr], [config.train.env_steps, 0.0]]
 
 
 def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:

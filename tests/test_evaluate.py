@@ -162,8 +162,9 @@ def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path):
         assert evaluate(config, run, tracker) == figures
     with (run.evaluation / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 4 * 2  # scenes, pilots, corridors
-    assert {row["Pilot"] for row in rows} == {"policy", "straight", "random", "oracle"}
+    assert len(rows) == 2 * 5 * 2  # scenes, pilots, corridors
+    pilots = {"policy stochastic", "policy deterministic", "straight", "random", "oracle"}
+    assert {row["Pilot"] for row in rows} == pilots
     assert (run.evaluation / "trajectories.png").stat().st_size > 10_000
     assert (run.evaluation / "episode.mp4").stat().st_size > 5_000
     assert not list(run.evaluation.glob(".*"))
