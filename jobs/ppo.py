@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+from collections import deque
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,17 +26,38 @@ MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken en
 
 
 class FlightMetrics(RLlibCallback):
-    """What flights look like, read off the environments' infos; rewards are the true ones."""
+    """What flights look like, read off the environments' infos; rewards are the true ones.
+
+    An iteration ends two or three flights, so their figures are means over the last `EPISODES`.
+    """
+
+    def __init__(self) -> None:
+        """Begin without flights."""
+        self._flights: deque[dict[str, float]] = deque(maxlen=EPISODES)
+        self._unfinished: dict[str, float] = {}
 
     def on_sample_end(self, *, metrics_logger: Any, samples: Any, **kwargs: Any) -> None:
         """Count the events of each step and the outcome of each flight that ended."""
         infos = [info for chunk in samples for info in chunk.get_infos()[1:]]
         for name, key in (("events_per_step", "num_events"), ("dropped_events", "dropped_events")):
             metrics_logger.log_value(name, float(np.mean([info[key] for info in infos])), window=1)
-        outcomes = {"success_rate": "success", "collision_rate": "collision", "distance_m": "distance_m"}
-        for info in (chunk.get_infos(-1) for chunk in samples if chunk.is_done):
-            for name, key in outcomes.items():
-                metrics_logger.log_value(name, float(info[key]), window=EPISODES)
+        for chunk in samples:
+            self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
+            if chunk.is_done:
+                self._flights.append(outcome(chunk.get_infos(-1), self._unfinished.pop(chunk.id_)))
+        for name in self._flights[0] if self._flights else ():
+            mean = float(np.mean([flight[name] for flight in self._flights]))
+            metrics_logger.log_value(name, mean, window=1)
+
+
+def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:
+    """The figures of a flight that has ended, from its last info."""
+    return {
+        "flight_return": episode_return,
+        "success_rate": float(info["success"]),
+        "collision_rate": float(info["collision"]),
+        "distance_m": float(info["distance_m"]),
+    }
 
 
 def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:

@@ -12,7 +12,7 @@ from jobs.progress import console
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-FILE_WIDTH = 120
+FILE_WIDTH = 140
 
 Interval = tuple[float, float]
 

@@ -34,7 +34,7 @@ OnResult = Callable[[int, Mapping[str, float]], None]
 
 # Name in the tracker -> where RLlib's result has it.
 METRICS = {
-    "train/episode_return": ("env_runners", "episode_return_mean"),
+    "train/episode_return": ("env_runners", "flight_return"),
     "train/episodes": ("env_runners", "num_episodes_lifetime"),
     "train/success_rate": ("env_runners", "success_rate"),
     "train/collision_rate": ("env_runners", "collision_rate"),

@@ -21,7 +21,7 @@ from envs.config import sensor_settings, settings_hash
 from jobs import train as training
 from jobs.cluster import use_token
 from jobs.config import ConfigError, parse
-from jobs.ppo import build_ppo, network_settings
+from jobs.ppo import FlightMetrics, build_ppo, network_settings
 from jobs.runs import open_run
 from jobs.train import TrainingError, read_metrics, reported_steps
 from models.evae import EventVAE
@@ -247,10 +247,10 @@ def test_returns_are_reported_unscaled(runner):
     done = [chunk for chunk in runner.sample(num_timesteps=16) if chunk.is_done]
     metrics = runner.get_metrics()
     metrics = {name: getattr(value, "peek", lambda value=value: value)() for name, value in metrics.items()}
-    assert metrics["episode_return_mean"] == pytest.approx(np.mean([chunk.get_return() for chunk in done]))
+    assert metrics["flight_return"] == pytest.approx(np.mean([chunk.get_return() for chunk in done]))
     distances = [chunk.get_infos(-1)["distance_m"] for chunk in done]
     assert metrics["distance_m"] == pytest.approx(np.mean(distances))
-    assert metrics["episode_return_mean"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
+    assert metrics["flight_return"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
     assert metrics["success_rate"] == metrics["collision_rate"] == 0.0
     assert metrics["dropped_events"] == 0.0
     assert metrics["events_per_step"] > 0.0
@@ -285,7 +285,7 @@ def result(**learner):
         "time_this_iter_s": 2.0,
         "env_runners": {
             "num_env_steps_sampled": 2048,
-            "episode_return_mean": 12.5,
+            "flight_return": 12.5,
             "num_episodes_lifetime": 3,
         },
         "learners": {"default_policy": losses | learner},
@@ -389,3 +389,40 @@ def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     window[0, 0, 2] = 5000
     assert np.isfinite(policy.logits(window)).all()
     assert policy.manifest["ppo"] == dataclasses.asdict(config.algo)
+
+
+class Chunk:
+    """A piece of an episode, as RLlib hands it to callbacks."""
+
+    def __init__(self, name, rewards, done, success=False):
+        self.id_, self.rewards, self.is_done = name, rewards, done
+        self.info = {
+            "num_events": 3,
+            "dropped_events": 0,
+            "success": success,
+            "collision": not success,
+            "distance_m": 7.0,
+        }
+
+    def get_return(self):
+        return sum(self.rewards)
+
+    def get_infos(self, index=None):
+        return self.info if index == -1 else [self.info] * (1 + len(self.rewards))
+
+
+class Logger(dict):
+    def log_value(self, name, value, window):
+        self[name] = value
+
+
+def test_flights_count_whole_and_stay_in_the_mean_over_iterations():
+    metrics, logger = FlightMetrics(), Logger()
+    metrics.on_sample_end(
+        metrics_logger=logger, samples=[Chunk("a", [1.0, 2.0], False), Chunk("b", [4.0], True)]
+    )
+    assert (logger["flight_return"], logger["success_rate"]) == (4.0, 0.0)
+    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("a", [5.0], True, success=True)])
+    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)  # 8 for a, 4 for b
+    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("c", [1.0], False)])
+    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)
