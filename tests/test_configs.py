@@ -75,6 +75,7 @@ def test_ppo_is_the_papers(composed):
     algo = parse(composed("+exp=bytestream", "budget=paper")).algo
     assert dataclasses.asdict(algo) == {
         "lr": 3e-4,
+        "lr_schedule": "constant",
         "gamma": 0.99,
         "lambda_": 0.95,
         "clip_param": 0.2,

@@ -109,4 +109,4 @@ def test_no_file_names_a_package_index_or_a_folder_of_one_machine():
 @pytest.mark.parametrize("room", ["envs", "models", "jobs", "platform"])
 def test_no_file_is_too_long_to_be_read_in_one_go(room):
     lengths = {path.name: len(path.read_text().splitlines()) for path in (ROOT / room).rglob("*.py")}
-    assert {name: length for name, length in lengths.items() if length > 250} == {}
+    assert {name: length for name, length in lengths.items() if length > 350} == {}
