@@ -39,7 +39,7 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 	    echo "    sudo apt-get install --no-install-recommends $(GL_PACKAGES)"; \
 	fi
 
-bytestream: setup ## from nothing to an evaluated policy (about 45 minutes; ARGS="budget=smoke": two)
+bytestream: setup ## from nothing to an evaluated policy (about 30 minutes; ARGS="budget=smoke": one)
 	$(LAUNCH) +exp=bytestream $(ARGS)
 
 sweep-robustness: setup ## fly the trained policy at other rates, thresholds and with sensor faults

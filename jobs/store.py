@@ -7,6 +7,8 @@ from typing import Any
 
 from jobs.config import Config, ConfigError
 
+REPOSITORY = Path(__file__).resolve().parent.parent
+
 SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep")
 MOST_METRICS = 40  # of one call; a page with hundreds of charts cannot be read, nor drawn
 MOST_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
@@ -34,6 +36,8 @@ def page(uri: str) -> str:
 
 def dashboard_command(uri: str) -> str:
     """The command that serves a store to browsers of this machine only."""
+    if uri == f"sqlite:///{REPOSITORY / 'mlflow.db'}":
+        return "make mlflow"
     lean = "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true"
     return f"{lean} mlflow server --workers 1 --host 127.0.0.1 --port 5000 --backend-store-uri {uri}"
 
