@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
+WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
+VIEW_TAG = "mlflow.sharedViewState"  # MLflow's own name for stored views
+RESULTS_VIEW = "results"
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ class Tracker:
 
     def link(self) -> str:
         """Address of the run's page."""
-        return f"{page(self.uri)}/#/experiments/{self.experiment_id}/runs/{self.run_id}"
+        return f"{page(self.uri)}/#/experiments/{self.experiment_id}/runs/{self.run_id}?{WORKFLOW}"
 
     def save_view(self, key: str, name: str, columns: Sequence[str], search: str = "") -> str:
         """Store a view of the experiment's runs under "Views", and return its address.
@@ -114,18 +117,21 @@ class Tracker:
         now_ms = int(time.time() * 1000)
         packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
         view = {"name": name, "createdAt": now_ms, "updatedAt": now_ms, "state": packed}
-        self.client.set_experiment_tag(self.experiment_id, f"mlflow.sharedViewState.{key}", json.dumps(view))
-        return f"{experiment_page(self)}&viewStateShareKey={quote(key)}"
+        self.client.set_experiment_tag(self.experiment_id, f"{VIEW_TAG}.{key}", json.dumps(view))
+        return experiment_page(self, key)
 
     def dashboard(self) -> str:
         """The command that opens the dashboard, and the addresses to open in it."""
         lines = [] if page(self.uri) == self.uri else [f"Dashboard: {dashboard_command(self.uri)}"]
-        return "\n".join([*lines, f"This run:  {self.link()}", f"All runs:  {experiment_page(self)}"])
+        stored = self.client.get_experiment(self.experiment_id).tags
+        view = RESULTS_VIEW if f"{VIEW_TAG}.{RESULTS_VIEW}" in stored else None
+        return "\n".join([*lines, f"This run:  {self.link()}", f"All runs:  {experiment_page(self, view)}"])
 
 
-def experiment_page(tracker: Tracker) -> str:
-    """Address of the table of runs; unless it names the workflow, MLflow opens a page for chat models."""
-    return f"{page(tracker.uri)}/#/experiments/{tracker.experiment_id}/runs?workflowType=machine_learning"
+def experiment_page(tracker: Tracker, view: str | None = None) -> str:
+    """Address of the table of runs, in a stored view (without one, it shows no figures)."""
+    shown = "" if view is None else f"&viewStateShareKey={quote(view)}"
+    return f"{page(tracker.uri)}/#/experiments/{tracker.experiment_id}/runs?{WORKFLOW}{shown}"
 
 
 @contextlib.contextmanager
@@ -147,6 +153,7 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
     with _ended(tracker):
         tracker.params(as_dict(folder.config))
         tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
+        tracker.artifact(folder.path / "config.yaml")
         yield tracker
 
 
