@@ -16,7 +16,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream sweep-robustness mlflow test lint check bench lock clean
+.PHONY: help setup system-libraries bytestream sweep-robustness mlflow test lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -62,6 +62,9 @@ check: lint test ## what must pass before a change is merged
 
 bench: setup ## measure the speed of the parts
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
+
+docs: setup ## the guide and the API as web pages in docs/_build
+	$(BIN)/python -m sphinx -q -b html docs docs/_build
 
 lock: setup ## write requirements.lock anew (ARGS=--upgrade: with the newest versions)
 	$(BIN)/pip-compile --quiet --extra dev,docs --strip-extras --allow-unsafe \
