@@ -32,8 +32,10 @@ $(INSTALLED): requirements.lock pyproject.toml
 
 system-libraries: # OpenGL without a screen, for renderer=pyrender
 	@$(PYTHON) -c 'import ctypes; ctypes.CDLL("libEGL.so.1"); ctypes.CDLL("libGL.so.1")' 2>/dev/null \
+	&& ls /usr/lib/*/dri/*swrast_dri.so /usr/lib/*/libgallium*.so 2>/dev/null | grep -q . \
 	|| if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-	    apt-get update && apt-get install --yes --no-install-recommends $(GL_PACKAGES); \
+	    { apt-get update && apt-get install --yes --no-install-recommends $(GL_PACKAGES); } \
+	    || echo "warning: no OpenGL, so renderer=pyrender will not run; renderer=raycast does without"; \
 	else \
 	    echo "renderer=pyrender needs OpenGL; install it with:"; \
 	    echo "    sudo apt-get install --no-install-recommends $(GL_PACKAGES)"; \

@@ -117,6 +117,13 @@ def sensor_settings(config: EnvConfig) -> dict[str, Any]:
     return {**dataclasses.asdict(config.camera), **flight, "max_step_m": config.renderer.max_step_m}
 
 
+def sensor_differences(theirs: dict[str, Any], config: EnvConfig) -> dict[str, tuple[Any, Any]]:
+    """Setting -> (their value, this simulation's value), for the sensor settings that differ."""
+    ours = sensor_settings(config)
+    pairs = {key: (theirs.get(key), ours.get(key)) for key in {**theirs, **ours}}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+
+
 def settings_hash(settings: dict[str, Any]) -> str:
     """First 12 hexadecimal digits of the SHA-256 of `settings` as canonical JSON."""
     text = json.dumps(settings, sort_keys=True, separators=(",", ":"), allow_nan=False)

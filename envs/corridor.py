@@ -244,3 +244,12 @@ def _stack_infos(infos: Any) -> dict[str, Any]:
     stacked: dict[str, Any] = {key: np.array([info[key] for info in infos]) for key in infos[0]}
     mask = np.ones(len(infos), bool)
     return stacked | {f"_{key}": mask for key in infos[0]}
+
+
+# Gymnasium imports what stands before the colon: make("envs.corridor:evade/Corridor-v0").
+if "evade/Corridor-v0" not in gymnasium.registry:
+    gymnasium.register(
+        id="evade/Corridor-v0",
+        entry_point="envs.corridor:CorridorEnv",
+        vector_entry_point="envs.corridor:CorridorVectorEnv",
+    )

@@ -38,9 +38,10 @@ class Outcome(NamedTuple):
 def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Generator, ...]:
     """Generators of an episode: for its scene, its spawn and its faults.
 
-    The split comes first in their entropy, so no seed makes a corridor of another split.
+    The split comes first in their entropy, so no seed makes a corridor of another split. The
+    seed comes last: it may be longer than a word, and what followed it would run into its end.
     """
-    streams = np.random.SeedSequence([SPLITS.index(split), seed, episode]).spawn(3)
+    streams = np.random.SeedSequence([SPLITS.index(split), episode, seed]).spawn(3)
     return tuple(np.random.default_rng(stream) for stream in streams)
 
 

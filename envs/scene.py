@@ -38,6 +38,7 @@ POLE = 0
 # The sun stands behind the start and to the right, so that the sides of a pole differ.
 SUN = (0.4, -0.5, math.sqrt(0.59))
 TRIES_PER_POLE = 200
+DENSEST = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +171,7 @@ LAYOUTS: dict[str, PolesLayout] = {
 }
 
 
-def make_scene(name: str, rng: np.random.Generator, **overrides: float) -> Scene:
+def make_scene(name: str, rng: np.random.Generator, /, **overrides: float) -> Scene:
     """Draw a scene of the layout `name`; the same state of `rng` gives the same bytes.
 
     Args:
@@ -217,10 +218,22 @@ def _check_layout(layout: PolesLayout) -> None:
             raise ValueError(f"layout: {rule}, got {layout}")
 
 
+def _share_covered(layout: PolesLayout) -> float:
+    """Share of the area that discs of diameter `min_gap_m` around all axes would cover."""
+    gap = layout.min_gap_m
+    width, length = layout.width_m - 2 * layout.radius_max_m + gap, layout.last_y_m - layout.first_y_m + gap
+    return layout.num_poles * 0.25 * math.pi * gap * gap / (width * length)
+
+
 def _place_poles(layout: PolesLayout, rng: np.random.Generator) -> np.ndarray:
     """Poles inside the lane and `min_gap_m` apart, by rejection with a bounded number of tries."""
     count = int(layout.num_poles)
     half = 0.5 * layout.width_m - layout.radius_max_m
+    if _share_covered(layout) > DENSEST:  # asked first: the tries would take minutes
+        raise ValueError(
+            f"layout num_poles={count} cannot be placed {layout.min_gap_m} m apart; "
+            "lower num_poles or min_gap_m, or widen the lane"
+        )
     tries = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (TRIES_PER_POLE * count, 2))
     kept = keep_apart(tries, layout.min_gap_m, count)
     if len(kept) < count:

@@ -21,9 +21,10 @@ from jobs.train import train
 def run(config: Config) -> dict[str, Any]:
     """Every stage of a run that is not done yet, then the table of its results."""
     folder = open_run(config)
+    config = folder.config
     console.print(f"Run folder: {folder.path}")
     with open_tracker(config, folder) as tracker:
-        collect(config, folder)
+        collect(config, folder, tracker)
         pretrain(config, folder, tracker)
         train(config, folder, encoder_file(folder), tracker.log)
         figures = evaluate(config, folder, tracker)

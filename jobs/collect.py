@@ -19,6 +19,7 @@ from envs.recordings import Recording, write_recording
 from jobs.config import Config
 from jobs.progress import progress
 from jobs.runs import Run, finish, finished, open_run
+from jobs.tracking import Tracker, open_tracker
 
 FLIGHT_GAP_US = 1_000_000
 MEAN_HOLD_M = 2.0
@@ -27,11 +28,11 @@ MEAN_HOLD_M = 2.0
 def run(config: Config) -> dict[str, Any]:
     """Collect the data sets of a run; return its folder."""
     folder = open_run(config)
-    collect(config, folder)
-    return {"run": str(folder.path)}
+    with open_tracker(folder.config, folder) as tracker:
+        return collect(folder.config, folder, tracker)
 
 
-def collect(config: Config, folder: Run) -> dict[str, Any]:
+def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     """Write the training and validation recordings of a run, unless they are there already."""
     done = finished(folder, "collect")
     if done is not None:
@@ -40,17 +41,17 @@ def collect(config: Config, folder: Run) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     with progress("Collect flights", sum(sizes.values()), "steps") as advance:
         for split, num_steps in sizes.items():
+            scenes = config.collect.scenes
+            shares = [len(part) for part in np.array_split(np.arange(num_steps), len(scenes))]
             flights = [
-                (
-                    config.env_config(scene=scene, split=split, observation="events"),
-                    num_steps // len(config.collect.scenes),
-                )
-                for scene in config.collect.scenes
+                (config.env_config(scene=scene, split=split, observation="events"), share)
+                for scene, share in zip(scenes, shares, strict=True)
             ]
             recording = record(flights, config.seed, advance)
             write_recording(data_file(folder, split), recording)
-            figures[f"{split}_events"] = len(recording.events)
-            figures[f"{split}_events_per_step"] = len(recording.events) / len(recording.index["step_t_us"])
+            figures[f"collect/{split}_events"] = len(recording.events)
+            figures[f"collect/{split}_flights"] = recording.about["flights"]
+    tracker.log(0, figures)
     return finish(folder, "collect", figures)
 
 

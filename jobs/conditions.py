@@ -2,21 +2,21 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envs.config import EnvConfig, settings_hash
+from envs.config import CameraConfig, EnvConfig, settings_hash
 from jobs.config import Config, ConfigError, env_with
 from jobs.evaluate import find_policy
+from jobs.flights import check_sensor
 from jobs.pilots import BOUNDS
 from jobs.runs import Run
 from models.policy import MANIFEST
 
 SHOWN_BOUNDS = ("straight", "oracle")
-
-Value = int | float | str
+CAMERA_SETTINGS = {field.name for field in dataclasses.fields(CameraConfig)}
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,19 @@ class Sweep:
     """All cells of a sweep.
 
     Attributes:
+        differ: Sensor setting -> (the policy's value, which is flown; the configured), if unequal.
         axes: Axis -> (value, cell of the policy), ascending.
         bounds: Pilot that bounds the policy -> its cell, without any change.
     """
 
-    axes: dict[str, list[tuple[Value, Cell]]]
+    differ: dict[str, tuple[Any, Any]]
+    axes: dict[str, list[tuple[float, Cell]]]
     bounds: dict[str, Cell]
+
+    @property
+    def identity(self) -> str:
+        """Hash of all that decides its figures: policy, conditions and corridors."""
+        return settings_hash({"cells": [[*cell.label, cell.key, *cell.seeds] for cell in self.cells()]})
 
     def cells(self) -> list[Cell]:
         """Every cell; two may share a key."""
@@ -76,36 +83,43 @@ def swept_policy(config: Config, folder: Run) -> str:
 
 
 def plan(config: Config, policy: str) -> Sweep:
-    """The cells of a sweep."""
-    identity = policy if policy in BOUNDS else settings_hash(read_manifest(policy))
-    base = config.env_config(scene=config.sweep.scene, split="eval")
+    """The cells of a sweep: a policy flies its own sensor, and each axis changes one setting of that."""
+    manifest = read_manifest(policy)
+    identity = settings_hash(manifest) if manifest else policy
+    configured = config.env_config(scene=config.sweep.scene, split="eval")
+    differ = check_sensor(manifest, configured, allow_mismatch=True) if manifest else {}
+    base = with_sensor(configured, manifest.get("sensor", {}))
 
     def cell(label: tuple[str, str], pilot: str, name: str, env: EnvConfig) -> Cell:
         action, seeds = config.evaluate.action, tuple(range(config.sweep.trials))
         key = settings_hash({"env": dataclasses.asdict(env), "pilot": name, "action": action})
         return Cell(label, key, pilot, action, env, seeds)
 
-    def point(axis: str, value: Value) -> tuple[Value, Cell]:
-        return value, cell((axis, shown(value)), policy, identity, env_with(base, axis, value))
+    def point(axis: str, value: float) -> tuple[float, Cell]:
+        return value, cell((axis, f"{value:g}"), policy, identity, env_with(base, axis, value))
 
     axes = {
-        axis: [point(axis, value) for value in ordered(values)] for axis, values in config.sweep.axes.items()
+        axis: [point(axis, value) for value in sorted(set(values))]
+        for axis, values in config.sweep.axes.items()
     }
-    return Sweep(axes, {name: cell((name, "-"), name, name, base) for name in SHOWN_BOUNDS})
+    return Sweep(differ, axes, {name: cell((name, "-"), name, name, base) for name in SHOWN_BOUNDS})
 
 
-def ordered(values: Sequence[Value]) -> list[Value]:
-    """Numbers ascending, each once; words as they are given."""
-    once = list(dict.fromkeys(values))
-    return once if any(isinstance(value, str) for value in once) else sorted(once)
+def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
+    """The simulation with the sensor settings of a manifest, named as `sensor_settings` names them.
 
-
-def shown(value: Value) -> str:
-    """A value as tables and figures show it."""
-    return value if isinstance(value, str) else f"{value:g}"
+    Raises:
+        pydantic.ValidationError: If a setting is unknown or refuses its value.
+    """
+    for name, value in sensor.items():
+        section = "camera" if name in CAMERA_SETTINGS else "renderer" if name == "max_step_m" else "env"
+        env = env_with(env, f"{section}.{name}", value)
+    return env
 
 
 def read_manifest(policy: str) -> dict[str, Any]:
-    """What a policy folder says about itself; its SHA-256 sums make it unique."""
+    """What a policy folder says about itself, unique by its SHA-256 sums; of a bound, nothing."""
+    if policy in BOUNDS:
+        return {}
     manifest: dict[str, Any] = json.loads((Path(policy) / MANIFEST).read_text())
     return manifest

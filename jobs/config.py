@@ -15,7 +15,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, Fraction, Positive, RendererConfig
-from jobs.refusals import explain
+from jobs.refusals import JOBS_CHOOSE, explain, nearest, refused_scenes
 
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -86,7 +86,6 @@ class PretrainConfig:
     lr: Positive
     weight_decay: NonNegative
     beta: NonNegative
-    beta_start: Annotated[int, Field(ge=0)]
     beta_schedule: Literal["appendix", "constant"]
     validate_every: Count
     checkpoint_every: Count
@@ -169,6 +168,11 @@ class Config:
 
 
 ENV_PARTS = ("camera", "faults", "renderer")
+ENV_KEYS = [
+    part.name
+    for part in dataclasses.fields(typing.cast(Any, EnvConfig))
+    if part.name not in (*ENV_PARTS, *JOBS_CHOOSE)
+]
 SECTIONS = {
     part.name: part.type for part in dataclasses.fields(Config) if dataclasses.is_dataclass(part.type)
 }
@@ -187,14 +191,13 @@ def parse(values: Mapping[str, Any]) -> Config:
     parts = {name: _build(section, values.get(name), name, refused) for name, section in SECTIONS.items()}
     parts["env"] = world = _build(EnvConfig, values.get("env"), "env", refused)
     if world is not None:  # 100 and 100.0 become the same setting, so that they name the same run
-        own = [part.name for part in dataclasses.fields(world) if part.name not in ENV_PARTS]
-        parts["env"] = {name: getattr(world, name) for name in own}
-        overlap = [name for name in ENV_PARTS if name in values["env"]]
-        refused += [f"env.{name}: no such key; {name} is a group of its own" for name in overlap]
+        parts["env"] = {name: getattr(world, name) for name in ENV_KEYS}
     refused_parts = [name for name, part in parts.items() if part is None]
     config = _build(Config, {**values, **parts}, "", refused, refused_parts)
     if not refused:
-        refused = _refused_axes(config)
+        named = [("env.scene", config.env["scene"]), ("sweep.scene", config.sweep.scene)]
+        named += [("collect.scenes", name) for name in config.collect.scenes]
+        refused = _refused_axes(config) + refused_scenes(named, config.env["layout"])
     if refused:
         raise ConfigError("\n".join(refused))
     return typing.cast(Config, config)
@@ -217,10 +220,9 @@ def env_with(config: EnvConfig, key: str, value: Any) -> EnvConfig:
 def known_keys() -> list[str]:
     """Every key that a configuration may have."""
     keys = [field.name for field in dataclasses.fields(Config)]
-    for name, section in {**SECTIONS, "env": EnvConfig}.items():
-        fields = [field.name for field in dataclasses.fields(typing.cast(Any, section))]
-        keys += [f"{name}.{field}" for field in fields if name != "env" or field not in ENV_PARTS]
-    return keys
+    for name, section in SECTIONS.items():
+        keys += [f"{name}.{field.name}" for field in dataclasses.fields(typing.cast(Any, section))]
+    return keys + [f"env.{name}" for name in ENV_KEYS]
 
 
 def as_dict(config: Config) -> dict[str, Any]:
@@ -233,6 +235,12 @@ def _build(section: Any, values: Any, name: str, refused: list[str], skip: Colle
     if not isinstance(values, Mapping):
         refused.append(f"{name}: must be a group of settings, got {values!r}")
         return None
+    if section is EnvConfig:
+        taken = [key for key in values if key in (*ENV_PARTS, *JOBS_CHOOSE)]
+        refused += [
+            f"env.{key}: no such key, got {values[key]!r}{nearest(f'env.{key}', [])}" for key in taken
+        ]
+        values = {key: value for key, value in values.items() if key not in taken}
     try:
         return section(**{str(key): value for key, value in values.items()})
     except pydantic.ValidationError as error:

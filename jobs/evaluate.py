@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from envs.corridor import CorridorEnv
-from jobs.config import Config, ConfigError
+from jobs.config import Config, ConfigError, as_dict
 from jobs.figures import Track, trajectory_figure
 from jobs.flights import Advance, Watch, Ways, check_sensor, fly, write_episodes
 from jobs.pictures import Film
@@ -63,6 +63,7 @@ class Task(NamedTuple):
 def run(config: Config) -> dict[str, Any]:
     """Evaluate the run's policy, or the newest one; return the figures of the tracker."""
     folder = open_run(config)
+    config = folder.config
     find_policy(config, folder)
     with open_tracker(config, folder) as tracker:
         figures = evaluate(config, folder, tracker)
@@ -71,14 +72,19 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
-    """Fly every task, write what came of it, and return the figures (once per run folder)."""
-    done = finished(folder, "evaluate")
-    if done is not None:
-        console.print((folder.evaluation / "table.md").read_text(), markup=False)
-        return done
+    """Fly every task, write what came of it, and return the figures.
+
+    What was asked before, of the same policy, is not flown again.
+    """
     path = find_policy(config, folder)
     policy = load_policy(path)
     check_sensor(policy.manifest, config.env_config())
+    asked = {"evaluate": as_dict(config)["evaluate"], "policy": policy.manifest["sha256"]}
+    done = finished(folder, "evaluate")
+    if done is not None and done["asked"] == asked:
+        console.print((folder.evaluation / "table.md").read_text(), markup=False)
+        return done["figures"]
+    console.print(f"Policy: {path}", markup=False)
     plan = tasks(config)
     flown: dict[Task, np.ndarray] = {}
     tracks: list[Track] = []
@@ -98,7 +104,7 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     if config.evaluate.video:
         seed = film_seed(flown[plan[0]])
         tracker.artifact(film(config, policy, path, seed, folder.evaluation / "episode.mp4"), "eval")
-    return finish(folder, "evaluate", figures)
+    return finish(folder, "evaluate", {"asked": asked, "figures": figures})["figures"]
 
 
 def tasks(config: Config) -> list[Task]:

@@ -33,24 +33,21 @@ Measure = Callable[[Summary], tuple[float, float, float]]
 
 def axis_figure(
     axis: str,
-    values: Sequence[int | float | str],
+    values: Sequence[float],
     rows: Sequence[Summary],
     bounds: Mapping[str, Summary],
-    trained: int | float | str | None,
+    trained: float | None,
 ) -> Figure:
     """How success and distance change along one axis of the sweep.
 
     Args:
         axis: Configuration key, such as "camera.contrast_threshold".
-        values: Value of each row, shape (n,): ascending numbers, or words.
+        values: Value of each row, shape (n,), ascending.
         rows: The policy's summaries, one per value.
         bounds: Summaries of pilots that bound the policy, by name; drawn as levels.
         trained: The value the policy was trained at, or None.
     """
     label, scale = AXES.get(axis, (axis, "linear"))
-    words = any(isinstance(value, str) for value in values)
-    places = list(range(len(values))) if words else list(values)
-    names = [value if isinstance(value, str) else f"{value:g}" for value in values]
     figure = Figure(figsize=(9.6, 3.9), layout="constrained")
     success, distance = figure.subplots(1, 2)
     for panel, measure in ((success, _success_percent), (distance, _distance_m)):
@@ -58,18 +55,16 @@ def axis_figure(
         points = np.array([measure(row) for row in rows])
         spread = np.abs(points[:, 1:] - points[:, :1]).T
         style = {"color": POLICY, "lw": 1.8, "marker": "o", "ms": 6, "capsize": 4}
-        panel.errorbar(places, points[:, 0], yerr=spread, label="policy", **style)
+        panel.errorbar(values, points[:, 0], yerr=spread, label="policy", **style)
         panel.set_xscale(scale)
-        panel.set_xticks(places, names)
+        panel.set_xticks(values, [f"{value:g}" for value in values])
         panel.set_xticks([], minor=True)
         panel.margins(x=0.12)
         panel.set_xlabel(label)
         panel.grid(axis="y", color=GRID)
         panel.spines[["top", "right"]].set_visible(False)
-        if trained in values:
-            panel.axvline(
-                places[values.index(trained)], color=MUTED, lw=1, ls=":", zorder=0, label="trained here"
-            )
+        if trained is not None and trained in values:
+            panel.axvline(trained, color=MUTED, lw=1, ls=":", zorder=0, label="trained here")
     success.set(ylim=(-3, 103), ylabel="Flights that reached the goal [%]")
     distance.set(ylim=(0, None), ylabel="Mean distance without collision [m]")
     handles, entries = success.get_legend_handles_labels()

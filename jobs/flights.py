@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.config import EnvConfig, sensor_settings
+from envs.config import EnvConfig, sensor_differences
 from envs.corridor import CorridorEnv
 from jobs.figures import Track
 from jobs.pilots import Pilot
@@ -124,9 +124,7 @@ def check_sensor(
     Raises:
         ValueError: If they differ and that is not allowed; both values are named.
     """
-    theirs, ours = manifest["sensor"], sensor_settings(config)
-    pairs = {key: (theirs.get(key), ours.get(key)) for key in {**theirs, **ours}}
-    differ = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+    differ = sensor_differences(manifest["sensor"], config)
     if differ and not allow_mismatch:
         got = "; ".join(f"{key} = {ours!r} instead of {theirs!r}" for key, (theirs, ours) in differ.items())
         raise ValueError(f"the sensor must be the policy's, got {got}; the sweep job flies such changes")

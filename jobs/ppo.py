@@ -13,7 +13,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
 
-from envs.config import sensor_settings, settings_hash
+from envs.config import sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from jobs.config import Config, ConfigError
 from models.rllib import EncodeWindows, ScaleRewards, module_spec
@@ -39,8 +39,11 @@ class FlightMetrics(RLlibCallback):
     def on_sample_end(self, *, metrics_logger: Any, samples: Any, **kwargs: Any) -> None:
         """Count the events of each step and the outcome of each flight that ended."""
         infos = [info for chunk in samples for info in chunk.get_infos()[1:]]
-        for name, key in (("events_per_step", "num_events"), ("dropped_events", "dropped_events")):
-            metrics_logger.log_value(name, float(np.mean([info[key] for info in infos])), window=1)
+        events, dropped = (
+            np.array([info[key] for info in infos]) for key in ("num_events", "dropped_events")
+        )
+        metrics_logger.log_value("events_per_step", float(events.mean()), window=1)
+        metrics_logger.log_value("dropped_events", float(dropped.sum()), window=1)
         for chunk in samples:
             self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
             if chunk.is_done:
@@ -77,9 +80,10 @@ def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
     check_sensor(config, about)
     algo, model = config.algo, config.model
     register_env(ENV, make_corridors)
+    flown = config.env_config(split="train", observation="window")
     return (
         PPOConfig()
-        .environment(ENV, env_config={"config": config.env_config()}, disable_env_checking=True)
+        .environment(ENV, env_config={"config": flown}, disable_env_checking=True)
         .framework("torch")
         .env_runners(
             num_env_runners=algo.num_env_runners,
@@ -158,12 +162,10 @@ def policy_settings(config: Config) -> dict[str, Any]:
 
 def check_sensor(config: Config, about: dict[str, Any]) -> None:
     """Refuse an encoder that was made for another sensor."""
-    here, there = sensor_settings(config.env_config()), about["sensor"]
-    if settings_hash(here) == about["sensor_hash"]:
-        return
-    names = sorted(name for name in {*here, *there} if here.get(name) != there.get(name))
-    values = ", ".join(f"{name}: {there.get(name)!r} there, {here.get(name)!r} here" for name in names)
-    raise ConfigError(
-        f"encoder: was made for another sensor (hash {about['sensor_hash']}, here {settings_hash(here)}): "
-        f"{values}; use its settings, or pretrain an encoder for these"
-    )
+    differ = sensor_differences(about["sensor"], config.env_config())
+    if differ:
+        values = ", ".join(
+            f"{name}: {there!r} there, {here!r} here" for name, (there, here) in differ.items()
+        )
+        remedy = "use its settings, or pretrain an encoder for these"
+        raise ConfigError(f"encoder: was made for another sensor: {values}; {remedy}")

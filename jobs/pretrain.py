@@ -33,8 +33,9 @@ PICTURE_WINDOWS = 8
 def run(config: Config) -> dict[str, Any]:
     """Collect if there is no data yet, then train the event VAE; return its figures."""
     folder = open_run(config)
+    config = folder.config
     with open_tracker(config, folder) as tracker:
-        collect(config, folder)
+        collect(config, folder, tracker)
         return pretrain(config, folder, tracker)
 
 
@@ -55,7 +56,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     held_out = held_out_windows(validation, settings, evae.grid)
     checkpoint = folder.encoder / "checkpoint.pt"
     first = restore(checkpoint, evae, optimizer, rng)
-    best: dict[str, float] = {}
+    latest: dict[str, float] = {}
     with progress("Pretrain the event VAE", settings.iterations, "iterations", done=first) as advance:
         for iteration in range(first, settings.iterations):
             evae.train()
@@ -64,15 +65,15 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
             losses = train_step(evae, optimizer, batch, targets, beta(settings, iteration), rng)
             last = iteration + 1 == settings.iterations
             if last or (iteration + 1) % settings.validate_every == 0:
-                best = held_out_figures(evae, held_out)
+                latest = held_out_figures(evae, held_out)
                 tracker.log(
-                    iteration + 1, {f"evae/{name}": value for name, value in {**losses, **best}.items()}
+                    iteration + 1, {f"evae/{name}": value for name, value in {**losses, **latest}.items()}
                 )
             if last or (iteration + 1) % settings.checkpoint_every == 0:
                 save_checkpoint(checkpoint, evae, optimizer, rng, iteration + 1)
-            explained = best.get("explained_step", 0.0)
+            explained = latest.get("explained_step", 0.0)
             advance(1, note=f"loss {losses['loss']:.4f}, held out {explained:.0%} explained")
-    return freeze(config, folder, tracker, evae, train.about, held_out, best)
+    return freeze(config, folder, tracker, evae, train.about, held_out)
 
 
 def build_evae(model: ModelConfig, sensor: dict[str, Any]) -> EventVAE:
@@ -90,10 +91,10 @@ def build_evae(model: ModelConfig, sensor: dict[str, Any]) -> EventVAE:
 
 
 def beta(settings: PretrainConfig, iteration: int) -> float:
-    """Weight of the KL divergence at an iteration (appendix B.2, or a constant after a start)."""
+    """Weight of the KL divergence at an iteration (appendix B.2, or a constant)."""
     if settings.beta_schedule == "appendix":
         return appendix_beta(iteration)
-    return settings.beta if iteration >= settings.beta_start else 0.0
+    return settings.beta
 
 
 def sample_windows(
@@ -178,10 +179,9 @@ def freeze(
     evae: EventVAE,
     about: dict[str, Any],
     held_out: dict[str, EventBatch],
-    figures: dict[str, float],
 ) -> dict[str, Any]:
-    """Write the encoder file and a picture of its reconstructions."""
-    evae.eval()
+    """Write the encoder file and a picture of its reconstructions; return its held-out figures."""
+    figures = held_out_figures(evae, held_out)
     manifest = {
         "sensor": about["sensor"],
         "sensor_hash": about["sensor_hash"],

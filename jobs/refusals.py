@@ -1,9 +1,11 @@
 """What a refused configuration says: the key, the rule, the value received, the nearest key."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import pydantic
+
+JOBS_CHOOSE = ("observation", "split")  # of `env`: training must never fly the corridors of evaluation
 
 
 def explain(error: pydantic.ValidationError, section: str, keys: Sequence[str]) -> list[str]:
@@ -27,10 +29,36 @@ def explain(error: pydantic.ValidationError, section: str, keys: Sequence[str]) 
 
 
 def nearest(key: str, keys: Sequence[str]) -> str:
-    """The words "did you mean KEY?" after a semicolon, or nothing if no key is near."""
+    """What to do instead of an unknown key, after a semicolon: the nearest key, or where to look."""
+    if key.removeprefix("env.") in JOBS_CHOOSE:
+        return "; every job chooses it itself"
     by_last_word = {known.rpartition(".")[2]: known for known in reversed(keys)}
     near = difflib.get_close_matches(key, keys, n=1, cutoff=0.75)
     if not near:
         words = difflib.get_close_matches(key.rpartition(".")[2], by_last_word, n=1, cutoff=0.7)
         near = [by_last_word[word] for word in words]
     return f"; did you mean {near[0]}?" if near else "; --cfg job shows every key"
+
+
+def refused_scenes(named: Sequence[tuple[str, str]], layout: Mapping[str, float]) -> list[str]:
+    """One line per scene that does not exist, and one for a layout of which no corridor can be made.
+
+    Evaluation flies scenes that the configuration does not name, so a layout has to suit all.
+
+    Args:
+        named: Keys and the scenes they name.
+        layout: Values that replace those of every scene.
+    """
+    # Imported here because they take a second, which a refusal of anything else can do without.
+    import numpy as np
+
+    from envs.scene import LAYOUTS, make_scene
+
+    known = ", ".join(sorted(LAYOUTS))
+    refused = [f"{key}: must be one of {known}, got {name!r}" for key, name in named if name not in LAYOUTS]
+    try:
+        for name in LAYOUTS:
+            make_scene(name, np.random.default_rng(0), **layout)
+    except ValueError as error:
+        refused.append(f"env.layout: {str(error).removeprefix('layout: ')}")
+    return refused

@@ -144,10 +144,10 @@ def columns(names: Sequence[str], rows: Sequence[Summary]) -> dict[str, list[str
     }
 
 
-def metrics(row: Summary, suffix: str = "") -> dict[str, float]:
+def metrics(row: Summary) -> dict[str, float]:
     """The figures of a row under the names that trackers and tables share."""
     low, high = row.distance_interval or (float("nan"), float("nan"))
-    values = {
+    return {
         "eval/success_rate": row.success,
         "eval/success_rate_low": row.success_interval[0],
         "eval/success_rate_high": row.success_interval[1],
@@ -157,4 +157,3 @@ def metrics(row: Summary, suffix: str = "") -> dict[str, float]:
         "sim/events_per_step": row.events_per_step,
         "sim/dropped_events": float(row.dropped),
     }
-    return {f"{name}{suffix}": value for name, value in values.items()}

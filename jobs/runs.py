@@ -18,8 +18,9 @@ import yaml
 from envs.config import settings_hash
 from jobs.config import Config, ConfigError, as_dict, parse
 
-# What a run is called or where it is computed and written down does not change what it is.
-UNNAMED = ("job", "resume", "runs_dir", "cluster", "tracking")
+# Where a run is computed and written down, and how its policy is flown afterwards, does not
+# change what is trained.
+UNNAMED = ("job", "resume", "runs_dir", "cluster", "tracking", "evaluate", "sweep")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 
@@ -73,7 +74,7 @@ def open_run(config: Config) -> Run:
 
 
 def reopen(path: Path, config: Config) -> Run:
-    """An existing run folder with its own stored configuration, computed where `config` says."""
+    """An existing run folder with its own stored configuration; only `UNNAMED` is taken from `config`."""
     stored = path.resolve() / "config.json"
     if not stored.is_file():
         raise ConfigError(
@@ -85,7 +86,7 @@ def reopen(path: Path, config: Config) -> Run:
 
 
 def run_name(config: Config) -> str:
-    """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change a result."""
+    """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained."""
     settings = {name: value for name, value in as_dict(config).items() if name not in UNNAMED}
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
 

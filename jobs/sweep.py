@@ -18,12 +18,12 @@ import torch
 from ray import tune
 
 from jobs.cluster import start_ray
-from jobs.conditions import Cell, Sweep, Value, plan, read_manifest, swept_policy
+from jobs.conditions import Cell, Sweep, plan, read_manifest, swept_policy
 from jobs.config import Config
 from jobs.evaluate import VIEW_COLUMNS
 from jobs.figures import axis_figure
 from jobs.flights import EPISODE, check_sensor, fly, write_episodes
-from jobs.pilots import BOUNDS, make_pilot
+from jobs.pilots import make_pilot
 from jobs.progress import console, progress
 from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
 from jobs.runs import Run, finish, open_run, write_atomic, write_json
@@ -68,11 +68,23 @@ def run(config: Config) -> dict[str, Any]:
     folder = open_run(config)
     policy = swept_policy(config, folder)
     sweep = plan(config, policy)
-    with open_tracker(config, folder, key="sweep") as tracker:
+    announce(policy, sweep)
+    with open_tracker(config, folder, key=f"sweep {sweep.identity[:8]}") as tracker:
+        tracker.tags({"kind": "sweep"})
         episodes = fly_cells(config, folder, sweep.cells())
         figures = report(folder, tracker, policy, sweep, episodes)
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "sweep", figures)
+
+
+def announce(policy: str, sweep: Sweep) -> None:
+    """Say which policy is flown, and where its sensor replaces the configured one."""
+    console.print(f"Policy: {policy}", markup=False)
+    if sweep.differ:
+        flown = ", ".join(
+            f"{name} = {own!r} instead of {ours!r}" for name, (own, ours) in sweep.differ.items()
+        )
+        console.print(f"Flown with the policy's own sensor: {flown}", markup=False)
 
 
 def fly_cells(config: Config, folder: Run, every: Sequence[Cell]) -> dict[str, np.ndarray]:
@@ -141,7 +153,7 @@ def report(
 ) -> dict[str, float]:
     """Tables, figures and tracked runs of a flown sweep; the policy's success rate by condition."""
     levels = {name: summarise(cell.label, episodes[cell.key]) for name, cell in sweep.bounds.items()}
-    sensor = {} if policy in BOUNDS else read_manifest(policy)["sensor"]
+    sensor = read_manifest(policy).get("sensor", {})
     rows: list[tuple[Cell, Summary]] = []
     for axis, points in sweep.axes.items():
         flown = [summarise(cell.label, episodes[cell.key]) for _, cell in points]
@@ -160,24 +172,35 @@ def report(
     return {"=".join(row.label): row.success for _, row in rows}
 
 
-def track_axis(tracker: Tracker, axis: str, values: Sequence[Value], rows: Sequence[Summary]) -> None:
+def track_axis(tracker: Tracker, axis: str, values: Sequence[float], rows: Sequence[Summary]) -> None:
     """One curve per axis in the parent run: its steps are the axis, in 1/1000 where it has fractions."""
-    numbers = [float(place if isinstance(value, str) else value) for place, value in enumerate(values)]
-    scale = 1 if all(number.is_integer() for number in numbers) else FRACTION_STEPS
-    for value, row in zip(numbers, rows, strict=True):
+    scale = 1 if all(float(value).is_integer() for value in values) else FRACTION_STEPS
+    for value, row in zip(values, rows, strict=True):
         figures = metrics(row)
         curve = {f"sweep/{name.partition('/')[2]}.{axis}": figures[name] for name in VIEW_COLUMNS}
-        tracker.log(round(value * scale), curve)
+        log_once(tracker, round(value * scale), curve)
+
+
+def log_once(tracker: Tracker, step: int, figures: Mapping[str, float]) -> None:
+    """Log the points that the MLflow run does not hold yet: MLflow would draw a repeated one twice."""
+    client, run_id = tracker.client, tracker.run_id
+    held = {
+        (name, point.step, point.value)
+        for name in client.get_run(run_id).data.metrics.keys() & figures.keys()
+        for point in client.get_metric_history(run_id, name)
+    }
+    tracker.log(step, {name: value for name, value in figures.items() if (name, step, value) not in held})
 
 
 def track_cell(folder: Run, parent: Tracker, cell: Cell, row: Summary, sensor: Mapping[str, Any]) -> None:
     """A child run for one condition, with what differs from the sensor the policy was trained with."""
     differ = check_sensor({"sensor": sensor}, cell.env, allow_mismatch=True) if sensor else {}
     axis, value = cell.label
-    with open_child(parent, folder, f"condition {axis} {cell.key}", f"{axis}={value}", "condition") as child:
+    slot = f"condition {parent.run_id} {axis} {cell.key}"  # a parent's conditions are its own
+    with open_child(parent, folder, slot, f"{axis}={value}", "condition") as child:
         child.params({"axis": axis, "value": value, "pilot": cell.pilot, "env": dataclasses.asdict(cell.env)})
         child.tags({"differs_from_training": json.dumps(differ)})
-        child.log(0, metrics(row))
+        log_once(child, 0, metrics(row))
 
 
 def publish(folder: Run, tracker: Tracker, policy: str, rows: Sequence[Summary]) -> None:
@@ -186,7 +209,10 @@ def publish(folder: Run, tracker: Tracker, policy: str, rows: Sequence[Summary])
     show(table("One setting changed at a time", LABELS, rows))
     write_atomic(folder.path / "sweep" / "table.md", text)
     tracker.text("sweep/table.md", text)
-    tracker.table("sweep/results", columns(LABELS, rows))
+    if "sweep/results.json" not in {
+        file.path for file in tracker.client.list_artifacts(tracker.run_id, "sweep")
+    }:
+        tracker.table("sweep/results", columns(LABELS, rows))  # MLflow appends to a table that is there
     shown = [f"metrics.`{name}`" for name in VIEW_COLUMNS]
     search = f"tags.`mlflow.parentRunId` = '{tracker.run_id}'"
     view = tracker.save_view("sweep", "Sweep", [*shown, "params.`axis`", "params.`value`"], search)

@@ -52,6 +52,7 @@ ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "trai
 ENV_STEPS = "num_env_steps_sampled_lifetime"
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
+LISTENER = "train"
 
 _LISTENERS: dict[str, Callable[[Mapping[str, Any]], None]] = {}
 
@@ -81,8 +82,9 @@ class Relay(tune.Callback):
 def run(config: Config) -> dict[str, Any]:
     """Collect and pretrain if that is still to be done, then train; return the figures."""
     folder = open_run(config)
+    config = folder.config
     with open_tracker(config, folder) as tracker:
-        collect(config, folder)
+        collect(config, folder, tracker)
         pretrain(config, folder, tracker)
         train(config, folder, encoder_file(folder), tracker.log)
     return finished(folder, "train") or {}
@@ -148,7 +150,8 @@ def export_policy(
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
     """The experiment in the run folder: continued if it is there, else new."""
     path = folder.train
-    if tune.Tuner.can_restore(path):
+    # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
+    if tune.Tuner.can_restore(path) and any(path.glob("experiment_state-*.json")):
         return tune.Tuner.restore(str(path), PPO, resume_errored=True, param_space=algorithm)
     return tune.Tuner(
         PPO,
@@ -158,7 +161,7 @@ def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
             storage_path=str(path.parent),
             stop={ENV_STEPS: config.train.env_steps},
             verbose=0,
-            callbacks=[Relay(str(path))],
+            callbacks=[Relay(LISTENER)],
             failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
             checkpoint_config=tune.CheckpointConfig(
                 checkpoint_frequency=config.train.checkpoint_every, num_to_keep=2, checkpoint_at_end=True
@@ -172,8 +175,8 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
     file = folder.train / "results.jsonl"
     file.parent.mkdir(parents=True, exist_ok=True)
-    reported = reported_steps(file)
-    last: dict[str, float] = {}
+    file.write_bytes(whole_lines(file))
+    reported, last = reported_so_far(file)
     total = config.train.env_steps
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
@@ -190,18 +193,26 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             advance(env_steps - reported, note=_note(last))
             reported = env_steps
 
-        _LISTENERS[str(folder.train)] = listen
+        _LISTENERS[LISTENER] = listen
         try:
             yield last
         finally:
-            del _LISTENERS[str(folder.train)]
+            del _LISTENERS[LISTENER]
 
 
-def reported_steps(file: Path) -> int:
-    """Environment steps of the last whole line of a results file; 0 if there is none."""
-    text = file.read_text() if file.exists() else ""
-    whole = text[: text.rfind("\n") + 1].splitlines()
-    return int(json.loads(whole[-1])["env_steps"]) if whole else 0
+def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
+    """Environment steps and metrics of the last whole line of a results file; 0 and none without one."""
+    lines = whole_lines(file).splitlines()
+    if not lines:
+        return 0, {}
+    row = json.loads(lines[-1])
+    return int(row.pop("env_steps")), {name: math.nan if x is None else x for name, x in row.items()}
+
+
+def whole_lines(file: Path) -> bytes:
+    """A file's content up to its last line end: a kill can leave half a line behind it."""
+    text = file.read_bytes() if file.exists() else b""
+    return text[: text.rfind(b"\n") + 1]
 
 
 def read_metrics(result: Mapping[str, Any]) -> dict[str, float]:

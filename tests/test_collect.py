@@ -1,8 +1,14 @@
+import dataclasses
+
 import numpy as np
 import pytest
+from test_runs import small_config
 
 from envs.config import EnvConfig, FaultsConfig
+from envs.recordings import read_recording
+from jobs import collect
 from jobs.collect import FLIGHT_GAP_US, record
+from jobs.runs import open_run
 
 
 def flights(**fields):
@@ -47,3 +53,9 @@ def test_the_facts_name_sensor_scenes_and_faults():
     assert about["scenes"] == ["poles"]
     assert about["faults"][0]["sparsity"] == 0.5
     assert about["seed"] == 4
+
+
+def test_a_resumed_job_works_with_the_stored_settings(tmp_path):
+    stored = open_run(small_config(tmp_path))
+    collect.run(dataclasses.replace(small_config(tmp_path), seed=99, resume=str(stored.path)))
+    assert read_recording(stored.data / "train.h5").about["seed"] == stored.config.seed

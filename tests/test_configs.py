@@ -8,6 +8,7 @@ from omegaconf import OmegaConf
 
 from envs.config import EnvConfig
 from jobs.config import ENV_PARTS, SECTIONS, Config, ConfigError, as_dict, env_with, known_keys, parse
+from jobs.refusals import JOBS_CHOOSE
 from jobs.runs import run_name
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -52,6 +53,7 @@ def test_every_file_of_every_group_is_accepted(composed, choice):
 
 def test_the_yaml_of_the_world_says_what_its_dataclasses_say(values):
     defaults = dataclasses.asdict(EnvConfig())
+    defaults = {name: value for name, value in defaults.items() if name not in JOBS_CHOOSE}
     assert {**values["env"], **{part: values[part] for part in ENV_PARTS}} == defaults
 
 
@@ -136,6 +138,15 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("env", None, "must be a group of settings, got None"),
         ("env.contrast_treshold", 0.2, "no such key, got 0.2; did you mean camera.contrast_threshold?"),
         ("sed", 1, "no such key, got 1; did you mean seed?"),
+        ("env.split", "eval", "env.split: no such key, got 'eval'; every job chooses it itself"),
+        ("env.observation", "luminance", "no such key, got 'luminance'; every job chooses it itself"),
+        ("env.scene", "moon", "env.scene: must be one of poles, poles_eval, got 'moon'"),
+        ("sweep.scene", "moon", "sweep.scene: must be one of poles, poles_eval, got 'moon'"),
+        ("collect.scenes", ["poles", "moon"], "collect.scenes: must be one of poles, poles_eval, got 'moon'"),
+        ("env.layout", {"num_poles": 100_000}, "num_poles=100000 cannot be placed 2.0 m apart"),
+        ("env.layout", {"num_poles": 2.5}, "num_poles must be a whole number"),
+        ("env.layout", {"num_pole": 3}, "has no 'num_pole'"),
+        ("env.layout", {"name": 3}, "has no 'name'"),
     ],
 )
 def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule):
@@ -160,6 +171,13 @@ def test_one_setting_of_the_world_can_be_replaced_by_its_key():
     assert env_with(EnvConfig(), "env.control_hz", 45.0).control_hz == 45.0
     assert env_with(EnvConfig(), "camera.memory", "frame").camera.memory == "frame"
     assert env_with(EnvConfig(), "camera.memory", "frame").camera.width == 64
+
+
+def test_what_jobs_choose_is_no_key_and_reaches_no_run(values):
+    assert {f"env.{name}" for name in JOBS_CHOOSE}.isdisjoint(known_keys())
+    config = parse(values)
+    assert set(config.env).isdisjoint(JOBS_CHOOSE)
+    assert (config.env_config().split, config.env_config().observation) == ("train", "window")
 
 
 def test_every_known_key_can_be_replaced(values):

@@ -8,7 +8,6 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-import envs
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, RendererConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import EVENT, EventCamera
@@ -56,11 +55,11 @@ def test_the_environment_passes_the_checkers(observation):
 
 
 def test_it_can_be_made_by_name_single_and_vectorised():
-    envs.register()
-    envs.register()
-    env = gymnasium.make("evade/Corridor-v0", camera=SMALL)
+    env = gymnasium.make("envs.corridor:evade/Corridor-v0", camera=SMALL)
     assert isinstance(env.unwrapped, CorridorEnv)
-    many = gymnasium.make_vec("evade/Corridor-v0", 2, vectorization_mode="vector_entry_point", camera=SMALL)
+    many = gymnasium.make_vec(
+        "envs.corridor:evade/Corridor-v0", 2, vectorization_mode="vector_entry_point", camera=SMALL
+    )
     assert isinstance(many, CorridorVectorEnv)
     assert many.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
 
@@ -376,3 +375,16 @@ def test_the_picture_shows_luminance_beside_events():
     assert picture.shape == (32, 128, 3)
     assert picture[:, 64:].any()
     assert CorridorEnv(camera=SMALL).render() is None
+
+
+def test_no_environment_of_a_vector_flies_what_another_flies_later():
+    several = CorridorVectorEnv(4, camera=SMALL)
+    several.reset(seed=3)
+    alone = CorridorEnv(camera=SMALL)
+    later = set()
+    alone.reset(seed=3)
+    for _ in range(6):
+        later.add(alone.scene.obstacles.tobytes())
+        alone.reset()
+    assert several.envs[0].scene.obstacles.tobytes() in later
+    assert not any(env.scene.obstacles.tobytes() in later for env in several.envs[1:])

@@ -11,7 +11,7 @@ from jobs.evaluate import evaluate, film_seed, find_policy, tasks, tracked_figur
 from jobs.flights import EPISODE, Ways, check_sensor, fly
 from jobs.pilots import PolicyPilot, make_pilot
 from jobs.report import summarise
-from jobs.runs import finish, open_run, write_json
+from jobs.runs import open_run, write_json
 from jobs.tracking import open_tracker
 from models.evae import EventVAE
 from models.policy import build_heads, load_policy, save_policy
@@ -171,7 +171,11 @@ def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path):
     assert (
         tracker.client.get_run(tracker.run_id).data.metrics["eval/distance_m"] == figures["eval/distance_m"]
     )
-    assert finish(run, "evaluate", figures) == figures
+    with open_tracker(config, run) as tracker:
+        more = dataclasses.replace(config, evaluate=dataclasses.replace(settings, episodes=3, video=False))
+        evaluate(more, run, tracker)
+    with (run.evaluation / "episodes.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 2 * 5 * 3
 
 
 def test_a_policy_flies_as_its_own_networks_say(policy):

@@ -85,12 +85,6 @@ def test_an_axis_figure_shows_each_value_the_bounds_and_where_the_policy_was_tra
     assert {"policy", "oracle", "trained here"} <= set(panel.get_legend_handles_labels()[1])
 
 
-def test_an_axis_of_words_keeps_their_order():
-    rows = [summarise(("camera.memory", word), episodes(2, 4)) for word in ("reference", "frame")]
-    figure = axis_figure("camera.memory", ["reference", "frame"], rows, {}, "reference")
-    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["reference", "frame"]
-
-
 def test_reconstructions_of_another_shape_are_refused():
     with pytest.raises(ValueError, match=r"pictures must be \(N, H, W\) as targets"):
         reconstruction_figure(np.zeros((2, 8, 8)), np.zeros((3, 8, 8)))

@@ -1,12 +1,14 @@
 import dataclasses
 import json
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from envs.config import CameraConfig, EnvConfig, RendererConfig, sensor_settings
 from jobs import sweep as sweeping
-from jobs.conditions import plan, swept_policy
+from jobs.conditions import plan, read_manifest, swept_policy, with_sensor
 from jobs.config import ConfigError
 from jobs.flights import EPISODE
 from jobs.runs import open_run
@@ -121,6 +123,39 @@ def test_another_policy_is_another_cell(tmp_path):
     assert len(keys | {plan(config, str(one)).cells()[0].key}) == 4
 
 
+def test_a_policy_flies_its_own_sensor_with_one_setting_changed_at_a_time(tmp_path):
+    config = sweep_config(tmp_path)
+    trained = config.env_config(control_hz=100.0, camera=CameraConfig(memory="frame"))
+    sweep = plan(config, str(save_untrained(tmp_path / "policy", trained)))
+    assert sweep.differ == {"control_hz": (100.0, 200.0), "memory": ("frame", "reference")}
+    own = sensor_settings(trained)
+    assert all(sensor_settings(cell.env) == own for _, cell in sweep.axes["faults.sparsity"])
+    assert all(sensor_settings(cell.env) == own for cell in sweep.bounds.values())
+    rates = [sensor_settings(cell.env) for _, cell in sweep.axes["env.control_hz"]]
+    assert rates == [own, {**own, "control_hz": 200.0}]
+
+
+def test_every_sensor_setting_of_a_manifest_reaches_the_simulation():
+    camera = CameraConfig(32, 48, 60.0, 0.3, 0.4, "frame", 1e-2, 7)
+    other = EnvConfig(camera=camera, control_hz=50.0, speed_mps=5.0, renderer=RendererConfig(max_step_m=0.05))
+    sensor = json.loads(json.dumps(sensor_settings(other)))
+    assert not sensor.items() & sensor_settings(EnvConfig()).items()
+    assert sensor_settings(with_sensor(EnvConfig(), sensor)) == sensor
+
+
+def test_a_sensor_unlike_the_configured_one_is_named_in_one_line(tmp_path, capsys):
+    config = sweep_config(tmp_path)
+    same = str(save_untrained(tmp_path / "same", config.env_config()))
+    slow = str(save_untrained(tmp_path / "slow", config.env_config(control_hz=100.0)))
+    lines = {}
+    for policy in (same, slow):
+        sweeping.announce(policy, plan(config, policy))
+        lines[policy] = capsys.readouterr().out.splitlines()
+    assert lines[same] == [f"Policy: {same}"]
+    assert lines[slow][0] == f"Policy: {slow}"
+    assert lines[slow][1:] == ["Flown with the policy's own sensor: control_hz = 100.0 instead of 200.0"]
+
+
 def test_a_policy_is_named_by_its_folder_or_its_run_folder(tmp_path):
     config = sweep_config(tmp_path)
     folder = open_run(config)
@@ -133,21 +168,64 @@ def test_a_policy_is_named_by_its_folder_or_its_run_folder(tmp_path):
         swept_policy(nowhere, folder)
 
 
-def test_a_sweep_is_one_run_with_a_child_for_each_condition(tmp_path, stub):
-    config = sweep_config(tmp_path)
+def tracked_sweeps(config):
+    """Client, and the children by name of each sweep's parent run."""
+    client, experiment = open_store(config.tracking.uri, config.tracking.experiment)
+    parents = client.search_runs([experiment], "tags.kind = 'sweep'")
+    below = "tags.`mlflow.parentRunId` = '{}'"
+    children = {
+        run.info.run_id: client.search_runs([experiment], below.format(run.info.run_id)) for run in parents
+    }
+    return client, {parent: {run.info.run_name: run for run in runs} for parent, runs in children.items()}
+
+
+def in_store(config, tmp_path):
+    return dataclasses.replace(
+        config, tracking=dataclasses.replace(config.tracking, uri=f"sqlite:///{tmp_path}/m.db")
+    )
+
+
+def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_a_rerun_adds_no_point(tmp_path, stub):
+    config = in_store(sweep_config(tmp_path), tmp_path)
     for _ in range(2):
         figures = sweeping.run(config)
     assert set(figures) == {f"{axis}={value:g}" for axis, values in AXES.items() for value in values}
     folder = open_run(config).path / "sweep"
     assert all((folder / name).is_file() for name in ("faults.sparsity.png", "table.md", "episodes.csv"))
-    client, experiment = open_store(f"sqlite:///{tmp_path}/mlflow.db", config.tracking.experiment)
-    runs = {run.info.run_name: run for run in client.search_runs([experiment])}
-    parent = runs.pop(f"{folder.parent.name} sweep")
-    assert set(runs) == set(figures)
-    assert {run.data.tags["mlflow.parentRunId"] for run in runs.values()} == {parent.info.run_id}
-    assert runs["env.control_hz=100"].data.metrics["eval/distance_m"] == 50.0
-    curve = client.get_metric_history(parent.info.run_id, "sweep/distance_m.env.control_hz")
-    assert {point.step for point in curve} == {100, 200}
+    client, sweeps = tracked_sweeps(config)
+    ((parent, children),) = sweeps.items()
+    assert (
+        client.get_run(parent).info.run_name
+        == f"{folder.parent.name} sweep {plan(config, 'straight').identity[:8]}"
+    )
+    assert set(children) == set(figures)
+    child = children["env.control_hz=100"].info.run_id
+    assert [point.value for point in client.get_metric_history(child, "eval/distance_m")] == [50.0]
+    curve = client.get_metric_history(parent, "sweep/distance_m.env.control_hz")
+    assert sorted(point.step for point in curve) == [100, 200]
+    table = client.download_artifacts(parent, "sweep/results.json", str(tmp_path))
+    assert len(json.loads(Path(table).read_text())["data"]) == len(figures) + 2
+
+
+def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differs_from_training(
+    tmp_path, stub
+):
+    config = in_store(sweep_config(tmp_path), tmp_path)
+    policy = save_untrained(tmp_path / "policy", config.env_config(control_hz=100.0))
+    config = dataclasses.replace(config, sweep=dataclasses.replace(config.sweep, policy=str(policy)))
+    first = sweeping.run(config)
+    manifest = read_manifest(str(policy))
+    (policy / "policy.json").write_text(json.dumps({**manifest, "sha256": {}}))
+    sweeping.run(config)
+    sweeping.run(dataclasses.replace(config, sweep=dataclasses.replace(config.sweep, trials=3)))
+    client, sweeps = tracked_sweeps(config)
+    assert len(sweeps) == 3
+    for parent, children in sweeps.items():
+        assert set(children) == set(first)
+        assert len(client.get_metric_history(parent, "sweep/distance_m.env.control_hz")) == 2
+        differ = {name: json.loads(run.data.tags["differs_from_training"]) for name, run in children.items()}
+        assert differ.pop("env.control_hz=200") == {"control_hz": [100.0, 200.0]}
+        assert not any(differ.values())
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from jobs.cluster import use_token
 from jobs.config import ConfigError, parse
 from jobs.ppo import FlightMetrics, build_ppo, network_settings
 from jobs.runs import open_run
-from jobs.train import TrainingError, read_metrics, reported_steps
+from jobs.train import TrainingError, read_metrics, reported_so_far
 from models.evae import EventVAE
 from models.policy import load_policy, save_policy
 from models.table import EncoderTable
@@ -310,9 +310,21 @@ def test_a_loss_that_is_not_finite_stops_the_training(bad):
 
 def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):
     file = tmp_path / "results.jsonl"
-    assert reported_steps(file) == 0
+    assert reported_so_far(file)[0] == 0
     file.write_text('{"env_steps": 64}\n{"env_steps": 128}\n{"env_st')
-    assert reported_steps(file) == 128
+    assert reported_so_far(file)[0] == 128
+
+
+def test_half_a_line_left_by_a_kill_is_not_written_on_to(tmp_path):
+    config = make_config(f"runs_dir={tmp_path}")
+    folder = open_run(config)
+    file = folder.train / "results.jsonl"
+    file.parent.mkdir(parents=True)
+    file.write_text('{"env_steps": 64, "train/entropy": 0.5}\n{"env_st')
+    with training._listening(config, folder, lambda step, metrics: None) as last:
+        assert last == {"train/entropy": 0.5}
+        training._LISTENERS[training.LISTENER]({**result(), "num_env_steps_sampled_lifetime": 128})
+    assert [json.loads(line)["env_steps"] for line in file.read_text().splitlines()] == [64, 128]
 
 
 def test_a_step_is_reported_once_even_after_a_restart(tmp_path):
@@ -321,7 +333,7 @@ def test_a_step_is_reported_once_even_after_a_restart(tmp_path):
     for steps in ((64, 128), (128, 192)):
         with training._listening(config, folder, lambda step, metrics: seen.append(step)) as last:
             for step in steps:
-                training._LISTENERS[str(folder.train)]({**result(), "num_env_steps_sampled_lifetime": step})
+                training._LISTENERS[training.LISTENER]({**result(), "num_env_steps_sampled_lifetime": step})
     assert seen == [64, 128, 192]
     assert last["train/episode_return"] == 12.5
     lines = (folder.train / "results.jsonl").read_text().splitlines()
@@ -364,7 +376,6 @@ train(config, open_run(config), Path(sys.argv[2]), lambda step, metrics: None)
 """
 
 
-@pytest.mark.slow
 def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     command = [sys.executable, "-c", SCRIPT, str(tmp_path), str(encoder)]
     config = make_config(*TINY, f"runs_dir={tmp_path}")
@@ -372,11 +383,11 @@ def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     results = folder.train / "results.jsonl"
     killed = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"HOME": "/nowhere"})
     deadline = time.monotonic() + 120
-    while reported_steps(results) < 400 and killed.poll() is None and time.monotonic() < deadline:
+    while reported_so_far(results)[0] < 400 and killed.poll() is None and time.monotonic() < deadline:
         time.sleep(0.1)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
-    before = reported_steps(results)
+    before = reported_so_far(results)[0]
     assert 400 <= before < 4000
     subprocess.run(command, cwd=ROOT, check=True, timeout=200)
     steps = [json.loads(line)["env_steps"] for line in results.read_text().splitlines()]
