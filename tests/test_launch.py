@@ -239,8 +239,13 @@ def test_the_traceback_of_a_refusal_is_shown_on_demand(launch, job, monkeypatch)
 
 
 def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):
+    # A background shell starts its children deaf to Ctrl+C; Python then makes no exception of it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     job(lambda config: signal.raise_signal(signal.SIGINT))
-    status, _, err = launch("+exp=train")
+    try:
+        status, _, err = launch("+exp=train")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert status == 130
     assert len(err.splitlines()) == 1
 
