@@ -23,7 +23,7 @@ from jobs.pictures import Film
 from jobs.pilots import BOUNDS, PolicyPilot, make_pilot
 from jobs.progress import console, progress
 from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
-from jobs.runs import Run, finish, finished, latest_policy, open_run, write_atomic
+from jobs.runs import Run, finish, finished, latest_policy, locate_run, open_run, write_atomic
 from jobs.tracking import RESULTS_VIEW, Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import reconstruct
@@ -62,9 +62,9 @@ class Task(NamedTuple):
 
 def run(config: Config) -> dict[str, Any]:
     """Evaluate the run's policy, or the newest one; return the figures of the tracker."""
+    find_policy(config, locate_run(config))
     folder = open_run(config)
     config = folder.config
-    find_policy(config, folder)
     with open_tracker(config, folder) as tracker:
         figures = evaluate(config, folder, tracker)
         console.print(tracker.dashboard())

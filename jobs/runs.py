@@ -63,14 +63,19 @@ def open_run(config: Config) -> Run:
     Raises:
         ConfigError: If `resume` names no run folder.
     """
+    run = locate_run(config)
+    if not (run.path / "config.json").exists():
+        values = as_dict(config)
+        write_atomic(run.path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
+        write_json(run.path / "config.json", values)
+    return run
+
+
+def locate_run(config: Config) -> Run:
+    """The same as `open_run`, without making anything: for jobs that may refuse to begin."""
     if config.resume is not None:
         return reopen(Path(config.resume), config)
-    path = Path(config.runs_dir).resolve() / run_name(config)
-    values = as_dict(config)
-    if not (path / "config.json").exists():
-        write_atomic(path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
-        write_json(path / "config.json", values)
-    return Run(path, config)
+    return Run(Path(config.runs_dir).resolve() / run_name(config), config)
 
 
 def reopen(path: Path, config: Config) -> Run:

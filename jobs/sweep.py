@@ -26,7 +26,7 @@ from jobs.flights import EPISODE, check_sensor, fly, write_episodes
 from jobs.pilots import make_pilot
 from jobs.progress import console, progress
 from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
-from jobs.runs import Run, finish, open_run, write_atomic, write_json
+from jobs.runs import Run, finish, locate_run, open_run, write_atomic, write_json
 from jobs.tracking import Tracker, open_child, open_tracker
 
 LABELS = ("Axis", "Value")
@@ -65,8 +65,9 @@ class KeepEpisodes(tune.Callback):
 
 def run(config: Config) -> dict[str, Any]:
     """Fly every condition that is not flown yet; report, and return the policy's figures."""
+    policy = swept_policy(config, locate_run(config))
     folder = open_run(config)
-    policy = swept_policy(config, folder)
+    config = folder.config
     sweep = plan(config, policy)
     announce(policy, sweep)
     with open_tracker(config, folder, key=f"sweep {sweep.identity[:8]}") as tracker:

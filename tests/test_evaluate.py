@@ -8,6 +8,7 @@ from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.config import ConfigError
 from jobs.evaluate import evaluate, film_seed, find_policy, tasks, tracked_figures
+from jobs.evaluate import run as run_evaluation
 from jobs.flights import EPISODE, Ways, check_sensor, fly
 from jobs.pilots import PolicyPilot, make_pilot
 from jobs.report import summarise
@@ -103,7 +104,8 @@ def test_without_a_policy_the_message_says_how_to_get_one(tmp_path):
     with pytest.raises(
         ConfigError, match=r"no trained policy in .*run python -m platform.launch \+exp=bytestream"
     ):
-        find_policy(config, open_run(config))
+        run_evaluation(config)
+    assert not (tmp_path / "runs").exists()  # refused before anything was made
 
 
 def test_a_runs_own_policy_comes_before_a_newer_one(tmp_path):
