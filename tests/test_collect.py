@@ -25,6 +25,19 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(recording):
     assert record(flights(), 1, lambda count: None).events.tobytes() != recording.events.tobytes()
 
 
+def test_another_seed_flies_other_corridors(monkeypatch):
+    seen = []
+
+    def look(env, rng, most_steps):
+        seen.append(env.scene.obstacles.tobytes())
+        return [env.events], [5000]
+
+    monkeypatch.setattr(collect, "fly_at_random", look)
+    for seed in (0, 1):
+        record([(EnvConfig(observation="events"), 3)], seed, lambda count: None)
+    assert len(set(seen)) == len(seen) == 6
+
+
 def test_every_event_lies_in_a_step_and_no_step_spans_two_flights(recording):
     start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
     assert len(start) == 900

@@ -42,7 +42,7 @@ def recording():
 @pytest.mark.parametrize("settings", [SETTINGS, COUNT], ids=["mixed", "count"])
 def test_windows_hold_what_they_say_and_stay_in_one_flight(recording, settings):
     start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
-    for events, start_us, window_us in sample_windows(recording, settings, 200, np.random.default_rng(1)):
+    for events, start_us, window_us in sample_windows(recording, settings, 3000, np.random.default_rng(1)):
         assert len(events) <= 500
         assert np.all((events["t"] > start_us) & (events["t"] <= start_us + window_us))
         first = int(np.searchsorted(start, start_us, side="right")) - 1
