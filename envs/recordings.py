@@ -1,115 +1,185 @@
-"""Event files: flights recorded by the simulator, in the HDF5 layout of the DSEC data set.
+"""Recordings of event cameras: read and write the files that the field uses.
 
-`/events/{t,x,y,p}`, `/t_offset` and `/ms_to_idx` are what other tools read; `/index/*` and
-the attribute `about` are ours: where each control step and flight begins, and how the
-events were made.
+`read_events` takes a file of any known format, `write_events` makes one, `video_to_events`
+turns a video into events and `downscale_events` makes pixels larger. `Recording` is the
+simulator's own: events with the steps and settings that made them.
 """
 
-import dataclasses
-import json
-from functools import cached_property
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import h5py
-import hdf5plugin
 import numpy as np
 
-from envs.events import EVENT
+from envs.aedat import MAGIC_2, MAGIC_4, read_aedat2, read_aedat4
+from envs.downscale import downscale_events
+from envs.dsec import (
+    Recording,
+    milliseconds_to_index,
+    read_hdf5,
+    read_recording,
+    write_hdf5,
+    write_recording,
+)
+from envs.eventfile import MAX_BYTES, MAX_EVENTS, EventFile, Request, check_events, check_file
+from envs.plainfiles import US_PER, read_nmnist, read_npz, read_text, write_npz, write_text
+from envs.prophesee import read_dat, read_evt, write_prophesee
+from envs.video import VideoStep, video_steps, video_to_events
 
-MAX_EVENTS = 2_000_000_000
-MAX_INDEX = 200_000_000
+__all__ = [
+    "FORMATS",
+    "EventFile",
+    "Recording",
+    "VideoStep",
+    "downscale_events",
+    "milliseconds_to_index",
+    "read_events",
+    "read_recording",
+    "video_steps",
+    "video_to_events",
+    "write_events",
+    "write_recording",
+]
+
+READERS: dict[str, Callable[[Request], EventFile]] = {
+    "aedat2": read_aedat2,
+    "aedat4": read_aedat4,
+    "dat": read_dat,
+    "evt": read_evt,
+    "evt2": lambda request: read_evt(request, "evt2"),
+    "evt21": lambda request: read_evt(request, "evt21"),
+    "evt3": lambda request: read_evt(request, "evt3"),
+    "hdf5": read_hdf5,
+    "nmnist": read_nmnist,
+    "npz": read_npz,
+    "txt": read_text,
+}
+FORMATS = tuple(name for name in READERS if name != "evt")
+WRITERS: dict[str, Callable[[Path, np.ndarray, int, int], None]] = {
+    "csv": lambda path, events, width, height: write_text(path, events, width, height, ","),
+    "dat": lambda path, events, width, height: write_prophesee(path, events, width, height, "dat"),
+    "evt2": lambda path, events, width, height: write_prophesee(path, events, width, height, "evt2"),
+    "evt3": lambda path, events, width, height: write_prophesee(path, events, width, height, "evt3"),
+    "hdf5": write_hdf5,
+    "npz": write_npz,
+    "txt": write_text,
+}
+
+# How a file begins; the first that fits names the format.
+BEGINNINGS = (
+    (MAGIC_2, "aedat2"),
+    (MAGIC_4, "aedat4"),
+    (b"\x89HDF\r\n\x1a\n", "hdf5"),
+    (b"PK\x03\x04", "npz"),
+    (b"% Data file containing", "dat"),
+    (b"% ", "evt"),
+)
+SUFFIXES = {
+    ".bin": "nmnist",
+    ".csv": "txt",
+    ".dat": "dat",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".npz": "npz",
+    ".raw": "evt",
+    ".txt": "txt",
+}
+WRITTEN_SUFFIXES = {**SUFFIXES, ".csv": "csv", ".raw": "evt3", ".bin": ""}
 
 
-@dataclasses.dataclass(frozen=True)
-class Recording:
-    """Events in time order, with where things begin and how they were made.
+def read_events(
+    path: str | Path,
+    format: str | None = None,
+    *,
+    width: int | None = None,
+    height: int | None = None,
+    columns: Sequence[str] | None = None,
+    time_unit: str | None = None,
+    max_events: int = MAX_EVENTS,
+    max_bytes: int = MAX_BYTES,
+) -> EventFile:
+    """Read an event file of any known format.
 
-    Attributes:
-        events: Shape (N,), dtype EVENT, sorted by t.
-        index: Named integer arrays, such as `step_t_us` (start of each control step [us]).
-        about: Plain facts: sensor settings, scenes, seed.
-    """
+    Sizes are checked before memory is taken: of the file, of what it declares, and of the
+    number of events.
 
-    events: np.ndarray
-    index: dict[str, np.ndarray]
-    about: dict[str, Any]
+    Args:
+        path: A regular file.
+        format: One of `FORMATS`; None: by how the file begins, else by its suffix.
+        width: Columns of the sensor [px], where the file does not say.
+        height: Its rows [px].
+        columns: Names of the columns of a text file without a header, such as
+            ("t", "x", "y", "p"); others than these four are passed over.
+        time_unit: "s", "ms", "us" or "ns", for text and npz files that do not say.
+        max_events: Most events that are read; each takes 13 bytes in the end and up to 60 on the way.
+        max_bytes: Largest file that is opened [bytes].
 
-    @cached_property
-    def t_us(self) -> np.ndarray:
-        """Times of the events [us], contiguous: searching the strided field copies all of it."""
-        return np.ascontiguousarray(self.events["t"])
-
-
-def write_recording(path: Path, recording: Recording) -> None:
-    """Write events, index and facts to an HDF5 file; the file appears whole or not at all.
+    Returns:
+        The events sorted by t (ties keep the order of the file; up to one second of disorder
+        is sorted and counted in `late`), p in {-1, +1}, with the sensor's size.
 
     Raises:
-        ValueError: The events are not of dtype EVENT or not sorted by time.
+        ValueError: The file is no regular file, of no known format, damaged, too large, or
+            breaks a rule of its format; the message names the file, the rule and the remedy.
     """
-    events = recording.events
-    if events.dtype != EVENT:
-        raise ValueError(f"events must have the dtype EVENT {EVENT}, got {events.dtype}")
-    if np.any(np.diff(events["t"]) < 0):
-        first = int(np.argmax(np.diff(events["t"]) < 0))
-        raise ValueError(f"events must be sorted by t; event {first + 1} is older than the one before it")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    pack = hdf5plugin.Blosc2(cname="zstd", clevel=3)
-    offset = int(events["t"][0]) if len(events) else 0
-    with h5py.File(part, "w") as file:
-        for name in ("t", "x", "y", "p"):
-            values = events[name] - offset if name == "t" else events[name]
-            file.create_dataset(f"events/{name}", data=values, **pack)
-        file["t_offset"] = np.int64(offset)
-        file["ms_to_idx"] = milliseconds_to_index(events["t"] - offset)
-        index = file.create_group("index")
-        for name, values in recording.index.items():
-            index.create_dataset(name, data=values, **pack)
-        file.attrs["about"] = json.dumps(recording.about, allow_nan=False)
-    part.replace(path)
-
-
-def read_recording(path: Path) -> Recording:
-    """Read a file that `write_recording` wrote.
-
-    Raises:
-        ValueError: The file is no such file, is truncated, links to other files, or declares
-            more events than `MAX_EVENTS`; nothing is allocated before that is known.
-    """
+    path = Path(path)
+    check_file(path, max_bytes)
+    kind = format or _guessed(path)
+    if kind not in READERS:
+        raise ValueError(f"{path}: format must be one of {', '.join(FORMATS)}, got {format!r}")
+    if time_unit is not None and time_unit not in US_PER:
+        raise ValueError(f"time_unit must be one of {', '.join(US_PER)}, got {time_unit!r}")
+    names = None if columns is None else tuple(columns)
     try:
-        with h5py.File(path, "r") as file:
-            count = _declared_length(file, "events/t", MAX_EVENTS)
-            events = np.empty(count, EVENT)
-            for name in ("t", "x", "y", "p"):
-                if _declared_length(file, f"events/{name}", MAX_EVENTS) != count:
-                    raise ValueError(f"events/{name} and events/t differ in length")
-                events[name] = file[f"events/{name}"][:]
-            events["t"] += int(file["t_offset"][()])
-            index = {}
-            for name in file["index"]:
-                _declared_length(file, f"index/{name}", MAX_INDEX)
-                index[name] = file[f"index/{name}"][:]
-            about = json.loads(file.attrs["about"])
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} is no readable event recording ({error}); collect it again") from error
-    return Recording(events, index, about)
+        return READERS[kind](Request(path, width, height, names, time_unit, max_events))
+    except MemoryError:
+        raise ValueError(
+            f"{path}: does not fit into memory; cut the file, or lower max_events to be told earlier"
+        ) from None
 
 
-def milliseconds_to_index(t_us: np.ndarray) -> np.ndarray:
-    """First event at or after each whole millisecond, as DSEC defines it: t[i[ms]] >= ms * 1000."""
-    last_ms = int(t_us[-1]) // 1000 if len(t_us) else 0
-    return np.searchsorted(t_us, np.arange(last_ms + 1, dtype=np.int64) * 1000).astype(np.uint64)
+def write_events(
+    path: str | Path, events: np.ndarray, width: int, height: int, format: str | None = None
+) -> None:
+    """Write events to a file, which appears whole or not at all; `read_events` gives the same events.
+
+    Formats: "npz", "hdf5" (the layout of DSEC), "txt" and "csv" (a header names columns, unit
+    and polarity code), and Prophesee's "dat", "evt2" and "evt3", which other tools open.
+
+    Args:
+        path: The file; its folder is made. A file of that name is replaced.
+        events: EVENT array (N,), sorted by t.
+        width: Columns of the sensor [px].
+        height: Its rows [px].
+        format: One of the above; None: by the suffix (`.raw` is "evt3").
+
+    Raises:
+        ValueError: The format is unknown, the events are not valid, or the format cannot hold
+            them: its clock ends before the last event (dat 2**32 us, evt2 2**34 us), or before
+            the first (evt3 2**24 us), or it has fewer pixels.
+    """
+    path = Path(path)
+    kind = format or WRITTEN_SUFFIXES.get(path.suffix.lower(), "")
+    if kind not in WRITERS:
+        raise ValueError(f"{path}: format must be one of {', '.join(WRITERS)}, got {format or path.suffix!r}")
+    check_events(events, width, height)
+    WRITERS[kind](path, events, width, height)
 
 
-def _declared_length(file: h5py.File, name: str, most: int) -> int:
-    """Length of a one-dimensional data set of this very file, checked before it is read."""
-    for part in (name.split("/")[0], name):
-        if not isinstance(file.get(part, getlink=True), h5py.HardLink):
-            raise ValueError(f"{part} is missing or a link")
-    data = file[name]
-    if not isinstance(data, h5py.Dataset) or data.ndim != 1 or data.external or data.is_virtual:
-        raise ValueError(f"{name} is not a plain one-dimensional data set")
-    if len(data) > most:
-        raise ValueError(f"{name} declares {len(data)} entries; at most {most} are read")
-    return len(data)
+def _guessed(path: Path) -> str:
+    """The format by how the file begins, else by its suffix."""
+    with path.open("rb") as file:
+        head = file.read(32)
+    if head.startswith(b"#!AER-DAT") and not head.startswith((MAGIC_2, MAGIC_4)):
+        raise ValueError(
+            f"{path}: is of another AEDAT version than 2.0 and 4.0; convert it with dv-processing"
+        )
+    for beginning, name in BEGINNINGS:
+        if head.startswith(beginning):
+            return name
+    name = SUFFIXES.get(path.suffix.lower(), "")
+    # These formats always begin as above, so a file that does not is another one or damaged.
+    if not name or name in ("hdf5", "npz", "dat"):
+        raise ValueError(
+            f"{path}: begins like no known event file; give format as one of {', '.join(FORMATS)}"
+        )
+    return name

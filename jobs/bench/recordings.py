@@ -1,0 +1,88 @@
+"""Speed and size of every event file format, against numpy's own npz, in one run.
+
+Run: python -m jobs.bench.recordings
+Expect: one table in about twenty seconds. "time / np.load" compares with `np.load` of a
+compressed npz file of the same events, its four arrays read and nothing checked. The events
+are those of a real recording where there is one (the folder EVADE_DATA, else ../shared/data),
+else a simulated flight's.
+"""
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from rich.table import Table
+
+from envs.corridor import CorridorEnv
+from envs.recordings import WRITERS, downscale_events, read_events, write_events
+from jobs.bench.throughput import interleaved
+from jobs.progress import console
+
+DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+SAMPLE = DATA / "expelliarmus_evt" / "evt3_sample.raw"
+FLIGHT_STEPS = 600
+
+
+def main() -> None:
+    """Measure and print the table."""
+    events, width, height, source = recording()
+    with TemporaryDirectory() as folder:
+        paths = {format: Path(folder) / f"events.{format}" for format in WRITERS}
+        work: dict[str, Callable[[], object]] = {"np.load of npz": partial(load_npz, paths["npz"])}
+        for format, path in paths.items():
+            work[f"write {format}"] = partial(write_events, path, events, width, height, format)
+            name = "txt" if format == "csv" else None
+            work[f"read {format}"] = partial(read_events, path, name)
+        shapes = (height, width), (height // 4, width // 4)
+        work["downscale, 4 times each way"] = partial(downscale_events, events, *shapes)
+        for format, path in paths.items():
+            write_events(path, events, width, height, format)
+        seconds = interleaved(work)
+        sizes = {format: path.stat().st_size / len(events) for format, path in paths.items()}
+    table = Table(
+        title=f"{len(events):,} events of {source}, {width}x{height}; medians of interleaved rounds"
+    )
+    for heading in ("work", "Mev/s", "time / np.load", "bytes per event"):
+        table.add_column(heading, justify="left" if heading == "work" else "right")
+    whole = seconds["np.load of npz"]
+    for name, taken in seconds.items():
+        size = sizes.get(name.partition(" ")[2])
+        row = (
+            f"{len(events) / taken / 1e6:,.1f}",
+            f"{taken / whole:.2f}",
+            "" if size is None else f"{size:.2f}",
+        )
+        table.add_row(name, *row)
+    console.print(table)
+
+
+def recording() -> tuple[np.ndarray, int, int, str]:
+    """Events to write and read, width and height of their sensor, and where they come from."""
+    if SAMPLE.is_file():
+        file = read_events(SAMPLE)
+        return file.events, file.width or 0, file.height or 0, f"a street ({SAMPLE.name})"
+    env = CorridorEnv()
+    env.reset(seed=0)
+    parts, clock_us = [], 0
+    for _ in range(FLIGHT_STEPS):
+        _, _, terminated, truncated, info = env.step(1)
+        parts.append(env.events.copy())
+        parts[-1]["t"] += clock_us
+        if terminated or truncated:
+            clock_us += info["t_us"]
+            env.reset()
+    flown = np.concatenate(parts)
+    return flown, env.config.camera.width, env.config.camera.height, "a simulated flight"
+
+
+def load_npz(path: Path) -> list[np.ndarray]:
+    """What a reader without checks does."""
+    with np.load(path) as file:
+        return [file[name] for name in ("t", "x", "y", "p")]
+
+
+if __name__ == "__main__":
+    main()
