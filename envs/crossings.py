@@ -1,29 +1,46 @@
-"""The event camera's kernels: which pixels crossed which levels, when, in time order.
+"""The event camera's kernels: which pixels crossed which levels between two frames, and when.
 
 A quiet pixel costs two compares: its quiet band is kept in linear luminance and lies inside
 [0, largest float32], so that whatever is not a luminance is outside it as well. Pixels
-outside are decided in float64. All functions but `first_invalid` and `step` take their
-input as valid.
+outside are decided in float64, by whole blocks, so that their logarithms are computed in
+wide instructions. All functions but `first_invalid` and `step` take their input as valid.
 
 Names: `luminance` float32 (N,), this frame; `previous` float32 (N,), the last one; `band`
-float32 (2, N), quiet from row 0 to row 1, both included; `level` float64 (3, N), first log
-luminance, ON count and OFF count; `response` the ON threshold, the OFF threshold and the
-luminance floor.
+float32 (2, N), quiet from row 0 to row 1, both included; `level` float64 (3, N), first level,
+ON count and OFF count since; `held` int64 (N,), end of each pixel's last dead time [us], or of
+length 0 without dead times; `thresholds` float64 (4, N) or (4, 1), see `threshold_rows`;
+`curve` see `response_curve`; `rule` is (refractory_us, max_events_per_pixel, carries, forgets,
+legacy).
 """
 
 import numba
 import numpy as np
 
-EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+from envs.response import LARGEST, light_of, respond
+from envs.trains import EVENT, events_of, limit_events, moment
 
 # Two luminances rounded to float32 leave their log difference uncertain by this much: a level
 # this near counts as reached, so that a step of exactly k thresholds gives k events.
-LOG_TOLERANCE = 2.0**-23
-MARGIN = 1e-9  # relative; far above the error of float64 exp and log
+TOLERANCE = 2.0**-23
+MARGIN = 1e-9  # relative; far above the error of float64 exp
 HALF_ULP = 2.0**-23  # relative; above the rounding of a bound to float32
-LARGEST = float(np.finfo(np.float32).max)
-DIGIT_BITS = 8
-DIGITS = 1 << DIGIT_BITS
+BLOCK = 1024  # pixels decided together
+# Where each column of a block's table starts; the response before is the first.
+AFTER, MEMORY, ON, OFF, COUNT, START, STRIDE = (column * BLOCK for column in range(1, 8))
+
+
+def threshold_rows(on: np.ndarray, off: np.ndarray, reach: int) -> np.ndarray:
+    """The kernels' form of the thresholds of all pixels, or of one that stands for all.
+
+    Args:
+        on: ON thresholds, float64 (N,) or (1,).
+        off: OFF thresholds, as many.
+        reach: Thresholds to the first event: 1, or 2 where the first is lost ("legacy").
+
+    Returns:
+        float64 (4, N) or (4, 1): ON and OFF threshold, quiet way up and quiet way down.
+    """
+    return np.stack((on, off, reach * on - TOLERANCE - MARGIN, reach * off - TOLERANCE - MARGIN))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -36,27 +53,48 @@ def first_invalid(luminance):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def remember(luminance, response, previous, band, level):
+def remember(luminance, curve, thresholds, state):
     """Start all memories from one frame."""
-    floor = response[2]
-    for i in range(luminance.size):
-        level[0, i] = np.log(luminance[i] + floor)
-        level[1, i] = 0.0
-        level[2, i] = 0.0
-    _band_around(luminance, response, band)
+    previous, band, level, held = state
     previous[:] = luminance
+    level[1:] = 0.0
+    held[:] = np.iinfo(np.int64).min
+    _look(luminance, curve, thresholds, band, level[0])
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _band_around(luminance, response, band):
-    """Quiet bands of all pixels whose remembered levels are the logs of `luminance`."""
-    on, off, floor = response
-    rise = np.exp(on - LOG_TOLERANCE) * (1.0 - MARGIN)
-    fall = np.exp(LOG_TOLERANCE - off) * (1.0 + MARGIN)
-    for i in range(luminance.size):
-        light = luminance[i] + floor
-        band[0, i] = _bound(light * fall - floor, 1.0 + HALF_ULP)
-        band[1, i] = _bound(light * rise - floor, 1.0 - HALF_ULP)
+def _look(luminance, curve, thresholds, band, level):
+    """Responses of all pixels into `level`, of length 0 if not wanted, and quiet bands around them."""
+    pixels, levels, work = _block(luminance.size)
+    for first in range(0, luminance.size, BLOCK):
+        number = min(BLOCK, luminance.size - first)
+        respond(curve, luminance[first : first + number], levels, work[2])
+        level[first : first + number] = levels[: level[first : first + number].size]
+        for j in range(number):
+            pixels[j] = first + j
+        _set_bands(pixels[:number], levels, curve, thresholds, band, work)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _block(size):
+    """Memory for pixels that are treated together: indices, levels, and levels and exponents to work with."""
+    size = min(size, BLOCK)
+    work = np.empty(size), np.empty(size), np.empty(size, np.int64)
+    return np.empty(size, np.int64), np.empty(size), work
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _set_bands(pixels, levels, curve, thresholds, band, work):
+    """Quiet bands of `pixels` around `levels`."""
+    low, high = work[0][: pixels.size], work[1][: pixels.size]
+    for j in range(pixels.size):
+        k = pixels[j] if thresholds.shape[1] > 1 else 0
+        low[j], high[j] = levels[j] - thresholds[3, k], levels[j] + thresholds[2, k]
+    light_of(curve, low, work[2])
+    light_of(curve, high, work[2])
+    for j in range(pixels.size):
+        band[0, pixels[j]] = _bound(low[j], 1.0 + HALF_ULP)
+        band[1, pixels[j]] = _bound(high[j], 1.0 - HALF_ULP)
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -66,30 +104,30 @@ def _bound(value, inwards):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def step(luminance, frame, forgets, response, state):
-    """One frame: (first invalid pixel or -1, events dropped, events). State changes only if all is valid."""
-    t0, t1, width, cap = frame
-    previous, band, level, words, outside = state
+def step(luminance, frame, rule, curve, thresholds, state, scratch):
+    """One frame: (first invalid pixel or -1, events dropped, events). State changes only if all is valid.
+
+    `frame` is (time of the last frame, time of this one, width, most events in all).
+    """
+    t0, t1, width, limit = frame
+    previous, band, _, _ = state
+    words, outside = scratch
     found = _scan(luminance, band, words, outside)
-    crossings = np.empty(found, np.int64)
-    logs = np.empty((3, found))
-    bad, firing, total, dropped = _count(luminance, (forgets, cap), response, state, (crossings, logs))
+    crossings, trains = np.empty(found, np.int64), np.empty((2 if rule[0] == 0 else 5, found))
+    bad, active = _decide(luminance, (t0, t1), rule, curve, thresholds, state, (outside, crossings, trains))
     if bad >= 0:
         return bad, 0, np.empty(0, EVENT)
-    times = np.empty(total, np.int64)
-    places = np.empty(total, np.int64)
-    _emit((t1 - t0, width, cap), response, outside[:firing], (crossings, logs), (times, places))
-    _advance(firing, forgets, response, (luminance, band, level, outside), crossings)
+    pixels, crossings, trains = outside[:active], crossings[:active], trains[:, :active]
+    sent = np.empty(active, np.int64)
+    wanted = 0
+    for j in range(active):
+        wanted += abs(crossings[j])
+        sent[j] = min(abs(crossings[j]), rule[1])
+    total = limit_events(trains, sent, t1 - t0, limit)
+    events = events_of((t0, t1, width), pixels, crossings, sent, trains, total)
+    _advance(luminance, (t0, t1), rule, curve, thresholds, state, (pixels, crossings, sent, trains))
     previous[:] = luminance
-    times, places = _sorted_by_time(times, places, t1 - t0)
-    events = np.empty(total, EVENT)
-    for i in range(total):
-        event, place = events[i], places[i]
-        event.t = t0 + times[i]
-        event.x = (place >> 1) & 0xFFFF
-        event.y = place >> 17
-        event.p = 2 * (place & 1) - 1
-    return -1, dropped, events
+    return -1, 0 if rule[2] else wanted - total, events
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -112,99 +150,182 @@ def _scan(luminance, band, words, outside):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _count(luminance, rule, response, state, out):
-    """Signed crossings and log levels (before, after, remembered) of firing pixels, compacted in place."""
-    forgets, cap = rule
-    on, off, floor = response
-    previous, _, level, _, outside = state
-    crossings, logs = out
-    firing, total, dropped = 0, 0, 0
-    for j in range(crossings.size):
-        i = outside[j]
-        if not 0.0 <= luminance[i] <= LARGEST:
-            return i, 0, 0, 0
-        before = np.log(previous[i] + floor)
-        after = np.log(luminance[i] + floor)
-        if after == before:
-            continue
-        remembered = before if forgets else _level(level, i, on, off)
-        change = after - remembered
-        n = int((abs(change) + LOG_TOLERANCE) / (on if change > 0.0 else off))
-        if n > 0:
-            outside[firing] = i
-            crossings[firing] = n if change > 0.0 else -n
-            logs[0, firing], logs[1, firing], logs[2, firing] = before, after, remembered
-            firing += 1
-            total += min(n, cap)
-            dropped += max(n - cap, 0)
-    return -1, firing, total, dropped
+def _decide(luminance, times, rule, curve, thresholds, state, out):
+    """Keep, of the pixels outside their band, those that fire or end a dead time, and describe their trains.
+
+    `trains` has the rows start and stride; with dead times also the response before and after,
+    and the remembered level.
+
+    Returns:
+        (first invalid pixel or -1, number kept).
+    """
+    previous, _, level, held = state
+    outside, crossings, trains = out
+    table, lights, exponents = np.empty(8 * BLOCK), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int64)
+    kept = 0
+    for first in range(0, crossings.size, BLOCK):
+        pixels = outside[first : min(first + BLOCK, crossings.size)]
+        bad = _respond_at(pixels, luminance, curve, table[AFTER:], lights, exponents)
+        if bad >= 0:
+            return bad, 0
+        _respond_at(pixels, previous, curve, table, lights, exponents)
+        _recall(pixels, level, thresholds, rule[3], table)
+        so_far = (outside, crossings, trains, kept)
+        if rule[0] > 0:
+            kept = _keep_with_dead_time(pixels, times, rule[0], held, table, so_far)
+        else:
+            _compare(pixels.size, times[1] - times[0], rule, table)
+            kept = _keep(pixels, times[1] - times[0], rule, table, so_far)
+    return -1, kept
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _respond_at(pixels, luminance, curve, levels, lights, exponents):
+    """Write the responses to the luminance of `pixels`; the first pixel whose luminance is none, or -1."""
+    for j in range(pixels.size):
+        lights[j] = luminance[pixels[j]]
+        if not 0.0 <= lights[j] <= LARGEST:
+            return pixels[j]
+    respond(curve, lights[: pixels.size], levels, exponents)
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _recall(pixels, level, thresholds, forgets, table):
+    """Fill the table's remembered levels and thresholds."""
+    for j in range(pixels.size):
+        k = pixels[j] if thresholds.shape[1] > 1 else 0
+        on, off = thresholds[0, k], thresholds[1, k]
+        table[ON + j], table[OFF + j] = on, off
+        table[MEMORY + j] = table[j] if forgets else _level(level, pixels[j], on, off)
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _level(level, i, on, off):
-    """Remembered log level; equal thresholds multiply the exact net count once."""
+    """Remembered level; equal thresholds multiply the exact net count once."""
     if on == off:
         return level[0, i] + (level[1, i] - level[2, i]) * on
     return level[0, i] + level[1, i] * on - level[2, i] * off
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _emit(frame, response, pixels, found, out):
-    """Times [us after the last frame] and places (y << 17 | x << 1 | ON) of all events, by pixel."""
-    interval, width, cap = frame
-    crossings, logs = found
-    times, places = out
-    event = 0
+def _compare(size, interval, rule, table):
+    """Fill the table's signed counts, starts and strides, without branches.
+
+    A still pixel fires only what it carries over. A level reached before this frame is due at
+    once: its pixel may by now move the other way, which gives pace 0.
+    """
+    _, _, carries, _, legacy = rule
+    for j in range(size):
+        before, after, remembered = table[j], table[AFTER + j], table[MEMORY + j]
+        way, change = after - before, after - remembered
+        step = table[ON + j] if change > 0.0 else -table[OFF + j]
+        count = max(np.floor((abs(change) + TOLERANCE) / abs(step)) - legacy, 0.0)
+        count = count if carries | (way != 0.0) else 0.0
+        table[COUNT + j] = np.copysign(count, change)
+        pace = interval / way
+        pace = pace if way * change > 0.0 else 0.0
+        table[START + j] = (remembered + step - before) * pace
+        table[STRIDE + j] = step * pace
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _keep(pixels, interval, rule, table, out):
+    """Append the pixels that fire to the kept ones; return how many these are now."""
+    _, cap, _, _, legacy = rule
+    outside, crossings, trains, kept = out
     for j in range(pixels.size):
-        n = crossings[j]
-        rises = n > 0
-        step = response[0] if rises else -response[1]
-        y = pixels[j] // width
-        place = (y << 17) | ((pixels[j] - y * width) << 1) | rises
-        before, after, remembered = logs[0, j], logs[1, j], logs[2, j]
-        pace = interval / (after - before)
-        for k in range(1, min(abs(n), cap) + 1):
-            t = np.rint((remembered + k * step - before) * pace)
-            times[event] = int(min(max(t, 1.0), interval))
-            places[event] = place
-            event += 1
+        count = table[COUNT + j]
+        outside[kept], crossings[kept] = pixels[j], int(count)
+        trains[0, kept], trains[1, kept] = table[START + j], table[STRIDE + j]
+        if legacy:
+            trains[0, kept], trains[1, kept] = 0.0, interval / min(abs(count), float(cap))
+        kept += count != 0.0
+    return kept
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _advance(firing, forgets, response, state, crossings):
-    """Move the remembered levels by all levels crossed, emitted or dropped, and the bands with them."""
-    luminance, band, level, pixels = state
-    on, off, floor = response
-    if forgets:
-        _band_around(luminance, response, band)
-        return
-    rise = np.exp(on - LOG_TOLERANCE) * (1.0 - MARGIN)
-    fall = np.exp(LOG_TOLERANCE - off) * (1.0 + MARGIN)
-    for j in range(firing):
+def _keep_with_dead_time(pixels, times, refractory_us, held, table, out):
+    """Append the pixels that fire or end a dead time to the kept ones; return how many these are now."""
+    outside, crossings, trains, kept = out
+    for j in range(pixels.size):
         i = pixels[j]
-        level[1 if crossings[j] > 0 else 2, i] += abs(crossings[j])
-        light = np.exp(_level(level, i, on, off))
-        band[0, i] = _bound(light * fall - floor, 1.0 + HALF_ULP)
-        band[1, i] = _bound(light * rise - floor, 1.0 - HALF_ULP)
+        if held[i] < times[1]:
+            pixel = (table[j], table[AFTER + j], table[MEMORY + j], table[ON + j], table[OFF + j])
+            n, start, stride, remembered, keep = _train_with_dead_time(pixel, times, held[i], refractory_us)
+            if keep:
+                outside[kept], crossings[kept] = i, n
+                trains[0, kept], trains[1, kept] = start, stride
+                trains[2, kept], trains[3, kept], trains[4, kept] = pixel[0], pixel[1], remembered
+                kept += 1
+    return kept
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _sorted_by_time(times, places, interval):
-    """Stable radix sort by time: ties stay in raster order. O(events) for any interval."""
-    other_times, other_places = np.empty_like(times), np.empty_like(places)
-    shift = 0
-    while interval >> shift > 0:
-        start = np.zeros(DIGITS + 1, np.int64)
-        for t in times:
-            start[((t >> shift) & (DIGITS - 1)) + 1] += 1
-        for digit in range(DIGITS):
-            start[digit + 1] += start[digit]
-        for i in range(times.size):
-            digit = (times[i] >> shift) & (DIGITS - 1)
-            other_times[start[digit]] = times[i]
-            other_places[start[digit]] = places[i]
-            start[digit] += 1
-        times, other_times = other_times, times
-        places, other_places = other_places, places
-        shift += DIGIT_BITS
-    return times, places
+def _train_with_dead_time(pixel, times, held, refractory_us):
+    """Signed crossings, start, stride, remembered level, and whether anything changed.
+
+    While the level moves one way at one pace, all events after the first are one dead time
+    and one threshold apart.
+    """
+    before, after, remembered, on, off = pixel
+    t0, t1 = times
+    ended, way = held >= t0, after - before
+    since = held - t0 if ended else 0
+    if ended:
+        remembered = before + way * (since / (t1 - t0))
+    sign, size = (1, on) if after > remembered else (-1, off)
+    if way == 0.0 or abs(after - remembered) + TOLERANCE < size:
+        return 0, 0.0, 0.0, remembered, ended
+    pace = (t1 - t0) / abs(way)
+    first = moment((sign * (remembered - before) + size) * pace, 0.0, 0, t1 - t0)
+    gap = np.rint(size * pace)
+    left = (t1 - t0) + gap - (size - TOLERANCE) * pace - first
+    n = 1 + int(max(left / (refractory_us + gap), 0.0))
+    return sign * n, float(first), refractory_us + gap, remembered, True
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _advance(luminance, times, rule, curve, thresholds, state, found):
+    """Move the remembered levels and the quiet bands of the pixels that fired or ended a dead time."""
+    _, band, level, held = state
+    pixels, crossings, sent, trains = found
+    refractory_us, _, carries, forgets, _ = rule
+    if forgets:
+        _look(luminance, curve, thresholds, band, level[0, :0])
+        return
+    if refractory_us > 0:
+        pixels = pixels[: _resume(pixels, crossings, trains, times, refractory_us, (band, level, held))]
+    else:
+        for j in range(pixels.size):
+            level[2 - (crossings[j] > 0), pixels[j]] += sent[j] if carries else abs(crossings[j])
+    _, levels, work = _block(pixels.size)
+    for first in range(0, pixels.size, BLOCK):
+        block = pixels[first : min(first + BLOCK, pixels.size)]
+        for j in range(block.size):
+            k = block[j] if thresholds.shape[1] > 1 else 0
+            levels[j] = _level(level, block[j], thresholds[0, k], thresholds[1, k])
+        _set_bands(block, levels, curve, thresholds, band, work)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _resume(pixels, crossings, trains, times, refractory_us, state):
+    """Start the dead time of each last event; compact the pixels that are out of it and return how many.
+
+    The others have no quiet band: they are decided in every frame, until their dead time ends.
+    """
+    band, level, held = state
+    t0, t1 = times
+    free = 0
+    for j in range(pixels.size):
+        i, n, remembered = pixels[j], abs(crossings[j]), trains[4, j]
+        if n > 0:
+            held[i] = t0 + moment(trains[0, j], trains[1, j], n - 1, t1 - t0) + refractory_us
+            if held[i] >= t1:
+                band[0, i], band[1, i] = 1.0, 0.0
+                continue
+            remembered = trains[2, j] + (trains[3, j] - trains[2, j]) * ((held[i] - t0) / (t1 - t0))
+        level[0, i], level[1, i], level[2, i] = remembered, 0.0, 0.0
+        pixels[free] = i
+        free += 1
+    return free

@@ -1,11 +1,23 @@
 """The event camera: linear luminance frames in, time-ordered brightness-change events out.
 
-A pixel fires when the logarithm of its luminance has moved by the contrast threshold from
-the level that it remembers (appendix E.1, read so that equations 5 to 8 are well founded).
-With `memory="reference"` that level moves only by whole thresholds, as in a real sensor, so
-slow change is never lost; it is held as the first log level plus integer counts, so it does
-not drift. With `memory="frame"` it is the previous frame, as the paper has it, and what
-stays below the threshold is forgotten.
+A pixel fires when its response to light (by default the logarithm) has moved by the contrast
+threshold from the level that it remembers (appendix E.1, read so that equations 5 to 8 are
+well founded). What it remembers is the setting `memory`:
+
+- "reference": the level moves only by whole thresholds, as in a real sensor, so events do not
+  depend on how often one looks; it is kept as a first level and counts, so it does not drift.
+- "frame": the level is the previous frame's, as the paper has it; what stays below the
+  threshold is forgotten.
+- "legacy": the published code of the paper (microsoft/event-vae-rl, event_sim.py). Of the
+  whole thresholds within the difference of two frames it loses the first, so a step of less
+  than two makes no event; the others are stamped from the start of the interval on, event k
+  of n at t_last + k (t - t_last) / n. To match it set `max_events_per_pixel=10` and
+  `luminance_floor=0.001 / 255`. Two things are not as published: the first event, which it
+  stamps t_last, is stamped t_last + 1 us, since that time belongs to the frame before; and
+  microseconds are not added to nanoseconds.
+
+One camera with memory "frame" or "legacy" expects one frame per control step: see
+`EventCamera.wants_sub_frames`.
 """
 
 import dataclasses
@@ -16,19 +28,46 @@ import numpy as np
 
 from envs import crossings
 from envs.config import CameraConfig
-from envs.crossings import EVENT
+from envs.response import encode, encoding_tables, response_curve
+from envs.trains import EVENT
 
 __all__ = ["EVENT", "EventCamera"]
 
 T_LIMIT_US = 2**52  # exact in float64, 142 years
+# Every pixel of the largest sensor can fire once; 0.6 GB at the most while they are sorted.
+MAX_EVENTS_PER_FRAME = 2**24
+LOWEST_SHARE = 0.1  # of the nominal threshold, under mismatch
+LOWEST_THRESHOLD = 1e-6
+
+
+def pixel_thresholds(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
+    """ON and OFF thresholds, float64 (H * W,) each, or (1,) without mismatch.
+
+    Under mismatch they are normal around the nominal threshold, ON and OFF independent, drawn
+    from `threshold_seed`, and never below a tenth of the nominal nor below 1e-6.
+    """
+    on = config.contrast_threshold
+    off = on if config.contrast_threshold_off is None else config.contrast_threshold_off
+    nominal = np.array([[on], [off]])
+    if config.threshold_mismatch == 0.0:
+        return nominal[0], nominal[1]
+    draws = np.random.default_rng(config.threshold_seed).standard_normal((2, config.height * config.width))
+    share = np.maximum(1.0 + config.threshold_mismatch * draws, LOWEST_SHARE)
+    thresholds = np.maximum(nominal * share, LOWEST_THRESHOLD)
+    return thresholds[0], thresholds[1]
 
 
 class EventCamera:
     """One event camera with its per-pixel memory.
 
+    Same frames, same times and same settings give the same bytes, on any machine: what
+    decides an event is computed without a library's logarithm.
+
     Attributes:
         config: The settings, `CameraConfig`.
-        dropped: Events lost to `max_events_per_pixel` in the last step.
+        dropped: Events lost in the last step, to `max_events_per_pixel` or because a frame
+            gives at most `MAX_EVENTS_PER_FRAME`, the earliest ones. With excess "carry" they
+            are not lost but fire in later frames, and the number is 0.
         t_us: Time of the last frame [us].
     """
 
@@ -45,22 +84,37 @@ class EventCamera:
         self.config = config
         self.dropped = 0
         self.t_us: int | None = None
-        on, off = config.contrast_threshold, config.contrast_threshold_off
-        self._response = (on, on if off is None else off, config.luminance_floor)
-        self._forgets = config.memory == "frame"
+        legacy = config.memory == "legacy"
+        self._curve = response_curve(config.response, config.luminance_floor)
+        self._thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if legacy else 1)
+        forgets, carries = config.memory != "reference", config.excess == "carry"
+        self._rule = (config.refractory_us, config.max_events_per_pixel, carries, forgets, legacy)
+        self._tables = None if config.encoding == "linear32" else encoding_tables(config.encoding)
         self._shape = (config.height, config.width)
         pixels = config.width * config.height
-        self._previous = np.zeros(pixels, np.float32)  # last frame
-        self._band = np.zeros((2, pixels), np.float32)  # quiet from row 0 to row 1, both included
-        self._level = np.zeros((3, pixels))  # first log luminance, ON count, OFF count
-        self._words = np.zeros((pixels + 7) // 8, np.uint64)  # scratch: one flag a pixel, padded
-        self._outside = np.zeros(8 * self._words.size, np.int64)  # scratch: pixels to decide
+        self._state = (
+            np.zeros(pixels, np.float32),  # last frame
+            np.zeros((2, pixels), np.float32),  # quiet from row 0 to row 1, both included
+            np.zeros((3, pixels)),  # first level, ON count, OFF count
+            np.zeros(pixels if config.refractory_us > 0 else 0, np.int64),  # end of the last dead time
+        )
+        words = np.zeros((pixels + 7) // 8, np.uint64)  # one flag a pixel, padded
+        self._scratch = (words, np.zeros(8 * words.size, np.int64))  # and the pixels to decide
+
+    @property
+    def wants_sub_frames(self) -> bool:
+        """Whether frames between those of the control steps make the events better.
+
+        True for memory "reference". "frame" and "legacy" compare one frame with the next and
+        forget, so each more frame costs them events: give them one frame per control step.
+        """
+        return self.config.memory == "reference"
 
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
-        """Remember a first frame; it makes no events.
+        """Remember a first frame; it makes no events, and no pixel is in its dead time.
 
         Args:
-            luminance: float32 (H, W), linear, finite, >= 0.
+            luminance: float32 (H, W), linear, finite, >= 0; 1 is white.
             t_us: Its time [us].
 
         Raises:
@@ -70,16 +124,16 @@ class EventCamera:
         bad = int(crossings.first_invalid(flat))
         if bad >= 0:
             raise self._refusal(flat, bad)
-        crossings.remember(flat, self._response, self._previous, self._band, self._level)
+        crossings.remember(self._encoded(flat), self._curve, self._thresholds, self._state)
         self.t_us, self.dropped = t_us, 0
 
     def step(self, luminance: np.ndarray, t_us: int) -> np.ndarray:
         """Events between the last frame and this one (appendix E.1).
 
-        Times are interpolated linearly in log luminance and rounded to whole microseconds.
+        Times are interpolated linearly in the response and rounded to whole microseconds.
 
         Args:
-            luminance: float32 (H, W), linear, finite, >= 0. It is copied.
+            luminance: float32 (H, W), linear, finite, >= 0; 1 is white. It is copied.
             t_us: Its time [us], later than the last frame's.
 
         Returns:
@@ -95,16 +149,28 @@ class EventCamera:
         if t_us <= self.t_us:
             raise ValueError(f"t_us must increase from frame to frame; got {t_us} after {self.t_us}.")
         bad, dropped, events = crossings.step(
-            flat,
-            (self.t_us, t_us, self.config.width, self.config.max_events_per_pixel),
-            self._forgets,
-            self._response,
-            (self._previous, self._band, self._level, self._words, self._outside),
+            self._encoded(flat),
+            (self.t_us, t_us, self.config.width, MAX_EVENTS_PER_FRAME),
+            self._rule,
+            self._curve,
+            self._thresholds,
+            self._state,
+            self._scratch,
         )
         if bad >= 0:
             raise self._refusal(flat, bad)
         self.t_us, self.dropped = t_us, dropped
         return events
+
+    def _encoded(self, flat: np.ndarray) -> np.ndarray:
+        """The frame as the sensor's front end hands it on."""
+        if self._tables is None:
+            return flat
+        encoded = np.empty_like(flat)
+        bad = int(encode(flat, *self._tables, encoded))
+        if bad >= 0:
+            raise self._refusal(flat, bad)
+        return encoded
 
     def _checked(self, luminance: np.ndarray, t_us: int) -> tuple[np.ndarray, int]:
         """The frame as a flat contiguous array and the time as an int."""

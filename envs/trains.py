@@ -1,0 +1,147 @@
+"""From trains to events: the events of one pixel between two frames lie evenly in time.
+
+Event k = 0, 1, ... of a train comes `start + k * stride` microseconds after the last frame,
+rounded to a whole microsecond in [1, interval]. `trains` is float64 (2, N), start and stride;
+`crossings` int64 (N,), levels crossed, negative if downwards; `sent` int64 (N,), how many of
+them become events; `pixels` int64 (N,), flat indices in increasing order.
+"""
+
+import numba
+import numpy as np
+
+EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+MIN_BITS, MAX_BITS = 6, 13  # of a sort's digit; 13 take a table of 64 KiB
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def moment(start, stride, k, interval):
+    """When event `k` of a train comes [us after the last frame]."""
+    return np.int64(min(max(np.rint(start + k * stride), 1.0), interval))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def limit_events(trains, sent, interval, limit):
+    """Lower `sent` so that at most `limit` events remain: none after some microsecond; return how many.
+
+    If the first microsecond alone holds more, all trains keep the same number of events.
+    """
+    total = sent.sum()
+    if total <= limit:
+        return total
+    early, late = 0, interval
+    while late - early > 1:
+        middle = (early + late) // 2
+        if _until(trains, sent, middle, interval) > limit:
+            late = middle
+        else:
+            early = middle
+    share = limit // sent.size
+    for j in range(sent.size):
+        sent[j] = _number(trains, sent, j, early, interval) if early > 0 else min(sent[j], share)
+    return sent.sum()
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _until(trains, sent, t, interval):
+    """Events up to and including time `t`."""
+    total = 0
+    for j in range(sent.size):
+        total += _number(trains, sent, j, t, interval)
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _number(trains, sent, j, t, interval):
+    """Events of train `j` up to and including time `t`."""
+    low, high = 0, sent[j]
+    while low < high:
+        middle = (low + high) // 2
+        if moment(trains[0, j], trains[1, j], middle, interval) <= t:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@numba.njit(cache=True, error_model="numpy")
+def events_of(frame, pixels, crossings, sent, trains, total):
+    """EVENT array of all trains, sorted by (t, y, x, order in the pixel). O(events) for any interval.
+
+    `frame` is (time of the last frame, time of this one, width). A radix sort by time is
+    stable, so that ties keep the raster order in which the trains come.
+    """
+    t0, t1, width = frame
+    events = np.empty(total, EVENT)
+    if total == 0:
+        return events
+    times, places = _emitted(t1 - t0, width, pixels, crossings, sent, trains, total)
+    passes, bits = _digits(t1 - t0, total)
+    mask = (1 << bits) - 1
+    for turn in range(passes - 1):
+        times, places = _moved(times, places, turn * bits, mask)
+    shift = (passes - 1) * bits
+    place_of = _starts(times, shift, mask, (t1 - t0) >> shift)
+    for i in range(total):
+        t, place = times[i], places[i]
+        digit = (t >> shift) & mask
+        event = events[place_of[digit]]
+        place_of[digit] += 1
+        event.t = t0 + t
+        event.x = (place >> 1) & 0xFFF
+        event.y = place >> 13
+        event.p = 2 * (place & 1) - 1
+    return events
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _emitted(interval, width, pixels, crossings, sent, trains, total):
+    """Times [us after the last frame] and places (y << 13 | x << 1 | ON) of all events, by pixel."""
+    times, places = np.empty(total, np.int64), np.empty(total, np.uint32)
+    event, y = 0, 0
+    for j in range(pixels.size):
+        while pixels[j] >= (y + 1) * width:
+            y += 1
+        place = np.uint32((y << 13) | ((pixels[j] - y * width) << 1) | (crossings[j] > 0))
+        start, stride = trains[0, j], trains[1, j]
+        for k in range(sent[j]):
+            times[event] = moment(start, stride, k, interval)
+            places[event] = place
+            event += 1
+    return times, places
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _digits(interval, total):
+    """Passes and bits per pass of the sort: few events do not pay for a large table."""
+    needed = 1
+    while interval >> needed > 0:
+        needed += 1
+    bits = MIN_BITS
+    while bits < MAX_BITS and (1 << bits) < 8 * total:
+        bits += 1
+    passes = (needed + bits - 1) // bits
+    return passes, (needed + passes - 1) // passes
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _starts(times, shift, mask, largest):
+    """Where the events of each digit, at most `largest`, start in the order of that digit."""
+    starts = np.zeros(largest + 2, np.int64)
+    for t in times:
+        starts[((t >> shift) & mask) + 1] += 1
+    for digit in range(largest + 1):
+        starts[digit + 1] += starts[digit]
+    return starts
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _moved(times, places, shift, mask):
+    """Times and places in the order of one digit, ties as they were."""
+    start = _starts(times, shift, mask, mask)
+    moved_times, moved_places = np.empty_like(times), np.empty_like(places)
+    for i in range(times.size):
+        digit = (times[i] >> shift) & mask
+        moved_times[start[digit]] = times[i]
+        moved_places[start[digit]] = places[i]
+        start[digit] += 1
+    return moved_times, moved_places

@@ -1,0 +1,151 @@
+"""The event camera's time per frame against plain copying and against the paper's published design.
+
+Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.events
+Expect: a table in about two minutes. All on one thread, medians of frames that take turns in
+one run. The scene is 24 gratings and three bars that move 0.1 ("sparse") or 1 ("dense")
+pixels per frame of 5 ms; threshold 0.2.
+
+Columns. "of copying": time as a multiple of `np.copyto` of the bytes that any design with this
+memory has to touch: per pixel the luminance (4) and the quiet band (8), per event what it
+changes and leaves (37: the event 13, the pixel's level 16 and band 8). "published": how many
+times longer the paper's design takes, typed anew: a loop over all pixels with two logarithms
+each, and a structured sort by field name. It makes fewer events, see memory "legacy" in
+`envs.events`.
+"""
+
+import time
+from collections.abc import Callable
+
+import numba
+import numpy as np
+from rich.table import Table
+
+from envs.events import EventCamera
+from jobs.progress import console
+
+SIZES = ((64, 64), (346, 260), (640, 480), (1280, 720))
+SPEEDS = (("sparse", 0.1), ("dense", 1.0))  # pixels per frame
+FRAMES = 12
+INTERVAL_US = 5000
+THRESHOLD = 0.2
+SECONDS = 2.5  # of measuring, per row
+PIXEL_BYTES, EVENT_BYTES = 12, 37
+PUBLISHED_EVENT = np.dtype([("timestamp", "f8"), ("x", "u2"), ("y", "u2"), ("polarity", "b")], align=True)
+
+
+def main() -> None:
+    """Measure and print the table."""
+    table = Table(title="Event camera, one thread, 5 ms per frame, threshold 0.2")
+    headings = ("pixels", "scene", "us/frame", "events/pixel", "ns/pixel", "of copying", "published")
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    for width, height in SIZES:
+        for name, speed in SPEEDS:
+            frames = moving_gratings(width, height, speed)
+            ours, events, copying, published = measure(frames)
+            pixels = width * height
+            row = (f"{1e6 * ours:,.1f}", f"{events / pixels:.4f}", f"{1e9 * ours / pixels:.2f}")
+            ratios = (f"{ours / copying:.1f}x", f"{published / ours:.1f}x")
+            table.add_row(f"{width}x{height}", name, *row, *ratios)
+    console.print(table)
+
+
+def moving_gratings(width: int, height: int, speed: float) -> list[np.ndarray]:
+    """Luminance of 24 random gratings of 1 to 12 cycles per width, behind three dark bars."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    wave = 2 * np.pi * rng.uniform(1, 12, 24) / width
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, 24))
+    frames = []
+    for k in range(FRAMES):
+        level = np.zeros((height, width), np.float32)
+        for along, across, shift in zip(wave * np.cos(angle), wave * np.sin(angle), phase, strict=True):
+            level += np.sin(along * (x - speed * k) + across * y + shift, dtype=np.float32)
+        luminance = 0.5 * np.exp(0.08 * level)
+        for bar in range(3):
+            place = (width * (bar + 0.5) / 3 + speed * k) % width
+            luminance *= 1 - 0.7 * np.clip(2.5 - np.abs(x - place), 0, 1)
+        frames.append(luminance.astype(np.float32))
+    return frames
+
+
+def measure(frames: list[np.ndarray]) -> tuple[float, float, float, float]:
+    """Median seconds per frame of the camera, its events per frame, and seconds of copying and published."""
+    height, width = frames[0].shape
+    camera, published = EventCamera(width, height, contrast_threshold=THRESHOLD), Published(width, height)
+    camera.reset(frames[0], 0)
+    events = np.mean([camera.step(frame, k * INTERVAL_US).size for k, frame in enumerate(frames[1:], 1)])
+    source = np.ones(int(PIXEL_BYTES * width * height + EVENT_BYTES * events), np.uint8)
+    target = np.empty_like(source)
+    starts: dict[str, Callable[[], object]] = {
+        "ours": lambda: camera.reset(frames[0], 0),
+        "copying": lambda: None,
+        "published": lambda: published.reset(frames[0]),
+    }
+    steps: dict[str, Callable[[np.ndarray, int], object]] = {
+        "ours": camera.step,
+        "copying": lambda frame, t_us: np.copyto(target, source),
+        "published": published.step,
+    }
+    taken: dict[str, list[float]] = {name: [] for name in steps}
+    end = time.perf_counter() + SECONDS
+    while time.perf_counter() < end or len(taken["ours"]) < 2 * FRAMES:
+        for name, step in steps.items():
+            starts[name]()
+            for k, frame in enumerate(frames[1:], 1):
+                start = time.perf_counter()
+                step(frame, k * INTERVAL_US)
+                taken[name].append(time.perf_counter() - start)
+    warm = {name: float(np.median(seconds[FRAMES - 1 :])) for name, seconds in taken.items()}
+    return warm["ours"], float(events), warm["copying"], warm["published"]
+
+
+class Published:
+    """The design of the paper's published simulator, with the clock in microseconds."""
+
+    def __init__(self, width: int, height: int) -> None:
+        """Make it for frames of (height, width)."""
+        self._width = width
+        self._last = np.zeros(width * height, np.float32)
+        self._t_us = 0.0
+        self.active = 0
+
+    def reset(self, luminance: np.ndarray) -> None:
+        """Start from `luminance` at time 0."""
+        self._last, self._t_us = luminance.ravel() + np.float32(0.001), 0.0
+
+    def step(self, luminance: np.ndarray, t_us: int) -> np.ndarray:
+        """Events since the last frame, sorted by time alone."""
+        current = luminance.ravel() + np.float32(0.001)
+        output, image = np.zeros(10 * current.size, PUBLISHED_EVENT), np.zeros(current.size)
+        interval = t_us - self._t_us
+        count = published_events(current, self._last, (self._t_us, interval, self._width), output, image)
+        self.active = np.nonzero(image)[0].size
+        self._last, self._t_us = current, t_us
+        events = output[:count]
+        events.sort(order=["timestamp"])
+        return events
+
+
+@numba.njit(cache=True, error_model="numpy")
+def published_events(current, last, frame, output, image):  # type: ignore[no-untyped-def]
+    """One less than the whole thresholds in the difference of two frames, at most 10; returns how many."""
+    t0, interval, width = frame
+    count = 0
+    for i in range(current.size):
+        change = np.log(current[i]) - np.log(last[i])
+        if abs(change) < THRESHOLD:
+            continue
+        number = min(int((abs(change) - THRESHOLD) / THRESHOLD), 10)
+        if number > 0:
+            image[i] = 255
+        for k in range(number):
+            output[count].timestamp = t0 + k * interval / number
+            output[count].x, output[count].y = i % width, i // width
+            output[count].polarity = 1 if change > 0 else -1
+            count += 1
+    return count
+
+
+if __name__ == "__main__":
+    main()
