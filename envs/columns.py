@@ -1,246 +1,261 @@
-"""Kernels of the ray caster: which poles are in view, what a column shows, what a pixel means.
+"""Kernels of the ray caster: an image as strips, a strip as columns, a column from near to far.
 
-They assume valid input; `envs.raycast` checks it. x right, y forward, z up; a slope u is
-right / forward in the camera's frame, so that x_pixel = width / 2 + focal * u.
+Columns of pixels are cut at each silhouette; a strip between two cuts is the mean over one
+or two columns inside it. In a column, what is nearer is painted first, and what remains
+uncovered is kept as gaps between rows. Input is assumed valid; `envs.raycast` checks it.
 """
 
 import math
-from typing import NamedTuple
 
 import numba
 import numpy as np
 
-NEAR = 1e-9  # [m]; smallest depth, so that a division is always defined
-# Columns of the array of poles in view: centre in the camera's frame [m], distance^2 - radius^2,
-# slopes right / forward of its left and right edge, radius, top [m], albedo, luminance of the cap.
-RIGHT, FORWARD, POWER, LOW, HIGH, RADIUS, TOP, ALBEDO, CAP = range(9)
+from envs import bodies as b
+from envs import spans as v
+from envs.bodies import KIND
+from envs.obstacles import BOX, CONE, ELLIPSOID
+from envs.spans import EYE_X, EYE_Y, EYE_Z, FOCAL, HORIZON, kernel
+from envs.surfaces import (
+    CAP_SPREAD,
+    END_SPREAD,
+    KNOWN,
+    LEFT,
+    RIGHT,
+    SLOPE,
+    WALL_AFTER,
+    WALL_DEPTH,
+    WALL_SIDE,
+    WEIGHT,
+    show_body,
+    show_walls,
+    wall_depth,
+)
 
-
-class World(NamedTuple):
-    """A scene as the kernels read it; metres and luminances."""
-
-    half_width: float
-    wall_height: float
-    walls_near: float
-    walls_far: float
-    wall_facing_right: float
-    wall_facing_left: float
-    ground: float
-    sky: float
-    ambient: float
-    diffuse: float
-    sun_x: float
-    sun_y: float
-
-
-class Camera(NamedTuple):
-    """Pose and geometry; x right, y forward, z up, yaw counter-clockwise from above."""
-
-    x: float
-    y: float
-    z: float
-    cos: float
-    sin: float
-    width: int
-    height: int
-    focal: float  # [pixels]
+TOGETHER = 1e-9  # [pixels] cuts nearer than this are one
+GAUSS = 0.5 - 0.5 / math.sqrt(3.0)  # where in a strip its first column stands; its second mirrors it
+NARROW = 0.3  # [strips] narrower ones are one column
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _see_poles(poles: np.ndarray, camera: Camera) -> np.ndarray:
-    """(M, 9) what the columns need of each pole in view, in the columns named RIGHT .. CAP."""
-    seen = np.empty((len(poles), 9))
-    count = 0
-    limit = 0.5 * camera.width / camera.focal
-    for i in range(len(poles)):
-        dx, dy = poles[i, 0] - camera.x, poles[i, 1] - camera.y
-        radius, top = poles[i, 2], poles[i, 3]
-        right = dx * camera.cos + dy * camera.sin
-        forward = dy * camera.cos - dx * camera.sin
-        distance = math.hypot(right, forward)
-        power = (distance - radius) * (distance + radius)
-        low, high = _edges(right, forward, radius, power)
-        if (power > 0.0 or camera.z > top) and low < limit and high > -limit:
-            seen[count, RIGHT], seen[count, FORWARD], seen[count, POWER] = right, forward, power
-            seen[count, LOW], seen[count, HIGH], seen[count, RADIUS] = low, high, radius
-            seen[count, TOP], seen[count, ALBEDO], seen[count, CAP] = top, poles[i, 4], poles[i, 5]
-            count += 1
-    return seen[:count]
+def render_area(
+    scene: tuple, world: np.ndarray, pose: tuple, focal: float, image: np.ndarray, samples: int, cull: float
+) -> None:
+    """Fill `image` (H, W) with the mean luminance over the area of each pixel.
 
-
-@numba.njit(cache=True, error_model="numpy")
-def _edges(right: float, forward: float, radius: float, power: float) -> tuple[float, float]:
-    """Slopes u = right / forward of both tangents to a circle; +-inf where one points backwards."""
-    if power <= 0.0:
-        return -math.inf, math.inf
-    tangent = math.sqrt(power)
-    left_forward = forward * tangent + right * radius
-    right_forward = forward * tangent - right * radius
-    if left_forward <= 0.0 and right_forward <= 0.0:
-        return math.inf, -math.inf
-    low = (right * tangent - forward * radius) / left_forward if left_forward > 0.0 else -math.inf
-    high = (right * tangent + forward * radius) / right_forward if right_forward > 0.0 else math.inf
-    return low, high
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _cuts(world: World, camera: Camera, seen: np.ndarray, samples: int) -> np.ndarray:
-    """Sorted positions [pixels] that cut the image into strips without a silhouette inside."""
-    slopes = np.empty(2 * len(seen) + 4)
-    slopes[: len(seen)] = seen[:, LOW]
-    slopes[len(seen) : 2 * len(seen)] = seen[:, HIGH]
-    for k in range(4):
-        dx = (world.half_width if k < 2 else -world.half_width) - camera.x
-        dy = (world.walls_near if k % 2 else world.walls_far) - camera.y
-        forward = dy * camera.cos - dx * camera.sin
-        right = dx * camera.cos + dy * camera.sin
-        slopes[2 * len(seen) + k] = right / forward if forward > 0.0 else math.inf
-    breaks = np.sort(0.5 * camera.width + camera.focal * slopes)
-    grid = camera.width * samples + 1
-    cuts = np.empty(grid + len(breaks))
-    size, k = 0, int(np.searchsorted(breaks, 0.0))
-    for i in range(grid):
-        while k < len(breaks) and breaks[k] < i / samples:
-            cuts[size] = breaks[k]
-            size, k = size + 1, k + 1
-        cuts[size] = i / samples
-        size += 1
-    return cuts[:size]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _insert(depths: np.ndarray, things: np.ndarray, count: int, depth: float, thing: int) -> int:
-    """Insert `thing` at `depth` into the `count` hits sorted by depth; the new count."""
-    k = count
-    while k > 0 and depths[k - 1] > depth:
-        depths[k], things[k] = depths[k - 1], things[k - 1]
-        k -= 1
-    depths[k], things[k] = depth, thing
-    return count + 1
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _hit(world: World, camera: Camera, seen: np.ndarray, u: float, scratch: tuple) -> int:
-    """All along slope `u`, nearest first: depth [m] and row of `seen`, or -1, -2 for a wall."""
-    depths, things, _, _ = scratch
-    count = 0
-    for i in range(len(seen)):
-        if seen[i, LOW] <= u <= seen[i, HIGH]:
-            middle = seen[i, RIGHT] * u + seen[i, FORWARD]
-            far = middle + math.sqrt(max(0.0, middle * middle - (1.0 + u * u) * seen[i, POWER]))
-            # power / far is (middle - root) / (1 + u u) without its cancellation.
-            depth = max(NEAR, seen[i, POWER] / far) if far > 0.0 else NEAR
-            count = _insert(depths, things, count, depth, i)
-    dx = u * camera.cos - camera.sin
-    for side in (-1, 1):
-        depth = (side * world.half_width - camera.x) / dx
-        y = camera.y + depth * (u * camera.sin + camera.cos)
-        if depth > NEAR and world.walls_near <= y <= world.walls_far:
-            count = _insert(depths, things, count, depth, -1 if side < 0 else -2)
-    return count
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _shade_pole(world: World, camera: Camera, seen: np.ndarray, u: float, depth: float, i: int) -> float:
-    right, forward = depth * u - seen[i, RIGHT], depth - seen[i, FORWARD]
-    sun_right = world.sun_x * camera.cos + world.sun_y * camera.sin
-    sun_forward = world.sun_y * camera.cos - world.sun_x * camera.sin
-    cosine = (right * sun_right + forward * sun_forward) / seen[i, RADIUS]
-    return seen[i, ALBEDO] * (world.ambient + world.diffuse * min(1.0, max(0.0, cosine)))
-
-
-@numba.njit(cache=True, error_model="numpy", inline="always")  # a call costs more than the work
-def _push(rows: np.ndarray, values: np.ndarray, count: int, row: float, luminance: float) -> int:
-    """Cover with `luminance` what lies between the highest covered row and `row`."""
-    values[count] = luminance
-    rows[count + 1] = min(max(row, 0.0), rows[count])
-    return count + 1
-
-
-@numba.njit(cache=True, error_model="numpy", inline="always")
-def _column(world: World, camera: Camera, seen: np.ndarray, u: float, scratch: tuple) -> int:
-    """Compose a column from below: values[k] covers rows[k + 1] .. rows[k]; the number of spans.
-
-    Exact because all stands on the ground and the camera is above it: what is farther is
-    visible only above what is nearer.
+    Args:
+        scene: Bodies (N, 9) and stacks of noise, as their kernels read them.
+        world: (VIEW,) float64 as `envs.spans` reads it; the frame's part is filled in here.
+        pose: x, y, z [m], yaw [rad], time [s].
+        focal: Focal length [pixels].
+        image: Float32.
+        samples: Strips per pixel.
+        cull: Bodies farther than this are not drawn [m].
     """
-    depths, things, rows, values = scratch
-    horizon = 0.5 * camera.height
-    rows[0], count = camera.height, 0
-    for k in range(_hit(world, camera, seen, u, scratch)):
-        scale, i = camera.focal / depths[k], things[k]
-        top = seen[i, TOP] if i >= 0 else world.wall_height
-        summit = horizon + scale * (camera.z - top)
-        if summit >= rows[count] and camera.z <= top:
-            continue
-        count = _push(rows, values, count, horizon + scale * camera.z, world.ground)
-        if i >= 0:
-            count = _push(rows, values, count, summit, _shade_pole(world, camera, seen, u, depths[k], i))
+    bodies, stacks = scene
+    height, width = image.shape
+    view, most = world.copy(), len(bodies)
+    _look(view, pose, focal, height, samples)
+    seen, order = np.empty((most, b.FIELDS)), np.empty(most, np.int64)
+    positions, codes = np.empty(6 * most + 4), np.empty(6 * most + 4, np.int64)
+    count = b.see_bodies(bodies, view, 0.5 * width / focal, cull, seen)
+    size, total = _events(view, seen, count, width, positions, codes, order)
+    rank = np.argsort(positions[:size])
+    positions, codes = positions[:size][rank], codes[:size][rank]
+    sheet = (np.zeros((v.LAYERS, height + 2)), np.empty((count + 6, 4)), np.empty(KNOWN), stacks)
+    _sweep(view, seen, (order, total), (positions, codes), image, samples, sheet)
+
+
+@kernel
+def _sweep(view, seen, begun: tuple, cuts: tuple, image: np.ndarray, samples: int, sheet: tuple) -> None:
+    """Paint the strips between cuts from left to right, with the bodies that are there in each."""
+    (order, total), (positions, codes) = begun, cuts
+    half = 0.5 * image.shape[1]
+    known, event = 0, 0
+    for cell in range(image.shape[1] * samples):
+        left, edge = cell / samples, (cell + 1) / samples
+        middle = (0.5 * (left + edge) - half) / view[FOCAL]
+        while edge - left > TOGETHER:
+            right = edge
+            if event < len(codes) and positions[event] < edge - TOGETHER:
+                right = positions[event]
+            known = _settle(view, seen, order, known, total, (0.5 * (left + right) - half) / view[FOCAL])
+            _paint_strip(view, seen, order, known, (left - half, right - half), sheet)
+            left = right
+            while event < len(codes) and positions[event] <= left + TOGETHER:
+                known, total = _pass(order, known, total, codes[event])
+                event += 1
+        v.texture_cell(view, sheet[3], sheet[0], middle)
+        if (cell + 1) % samples == 0:
+            v.develop(view, sheet[0], image, cell // samples)
+
+
+@kernel
+def _paint_strip(view, seen, order: np.ndarray, known: int, strip: tuple, sheet: tuple) -> None:
+    """Paint a strip, from its left to its right around the image's middle [pixels], by one or two columns."""
+    left, right = strip
+    hit, wide, start = sheet[2], right - left, left
+    columns = 1 if wide * view[v.SAMPLES] < NARROW else 2
+    for k in range(columns):
+        at = 0.5 if columns == 1 else (GAUSS if k == 0 else 1.0 - GAUSS)
+        hit[WEIGHT] = wide / columns
+        hit[SLOPE] = (left + at * wide) / view[FOCAL]
+        hit[LEFT], hit[RIGHT] = start / view[FOCAL], (start + hit[WEIGHT]) / view[FOCAL]
+        start += hit[WEIGHT]
+        _column(view, seen, order, known, sheet)
+
+
+@kernel
+def _look(view: np.ndarray, pose: tuple, focal: float, height: int, samples: int) -> None:
+    """Fill in what a frame adds to the numbers of the scene."""
+    view[EYE_X], view[EYE_Y], view[EYE_Z], yaw, view[v.TIME] = pose
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    view[v.COS], view[v.SIN] = cos, sin
+    view[HORIZON], view[FOCAL], view[v.SAMPLES] = 0.5 * height, focal, samples
+    view[v.SUN_RIGHT] = view[v.SUN_X] * cos + view[v.SUN_Y] * sin
+    view[v.SUN_FORWARD] = view[v.SUN_Y] * cos - view[v.SUN_X] * sin
+
+
+@kernel
+def _events(view, seen, count, width, positions, codes, order) -> tuple:
+    """Collect the cuts inside the image [pixels]; their codes: 2 i, body i begins; 2 i + 1, it ends; -1.
+
+    Returns:
+        The number of cuts, and that of bodies already begun at the left edge, in `order`.
+    """
+    size = total = 0
+    centre, focal = 0.5 * width, view[FOCAL]
+    for i in range(count):
+        low, high = centre + focal * seen[i, b.LOW], centre + focal * seen[i, b.HIGH]
+        if low <= 0.0:
+            order[total] = i
+            total += 1
         else:
-            side = world.half_width if i == -2 else -world.half_width
-            luminance = world.wall_facing_right if camera.x > side else world.wall_facing_left
-            count = _push(rows, values, count, summit, luminance)
-        if i >= 0 and camera.z > top:
-            behind = horizon + camera.focal * (camera.z - top) / _leave(seen, u, i)
-            count = _push(rows, values, count, behind, seen[i, CAP])
-    count = _push(rows, values, count, horizon, world.ground)
-    return _push(rows, values, count, 0.0, world.sky)
+            positions[size], codes[size] = low, 2 * i
+            size += 1
+        positions[size], codes[size] = high, 2 * i + 1
+        size += high < width
+        if seen[i, KIND] == CONE and seen[i, b.FORWARD] > 0.0:
+            positions[size], codes[size] = centre + focal * seen[i, b.RIGHT] / seen[i, b.FORWARD], -1
+            size += 0.0 < positions[size] < width
+        if seen[i, KIND] == BOX:
+            size = _corner_cuts(view, seen, i, width, positions, codes, size)
+    for k in range(4):
+        dx = (view[v.WALL_HALF] if k < 2 else -view[v.WALL_HALF]) - view[EYE_X]
+        dy = (view[v.WALL_NEAR] if k % 2 else view[v.WALL_FAR]) - view[EYE_Y]
+        forward = dy * view[v.COS] - dx * view[v.SIN]
+        right = dx * view[v.COS] + dy * view[v.SIN]
+        positions[size], codes[size] = centre + focal * right / forward, -1
+        size += forward > 0.0 and 0.0 < positions[size] < width
+    return size, total
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _leave(seen: np.ndarray, u: float, i: int) -> float:
-    """Depth at which slope `u` leaves the pole in row `i` of `seen` [m]."""
-    middle = seen[i, RIGHT] * u + seen[i, FORWARD]
-    square = 1.0 + u * u
-    return max(NEAR, (middle + math.sqrt(max(0.0, middle * middle - square * seen[i, POWER]))) / square)
+@kernel
+def _corner_cuts(view, seen, i: int, width: int, positions, codes, size: int) -> int:
+    """Add the corners of a box at which what it shows changes: the nearest; all, from above or below."""
+    level = view[EYE_Z] > seen[i, b.TOP] or view[EYE_Z] < seen[i, b.BOTTOM]
+    nearest, least = 0, math.inf
+    for k in range(4):
+        right, forward = b.corner(seen, i, view, k)
+        if right * right + forward * forward < least:
+            nearest, least = k, right * right + forward * forward
+    for k in range(4):
+        right, forward = b.corner(seen, i, view, k)
+        if forward > 0.0 and (level or k == nearest):
+            positions[size], codes[size] = 0.5 * width + view[FOCAL] * right / forward, -1
+            size += 0.0 < positions[size] < width
+    return size
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _scratch(size: int) -> tuple:
-    """Depths and things of a column's hits; rows and values of its spans."""
-    return np.empty(size + 2), np.empty(size + 2, np.int64), np.empty(3 * size + 9), np.empty(3 * size + 9)
+@kernel
+def _pass(order: np.ndarray, known: int, total: int, code: int) -> tuple:
+    """Begin or end a body: `order` holds `total` of them, of which the first `known` are sorted."""
+    if code < 0:
+        return known, total
+    i = code // 2
+    if code % 2 == 0:
+        order[total] = i
+        return known, total + 1
+    for k in range(total):
+        if order[k] == i:
+            for j in range(k, total - 1):
+                order[j] = order[j + 1]
+            return known - (k < known), total - 1
+    return known, total
 
 
-@numba.njit(cache=True, error_model="numpy")
-def render_area(poles: np.ndarray, world: World, camera: Camera, samples: int) -> np.ndarray:
-    """Mean luminance over the area of each pixel."""
-    seen = _see_poles(poles, camera)
-    cuts = _cuts(world, camera, seen, samples)
-    scratch = _scratch(len(seen))
-    rows, values = scratch[2], scratch[3]
-    # steps[r] holds how much row r is brighter than row r - 1: one span is four additions.
-    steps = np.zeros((camera.height + 2, camera.width))
-    for k in range(len(cuts) - 1):
-        wide, middle = cuts[k + 1] - cuts[k], 0.5 * (cuts[k] + cuts[k + 1])
-        column = min(int(middle), camera.width - 1)
-        spans = _column(world, camera, seen, (middle - 0.5 * camera.width) / camera.focal, scratch)
-        above = 0.0
-        for i in range(spans - 1, -1, -1):
-            row = int(rows[i + 1])
-            change = wide * (values[i] - above)
-            steps[row, column] += change * (row + 1 - rows[i + 1])
-            steps[row + 1, column] += change * (rows[i + 1] - row)
-            above = values[i]
-    image = np.empty((camera.height, camera.width), np.float32)
-    for row in range(camera.height):
-        if row > 0:
-            steps[row] += steps[row - 1]
-        image[row] = steps[row]
-    return image
+@kernel
+def _settle(view: np.ndarray, seen: np.ndarray, order: np.ndarray, known: int, total: int, u: float) -> int:
+    """Sort the newly begun bodies in among the others by what hides what along `u`; all are known then.
+
+    Bodies are convex and do not overlap, so that this order holds as long as both are there.
+    """
+    for k in range(known, total):
+        new = order[k]
+        j = k
+        while j > 0 and b.before(seen, new, order[j - 1], view, u):
+            order[j] = order[j - 1]
+            j -= 1
+        order[j] = new
+    return total
 
 
-@numba.njit(cache=True, error_model="numpy")
-def render_points(poles: np.ndarray, world: World, camera: Camera) -> np.ndarray:
-    """Luminance at the centre of each pixel."""
-    seen = _see_poles(poles, camera)
-    scratch = _scratch(len(seen))
-    rows, values = scratch[2], scratch[3]
-    image = np.empty((camera.height, camera.width), np.float32)
-    for column in range(camera.width):
-        _column(world, camera, seen, (column + 0.5 - 0.5 * camera.width) / camera.focal, scratch)
-        span = 0
-        for row in range(camera.height - 1, -1, -1):
-            while rows[span + 1] > row + 0.5:
-                span += 1
-            image[row, column] = values[span]
-    return image
+@kernel
+def _outline(view, seen, i: int, span: tuple, hit: np.ndarray) -> None:
+    """Fill `hit` with the rows of a body as the part of the strip shows them that the column stands for.
+
+    A slanting outline is taken as a line between both ends of the part, at the mean height of
+    the outline (Simpson's rule): exact for a cone.
+    """
+    hit[CAP_SPREAD] = hit[END_SPREAD] = 0.0
+    if seen[i, KIND] != CONE and seen[i, KIND] != ELLIPSOID:
+        b.section(seen, i, view, hit[SLOPE], span, hit)
+        return
+    cap = end = 0.0
+    for k in range(3):
+        u = hit[LEFT] + 0.5 * k * (hit[RIGHT] - hit[LEFT])
+        b.section(seen, i, view, u, b.depths(seen, i, view, u), hit)
+        share = 4.0 / 6.0 if k == 1 else 1.0 / 6.0
+        cap, end = cap + share * hit[b.CAP], end + share * hit[b.END]
+        sign = k - 1.0
+        hit[CAP_SPREAD] += sign * hit[b.CAP]
+        hit[END_SPREAD] += sign * hit[b.END]
+    b.section(seen, i, view, hit[SLOPE], span, hit)
+    hit[CAP_SPREAD], hit[END_SPREAD] = abs(hit[CAP_SPREAD]), abs(hit[END_SPREAD])
+    level = hit[b.CAP] < hit[b.SIDE] or hit[b.UNDER] < hit[b.END]
+    if not level:
+        hit[b.CAP], hit[b.END] = cap, max(cap, end)
+        hit[b.SIDE], hit[b.UNDER] = hit[b.CAP], hit[b.END]
+        # Edges that cross would paint less than nothing.
+        both, tall = 0.5 * (hit[CAP_SPREAD] + hit[END_SPREAD]), hit[b.END] - hit[b.CAP]
+        if both > tall:
+            hit[CAP_SPREAD], hit[END_SPREAD] = hit[CAP_SPREAD] * tall / both, hit[END_SPREAD] * tall / both
+    else:
+        hit[CAP_SPREAD] = hit[END_SPREAD] = 0.0
+
+
+@kernel
+def _column(view, seen, order: np.ndarray, known: int, sheet: tuple) -> None:
+    """Paint one column: bodies and walls from near to far, then the ground in the gaps."""
+    canvas, gaps, hit, _ = sheet
+    u = hit[SLOPE]
+    gaps[0, 0], gaps[0, 1], count = 0.0, 2.0 * view[HORIZON], 1
+    gaps[0, 2] = gaps[0, 3] = 0.0
+    east, west = wall_depth(view, 1.0, u), wall_depth(view, -1.0, u)
+    hit[WALL_SIDE] = 1.0 if east < west else -1.0
+    hit[WALL_DEPTH], hit[WALL_AFTER] = min(east, west), max(east, west)
+    highest = max(0.0, view[v.TALLEST] - view[EYE_Z]) * view[FOCAL]
+    for k in range(known):
+        i = order[k]
+        entry, leave = b.depths(seen, i, view, u)
+        if leave <= max(0.0, entry):
+            continue
+        count = show_walls(view, sheet, count, entry)
+        # Nothing behind can rise above this row, and below the gap is only ground.
+        if count == 0 or (count == 1 and entry > 0.0 and gaps[0, 1] <= view[HORIZON] - highest / entry):
+            return
+        _outline(view, seen, i, (entry, leave), hit)
+        count = show_body(view, seen, i, sheet, count)
+    count = show_walls(view, sheet, count, math.inf)
+    if view[v.GROUND + v.CONTRAST] > 0.0:
+        for k in range(count):
+            v.cover_ground(view, canvas, gaps[k, 0], gaps[k, 1], hit[WEIGHT])

@@ -1,25 +1,29 @@
-"""pyrender renderer for any scene that is a mesh: same interface and luminance as the ray caster.
+"""pyrender renderer for all that a scene can hold: same interface and luminance as the ray caster.
 
-Headless EGL, one merged primitive, unlit (FLAT) with baked luminance, read back from a
+Headless EGL, everything in one draw call with the shaders of `envs.shaders`, read back from a
 32-bit float framebuffer: linear, without gamma, not rounded to 8 bits. Nothing of OpenGL
 is imported before a renderer is made. A renderer belongs to the process that made it; it
 may be used from any thread, one at a time.
+
+At the same sample points the picture is that of `raycast.sample_luminance` but for the edges,
+which a rasteriser rounds to 1/256 pixel, and for the polygons that stand for the rims of poles
+and the outlines of ellipsoids. `raycast` says what is seen from where.
 """
 
 import contextlib
 import math
 import os
-import types
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from envs.obstacles import BOX
+from envs.primitives import Drawing, draw, repeat_m
 from envs.raycast import check_image, check_pose
 from envs.scene import Scene
+from envs.textures import PATTERNS, TILE, TILE_PERIODS, Texture, noise_tile
 
 NEAR_M = 0.02  # nothing nearer is drawn
-MULTISAMPLES = 4
 PACKAGES = "apt-get install --no-install-recommends libegl1 libgl1 libgl1-mesa-dri"
 
 
@@ -33,7 +37,7 @@ class PyrenderRenderer:
         height: int,
         fov_deg: float = 90.0,
         samples: int = 2,
-        sections: int = 32,
+        cull_m: float = math.inf,
     ) -> None:
         """Renderer of `width` x `height` pixels and `fov_deg` across.
 
@@ -43,21 +47,27 @@ class PyrenderRenderer:
             height: Rows of the image.
             fov_deg: Horizontal field of view [degrees]; pixels are square.
             samples: 1: one sample at each pixel centre, no anti-aliasing. n > 1: n x n
-                sub-pixels of 4 multisamples each, averaged; 2 gives 16 samples a pixel.
-            sections: Sides of the prism that stands for a round pole; its silhouette is off
-                by up to 0.3 % of the radius at 32, and by a sixteenth of that at 128.
+                sub-pixels of 4 multisamples each, averaged; 2 gives 16 samples a pixel at
+                edges, and 4 inside of surfaces, which matters for textures.
+            cull_m: Obstacles whose upright cylinder or box begins farther away are not drawn [m].
 
         Raises:
-            ValueError: If a size is not at least 1, or fov_deg not in [1, 170].
+            ValueError: If a size is not at least 1, fov_deg not in [1, 170], or cull_m not > 0.
             RuntimeError: If EGL or a system library it needs is missing; names the packages.
         """
         check_image(width, height, fov_deg, samples)
-        self.width, self.height, self.samples, self.sections = width, height, samples, sections
+        if not cull_m > 0.0:
+            raise ValueError(f"cull_m must be > 0 (inf: draw everything), got {cull_m!r}")
+        self.width, self.height, self.samples, self.cull_m = width, height, samples, cull_m
         self._platform, self._renderer = _start(width * samples, height * samples, samples > 1)
-        yfov = 2.0 * math.atan(math.tan(0.5 * math.radians(fov_deg)) * height / width)
-        import pyrender
+        self._slope = math.tan(0.5 * math.radians(fov_deg))
+        from envs.opengl import Camera
 
-        self._camera = pyrender.PerspectiveCamera(yfov, znear=NEAR_M, aspectRatio=width / height)
+        self._camera = Camera(
+            2.0 * math.atan(self._slope * height / width), NEAR_M, aspectRatio=width / height
+        )
+        fine = 0.5 * samples * np.array([width, height])
+        self._lens = np.array([fine[0], fine[1], self._slope / fine[0]])
         self.set_scene(scene)
 
     def set_scene(self, scene: Scene) -> None:
@@ -65,9 +75,18 @@ class PyrenderRenderer:
         import pyrender
 
         world = pyrender.Scene(bg_color=[scene.sky_luminance] * 3 + [1.0])
-        world.add(pyrender.Mesh([_primitive(mesh) for mesh in scene.to_trimesh(self.sections).dump()]))
+        drawing = draw(scene)
+        world.add(pyrender.Mesh([_primitive(drawing)]))
+        self._bodies = scene.obstacles[drawing.order]
+        self._first = np.append(drawing.first, len(drawing.faces))
+        self._renderer.runs = self._first[[0, -1]][None]
         self._node = world.add(self._camera, pose=np.eye(4))
         self._world = world
+        self._textures = (scene.ground_texture, scene.wall_texture, scene.obstacle_texture)
+        textured = not all(texture.plain for texture in self._textures)
+        uniforms = {"lens": self._lens, "sun": scene.sun, "lambert": (scene.ambient, scene.diffuse)}
+        with self._platform.current():
+            self._renderer.use(textured, uniforms | _constants(self._textures), _tiles(self._textures))
 
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
@@ -85,56 +104,43 @@ class PyrenderRenderer:
             (height, width) float32 linear luminance, row 0 on top.
 
         Raises:
-            ValueError: If the pose is not finite, below the ground, or farther than 1000 km.
+            ValueError: If the pose or the time is not finite or too large, or below the ground.
             RuntimeError: If OpenGL fails, or the renderer was closed.
         """
-        check_pose((x_m, y_m, z_m, yaw_rad))
+        check_pose((x_m, y_m, z_m, yaw_rad), t_s)
         if self._renderer is None:
             raise RuntimeError("the renderer is closed; make a new PyrenderRenderer")
         import pyrender
 
         self._world.set_pose(self._node, _camera_pose(x_m, y_m, z_m, yaw_rad))
+        eye_m = np.array([x_m, y_m, z_m])
+        if self.cull_m < math.inf:
+            near = [*(_distances(self._bodies, eye_m) <= self.cull_m), True]  # what is no obstacle always is
+            self._renderer.runs = np.stack([self._first[:-1], self._first[1:]], axis=1)[near]
+        if self._renderer.textured:
+            self._renderer.uniforms = _offsets(self._textures, eye_m, t_s)
         flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.OFFSCREEN
-        with _current(self._platform):
+        with self._platform.current():
             fine = self._renderer.render(self._world, flags)
-        s = self.samples
-        if s == 1:
-            return fine
-        return fine.reshape(self.height, s, self.width, s).mean(axis=(1, 3), dtype=np.float32)
+        return _mean_of_blocks(fine, self.samples)[::-1].copy()
 
     def close(self) -> None:
         """Free the OpenGL context; other renderers are not affected. Closing twice is allowed."""
         if getattr(self, "_renderer", None) is None:
             return
-        with _current(self._platform):
+        with self._platform.current():
             self._renderer.delete()
         self._platform.delete_context()
         self._renderer = None
 
     def __del__(self) -> None:
         """Close."""
-        # Without this, pyrender frees its objects in whatever context is current then.
         with contextlib.suppress(Exception):
             self.close()
 
 
-@contextlib.contextmanager
-def _current(platform: Any) -> Iterator[None]:
-    """Hold the context only while drawing, so that another thread may; OpenGL's errors cannot be pickled."""
-    from OpenGL.error import Error
-
-    try:
-        platform.make_current()
-        try:
-            yield
-        finally:
-            platform.make_uncurrent()
-    except Error as error:
-        raise RuntimeError(f"OpenGL failed: {' '.join(str(error).split())}") from None
-
-
 def _start(width: int, height: int, antialias: bool) -> tuple[Any, Any]:
-    """The EGL platform and pyrender's renderer, with a float framebuffer, or RuntimeError in one line."""
+    """The EGL platform and the renderer, with a float framebuffer, or RuntimeError in one line."""
     os.environ["PYOPENGL_PLATFORM"] = "egl"
     os.environ.setdefault("PYGLET_HEADLESS", "1")
     # llvmpipe's own threads hang a forked child.
@@ -143,98 +149,85 @@ def _start(width: int, height: int, antialias: bool) -> tuple[Any, Any]:
     if not hasattr(np, "infty"):
         np.infty = np.inf  # type: ignore[attr-defined]  # noqa: NPY201
     try:
-        from pyrender.platforms import egl
-        from pyrender.renderer import Renderer
+        from envs.opengl import start
 
-        egl.EGLPlatform.make_uncurrent = _make_uncurrent
-        egl.EGLPlatform.delete_context = _delete_context
-        device = egl.get_device_by_index(int(os.environ.get("EGL_DEVICE_ID", "0")))
-        platform = egl.EGLPlatform(width, height, device=device)
-        platform.init_context()
-        renderer = Renderer(width, height)
-        with _current(platform):
-            _use_float_framebuffer(renderer, antialias)
+        return start(width, height, antialias)
     except Exception as error:  # every missing library fails in its own way: ImportError, AttributeError, ...
         reason = " ".join(str(error).split())[:200]
         cause = f"{type(error).__name__}: {reason}"
         raise RuntimeError(f"pyrender cannot use EGL ({cause}); try: {PACKAGES}") from None
-    return platform, renderer
 
 
-def _make_uncurrent(platform: Any) -> None:
-    from OpenGL import EGL
-
-    if platform._egl_display is not None:
-        EGL.eglMakeCurrent(platform._egl_display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
-
-
-def _delete_context(platform: Any) -> None:
-    """As pyrender's, without eglTerminate: the display is shared, every other renderer would die."""
-    from OpenGL import EGL
-
-    if platform._egl_context is not None:
-        _make_uncurrent(platform)
-        EGL.eglDestroyContext(platform._egl_display, platform._egl_context)
-        platform._egl_context = platform._egl_display = None
+def _distances(bodies: np.ndarray, eye_m: np.ndarray) -> np.ndarray:
+    """(N,) from `eye_m` to the nearest point of each obstacle's upright cylinder or box [m]."""
+    aside = np.stack([bodies["x"], bodies["y"], bodies["z"]], axis=1) - eye_m
+    x, y, z = (np.abs(aside) - np.stack([bodies["rx"], bodies["ry"], bodies["rz"]], axis=1)).T
+    square = np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0))
+    circle = np.maximum(np.hypot(aside[:, 0], aside[:, 1]) - bodies["rx"], 0.0)
+    return np.hypot(np.where(bodies["kind"] == BOX, square, circle), np.maximum(z, 0.0))
 
 
-def _use_float_framebuffer(renderer: Any, antialias: bool) -> None:
-    """Give `renderer` framebuffers of one float channel and its own way of reading them."""
-    size = (renderer.viewport_width, renderer.viewport_height)
-    renderer._main_fb_ms, renderer._main_cb_ms, renderer._main_db_ms = _framebuffer(
-        size, MULTISAMPLES if antialias else 0
-    )
-    renderer._main_fb, renderer._main_cb, renderer._main_db = _framebuffer(size, 0)
-    renderer._main_fb_dims = size
-    renderer._configure_main_framebuffer = lambda: None
-    renderer._read_main_framebuffer = types.MethodType(_read_luminance, renderer)
-
-
-def _framebuffer(size: tuple[int, int], multisamples: int) -> tuple[int, int, int]:
-    """Framebuffer, float colour buffer and depth buffer of `size` (width, height)."""
-    from OpenGL import GL
-
-    color, depth = GL.glGenRenderbuffers(2)
-    frame = GL.glGenFramebuffers(1)
-    GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, frame)
-    for buffer, kind, point in (
-        (color, GL.GL_R32F, GL.GL_COLOR_ATTACHMENT0),
-        (depth, GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT),
-    ):
-        GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
-        GL.glRenderbufferStorageMultisample(GL.GL_RENDERBUFFER, multisamples, kind, *size)
-        GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, point, GL.GL_RENDERBUFFER, buffer)
-    if GL.glCheckFramebufferStatus(GL.GL_FRAMEBUFFER) != GL.GL_FRAMEBUFFER_COMPLETE:
-        raise RuntimeError(f"no float framebuffer of {size} pixels with {multisamples} multisamples")
-    return frame, color, depth
-
-
-def _read_luminance(renderer: Any, _scene: Any, _flags: int) -> np.ndarray:
-    """(H, W) float32, row 0 on top; resolves the multisamples first."""
-    from OpenGL import GL
-
-    width, height = renderer._main_fb_dims
-    box = (0, 0, width, height)
-    GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, renderer._main_fb_ms)
-    GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, renderer._main_fb)
-    GL.glBlitFramebuffer(*box, *box, GL.GL_COLOR_BUFFER_BIT, GL.GL_NEAREST)
-    GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, renderer._main_fb)
-    image = np.empty((height, width), np.float32)
-    GL.glReadPixels(*box, GL.GL_RED, GL.GL_FLOAT, image)
-    return image[::-1].copy()
-
-
-def _primitive(mesh: Any) -> Any:
-    """A trimesh as pyrender's primitive: grey of its `luminance`, or else its own colours."""
+def _primitive(drawing: Drawing) -> Any:
+    """All of a scene as one primitive of pyrender, whose attributes are those of `shaders.VERTEX`."""
     from pyrender import MetallicRoughnessMaterial, Primitive
 
-    if "luminance" in mesh.vertex_attributes:
-        luminance = np.asarray(mesh.vertex_attributes["luminance"], np.float32)[:, None]
-        colors = np.concatenate([np.repeat(luminance, 3, axis=1), np.ones_like(luminance)], axis=1)
-    else:
-        colors = np.asarray(mesh.visual.to_color().vertex_colors, np.float32) / np.float32(255.0)
-    material = MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, alphaMode="OPAQUE")
-    return Primitive(positions=mesh.vertices, indices=mesh.faces, color_0=colors, material=material, mode=4)
+    vertices = drawing.vertices
+    return Primitive(
+        positions=vertices["position"],
+        normals=vertices["ring"],
+        tangents=vertices["quadric"],
+        texcoord_0=vertices["surface"],
+        texcoord_1=vertices["origin"],
+        color_0=vertices["body"],
+        indices=drawing.faces,
+        material=MetallicRoughnessMaterial(alphaMode="OPAQUE"),
+        mode=4,
+    )
+
+
+def _constants(textures: tuple[Texture, ...]) -> dict[str, np.ndarray]:
+    """Uniforms of the textures that stay; the first is that of surfaces without any."""
+    pattern = [0] + [0 if texture.plain else PATTERNS.index(texture.pattern) for texture in textures]
+    scale = [(0.0, 0.0)] + [(1.0 / texture.period_m, texture.contrast) for texture in textures]
+    return {
+        "patterns": np.array(pattern)[:, None],
+        "scales": np.array(scale),
+        "texels": np.array([TILE]),
+        "periods": np.array([TILE_PERIODS]),
+        "tiles": np.array([0]),
+    }
+
+
+def _tiles(textures: tuple[Texture, ...]) -> np.ndarray | None:
+    """The noise of each texture, one above the other; None if there is none."""
+    noisy = [not texture.plain and texture.pattern == "noise" for texture in textures]
+    if not any(noisy):
+        return None
+    empty = np.zeros((TILE, TILE), np.float32)
+    return np.concatenate([noise_tile(t.seed) if n else empty for t, n in zip(textures, noisy, strict=True)])
+
+
+def _offsets(textures: tuple[Texture, ...], eye_m: np.ndarray, t_s: float) -> dict[str, np.ndarray]:
+    """Uniforms of the textures that change; without whole repeats, so that float32 is enough for them."""
+    around, moved = np.zeros((4, 3)), np.zeros((4, 2))
+    for i, texture in enumerate(textures, start=1):
+        around[i] = np.mod(eye_m, repeat_m(texture))
+        moved[i] = np.mod(np.multiply(texture.velocity_mps, t_s), repeat_m(texture))
+    return {"around": around, "moved": moved}
+
+
+def _mean_of_blocks(fine: np.ndarray, size: int) -> np.ndarray:
+    """(H, W) float32 mean over squares of `size` pixels of (H size, W size)."""
+    if size == 1:
+        return fine
+    rows = fine[::size].copy()
+    for i in range(1, size):
+        rows += fine[i::size]
+    total = rows[:, ::size].copy()
+    for j in range(1, size):
+        total += rows[:, j::size]
+    total *= np.float32(1.0 / size**2)
+    return total
 
 
 def _camera_pose(x_m: float, y_m: float, z_m: float, yaw_rad: float) -> np.ndarray:

@@ -1,60 +1,85 @@
-"""Ray caster for poles, walls and ground: exact anti-aliasing, float32 linear luminance.
+"""Ray caster for bodies, walls and ground: exact anti-aliasing, float32 linear luminance.
 
-The camera only yaws, so one image column is one horizontal direction, and all that stands
-on the ground covers an interval of its rows. A column is therefore composed exactly, from
-near to far, in one sweep from its bottom to the horizon. Pixel columns are cut at each
-silhouette; the pixel is the mean over its area (a box filter), exact in v and across
-silhouettes, by the midpoint rule between them.
+The camera only yaws, so one image column is one horizontal direction and every body covers
+an interval of its rows, known in closed form. A column is therefore composed exactly, from
+near to far. Pixel columns are cut at each silhouette; the pixel is the mean over its area (a
+box filter), exact in v, and by a rule of two points per strip in u. Textures are averaged
+over the footprint of each row of a strip.
 
-Rules where geometry leaves a choice: what is seen from behind is invisible (a pole from
-its inside, a wall from within its plane); from above, a pole shows its cap.
+Rules where geometry leaves a choice: what is seen from behind is invisible (a body from its
+inside, a wall from within its plane); bodies do not overlap, though one may float over
+another.
 """
 
 import math
 
 import numpy as np
 
-from envs.columns import Camera, World, render_area, render_points
-from envs.scene import POLE, Scene
+from envs import spans
+from envs.columns import render_area
+from envs.obstacles import BOX, CONE, ELLIPSOID, POLE
+from envs.points import shade_hits, trace_scene
+from envs.scene import Scene
+from envs.textures import NOISE, PATTERNS, around, noise_stack
 
-KINDS = (POLE,)  # what this renderer can draw
+KINDS = (POLE, CONE, ELLIPSOID, BOX)  # what this renderer can draw
 LIMIT_M = 1e6
+LIMIT_S = 1e9
+NO_STACKS = np.zeros(1, np.float32)
 
 
-def make_world(scene: Scene) -> tuple[np.ndarray, World]:
-    """The poles, (N, 6) float64 as `columns.see_poles` reads them, and the numbers of `scene`.
+def check_scene(scene: Scene) -> None:
+    """ValueError if the scene holds a mesh, which only pyrender draws."""
+    if scene.mesh is not None:
+        raise ValueError("raycast draws no meshes, and the scene has one; use pyrender")
 
-    Raises:
-        ValueError: If an obstacle is of a kind that only a mesh can represent.
-    """
-    obstacles = scene.obstacles
-    if not np.isin(obstacles["kind"], KINDS).all():
-        raise ValueError(f"raycast draws kinds {KINDS}, got {set(obstacles['kind'].tolist())}; use pyrender")
-    cap = scene.shade(obstacles["albedo"], (0.0, 0.0, 1.0))
-    top = obstacles["z"] + obstacles["rz"]
-    columns = (obstacles["x"], obstacles["y"], obstacles["rx"], top, obstacles["albedo"], cap)
-    return np.ascontiguousarray(np.stack(columns, axis=1), np.float64), World(
-        half_width=0.5 * scene.width_m,
-        wall_height=float(scene.wall_height_m),
-        walls_near=float(scene.walls_y_m[0]),
-        walls_far=float(scene.walls_y_m[1]),
-        wall_facing_right=float(scene.shade(scene.wall_albedo, (1.0, 0.0, 0.0))),
-        wall_facing_left=float(scene.shade(scene.wall_albedo, (-1.0, 0.0, 0.0))),
-        ground=float(scene.shade(scene.ground_albedo, (0.0, 0.0, 1.0))),
-        sky=float(scene.sky_luminance),
-        ambient=float(scene.ambient),
-        diffuse=float(scene.diffuse),
-        sun_x=float(scene.sun[0]),
-        sun_y=float(scene.sun[1]),
+
+def make_bodies(scene: Scene) -> np.ndarray:
+    """(M, 9) float64 what stands above the ground of the obstacles, as `envs.bodies` reads them."""
+    o = scene.obstacles[scene.obstacles["z"] + scene.obstacles["rz"] > 0.0]
+    turns = [around(scene.obstacle_texture, radius) for radius in o["rx"].tolist()]
+    bottom, top, radius = o["z"] - o["rz"], o["z"] + o["rz"], o["rx"].copy()
+    sunk = (bottom < 0.0) & (o["kind"] != ELLIPSOID)
+    cut = sunk & (o["kind"] == CONE)
+    radius[cut] *= (top / (top - bottom))[cut]
+    bottom[sunk] = 0.0
+    columns = (o["kind"], o["x"], o["y"], bottom, top, radius, o["ry"], o["albedo"], turns)
+    return np.ascontiguousarray(np.stack(columns, axis=1), np.float64)
+
+
+def make_textures(scene: Scene) -> tuple[list[float], np.ndarray]:
+    """The textures of ground, walls and obstacles, six numbers each, and the stacks of the noisy ones."""
+    numbers: list[float] = []
+    stacks: list[np.ndarray] = []
+    for texture in (scene.ground_texture, scene.wall_texture, scene.obstacle_texture):
+        contrast = 0.0 if texture.plain else texture.contrast
+        kind = PATTERNS.index(texture.pattern)
+        numbers += [kind, 1.0 / texture.period_m, contrast, *texture.velocity_mps, len(stacks)]
+        if kind == NOISE and not texture.plain:
+            stacks.append(noise_stack(texture.seed).ravel())
+    return numbers, np.concatenate(stacks) if stacks else NO_STACKS
+
+
+def make_view(scene: Scene, textures: list[float]) -> np.ndarray:
+    """(VIEW,) float64 what the kernels need of the scene; a frame fills in the rest."""
+    view = np.zeros(spans.VIEW)
+    faces = ((0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
+    tops = (scene.obstacles["z"] + scene.obstacles["rz"]).tolist()
+    view[spans.SKY : spans.SUN_Z + 1] = (
+        scene.sky_luminance,
+        float(scene.shade(scene.ground_albedo, faces[0])),
+        max([scene.wall_height_m, *tops]),
+        0.5 * scene.width_m,
+        scene.wall_height_m,
+        *scene.walls_y_m,
+        scene.wall_albedo,
+        scene.ambient,
+        scene.diffuse,
+        *scene.sun,
     )
-
-
-def make_camera(pose: tuple[float, float, float, float], width: int, height: int, fov_deg: float) -> Camera:
-    """Camera at `pose` (x, y, z [m], yaw [rad]) with `fov_deg` across `width` square pixels."""
-    check_pose(pose)
-    x, y, z, yaw = pose
-    focal = 0.5 * width / math.tan(0.5 * math.radians(fov_deg))
-    return Camera(float(x), float(y), float(z), math.cos(yaw), math.sin(yaw), width, height, focal)
+    view[spans.LIT_UP : spans.GROUND] = scene.shade(np.ones(6), np.array(faces, np.float64))
+    view[spans.GROUND :] = textures
+    return view
 
 
 def check_image(width: int, height: int, fov_deg: float, samples: int) -> None:
@@ -66,34 +91,60 @@ def check_image(width: int, height: int, fov_deg: float, samples: int) -> None:
         )
 
 
-def check_pose(pose: tuple[float, float, float, float]) -> None:
+def check_pose(pose: tuple[float, float, float, float], t_s: float = 0.0) -> None:
     """ValueError unless `pose` (x, y, z [m], yaw [rad]) is finite, above ground and within 1000 km."""
     x, y, z, yaw = pose
     if not (max(abs(x), abs(y), abs(z)) <= LIMIT_M and z >= 0.0 and math.isfinite(yaw)):
         raise ValueError(f"pose (x, y, z, yaw) must be finite, z >= 0 and within {LIMIT_M:g} m, got {pose}")
+    if not abs(t_s) <= LIMIT_S:
+        raise ValueError(f"t_s must be within +-{LIMIT_S:g} s; got {t_s!r}.")
+
+
+def focal_length(width: int, fov_deg: float) -> float:
+    """Focal length [pixels] of `width` square pixels that `fov_deg` spans."""
+    return 0.5 * width / math.tan(0.5 * math.radians(fov_deg))
 
 
 class RaycastRenderer:
     """Renders one scene after the other; holds no state but the scene and the image's geometry."""
 
     def __init__(
-        self, scene: Scene, width: int, height: int, fov_deg: float = 90.0, samples: int = 2
+        self,
+        scene: Scene,
+        width: int,
+        height: int,
+        fov_deg: float = 90.0,
+        samples: int = 1,
+        cull_m: float = math.inf,
     ) -> None:
         """Renderer of `width` x `height` square pixels with a horizontal field of view of `fov_deg`.
 
-        Pixel columns are cut into `samples` sub-columns, besides the cuts at silhouettes.
+        Args:
+            scene: What to draw.
+            width: Columns of the image.
+            height: Rows of the image.
+            fov_deg: Horizontal field of view [degrees].
+            samples: Strips into which each column of pixels is cut, besides the cuts at
+                silhouettes.
+            cull_m: Bodies whose nearest point is farther than this are not drawn [m].
 
         Raises:
-            ValueError: If a size is not at least 1, fov_deg not in [1, 170], or the scene
-                holds a kind this renderer cannot draw.
+            ValueError: If a size is not at least 1, fov_deg not in [1, 170], cull_m not
+                positive, or the scene holds what this renderer cannot draw.
         """
         check_image(width, height, fov_deg, samples)
+        if not cull_m > 0.0:
+            raise ValueError(f"cull_m must be > 0 m (inf: draw all); got {cull_m!r}.")
         self.width, self.height, self.fov_deg, self.samples = width, height, fov_deg, samples
+        self.cull_m = float(cull_m)
         self.set_scene(scene)
 
     def set_scene(self, scene: Scene) -> None:
-        """Draw `scene` from now on. Raises ValueError if it holds a kind this renderer cannot draw."""
-        self._poles, self._world = make_world(scene)
+        """Draw `scene` from now on. Raises ValueError if it holds what this renderer cannot draw."""
+        check_scene(scene)
+        textures, stacks = make_textures(scene)
+        self._scene, self._view = (make_bodies(scene), stacks), make_view(scene, textures)
+        self._focal = focal_length(self.width, self.fov_deg)
 
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
@@ -105,16 +156,20 @@ class RaycastRenderer:
             y_m: Position forward [m].
             z_m: Height above the ground [m], >= 0.
             yaw_rad: Heading, 0 along +y, counter-clockwise seen from above [rad].
-            t_s: Time [s]; a still scene does not depend on it.
+            t_s: Time [s], which moves the textures; finite.
 
         Returns:
             (height, width) float32 linear luminance, row 0 on top.
 
         Raises:
-            ValueError: If the pose is not finite, below the ground, or farther than 1000 km.
+            ValueError: If the pose or time is not finite, or the pose below the ground or
+                farther than 1000 km.
         """
-        camera = make_camera((x_m, y_m, z_m, yaw_rad), self.width, self.height, self.fov_deg)
-        return render_area(self._poles, self._world, camera, self.samples)
+        check_pose((x_m, y_m, z_m, yaw_rad), t_s)
+        pose = (float(x_m), float(y_m), float(z_m), float(yaw_rad), float(t_s))
+        image = np.empty((self.height, self.width), np.float32)
+        render_area(self._scene, self._view, pose, self._focal, image, self.samples, self.cull_m)
+        return image
 
 
 def sample_luminance(
@@ -124,12 +179,17 @@ def sample_luminance(
     height: int,
     fov_deg: float = 90.0,
     samples: int = 1,
+    t_s: float = 0.0,
 ) -> np.ndarray:
     """Mean of samples x samples point samples per pixel, without anti-aliasing; 1: pixel centres.
 
     Args and result as for `RaycastRenderer.render`, with `pose` = (x, y, z [m], yaw [rad]).
-    What any rasteriser computes at the same points, and the limit the exact image must agree with.
+    What any rasteriser computes at the same points, and the limit the exact image must agree
+    with; each ray is intersected with each body, by code that shares nothing with it.
     """
-    camera = make_camera(pose, width * samples, height * samples, fov_deg)
-    points = render_points(*make_world(scene), camera).astype(np.float64)
+    check_image(width, height, fov_deg, samples)
+    check_pose(pose, t_s)
+    check_scene(scene)
+    focal = focal_length(width * samples, fov_deg)
+    points = shade_hits(scene, trace_scene(scene, pose, width * samples, height * samples, focal), t_s)
     return points.reshape(height, samples, width, samples).mean(axis=(1, 3)).astype(np.float32)

@@ -1,17 +1,17 @@
+import dataclasses
+import gc
 import pickle
-import subprocess
-import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from envs.obstacles import KINDS, OBSTACLE
 from envs.rasterize import PyrenderRenderer
-from envs.raycast import RaycastRenderer, sample_luminance
+from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
+from envs.textures import Texture
 
-ROOT = Path(__file__).resolve().parents[1]
 POSES = [
     (0, 0, 2, 0),
     (5, 20, 2, 0.4),
@@ -44,33 +44,6 @@ def make(scene):
         renderer.close()
 
 
-def differences(renderer: PyrenderRenderer, name: str) -> np.ndarray:
-    """Mean difference of the renderers over each of 210 pictures, 7 poses in 30 scenes."""
-    means = []
-    for seed in range(30):
-        world = make_scene(name, np.random.default_rng(seed))
-        renderer.set_scene(world)
-        for pose in POSES:
-            points = sample_luminance(world, pose, 64, 64)
-            means.append(np.abs(renderer.render(*pose) - points).mean())
-    return np.array(means)
-
-
-# A few columns make the mean, where an upright edge lies on the other side of a sample point;
-# more sections do not remove them (a rasteriser snaps vertices to a sub-pixel grid), and
-# poles_eval has twice the poles, so twice the edges.
-@pytest.mark.parametrize(("name", "mean"), [("poles", 2e-4), ("poles_eval", 3e-4)])
-def test_both_renderers_are_the_same_picture_at_equal_sample_points(make, name, mean):
-    found = differences(make(samples=1), name)
-    assert found.mean() < mean
-    assert np.median(found) < 6e-5
-    assert (found < 2e-4).mean() > 0.8
-
-
-def test_with_more_sections_the_pictures_become_one(make):
-    assert np.median(differences(make(samples=1, sections=256), "poles")) < 1e-6
-
-
 def test_anti_aliasing_comes_closer_to_the_exact_picture(make, scene):
     exact = RaycastRenderer(scene, 64, 64)
     centres, smooth = make(samples=1), make()
@@ -88,6 +61,52 @@ def test_the_image_is_linear_float_and_finer_than_eight_bits(make, scene):
     assert image[0, 32] == np.float32(scene.sky_luminance)
     assert image[-1, 32] == pytest.approx(float(scene.shade(scene.ground_albedo, (0, 0, 1))), abs=1e-6)
     assert np.abs(image * 255 - np.rint(image * 255)).max() > 0.1
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_every_pixel_lies_between_the_darkest_and_the_brightest_surface(make, samples):
+    rng = np.random.default_rng(7)
+    found = np.zeros(24, OBSTACLE)
+    found["kind"] = np.arange(24) % len(KINDS)
+    found["x"], found["y"] = (np.arange(24) % 4) * 6.0 - 9.0, (np.arange(24) // 4) * 12.0 + 8.0
+    found["rx"] = found["ry"] = rng.uniform(0.05, 2.0, 24)
+    found["rz"], found["albedo"] = rng.uniform(0.05, 3.0, 24), 0.4
+    found["z"] = found["rz"] + rng.uniform(0.0, 3.0, 24) * (np.arange(24) % 3 > 0)
+    looks = {
+        key: Texture("noise", 1.0, 0.25) for key in ("ground_texture", "wall_texture", "obstacle_texture")
+    }
+    world = Scene(name="test", obstacles=found, **looks)
+    darkest, brightest = 0.4 * 0.75 * world.ambient, 0.8 * 1.25
+    renderer = make(scene=world, samples=samples)
+    for _ in range(60):
+        body = found[rng.integers(24)]
+        at = [body[k] + rng.choice([0.0, 1e-6, 1e-3, 1.0, 3.0]) * rng.normal() for k in ("x", "y", "z")]
+        image = renderer.render(at[0], at[1], abs(at[2]), rng.uniform(-10, 10), rng.uniform(-5, 5))
+        assert np.isfinite(image).all()
+        assert darkest - 1e-5 <= image.min() <= image.max() <= brightest + 1e-5
+
+
+def test_a_bad_pose_is_refused_and_leaves_the_renderer_working(make):
+    renderer = make()
+    before = renderer.render(0, 10, 2)
+    for bad in ((np.nan, 0, 2), (0, 0, -0.1), (0, 2e6, 2), (0, 0, 2, np.inf)):
+        with pytest.raises(ValueError, match="pose"):
+            renderer.render(*bad)
+    with pytest.raises(ValueError, match="t_s"):
+        renderer.render(0, 10, 2, 0, np.nan)
+    np.testing.assert_array_equal(renderer.render(0, 10, 2), before)
+
+
+def test_an_image_too_large_for_opengl_is_one_line(make, scene):
+    make()
+    with pytest.raises(RuntimeError, match="OpenGL failed") as caught:
+        PyrenderRenderer(scene, 100_000, 4)
+    assert "\n" not in str(caught.value)
+
+
+def test_pyrender_knows_the_bounds_of_what_it_draws(make):
+    low, high = make()._world.bounds  # fails where numpy has no `infty`
+    assert (low < high).all()
 
 
 def test_rendering_twice_gives_the_same_bytes(make):
@@ -111,6 +130,17 @@ def test_the_end_of_one_renderer_leaves_the_others_working(make, scene, end):
     assert np.array_equal(make().render(1, 10, 2), before)
 
 
+def test_a_renderer_collected_while_another_draws_takes_nothing_from_it(make):
+    keep = make()
+    before = keep.render(1, 10, 2)
+    other = make()
+    other._platform.delete_context()
+    with keep._platform.current():
+        other._renderer = None
+        gc.collect()
+    np.testing.assert_array_equal(keep.render(1, 10, 2), before)
+
+
 def test_threads_render_with_their_own_renderer_and_with_one_made_elsewhere(make, scene):
     shared = make()
     expected = shared.render(0, 20, 2)
@@ -130,6 +160,30 @@ def test_threads_render_with_their_own_renderer_and_with_one_made_elsewhere(make
     assert np.array_equal(results["shared"], expected)
 
 
+def test_textured_and_plain_scenes_share_a_renderer_and_two_renderers_a_scene(make, scene):
+    plain, waves = Texture(), Texture("noise", 2.0, 0.5, (1.0, 0.0))
+    worlds = [dataclasses.replace(scene, ground_texture=look) for look in (plain, waves)]
+    fresh = [make(scene=world).render(0, 10, 2, 0, 0.3) for world in worlds]
+    assert np.abs(fresh[0] - fresh[1]).mean() > 0.01
+    one, two = make(), make()
+    for _ in range(2):
+        for world, expected in zip(worlds, fresh, strict=True):
+            for renderer in (one, two):
+                renderer.set_scene(world)
+            for renderer in (one, two):
+                np.testing.assert_array_equal(renderer.render(0, 10, 2, 0, 0.3), expected)
+    one.close()
+    np.testing.assert_array_equal(two.render(0, 10, 2, 0, 0.3), fresh[1])
+
+
+def test_a_renderer_after_many_others_works(scene, make):
+    expected = make().render(0, 10, 2)
+    for _ in range(30):
+        other = PyrenderRenderer(scene, 64, 64)
+        np.testing.assert_array_equal(other.render(0, 10, 2), expected)
+        other.close()
+
+
 def test_scenes_follow_each_other_and_none_is_left_behind(make):
     worlds = [make_scene("poles", np.random.default_rng(seed)) for seed in range(3)]
     renderer = make()
@@ -138,13 +192,6 @@ def test_scenes_follow_each_other_and_none_is_left_behind(make):
         for world, expected in zip(worlds, fresh, strict=True):
             renderer.set_scene(world)
             assert np.array_equal(renderer.render(0, 10, 2), expected)
-
-
-def test_a_pole_is_invisible_from_its_inside_in_both_renderers(make, scene):
-    pole = scene.obstacles[0]
-    pose = (pole["x"], pole["y"], 2.0, 0.0)
-    difference = np.abs(make(samples=1).render(*pose) - sample_luminance(scene, pose, 64, 64))
-    assert (difference > 0.02).mean() < 1e-2
 
 
 def test_a_failure_of_opengl_can_be_pickled(make):
@@ -162,42 +209,26 @@ def _raise_gl_error() -> None:
     raise GLError(12290, "bad access", baseOperation=None)
 
 
-def run_python(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-
-
-def test_importing_the_renderer_loads_no_opengl():
-    heavy = "('OpenGL', 'pyrender', 'trimesh')"
-    code = f"import sys, envs.rasterize; sys.exit(any(m in sys.modules for m in {heavy}))"
-    assert run_python(code).returncode == 0
-
-
-@pytest.mark.parametrize("library", ["EGL", "GL"])
-def test_a_missing_system_library_is_one_line_that_names_the_packages(library):
-    code = f"""
-import ctypes, ctypes.util
-import numpy as np
-load, find = ctypes.CDLL.__init__, ctypes.util.find_library
-def blocked(self, name, *args, **keywords):
-    if name and str(name).split('/')[-1].split('.')[0] in ('{library}', 'lib{library}'):
-        raise OSError(f'{{name}}: cannot open shared object file: No such file or directory')
-    load(self, name, *args, **keywords)
-ctypes.CDLL.__init__ = blocked
-from envs.rasterize import PyrenderRenderer
-from envs.scene import make_scene
-try:
-    PyrenderRenderer(make_scene('poles', np.random.default_rng(0)), 8, 8)
-except RuntimeError as error:
-    print(error)
-"""
-    result = run_python(code)
-    assert "apt-get install --no-install-recommends libegl1 libgl1 libgl1-mesa-dri" in result.stdout, (
-        result.stderr
-    )
-    assert len(result.stdout.strip().splitlines()) == 1
+LOOKS = {
+    "plain": {},
+    "moving checkers": {
+        "ground_texture": Texture("checker", 2.0, 0.5, (1.0, 0.5)),
+        "wall_texture": Texture("checker", 1.5, 0.25, (0.5, 0.0)),
+        "obstacle_texture": Texture("checker", 0.5, 0.5, (1.0, 0.0)),
+    },
+    "moving noise": {
+        key: Texture("noise", 1.5, 0.25, (1.0, 0.5))
+        for key in ("ground_texture", "wall_texture", "obstacle_texture")
+    },
+}
 
 
 @pytest.mark.benchmark
+@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("kind", range(len(KINDS)), ids=KINDS)
 @pytest.mark.parametrize("samples", [1, 2])
-def test_a_frame_takes_milliseconds(benchmark, make, samples):
-    benchmark(make(samples=samples).render, 0.3, 20.0, 2.0)
+def test_a_frame_of_forty_bodies_takes_milliseconds(benchmark, make, scene, kind, look, samples):
+    found = scene.obstacles.copy()
+    found["kind"] = kind
+    world = dataclasses.replace(scene, obstacles=found, **LOOKS[look])
+    benchmark(make(scene=world, samples=samples).render, 0.3, 20.0, 2.0, 0.05, 0.1)

@@ -59,13 +59,13 @@ def test_every_pose_gives_a_finite_picture_within_the_scenes_luminances():
 )
 def test_the_exact_picture_is_the_mean_of_many_point_samples(pose):
     scene = make_scene("poles", np.random.default_rng(3))
-    few, many = (sample_luminance(scene, pose, 16, 16, samples=n) for n in (8, 300))
+    few, many = (sample_luminance(scene, pose, 16, 16, samples=n) for n in (8, 96))
     two, eight = (RaycastRenderer(scene, 16, 16, samples=n).render(*pose) for n in (2, 8))
-    # What is left at 300 x 300 points is their own error at upright edges, 1 / 600 pixel.
-    assert np.abs(two - many).mean() < 1e-3
-    assert np.abs(eight - many).mean() < 3e-4
-    assert np.abs(eight - many).max() < 0.006
-    assert np.abs(eight - many).mean() < 0.2 * np.abs(few - many).mean()
+    # What is left at 96 x 96 points is their own error at upright edges, 1 / 192 pixel.
+    assert np.abs(two - many).mean() < 1.2e-3
+    assert np.abs(eight - many).mean() < 1e-3
+    assert np.abs(eight - many).max() < 0.015
+    assert np.abs(eight - many).mean() < 0.25 * np.abs(few - many).mean()
 
 
 def test_more_sub_columns_converge():
@@ -173,11 +173,20 @@ def test_a_pose_that_cannot_be_is_refused(pose):
         renderer.render(*pose)
 
 
-def test_a_kind_or_an_image_that_cannot_be_drawn_is_refused():
-    other = poles((0.0, 10.0, 0.5, 8.0))
-    other["kind"] = 9
+def test_a_scene_or_an_image_that_cannot_be_drawn_is_refused():
+    triangle = (
+        np.array([[0.0, 5.0, 0.0], [1.0, 5.0, 0.0], [0.0, 5.0, 1.0]]),
+        np.array([[0, 1, 2]]),
+        np.ones(3),
+    )
     with pytest.raises(ValueError, match="pyrender"):
-        RaycastRenderer(Scene("hand", other), 8, 8)
+        RaycastRenderer(Scene("hand", poles(), mesh=triangle), 8, 8)
+    with pytest.raises(ValueError, match="pyrender"):
+        sample_luminance(Scene("hand", poles(), mesh=triangle), (0, 0, 2, 0), 8, 8)
+    with pytest.raises(ValueError, match="cull_m"):
+        RaycastRenderer(Scene("hand", poles()), 8, 8, cull_m=math.nan)
+    with pytest.raises(ValueError, match="t_s"):
+        RaycastRenderer(Scene("hand", poles()), 8, 8).render(0, 0, 2, t_s=math.inf)
     with pytest.raises(ValueError, match="fov_deg"):
         RaycastRenderer(Scene("hand", poles()), 8, 8, fov_deg=180.0)
 

@@ -1,0 +1,158 @@
+"""Textures: patterns on surfaces, at a point and averaged over a rectangle, still or moving.
+
+A texture multiplies the albedo of its surface by 1 + contrast * P(s - vs t, q - vq t), where
+P is the pattern, in [-1, 1], and (s, q) are surface coordinates in metres:
+
+- ground, caps and level faces of boxes: (x, y)
+- walls and the sides of boxes that face x: (y, z); those that face y: (x, z)
+- poles, cones and ellipsoids: (x0 + k * azimuth, y0 + z), with the azimuth
+  atan2(y - y0, x - x0) around their axis (x0, y0), and k such that a whole number of
+  periods (of tiles, for noise) closest to the circumference goes around
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+PLAIN, CHECKER, STRIPES, RINGS, NOISE = range(5)
+PATTERNS = ("plain", "checker", "stripes", "rings", "noise")
+TILE_PERIODS = 4  # the noise repeats after so many periods along both axes
+TILE = 256  # texels of the noise along either axis of its tile
+STACK_TEXELS, LEVELS = 128, 9  # texels along either axis, and number, of its filtered tiles
+
+
+@dataclass(frozen=True)
+class Texture:
+    """One pattern.
+
+    Attributes:
+        pattern: "plain": 0. "checker": +-1 in squares of half a period. "stripes": +-1 along
+            s. "rings": +-1 along q. "noise": a sum of waves between 1 and 2 periods long.
+        period_m: Length of one period along either axis [m].
+        contrast: Depth of the pattern, in [0, 1].
+        velocity_mps: How fast the pattern moves along s and q [m/s].
+        seed: Of the noise.
+    """
+
+    pattern: str = "plain"
+    period_m: float = 1.0
+    contrast: float = 0.0
+    velocity_mps: tuple[float, float] = (0.0, 0.0)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the values; ValueError names the one that is refused."""
+        if self.pattern not in PATTERNS:
+            raise ValueError(f"texture pattern must be one of {PATTERNS}; got {self.pattern!r}.")
+        if not 1e-3 <= self.period_m <= 1e4:
+            raise ValueError(f"texture period_m must be in [0.001, 10000] m; got {self.period_m!r}.")
+        if not 0.0 <= self.contrast <= 1.0:
+            raise ValueError(f"texture contrast must be in [0, 1]; got {self.contrast!r}.")
+        if not (len(self.velocity_mps) == 2 and all(abs(v) <= 1e4 for v in self.velocity_mps)):
+            raise ValueError(
+                f"texture velocity_mps must be two numbers within +-10000 m/s; got {self.velocity_mps!r}."
+            )
+        if not (isinstance(self.seed, int) and self.seed >= 0):
+            raise ValueError(f"texture seed must be a whole number >= 0; got {self.seed!r}.")
+
+    @property
+    def plain(self) -> bool:
+        """Whether the surface looks the same everywhere."""
+        return self.pattern == "plain" or self.contrast == 0.0
+
+    @property
+    def moving(self) -> bool:
+        """Whether the surface changes with time."""
+        return not self.plain and self.velocity_mps != (0.0, 0.0)
+
+
+def around(texture: Texture, radius_m: float) -> float:
+    """Metres of surface coordinate per radian around a round body, so that the pattern closes.
+
+    Args:
+        texture: What goes around.
+        radius_m: Largest radius of the body [m].
+    """
+    repeat = texture.period_m * (TILE_PERIODS if texture.pattern == "noise" else 1)
+    return max(1, round(2.0 * math.pi * radius_m / repeat)) * repeat / (2.0 * math.pi)
+
+
+@functools.cache
+def noise_waves(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The waves whose sum is the noise: cycles per tile along (s, q), (M, 2), and complex amplitudes (M,).
+
+    P(s, q) = Re sum of amplitude * exp(2 pi i (a s + b q)), s and q in tiles. All waves of a
+    half-plane between TILE_PERIODS / 2 and TILE_PERIODS cycles long, equally strong, with
+    random phases; the largest |P| among the texels is 1.
+    """
+    span = range(-TILE_PERIODS, TILE_PERIODS + 1)
+    half = [(a, b) for a in span for b in span if a > 0 or (a == 0 and b > 0)]
+    cycles = np.array([k for k in half if TILE_PERIODS / 2 <= math.hypot(*k) <= TILE_PERIODS])
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi, len(cycles))
+    amplitudes = np.exp(1j * phases)
+    amplitudes /= np.abs(_sum_waves(cycles, amplitudes, TILE)).max()
+    return cycles, amplitudes
+
+
+def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndarray:
+    """(size, size) float64 the sum of the waves at the texels, q along rows and s along columns."""
+    turns = 2j * math.pi / size * np.arange(size)
+    along_s, along_q = np.exp(np.outer(turns, cycles[:, 0])), np.exp(np.outer(turns, cycles[:, 1]))
+    return ((along_q * amplitudes) @ along_s.T).real
+
+
+@functools.cache
+def noise_stack(seed: int) -> np.ndarray:
+    """(LEVELS, STACK_TEXELS, STACK_TEXELS) float32, the mean over squares 0, 1/16, .. 1/2 tile wide."""
+    cycles, amplitudes = noise_waves(seed)
+    levels = [
+        _sum_waves(cycles, amplitudes * np.sinc(cycles * wide).prod(axis=1), STACK_TEXELS)
+        for wide in np.linspace(0.0, 0.5, LEVELS)
+    ]
+    stack = np.stack(levels).astype(np.float32)
+    stack.flags.writeable = False
+    return stack
+
+
+@functools.cache
+def noise_tile(seed: int) -> np.ndarray:
+    """One period of the noise, (TILE, TILE) float32, read-only: tile[j, i] is P at texel s = i, q = j."""
+    tile = _sum_waves(*noise_waves(seed), TILE).astype(np.float32)
+    tile.flags.writeable = False
+    return tile
+
+
+def pattern_points(texture: Texture, s_m: np.ndarray, q_m: np.ndarray, t_s: float = 0.0) -> np.ndarray:
+    """The pattern P at points of a surface, not filtered.
+
+    Args:
+        texture: What pattern, how long and how fast.
+        s_m: Surface coordinates [m], any shape.
+        q_m: The other surface coordinates [m], of the same shape.
+        t_s: Time [s].
+
+    Returns:
+        float64 in [-1, 1], of the same shape. A checker is +1 in the cell of the origin; the
+        noise is bilinear between the texels of `noise_tile`.
+    """
+    s = (np.asarray(s_m, np.float64) - texture.velocity_mps[0] * t_s) / texture.period_m
+    q = (np.asarray(q_m, np.float64) - texture.velocity_mps[1] * t_s) / texture.period_m
+    if texture.pattern == "noise":
+        return _bilinear(noise_tile(texture.seed), s * (TILE / TILE_PERIODS), q * (TILE / TILE_PERIODS))
+    along_s = 1.0 - 2.0 * (np.floor(2.0 * s) % 2.0)
+    along_q = 1.0 - 2.0 * (np.floor(2.0 * q) % 2.0)
+    signs = {"checker": along_s * along_q, "stripes": along_s, "rings": along_q}
+    return signs.get(texture.pattern, np.zeros(np.broadcast(s, q).shape))
+
+
+def _bilinear(tile: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Periodic bilinear interpolation of `tile` at `column`, `row` [texels]."""
+    left, top = np.floor(column), np.floor(row)
+    across, down = column - left, row - top
+    i, j = (left % TILE).astype(np.int64), (top % TILE).astype(np.int64)
+    right, below = (i + 1) % TILE, (j + 1) % TILE
+    upper = tile[j, i] * (1.0 - across) + tile[j, right] * across
+    lower = tile[below, i] * (1.0 - across) + tile[below, right] * across
+    return upper * (1.0 - down) + lower * down
