@@ -62,8 +62,9 @@ lint: setup ## style, format, types, and who imports whom
 
 check: lint test ## what must pass before a change is merged
 
-bench: setup ## measure the speed of the parts
+bench: setup ## measure the speed of the parts, and what the simulator's accuracy costs
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
+	$(LAUNCH) +exp=trade_simulator $(ARGS)
 
 docs: setup ## the guide and the API as web pages in docs/_build
 	$(BIN)/python -m sphinx -q -b html docs docs/_build

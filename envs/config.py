@@ -10,13 +10,25 @@ import hashlib
 import json
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+def _number_or_truth(value: Any) -> float | bool:
+    """One rule and one message, where a union of types would give two."""
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, int | float) or not abs(value) <= 1e300:
+        raise ValueError(f"must be a finite number, true or false, got {value!r}")
+    return float(value)
+
+
+Value = Annotated[float | bool, PlainValidator(_number_or_truth)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -31,10 +43,24 @@ class CameraConfig:
         contrast_threshold_off: Log-intensity step of OFF events; None: as for ON.
         memory: "reference": each pixel remembers the level of its last event, as a real
             sensor does. "frame": the paper's difference of two frames (equations 5-8),
-            which forgets what stayed below the threshold.
-        luminance_floor: Added to luminance before the logarithm, so that black is defined.
-        max_events_per_pixel: Most events of one pixel between two renders; the excess is
-            dropped, the reference moves on, and the number dropped is reported.
+            which forgets what stayed below the threshold. "legacy": the paper's published
+            code, see `envs.events`.
+        luminance_floor: Added to luminance before the logarithm, so that black is defined;
+            with response "lin_log" the luminance below which a pixel responds linearly.
+        max_events_per_pixel: Most events of one pixel between two renders, the earliest.
+        response: "log": log(luminance + floor). "lin_log": log(luminance) from the floor
+            upwards, and below it its tangent, as photoreceptors in the dark.
+        excess: What becomes of events beyond the most. "drop": the reference moves on past
+            them and their number is reported. "carry": they fire in later frames.
+        threshold_mismatch: Standard deviation of the pixels' thresholds as a share of the
+            threshold; fixed for each pixel, ON and OFF apart, at least a tenth of the
+            nominal. Real sensors: about 0.03.
+        threshold_seed: Which sensor of its kind: seed of the pixels' thresholds.
+        refractory_us: Dead time of a pixel after an event [us]; at its end the pixel takes
+            the level of that moment as its reference.
+        encoding: What the luminance, white = 1, goes through before the response.
+            "linear32": nothing. "linear8": clipped to [0, 1] and rounded to 8 bits.
+            "gamma8": the same on a scale of gamma 2.2, decoded again.
     """
 
     width: Annotated[int, Field(ge=1, le=4096)] = 64
@@ -42,14 +68,35 @@ class CameraConfig:
     fov_deg: Annotated[float, Field(ge=1, le=170)] = 90.0
     contrast_threshold: Annotated[float, Field(ge=1e-6, le=10)] = 0.2
     contrast_threshold_off: Annotated[float, Field(ge=1e-6, le=10)] | None = None
-    memory: Literal["reference", "frame"] = "reference"
+    memory: Literal["reference", "frame", "legacy"] = "reference"
     luminance_floor: Annotated[float, Field(ge=1e-9, le=1)] = 1e-3
     max_events_per_pixel: Annotated[int, Field(ge=1, le=100_000)] = 100
+    response: Literal["log", "lin_log"] = "log"
+    threshold_mismatch: Fraction = 0.0
+    threshold_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    refractory_us: Annotated[int, Field(ge=0, le=10**9)] = 0
+    excess: Literal["drop", "carry"] = "drop"
+    encoding: Literal["linear32", "linear8", "gamma8"] = "linear32"
+
+    @field_validator("refractory_us")
+    @classmethod
+    def _dead_time_needs_memory(cls, value: int, info: ValidationInfo) -> int:
+        if value > 0 and info.data.get("memory", "reference") != "reference":
+            raise ValueError(f"needs memory 'reference' or must be 0, got {value}")
+        return value
+
+    @field_validator("excess")
+    @classmethod
+    def _carrying_needs_memory(cls, value: str, info: ValidationInfo) -> str:
+        forgets = info.data.get("memory", "reference") != "reference" or info.data.get("refractory_us", 0) > 0
+        if value == "carry" and forgets:
+            raise ValueError("'carry' needs memory 'reference' and refractory_us 0; use 'drop'")
+        return value
 
 
 @dataclass(frozen=True, config=STRICT)
 class FaultsConfig:
-    """What a real sensor does wrong, fixed or drawn anew for each episode.
+    """What a real sensor does wrong. Which pixels are dead or hot is drawn once per episode.
 
     Attributes:
         sparsity: Fraction of pixels that are dead for the whole episode.
@@ -57,25 +104,41 @@ class FaultsConfig:
             (appendix D.3); 0.1 adds one false event to ten true ones on average.
         background_activity_hz: Events without cause per pixel and second, as a real
             sensor makes them, also in a still scene.
+        event_dropout: Probability that a true event is lost, each on its own.
+        shot_noise_hz: Events without cause per pixel and second in black, as photons arrive
+            unevenly; a quarter of that at white, on a straight line between (v2e).
+        leak_hz: ON events per pixel and second from leakage: regular, with a phase of its
+            own for each pixel.
+        hot_pixel_share: Fraction of pixels that are hot for the whole episode.
+        hot_pixel_hz: Events per second of a hot pixel.
     """
 
     sparsity: Fraction = 0.0
     background_activity: Annotated[float, Field(ge=0, le=100)] = 0.0
     background_activity_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    event_dropout: Fraction = 0.0
+    shot_noise_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    leak_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    hot_pixel_share: Fraction = 0.0
+    hot_pixel_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
-class RendererConfig:
-    """How the scene becomes luminance.
+class FidelityConfig:
+    """How exact the events have to be; `envs.fidelity.plan` chooses the cheapest way to that.
 
     Attributes:
-        name: "raycast", "pyrender", or "auto": the cheapest that can draw the scene.
-        max_step_m: Longest way flown between two renders [m]; a longer control step is
-            rendered in equal parts, so that events do not depend on the control rate.
+        tolerance: Accepted share of events that differ from the converged ones in pixel,
+            polarity or by more than 5 % of a control step in time, see `envs.accuracy`.
+        max_step_m: Longest way flown between two renders [m]; None: chosen.
+        samples: Anti-aliasing of the renderer; None: chosen.
+        cull_m: Obstacles farther than this are not drawn [m]; None: chosen.
     """
 
-    name: Literal["auto", "raycast", "pyrender"] = "auto"
-    max_step_m: Positive = 0.1
+    tolerance: Annotated[float, Field(ge=1e-3, le=1)] = 0.05
+    max_step_m: Positive | None = None
+    samples: Annotated[int, Field(ge=1, le=64)] | None = None
+    cull_m: Positive | None = None
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -83,8 +146,9 @@ class EnvConfig:
     """A corridor flight: the world, the vehicle, the sensor and the observation.
 
     Attributes:
-        scene: Name of a layout in `envs.scene`.
-        layout: Values that replace the layout's own, such as {"num_poles": 60}.
+        scene: Name of a layout in `envs.layouts`, or the path of a mesh file.
+        layout: Numbers and truth values that replace the layout's own, such as
+            {"num_obstacles": 60, "passable": False}; keys are the layout's fields.
         control_hz: Actions (and event windows) per second [Hz].
         speed_mps: Constant speed [m/s]; the way of one step is speed_mps / control_hz.
         vehicle_radius_m: The vehicle is a disc of this radius [m].
@@ -94,10 +158,11 @@ class EnvConfig:
         window_capacity: Most events that one window holds; the oldest beyond it are
             dropped and counted.
         split: Which corridors: those of one split never occur in another, whatever the seed.
+        renderer: "raycast", "pyrender", or "auto": the cheapest that can draw the scene.
     """
 
     scene: str = "poles"
-    layout: dict[str, float] = dataclasses.field(default_factory=dict)
+    layout: dict[str, Value] = dataclasses.field(default_factory=dict)
     control_hz: Annotated[float, Field(ge=0.1, le=1e6)] = 200.0
     speed_mps: Annotated[float, Field(gt=0, le=1e6)] = 20.0
     vehicle_radius_m: Annotated[float, Field(ge=0, le=10)] = 0.3
@@ -106,15 +171,16 @@ class EnvConfig:
     observation: Literal["window", "event_image", "luminance", "events"] = "window"
     window_capacity: Annotated[int, Field(ge=1, le=10_000_000)] = 4096
     split: Literal["train", "validation", "eval"] = "train"
+    renderer: Literal["auto", "raycast", "pyrender"] = "auto"
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     faults: FaultsConfig = dataclasses.field(default_factory=FaultsConfig)
-    renderer: RendererConfig = dataclasses.field(default_factory=RendererConfig)
+    fidelity: FidelityConfig = dataclasses.field(default_factory=FidelityConfig)
 
 
 def sensor_settings(config: EnvConfig) -> dict[str, Any]:
     """The settings that give an event its meaning: data, encoder and policy must share them."""
     flight = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
-    return {**dataclasses.asdict(config.camera), **flight, "max_step_m": config.renderer.max_step_m}
+    return {**dataclasses.asdict(config.camera), **flight, **dataclasses.asdict(config.fidelity)}
 
 
 def sensor_differences(theirs: dict[str, Any], config: EnvConfig) -> dict[str, tuple[Any, Any]]:

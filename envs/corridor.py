@@ -80,7 +80,9 @@ class CorridorEnv(gymnasium.Env):
         self._seed = self._seed if seed is None else int(seed)
         split = self.config.split
         scene_rng, spawn_rng, faults_rng = flight.random_streams(split, self._seed or 0, self._episode)
-        self.scene = make_scene(self.config.scene, scene_rng, **self.config.layout)
+        config = self.config
+        vehicle = config.vehicle_radius_m, config.camera_height_m
+        self.scene = make_scene(config.scene, scene_rng, *vehicle, **config.layout)
         self._spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
         self._moves = [0] * flight.NUM_ACTIONS
         self._place = (self._spawn_x, 0.0)
@@ -131,7 +133,8 @@ class CorridorEnv(gymnasium.Env):
         """Move and sense."""
         config, start = self.config, self._place
         planned = flight.planned_position(self._spawn_x, self._moves, config)
-        outcome = flight.fly(self.scene, start, planned, config.vehicle_radius_m)
+        vehicle = config.vehicle_radius_m, config.camera_height_m
+        outcome = flight.fly(self.scene, start, planned, *vehicle)
         self._sensor.step(start, outcome, flight.clock_us(sum(self._moves), config.control_hz))
         self._place = outcome.end
         return outcome

@@ -1,44 +1,136 @@
-"""What a scene requires: the cheapest renderer that can draw it, and how often to render."""
+"""What a scene requires: which renderer, how many renders, how much anti-aliasing, from one tolerance.
+
+The tolerance is the accepted event error of `envs.accuracy`. The rules below are fitted to
+that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
+(`python -m jobs.bench.fidelity`), with the constants rounded to the safe side.
+"""
 
 import importlib
 import math
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from envs.raycast import KINDS, RaycastRenderer
-from envs.scene import Scene
+from envs.config import EnvConfig
+from envs.raycast import RaycastRenderer
+from envs.scene import CONE, ELLIPSOID, Scene
 
 RENDERERS = ("auto", "raycast", "pyrender")
 
+RENDERS_TEXTURED = 1.3  # times those of a plain scene
+FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
+# From which tolerance on how many samples do. Straight edges are exact whatever the samples;
+# the outlines of cones and ellipsoids and the patterns of textures converge with them.
+SAMPLES = {
+    "straight": ((0.15, 1), (0.03, 2), (0.0, 4)),
+    "textured": ((0.15, 2), (0.03, 3), (0.0, 6)),
+    "curved": ((0.15, 3), (0.03, 6), (0.0, 12)),
+    "pyrender": ((0.3, 1), (0.15, 2), (0.0, 4)),
+}
 
-def choose_renderer(name: str, scene: Scene) -> Any:
-    """The renderer class called `name`; "auto" is the cheapest that can draw `scene`.
+
+@dataclass(frozen=True)
+class Plan:
+    """How one scene is simulated.
+
+    Attributes:
+        renderer: "raycast" or "pyrender".
+        samples: Its anti-aliasing.
+        max_step_m: Longest way flown between two renders [m]; infinite: one render a control step.
+        cull_m: Obstacles farther than this are not drawn [m].
+    """
+
+    renderer: str
+    samples: int
+    max_step_m: float
+    cull_m: float
+
+
+def plan(config: EnvConfig, scene: Scene) -> Plan:
+    """The cheapest way to simulate `scene` within `config.fidelity.tolerance`; what is set there is kept.
+
+    The paper's two-frame cameras (memory "frame" and "legacy") see one frame a control step:
+    more of them would change what they report, not make it more exact.
 
     Raises:
-        ValueError: If the name is not known, or the ray caster is forced on a scene that
-            holds an obstacle it cannot draw.
+        ValueError: The ray caster is asked for a scene that only a mesh can represent.
+    """
+    asked = config.fidelity
+    renderer = choose_renderer(config.renderer, scene)
+    remembers = config.camera.memory == "reference"
+    step_m = asked.max_step_m or _max_step_m(config, scene)
+    return Plan(
+        renderer=renderer,
+        samples=asked.samples or _samples(renderer, scene, asked.tolerance),
+        max_step_m=step_m if remembers else math.inf,
+        cull_m=asked.cull_m or math.inf,
+    )
+
+
+def choose_renderer(name: str, scene: Scene) -> str:
+    """The renderer called `name`; "auto" is the cheapest that can draw `scene`.
+
+    Raises:
+        ValueError: The name is not known, or the ray caster is asked for a scene with a mesh.
     """
     if name not in RENDERERS:
-        raise ValueError(f"renderer must be one of {RENDERERS}, got {name!r}")
-    analytic = bool(np.isin(scene.obstacles["kind"], KINDS).all())
-    if name == "raycast" and not analytic:
-        kinds = sorted(set(scene.obstacles["kind"].tolist()))
-        raise ValueError(f"renderer='raycast' draws kinds {KINDS} only, scene has {kinds}; use 'auto'")
-    if name == "pyrender" or not analytic:
-        return importlib.import_module("envs.rasterize").PyrenderRenderer
-    return RaycastRenderer
+        raise ValueError(f"renderer must be one of {RENDERERS}; got {name!r}.")
+    if name == "raycast" and scene.mesh is not None:
+        raise ValueError(f"renderer='raycast' cannot draw the mesh of scene {scene.name!r}; use 'auto'.")
+    if name == "auto":
+        return "raycast" if scene.mesh is None else "pyrender"
+    return name
+
+
+def make_renderer(chosen: Plan, scene: Scene, width: int, height: int, fov_deg: float) -> Any:
+    """The renderer of a plan. Raises RuntimeError if it is pyrender and OpenGL cannot run."""
+    make: Any = RaycastRenderer
+    if chosen.renderer == "pyrender":  # imported only where it is needed: it loads OpenGL
+        make = importlib.import_module("envs.rasterize").PyrenderRenderer
+    return make(scene, width, height, fov_deg, samples=chosen.samples, cull_m=chosen.cull_m)
 
 
 def sub_renders(step_m: float, max_step_m: float) -> int:
-    """How many equal parts, one render each, keep a control step of `step_m` within `max_step_m`.
+    """How many equal parts, one render each, keep a way of `step_m` within `max_step_m`.
 
     At least 1, also for a step of 0 m. A step that exceeds a multiple of `max_step_m` by
     rounding alone (relative 1e-9) is not divided further.
 
     Raises:
-        ValueError: If step_m is negative or max_step_m not positive, or either is not finite.
+        ValueError: If step_m is negative or max_step_m not positive, or step_m is not finite.
     """
-    if not (0.0 <= step_m < math.inf and 0.0 < max_step_m < math.inf):
-        raise ValueError(f"step_m must be >= 0, max_step_m > 0, both finite; got {step_m}, {max_step_m}")
+    if not (0.0 <= step_m < math.inf and max_step_m > 0.0):
+        raise ValueError(f"step_m must be finite and >= 0, max_step_m > 0; got {step_m}, {max_step_m}")
     return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
+
+
+def _max_step_m(config: EnvConfig, scene: Scene) -> float:
+    """Longest way between two renders [m], from a fit of the renders per control step.
+
+    Between renders, log luminance is taken as linear in time, so an event is late or early
+    within an interval; it may be so by 5 % of a control step. What a pixel sees changes
+    faster the farther a step leads and the smaller the pixel. Of a high threshold fewer
+    crossings are left, and those are the uncertain ones.
+    """
+    focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
+    step_m = config.speed_mps / config.control_hz
+    renders = 1.6 + 2.7 * (step_m / 0.1) ** 0.9
+    renders *= 1.0 if _plain(scene) else RENDERS_TEXTURED
+    renders *= max(1.0, focal / FOCAL_PIXELS) ** 0.5
+    renders *= max(1.0, config.camera.contrast_threshold / 0.2) ** 0.4
+    renders *= (0.05 / config.fidelity.tolerance) ** (0.6 if config.fidelity.tolerance < 0.05 else 0.5)
+    return step_m / max(1.0, renders)
+
+
+def _samples(renderer: str, scene: Scene, tolerance: float) -> int:
+    """Anti-aliasing whose own error is a small part of the tolerance, see SAMPLES."""
+    kind = "straight" if _plain(scene) else "textured"
+    if scene.kinds & {CONE, ELLIPSOID}:
+        kind = "curved"
+    if renderer == "pyrender":
+        kind = "pyrender"
+    return next(samples for least, samples in SAMPLES[kind] if tolerance >= least)
+
+
+def _plain(scene: Scene) -> bool:
+    textures = (scene.ground_texture, scene.wall_texture, scene.obstacle_texture)
+    return scene.mesh is None and all(texture.plain for texture in textures)

@@ -95,15 +95,16 @@ def planned_position(spawn_x_m: float, moves: list[int], config: EnvConfig) -> P
     return spawn_x_m + x, (forward + (left + right) * DIAGONAL) * config.speed_mps / config.control_hz
 
 
-def fly(scene: Scene, start: Point, planned: Point, radius_m: float) -> Outcome:
+def fly(scene: Scene, start: Point, planned: Point, radius_m: float, height_m: float) -> Outcome:
     """Fly from `start` towards `planned` until the first contact or the goal line (appendix D.1.1).
 
-    Contact and goal at the same place is a collision; so is a start in contact.
+    Contact and goal at the same place is a collision; so is a start in contact. The vehicle
+    is a level disc of `radius_m` that flies at `height_m`.
 
     Raises:
         ValueError: The reward is not finite.
     """
-    contact = scene.first_contact(start, planned, radius_m)
+    contact = scene.first_contact(start, planned, radius_m, height_m)
     goal = (scene.length_m - start[1]) / (planned[1] - start[1])
     flown = min(contact, goal, 1.0)
     collision = contact <= flown

@@ -4,12 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from envs.config import EnvConfig
+from envs.config import EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera
-from envs.faults import add_background, dead_pixels, drop_dead
-from envs.fidelity import choose_renderer, sub_renders
+from envs.faults import apply_faults, draw_pixel_faults
+from envs.fidelity import Plan, make_renderer, plan, sub_renders
 from envs.flight import Outcome, Point
 from envs.scene import Scene
+
+FAULTLESS = FaultsConfig()
 
 
 class Sensor:
@@ -19,7 +21,9 @@ class Sensor:
         events: EVENT array of the last step, faults included.
         luminance: float32 (H, W), the last render.
         dropped: Events of the last step lost to the camera's cap.
+        renders: Renders of the last step.
         t_us: The simulated clock [us].
+        plan: How the scene is simulated, `envs.fidelity.Plan`.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -27,15 +31,16 @@ class Sensor:
         self._config = config
         self._camera = EventCamera(config.camera)
         self._renderer: Any = None
+        self.plan: Plan
 
-    def reset(self, scene: Scene, place: Point, rng: np.random.Generator) -> None:
-        """Look at a new scene from `place` (x, y) [m] at time 0; `rng` draws the faults. No events."""
+    def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
+        """Look at a new scene from `place` (x, y) [m] at `t_us`; `rng` draws the faults. No events."""
         camera, self._rng = self._config.camera, rng
         self._set_renderer(scene)
-        self._dead = dead_pixels((camera.height, camera.width), self._config.faults.sparsity, rng)
-        self.t_us, self.dropped, self.events = 0, 0, np.empty(0, EVENT)
+        self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
+        self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
         self.luminance = self._render(*place)
-        self._camera.reset(self.luminance, 0)
+        self._camera.reset(self.luminance, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
         """Render the flown part of a control step in equal parts; set the events and the last render.
@@ -54,17 +59,22 @@ class Sensor:
         start_us = self.t_us
         moving_us = round(outcome.flown * (end_us - start_us))
         way_m = outcome.flown * self._config.speed_mps / self._config.control_hz
-        parts = min(sub_renders(way_m, self._config.renderer.max_step_m), moving_us) if moving_us else 0
+        self.renders = min(sub_renders(way_m, self.plan.max_step_m), moving_us) if moving_us else 0
         dx, dy = outcome.end[0] - start[0], outcome.end[1] - start[1]
         batches, self.dropped = [], 0
-        for k in range(1, parts + 1):
-            self.t_us = start_us + moving_us * k // parts
-            self.luminance = self._render(start[0] + dx * (k / parts), start[1] + dy * (k / parts))
+        for k in range(1, self.renders + 1):
+            self.t_us = start_us + moving_us * k // self.renders
+            part = k / self.renders
+            self.luminance = self._render(start[0] + dx * part, start[1] + dy * part)
             batches.append(self._camera.step(self.luminance, self.t_us))
             self.dropped += self._camera.dropped
         self.t_us = end_us
-        events = batches[0] if parts == 1 else np.concatenate((np.empty(0, EVENT), *batches))
-        self.events = self._with_faults(events, start_us)
+        events = batches[0] if len(batches) == 1 else np.concatenate((np.empty(0, EVENT), *batches))
+        faults = self._config.faults
+        if faults != FAULTLESS:
+            span_us = start_us, end_us
+            events = apply_faults(events, *span_us, self.luminance, faults, self._pixels, self._rng)
+        self.events = events
 
     def close(self) -> None:
         """Free the renderer."""
@@ -73,23 +83,16 @@ class Sensor:
             close()
         self._renderer = None
 
-    def _with_faults(self, events: np.ndarray, start_us: int) -> np.ndarray:
-        faults = self._config.faults
-        if faults.sparsity > 0.0:
-            events = drop_dead(events, self._dead)
-        if faults.background_activity > 0.0 or faults.background_activity_hz > 0.0:
-            events = add_background(events, start_us, self.t_us, faults, self._dead, self._rng)
-        return events
-
     def _render(self, x_m: float, y_m: float) -> np.ndarray:
         return self._renderer.render(x_m, y_m, self._config.camera_height_m, 0.0, self.t_us * 1e-6)
 
     def _set_renderer(self, scene: Scene) -> None:
-        """Keep the renderer from episode to episode if it can draw the new scene."""
-        make = choose_renderer(self._config.renderer.name, scene)
-        if type(self._renderer) is make:
+        """Keep the renderer from episode to episode while scenes ask for the same plan."""
+        chosen = plan(self._config, scene)
+        if self._renderer is not None and chosen == self.plan:
             self._renderer.set_scene(scene)
             return
         self.close()
         camera = self._config.camera
-        self._renderer = make(scene, camera.width, camera.height, camera.fov_deg)
+        self._renderer = make_renderer(chosen, scene, camera.width, camera.height, camera.fov_deg)
+        self.plan = chosen

@@ -16,6 +16,7 @@ from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
 from envs.recordings import Recording, write_recording
+from jobs.accuracy import achieved
 from jobs.config import Config
 from jobs.progress import progress
 from jobs.runs import Run, finish, finished, open_run
@@ -51,6 +52,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
             write_recording(data_file(folder, split), recording)
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_flights"] = recording.about["flights"]
+    figures |= achieved(config.env_config(scene=config.collect.scenes[0]))
     tracker.log(0, figures)
     return finish(folder, "collect", figures)
 

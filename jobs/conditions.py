@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envs.config import CameraConfig, EnvConfig, settings_hash
+from envs.config import CameraConfig, EnvConfig, FidelityConfig, settings_hash
 from jobs.config import Config, ConfigError, env_with
 from jobs.evaluate import find_policy
 from jobs.flights import check_sensor
@@ -17,6 +17,7 @@ from models.policy import MANIFEST
 
 SHOWN_BOUNDS = ("straight", "oracle")
 CAMERA_SETTINGS = {field.name for field in dataclasses.fields(CameraConfig)}
+FIDELITY_SETTINGS = {field.name for field in dataclasses.fields(FidelityConfig)}
 
 
 @dataclass(frozen=True)
@@ -111,10 +112,16 @@ def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
     Raises:
         pydantic.ValidationError: If a setting is unknown or refuses its value.
     """
-    for name, value in sensor.items():
-        section = "camera" if name in CAMERA_SETTINGS else "renderer" if name == "max_step_m" else "env"
-        env = env_with(env, f"{section}.{name}", value)
-    return env
+    camera = {name: value for name, value in sensor.items() if name in CAMERA_SETTINGS}
+    fidelity = {name: value for name, value in sensor.items() if name in FIDELITY_SETTINGS}
+    rest = {name: value for name, value in sensor.items() if name not in camera | fidelity}
+    # Together, because some settings of a camera exclude each other.
+    return dataclasses.replace(
+        env,
+        camera=dataclasses.replace(env.camera, **camera),
+        fidelity=dataclasses.replace(env.fidelity, **fidelity),
+        **rest,
+    )
 
 
 def read_manifest(policy: str) -> dict[str, Any]:

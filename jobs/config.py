@@ -14,7 +14,7 @@ import pydantic
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, Fraction, Positive, RendererConfig
+from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, Fraction, Positive
 from jobs.refusals import JOBS_CHOOSE, explain, nearest, refused_scenes
 
 Count = Annotated[int, Field(ge=1)]
@@ -121,6 +121,17 @@ class SweepConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class TradeConfig:
+    """What the simulator's accuracy is measured on, and how often its cost."""
+
+    scenes: Annotated[list[Name], Field(min_length=1)]
+    control_hz: Annotated[list[Positive], Field(min_length=1)]
+    flights: Count
+    steps: Count
+    rounds: Count
+
+
+@dataclass(frozen=True, config=STRICT)
 class ClusterConfig:
     """Where Ray runs."""
 
@@ -141,7 +152,7 @@ class TrackingConfig:
 class Config:
     """One experiment, checked."""
 
-    job: Literal["bytestream", "collect", "pretrain", "train", "evaluate", "sweep"]
+    job: Literal["bytestream", "collect", "pretrain", "train", "evaluate", "sweep", "trade_simulator"]
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
@@ -150,7 +161,8 @@ class Config:
     env: dict[str, Any]
     camera: CameraConfig
     faults: FaultsConfig
-    renderer: RendererConfig
+    renderer: Literal["auto", "raycast", "pyrender"]
+    fidelity: FidelityConfig
     model: ModelConfig
     algo: AlgoConfig
     collect: CollectConfig
@@ -158,6 +170,7 @@ class Config:
     train: TrainConfig
     evaluate: EvaluateConfig
     sweep: SweepConfig
+    trade: TradeConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
 
@@ -167,7 +180,8 @@ class Config:
         return EnvConfig(**{**self.env, **parts, **changes})
 
 
-ENV_PARTS = ("camera", "faults", "renderer")
+HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
+ENV_PARTS = ("camera", "faults", "renderer", "fidelity")
 ENV_KEYS = [
     part.name
     for part in dataclasses.fields(typing.cast(Any, EnvConfig))
@@ -196,8 +210,11 @@ def parse(values: Mapping[str, Any]) -> Config:
     config = _build(Config, {**values, **parts}, "", refused, refused_parts)
     if not refused:
         named = [("env.scene", config.env["scene"]), ("sweep.scene", config.sweep.scene)]
+        named += [("evaluate", HELD_OUT_SCENE)]
+        named += [("trade.scenes", name) for name in config.trade.scenes]
         named += [("collect.scenes", name) for name in config.collect.scenes]
-        refused = _refused_axes(config) + refused_scenes(named, config.env["layout"])
+        vehicle = config.env["vehicle_radius_m"], config.env["camera_height_m"]
+        refused = _refused_axes(config) + refused_scenes(named, config.env["layout"], vehicle)
     if refused:
         raise ConfigError("\n".join(refused))
     return typing.cast(Config, config)
@@ -210,7 +227,7 @@ def env_with(config: EnvConfig, key: str, value: Any) -> EnvConfig:
         pydantic.ValidationError: If the setting is unknown or refuses the value.
     """
     section, _, name = key.rpartition(".")
-    if section in ENV_PARTS:
+    if section in ENV_PARTS:  # a group of settings
         name, value = section, dataclasses.replace(getattr(config, section), **{name: value})
     elif section != "env":
         name = key

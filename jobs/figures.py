@@ -9,7 +9,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Circle, Patch, Polygon
 
 from envs.scene import Scene
 from jobs.report import Summary
@@ -132,6 +132,7 @@ class Track:
     scene: Scene
     way_m: np.ndarray
     outcome: str  # a key of OUTCOMES
+    height_m: float = 2.0  # at which it flew
 
 
 def trajectory_figure(tracks: Sequence[Track]) -> Figure:
@@ -145,7 +146,7 @@ def trajectory_figure(tracks: Sequence[Track]) -> Figure:
     grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
     for panel, seed in zip(grid.flat, seeds, strict=False):
         flown = [track for track in tracks if track.seed == seed]
-        _draw_scene(panel, flown[0].scene)
+        _draw_scene(panel, flown[0].scene, flown[0].height_m)
         for track in flown:
             _draw_way(panel, track)
         ends = ", ".join(f"{track.pilot} {track.way_m[-1, 1]:.0f} m" for track in flown)
@@ -161,15 +162,24 @@ def trajectory_figure(tracks: Sequence[Track]) -> Figure:
     return figure
 
 
-def _draw_scene(panel: Axes, scene: Scene) -> None:
+def _draw_scene(panel: Axes, scene: Scene, height_m: float) -> None:
     """Walls, goal line and obstacles; right of the flight is down, as seen by the pilot."""
     half = scene.width_m / 2
-    discs = [Ellipse((item["y"], item["x"]), 2 * item["ry"], 2 * item["rx"]) for item in scene.obstacles]
-    panel.add_collection(PatchCollection(discs, facecolor="#6b7280", edgecolor="none", zorder=2))
+    shapes = [_outline(section) for section in scene.sections(height_m)]
+    panel.add_collection(PatchCollection(shapes, facecolor="#6b7280", edgecolor="#6b7280", lw=0.5, zorder=2))
     panel.hlines([-half, half], 0, scene.length_m, color=INK, lw=2)
     panel.vlines(scene.length_m, -half, half, color=ORACLE, lw=1.5, ls=":")
     panel.set(xlim=(-2, scene.length_m + 2), ylim=(half + 1, -half - 1), aspect="equal", facecolor="#fafafa")
     panel.spines[:].set_visible(False)
+
+
+def _outline(section: np.ndarray) -> Patch:
+    """A section of `envs.obstacles`, its y to the right and its x upwards."""
+    x, y, ux, uy, hx, hy, radius = section
+    if hx == 0.0 and hy == 0.0:
+        return Circle((y, x), radius)
+    corners = [(a * hx, b * hy) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return Polygon([(y + a * uy + b * ux, x + a * ux - b * uy) for a, b in corners])
 
 
 def _draw_way(panel: Axes, track: Track) -> None:

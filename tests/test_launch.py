@@ -77,7 +77,7 @@ def test_help_names_every_job_experiment_and_budget(launch, launcher):
     for group in ("exp", "budget"):
         for file in (ROOT / "conf" / group).glob("*.yaml"):
             assert f"\n  {file.stem} " in out
-    assert out.count("\n  evade +exp=") == 5
+    assert out.count("\n  evade +exp=") == 6
     assert "$" not in out
 
 
@@ -116,12 +116,12 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["env.control_hz=inf"], "env.control_hz: Input should be a finite number, got inf"),
         (["env.speed_mps=-1"], "env.speed_mps: Input should be greater than 0, got -1"),
         (["faults.sparsity=1.5"], "faults.sparsity: Input should be less than or equal to 1, got 1.5"),
-        (["env.scene=moon"], "env.scene: must be one of poles, poles_eval, got 'moon'"),
-        (["collect.scenes=[moon]"], "collect.scenes: must be one of poles, poles_eval, got 'moon'"),
-        (["sweep.scene=moon"], "sweep.scene: must be one of poles, poles_eval, got 'moon'"),
+        (["env.scene=moon"], "env.scene: must be one of cones, dynamic, gates, poles, "),
+        (["collect.scenes=[moon]"], "collect.scenes: must be one of cones, dynamic, gates, poles, "),
+        (["sweep.scene=moon"], "sweep.scene: must be one of cones, dynamic, gates, poles, "),
         (
-            ["+env.layout.num_poles=100000"],
-            "env.layout: layout num_poles=100000 cannot be placed 2.0 m apart",
+            ["+env.layout.num_obstacles=100000"],
+            "env.layout: layout num_obstacles=100000 cannot be placed 2.0 m apart",
         ),
         (["env.split=eval"], "env.split: no such key, got env.split=eval; every job chooses it itself"),
         (["+env.split=eval"], "env.split: no such key, got 'eval'; every job chooses it itself"),
@@ -180,7 +180,7 @@ def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folde
     job(given.append)
     words = [
         "env.scene=poles_eval",
-        "+env.layout.num_poles=60",
+        "+env.layout.num_obstacles=60",
         "seed=3",
         "renderer=raycast",
         "resume=runs/x",
@@ -188,8 +188,8 @@ def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folde
     assert launch("+exp=train", *words) == (0, "", "")
     (config,) = given
     assert isinstance(config, Config)
-    assert (config.job, config.seed, config.renderer.name, config.resume) == ("train", 3, "raycast", "runs/x")
-    assert config.env_config().layout == {"num_poles": 60.0}
+    assert (config.job, config.seed, config.renderer, config.resume) == ("train", 3, "raycast", "runs/x")
+    assert config.env_config().layout == {"num_obstacles": 60.0}
     assert list(tmp_path.iterdir()) == []
     assert "HYDRA_FULL_ERROR" not in os.environ
 

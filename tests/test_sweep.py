@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from envs.config import CameraConfig, EnvConfig, RendererConfig, sensor_settings
+from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from jobs import sweep as sweeping
 from jobs.conditions import plan, read_manifest, swept_policy, with_sensor
 from jobs.config import ConfigError
@@ -26,6 +26,14 @@ def sweep_config(tmp_path, trials=2, **changes):
     return dataclasses.replace(config, sweep=settings, env={**config.env, "time_limit_s": 0.2})
 
 
+OTHER_CAMERA = {
+    "threshold_mismatch": 0.03,
+    "threshold_seed": 1,
+    "response": "lin_log",
+    "encoding": "linear8",
+}
+
+
 class StubTuner:
     """Flies in this process what Tune would fly in workers, and counts it."""
 
@@ -40,6 +48,7 @@ class StubTuner:
             rows["seed"], rows["distance_m"] = cell.seeds, 50.0
             self.flown += [(cell.key, seed) for seed in cell.seeds]
             result = {"key": cell.key, "label": list(cell.label), "episodes": rows.tolist()}
+            result |= {"event_error": 0.01, "renders_per_step": 3.0}
             self.keep.on_trial_result(1, [], None, result)
         return type("Results", (), {"errors": []})()
 
@@ -102,9 +111,8 @@ def test_episodes_survive_their_file_unchanged(tmp_path):
     cell = dataclasses.replace(plan(sweep_config(tmp_path), "straight").cells()[0], seeds=(3,))
     flown = np.array([(3, True, False, False, 100.0, 200.0, 1000, 1 / 3, 2)], EPISODE)
     keep = KeepEpisodes(tmp_path)
-    keep.on_trial_result(
-        1, [], None, {"key": cell.key, "label": list(cell.label), "episodes": flown.tolist()}
-    )
+    result = {"key": cell.key, "label": list(cell.label), "episodes": flown.tolist()}
+    keep.on_trial_result(1, [], None, result | {"event_error": 0.01, "renders_per_step": 3.0})
     np.testing.assert_array_equal(read_episodes(cell, tmp_path), flown)
     assert unflown(cell, tmp_path).seeds == ()
 
@@ -136,11 +144,18 @@ def test_a_policy_flies_its_own_sensor_with_one_setting_changed_at_a_time(tmp_pa
 
 
 def test_every_sensor_setting_of_a_manifest_reaches_the_simulation():
-    camera = CameraConfig(32, 48, 60.0, 0.3, 0.4, "frame", 1e-2, 7)
-    other = EnvConfig(camera=camera, control_hz=50.0, speed_mps=5.0, renderer=RendererConfig(max_step_m=0.05))
-    sensor = json.loads(json.dumps(sensor_settings(other)))
-    assert not sensor.items() & sensor_settings(EnvConfig()).items()
-    assert sensor_settings(with_sensor(EnvConfig(), sensor)) == sensor
+    changed = {"luminance_floor": 1e-2, "max_events_per_pixel": 7, "contrast_threshold_off": 0.4}
+    fidelity = FidelityConfig(0.1, max_step_m=0.05, samples=3, cull_m=40.0)
+    usual, differ = sensor_settings(EnvConfig()), set()
+    held = EnvConfig(camera=CameraConfig(refractory_us=10))
+    for exclusive in ({"memory": "frame"}, {"refractory_us": 100}, {"excess": "carry"}):
+        camera = CameraConfig(32, 48, 60.0, 0.3, **OTHER_CAMERA, **changed, **exclusive)
+        other = EnvConfig(camera=camera, control_hz=50.0, speed_mps=5.0, fidelity=fidelity)
+        sensor = json.loads(json.dumps(sensor_settings(other)))
+        differ |= {name for name in usual if sensor[name] != usual[name]}
+        assert sensor_settings(with_sensor(EnvConfig(), sensor)) == sensor
+        assert sensor_settings(with_sensor(held, sensor)) == sensor
+    assert differ == set(usual)
 
 
 def test_a_sensor_unlike_the_configured_one_is_named_in_one_line(tmp_path, capsys):

@@ -18,7 +18,7 @@ import torch
 import yaml
 from rich.table import Table
 
-from envs.config import EnvConfig, RendererConfig, sensor_settings, settings_hash
+from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import EventCamera
 from envs.rasterize import PyrenderRenderer
@@ -91,7 +91,7 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
     steps, batches = 400, 400 // NUM_ENVS
     rng = np.random.default_rng(0)
     single = CorridorEnv(CONFIG)
-    drawn = CorridorEnv(CONFIG, renderer=RendererConfig(name="pyrender"))
+    drawn = CorridorEnv(CONFIG, renderer="pyrender")
     several = CorridorVectorEnv(NUM_ENVS, CONFIG)
     several.reset(seed=0)
 

@@ -1,0 +1,146 @@
+"""Milliseconds per frame of the ray caster by scene, size and texture, beside pyrender; and its error.
+
+Run: python -m jobs.bench.render
+Expect: two tables in about two minutes on one core. Times are CPU time of the thread
+(`time.thread_time`), which other processes disturb less than the clock, along a flight
+from y = 0 to 90 m at 2 m height; medians of interleaved rounds. The error is the difference
+from the mean of 32 x 32 point samples per pixel, which at an upright edge is itself off by
+up to 1 / 64 of a pixel.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from envs.obstacles import BOX, CONE, ELLIPSOID, KINDS, OBSTACLE, POLE
+from envs.rasterize import PyrenderRenderer
+from envs.raycast import RaycastRenderer, sample_luminance
+from envs.scene import Scene
+from envs.textures import Texture
+from jobs.progress import console
+
+ROUNDS = 9
+WAYS = np.linspace(0.0, 90.0, 30)
+POSES = ((0.3, 0.0, 2.0, 0.0), (-4.0, 30.0, 2.0, 0.2), (6.0, 55.0, 2.0, -0.5), (2.0, 70.0, 2.0, 0.05))
+SIZES = (64, 128, 256)
+
+
+def main() -> None:
+    """Measure and print both tables."""
+    scenes = cases()
+    times = frame_times(scenes)
+    table = Table(title=f"ms per frame, CPU time of one thread, medians of {ROUNDS} interleaved rounds")
+    for head in ("scene", *(f"{n}x{n}" for n in SIZES), "64x64, samples 2", "pyrender 64x64"):
+        table.add_column(head, justify="left" if head == "scene" else "right")
+    for name in scenes:
+        table.add_row(name, *(f"{value:.3f}" if value < math.inf else "none" for value in times[name]))
+    console.print(table)
+    table = Table(title="|difference| of luminance from 32 x 32 point samples, 64x64")
+    for head in ("scene", "samples", "mean", "p99.9", "largest"):
+        table.add_column(head, justify="left" if head == "scene" else "right")
+    for name, scene in scenes.items():
+        for samples, found in errors(scene).items():
+            figures = (found.mean(), np.quantile(found, 0.999), found.max())
+            table.add_row(name, str(samples), *(f"{value:.5f}" for value in figures))
+    console.print(table)
+
+
+def cases() -> dict[str, Scene]:
+    """Scenes by name: numbers of poles, each kind, and textures on 40 poles."""
+    scenes = {f"{count} poles": crowd(POLE, count) for count in (0, 40, 400)}
+    scenes |= {f"40 {KINDS[kind]}s": crowd(kind, 40) for kind in (CONE, ELLIPSOID)}
+    scenes["12 gates"] = gates(12)
+    for pattern in ("checker", "stripes", "rings", "noise"):
+        scenes[f"40 poles, all {pattern}"] = textured(scenes["40 poles"], pattern)
+    return scenes
+
+
+def crowd(kind: int, count: int) -> Scene:
+    """`count` bodies of a kind on a jittered grid of a lane 30 m wide and 90 m long."""
+    rng = np.random.default_rng(0)
+    made = np.zeros(count, OBSTACLE)
+    columns = max(1, round(math.sqrt(count * 28.0 / 90.0)))
+    pitch_x, pitch_y = 28.0 / columns, 90.0 / max(1, math.ceil(count / columns))
+    radius = min(0.5, 0.2 * min(pitch_x, pitch_y))
+    k = np.arange(count)
+    room_x, room_y = 0.5 * pitch_x - radius, 0.5 * pitch_y - radius
+    made["x"] = (k % columns + 0.5) * pitch_x - 14.0 + rng.uniform(-room_x, room_x, count)
+    made["y"] = (k // columns + 0.5) * pitch_y + 10.0 + rng.uniform(-room_y, room_y, count)
+    made["kind"], made["rx"], made["ry"], made["albedo"] = kind, radius, radius, 0.25
+    made["rz"] = 4.0 if kind == POLE else 1.5
+    made["z"] = made["rz"]
+    return Scene("bench", made)
+
+
+def gates(count: int) -> Scene:
+    """`count` gates of four boxes each, one behind the other."""
+    made = np.zeros((count, 4), OBSTACLE)
+    x = np.random.default_rng(0).uniform(-11.0, 11.0, count)
+    made["kind"], made["albedo"], made["ry"] = BOX, 0.25, 0.25
+    made["x"] = x[:, None] + [-1.75, 1.75, 0.0, 0.0]
+    made["y"] = (10.0 + 90.0 / max(1, count) * np.arange(count))[:, None]
+    made["z"], made["rz"], made["rx"] = [3.0, 3.0, 4.75, 0.5], [3.0, 3.0, 1.25, 0.5], [0.25, 0.25, 1.5, 1.5]
+    return Scene("bench", made.ravel())
+
+
+def textured(scene: Scene, pattern: str) -> Scene:
+    """The scene with a pattern on all its surfaces."""
+    return replace(
+        scene,
+        ground_texture=Texture(pattern, 2.0, 0.3),
+        wall_texture=Texture(pattern, 1.5, 0.2),
+        obstacle_texture=Texture(pattern, 0.5, 0.3),
+    )
+
+
+def frame_times(scenes: dict[str, Scene]) -> dict[str, list[float]]:
+    """Milliseconds per frame, in the columns of the table; inf where there is no pyrender."""
+    stations: dict[tuple[str, int], Any] = {}
+    for name, scene in scenes.items():
+        settings = [(size, 1) for size in SIZES] + [(64, 2)]
+        for column, (size, samples) in enumerate(settings):
+            stations[name, column] = RaycastRenderer(scene, size, size, samples=samples).render
+        stations[name, len(settings)] = pyrender_or_none(scene)
+    spent = {key: [one_round(render) for _ in range(2)][1:] for key, render in stations.items()}
+    for _ in range(ROUNDS - 1):
+        for key, render in stations.items():
+            spent[key].append(one_round(render))
+    return {name: [float(np.median(spent[name, column])) for column in range(5)] for name in scenes}
+
+
+def pyrender_or_none(scene: Scene) -> Callable[..., Any] | None:
+    """The rival, where EGL works."""
+    try:
+        return PyrenderRenderer(scene, 64, 64).render
+    except (RuntimeError, ValueError):
+        return None
+
+
+def one_round(render: Callable[..., Any] | None) -> float:
+    """Milliseconds per frame of one flight."""
+    if render is None:
+        return math.inf
+    start = time.thread_time()
+    for y in WAYS:
+        render(0.3, float(y), 2.0)
+    return 1e3 * (time.thread_time() - start) / len(WAYS)
+
+
+def errors(scene: Scene) -> dict[int, np.ndarray]:
+    """Absolute differences from point samples, by the number of samples."""
+    found: dict[int, list[np.ndarray]] = {1: [], 2: [], 4: []}
+    for pose in POSES:
+        points = sample_luminance(scene, pose, 64, 64, samples=32)
+        for samples, differences in found.items():
+            image = RaycastRenderer(scene, 64, 64, samples=samples).render(*pose)
+            differences.append(np.abs(image - points))
+    return {samples: np.stack(differences) for samples, differences in found.items()}
+
+
+if __name__ == "__main__":
+    main()

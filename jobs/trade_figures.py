@@ -1,0 +1,72 @@
+"""Figures of what accuracy costs: cost against error with its Pareto front, events against control rate."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.figures import GRID, INK, MUTED
+
+COLOURS = {
+    "default": "#111827",
+    "tolerance": "#2563eb",
+    "renders": "#059669",
+    "anti-aliasing": "#d97706",
+    "pyrender": "#7c3aed",
+    "encoding": "#db2777",
+    "culling": "#0891b2",
+    "memory": "#dc2626",
+}
+FLOOR = 1e-3  # of an error that is drawn on a logarithmic axis
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Places of the points that no other beats in cost and error both, by rising cost."""
+    order = sorted(range(len(points)), key=lambda place: points[place])
+    front: list[int] = []
+    for place in order:
+        if not front or points[place][1] < points[front[-1]][1]:
+            front.append(place)
+    return front
+
+
+def trade_figure(
+    scene: str, rows: Sequence[tuple[str, str, float, float]], front: Sequence[int], tolerance: float
+) -> Figure:
+    """Cost [us] against event error of rows (knob, setting, cost, error); the front is a line."""
+    figure = Figure(figsize=(9.6, 5.6), layout="constrained")
+    panel = figure.subplots()
+    places = np.array([(cost, max(error, FLOOR)) for *_, cost, error in rows])
+    panel.plot(*places[list(front)].T, color=MUTED, lw=1.2, ls="--", zorder=1, label="Pareto front")
+    for knob in dict.fromkeys(row[0] for row in rows):
+        own = [place for place, row in enumerate(rows) if row[0] == knob]
+        star = knob == "default"
+        marker, size, above = ("*", 260, 4) if star else ("o", 34, 3)
+        look = {"marker": marker, "s": size, "zorder": above, "color": COLOURS.get(knob, INK), "label": knob}
+        panel.scatter(places[own, 0], places[own, 1], **look)  # type: ignore[arg-type]
+        for place in [] if star else own:
+            text = rows[place][1].rpartition(" ")[2]
+            panel.annotate(text, places[place], (5, 4), textcoords="offset points", fontsize=7, color=INK)
+    panel.axhline(tolerance, color=MUTED, lw=0.8, ls=":", label="tolerance asked")
+    panel.set(xscale="log", yscale="log", xlabel="Process time of an environment step [us]")
+    panel.set_ylabel("Event error: share of events that differ")
+    panel.set_title(f"Scene {scene}", loc="left", fontsize=10)
+    panel.grid(color=GRID)
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def memory_figure(rates_hz: Sequence[float], events_hz: Mapping[str, Sequence[float]]) -> Figure:
+    """Events per second of flight against the control rate, one line per memory mode."""
+    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+    panel = figure.subplots()
+    for memory, colour in zip(events_hz, ("#2563eb", "#d97706", "#dc2626"), strict=False):
+        panel.plot(rates_hz, events_hz[memory], marker="o", color=colour, label=f"memory: {memory}")
+    panel.set(xscale="log", xlabel="Control rate [Hz]", ylabel="Events per second of flight", ylim=(0, None))
+    panel.set_xticks(rates_hz, [f"{rate:g}" for rate in rates_hz])
+    panel.set_xticks([], minor=True)
+    panel.grid(axis="y", color=GRID)
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.legend(frameon=False)
+    return figure
