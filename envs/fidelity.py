@@ -23,7 +23,7 @@ FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 SAMPLES = {
     "straight": ((0.15, 1), (0.03, 2), (0.0, 4)),
     "textured": ((0.15, 2), (0.03, 3), (0.0, 6)),
-    "curved": ((0.15, 3), (0.03, 6), (0.0, 12)),
+    "curved": ((0.15, 3), (0.03, 8), (0.0, 12)),
     "pyrender": ((0.3, 1), (0.15, 2), (0.0, 4)),
 }
 
@@ -113,11 +113,11 @@ def _max_step_m(config: EnvConfig, scene: Scene) -> float:
     """
     focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     step_m = config.speed_mps / config.control_hz
-    renders = 1.6 + 2.7 * (step_m / 0.1) ** 0.9
+    renders = 1.8 + 2.7 * (step_m / 0.1) ** 0.9
     renders *= 1.0 if _plain(scene) else RENDERS_TEXTURED
     renders *= max(1.0, focal / FOCAL_PIXELS) ** 0.5
     renders *= max(1.0, config.camera.contrast_threshold / 0.2) ** 0.4
-    renders *= (0.05 / config.fidelity.tolerance) ** (0.6 if config.fidelity.tolerance < 0.05 else 0.5)
+    renders *= (0.05 / config.fidelity.tolerance) ** (0.65 if config.fidelity.tolerance < 0.05 else 0.5)
     return step_m / max(1.0, renders)
 
 
