@@ -113,7 +113,7 @@ def _max_step_m(config: EnvConfig, scene: Scene) -> float:
     """
     focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     step_m = config.speed_mps / config.control_hz
-    renders = 1.8 + 2.7 * (step_m / 0.1) ** 0.9
+    renders = 3.19 + 1.8 * (step_m / 0.1)
     renders *= 1.0 if _plain(scene) else RENDERS_TEXTURED
     renders *= max(1.0, focal / FOCAL_PIXELS) ** 0.5
     renders *= max(1.0, config.camera.contrast_threshold / 0.2) ** 0.4
