@@ -39,7 +39,7 @@ def downscale_events(
 
     Returns:
         EVENT array, sorted by t; for "integrate" at most one event per event, at its time. In
-        each block of n pixels the sums of polarities obey |sum in - n * sum out| < n.
+        each block of n pixels the sums of polarities obey -n < sum in - n * sum out < n.
 
     Raises:
         ValueError: A shape that is larger than the old one or not positive, an unknown rule, or
