@@ -17,12 +17,11 @@ import numpy as np
 
 from envs import spans
 from envs.columns import render_area
-from envs.obstacles import BOX, CONE, ELLIPSOID, POLE
+from envs.obstacles import CONE, ELLIPSOID
 from envs.points import shade_hits, trace_scene
 from envs.scene import Scene
 from envs.textures import NOISE, PATTERNS, around, noise_stack
 
-KINDS = (POLE, CONE, ELLIPSOID, BOX)  # what this renderer can draw
 LIMIT_M = 1e6
 LIMIT_S = 1e9
 NO_STACKS = np.zeros(1, np.float32)
