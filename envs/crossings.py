@@ -3,7 +3,7 @@
 A quiet pixel costs two compares: its quiet band is kept in linear luminance and lies inside
 [0, largest float32], so that whatever is not a luminance is outside it as well. Pixels
 outside are decided in float64, by whole blocks, so that their logarithms are computed in
-wide instructions. All functions but `first_invalid` and `step` take their input as valid.
+wide instructions. All functions but `first_invalid`, `steps` and `step` take their input as valid.
 
 Names: `luminance` float32 (N,), this frame; `previous` float32 (N,), the last one; `band`
 float32 (2, N), quiet from row 0 to row 1, both included; `level` float64 (3, N), first level,
@@ -46,6 +46,11 @@ def threshold_rows(on: np.ndarray, off: np.ndarray, reach: int) -> np.ndarray:
 @numba.njit(cache=True, error_model="numpy")
 def first_invalid(luminance):
     """Index of the first value that is not finite and >= 0, or -1."""
+    valid = True
+    for i in range(luminance.size):  # without a branch: it compiles to wide instructions
+        valid &= (luminance[i] >= 0.0) & (luminance[i] <= LARGEST)
+    if valid:
+        return -1
     for i in range(luminance.size):
         if not 0.0 <= luminance[i] <= LARGEST:
             return i
@@ -101,6 +106,44 @@ def _set_bands(pixels, levels, curve, thresholds, band, work):
 def _bound(value, inwards):
     """A bound of the quiet band as float32, never further out than `value` and never invalid."""
     return np.float32(min(max(value * inwards, 0.0), LARGEST))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def steps(frames, times, sensor, rule, curve, thresholds, state, scratch):
+    """Frames (K, N) one after the other: (bad or -1, events dropped, events).
+
+    Args:
+        frames: Float32.
+        times: int64 (K + 1,), of the frame before them and theirs, increasing [us].
+        sensor: Width, and most events of one frame.
+        rule: See above.
+        curve: See above.
+        thresholds: See above.
+        state: `previous`, `band`, `level` and `held`.
+        scratch: Flags and pixels to work with.
+
+    Returns:
+        Where the first invalid value stands in the flat frames, or -1; nothing is taken then.
+        The number of events dropped. EVENT array, sorted.
+    """
+    bad = first_invalid(frames.ravel()) if len(frames) > 1 else -1
+    if bad >= 0:
+        return bad, 0, np.empty(0, EVENT)
+    batches, dropped, total = [], 0, 0
+    for k in range(len(frames)):
+        frame = (times[k], times[k + 1], sensor[0], sensor[1])
+        bad, lost, events = step(frames[k], frame, rule, curve, thresholds, state, scratch)
+        if bad >= 0:
+            return bad, 0, np.empty(0, EVENT)
+        batches.append(events)
+        dropped, total = dropped + lost, total + events.size
+    if len(batches) == 1:
+        return -1, dropped, batches[0]
+    joined, first = np.empty(total, EVENT), 0
+    for events in batches:
+        joined[first : first + events.size] = events
+        first += events.size
+    return -1, dropped, joined
 
 
 @numba.njit(cache=True, error_model="numpy")

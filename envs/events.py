@@ -16,12 +16,14 @@ well founded). What it remembers is the setting `memory`:
   stamps t_last, is stamped t_last + 1 us, since that time belongs to the frame before; and
   microseconds are not added to nanoseconds.
 
-One camera with memory "frame" or "legacy" expects one frame per control step: see
-`EventCamera.wants_sub_frames`.
+Frames between those of the control steps make the events of "reference" better. "frame" and
+"legacy" compare one frame with the next and forget, so each more frame costs them events:
+give them one frame per control step.
 """
 
 import dataclasses
 import operator
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -101,15 +103,6 @@ class EventCamera:
         words = np.zeros((pixels + 7) // 8, np.uint64)  # one flag a pixel, padded
         self._scratch = (words, np.zeros(8 * words.size, np.int64))  # and the pixels to decide
 
-    @property
-    def wants_sub_frames(self) -> bool:
-        """Whether frames between those of the control steps make the events better.
-
-        True for memory "reference". "frame" and "legacy" compare one frame with the next and
-        forget, so each more frame costs them events: give them one frame per control step.
-        """
-        return self.config.memory == "reference"
-
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
         """Remember a first frame; it makes no events, and no pixel is in its dead time.
 
@@ -120,11 +113,11 @@ class EventCamera:
         Raises:
             ValueError: Wrong shape, dtype, value or time; the camera is unchanged.
         """
-        flat, t_us = self._checked(luminance, t_us)
-        bad = int(crossings.first_invalid(flat))
+        flat, t_us = self._checked(_stacked(luminance), 1), checked_time(t_us)
+        bad = int(crossings.first_invalid(flat[0]))
         if bad >= 0:
             raise self._refusal(flat, bad)
-        crossings.remember(self._encoded(flat), self._curve, self._thresholds, self._state)
+        crossings.remember(self._encoded(flat)[0], self._curve, self._thresholds, self._state)
         self.t_us, self.dropped = t_us, 0
 
     def step(self, luminance: np.ndarray, t_us: int) -> np.ndarray:
@@ -143,14 +136,33 @@ class EventCamera:
             ValueError: No reset yet, or wrong shape, dtype, value or time; the camera is
                 unchanged and takes the next good frame.
         """
-        flat, t_us = self._checked(luminance, t_us)
+        return self.steps(_stacked(luminance), (t_us,))
+
+    def steps(self, frames: np.ndarray, times_us: Sequence[int]) -> np.ndarray:
+        """Events of several frames, one after the other, in one call.
+
+        Args:
+            frames: float32 (K, H, W), K >= 1, each as `step` takes it.
+            times_us: Their times [us], each later than the one before.
+
+        Returns:
+            EVENT array with t in (t_last, times_us[-1]], sorted; the same bytes as K calls of
+            `step`. `dropped` counts the events lost in all K.
+
+        Raises:
+            ValueError: As `step`; if one frame or time is refused, none is taken.
+        """
         if self.t_us is None:
             raise ValueError("EventCamera.step needs a first frame; call reset(luminance, t_us) before it.")
-        if t_us <= self.t_us:
-            raise ValueError(f"t_us must increase from frame to frame; got {t_us} after {self.t_us}.")
-        bad, dropped, events = crossings.step(
+        times, flat = [self.t_us], self._checked(frames, len(times_us))
+        for t_us in times_us:
+            times.append(checked_time(t_us))
+            if times[-1] <= times[-2]:
+                raise ValueError(f"t_us must increase from frame to frame; got {t_us} after {times[-2]}.")
+        bad, dropped, events = crossings.steps(
             self._encoded(flat),
-            (self.t_us, t_us, self.config.width, MAX_EVENTS_PER_FRAME),
+            np.array(times),
+            (self.config.width, MAX_EVENTS_PER_FRAME),
             self._rule,
             self._curve,
             self._thresholds,
@@ -159,33 +171,43 @@ class EventCamera:
         )
         if bad >= 0:
             raise self._refusal(flat, bad)
-        self.t_us, self.dropped = t_us, dropped
+        self.t_us, self.dropped = times[-1], dropped
         return events
 
     def _encoded(self, flat: np.ndarray) -> np.ndarray:
-        """The frame as the sensor's front end hands it on."""
+        """The frames (K, N) as the sensor's front end hands them on."""
         if self._tables is None:
             return flat
         encoded = np.empty_like(flat)
-        bad = int(encode(flat, *self._tables, encoded))
+        bad = int(encode(flat.ravel(), *self._tables, encoded.ravel()))
         if bad >= 0:
             raise self._refusal(flat, bad)
         return encoded
 
-    def _checked(self, luminance: np.ndarray, t_us: int) -> tuple[np.ndarray, int]:
-        """The frame as a flat contiguous array and the time as an int."""
-        if getattr(luminance, "dtype", None) != np.float32 or luminance.shape != self._shape:
-            dtype, shape = getattr(luminance, "dtype", type(luminance)), getattr(luminance, "shape", None)
+    def _checked(self, frames: np.ndarray, count: int) -> np.ndarray:
+        """The frames as a contiguous (K, N) array."""
+        if getattr(frames, "dtype", None) != np.float32 or frames.shape != (count, *self._shape) or not count:
+            dtype, shape = getattr(frames, "dtype", type(frames)), getattr(frames, "shape", ())[1:]
             raise ValueError(f"luminance must be float32 {self._shape}; got {dtype} of shape {shape}.")
-        try:
-            t_us = operator.index(t_us)
-        except TypeError:
-            raise ValueError(f"t_us must be an integer number of microseconds; got {t_us!r}.") from None
-        if not -T_LIMIT_US < t_us < T_LIMIT_US:
-            raise ValueError(f"t_us must lie within +-2**52; got {t_us}.")
-        return luminance.ravel(), t_us
+        return frames.reshape(count, -1)
 
     def _refusal(self, flat: np.ndarray, pixel: int) -> ValueError:
         """The error for a value that is not a luminance."""
-        y, x = divmod(pixel, self.config.width)
-        return ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {flat[pixel]!s}.")
+        y, x = divmod(pixel % flat.shape[1], self.config.width)
+        return ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {flat.flat[pixel]!s}.")
+
+
+def _stacked(luminance: np.ndarray) -> np.ndarray:
+    """One frame as a stack of one; what is no array stays as it is, to be refused."""
+    return luminance[None] if isinstance(luminance, np.ndarray) else luminance
+
+
+def checked_time(t_us: int) -> int:
+    """A time as an int. Raises ValueError unless it is a whole number within +-2**52 [us]."""
+    try:
+        t_us = operator.index(t_us)
+    except TypeError:
+        raise ValueError(f"t_us must be an integer number of microseconds; got {t_us!r}.") from None
+    if not -T_LIMIT_US < t_us < T_LIMIT_US:
+        raise ValueError(f"t_us must lie within +-2**52; got {t_us}.")
+    return t_us

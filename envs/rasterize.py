@@ -124,6 +124,10 @@ class PyrenderRenderer:
             fine = self._renderer.render(self._world, flags)
         return _mean_of_blocks(fine, self.samples)[::-1].copy()
 
+    def render_way(self, poses: np.ndarray) -> np.ndarray:
+        """(K, height, width) images along a way, as `RaycastRenderer.render_way`."""
+        return np.stack([self.render(*pose) for pose in poses.tolist()])
+
     def close(self) -> None:
         """Free the OpenGL context; other renderers are not affected. Closing twice is allowed."""
         if getattr(self, "_renderer", None) is None:

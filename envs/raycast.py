@@ -13,6 +13,7 @@ another.
 
 import math
 
+import numba
 import numpy as np
 
 from envs import spans
@@ -93,7 +94,9 @@ def check_image(width: int, height: int, fov_deg: float, samples: int) -> None:
 def check_pose(pose: tuple[float, float, float, float], t_s: float = 0.0) -> None:
     """ValueError unless `pose` (x, y, z [m], yaw [rad]) is finite, above ground and within 1000 km."""
     x, y, z, yaw = pose
-    if not (max(abs(x), abs(y), abs(z)) <= LIMIT_M and z >= 0.0 and math.isfinite(yaw)):
+    # Each on its own: max() of Python may pass a NaN over.
+    near = all(abs(value) <= LIMIT_M for value in (x, y, z))
+    if not (near and z >= 0.0 and math.isfinite(yaw)):
         raise ValueError(f"pose (x, y, z, yaw) must be finite, z >= 0 and within {LIMIT_M:g} m, got {pose}")
     if not abs(t_s) <= LIMIT_S:
         raise ValueError(f"t_s must be within +-{LIMIT_S:g} s; got {t_s!r}.")
@@ -164,11 +167,47 @@ class RaycastRenderer:
             ValueError: If the pose or time is not finite, or the pose below the ground or
                 farther than 1000 km.
         """
-        check_pose((x_m, y_m, z_m, yaw_rad), t_s)
-        pose = (float(x_m), float(y_m), float(z_m), float(yaw_rad), float(t_s))
-        image = np.empty((self.height, self.width), np.float32)
-        render_area(self._scene, self._view, pose, self._focal, image, self.samples, self.cull_m)
-        return image
+        return self.render_way(np.array([[x_m, y_m, z_m, yaw_rad, t_s]], np.float64))[0]
+
+    def render_way(self, poses: np.ndarray) -> np.ndarray:
+        """The images seen one after the other along a way, in one call.
+
+        Args:
+            poses: float64 (K, 5), of each image what `render` takes: x, y, z [m], yaw [rad]
+                and time [s].
+
+        Returns:
+            (K, height, width) float32 linear luminance.
+
+        Raises:
+            ValueError: As `render`, for the first pose that is refused.
+        """
+        images = np.empty((len(poses), self.height, self.width), np.float32)
+        bad = _render_way(self._scene, self._view, poses, self._focal, images, self.samples, self.cull_m)
+        if bad >= 0:
+            x_m, y_m, z_m, yaw_rad, t_s = poses[bad].tolist()
+            check_pose((x_m, y_m, z_m, yaw_rad), t_s)
+        return images
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _render_way(
+    scene: tuple,
+    view: np.ndarray,
+    poses: np.ndarray,
+    focal: float,
+    images: np.ndarray,
+    samples: int,
+    cull: float,
+) -> int:
+    """Fill `images` (K, H, W); the index of the first pose that `check_pose` would refuse, or -1."""
+    for k in range(len(poses)):
+        x, y, z, yaw, t = poses[k]
+        near = abs(x) <= LIMIT_M and abs(y) <= LIMIT_M and 0.0 <= z <= LIMIT_M
+        if not (near and abs(yaw) < np.inf and abs(t) <= LIMIT_S):
+            return k
+        render_area(scene, view, (x, y, z, yaw, t), focal, images[k], samples, cull)
+    return -1
 
 
 def sample_luminance(

@@ -12,6 +12,7 @@ from envs.flight import Outcome, Point
 from envs.scene import Scene
 
 FAULTLESS = FaultsConfig()
+TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
 
 
 class Sensor:
@@ -30,6 +31,7 @@ class Sensor:
         """Make the sensor that `config` describes."""
         self._config = config
         self._camera = EventCamera(config.camera)
+        self._together = max(1, TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
         self.plan: Plan
 
@@ -39,7 +41,7 @@ class Sensor:
         self._set_renderer(scene)
         self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
         self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
-        self.luminance = self._render(*place)
+        self.luminance = self._renderer.render_way(self._poses(place, place, np.ones(1), np.array([t_us])))[0]
         self._camera.reset(self.luminance, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
@@ -60,14 +62,13 @@ class Sensor:
         moving_us = round(outcome.flown * (end_us - start_us))
         way_m = outcome.flown * self._config.speed_mps / self._config.control_hz
         self.renders = min(sub_renders(way_m, self.plan.max_step_m), moving_us) if moving_us else 0
-        dx, dy = outcome.end[0] - start[0], outcome.end[1] - start[1]
         batches, self.dropped = [], 0
-        for k in range(1, self.renders + 1):
-            self.t_us = start_us + moving_us * k // self.renders
-            part = k / self.renders
-            self.luminance = self._render(start[0] + dx * part, start[1] + dy * part)
-            batches.append(self._camera.step(self.luminance, self.t_us))
-            self.dropped += self._camera.dropped
+        for first in range(0, self.renders, self._together):
+            part = np.arange(first + 1, min(first + self._together, self.renders) + 1)
+            times = start_us + moving_us * part // self.renders
+            frames = self._renderer.render_way(self._poses(start, outcome.end, part / self.renders, times))
+            batches.append(self._camera.steps(frames, times.tolist()))
+            self.luminance, self.dropped = frames[-1], self.dropped + self._camera.dropped
         self.t_us = end_us
         events = batches[0] if len(batches) == 1 else np.concatenate((np.empty(0, EVENT), *batches))
         faults = self._config.faults
@@ -83,8 +84,14 @@ class Sensor:
             close()
         self._renderer = None
 
-    def _render(self, x_m: float, y_m: float) -> np.ndarray:
-        return self._renderer.render(x_m, y_m, self._config.camera_height_m, 0.0, self.t_us * 1e-6)
+    def _poses(self, start: Point, end: Point, part: np.ndarray, t_us: np.ndarray) -> np.ndarray:
+        """(K, 5) x, y, z [m], yaw [rad] and time [s] after each part of the way."""
+        poses = np.zeros((part.size, 5))
+        poses[:, 0] = start[0] + (end[0] - start[0]) * part
+        poses[:, 1] = start[1] + (end[1] - start[1]) * part
+        poses[:, 2] = self._config.camera_height_m
+        poses[:, 4] = t_us * 1e-6
+        return poses
 
     def _set_renderer(self, scene: Scene) -> None:
         """Keep the renderer from episode to episode while scenes ask for the same plan."""

@@ -85,9 +85,7 @@ def test_memory_legacy_stamps_events_from_the_start_of_the_interval_on():
 
 
 @pytest.mark.parametrize("memory", ["frame", "legacy"])
-def test_a_camera_that_forgets_wants_one_frame_per_control_step(memory):
-    assert EventCamera(1, 1).wants_sub_frames
-    assert not EventCamera(1, 1, memory=memory).wants_sub_frames
+def test_a_camera_that_forgets_loses_events_with_each_more_frame(memory):
     counts = [len(flight(rate, memory=memory)) for rate in (50, 100, 200)]
     assert counts[0] > counts[1] > counts[2]
 
@@ -292,3 +290,39 @@ def test_the_same_bytes_come_out_on_every_machine():
         else:
             digest.update(camera.step(image, 777 * k).tobytes())
     assert digest.hexdigest()[:16] == "825e8d91398eeda9"
+
+
+@pytest.mark.parametrize("fields", [{}, {"memory": "frame"}, {"refractory_us": 100}, {"encoding": "gamma8"}])
+def test_several_frames_in_one_call_give_the_bytes_of_one_call_each(fields):
+    one, many = (
+        EventCamera(16, 12, max_events_per_pixel=2, contrast_threshold=0.05, **fields) for _ in range(2)
+    )
+    frames = np.stack([texture(0.004 * k) for k in range(9)])
+    one.reset(frames[0], 5)
+    many.reset(frames[0], 5)
+    events, dropped = [], 0
+    for k in range(1, 9):
+        events.append(one.step(frames[k], 5 + 777 * k))
+        dropped += one.dropped
+    together = many.steps(frames[1:], [5 + 777 * k for k in range(1, 9)])
+    assert together.tobytes() == np.concatenate(events).tobytes()
+    assert many.dropped == dropped > 0
+    assert many.step(frames[3], 9000).tobytes() == one.step(frames[3], 9000).tobytes()
+
+
+@pytest.mark.parametrize("encoding", ["linear32", "gamma8"])
+def test_of_several_frames_none_is_taken_if_one_is_refused(encoding):
+    camera, other = (EventCamera(16, 12, encoding=encoding) for _ in range(2))
+    frames = np.stack([texture(0.004 * k) for k in range(4)])
+    camera.reset(frames[0], 0)
+    other.reset(frames[0], 0)
+    bad = frames[1:].copy()
+    bad[1, 7, 3] = np.nan
+    with pytest.raises(ValueError, match="pixel x=3, y=7 is nan"):
+        camera.steps(bad, [10, 20, 30])
+    with pytest.raises(ValueError, match="got 20 after 20"):
+        camera.steps(frames[1:], [10, 20, 20])
+    for wrong in (frames[1:, :5], frames[:0]):
+        with pytest.raises(ValueError, match="float32"):
+            camera.steps(wrong, [10, 20, 30][: len(wrong)])
+    assert camera.steps(frames[1:], [10, 20, 30]).tobytes() == other.steps(frames[1:], [10, 20, 30]).tobytes()

@@ -159,8 +159,8 @@ def test_a_tolerance_that_cannot_be_is_refused(tolerance):
 def test_a_bad_frame_is_refused_with_its_place_and_the_next_episode_flies(monkeypatch):
     env = CorridorEnv(camera=TINY)
     env.reset(seed=3)
-    good = env._sensor._renderer.render
-    monkeypatch.setattr(env._sensor._renderer, "render", lambda *pose: good(*pose) * np.float32(np.nan))
+    good = env._sensor._renderer.render_way
+    monkeypatch.setattr(env._sensor._renderer, "render_way", lambda poses: good(poses) * np.float32(np.nan))
     with pytest.raises(ValueError, match=r"episode 0, step 1, seed 3: luminance must be finite"):
         env.step(0)
     monkeypatch.undo()
