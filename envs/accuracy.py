@@ -15,6 +15,7 @@ from envs.sensor import Sensor
 
 # The converged simulation: so many times the renders of the tolerance 0.05, and this anti-aliasing.
 REFERENCE_RENDERS, REFERENCE_SAMPLES = 6, {"raycast": 12, "pyrender": 8}
+NO_CULLING_M = 1e6  # farther than any scene reaches
 TIME_SHARE = 0.05  # of a control step: how far apart in time two equal events may be
 MOST_KEPT = 64  # converged flights: several settings are measured against the same
 _CONVERGED: dict[str, np.ndarray] = {}
@@ -71,7 +72,7 @@ def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
     fidelity = FidelityConfig(
         max_step_m=plan(usual, scene).max_step_m / REFERENCE_RENDERS,
         samples=REFERENCE_SAMPLES[renderer],
-        cull_m=None,
+        cull_m=NO_CULLING_M,
     )
     return dataclasses.replace(usual, fidelity=fidelity)
 

@@ -94,12 +94,14 @@ class Sensor:
         return poses
 
     def _set_renderer(self, scene: Scene) -> None:
-        """Keep the renderer from episode to episode while scenes ask for the same plan."""
-        chosen = plan(self._config, scene)
-        if self._renderer is not None and chosen == self.plan:
+        """Keep the renderer from episode to episode while scenes ask for the same."""
+        chosen, camera = plan(self._config, scene), self._config.camera
+        same = self._renderer is not None
+        same = same and (chosen.renderer, chosen.samples) == (self.plan.renderer, self.plan.samples)
+        self.plan = chosen
+        if same:
             self._renderer.set_scene(scene)
+            self._renderer.cull_m = chosen.cull_m
             return
         self.close()
-        camera = self._config.camera
         self._renderer = make_renderer(chosen, scene, camera.width, camera.height, camera.fov_deg)
-        self.plan = chosen

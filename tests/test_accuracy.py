@@ -107,6 +107,13 @@ def test_the_error_achieved_is_within_the_tolerance_asked(scene, hz):
     assert accuracy.error <= EnvConfig().fidelity.tolerance
 
 
+def test_culling_by_tolerance_adds_little_to_the_error_in_a_long_lane():
+    lane = EnvConfig(layout={"last_y_m": 300.0, "num_obstacles": 120}, fidelity=FidelityConfig(0.2))
+    whole = dataclasses.replace(lane, fidelity=FidelityConfig(0.2, cull_m=1e5))
+    culled, exact = measure(lane, flights=4, steps=8), measure(whole, flights=4, steps=8)
+    assert exact.error < culled.error <= exact.error + 0.1 * 0.2
+
+
 SCENES = ["poles", "cones", "gates", "poles_dense", "poles_eval", "shape_change", "texture_change", "dynamic"]
 
 

@@ -68,6 +68,16 @@ def test_longer_steps_smaller_pixels_and_textures_take_more_renders():
     assert plan(EnvConfig(), textured).max_step_m < plan(EnvConfig(), SCENE).max_step_m
 
 
+def test_a_short_lane_is_drawn_whole_and_a_long_one_as_far_as_the_tolerance_asks():
+    lane = make_scene("poles", np.random.default_rng(0), last_y_m=400.0, num_obstacles=150)
+    assert plan(EnvConfig(), SCENE).cull_m == math.inf
+    assert plan(EnvConfig(), dataclasses.replace(SCENE, obstacles=SCENE.obstacles[:0])).cull_m == math.inf
+    usual = plan(EnvConfig(), lane).cull_m
+    assert 100.0 < usual < 200.0
+    assert plan(EnvConfig(fidelity=FidelityConfig(0.2)), lane).cull_m == pytest.approx(0.5 * usual)
+    assert plan(EnvConfig(fidelity=FidelityConfig(0.2)), SCENE).cull_m == pytest.approx(0.5 * usual)
+
+
 def test_what_is_set_is_kept():
     asked = FidelityConfig(tolerance=0.5, max_step_m=0.013, samples=5, cull_m=31.0)
     chosen = plan(EnvConfig(fidelity=asked), SCENE)

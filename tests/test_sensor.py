@@ -53,7 +53,7 @@ def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, flown):
     assert sensor.events.tobytes() == events.tobytes()
     assert events.size > 40
     assert sensor.t_us == 5000
-    expected = RaycastRenderer(scene, 16, 12, samples=sensor.plan.samples).render(
+    expected = RaycastRenderer(scene, 16, 12, samples=sensor.plan.samples, cull_m=sensor.plan.cull_m).render(
         *outcome.end, config.camera_height_m, 0.0, round(5000 * flown) * 1e-6
     )
     assert np.array_equal(sensor.luminance, expected)
@@ -96,13 +96,20 @@ def test_a_renderer_that_gives_no_luminance_is_named_and_stops_the_step(monkeypa
         sensor.step((1.0, 5.0), Outcome((1.0, 5.1), 1.0, 0.1, False, False), 5000)
 
 
-def test_the_renderer_stays_while_scenes_ask_for_the_same_plan():
+def test_the_renderer_stays_while_scenes_ask_for_the_same_and_culls_as_each_asks():
     config, _, sensor = look()
     renderer = sensor._renderer
     sensor.reset(make_scene(config.scene, np.random.default_rng(9)), (0.0, 0.0), np.random.default_rng(0))
     assert sensor._renderer is renderer
     sensor.reset(make_scene("poles", np.random.default_rng(9)), (0.0, 0.0), np.random.default_rng(0))
     assert sensor._renderer is not renderer
+    renderer = sensor._renderer
+    for last_y_m in (400.0, 90.0):
+        scene = make_scene("poles", np.random.default_rng(9), last_y_m=last_y_m)
+        sensor.reset(scene, (0.0, 0.0), np.random.default_rng(0))
+        assert sensor._renderer is renderer
+        assert renderer.cull_m == sensor.plan.cull_m
+        assert (renderer.cull_m == math.inf) == (last_y_m == 90.0)
     sensor.close()
     assert sensor._renderer is None
 
