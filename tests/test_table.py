@@ -6,7 +6,7 @@ import torch
 
 from models.batch import batch_windows
 from models.evae import EventVAE
-from models.table import EncoderTable
+from models.table import PRECISIONS, EncoderTable
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 WINDOW_US = 5000
@@ -50,9 +50,9 @@ def evae(request):
     return make_evae(request.param)
 
 
-@pytest.fixture
-def table(evae):
-    return EncoderTable.from_evae(evae)
+@pytest.fixture(params=PRECISIONS)
+def table(evae, request):
+    return EncoderTable.from_evae(evae, request.param)
 
 
 @pytest.mark.parametrize("variant", ["brp_full", "brp_xy"])
@@ -71,6 +71,48 @@ def test_the_table_is_the_module(variant, norm, dtype, context_bound, mu_bound):
         assert updated.dtype == latent.dtype == np.dtype(dtype)
         assert np.abs(updated - context).max() <= context_bound
         assert np.abs(latent - mu).max() <= mu_bound
+
+
+@pytest.mark.parametrize(("precision", "bound"), [("int16", 2.0**-11), ("int8", 0.06)])
+def test_a_rounded_table_is_off_by_one_unit_at_the_most_and_smaller(evae, precision, bound):
+    exact, rounded = EncoderTable.from_evae(evae), EncoderTable.from_evae(evae, precision)
+    assert rounded.features.nbytes * (2 if precision == "int16" else 4) == exact.features.nbytes
+    highest = exact.features.max() + 1.0
+    for count in (1, 7, 300):
+        events = make_events(count, seed=count)
+        context, mu = (exact.update(exact.empty(), events, 0, WINDOW_US), exact.encode(events, 0, WINDOW_US))
+        # What one unit is worth follows from the weights that take a context in units.
+        unit = np.abs(rounded.hidden[0]).max(0) / np.abs(exact.hidden[0]).max(0)
+        assert unit.max() <= max(bound, 2 * highest / 2**15)
+        units = rounded.update(rounded.empty(), events, 0, WINDOW_US)
+        assert (np.abs(units * unit - context) <= 1.001 * unit).all()
+        assert 0 < np.abs(rounded.encode(events, 0, WINDOW_US) - mu).max() < 2 * bound
+
+
+def test_large_features_widen_the_unit_of_int16_and_none_overflows():
+    evae = make_evae(norm="none")
+    with torch.no_grad():
+        evae.ecn.layers[-1].weight *= 1e4
+    exact, rounded = EncoderTable.from_evae(evae), EncoderTable.from_evae(evae, "int16")
+    events = make_events(300)
+    assert exact.features.max() > 100.0
+    # Two of 32767 units of the largest feature; the weights of the first layer are below 0.1.
+    assert np.abs(rounded.encode(events, 0, WINDOW_US) - exact.encode(events, 0, WINDOW_US)).max() < 0.05
+    assert (rounded.update(rounded.empty(), events, 0, WINDOW_US) >= 0).all()
+
+
+def test_a_table_with_more_time_bins_comes_closer_to_exact_time():
+    evae, events = make_evae(time_bins=4096), make_events(300)
+    exact = EncoderTable.from_evae(evae).encode(events, 0, WINDOW_US)
+    coarse = [EncoderTable.from_evae(evae, time_bins=bins) for bins in (8, 64, 512)]
+    errors = [np.abs(table.encode(events, 0, WINDOW_US) - exact).max() for table in coarse]
+    assert errors[0] > 4 * errors[1] > 16 * errors[2] > 0
+
+
+@pytest.mark.parametrize("wrong", [{"precision": "float8"}, {"time_bins": 0}, {"time_bins": 65537}])
+def test_a_table_of_unknown_precision_or_bins_is_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        EncoderTable.from_evae(make_evae(), **wrong)
 
 
 def test_making_a_table_leaves_the_model_as_it_was(evae):
