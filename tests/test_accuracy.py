@@ -7,9 +7,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
 
-from envs.accuracy import event_error, measure
+from envs import accuracy
+from envs.accuracy import converged, event_error, measure
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
 from envs.events import EVENT
+from envs.fidelity import plan
+from envs.scene import make_scene
 
 TIMES = st.integers(0, 30)
 
@@ -83,6 +86,30 @@ def test_the_converged_simulation_has_no_error_and_more_renders_never_hurt_much(
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > 8 * errors[3]
     assert errors[3] < 0.03
+
+
+@pytest.mark.parametrize("scene_name", ["poles", "texture_change"])
+def test_the_converged_simulation_renders_six_times_as_often_and_no_setting_spoils_it(scene_name):
+    scene = make_scene(scene_name, np.random.default_rng(0))
+    usual = plan(EnvConfig(), scene)
+    camera = CameraConfig(memory="legacy", encoding="gamma8", contrast_threshold=0.2)
+    spoilt = EnvConfig(camera=camera, fidelity=FidelityConfig(0.5), renderer="pyrender")
+    exact = converged(spoilt, scene)
+    chosen = plan(exact, scene)
+    assert (exact.camera, chosen.renderer) == (CameraConfig(), "raycast")
+    assert chosen.max_step_m == pytest.approx(usual.max_step_m / 6)
+    assert chosen.samples > usual.samples
+    assert chosen.cull_m > 1e5
+
+
+def test_a_flight_weighs_as_much_as_its_events(monkeypatch):
+    one, many = events([(1, 0, 0, 1)]), events([(t, 0, 0, 1) for t in range(8)])
+    flights = iter([(one, one, 1), (many, many[:0], 2)])
+    monkeypatch.setattr(accuracy, "_flight", lambda *_: next(flights))
+    found = measure(EnvConfig(), flights=2, steps=1)
+    assert found.error == pytest.approx(8 / 10)  # of ten events of both streams two have a partner
+    assert found.events == (4.5, 0.5)
+    assert found.renders == 1.5
 
 
 def test_two_measurements_agree_and_other_corridors_differ():

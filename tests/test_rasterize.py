@@ -109,6 +109,19 @@ def test_pyrender_knows_the_bounds_of_what_it_draws(make):
     assert (low < high).all()
 
 
+def test_the_uniforms_lie_in_memory_as_the_shaders_expect(make):
+    from OpenGL import GL
+
+    from envs.rasterize import FRAME
+
+    renderer = make()
+    with renderer._platform.current():
+        for program in renderer._renderer._programs.values():
+            size = np.zeros(1, np.int32)
+            GL.glGetActiveUniformBlockiv(program._program_id, 0, GL.GL_UNIFORM_BLOCK_DATA_SIZE, size)
+            assert size[0] == FRAME.itemsize
+
+
 def test_rendering_twice_gives_the_same_bytes(make):
     one, two = make(), make()
     assert one.render(0, 30, 2).tobytes() == one.render(0, 30, 2).tobytes() == two.render(0, 30, 2).tobytes()

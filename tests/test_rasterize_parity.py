@@ -138,6 +138,16 @@ def test_both_renderers_agree_from_places_that_no_flight_would_choose(renderer, 
         assert found.mean() < 1e-3, name
 
 
+@pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID], ids=["pole", "cone", "ellipsoid"])
+def test_corners_that_fall_together_far_away_move_no_edge(renderer, kind):
+    found = []
+    for away in np.geomspace(2.0, 200.0, 40):
+        body = np.array([(kind, 0.3, away, 3.0, 1.0, 1.0, 2.0, 0.3)], OBSTACLE)
+        scene = Scene(name="test", obstacles=body)
+        found += [differences(renderer, scene, (0.0, 0.0, z, 0.1), 0.0).mean() for z in (0.5, 3.0, 9.0)]
+    assert np.mean(found) < 3e-5
+
+
 def test_more_bodies_than_one_kind_hide_each_other(renderer):
     assert mean_differences(renderer, (POLE, CONE, ELLIPSOID, BOX), 8).mean() < 1.3e-4
 

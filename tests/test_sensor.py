@@ -59,7 +59,8 @@ def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, flown):
     assert np.array_equal(sensor.luminance, expected)
 
 
-def test_events_lost_to_the_cap_are_counted_over_all_renders_of_a_step():
+def test_events_lost_to_the_cap_are_counted_over_all_renders_of_a_step(monkeypatch):
+    monkeypatch.setattr(sensing, "TOGETHER", 16 * 12)
     capped = CameraConfig(width=16, height=12, contrast_threshold=0.002, max_events_per_pixel=1)
     _, _, free = look(camera=CameraConfig(width=16, height=12, contrast_threshold=0.002))
     _, _, sensor = look(camera=capped)
