@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
 
+import jobs.accuracy
 from envs import accuracy
 from envs.accuracy import converged, event_error, measure
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
@@ -158,3 +159,13 @@ def test_the_error_achieved_is_within_the_tolerance_asked_everywhere(scene):
                 if accuracy.error > tolerance:
                     short.append((hz, threshold, tolerance, round(accuracy.error, 4)))
     assert short == []
+
+
+@pytest.mark.parametrize(("error", "says"), [(0.02, False), (0.2, True)])
+def test_a_job_says_what_it_achieves_and_whether_that_is_less_than_asked(monkeypatch, capsys, error, says):
+    monkeypatch.setattr(jobs.accuracy, "measure", lambda config: accuracy.Accuracy(error, (9.0, 10.0), 3.0))
+    found = jobs.accuracy.achieved(EnvConfig())
+    assert found == {"sim/event_error": error, "sim/renders_per_step": 3.0}
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"{error:.1%} (asked: at most 5.0%)" in text
+    assert ("more than asked" in text) == says
