@@ -6,8 +6,8 @@ Importing this loads OpenGL; only `envs.rasterize` does, when a renderer is made
 import contextlib
 import ctypes
 import os
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from OpenGL import GL
@@ -18,10 +18,10 @@ from pyrender.renderer import Renderer
 from pyrender.shader_program import ShaderProgram
 
 from envs.shaders import FRAGMENT, VERTEX, source
+from envs.textures import noise_tile
 
 EGL = egl.egl  # imported before pyrender, OpenGL.EGL breaks the import of OpenGL.GL.shaders
 MULTISAMPLES = 4
-Uniforms = Mapping[str, np.ndarray]
 
 
 def start(width: int, height: int, antialias: bool) -> tuple["Platform", "LuminanceRenderer"]:
@@ -72,43 +72,16 @@ class Platform(egl.EGLPlatform):
 
 
 class Program(ShaderProgram):
-    """pyrender's shader program, from the text of its stages; it looks up each uniform once."""
+    """pyrender's shader program, from the text of its stages; it reads its uniforms from block 0."""
 
-    def __init__(self, textured: bool) -> None:
+    def __init__(self, surface: int, pattern: int) -> None:
         """Compile and link in the current context."""
-        super().__init__(source(VERTEX, textured), source(FRAGMENT, textured))
-        self._locations: dict[str, int] = {}
+        super().__init__(source(VERTEX, surface, pattern), source(FRAGMENT, surface, pattern))
         self._add_to_context()
+        GL.glUniformBlockBinding(self._program_id, GL.glGetUniformBlockIndex(self._program_id, "Frame"), 0)
 
     def _load(self, shader_filename: str) -> str:
         return shader_filename
-
-    def set_uniform(self, name: str, value: Any, unsigned: bool = False) -> None:
-        """Set what the shaders call `name`; what they do not use is left out.
-
-        `value` of shape (n,) is a number or a vector, of shape (m, n) an array of m of them, of
-        shape (4, 4) a matrix.
-        """
-        if name not in self._locations:
-            self._locations[name] = GL.glGetUniformLocation(self._program_id, name)
-        location = self._locations[name]
-        if location < 0:
-            return
-        value = np.asarray(value)
-        whole = np.issubdtype(value.dtype, np.integer)
-        value = np.ascontiguousarray(value, np.int32 if whole else np.float32)
-        if value.shape == (4, 4):
-            GL.glUniformMatrix4fv(location, 1, GL.GL_TRUE, value)
-        else:
-            _SET[value.shape[-1], whole](location, value.size // value.shape[-1], value)
-
-
-_SET = {
-    (1, False): GL.glUniform1fv,
-    (2, False): GL.glUniform2fv,
-    (3, False): GL.glUniform3fv,
-    (1, True): GL.glUniform1iv,
-}
 
 
 class Camera(PerspectiveCamera):
@@ -129,8 +102,25 @@ class Camera(PerspectiveCamera):
         return self._matrix
 
 
+class Draw(NamedTuple):
+    """What one program draws.
+
+    Attributes:
+        program: Surface and pattern, as in `shaders.source`.
+        runs: (R, 2) first and last + 1 of the faces.
+        noise: Its seed; None if there is no noise.
+    """
+
+    program: tuple[int, int]
+    runs: np.ndarray
+    noise: int | None = None
+
+
 class LuminanceRenderer(Renderer):
-    """pyrender's renderer with one float channel, multisampled or not, and the shaders of this package."""
+    """pyrender's renderer with one float channel, multisampled or not, and the shaders of this package.
+
+    The context is its own, so what never changes is set once.
+    """
 
     def __init__(self, width: int, height: int, antialias: bool) -> None:
         """Make the framebuffers, of `width` x `height` pixels, in the current context."""
@@ -139,26 +129,28 @@ class LuminanceRenderer(Renderer):
         self._main_fb_ms, self._main_cb_ms, self._main_db_ms = _framebuffer(size, MULTISAMPLES * antialias)
         self._main_fb, self._main_cb, self._main_db = _framebuffer(size, 0)
         self._main_fb_dims = size
-        self._programs: dict[bool, Program] = {}
-        self._tiles: int | None = None
-        self.textured = False
-        # Of the next frame: uniforms, and (R, 2) first and last + 1 of the faces to draw.
-        self.uniforms: Uniforms = {}
-        self.runs = np.zeros((0, 2), np.int64)
+        self._programs: dict[tuple[int, int], Program] = {}
+        self._tiles: dict[int, int] = {}  # by the seed of the noise
+        self._block = GL.glGenBuffers(1)
+        GL.glBindBufferBase(GL.GL_UNIFORM_BUFFER, 0, self._block)
+        # Nothing is too near to be seen.
+        for state in (GL.GL_DEPTH_TEST, GL.GL_CULL_FACE, GL.GL_DEPTH_CLAMP, GL.GL_MULTISAMPLE):
+            GL.glEnable(state)
+        GL.glViewport(0, 0, width, height)
+        # Of the next frame: what to draw, in this order, and the uniforms, one record.
+        self.draws: list[Draw] = []
+        self.frame = np.zeros(0)
 
-    def use(self, textured: bool, uniforms: Uniforms, tiles: np.ndarray | None) -> None:
-        """Prepare the program for a scene: its constants, and (T, N) float32 `tiles` if it has noise."""
-        self.textured = textured
-        if textured not in self._programs:
-            self._programs[textured] = Program(textured)
-        program = self._programs[textured]
-        program._bind()
-        for name, value in uniforms.items():
-            program.set_uniform(name, value)
-        program._unbind()
+    def use(self, draws: list[Draw], sky: float) -> None:
+        """Prepare for a scene: compile what is missing, and load the noise."""
+        GL.glClearColor(sky, sky, sky, 1.0)
         self._drop_tiles()
-        if tiles is not None:
-            self._tiles = _float_texture(tiles)
+        for draw in draws:
+            if draw.program not in self._programs:
+                self._programs[draw.program] = Program(*draw.program)
+            if draw.noise is not None and draw.noise not in self._tiles:
+                self._tiles[draw.noise] = _float_texture(noise_tile(draw.noise))
+        self.draws = draws
 
     def delete(self) -> None:
         """Free all objects of OpenGL."""
@@ -166,34 +158,33 @@ class LuminanceRenderer(Renderer):
             program.delete()
         self._programs.clear()
         self._drop_tiles()
+        GL.glDeleteBuffers(1, [self._block])
         super().delete()
 
     def __del__(self) -> None:
         """Nothing: pyrender would free its objects in whatever context is current then."""
 
     def _drop_tiles(self) -> None:
-        if self._tiles is not None:
-            GL.glDeleteTextures([self._tiles])
-            self._tiles = None
+        for texture in self._tiles.values():
+            GL.glDeleteTextures([texture])
+        self._tiles.clear()
 
-    def _get_primitive_program(self, _primitive: Any, _flags: int, _program_flags: int) -> Program:
-        return self._programs[self.textured]
-
-    def _bind_and_draw_primitive(self, primitive: Any, pose: Any, program: Program, flags: int) -> None:
-        """Without pyrender's materials."""
-        for name, value in self.uniforms.items():
-            program.set_uniform(name, value)
-        GL.glDisable(GL.GL_BLEND)
-        GL.glEnable(GL.GL_CULL_FACE)
-        GL.glEnable(GL.GL_DEPTH_CLAMP)  # nothing is too near to be seen
-        primitive._bind()
-        for first, end in self.runs.tolist():
-            start = ctypes.c_void_p(12 * first)
-            GL.glDrawElements(primitive.mode, 3 * (end - first), GL.GL_UNSIGNED_INT, start)
-        primitive._unbind()
-
-    def _configure_main_framebuffer(self) -> None:
-        """The framebuffers are there already."""
+    def _forward_pass(self, scene: Any, flags: int, seg_node_map: Any = None) -> np.ndarray:
+        """All of the frame, without pyrender's materials and lights."""
+        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._main_fb_ms)
+        GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
+        GL.glBufferData(GL.GL_UNIFORM_BUFFER, self.frame.nbytes, self.frame, GL.GL_STREAM_DRAW)
+        (mesh,) = scene.meshes
+        mesh.primitives[0]._bind()
+        for draw in self.draws:
+            self._programs[draw.program]._bind()
+            if draw.noise is not None:
+                GL.glBindTexture(GL.GL_TEXTURE_2D, self._tiles[draw.noise])
+            for first, end in draw.runs.tolist():
+                start = ctypes.c_void_p(12 * first)
+                GL.glDrawElements(GL.GL_TRIANGLES, 3 * (end - first), GL.GL_UNSIGNED_INT, start)
+        mesh.primitives[0]._unbind()
+        return self._read_main_framebuffer(scene, flags)
 
     def _read_main_framebuffer(self, _scene: Any, _flags: int) -> np.ndarray:
         """(H, W) float32, row 0 at the bottom; resolves the multisamples first."""
@@ -226,11 +217,11 @@ def _framebuffer(size: tuple[int, int], multisamples: int) -> tuple[int, int, in
 
 
 def _float_texture(texels: np.ndarray) -> int:
-    """A texture of one float channel, bound to unit 0."""
+    """A texture of one float channel that repeats, bilinear between its texels."""
     texture = GL.glGenTextures(1)
     GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
-    GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MIN_FILTER, GL.GL_NEAREST)
-    GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MAG_FILTER, GL.GL_NEAREST)
+    GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MIN_FILTER, GL.GL_LINEAR)
+    GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MAG_FILTER, GL.GL_LINEAR)
     height, width = texels.shape
     kinds = (GL.GL_RED, GL.GL_FLOAT)
     GL.glTexImage2D(GL.GL_TEXTURE_2D, 0, GL.GL_R32F, width, height, 0, *kinds, np.ascontiguousarray(texels))

@@ -4,25 +4,13 @@ Flat faces, the ground, the walls and a scene's own mesh are as in `envs.meshes`
 is a few rings of corners around its centre, which `envs.shaders` turns towards the camera.
 """
 
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from envs.meshes import Part, box_mesh, ground_mesh, mean_radius, wall_meshes
+from envs.meshes import Part, box_mesh, ground_mesh, wall_meshes
 from envs.obstacles import BOX, CONE, ELLIPSOID, POLE
-from envs.shaders import (
-    DISC,
-    FACE_X,
-    GROUND,
-    MESH,
-    NONE,
-    ON_GROUND,
-    ON_OBSTACLES,
-    ON_WALLS,
-    RIM,
-    SIDE,
-)
+from envs.shaders import DISC, FACE, GROUND, MESH, OUTLINE, RIM, RING, SIDE, WALL
 from envs.textures import TILE_PERIODS, Texture, around
 
 if TYPE_CHECKING:
@@ -34,16 +22,33 @@ VERTEX = np.dtype(
         ("position", "f4", 3),
         ("ring", "f4", 3),
         ("quadric", "f4", 4),
-        ("surface", "f4", 2),
         ("origin", "f4", 2),
         ("body", "f4", 4),
     ]
 )
-# Corners of a ring and corners of an ellipsoid's outline. Sides and outlines of poles and cones
-# are exact with any number; the rims of poles and the outlines of ellipsoids are polygons.
-RING, OUTLINE = 16, 40
 
-Triangles = tuple[np.ndarray, np.ndarray]  # (V,) VERTEX, (F, 3) faces
+
+class Piece(NamedTuple):
+    """Triangles of one kind of surface: of the obstacle `body`, or -1 of none."""
+
+    surface: int
+    body: int
+    vertices: np.ndarray  # (V,) VERTEX
+    faces: np.ndarray  # (F, 3)
+
+
+class Batch(NamedTuple):
+    """Faces that follow each other and are of one kind of surface.
+
+    Attributes:
+        surface: Which, one of `shaders.SURFACES`.
+        bodies: (N,) the obstacles whose faces follow each other; -1: of no obstacle.
+        first: (N + 1,) first face of each, and the first that is not of the batch.
+    """
+
+    surface: int
+    bodies: np.ndarray
+    first: np.ndarray
 
 
 class Drawing(NamedTuple):
@@ -52,38 +57,45 @@ class Drawing(NamedTuple):
     Attributes:
         vertices: (V,) VERTEX.
         faces: (F, 3) int64.
-        order: (N,) the obstacles in the order in which their faces follow each other.
-        first: (N + 1,) first face of each, and the first of the faces that are of no obstacle.
+        batches: In the order in which to draw them.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    order: np.ndarray
-    first: np.ndarray
+    batches: list[Batch]
 
 
 def draw(scene: "Scene") -> Drawing:
-    """The triangles of `scene`, what hides most first, so that less is shaded twice."""
+    """The triangles of `scene`."""
     bodies = scene.obstacles
-    parts, order = [], [np.zeros(0, np.int64)]
+    pieces: list[Piece] = []
     standing = bodies["z"] <= bodies["rz"]  # their undersides cannot be seen
     for kind in (POLE, CONE, ELLIPSOID):
         for on_ground in (True, False):
-            order.append(np.flatnonzero((bodies["kind"] == kind) & (standing == on_ground)))
-            parts += _round(scene, kind, bodies[order[-1]], not on_ground)
-    order.append(np.flatnonzero(bodies["kind"] == BOX))
-    for body in bodies[order[-1]]:
-        parts.append(_flat(box_mesh(scene, body), np.repeat(np.arange(3), 8), ON_OBSTACLES))
+            found = np.flatnonzero((bodies["kind"] == kind) & (standing == on_ground))
+            pieces += _round(scene, kind, found, not on_ground)
+    for i in np.flatnonzero(bodies["kind"] == BOX):
+        pieces.append(_flat(FACE, box_mesh(scene, bodies[i]), int(i)))
+        pieces[-1].vertices["body"][:, 3] = np.repeat(np.arange(3), 8)
     if scene.mesh is not None:
-        parts.append(_flat(scene.mesh, MESH, NONE))
-    parts += [_flat(wall, FACE_X, ON_WALLS) for wall in wall_meshes(scene)]
-    parts.append(_flat(ground_mesh(scene), GROUND, ON_GROUND))
-    offsets = np.cumsum([0] + [len(part[0]) for part in parts[:-1]])
-    faces = [part[1] + offset for part, offset in zip(parts, offsets, strict=True)]
-    first = np.cumsum([0] + [len(part[1]) for part in parts])[: len(bodies) + 1]
-    return Drawing(
-        np.concatenate([part[0] for part in parts]), np.concatenate(faces), np.concatenate(order), first
-    )
+        pieces.append(_flat(MESH, scene.mesh))
+    pieces += [_flat(WALL, wall) for wall in wall_meshes(scene)]
+    pieces.append(_flat(GROUND, ground_mesh(scene)))
+    return _join(sorted(pieces, key=lambda piece: piece.surface))
+
+
+def _join(pieces: list[Piece]) -> Drawing:
+    """The pieces, which are in the order of their surfaces, as one drawing."""
+    offsets = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
+    first = np.cumsum([0] + [len(piece.faces) for piece in pieces])
+    surfaces = np.array([piece.surface for piece in pieces])
+    bodies = np.array([piece.body for piece in pieces])
+    batches = []
+    for surface in np.unique(surfaces).tolist():
+        low, high = np.searchsorted(surfaces, [surface, surface + 1])
+        batches.append(Batch(surface, bodies[low:high], first[low : high + 1]))
+    faces = [piece.faces + offset for piece, offset in zip(pieces, offsets, strict=False)]
+    return Drawing(np.concatenate([piece.vertices for piece in pieces]), np.concatenate(faces), batches)
 
 
 def repeat_m(texture: Texture) -> float:
@@ -91,24 +103,32 @@ def repeat_m(texture: Texture) -> float:
     return texture.period_m * (TILE_PERIODS if texture.pattern == "noise" else 1)
 
 
-def _flat(part: Part, shape: int | np.ndarray, texture: int) -> Triangles:
+def _flat(surface: int, part: Part, body: int = -1) -> Piece:
     vertices = np.zeros(len(part[0]), VERTEX)
-    vertices["position"] = part[0]
-    vertices["surface"][:, 0], vertices["surface"][:, 1] = shape, texture
-    vertices["body"][:, 0] = part[2]
-    return vertices, part[1]
+    vertices["position"], vertices["body"][:, 0] = part[0], part[2]
+    return Piece(surface, body, vertices, part[1])
 
 
-def _round(scene: "Scene", kind: int, bodies: np.ndarray, underside: bool) -> list[Triangles]:
-    """The same corners for each of `bodies` (B,), which are all of one `kind`."""
-    corners, faces = _template(kind, underside)
-    count, size = len(bodies), len(corners)
+def _round(scene: "Scene", kind: int, found: np.ndarray, underside: bool) -> list[Piece]:
+    """The surfaces of the obstacles `found` (B,), which are all of one `kind`."""
+    pieces = []
+    for surface, corners, faces in _templates(kind, underside):
+        vertices = _vertices(scene, kind, scene.obstacles[found], corners)
+        if surface == RIM:
+            up, down = (scene.shade(scene.obstacles["albedo"][found], (0.0, 0.0, z)) for z in (1.0, -1.0))
+            vertices["body"][..., 0] = np.where(corners[:, 2] > 0.0, up[:, None], down[:, None])
+        pieces += [Piece(surface, int(i), part, faces) for i, part in zip(found, vertices, strict=True)]
+    return pieces
+
+
+def _vertices(scene: "Scene", kind: int, bodies: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(B, V) VERTEX the `corners` (V, 3) of each of `bodies`."""
     radius, half = bodies["rx"], bodies["rz"]
-    zero, texture = np.zeros(count), scene.obstacle_texture
-    vertices = np.zeros((count, size), VERTEX)
+    zero, texture = np.zeros(len(bodies)), scene.obstacle_texture
+    vertices = np.zeros((len(bodies), len(corners)), VERTEX)
     vertices["position"] = np.stack([bodies["x"], bodies["y"], bodies["z"]], axis=1)[:, None]
     vertices["ring"][..., 0] = corners[:, 0]
-    vertices["ring"][..., 1] = corners[:, 1] * (1.0 if kind == ELLIPSOID else radius[:, None])
+    vertices["ring"][..., 1] = corners[:, 1] * radius[:, None]
     vertices["ring"][..., 2] = corners[:, 2] * half[:, None]
     square = radius * radius
     terms = {
@@ -118,41 +138,35 @@ def _round(scene: "Scene", kind: int, bodies: np.ndarray, underside: bool) -> li
     }[kind]
     along = np.array([around(texture, float(r)) for r in radius])
     vertices["quadric"] = np.stack([*terms, along], axis=1)[:, None]
-    vertices["surface"][..., 0], vertices["surface"][..., 1] = corners[:, 3], ON_OBSTACLES
     centre = np.stack([bodies["x"], bodies["y"] + bodies["z"]], axis=1)
     vertices["origin"] = np.mod(centre, repeat_m(texture))[:, None]
-    up, down = (scene.shade(bodies["albedo"], (0.0, 0.0, z)) for z in (1.0, -1.0))
-    level = np.where(corners[:, 2] > 0.0, up[:, None], down[:, None])
-    vertices["body"][..., 0] = np.where(corners[:, 3] == RIM, level, bodies["albedo"][:, None])
-    vertices["body"][..., 1], vertices["body"][..., 2] = radius[:, None], half[:, None]
-    vertices["body"][..., 3] = RING // 4
-    return [(part, faces) for part in vertices]
+    for i, key in enumerate(("albedo", "rx", "rz")):
+        vertices["body"][..., i] = bodies[key][:, None]
+    return vertices
 
 
-def _template(kind: int, underside: bool) -> Triangles:
-    """Corners (V, 4) as angle, radius, height (1: the largest, the half height), shape; and faces (F, 3)."""
+def _templates(kind: int, underside: bool) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Surfaces of a body: kind; corners (V, 3) as number, radius, height, of 1 at most; faces (F, 3)."""
     if kind == ELLIPSOID:
-        angle = np.arange(OUTLINE) * (2.0 * math.pi / OUTLINE)
-        return _ring(angle, mean_radius(OUTLINE), 0.0, DISC), _polygon(OUTLINE, 0, up=True)
-    angle = (np.arange(RING) - RING // 2) * (2.0 * math.pi / RING)
-    i, j = np.arange(RING), (np.arange(RING) + 1) % RING
-    rings = [_ring(angle, 1.0, -1.0, SIDE), _ring(angle, 1.0 if kind == POLE else 0.0, 1.0, SIDE)]
-    faces = [np.stack([i, j, RING + i], axis=1)]
+        return [(DISC, _ring(np.arange(OUTLINE), 1.0, 0.0), _polygon(OUTLINE, up=True))]
+    corner, i, j = np.arange(RING) - RING // 2, np.arange(RING), (np.arange(RING) + 1) % RING
+    bottom, top = _ring(corner, 1.0, -1.0), _ring(corner, 1.0 if kind == POLE else 0.0, 1.0)
+    side = [np.stack([i, j, RING + i], axis=1)]
     if kind == POLE:
-        faces.append(np.stack([j, RING + j, RING + i], axis=1))
-        faces.append(_polygon(RING, len(rings) * RING, up=True))
-        rings.append(_ring(angle, 1.0, 1.0, RIM))
+        side.append(np.stack([j, RING + j, RING + i], axis=1))
+    found = [(SIDE, np.concatenate([bottom, top]), np.concatenate(side))]
+    if kind == POLE:
+        found.append((RIM, top, _polygon(RING, up=True)))
     if underside:
-        faces.append(_polygon(RING, len(rings) * RING, up=False))
-        rings.append(_ring(angle, 1.0, -1.0, RIM))
-    return np.concatenate(rings), np.concatenate(faces)
+        found.append((RIM, bottom, _polygon(RING, up=False)))
+    return found
 
 
-def _ring(angle: np.ndarray, radius: float, height: float, shape: int) -> np.ndarray:
-    return np.stack([angle, *(np.full_like(angle, value) for value in (radius, height, shape))], axis=1)
+def _ring(corner: np.ndarray, radius: float, height: float) -> np.ndarray:
+    return np.stack([corner, np.full(len(corner), radius), np.full(len(corner), height)], axis=1)
 
 
-def _polygon(corners: int, first: int, up: bool) -> np.ndarray:
+def _polygon(corners: int, up: bool) -> np.ndarray:
     """Triangles of a convex polygon whose corners are numbered counter-clockwise from above.
 
     Every second corner is cut off, then every second one of what is left: few thin triangles,
@@ -164,4 +178,4 @@ def _polygon(corners: int, first: int, up: bool) -> np.ndarray:
         i, k = left[::2][: len(j)], np.append(left[2::2], left[0])[: len(j)]
         faces.append(np.stack([i, j, k] if up else [i, k, j], axis=1))
         left = left[::2]
-    return first + np.concatenate(faces)
+    return np.concatenate(faces)

@@ -1,6 +1,6 @@
 """pyrender renderer for all that a scene can hold: same interface and luminance as the ray caster.
 
-Headless EGL, everything in one draw call with the shaders of `envs.shaders`, read back from a
+Headless EGL, one draw call per kind of surface with the shaders of `envs.shaders`, read back from a
 32-bit float framebuffer: linear, without gamma, not rounded to 8 bits. Nothing of OpenGL
 is imported before a renderer is made. A renderer belongs to the process that made it; it
 may be used from any thread, one at a time.
@@ -18,12 +18,27 @@ from typing import Any
 import numpy as np
 
 from envs.obstacles import BOX
-from envs.primitives import Drawing, draw, repeat_m
+from envs.primitives import Batch, Drawing, draw, repeat_m
 from envs.raycast import check_image, check_pose
 from envs.scene import Scene
-from envs.textures import PATTERNS, TILE, TILE_PERIODS, Texture, noise_tile
+from envs.shaders import TEXTURE_OF
+from envs.textures import PATTERNS, Texture
 
 NEAR_M = 0.02  # nothing nearer is drawn
+# The uniforms of a frame, as `shaders` has them in memory.
+FRAME = np.dtype(
+    [
+        ("clip", "f4", (4, 4)),
+        ("view", "f4", (4, 4)),
+        ("camera", "f4", 4),
+        ("lens", "f4", 4),
+        ("sun", "f4", 4),
+        ("lambert", "f4", 4),
+        ("around", "f4", (3, 4)),
+        ("moved", "f4", (3, 4)),
+        ("looks", "f4", (3, 4)),
+    ]
+)
 PACKAGES = "apt-get install --no-install-recommends libegl1 libgl1 libgl1-mesa-dri"
 
 
@@ -66,27 +81,30 @@ class PyrenderRenderer:
         self._camera = Camera(
             2.0 * math.atan(self._slope * height / width), NEAR_M, aspectRatio=width / height
         )
-        fine = 0.5 * samples * np.array([width, height])
-        self._lens = np.array([fine[0], fine[1], self._slope / fine[0]])
+        with self._platform.current():
+            self._projection = self._camera.get_projection_matrix(width * samples, height * samples)
         self.set_scene(scene)
 
     def set_scene(self, scene: Scene) -> None:
         """Draw `scene` from now on."""
         import pyrender
 
-        world = pyrender.Scene(bg_color=[scene.sky_luminance] * 3 + [1.0])
         drawing = draw(scene)
-        world.add(pyrender.Mesh([_primitive(drawing)]))
-        self._bodies = scene.obstacles[drawing.order]
-        self._first = np.append(drawing.first, len(drawing.faces))
-        self._renderer.runs = self._first[[0, -1]][None]
-        self._node = world.add(self._camera, pose=np.eye(4))
-        self._world = world
+        self._world = pyrender.Scene()
+        self._world.add(pyrender.Mesh([_primitive(drawing)]))
+        self._node = self._world.add(self._camera, pose=np.eye(4))
+        self._bodies, self._batches = scene.obstacles, drawing.batches
         self._textures = (scene.ground_texture, scene.wall_texture, scene.obstacle_texture)
-        textured = not all(texture.plain for texture in self._textures)
-        uniforms = {"lens": self._lens, "sun": scene.sun, "lambert": (scene.ambient, scene.diffuse)}
+        fine = 0.5 * self.samples * np.array([self.width, self.height])
+        frame = np.zeros((), FRAME)
+        frame["lens"][:3] = *fine, self._slope / fine[0]
+        frame["sun"][:3] = scene.sun
+        frame["lambert"][:2] = scene.ambient, scene.diffuse
+        frame["looks"][:, :2] = [(1.0 / texture.period_m, texture.contrast) for texture in self._textures]
+        self._renderer.frame = frame
+        draws = [_draw(batch, self._textures) for batch in drawing.batches]
         with self._platform.current():
-            self._renderer.use(textured, uniforms | _constants(self._textures), _tiles(self._textures))
+            self._renderer.use(draws, scene.sky_luminance)
 
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
@@ -112,17 +130,33 @@ class PyrenderRenderer:
             raise RuntimeError("the renderer is closed; make a new PyrenderRenderer")
         import pyrender
 
-        self._world.set_pose(self._node, _camera_pose(x_m, y_m, z_m, yaw_rad))
-        eye_m = np.array([x_m, y_m, z_m])
+        pose = _camera_pose(x_m, y_m, z_m, yaw_rad)
+        self._world.set_pose(self._node, pose)
+        self._set_frame(pose, t_s)
         if self.cull_m < math.inf:
-            near = [*(_distances(self._bodies, eye_m) <= self.cull_m), True]  # what is no obstacle always is
-            self._renderer.runs = np.stack([self._first[:-1], self._first[1:]], axis=1)[near]
-        if self._renderer.textured:
-            self._renderer.uniforms = _offsets(self._textures, eye_m, t_s)
+            self._cull(pose[:3, 3])
         flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.OFFSCREEN
         with self._platform.current():
             fine = self._renderer.render(self._world, flags)
         return _mean_of_blocks(fine, self.samples)[::-1].copy()
+
+    def _set_frame(self, pose: np.ndarray, t_s: float) -> None:
+        """Write the uniforms that change; without whole repeats of textures, so that float32 is enough."""
+        frame = self._renderer.frame
+        view = np.eye(4)
+        view[:3, :3] = pose[:3, :3].T
+        frame["view"], frame["clip"], frame["camera"][:3] = view, self._projection @ view, pose[:3, 3]
+        for i, texture in enumerate(self._textures):
+            if not texture.plain:
+                repeat = repeat_m(texture)
+                frame["around"][i, :3] = np.mod(pose[:3, 3], repeat)
+                frame["moved"][i, :2] = [v * t_s % repeat for v in texture.velocity_mps]
+
+    def _cull(self, eye_m: np.ndarray) -> None:
+        """Draw what is no obstacle, and the obstacles within `cull_m`."""
+        near = np.append(_distances(self._bodies, eye_m) <= self.cull_m, True)  # the last: of no obstacle
+        for i, batch in enumerate(self._batches):
+            self._renderer.draws[i] = self._renderer.draws[i]._replace(runs=_runs(batch, near))
 
     def render_way(self, poses: np.ndarray) -> np.ndarray:
         """(K, height, width) images along a way, as `RaycastRenderer.render_way`."""
@@ -180,8 +214,7 @@ def _primitive(drawing: Drawing) -> Any:
         positions=vertices["position"],
         normals=vertices["ring"],
         tangents=vertices["quadric"],
-        texcoord_0=vertices["surface"],
-        texcoord_1=vertices["origin"],
+        texcoord_0=vertices["origin"],
         color_0=vertices["body"],
         indices=drawing.faces,
         material=MetallicRoughnessMaterial(alphaMode="OPAQUE"),
@@ -189,35 +222,20 @@ def _primitive(drawing: Drawing) -> Any:
     )
 
 
-def _constants(textures: tuple[Texture, ...]) -> dict[str, np.ndarray]:
-    """Uniforms of the textures that stay; the first is that of surfaces without any."""
-    pattern = [0] + [0 if texture.plain else PATTERNS.index(texture.pattern) for texture in textures]
-    scale = [(0.0, 0.0)] + [(1.0 / texture.period_m, texture.contrast) for texture in textures]
-    return {
-        "patterns": np.array(pattern)[:, None],
-        "scales": np.array(scale),
-        "texels": np.array([TILE]),
-        "periods": np.array([TILE_PERIODS]),
-        "tiles": np.array([0]),
-    }
+def _draw(batch: Batch, textures: tuple[Texture, ...]) -> Any:
+    """How to draw all of `batch`."""
+    from envs.opengl import Draw
+
+    place = TEXTURE_OF[batch.surface]
+    texture = Texture() if place is None or textures[place].plain else textures[place]
+    noise = texture.seed if texture.pattern == "noise" else None
+    return Draw((batch.surface, PATTERNS.index(texture.pattern)), batch.first[[0, -1]][None], noise)
 
 
-def _tiles(textures: tuple[Texture, ...]) -> np.ndarray | None:
-    """The noise of each texture, one above the other; None if there is none."""
-    noisy = [not texture.plain and texture.pattern == "noise" for texture in textures]
-    if not any(noisy):
-        return None
-    empty = np.zeros((TILE, TILE), np.float32)
-    return np.concatenate([noise_tile(t.seed) if n else empty for t, n in zip(textures, noisy, strict=True)])
-
-
-def _offsets(textures: tuple[Texture, ...], eye_m: np.ndarray, t_s: float) -> dict[str, np.ndarray]:
-    """Uniforms of the textures that change; without whole repeats, so that float32 is enough for them."""
-    around, moved = np.zeros((4, 3)), np.zeros((4, 2))
-    for i, texture in enumerate(textures, start=1):
-        around[i] = np.mod(eye_m, repeat_m(texture))
-        moved[i] = np.mod(np.multiply(texture.velocity_mps, t_s), repeat_m(texture))
-    return {"around": around, "moved": moved}
+def _runs(batch: Batch, near: np.ndarray) -> np.ndarray:
+    """(R, 2) first and last + 1 of the faces of the bodies that are `near`; neighbours in one run."""
+    drawn = np.concatenate([[False], near[batch.bodies], [False]])
+    return batch.first[np.flatnonzero(drawn[1:] != drawn[:-1]).reshape(-1, 2)]
 
 
 def _mean_of_blocks(fine: np.ndarray, size: int) -> np.ndarray:
