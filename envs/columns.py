@@ -1,8 +1,8 @@
-"""Kernels of the ray caster: an image as strips, a strip as columns, a column from near to far.
+"""Kernels of the ray caster: an image as strips, and a strip from near to far.
 
-Columns of pixels are cut at each silhouette; a strip between two cuts is the mean over one
-or two columns inside it. In a column, what is nearer is painted first, and what remains
-uncovered is kept as gaps between rows. Input is assumed valid; `envs.raycast` checks it.
+Columns of pixels are cut at each silhouette. In a strip between two cuts all edges are taken
+as straight; what is nearer is painted first, and what remains uncovered is kept as gaps
+between edges. Input is assumed valid; `envs.raycast` checks it.
 """
 
 import math
@@ -12,28 +12,20 @@ import numpy as np
 
 from envs import bodies as b
 from envs import spans as v
-from envs.bodies import KIND
+from envs.bodies import FIRST, KIND, KNOWN, LAST, SLOPE, WALL_AFTER, WALL_DEPTH, WALL_SIDE, WEIGHT
 from envs.obstacles import BOX, CONE, ELLIPSOID
-from envs.spans import EYE_X, EYE_Y, EYE_Z, FOCAL, HORIZON, kernel
+from envs.patterns import texture_cell
+from envs.spans import EYE_X, EYE_Y, EYE_Z, FOCAL, HORIZON, inlined, kernel
 from envs.surfaces import (
-    CAP_SPREAD,
-    END_SPREAD,
-    KNOWN,
-    LEFT,
-    RIGHT,
-    SLOPE,
-    WALL_AFTER,
-    WALL_DEPTH,
-    WALL_SIDE,
-    WEIGHT,
+    enter_gap,
     show_body,
     show_walls,
     wall_depth,
 )
 
 TOGETHER = 1e-9  # [pixels] cuts nearer than this are one
-GAUSS = 0.5 - 0.5 / math.sqrt(3.0)  # where in a strip its first column stands; its second mirrors it
-NARROW = 0.3  # [strips] narrower ones are one column
+ARC_PARTS = 3  # strips of equal height at either end of an ellipsoid's outline
+MOST_CUTS = 2 + 2 * max(2, ARC_PARTS)  # of one body: its ends, and corners or arcs
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -56,20 +48,20 @@ def render_area(
     view, most = world.copy(), len(bodies)
     _look(view, pose, focal, height, samples)
     seen, order = np.empty((most, b.FIELDS)), np.empty(most, np.int64)
-    positions, codes = np.empty(6 * most + 4), np.empty(6 * most + 4, np.int64)
+    positions, codes = np.empty(MOST_CUTS * most + 5), np.empty(MOST_CUTS * most + 5, np.int64)
     count = b.see_bodies(bodies, view, 0.5 * width / focal, cull, seen)
     size, total = _events(view, seen, count, width, positions, codes, order)
     rank = np.argsort(positions[:size])
     positions, codes = positions[:size][rank], codes[:size][rank]
-    sheet = (np.zeros((v.LAYERS, height + 2)), np.empty((count + 6, 4)), np.empty(KNOWN), stacks)
-    _sweep(view, seen, (order, total), (positions, codes), image, samples, sheet)
+    sheet = np.zeros((v.SHEET, max(height + v.PADDING, 2 * count + 32, KNOWN)))
+    _sweep(view, seen, (order, total), (positions, codes), image, sheet, stacks)
 
 
 @kernel
-def _sweep(view, seen, begun: tuple, cuts: tuple, image: np.ndarray, samples: int, sheet: tuple) -> None:
+def _sweep(view, seen, begun: tuple, cuts: tuple, image: np.ndarray, sheet: np.ndarray, stacks):
     """Paint the strips between cuts from left to right, with the bodies that are there in each."""
     (order, total), (positions, codes) = begun, cuts
-    half = 0.5 * image.shape[1]
+    hit, half, samples = sheet[v.HIT], 0.5 * image.shape[1], int(view[v.SAMPLES])
     known, event = 0, 0
     for cell in range(image.shape[1] * samples):
         left, edge = cell / samples, (cell + 1) / samples
@@ -79,29 +71,15 @@ def _sweep(view, seen, begun: tuple, cuts: tuple, image: np.ndarray, samples: in
             if event < len(codes) and positions[event] < edge - TOGETHER:
                 right = positions[event]
             known = _settle(view, seen, order, known, total, (0.5 * (left + right) - half) / view[FOCAL])
-            _paint_strip(view, seen, order, known, (left - half, right - half), sheet)
+            hit[FIRST], hit[LAST] = (left - half) / view[FOCAL], (right - half) / view[FOCAL]
+            _paint_strip(view, seen, order, known, sheet, stacks)
             left = right
             while event < len(codes) and positions[event] <= left + TOGETHER:
                 known, total = _pass(order, known, total, codes[event])
                 event += 1
-        v.texture_cell(view, sheet[3], sheet[0], middle)
+        texture_cell(view, stacks, sheet, middle)
         if (cell + 1) % samples == 0:
-            v.develop(view, sheet[0], image, cell // samples)
-
-
-@kernel
-def _paint_strip(view, seen, order: np.ndarray, known: int, strip: tuple, sheet: tuple) -> None:
-    """Paint a strip, from its left to its right around the image's middle [pixels], by one or two columns."""
-    left, right = strip
-    hit, wide, start = sheet[2], right - left, left
-    columns = 1 if wide * view[v.SAMPLES] < NARROW else 2
-    for k in range(columns):
-        at = 0.5 if columns == 1 else (GAUSS if k == 0 else 1.0 - GAUSS)
-        hit[WEIGHT] = wide / columns
-        hit[SLOPE] = (left + at * wide) / view[FOCAL]
-        hit[LEFT], hit[RIGHT] = start / view[FOCAL], (start + hit[WEIGHT]) / view[FOCAL]
-        start += hit[WEIGHT]
-        _column(view, seen, order, known, sheet)
+            v.develop(view, sheet, image, cell // samples)
 
 
 @kernel
@@ -134,9 +112,10 @@ def _events(view, seen, count, width, positions, codes, order) -> tuple:
             size += 1
         positions[size], codes[size] = high, 2 * i + 1
         size += high < width
-        if seen[i, KIND] == CONE and seen[i, b.FORWARD] > 0.0:
-            positions[size], codes[size] = centre + focal * seen[i, b.RIGHT] / seen[i, b.FORWARD], -1
-            size += 0.0 < positions[size] < width
+        if seen[i, KIND] == CONE:
+            size = _cone_cuts(view, seen, i, width, positions, codes, size)
+        if seen[i, KIND] == ELLIPSOID:
+            size = _arc_cuts(view, seen, i, width, positions, codes, size)
         if seen[i, KIND] == BOX:
             size = _corner_cuts(view, seen, i, width, positions, codes, size)
     for k in range(4):
@@ -147,6 +126,41 @@ def _events(view, seen, count, width, positions, codes, order) -> tuple:
         positions[size], codes[size] = centre + focal * right / forward, -1
         size += forward > 0.0 and 0.0 < positions[size] < width
     return size, total
+
+
+@kernel
+def _cone_cuts(view, seen, i: int, width: int, positions, codes, size: int) -> int:
+    """Add the axis of a cone, and where its straight outlines meet the edge of its base."""
+    right, forward, radius = seen[i, b.RIGHT], seen[i, b.FORWARD], seen[i, b.RX]
+    square = right * right + forward * forward
+    rise = seen[i, b.TOP] - view[EYE_Z]
+    # Of the turn about the axis from the eye to the outline, the cosine over the distance.
+    cosine = radius * radius * rise / ((seen[i, b.TOP] - seen[i, b.BOTTOM]) * max(square, b.NEAR))
+    rest = radius * radius / max(square, b.NEAR) - cosine * cosine
+    for k in range(-1, 2):
+        sine = k * math.sqrt(max(0.0, rest))
+        back = abs(k) * cosine
+        ahead = forward - back * forward + sine * right
+        positions[size], codes[size] = (right - back * right - sine * forward) / max(b.NEAR, ahead), -1
+        positions[size] = 0.5 * width + view[FOCAL] * positions[size]
+        size += ahead > 0.0 and rest > 0.0 and 0.0 < positions[size] < width
+    return size
+
+
+@kernel
+def _arc_cuts(view, seen, i: int, width: int, positions, codes, size: int) -> int:
+    """Add cuts where an ellipsoid's outline bends most: in the outermost cell at its left and right end.
+
+    The outline rises there as a square root does, and so cuts divide its height evenly.
+    """
+    low, high = seen[i, b.LOW], seen[i, b.HIGH]
+    reach = min(0.5 * (high - low), 1.0 / (view[v.SAMPLES] * view[FOCAL]))
+    for k in range(1, ARC_PARTS + 1):
+        bend = reach * (k / ARC_PARTS) ** 2
+        for u in (low + bend, high - bend):
+            positions[size], codes[size] = 0.5 * width + view[FOCAL] * u, -1
+            size += 0.0 < positions[size] < width
+    return size
 
 
 @kernel
@@ -199,47 +213,15 @@ def _settle(view: np.ndarray, seen: np.ndarray, order: np.ndarray, known: int, t
     return total
 
 
-@kernel
-def _outline(view, seen, i: int, span: tuple, hit: np.ndarray) -> None:
-    """Fill `hit` with the rows of a body as the part of the strip shows them that the column stands for.
-
-    A slanting outline is taken as a line between both ends of the part, at the mean height of
-    the outline (Simpson's rule): exact for a cone.
-    """
-    hit[CAP_SPREAD] = hit[END_SPREAD] = 0.0
-    if seen[i, KIND] != CONE and seen[i, KIND] != ELLIPSOID:
-        b.section(seen, i, view, hit[SLOPE], span, hit)
-        return
-    cap = end = 0.0
-    for k in range(3):
-        u = hit[LEFT] + 0.5 * k * (hit[RIGHT] - hit[LEFT])
-        b.section(seen, i, view, u, b.depths(seen, i, view, u), hit)
-        share = 4.0 / 6.0 if k == 1 else 1.0 / 6.0
-        cap, end = cap + share * hit[b.CAP], end + share * hit[b.END]
-        sign = k - 1.0
-        hit[CAP_SPREAD] += sign * hit[b.CAP]
-        hit[END_SPREAD] += sign * hit[b.END]
-    b.section(seen, i, view, hit[SLOPE], span, hit)
-    hit[CAP_SPREAD], hit[END_SPREAD] = abs(hit[CAP_SPREAD]), abs(hit[END_SPREAD])
-    level = hit[b.CAP] < hit[b.SIDE] or hit[b.UNDER] < hit[b.END]
-    if not level:
-        hit[b.CAP], hit[b.END] = cap, max(cap, end)
-        hit[b.SIDE], hit[b.UNDER] = hit[b.CAP], hit[b.END]
-        # Edges that cross would paint less than nothing.
-        both, tall = 0.5 * (hit[CAP_SPREAD] + hit[END_SPREAD]), hit[b.END] - hit[b.CAP]
-        if both > tall:
-            hit[CAP_SPREAD], hit[END_SPREAD] = hit[CAP_SPREAD] * tall / both, hit[END_SPREAD] * tall / both
-    else:
-        hit[CAP_SPREAD] = hit[END_SPREAD] = 0.0
-
-
-@kernel
-def _column(view, seen, order: np.ndarray, known: int, sheet: tuple) -> None:
-    """Paint one column: bodies and walls from near to far, then the ground in the gaps."""
-    canvas, gaps, hit, _ = sheet
-    u = hit[SLOPE]
-    gaps[0, 0], gaps[0, 1], count = 0.0, 2.0 * view[HORIZON], 1
-    gaps[0, 2] = gaps[0, 3] = 0.0
+@inlined
+def _paint_strip(view, seen, order: np.ndarray, known: int, sheet: np.ndarray, stacks) -> None:
+    """Paint one strip: bodies and walls from near to far, then the ground in the gaps."""
+    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
+    u = 0.5 * (hit[FIRST] + hit[LAST])
+    gaps[0, 0] = gaps[1, 0] = 0.0
+    gaps[2, 0] = gaps[3, 0] = 2.0 * view[HORIZON]
+    gaps[4, 0], gaps[5, 0] = 0.0, 1.0
+    count = 1
     east, west = wall_depth(view, 1.0, u), wall_depth(view, -1.0, u)
     hit[WALL_SIDE] = 1.0 if east < west else -1.0
     hit[WALL_DEPTH], hit[WALL_AFTER] = min(east, west), max(east, west)
@@ -251,11 +233,15 @@ def _column(view, seen, order: np.ndarray, known: int, sheet: tuple) -> None:
             continue
         count = show_walls(view, sheet, count, entry)
         # Nothing behind can rise above this row, and below the gap is only ground.
-        if count == 0 or (count == 1 and entry > 0.0 and gaps[0, 1] <= view[HORIZON] - highest / entry):
+        rise = view[HORIZON] - highest / max(b.NEAR, entry)
+        if count == 0 or (count == 1 and gaps[2, 0] <= rise and gaps[3, 0] <= rise):
             return
-        _outline(view, seen, i, (entry, leave), hit)
-        count = show_body(view, seen, i, sheet, count)
+        hit[b.MEAN_ROOT] = b.outline(seen, i, view, (hit[FIRST], hit[LAST]), hit)
+        hit[b.ENTRY], hit[b.EXIT] = max(b.NEAR, entry), max(b.NEAR, leave)
+        count = show_body(view, seen, i, sheet, stacks, count)
     count = show_walls(view, sheet, count, math.inf)
     if view[v.GROUND + v.CONTRAST] > 0.0:
         for k in range(count):
-            v.cover_ground(view, canvas, gaps[k, 0], gaps[k, 1], hit[WEIGHT])
+            enter_gap(view, gaps, k, hit)
+            top, bottom = (gaps[0, k], gaps[1, k]), (gaps[2, k], gaps[3, k])
+            v.cover_ground(view, sheet, top, bottom, hit[WEIGHT], hit[SLOPE])

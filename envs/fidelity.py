@@ -20,11 +20,11 @@ CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the err
 RENDERS_TEXTURED = 1.3  # times those of a plain scene
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 # From which tolerance on how many samples do. Straight edges are exact whatever the samples;
-# the outlines of cones and ellipsoids and the patterns of textures converge with them.
+# the light and the arcs of cones and ellipsoids and the patterns of textures converge with them.
 SAMPLES = {
-    "straight": ((0.15, 1), (0.03, 2), (0.0, 4)),
+    "straight": ((0.03, 1), (0.0, 2)),
     "textured": ((0.15, 2), (0.03, 3), (0.0, 6)),
-    "curved": ((0.15, 3), (0.03, 8), (0.0, 12)),
+    "curved": ((0.15, 2), (0.03, 4), (0.0, 12)),
     "pyrender": ((0.3, 1), (0.15, 2), (0.0, 4)),
 }
 

@@ -3,8 +3,8 @@
 The camera only yaws, so one image column is one horizontal direction and every body covers
 an interval of its rows, known in closed form. A column is therefore composed exactly, from
 near to far. Pixel columns are cut at each silhouette; the pixel is the mean over its area (a
-box filter), exact in v, and by a rule of two points per strip in u. Textures are averaged
-over the footprint of each row of a strip.
+box filter), exact in v, and in u for straight edges and for the arcs of round outlines up to
+their curvature within a strip. Textures are averaged over the footprint of each row of a strip.
 
 Rules where geometry leaves a choice: what is seen from behind is invisible (a body from its
 inside, a wall from within its plane); bodies do not overlap, though one may float over

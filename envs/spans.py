@@ -1,22 +1,23 @@
-"""Kernels that paint one column: flat spans by exact coverage, textures by filtered patterns.
+"""Kernels that paint one column: flat spans between straight edges, by exact coverage.
 
-A column is a canvas with one number per pixel row in each of its layers: SPANS holds how much
-brighter a row is than the one above, so that a flat span of any length costs four
-additions; PAINT holds luminance added to a single row. The background, sky above the
-horizon and plain ground below, is added once per column by `develop`, so a span is painted
-as its difference from the background and what nothing hides costs nothing.
+All that is known while an image is painted is one array, the sheet, of which each row holds
+one thing: short lists of arguments are what kernels are fast by. SPANS holds how much
+brighter each row of pixels is than the one above, so that a flat span of any length costs few
+additions; PAINT holds luminance added to a single row. The background, sky above the horizon
+and plain ground below, is added once per column by `develop`, so a span is painted as its
+difference from the background and what nothing hides costs nothing.
+
+An edge is straight from the left to the right end of the strip being painted, and given by
+its rows there. Where edges part a strip, the shares of each row add up to one exactly.
 """
-
-import math
 
 import numba
 import numpy as np
 
-from envs.textures import LEVELS, NOISE, RINGS, STACK_TEXELS, STRIPES
-
 # Kernels allocate nothing, so that arrays need no counting of references: that, by atomic
 # instructions at each call, took five times as long as the work.
 kernel = numba.njit(cache=True, error_model="numpy", _nrt=False)
+inlined = numba.njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 # What holds for a whole frame, in one array: row of the horizon, focal length [pixels], eye
 # [m], heading, time [s], strips per pixel; of the scene: luminance of sky and ground, height
 # of the tallest [m], walls (half width, top, ends [m], albedo), Lambert weights, the sun in
@@ -28,307 +29,196 @@ LIT_UP, LIT_DOWN, LIT_EAST, LIT_WEST, LIT_NORTH, LIT_SOUTH = range(24, 30)
 # The textures follow: where in the array each begins, and what it consists of.
 GROUND, WALL, BODY, VIEW = 30, 36, 42, 48
 PATTERN, FREQUENCY, CONTRAST, SPEED_S, SPEED_Q, STACK = range(6)
-NARROW = 1e-6  # [periods] a footprint below this is a point
-FINEST = 1e-6  # [pixels] distance from the horizon up to which rows are told apart
-LOOKUPS = 8  # most lookups of noise along the longer axis of a footprint, per sample
-SHARP = 1e-3  # [rows] an edge that slopes less is level
-FAINT = 0.05  # weight below which a coarser level of noise is left out
-UNSEEN = 1e-9  # [pixels] weight below which a surface is not textured
-# Layers of the canvas, see above; the last three say, in two layers each, what shows in a row.
-SPANS, PAINT, GROUND_SHOWN, RIGHT_SHOWN, LEFT_SHOWN = 0, 1, 2, 4, 6
-LAYERS = 8
+FINEST = 1e-9  # [rows] an edge that slopes less is level
+# Rows of the sheet: the column that is painted; what shows of ground and walls in it, three
+# rows each, see `cover`; the gaps, one edge's end each; what is known of the strip; columns
+# that wait for being developed together, because sums that do not wait for each other are fast.
+SPANS, PAINT, GROUND_SHOWN, RIGHT_SHOWN, LEFT_SHOWN, GAPS, HIT, WAITING, SHEET = 0, 1, 2, 5, 8, 11, 17, 18, 26
+BLOCK = 4
+PADDING = 3  # numbers beyond the rows of the image; the last of SPANS is what changes at the horizon
 
 
 @kernel
-def _step(canvas: np.ndarray, layer: int, row: float, change: float) -> None:
+def _step(sheet: np.ndarray, layer: int, row: float, change: float) -> None:
     """From `row` downwards all is greater by `change`; exact for a row cut by it."""
     r = int(row)
     below = change * (row - r)
-    canvas[layer, r] += change - below
-    canvas[layer, r + 1] += below
+    sheet[layer, r] += change - below
+    sheet[layer, r + 1] += below
 
 
 @kernel
-def fill(view: np.ndarray, canvas: np.ndarray, top: float, bottom: float, luminance: float, weight: float):
-    """Paint rows top .. bottom, which must lie in the image, with one luminance over the background."""
-    horizon = view[HORIZON]
-    if top >= bottom:
+def _ramp(sheet: np.ndarray, layer: int, left: float, right: float, change: float) -> None:
+    """Below an edge from row `left` to row `right` all is greater by `change`; exact for the rows it cuts."""
+    low, high = min(left, right), max(left, right)
+    first, last = int(low), int(high)
+    if first == last or high - low < FINEST:
+        _step(sheet, layer, 0.5 * (low + high), change)
         return
-    if top < horizon:
-        _step(canvas, SPANS, top, weight * (luminance - view[SKY]))
-        if bottom > horizon:
-            _step(canvas, SPANS, horizon, weight * (view[SKY] - view[FLOOR]))
+    part = 0.5 * change / (high - low)
+    share = total = 0.0
+    for row in range(first, last):
+        reach = part * (row + 1.0 - low) * (row + 1.0 - low)
+        sheet[layer, row] += reach - total - share
+        share, total = reach - total, reach
+    rest = part * (high - low) * (high - low) - total + change * (last + 1.0 - high)
+    sheet[layer, last] += rest - share
+    sheet[layer, last + 1] += change - rest
+
+
+@kernel
+def share_below(row: float, left: float, right: float) -> float:
+    """Share of a row that lies below an edge from row `left` to row `right`."""
+    low, high = min(left, right), max(left, right)
+    spread = high - low
+    if spread < FINEST:
+        return min(1.0, max(0.0, row + 1.0 - low))
+    above, below = min(max(row - low, 0.0), spread), min(max(row + 1.0 - low, 0.0), spread)
+    return 0.5 * (below - above) * (below + above) / spread + min(1.0, max(0.0, row + 1.0 - high))
+
+
+@kernel
+def _edge(view: np.ndarray, sheet: np.ndarray, edge: tuple, luminance: float, weight: float) -> None:
+    """Paint all below an edge with one luminance over the background."""
+    left, right = edge
+    horizon = view[HORIZON]
+    over_sky, over_floor = weight * (luminance - view[SKY]), weight * (luminance - view[FLOOR])
+    if left >= horizon and right >= horizon:
+        _ramp(sheet, SPANS, left, right, over_floor)
+    elif left <= horizon and right <= horizon:
+        _ramp(sheet, SPANS, left, right, over_sky)
+        sheet[SPANS, -1] += over_floor - over_sky
     else:
-        _step(canvas, SPANS, top, weight * (luminance - view[FLOOR]))
-    behind = view[FLOOR] if bottom > horizon else view[SKY]
-    _step(canvas, SPANS, bottom, weight * (behind - luminance))
+        low, high = min(left, right), max(left, right)
+        part = (horizon - low) / (high - low)
+        _ramp(sheet, SPANS, low, horizon, part * over_sky)
+        _ramp(sheet, SPANS, horizon, high, (1.0 - part) * over_floor)
+        sheet[SPANS, -1] += part * (over_floor - over_sky)
 
 
 @kernel
-def share_below(row: int, edge: float, spread: float) -> float:
-    """Share of a row that lies below an edge which slopes evenly over `spread` rows around `edge`."""
-    if spread < SHARP:
-        return min(1.0, max(0.0, row + 1.0 - edge))
-    above, below = edge - 0.5 * spread, edge + 0.5 * spread
-    low, high = min(max(row, above), below), min(max(row + 1.0, above), below)
-    share = 0.5 * (high - low) * (high + low - 2.0 * above) / spread
-    return share + max(0.0, row + 1.0 - max(row, below))
+def fill(view, sheet: np.ndarray, top: tuple, bottom: tuple, luminance: float, weight: float) -> None:
+    """Paint what lies between two edges, which must lie in the image, with one luminance."""
+    _edge(view, sheet, top, luminance, weight)
+    _edge(view, sheet, bottom, luminance, -weight)
 
 
 @kernel
-def _slope(view, canvas: np.ndarray, edge: float, spread: float, luminance: float, weight: float):
-    """Paint all below a sloping edge with one luminance over the background."""
-    sky, floor, horizon = luminance - view[SKY], luminance - view[FLOOR], view[HORIZON]
-    rows = canvas.shape[1] - 2
-    row, painted = max(0, math.floor(edge - 0.5 * spread)), 0.0
-    last = edge + 0.5 * spread
-    while row < rows and row <= last:
-        # The row that holds the horizon has both behind it.
-        over = min(1.0, max(0.0, horizon - row))
-        value = share_below(row, edge, spread) * (over * sky + (1.0 - over) * floor)
-        canvas[SPANS, row] += weight * (value - painted)
-        row, painted = row + 1, value
-    below = sky if row < horizon else floor
-    canvas[SPANS, row] += weight * (below - painted)
-    if row < horizon:
-        _step(canvas, SPANS, horizon, weight * (view[SKY] - view[FLOOR]))
+def develop(view: np.ndarray, sheet: np.ndarray, image: np.ndarray, column: int) -> None:
+    """Take the painted column off the sheet; once there are enough, write them into the image."""
+    rows, place = image.shape[0] + 2, column % BLOCK
+    _step(sheet, SPANS, view[HORIZON], view[FLOOR] - view[SKY] + sheet[SPANS, -1])
+    for row in range(rows):
+        sheet[WAITING + place, row] = sheet[SPANS, row]
+        sheet[WAITING + BLOCK + place, row] = sheet[PAINT, row]
+        sheet[SPANS, row] = sheet[PAINT, row] = 0.0
+    sheet[SPANS, -1] = 0.0
+    if place == BLOCK - 1:
+        _sum_block(view[SKY], sheet[WAITING:], image, column - place)
+    elif column == image.shape[1] - 1:
+        for first in range(column - place, column + 1):
+            _sum_column(view[SKY], sheet[WAITING + first % BLOCK :: BLOCK], image, first)
 
 
 @kernel
-def fill_sloping(view, canvas, rows: tuple, spreads: tuple, luminance: float, weight: float):
-    """As `fill`, between edges that slope over `spreads` rows within the column."""
-    if spreads[0] < SHARP and spreads[1] < SHARP:
-        fill(view, canvas, rows[0], rows[1], luminance, weight)
-    elif rows[0] < rows[1]:
-        _slope(view, canvas, rows[0], spreads[0], luminance, weight)
-        _slope(view, canvas, rows[1], spreads[1], luminance, -weight)
-
-
-@kernel
-def develop(view: np.ndarray, canvas: np.ndarray, image: np.ndarray, column: int) -> None:
-    """Write the painted column over the background into the image, and clear the canvas."""
-    _step(canvas, SPANS, view[HORIZON], view[FLOOR] - view[SKY])
-    running = view[SKY]
+def _sum_block(sky: float, waiting: np.ndarray, image: np.ndarray, first: int) -> None:
+    """Write columns `first` .. `first` + 3."""
+    one = two = three = four = sky
     for row in range(image.shape[0]):
-        running += canvas[SPANS, row]
-        image[row, column] = running + canvas[PAINT, row]
-    canvas[SPANS] = 0.0
-    canvas[PAINT] = 0.0
+        one += waiting[0, row]
+        two += waiting[1, row]
+        three += waiting[2, row]
+        four += waiting[3, row]
+        image[row, first] = one + waiting[4, row]
+        image[row, first + 1] = two + waiting[5, row]
+        image[row, first + 2] = three + waiting[6, row]
+        image[row, first + 3] = four + waiting[7, row]
 
 
 @kernel
-def _wave(middle: float, wide: float) -> float:
-    """Mean of a square wave of period 1, +1 first, over an interval [periods]; exact."""
-    if wide < NARROW:
-        return 1.0 if middle - np.floor(middle) < 0.5 else -1.0
-    a, b = middle - 0.5 * wide, middle + 0.5 * wide
-    a, b = a - np.floor(a), b - np.floor(b)
-    return min(1.0, max(-1.0, (min(b, 1.0 - b) - min(a, 1.0 - a)) / wide))
+def _sum_column(sky: float, waiting: np.ndarray, image: np.ndarray, column: int) -> None:
+    """Write one column."""
+    running = sky
+    for row in range(image.shape[0]):
+        running += waiting[0, row]
+        image[row, column] = running + waiting[1, row]
 
 
 @kernel
-def _look_up(stacks: np.ndarray, start: int, s: float, q: float) -> float:
-    """Periodic bilinear interpolation at (s, q) [tiles] in the tile that begins at `start`."""
-    x, y = (s - np.floor(s)) * STACK_TEXELS, (q - np.floor(q)) * STACK_TEXELS
-    i, j = int(x), int(y)
-    x, y = x - i, y - j
-    i, j = i & (STACK_TEXELS - 1), j & (STACK_TEXELS - 1)
-    right = ((i + 1) & (STACK_TEXELS - 1)) - i
-    here = start + j * STACK_TEXELS + i
-    below = start + ((j + 1) & (STACK_TEXELS - 1)) * STACK_TEXELS + i
-    upper = stacks[here] + x * (stacks[here + right] - stacks[here])
-    lower = stacks[below] + x * (stacks[below + right] - stacks[below])
-    return upper + y * (lower - upper)
+def cover(sheet: np.ndarray, layer: int, top: tuple, bottom: tuple, weight: float, u: float) -> None:
+    """Note that what lies between two edges shows the surface of `layer`; its pattern follows once per cell.
 
-
-@kernel
-def _noise(stacks: np.ndarray, k: int, s: float, q: float, axes: tuple, most: int) -> float:
-    """Mean of noise over a parallelogram [tiles]: lookups along its longer axis, each a filtered square."""
-    es, eq, fs, fq = axes
-    short, long = es * es + eq * eq, fs * fs + fq * fq
-    if short > long:
-        short, long, fs, fq = long, short, es, eq
-    short, long = math.sqrt(short), math.sqrt(long)
-    # A sixteenth of a tile is a quarter of the shortest period, which one lookup resolves.
-    count = min(most, 1 + int(long / max(short, 0.0625)))
-    level = min(LEVELS - 1.0, max(short, long / count) * 2.0 * (LEVELS - 1))
-    low = min(int(level), LEVELS - 2)
-    finer = (k * LEVELS + low) * STACK_TEXELS * STACK_TEXELS
-    coarser = finer + STACK_TEXELS * STACK_TEXELS
-    # Filtering weakens a wave by the square of its width, to first order.
-    blend = (level * level - low * low) / (2.0 * low + 1.0)
-    total = 0.0
-    for j in range(count):
-        along = (j + 0.5) / count - 0.5
-        x, y = s + along * fs, q + along * fq
-        value = _look_up(stacks, finer, x, y)
-        if blend > FAINT:
-            value += blend * (_look_up(stacks, coarser, x, y) - value)
-        total += value
-    return total / count
-
-
-@kernel
-def pattern(view, stacks, k: int, s: float, q: float, axes: tuple, most: int) -> float:
-    """Contrast times the mean of texture `k` over the parallelogram of `axes` around (s, q) [m].
-
-    Exact for checker, stripes and rings if the footprint is a rectangle along s and q; else
-    each coordinate is averaged on its own, over a width of the same variance. Noise takes at
-    most `most` lookups.
+    Two more layers say where the part that shows of a row has its middle, the first moments:
+    in the row, and along the slopes, of which `u` is that of the middle here.
     """
-    scale = view[k + FREQUENCY]
-    s = (s - view[k + SPEED_S] * view[TIME]) * scale
-    q = (q - view[k + SPEED_Q] * view[TIME]) * scale
-    es, eq, fs, fq = axes[0] * scale, axes[1] * scale, axes[2] * scale, axes[3] * scale
-    kind, mean = int(view[k + PATTERN]), view[k + CONTRAST]
-    if kind == NOISE:
-        tiles = (0.25 * es, 0.25 * eq, 0.25 * fs, 0.25 * fq)
-        return mean * _noise(stacks, int(view[k + STACK]), 0.25 * s, 0.25 * q, tiles, most)
-    if kind != RINGS:
-        mean *= _wave(s, math.sqrt(es * es + fs * fs))
-    if kind != STRIPES:
-        mean *= _wave(q, math.sqrt(eq * eq + fq * fq))
-    return mean
+    _ramp(sheet, layer, top[0], top[1], weight)
+    _ramp(sheet, layer, bottom[0], bottom[1], -weight)
+    _ramp(sheet, layer + 2, top[0], top[1], weight * u)
+    _ramp(sheet, layer + 2, bottom[0], bottom[1], -weight * u)
+    high, low = 0.5 * (top[0] + top[1]), 0.5 * (bottom[0] + bottom[1])
+    first, last = int(high), int(low)
+    above, below = high - first, low - last
+    sheet[layer + 1, first] += 0.5 * weight * above * (1.0 - above)
+    sheet[layer + 1, last] -= 0.5 * weight * below * (1.0 - below)
 
 
 @kernel
-def level_row(view, stacks, k: int, low: float, high: float, height: float, u: float, wide: float):
-    """Contrast times the mean of texture `k` of a level face at `height` [m] over rows low .. high.
+def cover_ground(view, sheet: np.ndarray, top: tuple, bottom: tuple, weight: float, u: float) -> None:
+    """As `cover`, for what shows of the ground between two edges."""
+    horizon = view[HORIZON]
+    top = (max(top[0], horizon), max(top[1], horizon))
+    bottom = (max(bottom[0], horizon), max(bottom[1], horizon))
+    if top[0] < bottom[0] or top[1] < bottom[1]:
+        cover(sheet, GROUND_SHOWN, top, bottom, weight, u)
 
-    `u` and `wide` are the slope of the strip's middle and its width in slopes. The footprint
-    is cut into parts of equal rows where it is long and neither along s nor along q.
+
+@inlined
+def beyond(edge: tuple, limit: tuple) -> tuple[float, float]:
+    """An edge, moved below a limit where it is above.
+
+    Where they cross, what lies between them is a triangle that ends there: it is drawn as one
+    of the same area that reaches through the strip.
     """
-    drop = view[FOCAL] * (view[EYE_Z] - height)
-    along_s, along_q = u * view[COS] - view[SIN], u * view[SIN] + view[COS]
-    low, high = low - view[HORIZON], high - view[HORIZON]
-    if abs(low) < FINEST:
-        low = math.copysign(FINEST, drop)
-    if abs(high) < FINEST:
-        high = math.copysign(FINEST, drop)
-    long = abs(drop / low - drop / high) * view[k + FREQUENCY]
-    if view[k + PATTERN] == NOISE:
-        parts = 1 + int(min(3.0, 0.25 * long))
-        most = max(1, int(LOOKUPS * view[SAMPLES]) // parts)
-    else:
-        slant = min(abs(along_s), abs(along_q))
-        most, parts = 1, 1 + int(min(8.0 * view[SAMPLES] - 1.0, 4.0 * view[SAMPLES] * slant * long))
-    part, total, first = (high - low) / parts, 0.0, drop / low
-    for j in range(parts):
-        last = drop / (low + (j + 1) * part)
-        depth, long = 0.5 * (first + last), last - first
-        across = depth * wide
-        axes = (across * view[COS], across * view[SIN], long * along_s, long * along_q)
-        s, q = view[EYE_X] + depth * along_s, view[EYE_Y] + depth * along_q
-        total += pattern(view, stacks, k, s, q, axes, most)
-        first = last
-    return total / parts
+    one, other = edge[0] - limit[0], edge[1] - limit[1]
+    if one >= 0.0 and other >= 0.0:
+        return edge
+    if one > 0.0:
+        return limit[0] + one * one / (one - other), limit[1]
+    if other > 0.0:
+        return limit[0], limit[1] + other * other / (other - one)
+    return limit
+
+
+@inlined
+def is_open(top: tuple, bottom: tuple) -> bool:
+    """Whether anything lies between two edges."""
+    return top[0] < bottom[0] or top[1] < bottom[1]
 
 
 @kernel
-def texture_level(view, stacks, canvas, top: float, bottom: float, height: float, ray: tuple) -> None:
-    """Add the pattern of a body's level face at `height` [m] to rows top .. bottom.
-
-    `ray` is slope, width of the strip in slopes, weighted luminance.
-    """
-    u, wide, weight = ray
-    row = int(top)
-    while row < bottom:
-        low, high = max(top, row), min(bottom, row + 1.0)
-        mean = level_row(view, stacks, BODY, low, high, height, u, wide)
-        canvas[PAINT, row] += weight * (high - low) * mean
-        row += 1
+def cut_gap(gaps: np.ndarray, k: int, new: int, part: float) -> None:
+    """Cut gap `k` after a part of its width; the rest becomes gap `new`."""
+    for row in range(6):
+        gaps[row, new] = gaps[row, k]
+    for row in (0, 2, 4):
+        middle = gaps[row, k] + part * (gaps[row + 1, k] - gaps[row, k])
+        gaps[row + 1, k] = gaps[row, new] = middle
 
 
-@kernel
-def texture_side(view, stacks, canvas, top: float, bottom: float, side: tuple) -> None:
-    """Add the pattern of a body's upright face to rows top .. bottom.
-
-    `side` is s at both ends of the strip [m], depth [m], q at height 0 [m], weighted luminance.
-    """
-    s_left, s_right, depth, foot, weight = side
-    tall = depth / view[FOCAL]
-    middle, most = 0.5 * (s_left + s_right), int(LOOKUPS * view[SAMPLES])
-    row = int(top)
-    while row < bottom:
-        low, high = max(top, row), min(bottom, row + 1.0)
-        q = foot + view[EYE_Z] - (0.5 * (low + high) - view[HORIZON]) * tall
-        axes = (s_right - s_left, 0.0, 0.0, (high - low) * tall)
-        mean = pattern(view, stacks, BODY, middle, q, axes, most)
-        canvas[PAINT, row] += weight * (high - low) * mean
-        row += 1
-
-
-@kernel
-def cover(canvas: np.ndarray, layer: int, top: float, bottom: float, weight: float) -> None:
-    """Note that rows top .. bottom show the surface of `layer`; its pattern follows once per cell.
-
-    One more layer says where in its row the part that shows has its middle: the first moment.
-    """
-    _step(canvas, layer, top, weight)
-    _step(canvas, layer, bottom, -weight)
-    first, last = int(top), int(bottom)
-    above, below = top - first, bottom - last
-    canvas[layer + 1, first] += 0.5 * weight * above * (1.0 - above)
-    canvas[layer + 1, last] -= 0.5 * weight * below * (1.0 - below)
-
-
-@kernel
-def cover_ground(view, canvas: np.ndarray, top: float, bottom: float, weight: float) -> None:
-    """As `cover`, for what rows top .. bottom show of the ground."""
-    top = max(top, view[HORIZON])
-    if top < bottom:
-        cover(canvas, GROUND_SHOWN, top, bottom, weight)
-
-
-@kernel
-def texture_cell(view, stacks, canvas, u: float) -> None:
-    """Add the patterns of ground and walls to what the cell of slope `u` shows of them."""
-    if view[GROUND + CONTRAST] > 0.0:
-        _texture_layer(view, stacks, canvas, GROUND_SHOWN, u)
-    if view[WALL + CONTRAST] > 0.0:
-        _texture_layer(view, stacks, canvas, RIGHT_SHOWN, u)
-        _texture_layer(view, stacks, canvas, LEFT_SHOWN, u)
-
-
-@kernel
-def _texture_layer(view, stacks, canvas, layer: int, u: float) -> None:
-    """Add the pattern of the ground or a wall where the cell of slope `u` shows it; forget what it shows.
-
-    What shows of a row is taken as an interval of rows around its middle, as wide as the
-    cell: exact where the row is cut above or below, a texture's share of a pixel where it is
-    cut at the side.
-    """
-    shown, wide = 0.0, 1.0 / (view[SAMPLES] * view[FOCAL])
-    ground = layer == GROUND_SHOWN
-    side = 1.0 if layer == RIGHT_SHOWN else -1.0
-    facing = view[LIT_EAST] if side * view[WALL_HALF] < view[EYE_X] else view[LIT_WEST]
-    base = view[FLOOR] if ground else view[WALL_ALBEDO] * facing
-    for row in range(int(view[HORIZON]) if ground else 0, canvas.shape[1] - 2):
-        shown += canvas[layer, row]
-        if shown > UNSEEN:
-            down = canvas[layer + 1, row] / shown
-            tall = 1.0 - 2.0 * abs(down)
-            low = row + 0.5 + down - 0.5 * tall
-            if ground:
-                mean = level_row(view, stacks, GROUND, low, low + tall, 0.0, u, wide)
-            else:
-                mean = wall_row(view, stacks, low, low + tall, side, u, wide)
-            canvas[PAINT, row] += shown * base * mean
-    canvas[layer : layer + 2] = 0.0
-
-
-@kernel
-def wall_row(view, stacks, low: float, high: float, side: float, u: float, wide: float) -> float:
-    """Contrast times the mean of the wall at x = side * half width over rows low .. high."""
-    away = side * view[WALL_HALF] - view[EYE_X]
-    left, right = u - 0.5 * wide, u + 0.5 * wide
-    one = away / (left * view[COS] - view[SIN])
-    other = away / (right * view[COS] - view[SIN])
-    # A cell may reach past the slope that is parallel to the wall.
-    one, other = min(abs(one), 1e9), min(abs(other), 1e9)
-    one, other = one * (left * view[SIN] + view[COS]), other * (right * view[SIN] + view[COS])
-    tall = away / (u * view[COS] - view[SIN]) / view[FOCAL]
-    q = view[EYE_Z] - (0.5 * (low + high) - view[HORIZON]) * tall
-    axes = (other - one, 0.0, 0.0, (high - low) * tall)
-    s = view[EYE_Y] + 0.5 * (one + other)
-    return pattern(view, stacks, WALL, s, q, axes, int(LOOKUPS * view[SAMPLES]))
+@inlined
+def left_of_row(edges: tuple, start: float, end: float) -> tuple[float, float]:
+    """From where to where in the strip, of 0 .. 1, two edges leave something of rows start .. end."""
+    (top, bottom), left, right = edges, 0.0, 1.0
+    if top[0] != top[1]:  # below the upper edge
+        crossing = (end - top[0]) / (top[1] - top[0])
+        if top[0] < top[1]:
+            right = min(right, max(0.0, crossing))
+        else:
+            left = max(left, min(1.0, crossing))
+    if bottom[0] != bottom[1]:  # above the lower edge
+        crossing = (start - bottom[0]) / (bottom[1] - bottom[0])
+        if bottom[0] > bottom[1]:
+            right = min(right, max(0.0, crossing))
+        else:
+            left = max(left, min(1.0, crossing))
+    return left, max(left, right)

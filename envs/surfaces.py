@@ -1,8 +1,9 @@
-"""Kernels that show a wall or a body in one column: clip it to the gaps, paint it, close them.
+"""Kernels that show a wall or a body in one strip: clip it to the gaps, paint it, close them.
 
-A column's gaps are what nothing nearer covers: rows `gaps[k, 0]` .. `gaps[k, 1]`. `sheet` is
-the canvas, the gaps, what is known of the column, and the stacks of noise. Input is assumed
-valid.
+A strip's gaps are what nothing nearer covers, each between two straight edges: rows
+`gaps[0, k]` and `gaps[1, k]` are the left and the right end of the upper one, 2 and 3 of the
+lower; 4 and 5 are from where to where in the strip it reaches, of 0 .. 1. What is shown is
+clipped to gaps at both ends, so that it and the gaps always part the strip. Input is assumed valid.
 """
 
 import math
@@ -10,19 +11,34 @@ import math
 import numpy as np
 
 from envs import bodies as b
+from envs import patterns as p
 from envs import spans as v
-from envs.bodies import CAP, END, ENTRY, KIND, SIDE, UNDER
+from envs.bodies import (
+    CAP,
+    END,
+    ENTRY,
+    FIRST,
+    KIND,
+    LAST,
+    LEFT_END,
+    LEVEL_LIGHT,
+    LIGHT,
+    MEAN_ROOT,
+    RIGHT_END,
+    SIDE,
+    SLOPE,
+    UNDER,
+    WALL_AFTER,
+    WALL_DEPTH,
+    WALL_SIDE,
+    WEIGHT,
+)
 from envs.obstacles import BOX, ELLIPSOID, POLE
-from envs.spans import EYE_X, EYE_Y, EYE_Z, FOCAL, HORIZON, kernel
+from envs.spans import EYE_X, EYE_Y, EYE_Z, FOCAL, HORIZON, inlined, kernel
 
-# What is known of a column, beside what `envs.bodies` says of a body in it: its slope, those of
-# both ends of the part of the strip it stands for, its weight [pixels]; luminance of the side
-# and of the level face of what is shown; the wall that comes next: which (+-1), its depth and
-# that of the other one [m].
-SLOPE, LEFT, RIGHT, WEIGHT, BESIDE, LIGHT, LEVEL_LIGHT, WALL_SIDE, WALL_DEPTH, WALL_AFTER = range(6, 16)
-# By how many rows its upper and its lower edge slope from one end of that part to the other.
-CAP_SPREAD, END_SPREAD = 16, 17
-KNOWN = 18
+SLIGHT = 0.02  # [rows] edges that cross by less are not cut there
+GAUSS = 0.5 / math.sqrt(3.0)  # how far from the middle two points stand that stand for a length of 1
+BROAD = 0.1  # [widths of a body] a strip wider than this is lit by two points
 
 
 @kernel
@@ -33,71 +49,138 @@ def wall_depth(view: np.ndarray, side: float, u: float) -> float:
     return depth if depth > b.NEAR and view[v.WALL_NEAR] <= y <= view[v.WALL_FAR] else math.inf
 
 
+@inlined
+def _ends(gaps: np.ndarray, k: int, hit: np.ndarray, edge: int) -> tuple[float, float]:
+    """Rows of an edge of what is shown at both ends of gap `k`."""
+    left, right = hit[edge], hit[edge + 1]
+    return left + gaps[4, k] * (right - left), right + (1.0 - gaps[5, k]) * (left - right)
+
+
+@inlined
+def _clip(gaps: np.ndarray, k: int, hit: np.ndarray, edge: int) -> tuple[float, float]:
+    """An edge of what is shown, moved into gap `k`."""
+    left, right = v.beyond(_ends(gaps, k, hit, edge), (gaps[0, k], gaps[1, k]))
+    left, right = v.beyond((-left, -right), (-gaps[2, k], -gaps[3, k]))
+    return -left, -right
+
+
+@inlined
+def _cut_gaps(gaps: np.ndarray, hit: np.ndarray, count: int) -> int:
+    """Cut the gaps where an edge of what is shown crosses one of theirs; their new number."""
+    count = _cut_by(gaps, hit, count, CAP)
+    count = _cut_by(gaps, hit, count, END)
+    if hit[SIDE] > hit[CAP] or hit[SIDE + 1] > hit[CAP + 1]:
+        count = _cut_by(gaps, hit, count, SIDE)
+    if hit[END] > hit[UNDER] or hit[END + 1] > hit[UNDER + 1]:
+        count = _cut_by(gaps, hit, count, UNDER)
+    return count
+
+
+@kernel
+def _cut_by(gaps: np.ndarray, hit: np.ndarray, count: int, edge: int) -> int:
+    """Cut the gaps where one edge crosses theirs, as long as less than half the room is used."""
+    k = 0
+    while k < count:
+        for limit in (0, 2):
+            left, right = _ends(gaps, k, hit, edge)
+            one, other = left - gaps[limit, k], right - gaps[limit + 1, k]
+            if one * other < 0.0 and min(abs(one), abs(other)) > SLIGHT and 2 * count < gaps.shape[1]:
+                v.cut_gap(gaps, k, count, one / (one - other))
+                count += 1
+        k += 1
+    return count
+
+
+@inlined
+def enter_gap(view: np.ndarray, gaps: np.ndarray, k: int, hit: np.ndarray) -> None:
+    """Note where gap `k` is, and its weight."""
+    wide = hit[LAST] - hit[FIRST]
+    hit[LEFT_END], hit[RIGHT_END] = hit[FIRST] + gaps[4, k] * wide, hit[FIRST] + gaps[5, k] * wide
+    hit[SLOPE] = 0.5 * (hit[LEFT_END] + hit[RIGHT_END])
+    hit[WEIGHT] = view[FOCAL] * (hit[RIGHT_END] - hit[LEFT_END])
+
+
 @kernel
 def _carve(view, sheet, count: int, k: int, standing: bool) -> int:
-    """Take rows CAP .. END out of gap `k`; below what stands on the ground only the ground is left."""
-    canvas, gaps, hit, _ = sheet
-    top, bottom = gaps[k, 0], gaps[k, 1]
-    if standing and hit[END] < bottom:
+    """Take what is shown out of gap `k`; below what stands on the ground only the ground is left."""
+    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
+    first, last = _clip(gaps, k, hit, CAP), _clip(gaps, k, hit, END)
+    top, bottom = (gaps[0, k], gaps[1, k]), (gaps[2, k], gaps[3, k])
+    below = v.is_open(last, bottom) and count < gaps.shape[1]
+    if below and standing:
         if view[v.GROUND + v.CONTRAST] > 0.0:
-            v.cover_ground(view, canvas, hit[END], bottom, hit[WEIGHT])
-        bottom = hit[END]
-    if top < hit[CAP]:
-        below = gaps[k, 3]
-        gaps[k, 1], gaps[k, 3] = hit[CAP], hit[CAP_SPREAD]
-        if hit[END] < bottom:
-            gaps[count, 0], gaps[count, 1] = hit[END], bottom
-            gaps[count, 2], gaps[count, 3] = hit[END_SPREAD], below
+            v.cover_ground(view, sheet, last, bottom, hit[WEIGHT], hit[SLOPE])
+        below = False
+    if v.is_open(top, first):
+        gaps[2, k], gaps[3, k] = first
+        if below:
+            gaps[0, count], gaps[1, count] = last
+            gaps[2, count], gaps[3, count] = bottom
+            gaps[4, count], gaps[5, count] = gaps[4, k], gaps[5, k]
             return count + 1
         return count
-    if hit[END] < bottom:
-        gaps[k, 0], gaps[k, 2] = hit[END], hit[END_SPREAD]
+    if below:
+        gaps[0, k], gaps[1, k] = last
         return count
-    for column in range(4):
-        gaps[k, column] = gaps[count - 1, column]
+    for row in range(6):
+        gaps[row, k] = gaps[row, count - 1]
     return count - 1
 
 
 @kernel
-def _spreads(gaps: np.ndarray, k: int, hit: np.ndarray) -> tuple[float, float]:
-    """By how many rows the edges slope of what gap `k` shows between rows CAP and END."""
-    above = hit[CAP_SPREAD] if hit[CAP] > gaps[k, 0] else gaps[k, 2]
-    below = hit[END_SPREAD] if hit[END] < gaps[k, 1] else gaps[k, 3]
-    return above, below
-
-
-@kernel
-def show_walls(view: np.ndarray, sheet: tuple, count: int, limit: float) -> int:
+def show_walls(view: np.ndarray, sheet: np.ndarray, count: int, limit: float) -> int:
     """Paint the walls nearer than `limit` [m] that are still to come into the gaps; their new number."""
-    canvas, gaps, hit, _ = sheet
+    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
     while hit[WALL_DEPTH] < limit:
-        side, scale = hit[WALL_SIDE], view[FOCAL] / hit[WALL_DEPTH]
-        hit[CAP] = view[HORIZON] + scale * (view[EYE_Z] - view[v.WALL_TOP])
-        hit[END] = view[HORIZON] + scale * view[EYE_Z]
-        hit[CAP_SPREAD] = hit[END_SPREAD] = 0.0
+        side = hit[WALL_SIDE]
+        away = view[FOCAL] / (side * view[v.WALL_HALF] - view[EYE_X])
+        for k in range(2):
+            scale = max(0.0, away * (hit[FIRST + k] * view[v.COS] - view[v.SIN]))
+            hit[CAP + k] = view[HORIZON] + scale * (view[EYE_Z] - view[v.WALL_TOP])
+            hit[END + k] = view[HORIZON] + scale * view[EYE_Z]
+        for k in range(2):
+            hit[SIDE + k], hit[UNDER + k] = hit[CAP + k], hit[END + k]
         facing = view[v.LIT_EAST] if view[EYE_X] > side * view[v.WALL_HALF] else view[v.LIT_WEST]
+        count = _cut_gaps(gaps, hit, count)
         for k in range(count - 1, -1, -1):
-            top, bottom = max(gaps[k, 0], hit[CAP]), min(gaps[k, 1], hit[END])
-            if top < bottom:
-                spreads = _spreads(gaps, k, hit)
-                light = view[v.WALL_ALBEDO] * facing
-                v.fill_sloping(view, canvas, (top, bottom), spreads, light, hit[WEIGHT])
+            top, bottom = _clip(gaps, k, hit, CAP), _clip(gaps, k, hit, END)
+            if v.is_open(top, bottom):
+                enter_gap(view, gaps, k, hit)
+                v.fill(view, sheet, top, bottom, view[v.WALL_ALBEDO] * facing, hit[WEIGHT])
                 if view[v.WALL + v.CONTRAST] > 0.0:
                     layer = v.RIGHT_SHOWN if side > 0.0 else v.LEFT_SHOWN
-                    v.cover(canvas, layer, top, bottom, hit[WEIGHT])
+                    v.cover(sheet, layer, top, bottom, hit[WEIGHT], hit[SLOPE])
                 count = _carve(view, sheet, count, k, True)
         hit[WALL_SIDE], hit[WALL_DEPTH], hit[WALL_AFTER] = -side, hit[WALL_AFTER], math.inf
     return count
 
 
 @kernel
+def _lit_part(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> float:
+    """Mean cosine over a strip of which the sun lights one side, up to where its rays graze the pole."""
+    length = math.sqrt(view[v.SUN_RIGHT] * view[v.SUN_RIGHT] + view[v.SUN_FORWARD] * view[v.SUN_FORWARD])
+    right, forward = -view[v.SUN_FORWARD] / length, view[v.SUN_RIGHT] / length
+    away = right * seen[i, b.RIGHT] + forward * seen[i, b.FORWARD]
+    radius = -math.copysign(seen[i, b.RX], away)
+    grazed = (seen[i, b.RIGHT] + radius * right) / max(b.NEAR, seen[i, b.FORWARD] + radius * forward)
+    grazed = min(max(grazed, hit[FIRST]), hit[LAST])
+    low, high = (hit[FIRST], grazed) if hit[b.COSINES] > 0.0 else (grazed, hit[LAST])
+    arc = b.mean_root(seen, i, low, high, (b.root(seen, i, low), b.root(seen, i, high)))
+    return b.cosine(seen, i, view, 0.5 * (low + high), arc) * (high - low) / (hit[LAST] - hit[FIRST])
+
+
+@inlined
 def _side_light(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> float:
-    """Luminance of a pole's or box's side where the column meets it."""
+    """Mean luminance of a pole's or box's side over the strip."""
+    middle = 0.5 * (hit[FIRST] + hit[LAST])
     if seen[i, KIND] == POLE:
-        right, forward = hit[ENTRY] * hit[SLOPE] - seen[i, b.RIGHT], hit[ENTRY] - seen[i, b.FORWARD]
-        cosine = (right * view[v.SUN_RIGHT] + forward * view[v.SUN_FORWARD]) / seen[i, b.RX]
+        one, other = hit[b.COSINES], hit[b.COSINES + 1]
+        if one < 0.0 or other < 0.0:
+            cosine = _lit_part(view, seen, i, hit) if max(one, other) > 0.0 else 0.0
+        else:
+            cosine = b.cosine(seen, i, view, middle, hit[MEAN_ROOT])
         return seen[i, b.ALBEDO] * (view[v.AMBIENT] + view[v.DIFFUSE] * min(1.0, max(0.0, cosine)))
-    along_x, along_y = hit[SLOPE] * view[v.COS] - view[v.SIN], hit[SLOPE] * view[v.SIN] + view[v.COS]
+    along_x, along_y = middle * view[v.COS] - view[v.SIN], middle * view[v.SIN] + view[v.COS]
     near_x, near_y, _ = b.box_slab(seen, i, along_x, along_y)
     if near_x > near_y:
         return seen[i, b.ALBEDO] * (view[v.LIT_WEST] if along_x > 0.0 else view[v.LIT_EAST])
@@ -105,32 +188,49 @@ def _side_light(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> 
 
 
 @kernel
-def show_body(view: np.ndarray, seen: np.ndarray, i: int, sheet: tuple, count: int) -> int:
-    """Paint what the column knows of a body into the gaps; their new number."""
-    canvas, gaps, hit, _ = sheet
+def _cut_for_body(view, seen, i: int, sheet: np.ndarray, count: int) -> int:
+    """Cut the gaps where a body's edges cross theirs, and in two for a pattern that bends around it."""
+    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
+    count = _cut_gaps(gaps, hit, count)
+    broad = hit[LAST] - hit[FIRST] > BROAD * (seen[i, b.HIGH] - seen[i, b.LOW])
+    if view[v.BODY + v.CONTRAST] > 0.0 and seen[i, KIND] != BOX and broad and 2 * count < gaps.shape[1]:
+        for k in range(count):
+            v.cut_gap(gaps, k, count + k, 0.5)
+        count *= 2
+    return count
+
+
+@inlined
+def _paint_faces(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges: tuple) -> None:
+    """Paint what lies between four edges: a body's level top, its side, its underside."""
+    hit, (top, first, last, bottom) = sheet[v.HIT], edges
+    if v.is_open(first, last):
+        v.fill(view, sheet, first, last, hit[LIGHT], hit[WEIGHT])
+        if seen[i, KIND] != POLE and seen[i, KIND] != BOX:
+            _shade_rows(view, seen, i, sheet, stacks, (first, last))
+    if v.is_open(top, first):
+        v.fill(view, sheet, top, first, hit[LEVEL_LIGHT], hit[WEIGHT])
+    if v.is_open(last, bottom):
+        v.fill(view, sheet, last, bottom, hit[LEVEL_LIGHT], hit[WEIGHT])
+    if view[v.BODY + v.CONTRAST] > 0.0:
+        _texture_faces(view, seen, i, sheet, stacks, edges)
+
+
+@inlined
+def show_body(view, seen: np.ndarray, i: int, sheet: np.ndarray, stacks: np.ndarray, count: int) -> int:
+    """Paint what the strip knows of a body into the gaps; their new number."""
+    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
     curved = seen[i, KIND] != POLE and seen[i, KIND] != BOX
-    if not curved:
-        hit[LIGHT] = _side_light(view, seen, i, hit)
+    hit[LIGHT] = 0.0 if curved else _side_light(view, seen, i, hit)
     lit = view[v.LIT_UP] if view[EYE_Z] > seen[i, b.TOP] else view[v.LIT_DOWN]
     hit[LEVEL_LIGHT] = seen[i, b.ALBEDO] * lit
+    count = _cut_for_body(view, seen, i, sheet, count)
     for k in range(count - 1, -1, -1):
-        top, bottom = max(gaps[k, 0], hit[CAP]), min(gaps[k, 1], hit[END])
-        if top < bottom:
-            first, last = max(top, hit[SIDE]), min(bottom, hit[UNDER])
-            above, below = _spreads(gaps, k, hit)
-            spreads = (above if first == top else 0.0, below if last == bottom else 0.0)
-            if curved:
-                _paint_curved(view, seen, i, sheet, (first, last), spreads)
-            else:
-                v.fill_sloping(view, canvas, (first, last), spreads, hit[LIGHT], hit[WEIGHT])
-            if top < hit[SIDE]:
-                rows, spreads = (top, min(bottom, hit[SIDE])), (above, 0.0)
-                v.fill_sloping(view, canvas, rows, spreads, hit[LEVEL_LIGHT], hit[WEIGHT])
-            if hit[UNDER] < bottom:
-                rows, spreads = (max(top, hit[UNDER]), bottom), (0.0, below)
-                v.fill_sloping(view, canvas, rows, spreads, hit[LEVEL_LIGHT], hit[WEIGHT])
-            if view[v.BODY + v.CONTRAST] > 0.0:
-                _texture_faces(view, seen, i, sheet, top, bottom)
+        top, bottom = _clip(gaps, k, hit, CAP), _clip(gaps, k, hit, END)
+        if v.is_open(top, bottom):
+            first, last = _clip(gaps, k, hit, SIDE), _clip(gaps, k, hit, UNDER)
+            enter_gap(view, gaps, k, hit)
+            _paint_faces(view, seen, i, sheet, stacks, (top, first, last, bottom))
             # Under the belly of an ellipsoid more than the ground can be seen.
             standing = seen[i, b.BOTTOM] <= b.NEAR and seen[i, KIND] != ELLIPSOID
             count = _carve(view, sheet, count, k, standing)
@@ -138,105 +238,97 @@ def show_body(view: np.ndarray, seen: np.ndarray, i: int, sheet: tuple, count: i
 
 
 @kernel
-def _texture_faces(view, seen, i: int, sheet: tuple, top: float, bottom: float) -> None:
-    """Add the pattern to what rows top .. bottom show of a body's flat faces, or of a pole's side."""
-    canvas, _, hit, stacks = sheet
-    ray = (0.5 * (hit[LEFT] + hit[RIGHT]), hit[RIGHT] - hit[LEFT], hit[WEIGHT] * hit[LEVEL_LIGHT])
-    if top < hit[SIDE]:
-        v.texture_level(view, stacks, canvas, top, min(bottom, hit[SIDE]), seen[i, b.TOP], ray)
-    if hit[UNDER] < bottom:
-        v.texture_level(view, stacks, canvas, max(top, hit[UNDER]), bottom, seen[i, b.BOTTOM], ray)
-    first, last = max(top, hit[SIDE]), min(bottom, hit[UNDER])
-    if first < last and seen[i, KIND] == BOX:
-        s, e = _along_face(view, seen, i, hit)
-        side = (s, e, hit[ENTRY], 0.0, hit[WEIGHT] * hit[LIGHT])
-        v.texture_side(view, stacks, canvas, first, last, side)
-    if first < last and seen[i, KIND] == POLE:
-        s, e = _around(view, seen, i, hit)
-        side = (s, e, hit[ENTRY], seen[i, b.Y], hit[WEIGHT] * hit[LIGHT])
-        v.texture_side(view, stacks, canvas, first, last, side)
-
-
-@kernel
-def _along_face(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> tuple[float, float]:
-    """World y (x) where both ends of the strip meet the face of a box that looks along x (y) [m]."""
-    cos, sin = view[v.COS], view[v.SIN]
-    along_x, along_y = hit[SLOPE] * cos - sin, hit[SLOPE] * sin + cos
-    near_x, near_y, _ = b.box_slab(seen, i, along_x, along_y)
-    if near_x > near_y:
-        away = seen[i, b.DX] - math.copysign(seen[i, b.RX], along_x)
-        one = away / (hit[LEFT] * cos - sin) * (hit[LEFT] * sin + cos)
-        other = away / (hit[RIGHT] * cos - sin) * (hit[RIGHT] * sin + cos)
-        return view[EYE_Y] + one, view[EYE_Y] + other
-    away = seen[i, b.DY] - math.copysign(seen[i, b.RY], along_y)
-    one = away / (hit[LEFT] * sin + cos) * (hit[LEFT] * cos - sin)
-    other = away / (hit[RIGHT] * sin + cos) * (hit[RIGHT] * cos - sin)
-    return view[EYE_X] + one, view[EYE_X] + other
-
-
-@kernel
-def _around(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> tuple[float, float]:
-    """Surface coordinate s [m] where both ends of the strip meet a pole."""
-    entry, _ = b.depths(seen, i, view, hit[LEFT])
-    one = math.atan2(entry - seen[i, b.FORWARD], entry * hit[LEFT] - seen[i, b.RIGHT])
-    entry, _ = b.depths(seen, i, view, hit[RIGHT])
-    other = math.atan2(entry - seen[i, b.FORWARD], entry * hit[RIGHT] - seen[i, b.RIGHT])
-    return _metres(view, seen, i, one, other)
-
-
-@kernel
-def _metres(view: np.ndarray, seen: np.ndarray, i: int, one: float, other: float) -> tuple[float, float]:
-    """Surface coordinates s of two azimuths in the camera's frame, by the shorter way between them."""
-    turn = other - one
-    turn -= 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
-    start = seen[i, b.X] + seen[i, b.TURN] * (one + math.atan2(view[v.SIN], view[v.COS]))
-    return start, start + seen[i, b.TURN] * turn
-
-
-@kernel
-def _paint_curved(view, seen, i: int, sheet: tuple, rows: tuple, spreads: tuple) -> None:
-    """Paint a cone's side or an ellipsoid row by row, each by the middles of a few parts."""
-    (canvas, _, hit, stacks), (top, bottom) = sheet, rows
-    if top >= bottom:
+def _texture_faces(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges: tuple) -> None:
+    """Add the pattern to a body's flat faces: between four edges, the level top, the side, the underside."""
+    top, first, last, bottom = edges
+    hit = sheet[v.HIT]
+    ray = (
+        0.5 * (hit[LEFT_END] + hit[RIGHT_END]),
+        hit[RIGHT_END] - hit[LEFT_END],
+        hit[WEIGHT] * hit[LEVEL_LIGHT],
+    )
+    if v.is_open(top, first):
+        p.texture_level(view, stacks, sheet, top, first, seen[i, b.TOP], ray)
+    if v.is_open(last, bottom):
+        p.texture_level(view, stacks, sheet, last, bottom, seen[i, b.BOTTOM], ray)
+    if not v.is_open(first, last):
         return
-    v.fill_sloping(view, canvas, rows, spreads, 0.0, hit[WEIGHT])
-    textured = view[v.BODY + v.CONTRAST] > 0.0
-    row = max(0, math.floor(top - 0.5 * spreads[0]))
-    end = min(bottom + 0.5 * spreads[1], canvas.shape[1] - 2.0)
-    while row < end:
-        share = v.share_below(row, top, spreads[0]) - v.share_below(row, bottom, spreads[1])
-        low = min(max(top, row), bottom)
-        high = max(min(bottom, row + 1.0), low)
-        # Luminance changes fastest next to the outline, which a row that is cut contains.
-        parts = 1 if high - low == 1.0 else 2
-        part, cosines = (high - low) / parts, 0.0
-        for k in range(parts):
-            fall = (low + (k + 0.5) * part - view[HORIZON]) / view[FOCAL]
-            _, _, _, right, forward, up = b.meet(seen, i, view, hit[SLOPE], fall, hit)
-            cosine = right * view[v.SUN_RIGHT] + forward * view[v.SUN_FORWARD] + up * view[v.SUN_Z]
-            cosines += min(1.0, max(0.0, cosine))
-        light = seen[i, b.ALBEDO] * (view[v.AMBIENT] + view[v.DIFFUSE] * cosines / parts)
-        if textured:
-            light *= 1.0 + _curved_pattern(view, seen, i, hit, low, high, stacks)
-        canvas[v.PAINT, row] += hit[WEIGHT] * share * light
-        row += 1
+    if seen[i, KIND] == BOX:
+        s, e = p.along_face(view, seen, i, hit)
+        side = (s, e, hit[ENTRY], 0.0, hit[WEIGHT] * hit[LIGHT])
+        p.texture_side(view, stacks, sheet, first, last, side)
+    if seen[i, KIND] == POLE:
+        s, e = p.around_pole(view, seen, i, hit)
+        side = (s, e, hit[ENTRY], seen[i, b.Y], hit[WEIGHT] * hit[LIGHT])
+        p.texture_side(view, stacks, sheet, first, last, side)
+
+
+@inlined
+def _cosine(view: np.ndarray, shape: tuple, ray: tuple, fall: float, span: tuple) -> float:
+    """Cosine between the sun and a quadric, at least 0, where the ray of `fall` per depth meets it.
+
+    `ray` is its slope, and right and forward of the body's axis [m].
+    """
+    u, right, forward = ray
+    _, _, _, ratio, _, size = shape
+    depth, up = p.meet(shape, fall, span)
+    length = math.sqrt(max(1e-300, size + ratio * (ratio - 1.0) * up * up))
+    east, north = depth * u - right, depth - forward
+    towards = east * view[v.SUN_RIGHT] + north * view[v.SUN_FORWARD] + ratio * up * view[v.SUN_Z]
+    return min(1.0, max(0.0, towards / length))
 
 
 @kernel
-def _curved_pattern(view, seen, i, hit, low, high, stacks) -> float:
-    """Contrast times the pattern's mean over rows low .. high of a cone's side or an ellipsoid."""
-    fall = (0.5 * (low + high) - view[HORIZON]) / view[FOCAL]
-    tall = 0.5 * (high - low) / view[FOCAL]
-    u = 0.5 * (hit[LEFT] + hit[RIGHT])
-    right, forward, left_z, _, _, _ = b.meet(seen, i, view, hit[LEFT], fall, hit)
-    one = math.atan2(forward, right)
-    right, forward, right_z, _, _, _ = b.meet(seen, i, view, hit[RIGHT], fall, hit)
-    left_s, right_s = _metres(view, seen, i, one, math.atan2(forward, right))
-    right, forward, upper_z, _, _, _ = b.meet(seen, i, view, u, fall - tall, hit)
-    one = math.atan2(forward, right)
-    right, forward, lower_z, _, _, _ = b.meet(seen, i, view, u, fall + tall, hit)
-    upper_s, lower_s = _metres(view, seen, i, one, math.atan2(forward, right))
-    s = 0.5 * (left_s + right_s)
-    z = 0.5 * (seen[i, b.BOTTOM] + seen[i, b.TOP]) + 0.5 * (upper_z + lower_z)
-    axes = (right_s - left_s, right_z - left_z, lower_s - upper_s, lower_z - upper_z)
-    return v.pattern(view, stacks, v.BODY, s, seen[i, b.Y] + z, axes, int(v.LOOKUPS * view[v.SAMPLES]))
+def _shade_rows(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges: tuple) -> None:
+    """Light a cone's side or an ellipsoid between two edges, row by row."""
+    hit = sheet[v.HIT]
+    top, bottom = edges
+    wide = hit[RIGHT_END] - hit[LEFT_END]
+    broad = wide > BROAD * (seen[i, b.HIGH] - seen[i, b.LOW])
+    u, second = hit[SLOPE] - broad * GAUSS * wide, hit[SLOPE] + GAUSS * wide
+    shape, other, span = p.quadric(seen, i, view, u), p.quadric(seen, i, view, second), (0.0, math.inf)
+    ray = (u, seen[i, b.RIGHT], seen[i, b.FORWARD])
+    ambient = hit[WEIGHT] * seen[i, b.ALBEDO] * view[v.AMBIENT]
+    diffuse = hit[WEIGHT] * seen[i, b.ALBEDO] * view[v.DIFFUSE]
+    textured = view[v.BODY + v.CONTRAST] > 0.0
+    high, low = min(top[0], top[1]), max(bottom[0], bottom[1])
+    per_row, whole, rest = 1.0 / view[FOCAL], max(top[0], top[1]), min(bottom[0], bottom[1])
+    for row in range(int(high), math.ceil(low)):
+        start, end = max(high, row), min(low, row + 1.0)
+        fall = (0.5 * (start + end) - view[HORIZON]) * per_row
+        if row >= whole and row + 1 <= rest:
+            share, cosine = 1.0, _cosine(view, shape, ray, fall, span)
+            if broad:
+                cosine = 0.5 * (_cosine(view, other, (second, *ray[1:]), fall, span) + cosine)
+        else:
+            share = v.share_below(row, top[0], top[1]) - v.share_below(row, bottom[0], bottom[1])
+            cosine = _cut_row(view, seen, i, hit, edges, (start, end))
+        light = ambient + diffuse * cosine
+        if textured:
+            light *= 1.0 + p.curved_pattern(view, seen, i, hit, start, max(start, end), stacks)
+        sheet[v.PAINT, row] += share * light
+
+
+@kernel
+def _cut_row(view, seen, i: int, hit: np.ndarray, edges: tuple, rows: tuple) -> float:
+    """Cosine between the sun and what the edges leave of a row of a curved body.
+
+    Luminance changes fastest next to the outline: four points of what is left, at each of
+    two slopes the quarters of the rows between the edges.
+    """
+    (top, bottom), (start, end) = edges, rows
+    left, right = v.left_of_row(edges, start, end)
+    total = tall = 0.0
+    for k in range(2):
+        x = left + (0.5 + (2 * k - 1) * GAUSS) * (right - left)
+        u = hit[LEFT_END] + x * (hit[RIGHT_END] - hit[LEFT_END])
+        upper = max(start, top[0] + x * (top[1] - top[0]))
+        lower = max(upper, min(end, bottom[0] + x * (bottom[1] - bottom[0])))
+        shape, ray = p.quadric(seen, i, view, u), (u, seen[i, b.RIGHT], seen[i, b.FORWARD])
+        span = b.depths(seen, i, view, u)
+        span = (max(b.NEAR, span[0]), max(b.NEAR, span[1]))
+        for j in range(2):
+            fall = (upper + (0.5 + (2 * j - 1) * GAUSS) * (lower - upper) - view[HORIZON]) / view[FOCAL]
+            total += 0.5 * (lower - upper) * _cosine(view, shape, ray, fall, span)
+        tall += lower - upper
+    return total / max(tall, 1e-9)
