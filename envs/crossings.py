@@ -16,12 +16,10 @@ legacy).
 import numba
 import numpy as np
 
+from envs.deadtime import TOLERANCE, resume, train_with_dead_time
 from envs.response import LARGEST, light_of, respond
-from envs.trains import EVENT, events_of, limit_events, moment
+from envs.trains import EVENT, events_of, limit_events
 
-# Two luminances rounded to float32 leave their log difference uncertain by this much: a level
-# this near counts as reached, so that a step of exactly k thresholds gives k events.
-TOLERANCE = 2.0**-23
 MARGIN = 1e-9  # relative; far above the error of float64 exp
 HALF_ULP = 2.0**-23  # relative; above the rounding of a bound to float32
 BLOCK = 1024  # pixels decided together
@@ -295,37 +293,13 @@ def _keep_with_dead_time(pixels, times, refractory_us, held, table, out):
         i = pixels[j]
         if held[i] < times[1]:
             pixel = (table[j], table[AFTER + j], table[MEMORY + j], table[ON + j], table[OFF + j])
-            n, start, stride, remembered, keep = _train_with_dead_time(pixel, times, held[i], refractory_us)
+            n, start, stride, remembered, keep = train_with_dead_time(pixel, times, held[i], refractory_us)
             if keep:
                 outside[kept], crossings[kept] = i, n
                 trains[0, kept], trains[1, kept] = start, stride
                 trains[2, kept], trains[3, kept], trains[4, kept] = pixel[0], pixel[1], remembered
                 kept += 1
     return kept
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _train_with_dead_time(pixel, times, held, refractory_us):
-    """Signed crossings, start, stride, remembered level, and whether anything changed.
-
-    While the level moves one way at one pace, all events after the first are one dead time
-    and one threshold apart.
-    """
-    before, after, remembered, on, off = pixel
-    t0, t1 = times
-    ended, way = held >= t0, after - before
-    since = held - t0 if ended else 0
-    if ended:
-        remembered = before + way * (since / (t1 - t0))
-    sign, size = (1, on) if after > remembered else (-1, off)
-    if way == 0.0 or abs(after - remembered) + TOLERANCE < size:
-        return 0, 0.0, 0.0, remembered, ended
-    pace = (t1 - t0) / abs(way)
-    first = moment((sign * (remembered - before) + size) * pace, 0.0, 0, t1 - t0)
-    gap = np.rint(size * pace)
-    left = (t1 - t0) + gap - (size - TOLERANCE) * pace - first
-    n = 1 + int(max(left / (refractory_us + gap), 0.0))
-    return sign * n, float(first), refractory_us + gap, remembered, True
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -338,7 +312,7 @@ def _advance(luminance, times, rule, curve, thresholds, state, found):
         _look(luminance, curve, thresholds, band, level[0, :0])
         return
     if refractory_us > 0:
-        pixels = pixels[: _resume(pixels, crossings, trains, times, refractory_us, (band, level, held))]
+        pixels = pixels[: resume(pixels, crossings, trains, times, refractory_us, (band, level, held))]
     else:
         for j in range(pixels.size):
             level[2 - (crossings[j] > 0), pixels[j]] += sent[j] if carries else abs(crossings[j])
@@ -349,26 +323,3 @@ def _advance(luminance, times, rule, curve, thresholds, state, found):
             k = block[j] if thresholds.shape[1] > 1 else 0
             levels[j] = _level(level, block[j], thresholds[0, k], thresholds[1, k])
         _set_bands(block, levels, curve, thresholds, band, work)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _resume(pixels, crossings, trains, times, refractory_us, state):
-    """Start the dead time of each last event; compact the pixels that are out of it and return how many.
-
-    The others have no quiet band: they are decided in every frame, until their dead time ends.
-    """
-    band, level, held = state
-    t0, t1 = times
-    free = 0
-    for j in range(pixels.size):
-        i, n, remembered = pixels[j], abs(crossings[j]), trains[4, j]
-        if n > 0:
-            held[i] = t0 + moment(trains[0, j], trains[1, j], n - 1, t1 - t0) + refractory_us
-            if held[i] >= t1:
-                band[0, i], band[1, i] = 1.0, 0.0
-                continue
-            remembered = trains[2, j] + (trains[3, j] - trains[2, j]) * ((held[i] - t0) / (t1 - t0))
-        level[0, i], level[1, i], level[2, i] = remembered, 0.0, 0.0
-        pixels[free] = i
-        free += 1
-    return free

@@ -20,11 +20,13 @@ CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the err
 RENDERS_TEXTURED = 1.3  # times those of a plain scene
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 # From which tolerance on how many samples do. Straight edges are exact whatever the samples;
-# the light and the arcs of cones and ellipsoids and the patterns of textures converge with them.
+# the light and the arcs of cones and ellipsoids and the patterns of textures converge with them,
+# and patterns on cones and ellipsoids need the most.
 SAMPLES = {
     "straight": ((0.03, 1), (0.0, 2)),
     "textured": ((0.15, 2), (0.03, 3), (0.0, 6)),
     "curved": ((0.15, 2), (0.03, 4), (0.0, 12)),
+    "both": ((0.15, 3), (0.03, 7), (0.0, 12)),
     "pyrender": ((0.3, 1), (0.15, 2), (0.0, 4)),
 }
 
@@ -137,7 +139,7 @@ def _samples(renderer: str, scene: Scene, tolerance: float) -> int:
     """Anti-aliasing whose own error is a small part of the tolerance, see SAMPLES."""
     kind = "straight" if _plain(scene) else "textured"
     if scene.kinds & {CONE, ELLIPSOID}:
-        kind = "curved"
+        kind = "curved" if kind == "straight" else "both"
     if renderer == "pyrender":
         kind = "pyrender"
     return next(samples for least, samples in SAMPLES[kind] if tolerance >= least)

@@ -16,6 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, Fraction, Positive
 from jobs.refusals import JOBS_CHOOSE, explain, nearest, refused_scenes
+from models.kinds import KINDS, SMALLEST_IMAGE
 
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -28,16 +29,33 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True, config=STRICT)
 class ModelConfig:
-    """The policy's representation and network (appendix A.1, D.1.2)."""
+    """The policy's representation and network (appendix A.1, D.1.2).
 
-    name: Literal["brp_full", "brp_xy"]
-    context: Annotated[int, Field(ge=8, le=8192, multiple_of=2)]
-    latent: Annotated[int, Field(ge=1, le=256)]
-    norm: Literal["batch", "none"]
-    target: Literal["signed", "occupancy"]
-    time_bins: Annotated[int, Field(ge=2, le=65536)]
+    The settings of the event VAE (`EVAE_SETTINGS`) are None for a policy without one, `hidden`
+    for one whose network has fixed sizes.
+    """
+
+    name: str
+    context: Annotated[int, Field(ge=8, le=8192, multiple_of=2)] | None
+    latent: Annotated[int, Field(ge=1, le=256)] | None
+    norm: Literal["batch", "none"] | None
+    target: Literal["signed", "occupancy"] | None
+    time_bins: Annotated[int, Field(ge=2, le=65536)] | None
     stack: Annotated[int, Field(ge=1, le=32)]
-    hidden: list[Count]
+    hidden: list[Count] | None
+
+    @pydantic.model_validator(mode="after")
+    def _fits_its_kind(self) -> "ModelConfig":
+        if self.name not in KINDS:
+            raise ValueError(f"name must be one of {', '.join(KINDS)}, got {self.name!r}")
+        kind = KINDS[self.name]
+        wanted = {**dict.fromkeys(EVAE_SETTINGS, kind.encoder), "hidden": kind.network == "mlp"}
+        for setting, wants in wanted.items():
+            value = getattr(self, setting)
+            if wants != (value is not None):
+                rule = f"be given for {self.name}" if wants else f"be null: {self.name} has no such part"
+                raise ValueError(f"{setting} must {rule}, got {value!r}")
+        return self
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -132,6 +150,16 @@ class TradeConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class TradeEncoderConfig:
+    """How long the encoders that are compared are trained, and on what they are measured."""
+
+    iterations: Count
+    seeds: Count
+    windows: Annotated[int, Field(ge=4)]
+    rounds: Count
+
+
+@dataclass(frozen=True, config=STRICT)
 class ClusterConfig:
     """Where Ray runs."""
 
@@ -152,7 +180,9 @@ class TrackingConfig:
 class Config:
     """One experiment, checked."""
 
-    job: Literal["bytestream", "collect", "pretrain", "train", "evaluate", "sweep", "trade_simulator"]
+    job: Literal[
+        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "trade_simulator", "trade_encoder"
+    ]
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
@@ -171,6 +201,7 @@ class Config:
     evaluate: EvaluateConfig
     sweep: SweepConfig
     trade: TradeConfig
+    trade_encoder: TradeEncoderConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
 
@@ -180,6 +211,7 @@ class Config:
         return EnvConfig(**{**self.env, **parts, **changes})
 
 
+EVAE_SETTINGS = ("context", "latent", "norm", "target", "time_bins")
 HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
 ENV_PARTS = ("camera", "faults", "renderer", "fidelity")
 ENV_KEYS = [
@@ -214,7 +246,8 @@ def parse(values: Mapping[str, Any]) -> Config:
         named += [("trade.scenes", name) for name in config.trade.scenes]
         named += [("collect.scenes", name) for name in config.collect.scenes]
         vehicle = config.env["vehicle_radius_m"], config.env["camera_height_m"]
-        refused = _refused_axes(config) + refused_scenes(named, config.env["layout"], vehicle)
+        refused = _refused_picture(config) + _refused_axes(config)
+        refused += refused_scenes(named, config.env["layout"], vehicle)
     if refused:
         raise ConfigError("\n".join(refused))
     return typing.cast(Config, config)
@@ -263,6 +296,15 @@ def _build(section: Any, values: Any, name: str, refused: list[str], skip: Colle
     except pydantic.ValidationError as error:
         refused += [line for line in explain(error, name, known_keys()) if line.partition(":")[0] not in skip]
         return None
+
+
+def _refused_picture(config: Config) -> list[str]:
+    """Sides of the sensor's picture that the policy's network cannot take."""
+    if KINDS[config.model.name].network != "cnn":
+        return []
+    sides = {name: getattr(config.camera, name) for name in ("width", "height")}
+    rule = f"must be at least {SMALLEST_IMAGE} for the network of {config.model.name}"
+    return [f"camera.{name}: {rule}, got {side}" for name, side in sides.items() if side < SMALLEST_IMAGE]
 
 
 def _refused_axes(config: Config) -> list[str]:

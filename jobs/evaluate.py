@@ -20,7 +20,7 @@ from jobs.accuracy import achieved
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
 from jobs.figures import Track, trajectory_figure
 from jobs.flights import Advance, Watch, Ways, check_sensor, fly, write_episodes
-from jobs.pictures import Film
+from jobs.pictures import Decode, Film
 from jobs.pilots import BOUNDS, PolicyPilot, make_pilot
 from jobs.progress import console, progress
 from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
@@ -28,6 +28,7 @@ from jobs.runs import Run, finish, finished, latest_policy, locate_run, open_run
 from jobs.tracking import RESULTS_VIEW, Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import reconstruct
+from models.kinds import KINDS
 from models.policy import ENCODER, Policy, load_policy
 from models.weights import load_encoder
 
@@ -85,6 +86,7 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
         console.print((folder.evaluation / "table.md").read_text(), markup=False)
         return done["figures"]
     console.print(f"Policy: {path}", markup=False)
+    tracker.tags({"policy": policy.manifest["name"]})
     plan = tasks(config)
     flown: dict[Task, np.ndarray] = {}
     tracks: list[Track] = []
@@ -200,21 +202,27 @@ def film_seed(episodes: np.ndarray) -> int:
 
 def film(config: Config, policy: Policy, source: Path, seed: int, path: Path) -> Path:
     """Film the flight of the policy in `source` through one held-out corridor; return the file."""
-    evae, _ = load_encoder(source / ENCODER)
+    decode = decoder(source) if KINDS[policy.manifest["name"]].encoder else None
     pilot = PolicyPilot(policy, config.evaluate.action == "stochastic")
     env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
+    with Film(path, env_config.control_hz, decode) as reel:
+
+        def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
+            caption = f"{HELD_OUT_SCENE} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
+            ending = "   goal" if info["success"] else "   collision" if info["collision"] else ""
+            reel.step(env.luminance, env.events, observation, f"{caption}{ending}")
+
+        fly(pilot, env_config, [seed], watch=watch)
+    return path
+
+
+def decoder(source: Path) -> Decode:
+    """What draws, from an event window, the picture that the latents of the policy in `source` hold."""
+    evae, _ = load_encoder(source / ENCODER)
 
     @torch.no_grad()
     def decode(window: np.ndarray) -> np.ndarray:
         logits = evae(batch_packed(window[None], evae.grid))[0]
         return reconstruct(logits, evae.target).reshape(evae.grid.height, evae.grid.width).numpy()
 
-    with Film(path, env_config.control_hz, decode) as reel:
-
-        def watch(env: CorridorEnv, seed: int, window: np.ndarray, info: Mapping[str, Any]) -> None:
-            caption = f"{HELD_OUT_SCENE} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
-            ending = "   goal" if info["success"] else "   collision" if info["collision"] else ""
-            reel.step(env.luminance, env.events, window, f"{caption}{ending}")
-
-        fly(pilot, env_config, [seed], watch=watch)
-    return path
+    return decode

@@ -48,17 +48,17 @@ def fly(
 
     Args:
         pilot: Chooses the actions.
-        config: The simulation; its observation is taken as "window".
+        config: The simulation; its observation is the one that the pilot sees.
         seeds: One corridor each, shape (n,).
         num_envs: Most episodes at once.
-        watch: Called after each step with the environment, the seed, the window and the info.
+        watch: Called after each step with the environment, the seed, the observation and the info.
         advance: Told 1 at the end of each episode.
 
     Returns:
         EPISODE (n,), in the order of the seeds. `distance_m` is the way along y without
         collision [m], `dropped` what neither pixel nor window could hold.
     """
-    config = dataclasses.replace(config, observation="window")
+    config = dataclasses.replace(config, observation=pilot.observation)
     envs = [CorridorEnv(config) for _ in range(min(num_envs, len(seeds)))]
     parts = [np.empty(0, EPISODE)]
     try:
@@ -80,23 +80,23 @@ def _fly_batch(
 ) -> np.ndarray:
     """One episode per environment, until the last one ends."""
     started = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
-    windows = np.stack([window for window, _ in started])
+    observations = np.stack([observation for observation, _ in started])
     infos = [info for _, info in started]
     pilot.reset(envs, seeds)
     episodes = np.zeros(len(envs), EPISODE)
     episodes["seed"] = seeds
     flying = list(range(len(envs)))
     while flying:
-        actions = pilot(windows, infos)
+        actions = pilot(observations, infos)
         for row in tuple(flying):
-            window, reward, terminated, truncated, info = envs[row].step(int(actions[row]))
-            windows[row], infos[row] = window, info
+            observation, reward, terminated, truncated, info = envs[row].step(int(actions[row]))
+            observations[row], infos[row] = observation, info
             _count(episodes, row, reward, truncated, info)
-            watch(envs[row], seeds[row], window, info)
+            watch(envs[row], seeds[row], observation, info)
             if terminated or truncated:
                 advance(1)
                 flying.remove(row)
-                windows[row] = 0  # an empty window costs the pilot nothing
+                observations[row] = 0  # an empty window costs the pilot nothing
     episodes["events_per_step"] /= episodes["steps"]
     return episodes
 
@@ -141,7 +141,7 @@ class Ways:
         self.scenes: dict[int, Any] = {}
         self.height_m = 0.0
 
-    def add(self, env: CorridorEnv, seed: int, window: np.ndarray, info: Mapping[str, Any]) -> None:
+    def add(self, env: CorridorEnv, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
         """Note where a flight is now."""
         if seed in self.seeds:
             self.points[seed].append((info["x_m"], info["y_m"]))

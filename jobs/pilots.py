@@ -7,7 +7,7 @@ something between them.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from envs.scene import Scene
 if TYPE_CHECKING:
     from models.policy import Policy
 
+Observation = Literal["window", "event_image", "luminance"]
 BOUNDS = ("straight", "random", "oracle")
 # Of one step in x and y, in step lengths: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])
@@ -28,13 +29,21 @@ SIDE_PRICE = 0.01  # of a lattice step to the side: of two free ways, the straig
 
 
 class Pilot(Protocol):
-    """Chooses an action for each flight of a batch."""
+    """Chooses an action for each flight of a batch.
+
+    Attributes:
+        observation: What its environments must show, as `envs.config.EnvConfig` names it.
+    """
+
+    @property
+    def observation(self) -> Observation:
+        """What it sees."""
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Begin one flight per environment, which has just been reset with its seed."""
 
-    def __call__(self, windows: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Actions (B,) for event windows int32 (B, capacity + 1, 4) and the flights' infos."""
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Actions (B,) for observations (B, ...) and the flights' infos."""
 
 
 def make_pilot(name: str, action: str = "deterministic") -> Pilot:
@@ -59,10 +68,12 @@ def make_pilot(name: str, action: str = "deterministic") -> Pilot:
 class StraightPilot:
     """Always ahead."""
 
+    observation: Observation = "window"
+
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Nothing to remember."""
 
-    def __call__(self, windows: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
         """Zeros (B,)."""
         return np.zeros(len(infos), np.int64)
 
@@ -70,30 +81,33 @@ class StraightPilot:
 class RandomPilot:
     """Any action with the same probability at each step, drawn from the flight's own stream."""
 
+    observation: Observation = "window"
+
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """One stream per flight, so that no flight depends on its neighbours."""
         self._streams = flight_streams(seeds)
 
-    def __call__(self, windows: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
         """Actions (B,)."""
         return np.array([stream.integers(NUM_ACTIONS) for stream in self._streams])
 
 
 class PolicyPilot:
-    """A trained policy; it sees the event windows alone."""
+    """A trained policy; it sees its observation alone."""
 
     def __init__(self, policy: "Policy", stochastic: bool = False) -> None:
         """Fly a loaded policy, choosing its likeliest action or drawing one as in training."""
         self.policy, self.stochastic = policy, stochastic
+        self.observation = cast(Observation, policy.observation)
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Forget the flights before."""
         self.policy.reset(len(envs))
         self._streams = flight_streams(seeds)
 
-    def __call__(self, windows: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
         """Actions (B,); draws come from each flight's own stream."""
-        logits = self.policy.logits(windows).astype(np.float64)
+        logits = self.policy.logits(observations).astype(np.float64)
         if not self.stochastic:
             return logits.argmax(axis=1)
         gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])
@@ -102,6 +116,8 @@ class PolicyPilot:
 
 class OraclePilot:
     """Plans on a lattice with the true geometry, then follows the plan."""
+
+    observation: Observation = "window"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Plan one way per flight."""
@@ -112,7 +128,7 @@ class OraclePilot:
             plan = plan_way(env.scene, env.camera_pose()[0], *vehicle)
             self._plans.append((plan, MOVES * step_m))
 
-    def __call__(self, windows: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
         """For each flight the action that ends closest to its plan."""
         flights = zip(self._plans, infos, strict=True)
         return np.array([follow(*plan, info["x_m"], info["y_m"]) for plan, info in flights])

@@ -16,7 +16,9 @@ from ray.tune.registry import register_env
 from envs.config import sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from jobs.config import Config, ConfigError
-from models.rllib import EncodeWindows, ScaleRewards, module_spec
+from jobs.learner import PlainPPOLearner
+from models.kinds import KINDS
+from models.rllib import ScaleRewards, StackFeatures, module_spec, stack_space
 from models.weights import load_encoder
 
 ENV = "evade-corridors"
@@ -63,7 +65,7 @@ def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:
     }
 
 
-def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
+def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConfig:
     """The algorithm of an experiment; every default of RLlib that differs from the paper's is set.
 
     `vf_clip_param` is infinite because RLlib clips the squared error, which with rewards of
@@ -71,16 +73,15 @@ def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
 
     Args:
         config: The experiment.
-        encoder_path: The frozen encoder's file.
+        encoder_path: The frozen encoder's file, for a policy that has one.
 
     Raises:
         ConfigError: If the encoder was made for another sensor.
     """
-    _, about = load_encoder(encoder_path)
-    check_sensor(config, about)
-    algo, model = config.algo, config.model
+    algo, settings = config.algo, network_settings(config)
     register_env(ENV, make_corridors)
-    flown = config.env_config(split="train", observation="window")
+    spec = module_spec(settings, config.seed, frozen_encoder(config, encoder_path))
+    flown = config.env_config(split="train", observation=KINDS[config.model.name].observation)
     return (
         PPOConfig()
         .environment(ENV, env_config={"config": flown}, disable_env_checking=True)
@@ -89,9 +90,15 @@ def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
             num_env_runners=algo.num_env_runners,
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
             gym_env_vectorize_mode="vector_entry_point",
-            env_to_module_connector=partial(make_encode_windows, stack=model.stack, latent=model.latent),
+            env_to_module_connector=partial(make_stack_features, space=stack_space(settings)),
         )
-        .learners(num_learners=0, learner_connector=partial(make_scale_rewards, scale=algo.reward_scale))
+        # It learns while the processes that fly, if any, wait: it needs no core of its own then.
+        .resources(num_cpus_for_main_process=0 if algo.num_env_runners else 1)
+        .learners(
+            num_learners=0,
+            learner_class=PlainPPOLearner,
+            learner_connector=partial(make_scale_rewards, scale=algo.reward_scale),
+        )
         .training(
             lr=learning_rate(config),
             gamma=algo.gamma,
@@ -108,7 +115,7 @@ def build_ppo(config: Config, encoder_path: str | Path) -> PPOConfig:
             grad_clip=algo.grad_clip,
             grad_clip_by="global_norm",
         )
-        .rl_module(rl_module_spec=module_spec(encoder_path, about, network_settings(config), config.seed))
+        .rl_module(rl_module_spec=spec)
         .callbacks(FlightMetrics)
         .reporting(metrics_num_episodes_for_smoothing=EPISODES)
         .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
@@ -128,9 +135,9 @@ def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
     return CorridorVectorEnv(context["num_envs"], context["config"])
 
 
-def make_encode_windows(env: Any, spaces: Any, device: Any, *, stack: int, latent: int) -> EncodeWindows:
+def make_stack_features(env: Any, spaces: Any, device: Any, *, space: Any) -> StackFeatures:
     """RLlib's way to ask for the env-to-module connector."""
-    return EncodeWindows(stack=stack, latent=latent)
+    return StackFeatures(space=space)
 
 
 def make_scale_rewards(observation_space: Any, action_space: Any, *, scale: float) -> ScaleRewards:
@@ -140,17 +147,23 @@ def make_scale_rewards(observation_space: Any, action_space: Any, *, scale: floa
 
 def network_settings(config: Config) -> dict[str, Any]:
     """What the policy's networks are built from."""
-    model = config.model
-    sizes = {"stack": model.stack, "latent": model.latent, "hidden": list(model.hidden)}
-    return {**sizes, "num_actions": NUM_ACTIONS}
+    model, camera = config.model, config.camera
+    return {
+        "name": model.name,
+        "width": camera.width,
+        "height": camera.height,
+        "latent": model.latent,
+        "stack": model.stack,
+        "hidden": model.hidden,
+        "num_actions": NUM_ACTIONS,
+    }
 
 
 def policy_settings(config: Config) -> dict[str, Any]:
     """What a policy must be flown with, for its manifest."""
     sensor = sensor_settings(config.env_config())
     return {
-        "name": config.model.name,
-        "observation": config.env_config().observation,
+        "observation": KINDS[config.model.name].observation,
         "window_capacity": config.env_config().window_capacity,
         "sensor": sensor,
         "sensor_hash": settings_hash(sensor),
@@ -160,8 +173,19 @@ def policy_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def check_sensor(config: Config, about: dict[str, Any]) -> None:
-    """Refuse an encoder that was made for another sensor."""
+def frozen_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, dict[str, Any]] | None:
+    """The encoder file with its manifest; None for a policy without one.
+
+    Raises:
+        ConfigError: It was made for another sensor.
+        ValueError: A policy that needs one got none, or the other way round.
+    """
+    name, needed = config.model.name, KINDS[config.model.name].encoder
+    if needed != (path is not None):
+        raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")
+    if path is None:
+        return None
+    _, about = load_encoder(path)
     differ = sensor_differences(about["sensor"], config.env_config())
     if differ:
         values = ", ".join(
@@ -169,3 +193,4 @@ def check_sensor(config: Config, about: dict[str, Any]) -> None:
         )
         remedy = "use its settings, or pretrain an encoder for these"
         raise ConfigError(f"encoder: was made for another sensor: {values}; {remedy}")
+    return path, about

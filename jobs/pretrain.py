@@ -14,13 +14,14 @@ import torch
 
 from envs.recordings import Recording, read_recording
 from jobs.collect import collect, data_file
-from jobs.config import Config, ModelConfig, PretrainConfig
+from jobs.config import EVAE_SETTINGS, Config, ConfigError, ModelConfig, PretrainConfig
 from jobs.figures import reconstruction_figure
 from jobs.progress import progress
-from jobs.runs import Run, finish, finished, open_run
+from jobs.runs import Run, finish, finished, locate_run, open_run
 from jobs.tracking import Tracker, open_tracker
 from models.batch import EventBatch, Grid, batch_windows
 from models.evae import EventVAE, appendix_beta, event_targets, reconstruct, train_step, validate
+from models.kinds import KINDS
 from models.weights import save_encoder
 
 Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
@@ -31,12 +32,28 @@ PICTURE_WINDOWS = 8
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Collect if there is no data yet, then train the event VAE; return its figures."""
+    """Collect if there is no data yet, then train the event VAE; return its figures.
+
+    Raises:
+        ConfigError: The policy has no event VAE.
+    """
+    name = locate_run(config).config.model.name
+    if not KINDS[name].encoder:
+        raise ConfigError(f"model: {name} has no event VAE to pretrain; go on with job=train")
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:
-        collect(config, folder, tracker)
-        return pretrain(config, folder, tracker)
+        prepare_encoder(config, folder, tracker)
+    return finished(folder, "pretrain") or {}
+
+
+def prepare_encoder(config: Config, folder: Run, tracker: Tracker) -> Path | None:
+    """Collect and pretrain what is not there yet; the encoder file, or None if the policy has no encoder."""
+    if not KINDS[config.model.name].encoder:
+        return None
+    collect(config, folder, tracker)
+    pretrain(config, folder, tracker)
+    return encoder_file(folder)
 
 
 def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
@@ -78,16 +95,8 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
 
 def build_evae(model: ModelConfig, sensor: dict[str, Any]) -> EventVAE:
     """The untrained event VAE that a model configuration and a sensor ask for."""
-    return EventVAE(
-        variant=model.name,
-        width=sensor["width"],
-        height=sensor["height"],
-        context=model.context,
-        latent=model.latent,
-        norm=model.norm,
-        target=model.target,
-        time_bins=model.time_bins,
-    )
+    settings = {name: getattr(model, name) for name in EVAE_SETTINGS}
+    return EventVAE(variant=model.name, width=sensor["width"], height=sensor["height"], **settings)
 
 
 def beta(settings: PretrainConfig, iteration: int) -> float:

@@ -20,7 +20,7 @@ from jobs.config import Config, ConfigError, as_dict, parse
 
 # Where a run is computed and written down, and how its policy is flown afterwards, does not
 # change what is trained.
-UNNAMED = ("job", "resume", "runs_dir", "cluster", "tracking", "evaluate", "sweep", "trade")
+UNNAMED = ("job", "resume", "runs_dir", "cluster", "tracking", "evaluate", "sweep", "trade", "trade_encoder")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 

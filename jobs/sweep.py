@@ -73,7 +73,7 @@ def run(config: Config) -> dict[str, Any]:
     sweep = plan(config, policy)
     announce(policy, sweep)
     with open_tracker(config, folder, key=f"sweep {sweep.identity[:8]}") as tracker:
-        tracker.tags({"kind": "sweep"})
+        tracker.tags({"kind": "sweep", "policy": read_manifest(policy).get("name", policy)})
         episodes = fly_cells(config, folder, sweep.cells())
         figures = report(folder, tracker, policy, sweep, episodes)
         console.print(tracker.dashboard(), markup=False)

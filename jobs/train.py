@@ -1,4 +1,4 @@
-"""Train the policy by PPO on the frozen encoder (appendix D.1).
+"""Train the policy by PPO (appendix D.1), on the frozen encoder if it has one.
 
 Run: python -m platform.launch +exp=train
 Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
@@ -20,10 +20,9 @@ from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.cluster import start_ray
-from jobs.collect import collect
 from jobs.config import Config, ConfigError
 from jobs.ppo import build_ppo, policy_settings
-from jobs.pretrain import encoder_file, pretrain
+from jobs.pretrain import prepare_encoder
 from jobs.progress import progress
 from jobs.runs import Run, finish, finished, open_run
 from jobs.tracking import open_tracker
@@ -80,23 +79,21 @@ class Relay(tune.Callback):
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Collect and pretrain if that is still to be done, then train; return the figures."""
+    """Collect and pretrain where the policy needs that and it is not done; train; return the figures."""
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:
-        collect(config, folder, tracker)
-        pretrain(config, folder, tracker)
-        train(config, folder, encoder_file(folder), tracker.log)
+        train(config, folder, prepare_encoder(config, folder, tracker), tracker.log)
     return finished(folder, "train") or {}
 
 
-def train(config: Config, folder: Run, encoder_path: Path, on_result: OnResult) -> Path:
+def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
     """Train until `train.env_steps`, from the newest checkpoint if there is one; export the policy.
 
     Args:
         config: The experiment.
         folder: The run folder.
-        encoder_path: The frozen encoder's file.
+        encoder_path: The frozen encoder's file; None for a policy without one.
         on_result: Called with (environment steps, metrics) after each PPO iteration, in this
             process; a metric that was not measured is NaN.
 
@@ -124,14 +121,14 @@ def train(config: Config, folder: Run, encoder_path: Path, on_result: OnResult) 
 
 def check_cpus(config: Config) -> None:
     """Refuse more env runners than a local Ray has CPUs for: Tune would wait for them forever."""
-    needed, cpus = 1 + config.algo.num_env_runners, int(ray.cluster_resources().get("CPU", 0))
+    needed, cpus = config.algo.num_env_runners, int(ray.cluster_resources().get("CPU", 0))
     if config.cluster.name == "local" and needed > cpus:
-        rule = f"needs {needed} CPUs, one of them to learn, and Ray has {cpus}"
+        rule = f"needs as many CPUs, and Ray has {cpus}"
         raise ConfigError(f"algo.num_env_runners: {rule}, got {config.algo.num_env_runners}")
 
 
 def export_policy(
-    config: Config, checkpoint: Path, encoder_path: Path, target: Path, figures: dict[str, float]
+    config: Config, checkpoint: Path, encoder_path: Path | None, target: Path, figures: dict[str, float]
 ) -> None:
     """Write the policy folder of a checkpoint of this run.
 
@@ -139,12 +136,12 @@ def export_policy(
         TrainingError: If the checkpoint's encoder is not the one in the file.
     """
     module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
-    evae, _ = load_encoder(encoder_path)
-    frozen = evae.state_dict()
-    if not all(torch.equal(value, frozen[name]) for name, value in module.encoder.state_dict().items()):
+    evae = None if encoder_path is None else load_encoder(encoder_path)[0]
+    frozen = {} if evae is None else evae.state_dict()
+    flown = {} if module.encoder is None else module.encoder.state_dict()
+    if not all(torch.equal(value, frozen[name]) for name, value in flown.items()):
         raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
-    manifest = {**policy_settings(config), "figures": figures}
-    save_policy(target, evae, {"pi": module.pi, "vf": module.vf}, manifest)
+    save_policy(target, module.networks(), {**policy_settings(config), "figures": figures}, evae)
 
 
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:

@@ -1,8 +1,15 @@
-"""The time of an event, as the network sees it: a bin of its window, embedded by sines and cosines.
+"""The time of an event, as the network sees it: a bin of its window, and the code of that bin.
 
 Time is normalised by the fixed window, t = (t_us - start_us) / window_us in (0, 1], newest
 near 1 (appendix A.3), and then quantised to the centre of one of `time_bins` bins. The grid
 is part of the model: a table with one row per bin is therefore the model exactly.
+
+A code is what is added to the features of an event before the maximum over events:
+
+    "additive"   sines and cosines of t (paper equation 1)
+    "eventnet"   minus the age 1 - t, the decay of EventNet; its rotation by the age of the event
+                 that wins follows after the maximum (`eventnet_phase`)
+    "none"       nothing
 """
 
 import functools
@@ -10,6 +17,8 @@ import functools
 import numba
 import numpy as np
 import numpy.typing as npt
+
+CODINGS = ("additive", "eventnet", "none")
 
 
 def temporal_embedding(t: npt.ArrayLike, context: int) -> np.ndarray:
@@ -37,16 +46,52 @@ def temporal_embedding(t: npt.ArrayLike, context: int) -> np.ndarray:
     return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
 
 
-@functools.lru_cache(maxsize=4)
-def embedding_table(time_bins: int, context: int, dtype: str = "float32") -> np.ndarray:
-    """Read-only `dtype` (time_bins, context): the embedding at each bin's centre (i + 1/2) / time_bins.
+def time_code(t: npt.ArrayLike, context: int, coding: str = "additive") -> np.ndarray:
+    """What a coding adds to the features of events at normalised times: float64 (..., context).
 
-    It is computed in float64 and rounded once. Centres, because left edges triple the error
-    of the quantisation in the latent.
+    Raises:
+        ValueError: As `temporal_embedding`, or the coding is unknown.
+
+    Source: paper equation 1 and equation 4 (appendix A.2).
     """
-    table = temporal_embedding((np.arange(time_bins) + 0.5) / time_bins, context).astype(dtype)
+    embedded = temporal_embedding(t, context)
+    if coding == "additive":
+        return embedded
+    if coding not in CODINGS:
+        raise ValueError(f"coding must be one of {', '.join(CODINGS)}, got {coding!r}")
+    times = np.asarray(t, np.float64)[..., None]
+    return np.broadcast_to(times - 1.0 if coding == "eventnet" else 0.0, embedded.shape)
+
+
+def bin_centres(time_bins: int) -> np.ndarray:
+    """Normalised times (time_bins,) of the bins; left edges would triple the latent's error."""
+    return (np.arange(time_bins) + 0.5) / time_bins
+
+
+@functools.lru_cache(maxsize=4)
+def embedding_table(
+    time_bins: int, context: int, dtype: str = "float32", coding: str = "additive"
+) -> np.ndarray:
+    """Read-only `dtype` (time_bins, context): the code of each bin's centre; one row of zeros for "none".
+
+    It is computed in float64 and rounded once.
+    """
+    centres = bin_centres(1 if coding == "none" else time_bins)
+    table = np.array(time_code(centres, context, coding), dtype)
     table.setflags(write=False)
     return table
+
+
+@functools.lru_cache(maxsize=4)
+def eventnet_phase(time_bins: int, dtype: str = "float32") -> np.ndarray:
+    """Read-only `dtype` (2, time_bins): real and imaginary part of exp(-i 2 pi age) of each bin.
+
+    Source: paper equation 4 (appendix A.2), from EventNet (Sekikawa et al. 2019).
+    """
+    angle = 2.0 * np.pi * (1.0 - bin_centres(time_bins))
+    phase = np.stack([np.cos(angle), -np.sin(angle)]).astype(dtype)
+    phase.setflags(write=False)
+    return phase
 
 
 @numba.njit(cache=True, error_model="numpy")

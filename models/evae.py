@@ -21,8 +21,10 @@ from torch.nn import functional
 
 from models.batch import EventBatch, Grid
 from models.context import EventContextNetwork
+from models.embedding import CODINGS
+from models.pictures import PictureContextNetwork
 
-VARIANTS = ("brp_full", "brp_xy")
+VARIANTS = ("brp_full", "brp_xy", "eivae")
 NORMS = ("batch", "none")
 TARGETS = ("signed", "occupancy")
 LIMITS = {"width": 4096, "height": 4096, "context": 8192, "latent": 256, "time_bins": 65536}
@@ -34,7 +36,8 @@ class EventVAE(nn.Module):
     """Event context network, encoder 1024-256-(mu, logvar) and decoder latent-256-1024-H W.
 
     Args:
-        variant: "brp_full" sees t, x, y, p; "brp_xy" sees x, y alone.
+        variant: "brp_full" sees t, x, y, p; "brp_xy" sees x, y alone; "eivae" sees event
+            images through convolutions, which leave norm, time_bins and coding without use.
         width, height: Pixels of the sensor.
         context: Features of the context vector, even.
         latent: Size of z.
@@ -42,12 +45,15 @@ class EventVAE(nn.Module):
         target: What is reconstructed: "signed" (Tanh, smooth L1) or "occupancy" (Sigmoid,
             binary cross entropy); see `event_targets`.
         time_bins: Resolution of time within a window, part of the model.
+        coding: How the time of an event enters the context: "additive" (sines and cosines),
+            "eventnet" (decay and rotation, twice the numbers) or "none"; "brp_xy" has no time
+            and takes "additive" as "none".
 
     Raises:
         ValueError: A setting outside its range; the message names it.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the settings of an encoder file
         self,
         variant: str = "brp_full",
         width: int = 64,
@@ -57,17 +63,23 @@ class EventVAE(nn.Module):
         norm: str = "batch",
         target: str = "signed",
         time_bins: int = 1024,
+        coding: str = "additive",
     ) -> None:
         super().__init__()
         self.settings: dict[str, Any] = {
             "variant": variant, "width": width, "height": height, "context": context,
-            "latent": latent, "norm": norm, "target": target, "time_bins": time_bins,
+            "latent": latent, "norm": norm, "target": target, "time_bins": time_bins, "coding": coding,
         }  # fmt: skip
         check_settings(self.settings)
         self.grid = Grid(width, height, time_bins)
         self.target = target
-        self.ecn = EventContextNetwork(self.grid, variant, context, norm)
-        self.encoder = nn.Sequential(nn.Linear(context, 256), nn.ReLU(), nn.Linear(256, 2 * latent))
+        self.ecn: nn.Module = (
+            PictureContextNetwork(self.grid, context)
+            if variant == "eivae"
+            else EventContextNetwork(self.grid, variant, context, norm, coding)
+        )
+        parts = 2 if coding == "eventnet" else 1  # real and imaginary
+        self.encoder = nn.Sequential(nn.Linear(parts * context, 256), nn.ReLU(), nn.Linear(256, 2 * latent))
         self.decoder = nn.Sequential(
             nn.Linear(latent, 256),
             nn.ReLU(),
@@ -101,7 +113,8 @@ def check_settings(settings: dict[str, Any]) -> None:
     Raises:
         ValueError: Names the setting, the value and the rule.
     """
-    for name, allowed in (("variant", VARIANTS), ("norm", NORMS), ("target", TARGETS)):
+    choices = (("variant", VARIANTS), ("norm", NORMS), ("target", TARGETS), ("coding", CODINGS))
+    for name, allowed in choices:
         if settings[name] not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {settings[name]!r}")
     for name, limit in LIMITS.items():
@@ -110,6 +123,9 @@ def check_settings(settings: dict[str, Any]) -> None:
             raise ValueError(f"{name} must be an integer in 1..{limit}, got {value!r}")
     if settings["context"] % 2:
         raise ValueError(f"context must be even (sines and cosines), got {settings['context']}")
+    if settings["variant"] != "brp_full" and settings["coding"] == "eventnet":
+        rule = f"must be additive or none for {settings['variant']}, which has no time"
+        raise ValueError(f"coding {rule}, got 'eventnet'")
 
 
 def event_targets(batch: EventBatch, target: str) -> Tensor:

@@ -1,113 +1,109 @@
-"""The parts of a policy: the encoder's half that flies, the stack of latents, two small networks."""
+"""What decides: networks from a stack of features to logits and a value, each as three parts.
+
+    logits = pi(trunk(stack)),   value = vf(trunk(stack))
+
+`NETWORKS` says how each is put together; a part without weights costs nothing. Weights are
+those of a later `initialise`, or of a file.
+"""
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from models.evae import EventVAE
-from models.table import EncoderTable
-from models.weights import EncoderFileError, load_encoder
+from models.event_set import OUTPUTS, EventSet
+from models.features import feature_of
+from models.kinds import KINDS
+
+PARTS = ("trunk", "pi", "vf")
+# Of the last layer's weights; all other layers have sqrt(2) (stable-baselines' policies).
+LAST_GAIN = {"pi": 0.01, "vf": 1.0}
+CNN_OUTPUTS = 512
 
 
-def mlp(inputs: int, hidden: Sequence[int], outputs: int, gain: float, seed: int = 0) -> nn.Sequential:
-    """Dense tanh layers and a linear head with orthogonal weights and zero biases.
+def build_networks(settings: Mapping[str, Any], seed: int = 0) -> nn.ModuleDict:
+    """The networks of a policy with its initial weights.
 
     Args:
-        inputs: Numbers in.
-        hidden: Neurons of each tanh layer.
-        outputs: Numbers out.
-        gain: Of the head's weights; hidden layers have sqrt(2).
-        seed: Of the initial weights.
-
-    Source: appendix D.1.2 ("two dense layers of 64 neurons each"); activation and
-    initial weights are those of stable-baselines' MlpPolicy, which it names.
+        settings: As in a manifest: `name`, `stack`, `hidden` and `num_actions`, and what the
+            feature's shape follows from.
+        seed: Of the weights.
     """
-    generator = torch.Generator().manual_seed(seed)
-    sizes = [inputs, *hidden, outputs]
+    return initialise(assemble(settings), seed)
+
+
+def assemble(settings: Mapping[str, Any]) -> nn.ModuleDict:
+    """The parts of a policy's networks (`PARTS`); their weights mean nothing yet."""
+    build = NETWORKS[KINDS[settings["name"]].network]
+    shape = (settings["stack"], *feature_of(settings).shape(settings))
+    return nn.ModuleDict(dict(zip(PARTS, build(shape, settings), strict=True)))
+
+
+def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
+    """Orthogonal weights and zero biases, as in stable-baselines' policies; returns the networks."""
+    for offset, name in enumerate(("pi", "vf", "trunk")):
+        generator = torch.Generator().manual_seed(seed + offset)
+        layers = [part for part in networks[name].modules() if isinstance(part, nn.Linear | nn.Conv2d)]
+        for layer in layers:
+            gain = LAST_GAIN.get(name, math.sqrt(2.0)) if layer is layers[-1] else math.sqrt(2.0)
+            nn.init.orthogonal_(layer.weight, gain, generator=generator)
+            nn.init.zeros_(layer.bias)
+    return networks
+
+
+def two_mlps(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
+    """Two separate networks of dense tanh layers (appendix D.1.2; stable-baselines' MlpPolicy)."""
+    inputs, hidden = math.prod(shape), settings["hidden"]
+    pi, vf = mlp(inputs, hidden, settings["num_actions"]), mlp(inputs, hidden, 1)
+    return nn.Flatten(), pi, vf
+
+
+def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """Dense tanh layers and a linear head."""
     layers: list[nn.Module] = []
-    for fan_in, fan_out in itertools.pairwise(sizes):
-        layer = nn.Linear(fan_in, fan_out)
-        last = len(layers) == 2 * len(hidden)
-        nn.init.orthogonal_(layer.weight, gain if last else math.sqrt(2.0), generator=generator)
-        nn.init.zeros_(layer.bias)
-        layers += [layer] if last else [layer, nn.Tanh()]
-    return nn.Sequential(*layers)
+    for fan_in, fan_out in itertools.pairwise([inputs, *hidden]):
+        layers += [nn.Linear(fan_in, fan_out), nn.Tanh()]
+    return nn.Sequential(*layers, nn.Linear([inputs, *hidden][-1], outputs))
 
 
-def build_heads(manifest: Mapping[str, Any], seed: int = 0) -> dict[str, nn.Sequential]:
-    """The policy network "pi" (logits, gain 0.01) and the value network "vf" (gain 1): separate."""
-    inputs, hidden = manifest["stack"] * manifest["latent"], manifest["hidden"]
-    return {
-        "pi": mlp(inputs, hidden, manifest["num_actions"], 0.01, seed),
-        "vf": mlp(inputs, hidden, 1, 1.0, seed + 1),
-    }
+def nature_cnn(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
+    """Convolutions that policy and value share, over the stacked pictures as channels.
 
-
-def encoder_part(evae: EventVAE) -> nn.ModuleDict:
-    """The half of an event VAE that flies, events to latent, with every tensor as a buffer.
-
-    A buffer is in every state and in no optimiser: the encoder is frozen by construction.
+    The sizes are those of Mnih et al. (Nature 2015), as in stable-baselines' CnnPolicy, which
+    appendix D.1.2 names. Pictures need `models.kinds.SMALLEST_IMAGE` pixels each way.
     """
-    part = nn.ModuleDict({"ecn": evae.ecn, "encoder": evae.encoder}).eval()
-    for module in part.modules():
-        for name, value in list(module.named_parameters(recurse=False)):
-            delattr(module, name)
-            module.register_buffer(name, value.detach())
-    return part
+    stack, *sides = shape
+    height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in sides)
+    trunk = nn.Sequential(
+        Bytes(),
+        *(nn.Conv2d(stack, 32, 8, 4), nn.ReLU()),
+        *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),
+        *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),
+        nn.Flatten(),
+        *(nn.Linear(64 * height * width, CNN_OUTPUTS), nn.ReLU()),
+    )
+    return trunk, nn.Linear(CNN_OUTPUTS, settings["num_actions"]), nn.Linear(CNN_OUTPUTS, 1)
 
 
-def read_encoder_part(path: str, digest: str, settings: Mapping[str, Any]) -> nn.ModuleDict:
-    """The `encoder_part` of an encoder file, or one full of NaN if that file is not there.
-
-    A checkpoint is opened where its encoder file no longer is; the state it holds then
-    replaces the NaN, and `tabulate` refuses to fly on what is left of them.
-
-    Args:
-        path: The encoder file.
-        digest: Its SHA-256; a file of another digest counts as not there.
-        settings: Of its event VAE.
-    """
-    try:
-        evae, manifest = load_encoder(path)
-        if manifest["sha256"] == digest:
-            return encoder_part(evae)
-    except EncoderFileError:
-        pass
-    part = encoder_part(EventVAE(**settings))
-    for value in part.buffers():
-        value.fill_(math.nan if value.is_floating_point() else 0)
-    return part
+def event_set(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
+    """A network over sets of events that policy and value share (`models.event_set`)."""
+    trunk = EventSet(shape[0], (settings["width"], settings["height"]))
+    return trunk, nn.Linear(OUTPUTS, settings["num_actions"]), nn.Linear(OUTPUTS, 1)
 
 
-def tabulate(part: nn.ModuleDict, settings: Mapping[str, Any]) -> EncoderTable:
-    """The lookup table of an `encoder_part` of an event VAE with these settings.
+class Bytes(nn.Module):
+    """Bytes to numbers in [0, 1]; here, so that pictures travel and are stored as bytes."""
 
-    Raises:
-        ValueError: If the part was never given its weights.
-    """
-    if not all(torch.isfinite(value).all() for value in part.buffers()):
-        raise ValueError("encoder must have finite weights, got NaN: its file is missing or changed")
-    evae = EventVAE(**settings)
-    evae.load_state_dict({**evae.state_dict(), **part.state_dict()})
-    return EncoderTable.from_evae(evae)
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Scale uint8 (...) to float32 (...)."""
+        return pictures.float().div_(255.0)
 
 
-def push_latents(stacks: np.ndarray, latents: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Append the newest latent to each stack; the first of a flight fills its whole stack.
-
-    Args:
-        stacks: float32 (B, stack * latent), oldest latent first.
-        latents: float32 (B, latent).
-        first: bool (B,), True where the latent is the first of a flight.
-
-    Returns:
-        float32 (B, stack * latent), a new array.
-    """
-    latent = latents.shape[1]
-    tiled = np.tile(latents, (1, stacks.shape[1] // latent))
-    return np.where(first[:, None], tiled, np.concatenate([stacks[:, latent:], latents], axis=1))
+NETWORKS: dict[str, Callable[..., tuple[nn.Module, ...]]] = {
+    "mlp": two_mlps,
+    "cnn": nature_cnn,
+    "set": event_set,
+}

@@ -1,7 +1,7 @@
-"""What flies: frozen encoder, a stack of the last latents, two small networks, one folder.
+"""What flies: a stack of the last features, a network, the frozen encoder if there is one; one folder.
 
-A policy folder turns event windows into actions with the preprocessing of training, on a
-machine without Ray and without running anyone's code: two safetensors files and their JSON
+A policy folder turns observations, or events, into actions with the preprocessing of training,
+on a machine without Ray and without running anyone's code: safetensors files and their JSON
 manifests, each checked against its SHA-256 before use.
 """
 
@@ -14,16 +14,22 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from models.evae import EventVAE
-from models.networks import build_heads, push_latents
+from models.features import feature_of, push_features
+from models.frozen import encoder_of
+from models.kinds import KINDS, SMALLEST_IMAGE
+from models.networks import assemble
+from models.pictures import PictureEncoder
 from models.table import EncoderTable
 from models.weights import load_encoder, save_encoder, write_atomic
 
-MANIFEST, ENCODER, HEADS = "policy.json", "encoder.safetensors", "heads.safetensors"
-REQUIRED = ("format", "sha256", "stack", "latent", "hidden", "num_actions", "sensor", "sensor_hash")
-FORMAT = 1
+MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
+ENCODER_FILES = (ENCODER, "encoder.json")
+SIZES = ("stack", "num_actions", "width", "height")
+REQUIRED = ("sha256", "name", *SIZES, "latent", "hidden", "sensor", "sensor_hash")
+FORMAT = 2
 MAX_BYTES = 1 << 28  # of one file, which is read whole
 MAX_SIZE = 1 << 16  # of a layer
 
@@ -33,74 +39,89 @@ class PolicyFileError(ValueError):
 
 
 class Policy:
-    """Event windows in, actions out; remembers the last latents of each flight.
+    """Observations in, actions out; remembers the last features of each flight.
 
     Attributes:
-        manifest: Sensor settings and hash, network sizes, training settings and figures.
+        manifest: Name, sensor settings and hash, network sizes, training settings and figures.
         deterministic: True: the most likely action; False: one drawn from the distribution.
     """
 
     def __init__(
         self,
-        table: EncoderTable,
-        head: nn.Module,
-        manifest: dict[str, Any],
+        networks: nn.ModuleDict,
+        manifest: Mapping[str, Any],
+        encoder: EncoderTable | PictureEncoder | None = None,
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> None:
-        """Join an encoder and a policy network; a stochastic policy needs `rng`."""
+        """Join the networks and the encoder, if any; a stochastic policy needs `rng`."""
         if not deterministic and rng is None:
             raise ValueError("rng must be given for a stochastic policy (deterministic=False), got None")
-        self.table, self.head, self.manifest = table, head, manifest
+        self.networks, self.manifest, self.encoder = networks, manifest, encoder
         self.deterministic, self.rng = deterministic, rng
+        self._feature = feature_of(manifest)
         self.reset()
 
+    @property
+    def observation(self) -> str:
+        """What the environment must show it: "window", "event_image" or "luminance"."""
+        return KINDS[self.manifest["name"]].observation
+
     def reset(self, num_envs: int = 1) -> None:
-        """Forget everything: the next windows are the first of `num_envs` flights."""
-        size = self.manifest["stack"] * self.manifest["latent"]
-        self._stacks = np.zeros((num_envs, size), np.float32)
+        """Forget everything: the next observations are the first of `num_envs` flights."""
+        shape = (num_envs, self.manifest["stack"], *self._feature.shape(self.manifest))
+        self._stacks = np.zeros(shape, self._feature.dtype)
         self._first = np.ones(num_envs, bool)
 
-    def __call__(self, windows: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
         """Choose an action for each flight.
 
         Args:
-            windows: int32 (B, capacity + 1, 4), one event window per flight.
-            restarted: bool (B,), True where the window is the first of a new flight (with
-                Gymnasium's NEXT_STEP autoreset: where the step before was terminated or
-                truncated); None: nowhere.
+            observations: (B, ...), one per flight, of the kind that `observation` names:
+                windows int32 (B, capacity + 1, 4), event images uint8 (B, H, W) or luminance
+                float32 (B, H, W).
+            restarted: bool (B,), True where the observation is the first of a new flight
+                (with Gymnasium's NEXT_STEP autoreset: where the step before was terminated
+                or truncated); None: nowhere.
 
         Returns:
             int64 (B,) actions.
         """
-        return self._choose(self.logits(windows, restarted))
+        return self._choose(self.logits(observations, restarted))
 
     def act(self, events: np.ndarray, start_us: int, window_us: int) -> int:
         """Choose the action of one flight from the events of its control step.
 
         Args:
-            events: EVENT array of the step, t in (start_us, start_us + window_us].
+            events: EVENT array of the step in time order, t in (start_us, start_us + window_us].
             start_us: Start of the step on the clock of the events [us].
             window_us: Length of the step [us].
+
+        Raises:
+            ValueError: The policy does not see events.
         """
-        latent = self.table.encode(events, start_us, window_us)
-        return int(self._choose(self._logits(latent[None], None))[0])
+        if self._feature.from_events is None:
+            rule = f"a policy that sees {self.observation}: call it with observations"
+            raise ValueError(f"events say nothing to {rule}")
+        feature = self._feature.from_events((events, start_us, window_us), self.manifest, self.encoder)
+        return int(self._choose(self._logits(feature[None], None))[0])
 
-    def logits(self, windows: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
+    def logits(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
         """Unnormalised log-probabilities float32 (B, actions); arguments as in a call."""
-        return self._logits(self.table.encode_windows(windows), restarted)
+        features = self._feature.from_observations(observations, self.manifest, self.encoder)
+        return self._logits(features, restarted)
 
-    def _logits(self, latents: np.ndarray, restarted: np.ndarray | None) -> np.ndarray:
-        if len(latents) != len(self._stacks):
+    def _logits(self, features: np.ndarray, restarted: np.ndarray | None) -> np.ndarray:
+        if len(features) != len(self._stacks):
             raise ValueError(
-                f"windows must be one for each of {len(self._stacks)} flights, got {len(latents)}: "
+                f"observations must be one for each of {len(self._stacks)} flights, got {len(features)}: "
                 "call reset(num_envs) first"
             )
         first = self._first if restarted is None else self._first | restarted
-        self._stacks = push_latents(self._stacks, latents, first)
-        self._first = np.zeros(len(latents), bool)
+        self._stacks = push_features(self._stacks, features, first)
+        self._first = np.zeros(len(features), bool)
         with torch.inference_mode():
-            return self.head(torch.from_numpy(self._stacks)).numpy()
+            return self.networks["pi"](self.networks["trunk"](torch.from_numpy(self._stacks))).numpy()
 
     def _choose(self, logits: np.ndarray) -> np.ndarray:
         if self.deterministic or self.rng is None:
@@ -112,31 +133,34 @@ class Policy:
 
 
 def save_policy(
-    path: str | Path, evae: EventVAE, heads: Mapping[str, nn.Module], manifest: Mapping[str, Any]
+    path: str | Path, networks: nn.ModuleDict, manifest: Mapping[str, Any], evae: EventVAE | None = None
 ) -> Path:
     """Write a policy folder that is sufficient alone; its manifest comes last, and seals it.
 
     Args:
         path: Folder, made if missing.
-        evae: The frozen event VAE.
-        heads: Networks of `build_heads`: "pi", and "vf" for those who train on.
-        manifest: At least `stack`, `latent`, `hidden`, `num_actions`, `sensor` and
-            `sensor_hash`; anything else that JSON holds, such as training figures.
+        networks: Those of `models.networks.assemble`; with the value, for those who train on.
+        manifest: At least `name`, `stack`, `num_actions`, `width`, `height`, `latent` and
+            `hidden` (or None), `sensor` and `sensor_hash`; anything else that JSON holds,
+            such as training figures.
+        evae: The frozen event VAE, for a policy that has one.
 
     Returns:
         The folder.
+
+    Raises:
+        ValueError: An event VAE is missing or too many.
     """
+    needed = KINDS[manifest["name"]].encoder
+    if needed != (evae is not None):
+        raise ValueError(f"evae must be {'given' if needed else 'None'} for {manifest['name']}, got {evae!r}")
     folder = Path(path)
     folder.mkdir(parents=True, exist_ok=True)
-    about = {key: manifest[key] for key in ("sensor", "sensor_hash")}
-    save_encoder(folder / ENCODER, evae, about)
-    tensors = {
-        f"{name}.{key}": value.detach().contiguous()
-        for name, head in heads.items()
-        for key, value in head.state_dict().items()
-    }
-    write_atomic(folder / HEADS, safetensors.torch.save(tensors))
-    sums = {name: _digest(folder / name) for name in (ENCODER, HEADS)}
+    if evae is not None:
+        save_encoder(folder / ENCODER, evae, {key: manifest[key] for key in ("sensor", "sensor_hash")})
+    tensors = {name: value.detach().contiguous() for name, value in networks.state_dict().items()}
+    write_atomic(folder / NETWORKS, safetensors.torch.save(tensors))
+    sums = {name: _digest(folder / name) for name in _files(manifest["name"])}
     text = json.dumps({**manifest, "format": FORMAT, "sha256": sums}, indent=2, allow_nan=False)
     write_atomic(folder / MANIFEST, text.encode())
     return folder
@@ -155,10 +179,14 @@ def load_policy(
     for name, expected in manifest["sha256"].items():
         if _digest(folder / name) != expected:
             raise PolicyFileError(f"{folder / name}: SHA-256 must be {expected}: another or a damaged file")
-    evae, _ = load_encoder(folder / ENCODER)
-    heads = nn.ModuleDict(build_heads(manifest)).requires_grad_(False)
-    _load_heads(folder / HEADS, heads)
-    return Policy(EncoderTable.from_evae(evae), heads["pi"], manifest, deterministic, rng)
+    table = _load_encoder(folder, manifest) if KINDS[manifest["name"]].encoder else None
+    networks = _load_networks(folder / NETWORKS, manifest)
+    return Policy(networks, manifest, table, deterministic, rng)
+
+
+def _files(name: str) -> tuple[str, ...]:
+    """The files that a policy's manifest vouches for."""
+    return (*(ENCODER_FILES if KINDS[name].encoder else ()), NETWORKS)
 
 
 def _read_manifest(file: Path) -> dict[str, Any]:
@@ -166,31 +194,67 @@ def _read_manifest(file: Path) -> dict[str, Any]:
         manifest = json.loads(_read(file))
     except (ValueError, RecursionError) as error:
         raise PolicyFileError(f"{file}: not a JSON file: {error}") from None
-    missing = [key for key in REQUIRED if not isinstance(manifest, dict) or key not in manifest]
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        found = manifest.get("format") if isinstance(manifest, dict) else None
+        raise PolicyFileError(f"{file}: format {found!r}, this version reads {FORMAT}; train it anew")
+    missing = [key for key in REQUIRED if key not in manifest]
     if missing:
         raise PolicyFileError(f"{file}: the manifest lacks {missing}; export the policy again")
-    if manifest["format"] != FORMAT:
-        raise PolicyFileError(f"{file}: format {manifest['format']!r}, this version reads {FORMAT}")
-    if not isinstance(manifest["sha256"], dict) or set(manifest["sha256"]) != {ENCODER, HEADS}:
-        raise PolicyFileError(f"{file}: sha256 must name {ENCODER} and {HEADS}, got {manifest['sha256']!r}")
-    hidden = manifest["hidden"] if isinstance(manifest["hidden"], list) else [None]
-    sizes = [manifest["stack"], manifest["latent"], manifest["num_actions"], *hidden]
-    if not all(type(size) is int and 1 <= size <= MAX_SIZE for size in sizes):
-        rule = f"must be integers in 1..{MAX_SIZE}"
-        raise PolicyFileError(f"{file}: stack, latent, num_actions and hidden {rule}")
+    name = manifest["name"]
+    if not isinstance(name, str) or name not in KINDS:
+        raise PolicyFileError(f"{file}: name must be one of {', '.join(KINDS)}, got {name!r}")
+    if not isinstance(manifest["sha256"], dict) or set(manifest["sha256"]) != set(_files(name)):
+        wanted = ", ".join(_files(name))
+        raise PolicyFileError(f"{file}: sha256 must name {wanted}, got {manifest['sha256']!r}")
+    _check_sizes(file, manifest)
     return manifest
 
 
-def _load_heads(file: Path, heads: nn.Module) -> None:
-    """Put the file's tensors into the networks; they must fit one by one and be finite."""
+def _check_sizes(file: Path, manifest: Mapping[str, Any]) -> None:
+    """Refuse sizes of which no network can be built."""
+    kind = KINDS[manifest["name"]]
+    used = [*SIZES, *(["latent"] if kind.encoder else [])]
+    hidden = manifest["hidden"] if kind.network == "mlp" else []
+    sizes = [manifest[name] for name in used] + (hidden if isinstance(hidden, list) else [None])
+    if not all(type(size) is int and 1 <= size <= MAX_SIZE for size in sizes):
+        raise PolicyFileError(f"{file}: {', '.join(used)} and hidden must be integers in 1..{MAX_SIZE}")
+    if kind.network == "cnn" and min(manifest["width"], manifest["height"]) < SMALLEST_IMAGE:
+        rule = f"must be at least {SMALLEST_IMAGE} for {manifest['name']}"
+        raise PolicyFileError(f"{file}: width and height {rule}")
+
+
+def _load_encoder(folder: Path, manifest: Mapping[str, Any]) -> EncoderTable | PictureEncoder:
+    evae, _ = load_encoder(folder / ENCODER)
+    ours = {"variant": manifest["name"], **{key: manifest[key] for key in ("latent", "width", "height")}}
+    theirs = {key: evae.settings[key] for key in ours}
+    if ours != theirs:
+        raise PolicyFileError(f"{folder / ENCODER}: must be the encoder of {ours}, got one of {theirs}")
+    return encoder_of(evae)
+
+
+def _load_networks(file: Path, manifest: Mapping[str, Any]) -> nn.ModuleDict:
+    """The networks of the file's tensors, which must fit one by one and be finite.
+
+    They are put together without memory for their weights: sizes that the file does not
+    bear out cost nothing.
+    """
     try:
         tensors = safetensors.torch.load(_read(file))
-        heads.load_state_dict(tensors)
-    except (safetensors.SafetensorError, RuntimeError) as error:
-        raise PolicyFileError(f"{file}: not the networks of this policy: {error}") from None
+    except safetensors.SafetensorError as error:
+        raise PolicyFileError(f"{file}: not a safetensors file: {error}") from None
+    with torch.device("meta"):
+        networks = assemble(manifest)
+    if _forms(tensors) != _forms(networks.state_dict()):
+        raise PolicyFileError(f"{file}: not the networks of this policy: other tensors than it needs")
     bad = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
     if bad:
         raise PolicyFileError(f"{file}: weights must be finite, those of {bad} are not")
+    networks.load_state_dict(tensors, assign=True)
+    return networks.requires_grad_(False)
+
+
+def _forms(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
+    return {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()}
 
 
 def _digest(file: Path) -> str:

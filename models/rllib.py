@@ -1,9 +1,9 @@
-"""The policy inside RLlib: a module that owns the frozen encoder, and its connectors.
+"""A policy inside RLlib: a module that owns the networks and the frozen encoder, and its connectors.
 
-Each event window is encoded exactly once, on its way from the environment to the module
-(`EncodeWindows`), and replaced there by the stack of latents: PPO's epochs and its bootstrap
-values see `stack * latent` floats, and a raw window never reaches a learner. `models.policy`
-is the same policy without Ray.
+What a policy keeps of a step (`models.features`) is made exactly once, on its way from the
+environment to the module (`StackFeatures`), and the stack of the last ones takes the
+observation's place there: PPO's epochs and its bootstrap values see stacks, and a raw window
+never reaches a learner. `models.policy` is the same policy without Ray.
 """
 
 from collections.abc import Mapping
@@ -18,19 +18,27 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, ValueFunctionAPI
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
-from torch import Tensor
+from torch import Tensor, nn
 
-from models.networks import build_heads, push_latents, read_encoder_part, tabulate
+from models.features import feature_of, push_features
+from models.frozen import read_encoder_part, tabulate
+from models.networks import PARTS, build_networks
+from models.pictures import PictureEncoder
 from models.table import EncoderTable
 
-
-def latent_space(stack: int, latent: int) -> gym.spaces.Box:
-    """What the networks see: float32 (stack * latent,), oldest latent first."""
-    return gym.spaces.Box(-np.inf, np.inf, (stack * latent,), np.float32)
+VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
 
 
-class EncodedPolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
-    """Frozen encoder, policy network and value network.
+def stack_space(settings: Mapping[str, Any]) -> gym.spaces.Box:
+    """What the networks see: (stack, *feature), oldest feature first."""
+    feature = feature_of(settings)
+    whole = np.issubdtype(feature.dtype, np.integer)
+    low, high = (np.iinfo(feature.dtype).min, np.iinfo(feature.dtype).max) if whole else (-np.inf, np.inf)
+    return gym.spaces.Box(low, high, (settings["stack"], *feature.shape(settings)), feature.dtype)
+
+
+class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
+    """Frozen encoder, where the policy has one, and the networks.
 
     The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
     checkpoint is sufficient alone. `model_config` holds what `module_spec` puts there.
@@ -39,18 +47,18 @@ class EncodedPolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     def setup(self) -> None:
         """Build the parts; called once by RLlib."""
         settings: Any = self.model_config
-        self.encoder = read_encoder_part(**settings["encoder"])
-        self.encoder_settings = settings["encoder"]["settings"]
-        heads = build_heads(settings, settings["seed"])
-        self.pi, self.vf = heads["pi"], heads["vf"]
-        self._table: EncoderTable | None = None
+        about = settings["encoder"]
+        self.encoder = None if about is None else read_encoder_part(**about)
+        networks = build_networks(settings, settings["seed"])
+        self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
+        self._table: EncoderTable | PictureEncoder | None = None
 
     def get_non_inference_attributes(self) -> list[str]:
         """What an env runner does without."""
         return ["vf"]
 
-    def train(self, mode: bool = True) -> "EncodedPolicyModule":
-        """Keep every part as it is: the encoder stays frozen, tanh networks have no modes.
+    def train(self, mode: bool = True) -> "PolicyModule":
+        """Keep every part as it is: the encoder stays frozen, the networks have no modes.
 
         RLlib toggles the mode around every forward pass; a walk through all parts each
         time would take longer than the pass, and would let running statistics move.
@@ -58,14 +66,22 @@ class EncodedPolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         self.training = mode
         return self
 
-    def encode(self, windows: np.ndarray) -> np.ndarray:
-        """Latents float32 (B, latent) of event windows int32 (B, capacity + 1, 4)."""
-        if self._table is None:
-            self._table = tabulate(self.encoder, self.encoder_settings)
-        return self._table.encode_windows(windows)
+    def networks(self) -> nn.ModuleDict:
+        """The networks, as `models.networks.assemble` names them."""
+        return nn.ModuleDict({name: getattr(self, name) for name in PARTS})
+
+    def features(self, observations: np.ndarray) -> np.ndarray:
+        """Features (B, ...) of observations (B, ...)."""
+        settings: Any = self.model_config
+        if self.encoder is not None and self._table is None:
+            self._table = tabulate(self.encoder, settings["encoder"]["settings"])
+        return feature_of(settings).from_observations(observations, settings, self._table)
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Load weights; the table is built anew only if they change the encoder."""
+        if self.encoder is None:
+            super().set_state(state)
+            return
         before = [value.clone() for value in self.encoder.state_dict().values()]
         super().set_state(state)
         if not all(map(torch.equal, before, self.encoder.state_dict().values())):
@@ -76,69 +92,82 @@ class EncodedPolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return {**self.__dict__, "_table": None}
 
     def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-        return {Columns.ACTION_DIST_INPUTS: self.pi(batch[Columns.OBS])}
+        return {Columns.ACTION_DIST_INPUTS: self.pi(self.trunk(batch[Columns.OBS]))}
+
+    def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        """The same, and what the trunk gives, so that the value's loss need not run it again."""
+        embeddings = self.trunk(batch[Columns.OBS])
+        return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), Columns.EMBEDDINGS: embeddings}
 
     def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Tensor:
-        """Values float32 (B,) of the batch's observations."""
-        return self.vf(batch[Columns.OBS]).squeeze(-1)
+        """Values float32 (B,) of the batch's observations.
+
+        Without the trunk's embeddings no gradient is kept: RLlib asks so for the targets, of
+        the whole batch, whose graph would be a gigabyte of activations.
+        """
+        if embeddings is not None:
+            return self.vf(embeddings).squeeze(-1)
+        with torch.no_grad():
+            parts = [self.vf(self.trunk(part)) for part in batch[Columns.OBS].split(VALUE_ROWS)]
+        return torch.cat(parts).squeeze(-1)
 
 
 def module_spec(
-    encoder_path: str | Path, manifest: Mapping[str, Any], settings: Mapping[str, Any], seed: int
+    settings: Mapping[str, Any], seed: int, encoder: tuple[str | Path, Mapping[str, Any]] | None = None
 ) -> RLModuleSpec:
     """Specification of the module.
 
     Args:
-        encoder_path: The frozen encoder's file.
-        manifest: Of that file.
-        settings: What `build_heads` reads.
+        settings: What `models.networks.build_networks` reads.
         seed: Of the networks' initial weights.
+        encoder: The frozen encoder's file and its manifest; None for a policy without one.
     """
-    encoder = {"path": str(encoder_path), "digest": manifest["sha256"], "settings": manifest["model"]}
+    about = None
+    if encoder is not None:
+        path, manifest = encoder
+        about = {"path": str(path), "digest": manifest["sha256"], "settings": manifest["model"]}
     return RLModuleSpec(
-        module_class=EncodedPolicyModule,
-        observation_space=latent_space(settings["stack"], settings["latent"]),
+        module_class=PolicyModule,
+        observation_space=stack_space(settings),
         action_space=gym.spaces.Discrete(settings["num_actions"]),
-        model_config={**settings, "encoder": encoder, "seed": seed},
+        model_config={**settings, "encoder": about, "seed": seed},
     )
 
 
-class EncodeWindows(ConnectorV2):
-    """Env-to-module: replace each episode's newest window by its stack of latents."""
+class StackFeatures(ConnectorV2):
+    """Env-to-module: replace each episode's newest observation by its stack of features."""
 
     def __init__(
         self,
         input_observation_space: gym.Space | None = None,
         input_action_space: gym.Space | None = None,
         *,
-        stack: int,
-        latent: int,
+        space: gym.spaces.Box,
     ) -> None:
-        """Keep the sizes; spaces are RLlib's."""
-        self.stack, self.latent = stack, latent
+        """Keep the space of a stack; the others are RLlib's."""
+        self.space = space
         super().__init__(input_observation_space, input_action_space)
 
     def recompute_output_observation_space(
         self, input_observation_space: gym.Space, input_action_space: gym.Space
     ) -> gym.Space:
-        """The space of a stack of latents."""
-        return latent_space(self.stack, self.latent)
+        """The space of a stack of features."""
+        return self.space
 
     def __call__(self, *, rl_module: Any, batch: dict[str, Any], episodes: list[Any], **kwargs: Any) -> Any:
-        """Encode the newest window of all episodes in one call.
+        """Make the newest features of all episodes in one call.
 
         RLlib calls this after each step with every episode, also with those that this
-        step ended: a truncated flight's last window is encoded for its bootstrap value.
+        step ended: a truncated flight's last observation is needed for its bootstrap value.
         """
-        windows = np.stack([episode.get_observations(-1) for episode in episodes])
-        latents = rl_module.encode(windows)
+        features = rl_module.features(np.stack([episode.get_observations(-1) for episode in episodes]))
         first = np.array([episode.t == 0 for episode in episodes])
-        stacks = np.zeros((len(episodes), self.stack * self.latent), np.float32)
+        stacks = np.zeros((len(episodes), *self.space.shape), self.space.dtype)
         for row, episode in enumerate(episodes):
             if not first[row]:
                 stacks[row] = episode.get_observations(-2)
-        for episode, stacked in zip(episodes, push_latents(stacks, latents, first), strict=True):
-            episode.observation_space = self.observation_space
+        for episode, stacked in zip(episodes, push_features(stacks, features, first), strict=True):
+            episode.observation_space = self.space
             episode.set_observations(at_indices=-1, new_data=stacked)
         return batch
 

@@ -8,6 +8,9 @@ of embedding per time bin. A context is the maximum of their sums, floored at 0,
 a sum is rounded the same in every chunk, and a maximum does not round. The rows are computed
 in float64 and rounded once, to the model's precision or a smaller one; `tests/test_table.py`
 states the distance to the module.
+
+With EventNet's coding a context also holds the time bin of the event that each magnitude is from,
+of equal ones the newest; the phase of that bin follows when the latent is asked for.
 """
 
 from dataclasses import dataclass
@@ -18,7 +21,7 @@ import numpy as np
 import torch
 
 from models.batch import Grid, index_events, index_packed
-from models.embedding import embedding_table
+from models.embedding import bin_centres, eventnet_phase, time_code
 from models.evae import EventVAE
 
 PRECISIONS = ("model", "int16", "int8")
@@ -32,10 +35,11 @@ class EncoderTable:
     Attributes:
         grid: Sensor size and time bins.
         features: (cells, D) rows for each (p, y, x), or (y, x) without polarity; >= 0.
-        embedding: (time_bins, D), or one row of zeros for an encoder without time.
-        hidden: Weight (256, D) and bias (256,) of the encoder's first layer; the weight takes
-            a context in the units of the rows.
+        embedding: Code of each time bin (time_bins, D), or one row of zeros for an encoder without time.
+        hidden: Weight (256, D or 2 D) and bias (256,) of the encoder's first layer; the weight
+            takes a context in the units of the rows.
         head: Weight (latent, 256) and bias (latent,) of mu.
+        phase: Of each time bin, real and imaginary part (2, time_bins), for EventNet's coding.
     """
 
     grid: Grid
@@ -43,6 +47,7 @@ class EncoderTable:
     embedding: np.ndarray
     hidden: tuple[np.ndarray, np.ndarray]
     head: tuple[np.ndarray, np.ndarray]
+    phase: np.ndarray | None = None
 
     @classmethod
     def from_evae(
@@ -59,42 +64,45 @@ class EncoderTable:
             time_bins: Another resolution of time than the model's; None: the model's, exact.
 
         Raises:
-            ValueError: Unknown precision, or time_bins out of the model's range.
+            ValueError: Unknown precision, time_bins out of the model's range, or weights that
+                are neither float32 nor float64.
         """
         if precision not in PRECISIONS:
             raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
-        settings = evae.settings if time_bins is None else {**evae.settings, "time_bins": time_bins}
         dtype = str(evae.encoder[0].weight.dtype).removeprefix("torch.")
-        exact = EventVAE(**settings).double()
-        exact.load_state_dict(evae.state_dict())
+        if dtype not in ("float32", "float64"):
+            raise ValueError(f"weights must be float32 or float64, got {dtype}: call evae.float()")
+        exact = _exact(evae, time_bins)
         with torch.no_grad():
             features = exact.ecn.cell_features().numpy()
-        if settings["variant"] == "brp_full":
-            grid = exact.grid
-            embedding = embedding_table(grid.time_bins, settings["context"], "float64")
-        else:
-            grid, embedding = exact.grid._replace(time_bins=1), np.zeros((1, settings["context"]))
+        coding = exact.ecn.coding
+        grid = exact.grid._replace(time_bins=1) if coding == "none" else exact.grid
+        embedding = time_code(bin_centres(grid.time_bins), features.shape[1], coding)
         features, embedding, scale = _rounded(features, embedding, precision, dtype)
         first, _, last = exact.encoder
-        latent = settings["latent"]
+        hidden = _array(first.weight) * np.resize(scale, first.in_features), _array(first.bias)
+        head = [_array(part)[: evae.settings["latent"]] for part in (last.weight, last.bias)]
         return cls(
             grid=grid,
             features=_read_only(features),
             embedding=_read_only(embedding),
-            hidden=(_read_only(_array(first.weight) * scale, dtype), _read_only(_array(first.bias), dtype)),
-            head=(
-                _read_only(_array(last.weight)[:latent], dtype),
-                _read_only(_array(last.bias)[:latent], dtype),
-            ),
+            hidden=(_read_only(hidden[0], dtype), _read_only(hidden[1], dtype)),
+            head=(_read_only(head[0], dtype), _read_only(head[1], dtype)),
+            phase=eventnet_phase(grid.time_bins, dtype) if coding == "eventnet" else None,
         )
 
     def empty(self) -> np.ndarray:
-        """Context (D,) of no event: zeros, int16 for rows of int8, whose sums it holds."""
-        dtype = np.int16 if self.features.dtype == np.int8 else self.features.dtype
-        return np.zeros(self.features.shape[1], dtype)
+        """Context of no event: zeros (D,), int16 for rows of int8, whose sums it holds.
+
+        With EventNet's coding (2, D), magnitudes and time bins; int32 for rows of integers.
+        """
+        dtype = self.features.dtype
+        if self.phase is not None:
+            return np.zeros((2, self.features.shape[1]), np.int32 if dtype.kind == "i" else dtype)
+        return np.zeros(self.features.shape[1], np.int16 if dtype == np.int8 else dtype)
 
     def update(self, context: np.ndarray, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Context (D,) after more events of the same window; `context` is left as it was.
+        """Context after more events of the same window; `context`, as of `empty`, is left as it was.
 
         Raises:
             ValueError: As `models.batch.index_events`, or `context` is not one of this table's.
@@ -107,12 +115,20 @@ class EncoderTable:
             )
         address = index_events(tuple(events[name] for name in "txyp"), start_us, window_us, self.grid)
         result = context.copy()
-        _raise_to(self.features, self.embedding, address, result)
+        self._raise(address, result)
         return result
 
+    def _raise(self, address: np.ndarray, context: np.ndarray) -> None:
+        """Raise `context` to the maximum over it and the addressed events (2, N)."""
+        kernel = _raise_to if self.phase is None else _raise_to_newest
+        kernel(self.features, self.embedding, address, context)
+
     def latent(self, context: np.ndarray) -> np.ndarray:
-        """Latent mu (latent,) of a context (D,)."""
-        return _mlp(context.astype(self.head[1].dtype), *self.hidden, *self.head)
+        """Latent mu (latent,) of a context."""
+        values = context.astype(self.head[1].dtype)
+        if self.phase is not None:
+            values = (values[0] * self.phase[:, context[1].astype(np.int64)]).ravel()
+        return _mlp(values, *self.hidden, *self.head)
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
         """Latent mu (latent,) of one window; without events, that of the zero context.
@@ -136,9 +152,17 @@ class EncoderTable:
         latents = np.empty((len(windows), len(self.head[1])), self.head[1].dtype)
         for row, window in enumerate(windows):
             context = self.empty()
-            _raise_to(self.features, self.embedding, index_packed(window, self.grid), context)
+            self._raise(index_packed(window, self.grid), context)
             latents[row] = self.latent(context)
         return latents
+
+
+def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
+    """The model in float64, with another resolution of time unless that is None."""
+    settings = evae.settings if time_bins is None else {**evae.settings, "time_bins": time_bins}
+    exact = EventVAE(**settings).double()
+    exact.load_state_dict(evae.state_dict())
+    return exact
 
 
 def _rounded(
@@ -183,6 +207,20 @@ def _raise_to(features, embedding, address, context) -> None:  # type: ignore[no
             early = max(feature_1[j] + code_1[j], feature_2[j] + code_2[j])
             late = max(feature_3[j] + code_3[j], feature_4[j] + code_4[j])
             context[j] = max(max(early, late), context[j])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _raise_to_newest(features, embedding, address, context) -> None:  # type: ignore[no-untyped-def]
+    """Raise magnitudes and their time bins `context` (2, D); of equal magnitudes the newest stays."""
+    best, newest, cells = context[0], context[1], len(features)
+    for n in range(address.shape[1]):
+        feature, code = features[address[0, n] % cells], embedding[address[1, n]]
+        time = context.dtype.type(address[1, n])
+        for j in range(len(best)):
+            value = context.dtype.type(feature[j] + code[j])
+            better = (value > best[j]) | ((value == best[j]) & (time > newest[j]))
+            best[j] = value if better else best[j]
+            newest[j] = time if better else newest[j]
 
 
 # Reordering the sums lets them use vector registers (20 times faster); it decides no event.

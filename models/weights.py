@@ -22,6 +22,7 @@ FORMAT = 1
 MAX_MANIFEST_BYTES = 1 << 20
 MAX_HEADER_BYTES = 1 << 20
 RESERVED = ("format", "model", "sha256")
+ADDED_SETTINGS = {"coding": "additive"}  # what a file means that was written before there was a choice
 
 
 class EncoderFileError(ValueError):
@@ -103,7 +104,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if manifest["format"] != FORMAT:
         raise EncoderFileError(f"{path}: format {manifest['format']!r}, this version reads {FORMAT}")
     try:
-        settings = manifest["model"]
+        settings = manifest["model"] = {**ADDED_SETTINGS, **manifest["model"]}
         check_settings(settings)
         if set(settings) != set(EventVAE.__init__.__annotations__) - {"return"}:
             raise ValueError(f"unknown settings among {sorted(settings)}")

@@ -18,13 +18,14 @@ ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "conf"
 
 JOBS = {
-    "bytestream": "jobs.bytestream",
+    "pipeline": "jobs.pipeline",
     "collect": "jobs.collect",
     "pretrain": "jobs.pretrain",
     "train": "jobs.train",
     "evaluate": "jobs.evaluate",
     "sweep": "jobs.sweep",
     "trade_simulator": "jobs.trade_simulator",
+    "trade_encoder": "jobs.trade_encoder",
 }
 
 # Two threads beside other busy processes ran ten times slower than one.

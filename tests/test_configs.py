@@ -7,11 +7,32 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from envs.config import EnvConfig
-from jobs.config import ENV_PARTS, SECTIONS, Config, ConfigError, as_dict, env_with, known_keys, parse
+from jobs.config import (
+    ENV_PARTS,
+    EVAE_SETTINGS,
+    SECTIONS,
+    Config,
+    ConfigError,
+    as_dict,
+    env_with,
+    known_keys,
+    parse,
+)
 from jobs.refusals import JOBS_CHOOSE
 from jobs.runs import run_name
+from models.kinds import KINDS
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
+
+POLICIES = {
+    "bytestream": "brp_full",
+    "bytestream_xy": "brp_xy",
+    "event_columns": "event_columns",
+    "event_set": "event_set",
+    "event_image": "eip",
+    "event_image_vae": "eivae",
+    "rgb": "rgb",
+}
 
 
 def options(group: str) -> list[str]:
@@ -43,7 +64,7 @@ def changed(values: dict, key: str, value: object) -> dict:
 def test_every_experiment_is_accepted_with_every_budget(composed, exp, budget):
     config = parse(composed(f"+exp={exp}", f"budget={budget}"))
     assert config.budget == budget
-    assert config.job == ("sweep" if exp == "robustness" else exp)
+    assert config.job == ("sweep" if exp == "robustness" else "pipeline" if exp in POLICIES else exp)
 
 
 @pytest.mark.parametrize("choice", CHOICES)
@@ -96,6 +117,30 @@ def test_ppo_is_the_papers(composed):
 def test_the_stages_of_an_experiment_share_its_run_folder(composed):
     stages = ("bytestream", "collect", "pretrain", "train", "evaluate")
     assert len({run_name(parse(composed(f"+exp={stage}"))) for stage in stages}) == 1
+
+
+@pytest.mark.parametrize(
+    ("exp", "name"),
+    POLICIES.items(),
+)
+def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_its_name(composed, exp, name):
+    jobs = ("pipeline", "train", "evaluate", "sweep")
+    configs = [parse(composed(f"+exp={exp}", f"job={job}")) for job in jobs]
+    assert [(config.job, config.model.name) for config in configs] == [(job, name) for job in jobs]
+    (folder,) = {run_name(config) for config in configs}
+    assert folder.startswith(f"{exp}-short-s0-")
+
+
+@pytest.mark.parametrize("name", sorted(KINDS))
+def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
+    values = composed("+exp=bytestream", f"model={name}")
+    kind = KINDS[name]
+    needed = {**dict.fromkeys(EVAE_SETTINGS, kind.encoder), "hidden": kind.network == "mlp"}
+    usual = composed("+exp=bytestream")["model"]
+    for key, wanted in needed.items():
+        other, rule = (None, f"be given for {name}") if wanted else (usual[key], f"be null: {name} has no")
+        with pytest.raises(ConfigError, match=f"^model: {key} must {rule}.*got"):
+            parse(changed(values, f"model.{key}", other))
 
 
 def test_a_whole_number_names_the_same_run_as_its_float(composed):
@@ -151,6 +196,9 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("env.layout", {"num_obstacles": 2.5}, "num_obstacles must be a whole number"),
         ("env.layout", {"num_pole": 3}, "has no 'num_pole'"),
         ("env.layout", {"name": 3}, "has no 'name'"),
+        ("model.name", "snn", f"name must be one of {', '.join(KINDS)}, got 'snn'"),
+        ("model.latent", None, "latent must be given for brp_full, got None"),
+        ("model.hidden", None, "hidden must be given for brp_full, got None"),
     ],
 )
 def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule):
@@ -159,6 +207,15 @@ def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule
     assert str(refusal.value).startswith(key.partition(".")[0])
     assert rule in str(refusal.value)
     assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_a_picture_too_small_for_the_network_is_refused(composed):
+    with pytest.raises(
+        ConfigError, match=r"^camera\.width: must be at least 36 for the network of rgb, got 35$"
+    ):
+        parse(composed("+exp=rgb", "camera.width=35"))
+    parse(composed("+exp=rgb", "camera.width=36"))
+    parse(composed("+exp=event_columns", "camera.width=35"))
 
 
 def test_all_refusals_come_at_once(values):

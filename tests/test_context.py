@@ -5,11 +5,12 @@ import pytest
 import torch
 
 from models.batch import EventBatch, Grid
-from models.context import EventContextNetwork
+from models.context import EventContextNetwork, newest_first
 
 GRID = Grid(width=12, height=9, time_bins=32)
 SIZES = [40, 0, 1, 300, 7, 0]
-CASES = [(variant, norm) for variant in ("brp_full", "brp_xy") for norm in ("batch", "none")]
+KINDS = [("brp_full", "additive"), ("brp_full", "eventnet"), ("brp_full", "none"), ("brp_xy", "additive")]
+CASES = [(*kind, norm) for kind in KINDS for norm in ("batch", "none")]
 
 
 def make_batch(seed, sizes=SIZES, grid=GRID):
@@ -19,9 +20,9 @@ def make_batch(seed, sizes=SIZES, grid=GRID):
     return EventBatch(grid, code, rng.integers(0, grid.time_bins, offsets[-1], dtype=np.int32), offsets)
 
 
-def make_network(variant="brp_full", norm="batch", dtype=torch.float64, context=48):
+def make_network(variant="brp_full", norm="batch", dtype=torch.float64, context=48, coding="additive"):
     torch.manual_seed(1)
-    network = EventContextNetwork(GRID, variant, context, norm).to(dtype)
+    network = EventContextNetwork(GRID, variant, context, norm, coding).to(dtype)
     for normalisation in network.norms:
         torch.nn.init.uniform_(normalisation.weight, 0.5, 1.5)
         torch.nn.init.uniform_(normalisation.bias, -0.3, 0.3)
@@ -49,20 +50,58 @@ def relative_differences(network, batches):
     }
 
 
-@pytest.mark.parametrize(("variant", "norm"), CASES)
+@pytest.mark.parametrize(("variant", "coding", "norm"), CASES)
 @pytest.mark.parametrize("training", [True, False])
-def test_the_fused_form_is_the_plain_formula_in_float64(variant, norm, training):
-    network = make_network(variant, norm).train(training)
+def test_the_fused_form_is_the_plain_formula_in_float64(variant, coding, norm, training):
+    network = make_network(variant, norm, coding=coding).train(training)
     differences = relative_differences(network, [make_batch(0), make_batch(1, [500, 3])])
     assert max(differences.values()) < 1e-10, differences
 
 
-@pytest.mark.parametrize(("variant", "norm"), CASES)
-def test_the_fused_form_is_the_plain_formula_in_float32_to_its_rounding(variant, norm):
-    network = make_network(variant, norm, torch.float32)
+@pytest.mark.parametrize(("variant", "coding", "norm"), CASES)
+def test_the_fused_form_is_the_plain_formula_in_float32_to_its_rounding(variant, coding, norm):
+    network = make_network(variant, norm, torch.float32, coding=coding)
     differences = relative_differences(network, [make_batch(0)])
     assert differences["context"] < 5e-6
     assert max(differences.values()) < 5e-5, differences
+
+
+@pytest.mark.parametrize("form", ["forward", "plain"])
+def test_eventnet_keeps_the_complex_number_of_largest_magnitude(form):
+    network = make_network(coding="eventnet").eval()
+    batch = make_batch(0, [1, 60, 7])
+    squashed = network.cell_features().detach().numpy()[batch.code]
+    assert 0 <= squashed.min() < 0.01 < 0.3 < squashed.max() < 1
+    age = 1 - (batch.bin[:, None] + 0.5) / GRID.time_bins
+    numbers = np.maximum(squashed - age, 0) * np.exp(-2j * np.pi * age)
+    context = getattr(network, form)(batch).detach().numpy()
+    assert context.shape == (3, 96)
+    for row, part in zip(context, np.split(numbers, batch.offsets[1:-1]), strict=True):
+        largest = part[np.abs(part).argmax(0), np.arange(48)]
+        assert np.abs(row - np.concatenate([largest.real, largest.imag])).max() < 1e-12
+
+
+@pytest.mark.parametrize("form", ["forward", "plain"])
+def test_eventnet_forgets_an_event_older_than_its_feature_is_large(form):
+    network, batch = make_network(coding="eventnet").eval(), make_batch(0, [300])
+    oldest = EventBatch(GRID, batch.code, batch.bin * 0, batch.offsets)
+    assert getattr(network, form)(batch).any()
+    assert not getattr(network, form)(oldest).any()
+
+
+def test_of_equals_the_newest_comes_first_and_windows_stay_together():
+    events = (np.arange(5), np.array([3, 7, 5, 0, 2]), np.array([0, 3, 3, 5]), None)
+    cell, bins, offsets, _ = newest_first(events)
+    assert cell.tolist() == [1, 2, 0, 4, 3]
+    assert bins.tolist() == [7, 5, 3, 2, 0]
+    assert offsets.tolist() == [0, 3, 3, 5]
+
+
+@pytest.mark.parametrize("form", ["forward", "plain"])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused(form, dtype):
+    with pytest.raises(ValueError, match="must be float32 or float64, got torch"):
+        getattr(make_network(dtype=dtype), form)(make_batch(0))
 
 
 def test_the_fused_form_of_float32_is_close_to_the_plain_formula_of_float64():
@@ -79,17 +118,19 @@ def test_the_appendix_sizes_agree_as_well():
 
 
 @pytest.mark.parametrize("form", ["forward", "plain"])
-def test_an_empty_window_has_the_zero_context(form):
-    context = getattr(make_network(), form)(make_batch(0))
+@pytest.mark.parametrize("coding", ["additive", "eventnet"])
+def test_an_empty_window_has_the_zero_context(form, coding):
+    context = getattr(make_network(coding=coding), form)(make_batch(0))
     assert not context[1].any()
     assert not context[5].any()
     assert context[0].any()
 
 
 @pytest.mark.parametrize("form", ["forward", "plain"])
-def test_a_batch_of_empty_windows_alone_is_defined_in_eval_mode(form):
-    context = getattr(make_network().eval(), form)(make_batch(0, [0, 0]))
-    assert context.shape == (2, 48)
+@pytest.mark.parametrize(("coding", "size"), [("additive", 48), ("eventnet", 96)])
+def test_a_batch_of_empty_windows_alone_is_defined_in_eval_mode(form, coding, size):
+    context = getattr(make_network(coding=coding).eval(), form)(make_batch(0, [0, 0]))
+    assert context.shape == (2, size)
     assert not context.any()
 
 
@@ -106,11 +147,16 @@ def test_one_event_needs_no_statistics_in_eval_mode_or_without_normalisation(for
     assert getattr(make_network(norm="none"), form)(make_batch(0, [1])).any()
 
 
-def test_equal_events_have_finite_gradients():
+@pytest.mark.parametrize("form", ["forward", "plain"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("coding", ["additive", "eventnet", "none"])
+def test_equal_events_have_no_variance_and_finite_gradients(form, dtype, coding):
     one = np.full(50, 17, np.int32)
     batch = EventBatch(GRID, one, one, np.array([0, 50]))
-    for name, value in run(make_network(), "forward", [batch]).items():
+    for name, value in run(make_network(dtype=dtype, coding=coding), form, [batch]).items():
         assert torch.isfinite(value).all(), name
+        if "running_var" in name:
+            assert (value > 0).all(), name
 
 
 def test_in_eval_mode_an_event_repeated_2000_times_is_the_event_once():
@@ -120,21 +166,24 @@ def test_in_eval_mode_an_event_repeated_2000_times_is_the_event_once():
     assert torch.equal(network(single), network(many))
 
 
-def test_the_order_of_events_in_a_window_does_not_matter():
-    network, batch = make_network(dtype=torch.float32).eval(), make_batch(0, [300])
+@pytest.mark.parametrize("coding", ["additive", "eventnet", "none"])
+def test_the_order_of_events_in_a_window_does_not_matter(coding):
+    network, batch = make_network(dtype=torch.float32, coding=coding).eval(), make_batch(0, [300])
     order = np.random.default_rng(2).permutation(300)
     assert torch.equal(
         network(batch), network(EventBatch(GRID, batch.code[order], batch.bin[order], batch.offsets))
     )
 
 
-def test_without_time_the_bins_do_not_matter():
-    network, batch = make_network("brp_xy").eval(), make_batch(0)
+@pytest.mark.parametrize(("variant", "coding"), [("brp_xy", "additive"), ("brp_full", "none")])
+def test_without_time_the_bins_do_not_matter(variant, coding):
+    network, batch = make_network(variant, coding=coding).eval(), make_batch(0)
     assert torch.equal(network(batch), network(EventBatch(GRID, batch.code, batch.bin * 0, batch.offsets)))
 
 
-def test_with_time_the_bins_do_matter():
-    network, batch = make_network().eval(), make_batch(0)
+@pytest.mark.parametrize("coding", ["additive", "eventnet"])
+def test_with_time_the_bins_do_matter(coding):
+    network, batch = make_network(coding=coding).eval(), make_batch(0)
     assert not torch.equal(
         network(batch), network(EventBatch(GRID, batch.code, batch.bin * 0, batch.offsets))
     )

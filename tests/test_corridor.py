@@ -9,7 +9,6 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv
-from envs.events import EVENT
 from envs.flight import clock_us, fly, planned_position
 from envs.scene import OBSTACLE, POLE, Scene
 from envs.windows import unpack_window
@@ -199,38 +198,6 @@ def test_the_same_seed_gives_the_same_bytes(faults):
     assert first != flight_bytes(CorridorEnv(camera=SMALL, faults=faults, time_limit_s=0.1), 8, actions)
 
 
-def test_the_vector_form_gives_the_bytes_of_single_environments():
-    config = EnvConfig(camera=SMALL, faults=FAULTY, time_limit_s=0.1)
-    many, singles = CorridorVectorEnv(3, config), [CorridorEnv(config) for _ in range(3)]
-    seeds = [5, 9, 5]
-    observations, infos = many.reset(seed=seeds)
-    expected = [env.reset(seed=seed) for env, seed in zip(singles, seeds, strict=True)]
-    over = [False] * 3
-    for actions in np.random.default_rng(0).integers(0, 3, (50, 3)):
-        previous, copy = observations, observations.copy()
-        observations, rewards, terminated, truncated, infos = many.step(actions)
-        assert np.array_equal(previous, copy), "what was handed out is never written again"
-        for i, env in enumerate(singles):
-            result = (*env.reset(), 0.0, False, False) if over[i] else env.step(actions[i])
-            observation, info = result[0], result[1 if over[i] else 4]
-            ends = (0.0, False, False) if over[i] else result[1:4]
-            assert observations[i].tobytes() == observation.tobytes()
-            assert (rewards[i], terminated[i], truncated[i]) == ends
-            assert {key: infos[key][i] for key in info} == info
-            over[i] = ends[1] or ends[2]
-    assert infos["episode"].tolist() == [2, 2, 2]
-    assert len(expected) == 3
-
-
-def test_one_seed_for_all_gives_each_environment_corridors_of_its_own():
-    runners = [CorridorVectorEnv(2, camera=SMALL) for _ in range(2)]
-    poles = set()
-    for seed, runner in enumerate(runners):
-        runner.reset(seed=seed)
-        poles |= {env.scene.obstacles.tobytes() for env in runner.envs}
-    assert len(poles) == 4
-
-
 def test_splits_never_share_a_corridor_and_options_pick_an_episode():
     def poles(split, seed, episode):
         env = CorridorEnv(camera=SMALL, split=split)
@@ -317,28 +284,6 @@ def test_unknown_options_are_refused(options):
         CorridorEnv(camera=SMALL).reset(seed=0, options=options)
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_the_vector_form_refuses_the_wrong_number_of_actions_and_seeds(count):
-    many = CorridorVectorEnv(2, camera=SMALL)
-    with pytest.raises(ValueError, match="seed"):
-        many.reset(seed=[0] * count)
-    many.reset(seed=0)
-    with pytest.raises(ValueError, match="actions"):
-        many.step(np.zeros(count, int))
-    with pytest.raises(ValueError, match="num_envs"):
-        CorridorVectorEnv(0)
-
-
-def test_the_vector_form_serves_event_sequences_of_different_lengths():
-    many = CorridorVectorEnv(2, camera=SMALL, observation="events")
-    many.reset(seed=0)
-    observations = many.step(np.array([0, 1]))[0]
-    for env, rows in zip(many.envs, observations, strict=True):
-        assert rows.dtype == np.int64
-        assert np.array_equal(rows[:, 0], env.events["t"])
-        assert rows.shape == (len(env.events), len(EVENT))
-
-
 def test_the_picture_shows_luminance_beside_events():
     camera = CameraConfig(width=16, height=8, contrast_threshold=0.02)
     env = CorridorEnv(camera=camera, render_mode="rgb_array")
@@ -350,16 +295,3 @@ def test_the_picture_shows_luminance_beside_events():
     assert picture.shape == (32, 128, 3)
     assert picture[:, 64:].any()
     assert CorridorEnv(camera=SMALL).render() is None
-
-
-def test_no_environment_of_a_vector_flies_what_another_flies_later():
-    several = CorridorVectorEnv(4, camera=SMALL)
-    several.reset(seed=3)
-    alone = CorridorEnv(camera=SMALL)
-    later = set()
-    alone.reset(seed=3)
-    for _ in range(6):
-        later.add(alone.scene.obstacles.tobytes())
-        alone.reset()
-    assert several.envs[0].scene.obstacles.tobytes() in later
-    assert not any(env.scene.obstacles.tobytes() in later for env in several.envs[1:])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from models.embedding import embedding_table, temporal_embedding, time_bin
+from models.embedding import embedding_table, eventnet_phase, temporal_embedding, time_bin, time_code
 
 
 def test_the_embedding_is_sines_then_cosines_of_the_published_frequencies():
@@ -42,6 +42,28 @@ def test_the_table_holds_the_bin_centres_and_cannot_be_written():
 
 def test_the_table_is_the_float64_embedding_rounded_once():
     assert np.array_equal(embedding_table(64, 16), embedding_table(64, 16, "float64").astype(np.float32))
+
+
+def test_eventnet_takes_the_age_off_every_feature_and_none_adds_nothing():
+    times = np.array([0.0, 0.3, 1.0])
+    assert np.allclose(time_code(times, 4, "eventnet"), np.repeat([[-1.0], [-0.7], [0.0]], 4, axis=1))
+    assert np.array_equal(time_code(times, 4, "none"), np.zeros((3, 4)))
+    assert np.array_equal(time_code(times, 4), temporal_embedding(times, 4))
+    assert embedding_table(8, 4, "float64", "eventnet")[:, 0].tolist() == [-0.9375 + i / 8 for i in range(8)]
+    assert np.array_equal(embedding_table(8, 4, "float32", "none"), np.zeros((1, 4), np.float32))
+
+
+def test_eventnet_turns_once_backwards_over_the_window():
+    phase = eventnet_phase(8, "float64")
+    age = 1 - (np.arange(8) + 0.5) / 8
+    assert np.allclose(phase[0] + 1j * phase[1], np.exp(-2j * np.pi * age), atol=1e-15)
+    with pytest.raises(ValueError, match="read-only"):
+        phase[0, 0] = 1
+
+
+def test_an_unknown_coding_is_refused():
+    with pytest.raises(ValueError, match="coding must be one of additive, eventnet, none, got 'sum'"):
+        time_code(0.5, 8, "sum")
 
 
 def test_bins_are_the_floor_of_time_times_bins_with_the_window_end_in_the_last():

@@ -65,6 +65,8 @@ def test_the_settings_rebuild_the_model():
         ({"variant": "eip"}, "variant must be one of brp_full, brp_xy, got 'eip'"),
         ({"norm": "layer"}, "norm must be one of"),
         ({"target": "age"}, "target must be one of"),
+        ({"coding": "rotary"}, "coding must be one of additive, eventnet, none, got 'rotary'"),
+        ({"variant": "brp_xy", "coding": "eventnet"}, "coding must be additive or none for brp_xy"),
         ({"context": 63}, "context must be even"),
         ({"latent": 0}, "latent must be an integer in 1..256, got 0"),
         ({"width": 4097}, "width must be"),
@@ -173,9 +175,17 @@ def test_without_noise_the_latent_is_the_mean_and_noise_is_scaled_by_the_deviati
     assert torch.allclose(evae(batch, noise)[0], expected, atol=1e-6)
 
 
-@pytest.mark.parametrize(("variant", "target"), [("brp_full", "signed"), ("brp_xy", "occupancy")])
-def test_training_beats_the_mean_picture_on_windows_never_seen(variant, target):
-    evae, rng = small(variant=variant, target=target), np.random.default_rng(3)
+@pytest.mark.parametrize(
+    ("variant", "target", "coding"),
+    [
+        ("brp_full", "signed", "additive"),
+        ("brp_xy", "occupancy", "additive"),
+        ("brp_full", "occupancy", "eventnet"),
+        ("brp_full", "occupancy", "none"),
+    ],
+)
+def test_training_beats_the_mean_picture_on_windows_never_seen(variant, target, coding):
+    evae, rng = small(variant=variant, target=target, coding=coding), np.random.default_rng(3)
     optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3)
     losses = []
     for _ in range(80):
@@ -222,6 +232,21 @@ def test_empty_windows_take_part_in_training():
         evae, torch.optim.Adam(evae.parameters()), batch, event_targets(batch, "signed"), 1e-3, rng
     )
     assert np.isfinite(figures["loss"])
+
+
+@pytest.mark.parametrize("value", [-1e4, 1e4])
+def test_training_survives_an_encoder_whose_logvar_is_extreme(value):
+    evae, rng = small(), np.random.default_rng(0)
+    with torch.no_grad():
+        evae.encoder[-1].bias[8:] = value
+    batch = bars(evae, 4, rng)
+    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-2)
+    for _ in range(3):
+        figures = train_step(evae, optimizer, batch, event_targets(batch, "signed"), 1e-3, rng)
+        assert all(np.isfinite(figure) for figure in figures.values())
+    bias = evae.encoder[-1].bias.detach()[8:]
+    assert torch.isfinite(torch.cat([p.detach().flatten() for p in evae.parameters()])).all()
+    assert (bias.abs() < abs(value)).all()
 
 
 def test_a_gradient_that_is_not_finite_stops_before_the_parameters_move():

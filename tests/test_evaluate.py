@@ -15,25 +15,46 @@ from jobs.report import summarise
 from jobs.runs import open_run, write_json
 from jobs.tracking import open_tracker
 from models.evae import EventVAE
-from models.policy import build_heads, load_policy, save_policy
+from models.kinds import KINDS
+from models.networks import build_networks
+from models.policy import load_policy, save_policy
 from tests.test_runs import small_config
 
 HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
 
 
-def save_untrained(path, env_config=HELD_OUT):
+def save_untrained(path, env_config=HELD_OUT, name="brp_full"):
     """A policy folder with random weights; large ones, so that its actions differ."""
-    settings = {"stack": 3, "latent": 8, "hidden": [16], "num_actions": 3}
-    sensor = sensor_settings(env_config)
-    manifest = {**settings, "sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {}}
-    heads = build_heads(manifest, seed=3)
-    heads["pi"][-1].weight.data *= 1000.0
-    return save_policy(path, EventVAE(context=64).freeze(), heads, manifest)
+    kind, sensor = KINDS[name], sensor_settings(env_config)
+    sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
+    parts = {"latent": 8 if kind.encoder else None, "hidden": [16] if kind.network == "mlp" else None}
+    about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {}}
+    networks = build_networks({"name": name, **sizes, **parts}, seed=3)
+    for value in networks["pi"].parameters():
+        value.data *= 1000.0
+    evae = EventVAE(context=64).freeze() if kind.encoder else None
+    return save_policy(path, networks, {"name": name, **sizes, **parts, **about}, evae)
 
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     return save_untrained(tmp_path_factory.mktemp("flown") / "policy")
+
+
+@pytest.mark.parametrize("name", ["brp_full", "event_columns", "eip", "rgb"])
+def test_a_policy_of_each_kind_flies_the_same_corridors_by_what_it_sees(tmp_path, name):
+    short = dataclasses.replace(HELD_OUT, time_limit_s=0.15)
+    corridors, shapes = {}, {}
+
+    def watch(env, seed, observation, info):
+        corridors.setdefault(seed, set()).add(env.scene.obstacles.tobytes())
+        shapes.setdefault(env.config.observation, set()).add(observation.shape)
+
+    for pilot in ("straight", str(save_untrained(tmp_path, name=name))):
+        fly(make_pilot(pilot), short, [3, 4], watch=watch)
+    assert [len(seen) for seen in corridors.values()] == [1, 1]
+    shape = (4097, 4) if KINDS[name].observation == "window" else (64, 64)
+    assert shapes == {"window": {(4097, 4)}, KINDS[name].observation: {shape}}
 
 
 @pytest.mark.parametrize("action", ["deterministic", "stochastic"])
@@ -153,12 +174,13 @@ def test_the_tracked_figures_name_pilot_scene_and_renderer(tmp_path):
     assert len(figures) <= 40
 
 
-def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path):
+@pytest.mark.parametrize("name", ["brp_full", "rgb"])
+def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)
     config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.6})
     run = open_run(config)
-    save_untrained(run.policy, config.env_config())
+    save_untrained(run.policy, config.env_config(), name)
     with open_tracker(config, run) as tracker:
         figures = evaluate(config, run, tracker)
         assert evaluate(config, run, tracker) == figures

@@ -78,6 +78,20 @@ def test_a_short_lane_is_drawn_whole_and_a_long_one_as_far_as_the_tolerance_asks
     assert plan(EnvConfig(fidelity=FidelityConfig(0.2)), SCENE).cull_m == pytest.approx(0.5 * usual)
 
 
+def test_round_bodies_and_patterns_take_more_samples_and_both_together_the_most():
+    def samples(name, **fields):
+        return plan(EnvConfig(**fields), make_scene(name, np.random.default_rng(0))).samples
+
+    plain, gates, patterns, cones, ellipsoids, both = (
+        samples(name) for name in ("poles", "gates", "texture_change", "cones", "shape_change", "dynamic")
+    )
+    assert plain == gates < min(patterns, cones, ellipsoids)
+    assert max(patterns, cones, ellipsoids) < both
+    assert cones == ellipsoids
+    # pyrender samples points: what edges need does not depend on what the ray caster's do.
+    assert samples("poles", renderer="pyrender") == samples("dynamic", renderer="pyrender") > plain
+
+
 def test_what_is_set_is_kept():
     asked = FidelityConfig(tolerance=0.5, max_step_m=0.013, samples=5, cull_m=31.0)
     chosen = plan(EnvConfig(fidelity=asked), SCENE)

@@ -77,7 +77,7 @@ def test_help_names_every_job_experiment_and_budget(launch, launcher):
     for group in ("exp", "budget"):
         for file in (ROOT / "conf" / group).glob("*.yaml"):
             assert f"\n  {file.stem} " in out
-    assert out.count("\n  evade +exp=") == 6
+    assert out.count("\n  evade +exp=") == 7
     assert "$" not in out
 
 
@@ -127,7 +127,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["+env.split=eval"], "env.split: no such key, got 'eval'; every job chooses it itself"),
         (["seed=null"], "seed: Input should be a valid integer, got None"),
         (["seed="], "seed: Input should be a valid integer, got ''"),
-        (["job=os.system"], "job: Input should be 'bytestream'"),
+        (["job=os.system"], "job: Input should be 'pipeline'"),
         (["budget=huge"], "budget: must be one of paper, short, smoke, got 'huge'"),
         (["env=3"], "env=3: "),
         (["seed=[1"], "seed=[1: "),
@@ -159,7 +159,7 @@ def test_a_refused_command_line_ends_with_status_2_and_one_message(launch, job, 
 def test_without_an_experiment_the_message_lists_them(launch, words):
     status, _, err = launch(*words)
     assert status == 2
-    assert "name an experiment with +exp=NAME, one of bytestream, collect, " in err
+    assert "name an experiment with +exp=NAME, one of bytestream, bytestream_xy, collect, " in err
     assert len(err.splitlines()) == 1
 
 

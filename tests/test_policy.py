@@ -1,3 +1,4 @@
+import hashlib
 import json
 import subprocess
 import sys
@@ -8,242 +9,208 @@ import torch
 from torch import nn
 
 from models.evae import EventVAE
-from models.networks import build_heads, encoder_part, push_latents, read_encoder_part, tabulate
-from models.policy import ENCODER, HEADS, MANIFEST, Policy, PolicyFileError, load_policy, save_policy
-from models.table import EncoderTable
-from models.weights import save_encoder
+from models.features import feature_of
+from models.frozen import encoder_of
+from models.kinds import KINDS
+from models.networks import build_networks
+from models.policy import (
+    ENCODER,
+    MANIFEST,
+    Policy,
+    load_policy,
+    save_policy,
+)
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
-SIZES = {"stack": 3, "latent": 8, "hidden": [64, 64], "num_actions": 3}
-SENSOR = {"sensor": {"width": 16, "height": 16}, "sensor_hash": "0123456789ab"}
+SIDE = 40
+SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789ab"}
+FLOWN = ("brp_full", "event_columns", "event_set", "eip", "eivae", "rgb")
 
 
-@pytest.fixture(scope="module")
-def evae():
-    torch.manual_seed(0)
-    return EventVAE(width=16, height=16, context=64, time_bins=32).freeze()
+def make_evae(seed=0, variant="brp_full"):
+    torch.manual_seed(seed)
+    return EventVAE(variant, width=SIDE, height=SIDE, context=64, time_bins=32).freeze()
 
 
-@pytest.fixture(scope="module")
-def heads():
-    heads = build_heads(SIZES, seed=3)
-    with torch.no_grad():
-        heads["pi"][-1].weight.mul_(100.0)  # so that actions differ
-    return heads
+def make_settings(name):
+    kind = KINDS[name]
+    sizes = {"width": SIDE, "height": SIDE, "stack": 3, "num_actions": 3}
+    parts = {
+        "latent": 8 if kind.encoder else None,
+        "hidden": [64, 64] if kind.network == "mlp" else None,
+    }
+    return {"name": name, **sizes, **parts, **SENSOR, "figures": {"return": 1.5}}
+
+
+def make_networks(name):
+    networks = build_networks(make_settings(name), seed=3)
+    for value in networks["pi"].parameters():
+        value.data.mul_(100.0)  # so that actions differ
+    return networks
+
+
+def save(path, name):
+    evae = make_evae(variant=name) if KINDS[name].encoder else None
+    return save_policy(path, make_networks(name), make_settings(name), evae)
+
+
+@pytest.fixture(scope="module", params=FLOWN)
+def name(request):
+    return request.param
 
 
 @pytest.fixture
-def folder(tmp_path, evae, heads):
-    return save_policy(tmp_path / "policy", evae, heads, {**SIZES, **SENSOR, "figures": {"return": 1.5}})
+def folder(tmp_path, name):
+    return save(tmp_path / "policy", name)
 
 
-def make_windows(rng, count, capacity=40):
+@pytest.fixture
+def encoded(tmp_path):
+    return save(tmp_path / "policy", "brp_full")
+
+
+def make_windows(rng, count, capacity=40, side=16):
     windows = np.zeros((count, capacity + 1, 4), np.int32)
     for window in windows:
         events = int(rng.integers(0, capacity + 1))
         window[0] = events, 0, 5000, 0
         window[1 : events + 1, 0] = np.sort(rng.integers(1, 5001, events))
-        window[1 : events + 1, 1:3] = rng.integers(0, 16, (events, 2))
+        window[1 : events + 1, 1:3] = rng.integers(0, side, (events, 2))
         window[1 : events + 1, 3] = rng.choice([-1, 1], events)
     return windows
 
 
-def expected_logits(evae, heads, flights):
-    """Logits after the last of each flight's windows (B, T, capacity + 1, 4), window by window."""
-    table, rows = EncoderTable.from_evae(evae), []
-    for windows in flights:
-        latents = list(table.encode_windows(windows))
-        rows.append(np.concatenate(([latents[0]] * 3 + latents)[-3:] if len(latents) < 3 else latents[-3:]))
+def make_observations(name, rng, count):
+    """What an environment might show, (count, ...)."""
+    if KINDS[name].observation == "window":
+        return make_windows(rng, count, side=SIDE)
+    pictures = rng.choice([0, 0, 0, 125, 255], (count, SIDE, SIDE)).astype(np.uint8)
+    return pictures if name == "eip" else (pictures / 255).astype(np.float32)
+
+
+def step_events(window, start_us):
+    rows = window[1 : window[0, 0] + 1]
+    events = np.empty(len(rows), EVENT)
+    for column, field in enumerate("txyp"):
+        events[field] = rows[:, column]
+    events["t"] += start_us
+    return events
+
+
+def expected_logits(name, flights):
+    """Logits after the last of each flight's observations (B, T, ...), by a plain loop."""
+    settings, networks = make_settings(name), make_networks(name)
+    table = encoder_of(make_evae(variant=name)) if KINDS[name].encoder else None
+    stacks = []
+    for observations in flights:
+        features = list(feature_of(settings).from_observations(observations, settings, table))
+        stacks.append(np.stack((features[:1] * 2 + features)[-3:]))
     with torch.no_grad():
-        return heads["pi"](torch.from_numpy(np.array(rows, np.float32))).numpy()
+        return networks["pi"](networks["trunk"](torch.from_numpy(np.stack(stacks)))).numpy()
 
 
-def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(folder, evae, heads):
+def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(name, folder):
     policy = load_policy(folder)
-    flights = make_windows(np.random.default_rng(0), 5 * 4).reshape(5, 4, 41, 4)
+    flights = make_observations(name, np.random.default_rng(0), 20)
+    flights = flights.reshape(5, 4, *flights.shape[1:])
     policy.reset(5)
     for t in range(1, 5):
         logits = policy.logits(flights[:, t - 1])
-        np.testing.assert_allclose(logits, expected_logits(evae, heads, flights[:, :t]), rtol=0, atol=2e-6)
+        np.testing.assert_allclose(logits, expected_logits(name, flights[:, :t]), rtol=1e-5, atol=1e-5)
+    assert np.ptp(logits, axis=0).max() > 1e-2
     assert policy.manifest["figures"] == {"return": 1.5}
-    assert policy.manifest["sensor_hash"] == "0123456789ab"
+    assert policy.observation == KINDS[name].observation
 
 
-def test_the_first_latent_fills_the_stack_and_later_ones_push_out_the_oldest():
-    stacks = np.arange(12, dtype=np.float32).reshape(2, 6)
-    latents = np.array([[90, 91], [92, 93]], np.float32)
-    pushed = push_latents(stacks, latents, np.array([True, False]))
-    np.testing.assert_array_equal(pushed, [[90, 91] * 3, [8, 9, 10, 11, 92, 93]])
-    assert pushed.dtype == np.float32
-    assert stacks[0, 0] == 0
+def test_the_same_policy_is_saved_as_the_same_bytes_and_each_file_has_its_sum(name, folder, tmp_path):
+    again = save(tmp_path / "again", name)
+    files = sorted(path.name for path in folder.iterdir())
+    assert files == sorted(path.name for path in again.iterdir())
+    assert (ENCODER in files) is KINDS[name].encoder
+    for file in files:
+        assert (folder / file).read_bytes() == (again / file).read_bytes()
+    sums = json.loads((folder / MANIFEST).read_text())["sha256"]
+    assert sums == {
+        file: hashlib.sha256((folder / file).read_bytes()).hexdigest() for file in files if file != MANIFEST
+    }
 
 
-def test_a_restarted_flight_forgets_and_its_neighbours_remember(folder):
-    windows = make_windows(np.random.default_rng(1), 12).reshape(4, 3, 41, 4)
+def test_a_restarted_flight_forgets_and_its_neighbours_remember(name, folder):
+    steps = make_observations(name, np.random.default_rng(1), 12)
+    steps = steps.reshape(4, 3, *steps.shape[1:])
     kept, restarted, alone = load_policy(folder), load_policy(folder), load_policy(folder)
     kept.reset(3)
     restarted.reset(3)
-    for step in windows[:3]:
+    for step in steps[:3]:
         kept.logits(step)
         restarted.logits(step)
-    whole = kept.logits(windows[3])
-    part = restarted.logits(windows[3], np.array([False, True, False]))
+    whole = kept.logits(steps[3])
+    part = restarted.logits(steps[3], np.array([False, True, False]))
     np.testing.assert_array_equal(part[[0, 2]], whole[[0, 2]])
     assert not np.array_equal(part[1], whole[1])
-    np.testing.assert_allclose(part[1], alone.logits(windows[3][1:2])[0], rtol=0, atol=2e-6)
+    np.testing.assert_allclose(part[1], alone.logits(steps[3][1:2])[0], rtol=1e-5, atol=1e-5)
 
 
-def test_events_give_the_same_actions_as_their_packed_windows(folder):
-    windows = make_windows(np.random.default_rng(2), 30)
+@pytest.mark.parametrize("name", ["brp_full", "event_columns", "eip"])
+def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path, name):
+    folder = save(tmp_path, name)
+    windows = make_windows(np.random.default_rng(2), 30, side=SIDE)
+    settings = make_settings("eip")
     batch, single = load_policy(folder), load_policy(folder)
-    chosen = [int(batch(window[None])[0]) for window in windows]
-    acted = []
+    chosen, acted = [], []
     for step, window in enumerate(windows):
-        rows = window[1 : window[0, 0] + 1]
-        events = np.empty(len(rows), EVENT)
-        for column, name in enumerate("txyp"):
-            events[name] = rows[:, column]
-        events["t"] += 5000 * step
+        events = step_events(window, 5000 * step)
+        shown = window
+        if name == "eip":
+            shown = feature_of(settings).from_events((events, 5000 * step, 5000), settings, None)
+        chosen.append(int(batch(shown[None])[0]))
         acted.append(single.act(events, 5000 * step, 5000))
     assert acted == chosen
     assert len(set(chosen)) > 1
 
 
-def test_actions_are_int64_and_the_likeliest_ones(folder):
+def test_a_policy_that_sees_no_events_says_so(tmp_path):
+    with pytest.raises(ValueError, match="a policy that sees luminance: call it with observations"):
+        load_policy(save(tmp_path, "rgb")).act(np.empty(0, EVENT), 0, 5000)
+
+
+def test_actions_are_int64_and_the_likeliest_ones(name, folder):
     policy = load_policy(folder)
-    windows = make_windows(np.random.default_rng(3), 6)
+    observations = make_observations(name, np.random.default_rng(3), 6)
     policy.reset(6)
-    actions = policy(windows)
+    actions = policy(observations)
     policy.reset(6)
     assert actions.dtype == np.int64
-    np.testing.assert_array_equal(actions, policy.logits(windows).argmax(axis=1))
+    np.testing.assert_array_equal(actions, policy.logits(observations).argmax(axis=1))
 
 
-def test_a_stochastic_policy_draws_actions_with_their_probabilities(evae):
+def test_a_stochastic_policy_draws_actions_with_their_probabilities():
     class Fixed(nn.Module):
         def forward(self, stacks):
             return torch.log(torch.tensor([0.2, 0.5, 0.3])).repeat(len(stacks), 1) + 40.0
 
-    table, count = EncoderTable.from_evae(evae), 4000
-    policy = Policy(table, Fixed(), SIZES, deterministic=False, rng=np.random.default_rng(4))
+    count, settings = 4000, make_settings("event_columns")
+    networks = nn.ModuleDict({"trunk": nn.Identity(), "pi": Fixed()})
+    policy = Policy(networks, settings, deterministic=False, rng=np.random.default_rng(4))
     policy.reset(count)
     actions = policy(np.repeat(make_windows(np.random.default_rng(5), 1), count, axis=0))
     shares = np.bincount(actions, minlength=3) / count
     np.testing.assert_allclose(shares, [0.2, 0.5, 0.3], atol=0.03)  # 4 standard errors
     with pytest.raises(ValueError, match="rng must be given"):
-        Policy(table, Fixed(), SIZES, deterministic=False)
+        Policy(networks, settings, deterministic=False)
 
 
-def test_a_number_of_windows_other_than_that_of_the_flights_is_refused(folder):
-    policy = load_policy(folder)
+def test_a_number_of_observations_other_than_that_of_the_flights_is_refused(name, folder):
     with pytest.raises(ValueError, match=r"one for each of 1 flights, got 2: call reset\(num_envs\)"):
-        policy(make_windows(np.random.default_rng(6), 2))
+        load_policy(folder)(make_observations(name, np.random.default_rng(6), 2))
 
 
-def test_hidden_layers_are_orthogonal_and_the_two_networks_share_nothing():
-    heads = build_heads(SIZES, seed=7)
-    for name, gain in (("pi", 0.01), ("vf", 1.0)):
-        layers = [layer for layer in heads[name] if isinstance(layer, nn.Linear)]
-        assert [tuple(layer.weight.shape) for layer in layers[:2]] == [(64, 24), (64, 64)]
-        for layer, scale in zip(layers, (2**0.5, 2**0.5, gain), strict=True):
-            weight = layer.weight.detach().double()
-            gram = weight @ weight.T if weight.shape[0] <= weight.shape[1] else weight.T @ weight
-            torch.testing.assert_close(gram, scale**2 * torch.eye(len(gram)).double(), atol=1e-5, rtol=0)
-            assert not layer.bias.any()
-        assert [type(layer) for layer in heads[name][1::2]] == [nn.Tanh, nn.Tanh]
-    again, other = build_heads(SIZES, seed=7), build_heads(SIZES, seed=8)
-    assert torch.equal(heads["pi"][0].weight, again["pi"][0].weight)
-    assert not torch.equal(heads["pi"][0].weight, other["pi"][0].weight)
-    assert not torch.equal(heads["pi"][0].weight, heads["vf"][0].weight)
-
-
-def damage_heads(folder):
-    data = bytearray((folder / HEADS).read_bytes())
-    data[-1] ^= 1
-    (folder / HEADS).write_bytes(data)
-
-
-def swap_encoder(folder):
-    torch.manual_seed(99)
-    evae = EventVAE(width=16, height=16, context=64, time_bins=32).freeze()
-    save_encoder(folder / ENCODER, evae, {})
-
-
-def drop_heads(folder):
-    (folder / HEADS).unlink()
-
-
-def cut_manifest(folder):
-    (folder / MANIFEST).write_text((folder / MANIFEST).read_text()[:-20])
-
-
-def change_manifest(key, value):
-    def change(folder):
-        manifest = json.loads((folder / MANIFEST).read_text())
-        (folder / MANIFEST).write_text(json.dumps({**manifest, key: value}))
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (damage_heads, r"heads\.safetensors: SHA-256 must be"),
-        (swap_encoder, r"encoder\.safetensors: SHA-256 must be"),
-        (drop_heads, r"heads\.safetensors: cannot be read: No such file"),
-        (cut_manifest, r"policy\.json: not a JSON file"),
-        (change_manifest("format", 2), r"format 2, this version reads 1"),
-        (change_manifest("hidden", [64, 32]), "not the networks of this policy"),
-        (change_manifest("stack", 10**9), "must be integers in 1"),
-        (change_manifest("hidden", "x"), "must be integers in 1"),
-        (change_manifest("sha256", {}), "sha256 must name"),
-    ],
-)
-def test_a_folder_that_is_not_the_one_exported_is_refused_by_name(folder, spoil, message):
-    spoil(folder)
-    with pytest.raises(PolicyFileError, match=message):
-        load_policy(folder)
-
-
-def test_weights_that_are_not_finite_are_refused(tmp_path, evae):
-    heads = build_heads(SIZES)
-    with torch.no_grad():
-        heads["pi"][0].bias[3] = torch.nan
-    folder = save_policy(tmp_path, evae, heads, {**SIZES, **SENSOR})
-    with pytest.raises(PolicyFileError, match=r"weights must be finite.*pi\.0\.bias"):
-        load_policy(folder)
-
-
-def test_the_flying_half_of_an_encoder_gives_the_table_of_the_whole(evae):
-    part = tabulate(encoder_part(evae_copy(evae)), evae.settings)
-    windows = make_windows(np.random.default_rng(8), 10)
-    whole = EncoderTable.from_evae(evae)
-    np.testing.assert_array_equal(part.encode_windows(windows), whole.encode_windows(windows))
-
-
-def test_the_flying_half_is_all_buffers_and_without_the_decoder(evae):
-    part = encoder_part(evae_copy(evae))
-    assert list(part.parameters()) == []
-    assert not [name for name in part.state_dict() if name.startswith("decoder")]
-    assert not part.training
-
-
-def test_an_encoder_whose_file_is_missing_or_changed_does_not_fly(tmp_path, evae):
-    path = str(tmp_path / "encoder.safetensors")
-    missing = read_encoder_part(path, "0" * 64, evae.settings)
-    save_encoder(path, evae, {})
-    changed = read_encoder_part(path, "0" * 64, evae.settings)
-    for part in (missing, changed):
-        with pytest.raises(ValueError, match="its file is missing or changed"):
-            tabulate(part, evae.settings)
+def test_an_encoder_is_saved_if_and_only_if_the_policy_has_one(tmp_path):
+    for name, evae, rule in (("brp_full", None, "given"), ("eip", make_evae(), "None")):
+        with pytest.raises(ValueError, match=f"evae must be {rule} for {name}"):
+            save_policy(tmp_path, make_networks(name), make_settings(name), evae)
 
 
 def test_flying_needs_no_ray():
     code = "import sys, models.policy; sys.exit('ray' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def evae_copy(evae):
-    copy = EventVAE(**evae.settings)
-    copy.load_state_dict(evae.state_dict())
-    return copy.freeze()

@@ -6,18 +6,22 @@ import torch
 
 from envs.config import EnvConfig
 from jobs.collect import record
-from jobs.config import PretrainConfig
+from jobs.config import ConfigError, ModelConfig, PretrainConfig
 from jobs.pretrain import (
     beta,
     cut_window,
     held_out_figures,
     held_out_windows,
+    prepare_encoder,
     restore,
+    run,
     sample_windows,
     save_checkpoint,
 )
+from jobs.runs import open_run
 from models.batch import batch_windows
 from models.evae import EventVAE, event_targets, train_step
+from tests.test_runs import small_config
 
 SETTINGS = PretrainConfig(
     iterations=100,
@@ -109,3 +113,14 @@ def test_training_explains_windows_of_flights_that_it_never_saw(recording):
     after = held_out_figures(training(recording, 150)[0], held_out)
     assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]
     assert after["explained_four_steps"] > before["explained_four_steps"]
+
+
+def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
+    model = ModelConfig(
+        "eip", context=None, latent=None, norm=None, target=None, time_bins=None, stack=3, hidden=None
+    )
+    config = dataclasses.replace(small_config(tmp_path), model=model)
+    with pytest.raises(ConfigError, match="model: eip has no event VAE to pretrain; go on with job=train"):
+        run(config)
+    assert not (tmp_path / "runs").exists()  # refused before anything was made
+    assert prepare_encoder(config, open_run(config), None) is None

@@ -61,6 +61,22 @@ def test_a_saved_encoder_comes_back_bit_for_bit_frozen_with_its_manifest(path):
     assert manifest["model"] == saved.settings
 
 
+def test_an_encoder_from_before_there_was_a_choice_of_coding_comes_back_with_the_additive_one(path):
+    rewrite(path, lambda manifest: manifest["model"].pop("coding"))
+    loaded, manifest = load_encoder(path)
+    assert loaded.settings["coding"] == manifest["model"]["coding"] == "additive"
+    assert torch.equal(loaded.encoder[0].weight, make_evae().encoder[0].weight)
+
+
+def test_an_encoder_of_another_coding_comes_back_with_it(tmp_path):
+    torch.manual_seed(0)
+    evae = EventVAE(**{**SETTINGS, "variant": "brp_full", "coding": "eventnet"})
+    save_encoder(tmp_path / "e.safetensors", evae, {})
+    loaded, _ = load_encoder(tmp_path / "e.safetensors")
+    assert loaded.settings["coding"] == "eventnet"
+    assert loaded.encoder[0].in_features == 32
+
+
 def test_saving_over_an_encoder_replaces_it_and_leaves_no_other_file(path):
     evae = make_evae()
     with torch.no_grad():

@@ -54,7 +54,7 @@ def compare(variant: str, windows: int = 50, events: int = 2000, repeats: int = 
     fused, plain = [], []
     for _ in range(repeats):
         fused += [seconds(step) for _ in range(5)]
-        evae.ecn.forward = evae.ecn.plain  # type: ignore[method-assign]
+        evae.ecn.forward = evae.ecn.plain
         plain.append(seconds(step))
         del evae.ecn.forward
     return {

@@ -38,6 +38,45 @@ def flown(tmp_path_factory):
     return folder, run, printed
 
 
+FEW_STEPS = (
+    "algo.train_batch_size_per_learner=256",
+    "train.env_steps=512",
+    "evaluate.episodes=2",
+    "evaluate.renderers=[raycast]",
+    "evaluate.video=false",
+    "env.scene=poles_eval",  # one scene instead of two
+    "env.time_limit_s=1.0",
+)
+
+
+@pytest.mark.parametrize(
+    ("exp", "words"),
+    [
+        ("event_columns", FEW_STEPS),
+        pytest.param("event_image", (), marks=pytest.mark.slow),
+        pytest.param("rgb", (), marks=pytest.mark.slow),
+    ],
+)
+def test_a_policy_without_an_event_vae_trains_and_evaluates_at_once(tmp_path, exp, words):
+    printed = launch(tmp_path, f"+exp={exp}", *words)
+    assert re.search(r"policy stochastic\s+│ poles_eval\s+│ raycast\s+│\s+\d+ │\s+\d+ \[\d+, \d+\]", printed)
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run.name.startswith(f"{exp}-smoke-s0-")
+    assert not {"data", "encoder"} & {path.name for path in run.iterdir()}
+    assert {path.stem for path in (run / "stages").iterdir()} == {"train", "evaluate"}
+    assert {path.name for path in (run / "policy").iterdir()} == {"policy.json", "networks.safetensors"}
+    assert (run / "eval" / "episode.mp4").is_file() is (not words)
+    policy = load_policy(run / "policy")
+    env = CorridorEnv(EnvConfig(split="eval", observation=policy.observation))
+    observation, _ = env.reset(seed=0)
+    for _ in range(5):
+        observation, *_ = env.step(int(policy(observation[None])[0]))
+    _, stored = stored_run(tmp_path)
+    assert (stored.info.status, stored.data.tags["policy"]) == ("FINISHED", policy.manifest["name"])
+    assert stored.info.run_name == run.name
+    assert all(any(name.startswith(section) for name in stored.data.metrics) for section in SECTIONS[1:])
+
+
 def stored_run(folder: Path):
     client = MlflowClient(f"sqlite:///{folder / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("evade")

@@ -2,16 +2,16 @@
 
 Run: python -m platform.launch +exp=bytestream
 Expect: 30 to 40 minutes on two cores with budget=short; a table of success rates and
-distances with intervals, and the command that opens the dashboard. A stopped run
-continues where it was when the same command is given again.
+distances with intervals, and the command that opens the dashboard. A policy without an event
+VAE, such as +exp=event_columns, begins with its training. A stopped run continues where it
+was when the same command is given again.
 """
 
 from typing import Any
 
-from jobs.collect import collect
 from jobs.config import Config
 from jobs.evaluate import evaluate
-from jobs.pretrain import encoder_file, pretrain
+from jobs.pretrain import prepare_encoder
 from jobs.progress import console
 from jobs.runs import open_run
 from jobs.tracking import open_tracker
@@ -19,14 +19,12 @@ from jobs.train import train
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Every stage of a run that is not done yet, then the table of its results."""
+    """Every stage of a run that its policy needs and that is not done yet, then the table of its results."""
     folder = open_run(config)
     config = folder.config
     console.print(f"Run folder: {folder.path}")
     with open_tracker(config, folder) as tracker:
-        collect(config, folder, tracker)
-        pretrain(config, folder, tracker)
-        train(config, folder, encoder_file(folder), tracker.log)
+        train(config, folder, prepare_encoder(config, folder, tracker), tracker.log)
         figures = evaluate(config, folder, tracker)
         console.print(tracker.dashboard())
     return figures
