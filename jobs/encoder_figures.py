@@ -23,7 +23,7 @@ COLOURS = {
 # Where the labels of a knob stand from their points [points], so that near ones stay apart.
 LABELS = {
     "torch": ((0, 8), "center"),
-    "precision": ((0, 11), "right"),
+    "precision": ((-5, 6), "right"),
     "newest events": ((-6, -3), "right"),
     "chunks": ((0, -13), "center"),
 }
@@ -61,9 +61,10 @@ def draw_rows(panel: Axes, rows: Sequence[Row], places: Sequence[int], front: se
         marker, size, above = ("*", 16, 4) if knob == "default" else ("o", 6, 3)
         spots = np.array([points[place] for place in own])
         panel.plot(*spots.T, marker, ms=size, mew=0, zorder=above, color=COLOURS[knob], label=knob)
-        offset, side = LABELS.get(knob, ((6, 3), "left"))
+        (right, up), side = LABELS.get(knob, ((6, 3), "left"))
         look: dict[str, Any] = {"textcoords": "offset points", "ha": side, "fontsize": 7}
-        for place in own:
+        for step, place in enumerate(own):
+            offset = (right, up - 9 * (step % 3)) if knob == "chunks" else (right, up)
             panel.annotate(rows[place].setting, points[place], offset, color=COLOURS[knob], **look)
 
 

@@ -190,9 +190,14 @@ def fronts(rows: Sequence[Row]) -> set[int]:
 def cells(row: Row, network_us: float, on_front: bool) -> tuple[str, ...]:
     """A row as text; the network's cost of 2,000 events is what "times faster" refers to."""
     costs = f"{row.step_us:,.0f}", f"{row.dense_us:,.0f}", f"{network_us / row.dense_us:,.0f}"
-    errors = f"{100 * row.error_mean:.2g}", f"{100 * row.error_max:.2g}"
+    errors = short(100 * row.error_mean), short(100 * row.error_max)
     mark = ("*" if on_front else "") + (" default" if row.knob == "default" else "")
     return (row.knob, row.setting, *costs, *errors, f"{100 * row.explained:.1f}", mark.strip())
+
+
+def short(value: float) -> str:
+    """A number with two digits that count, or whole from 100 on."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.2g}"
 
 
 def columns(rows: Sequence[Row]) -> dict[str, list[Any]]:

@@ -62,7 +62,7 @@ def test_the_settings_rebuild_the_model():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"variant": "eip"}, "variant must be one of brp_full, brp_xy, got 'eip'"),
+        ({"variant": "eip"}, "variant must be one of brp_full, brp_xy, eivae, got 'eip'"),
         ({"norm": "layer"}, "norm must be one of"),
         ({"target": "age"}, "target must be one of"),
         ({"coding": "rotary"}, "coding must be one of additive, eventnet, none, got 'rotary'"),

@@ -135,6 +135,7 @@ def test_a_row_becomes_text_and_columns():
     expected = ("precision", "int16", "60", "250", "100", "0.1", "1.2", "23.4", "*")
     assert cells(row, 25_000.0, True) == expected
     assert cells(make_row(), 10.0, True)[-1] == "* default"
+    assert cells(make_row(error=12.5), 10.0, False)[5:7] == ("1,250", "2,500")
     assert columns([row]) == {
         "form": ["precision int16"],
         "step_us": [60.4],

@@ -132,7 +132,7 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
     sensor = sensor_settings(CONFIG)
     path = folder / "encoder.safetensors"
     save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
-    config = _composed()
+    config = composed()
     size = config.algo.train_batch_size_per_learner
     start_ray(config.cluster, folder)
     ppo = {
@@ -149,9 +149,9 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
     return [(name, seconds / size) for name, seconds in interleaved(work).items()]
 
 
-def _composed() -> Config:
-    """The default experiment, as the launcher composes it."""
-    command = [sys.executable, "-m", "platform.launch", "+exp=train", "--cfg", "job"]
+def composed(*words: str) -> Config:
+    """The default experiment with some words of the command line, as the launcher composes it."""
+    command = [sys.executable, "-m", "platform.launch", "+exp=train", "--cfg", "job", *words]
     return parse(yaml.safe_load(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
 
 

@@ -1,0 +1,197 @@
+"""Environment steps per second of whole PPO training, against stable-baselines3 on the same flights.
+
+Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo
+Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
+`jobs.learner`, "stable-baselines3" its PPO with the same networks, encoder, corridors and
+settings. All take turns in one process; an iteration flies 2,048 steps in 16 corridors and
+learns 10 epochs. Seconds are wall time, medians over the rounds: `ppo_fast` flies in processes
+of its own, so the machine should be quiet. The second table is ours for every kind of policy.
+"""
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
+from rich.table import Table
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
+
+from envs.config import EnvConfig, sensor_settings, settings_hash
+from envs.corridor import CorridorEnv
+from jobs.bench.throughput import composed
+from jobs.cluster import start_ray
+from jobs.config import Config
+from jobs.ppo import build_ppo
+from jobs.progress import console
+from models.evae import EventVAE
+from models.features import push_features
+from models.kinds import KINDS
+from models.table import EncoderTable
+from models.weights import save_encoder
+
+ROUNDS, FEW_ROUNDS = 5, 2
+MINIBATCHES = (32, 256)
+STEPS = 2048  # of an iteration (appendix D.1.2)
+CONSTANT = "algo.lr_schedule=constant"
+
+
+class EncodedCorridors(VecEnv):
+    """Corridors as stable-baselines3 wants them: stacks of latents, each flight reset where it ends."""
+
+    def __init__(self, num_envs: int, config: EnvConfig, table: EncoderTable, stack: int) -> None:
+        """Make `num_envs` corridors that `table` encodes."""
+        self.corridors = [CorridorEnv(config) for _ in range(num_envs)]
+        self.table, self.shape = table, (num_envs, stack, len(table.head[1]))
+        space = gymnasium.spaces.Box(-np.inf, np.inf, self.shape[1:], np.float32)
+        super().__init__(num_envs, space, self.corridors[0].action_space)
+
+    def reset(self) -> np.ndarray:
+        """Start all flights."""
+        windows = [env.reset(seed=k << 32)[0] for k, env in enumerate(self.corridors)]
+        self.stacks = np.zeros(self.shape, np.float32)
+        self.stacks = self._push(np.stack(windows), np.ones(self.num_envs, bool))
+        return self.stacks
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        """Fly one step everywhere."""
+        results = [env.step(int(action)) for env, action in zip(self.corridors, self._actions, strict=True)]
+        done = np.array([result[2] or result[3] for result in results])
+        stacks = self._push(np.stack([result[0] for result in results]), np.zeros(self.num_envs, bool))
+        infos: list[dict[str, Any]] = [{} for _ in results]
+        if done.any():
+            windows = np.stack([results[k][0] for k in range(self.num_envs)])
+            for k in np.flatnonzero(done):
+                infos[k] |= {"terminal_observation": stacks[k], "TimeLimit.truncated": results[k][3]}
+                windows[k] = self.corridors[k].reset()[0]
+            stacks = np.where(done[:, None, None], self._push(windows, done), stacks)
+        self.stacks = stacks
+        return stacks, np.array([result[1] for result in results], np.float32), done, infos
+
+    def _push(self, windows: np.ndarray, first: np.ndarray) -> np.ndarray:
+        return push_features(self.stacks, self.table.encode_windows(windows), first)
+
+    def close(self) -> None:
+        """Close all."""
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """None is."""
+        return [False] * self.num_envs
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method of every corridor."""
+        return [getattr(env, method_name)(*args, **kwargs) for env in self.corridors]
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of every corridor."""
+        return [getattr(env, attr_name) for env in self.corridors]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of every corridor."""
+        for env in self.corridors:
+            setattr(env, attr_name, value)
+
+
+def main() -> None:
+    """Measure and print both tables."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        show("bytestream", seconds_of(against_others(Path(folder)), ROUNDS), "stable-baselines3, 32")
+        show("every policy, minibatches of 32", seconds_of(every_kind(Path(folder)), FEW_ROUNDS), "brp_full")
+
+
+def show(title: str, seconds: dict[str, float], unit: str) -> None:
+    """Print environment steps per second, and as multiples of one row."""
+    table = Table(title=f"PPO, {title}: iterations of {STEPS:,} steps that take turns, medians")
+    for head in ("training loop", "steps/s", f"of {unit}"):
+        table.add_column(head, justify="left" if head == "training loop" else "right")
+    for name, value in seconds.items():
+        table.add_row(name, f"{STEPS / value:,.0f}", f"{seconds[unit] / value:.2f}x")
+    console.print(table)
+
+
+def seconds_of(work: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Median wall time of each piece of work; the first round is not counted."""
+    taken: dict[str, list[float]] = {name: [] for name in work}
+    for turn in range(rounds + 1):
+        for name, piece in work.items():
+            start = time.perf_counter()
+            piece()
+            if turn:
+                taken[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in taken.items()}
+
+
+def against_others(folder: Path) -> dict[str, Callable[[], object]]:
+    """One iteration on bytestream of our learner, RLlib's and stable-baselines3's."""
+    evae = EventVAE("brp_full").freeze()
+    path, table = encoder_file(evae, folder), EncoderTable.from_evae(evae)
+    work: dict[str, Callable[[], object]] = {}
+    for size in MINIBATCHES:
+        config = composed(f"algo.minibatch_size={size}", CONSTANT)
+        start_ray(config.cluster, folder)
+        ppo = build_ppo(config, path)
+        work[f"ours, {size}"] = ppo.build_algo().train
+        theirs = ppo.copy(copy_frozen=False).learners(learner_class=PPOTorchLearner)
+        work[f"RLlib's learner, {size}"] = theirs.build_algo().train
+        model = stable_baselines(config, table)
+        work[f"stable-baselines3, {size}"] = partial(model.learn, STEPS, reset_num_timesteps=False)
+    fast = composed("algo=ppo_fast", CONSTANT)
+    work["ours, algo=ppo_fast"] = build_ppo(fast, path).build_algo().train
+    return work
+
+
+def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
+    """One iteration of our learner for each kind of policy."""
+    work: dict[str, Callable[[], object]] = {}
+    for name, kind in KINDS.items():
+        config = composed(f"model={name}", CONSTANT)
+        evae = EventVAE(name, context=config.model.context or 8).freeze() if kind.encoder else None
+        path = encoder_file(evae, folder) if evae else None
+        work[name] = build_ppo(config, path).build_algo().train
+    return work
+
+
+def encoder_file(evae: EventVAE, folder: Path) -> Path:
+    """The file of an encoder for the default sensor."""
+    sensor = sensor_settings(EnvConfig())
+    path = folder / f"{evae.settings['variant']}.safetensors"
+    save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
+    return path
+
+
+def stable_baselines(config: Config, table: EncoderTable) -> PPO:
+    """PPO of stable-baselines3 with an experiment's settings."""
+    algo, flown = config.algo, config.env_config(split="train", observation="window")
+    corridors = EncodedCorridors(algo.num_envs_per_env_runner, flown, table, config.model.stack)
+    return PPO(
+        "MlpPolicy",
+        corridors,
+        learning_rate=algo.lr,
+        n_steps=algo.train_batch_size_per_learner // algo.num_envs_per_env_runner,
+        batch_size=algo.minibatch_size,
+        n_epochs=algo.num_epochs,
+        gamma=algo.gamma,
+        gae_lambda=algo.lambda_,
+        clip_range=algo.clip_param,
+        vf_coef=algo.vf_loss_coeff,
+        ent_coef=algo.entropy_coeff,
+        max_grad_norm=algo.grad_clip,
+        policy_kwargs={"net_arch": list(config.model.hidden or ())},
+        device="cpu",
+    )
+
+
+if __name__ == "__main__":
+    main()
