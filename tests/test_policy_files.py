@@ -77,7 +77,7 @@ def first_format(folder):
         (first_format, r"policy\.json: format 1, this version reads 2; train it anew$"),
         (change_manifest(format=3), r"format 3, this version reads 2"),
         (forget("name"), r"the manifest lacks \['name'\]"),
-        (change_manifest(name="eivae"), r"name must be one of brp_full, .*, got 'eivae'"),
+        (change_manifest(name="snn"), r"name must be one of brp_full, .*, got 'snn'"),
         (change_manifest(name=["eip"]), r"name must be one of brp_full, .*, got \['eip'\]"),
         (change_manifest(name="brp_xy"), r"encoder\.safetensors: must be the encoder of .*'brp_xy'"),
         (change_manifest(width=64), r"encoder\.safetensors: must be the encoder of .*'width': 64"),
