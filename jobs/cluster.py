@@ -21,7 +21,9 @@ QUIET = {
     # Ray's own 15 leaves a worker a thirtieth of a core that any other program wants.
     "RAY_worker_niceness": "0",
     "RAY_AIR_NEW_OUTPUT": "0",
-    "TUNE_GLOBAL_CHECKPOINT_S": "1",
+    # Write down at once which checkpoint is the newest: a kill must not leave the name of one
+    # that newer ones have replaced.
+    "TUNE_GLOBAL_CHECKPOINT_S": "0",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }

@@ -51,6 +51,7 @@ ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "trai
 ENV_STEPS = "num_env_steps_sampled_lifetime"
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
+CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
 LISTENER = "train"
 
 _LISTENERS: dict[str, Callable[[Mapping[str, Any]], None]] = {}
@@ -161,7 +162,9 @@ def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
             callbacks=[Relay(LISTENER)],
             failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
             checkpoint_config=tune.CheckpointConfig(
-                checkpoint_frequency=config.train.checkpoint_every, num_to_keep=2, checkpoint_at_end=True
+                checkpoint_frequency=config.train.checkpoint_every,
+                num_to_keep=CHECKPOINTS_KEPT,
+                checkpoint_at_end=True,
             ),
         ),
     )
