@@ -41,7 +41,7 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 	    echo "    sudo apt-get install --no-install-recommends $(GL_PACKAGES)"; \
 	fi
 
-bytestream: setup ## from nothing to an evaluated policy (30 to 40 minutes; ARGS="budget=smoke": one)
+bytestream: setup ## from nothing to an evaluated policy (half an hour; ARGS="budget=smoke": a minute)
 	$(LAUNCH) +exp=bytestream $(ARGS)
 
 sweep-robustness: setup ## fly the trained policy at other rates, thresholds and with sensor faults
