@@ -79,6 +79,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
         ConfigError: If the encoder was made for another sensor.
     """
     algo, settings = config.algo, network_settings(config)
+    own_cpus = 0 if algo.num_env_runners else 1
     register_env(ENV, make_corridors)
     spec = module_spec(settings, config.seed, frozen_encoder(config, encoder_path))
     flown = config.env_config(split="train", observation=KINDS[config.model.name].observation)
@@ -93,9 +94,10 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             env_to_module_connector=partial(make_stack_features, space=stack_space(settings)),
         )
         # It learns while the processes that fly, if any, wait: it needs no core of its own then.
-        .resources(num_cpus_for_main_process=0 if algo.num_env_runners else 1)
+        .resources(num_cpus_for_main_process=own_cpus)
         .learners(
             num_learners=0,
+            num_cpus_per_learner=own_cpus,
             learner_class=PlainPPOLearner,
             learner_connector=partial(make_scale_rewards, scale=algo.reward_scale),
         )

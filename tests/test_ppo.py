@@ -4,12 +4,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 from envs.windows import unpack_window
 from jobs.config import ConfigError
-from jobs.ppo import FlightMetrics, build_ppo, network_settings, policy_settings
+from jobs.ppo import build_ppo, network_settings, policy_settings
 from models.features import feature_of
 from models.kinds import KINDS
 from models.policy import load_policy, save_policy
@@ -156,6 +157,12 @@ def test_the_settings_are_those_of_the_appendix(name, encoder):
     spaces = {"brp_full": ((3, 8), "f4"), "event_columns": ((3, 128), "f4"), "event_set": ((3, 256, 4), "i2")}
     spaces |= dict.fromkeys(("eip", "rgb"), ((3, 64, 64), "u1"))
     assert (space.shape, space.dtype) == spaces[name]
+
+
+@pytest.mark.parametrize(("runners", "cpus"), [(0, 1), (1, 1), (2, 2)])
+def test_a_training_asks_for_a_core_per_process_that_flies_or_one_in_all(encoder, runners, cpus):
+    ppo = make_ppo("brp_full", encoder, f"algo.num_env_runners={runners}")
+    assert PPO.default_resource_request(ppo).required_resources["CPU"] == cpus
 
 
 def test_the_networks_are_built_from_what_the_configuration_says():
@@ -343,15 +350,3 @@ class Chunk:
 class Logger(dict):
     def log_value(self, name, value, window):
         self[name] = value
-
-
-def test_flights_count_whole_and_stay_in_the_mean_over_iterations():
-    metrics, logger = FlightMetrics(), Logger()
-    metrics.on_sample_end(
-        metrics_logger=logger, samples=[Chunk("a", [1.0, 2.0], False), Chunk("b", [4.0], True)]
-    )
-    assert (logger["flight_return"], logger["success_rate"]) == (4.0, 0.0)
-    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("a", [5.0], True, success=True)])
-    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)  # 8 for a, 4 for b
-    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("c", [1.0], False)])
-    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)

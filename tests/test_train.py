@@ -19,6 +19,7 @@ from envs.config import sensor_settings, settings_hash
 from jobs import train as training
 from jobs.cluster import use_token
 from jobs.config import parse
+from jobs.ppo import FlightMetrics
 from jobs.runs import open_run
 from jobs.train import TrainingError, read_metrics, reported_so_far
 from models.evae import EventVAE
@@ -182,3 +183,15 @@ def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     window[0, 0, 2] = 5000
     assert np.isfinite(policy.logits(window)).all()
     assert policy.manifest["ppo"] == dataclasses.asdict(config.algo)
+
+
+def test_flights_count_whole_and_stay_in_the_mean_over_iterations():
+    metrics, logger = FlightMetrics(), Logger()
+    metrics.on_sample_end(
+        metrics_logger=logger, samples=[Chunk("a", [1.0, 2.0], False), Chunk("b", [4.0], True)]
+    )
+    assert (logger["flight_return"], logger["success_rate"]) == (4.0, 0.0)
+    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("a", [5.0], True, success=True)])
+    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)  # 8 for a, 4 for b
+    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("c", [1.0], False)])
+    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)
