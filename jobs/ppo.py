@@ -24,6 +24,7 @@ from models.weights import load_encoder
 ENV = "evade-corridors"
 NUM_ACTIONS = 3
 EPISODES = 100  # that a rate is averaged over
+LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 
 
@@ -79,7 +80,9 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
         ConfigError: If the encoder was made for another sensor.
     """
     algo, settings = config.algo, network_settings(config)
-    own_cpus = 0 if algo.num_env_runners else 1
+    # It learns while the processes that fly, if any, wait: together they need a core for each of these.
+    runners = algo.num_env_runners
+    own_cpus = LITTLE if runners else 1
     register_env(ENV, make_corridors)
     spec = module_spec(settings, config.seed, frozen_encoder(config, encoder_path))
     flown = config.env_config(split="train", observation=KINDS[config.model.name].observation)
@@ -88,12 +91,12 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
         .environment(ENV, env_config={"config": flown}, disable_env_checking=True)
         .framework("torch")
         .env_runners(
-            num_env_runners=algo.num_env_runners,
+            num_env_runners=runners,
+            num_cpus_per_env_runner=1.0 - LITTLE / max(1, runners),
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
             gym_env_vectorize_mode="vector_entry_point",
             env_to_module_connector=partial(make_stack_features, space=stack_space(settings)),
         )
-        # It learns while the processes that fly, if any, wait: it needs no core of its own then.
         .resources(num_cpus_for_main_process=own_cpus)
         .learners(
             num_learners=0,

@@ -185,6 +185,31 @@ def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     assert policy.manifest["ppo"] == dataclasses.asdict(config.algo)
 
 
+class Chunk:
+    """A piece of an episode, as RLlib hands it to callbacks."""
+
+    def __init__(self, name, rewards, done, success=False):
+        self.id_, self.rewards, self.is_done = name, rewards, done
+        self.info = {
+            "num_events": 3,
+            "dropped_events": 0,
+            "success": success,
+            "collision": not success,
+            "distance_m": 7.0,
+        }
+
+    def get_return(self):
+        return sum(self.rewards)
+
+    def get_infos(self, index=None):
+        return self.info if index == -1 else [self.info] * (1 + len(self.rewards))
+
+
+class Logger(dict):
+    def log_value(self, name, value, window):
+        self[name] = value
+
+
 def test_flights_count_whole_and_stay_in_the_mean_over_iterations():
     metrics, logger = FlightMetrics(), Logger()
     metrics.on_sample_end(
