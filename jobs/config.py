@@ -300,7 +300,7 @@ def _build(section: Any, values: Any, name: str, refused: list[str], skip: Colle
 
 def _refused_picture(config: Config) -> list[str]:
     """Sides of the sensor's picture that the policy's network cannot take."""
-    if KINDS[config.model.name].network != "cnn":
+    if KINDS[config.model.name].network != "cnn" and config.model.name != "eivae":
         return []
     sides = {name: getattr(config.camera, name) for name in ("width", "height")}
     rule = f"must be at least {SMALLEST_IMAGE} for the network of {config.model.name}"

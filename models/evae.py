@@ -13,7 +13,6 @@ iterations. A weight near 1e-5 keeps it alive.
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -22,7 +21,7 @@ from torch.nn import functional
 from models.batch import EventBatch, Grid
 from models.context import EventContextNetwork
 from models.embedding import CODINGS
-from models.pictures import PictureContextNetwork
+from models.pictures import PictureContextNetwork, last_polarity
 
 VARIANTS = ("brp_full", "brp_xy", "eivae")
 NORMS = ("batch", "none")
@@ -135,18 +134,8 @@ def event_targets(batch: EventBatch, target: str) -> Tensor:
     had any event, else 0. Both follow from the set of events alone, as the context does: an
     event that occurs twice counts once. Events of a window are taken in their given (time) order.
     """
-    pixels = batch.grid.width * batch.grid.height
-    picture = np.zeros((len(batch), pixels), np.float32)
-    _draw(batch.code, batch.offsets, target == "signed", picture)
-    return torch.from_numpy(picture)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _draw(code, offsets, signed, picture) -> None:  # type: ignore[no-untyped-def]
-    pixels = picture.shape[1]
-    for b in range(picture.shape[0]):
-        for n in range(offsets[b], offsets[b + 1]):
-            picture[b, code[n] % pixels] = 1.0 if not signed or code[n] >= pixels else -1.0
+    last = last_polarity(batch)
+    return torch.from_numpy(last if target == "signed" else np.abs(last))
 
 
 def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from models.batch import EventBatch, Grid, batch_packed, batch_windows
+from models.kinds import SMALLEST_IMAGE
 
 OFF_SHARE = 125.0 / 255.0  # of the picture value of ON (appendix D.1.2)
-SMALLEST = 36  # pixels, of which the third convolution leaves one
 
 
 class PictureContextNetwork(nn.Module):
@@ -33,9 +33,9 @@ class PictureContextNetwork(nn.Module):
 
     def __init__(self, grid: Grid, context: int) -> None:
         super().__init__()
-        if min(grid.width, grid.height) < SMALLEST:
+        if min(grid.width, grid.height) < SMALLEST_IMAGE:
             raise ValueError(
-                f"event images need {SMALLEST} pixels each way, got {grid.width} x {grid.height}"
+                f"event images need {SMALLEST_IMAGE} pixels each way, got {grid.width} x {grid.height}"
             )
         self.grid = grid
         height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in (grid.height, grid.width))

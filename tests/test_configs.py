@@ -1,4 +1,5 @@
 import dataclasses
+import re
 from pathlib import Path
 
 import pytest
@@ -209,12 +210,12 @@ def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule
     assert len(str(refusal.value).splitlines()) == 1
 
 
-def test_a_picture_too_small_for_the_network_is_refused(composed):
-    with pytest.raises(
-        ConfigError, match=r"^camera\.width: must be at least 36 for the network of rgb, got 35$"
-    ):
-        parse(composed("+exp=rgb", "camera.width=35"))
-    parse(composed("+exp=rgb", "camera.width=36"))
+@pytest.mark.parametrize("exp", ["event_image", "event_image_vae", "rgb"])
+def test_a_picture_too_small_for_the_network_is_refused(composed, exp):
+    rule = f"camera.width: must be at least 36 for the network of {POLICIES[exp]}, got 35"
+    with pytest.raises(ConfigError, match=f"^{re.escape(rule)}$"):
+        parse(composed(f"+exp={exp}", "camera.width=35"))
+    parse(composed(f"+exp={exp}", "camera.width=36"))
     parse(composed("+exp=event_columns", "camera.width=35"))
 
 
