@@ -1,15 +1,17 @@
 """RLlib's PPO learner with all minibatches of an iteration in one loop.
 
-The loss, its gradient and the optimiser are RLlib's (`tests/test_learner.py` compares the
-weights after an update). Around each minibatch of 32 steps RLlib slices, dispatches, times and
-logs, which takes longer than the gradient of two small networks; here that is done once per
-iteration. The rows that RLlib appends to each flight to bootstrap its value, and masks in the
-loss, are taken out, so that every minibatch holds as many steps as was asked.
+The value targets, the loss, its gradient and the optimiser are RLlib's (`tests/test_learner.py`
+compares them, and the weights after an update). Around each minibatch of 32 steps RLlib slices,
+dispatches, times and logs, which takes longer than the gradient of two small networks; here that
+is done once per iteration, and no pipeline of connectors makes the batch. RLlib appends a row to
+each flight to bootstrap its value: it masks that row in the loss, but counts it in minibatches
+and in the mean and deviation of the advantages. Here it is in neither.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from ray.rllib.algorithms.ppo.ppo import LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
@@ -17,7 +19,10 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.learner.learner import ENTROPY_KEY, POLICY_LOSS_KEY, VF_LOSS_KEY
 from ray.rllib.core.learner.training_data import TrainingData
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.evaluation.postprocessing import Postprocessing
+from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
+from scipy.signal import lfilter
 from torch import Tensor, nn
 
 READ = (
@@ -29,6 +34,28 @@ READ = (
 )
 GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
 EXPLAINED_ROWS = 1024  # values are compared with their targets so many at a time
+LEAST_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
+REWARD_SCALE = (
+    "reward_scale"  # of the learner's own settings: multiplies rewards; episodes keep the true ones
+)
+
+
+def advantages(
+    values: np.ndarray, rewards: np.ndarray, terminated: bool, gamma: float, lambda_: float
+) -> np.ndarray:
+    """Generalised advantage estimates of a piece of a flight (Schulman et al. 2016), float64 (T,).
+
+    Args:
+        values: Of its T + 1 observations, (T + 1,).
+        rewards: Of its T steps, (T,).
+        terminated: Whether it ended for good, so that its last observation has no value.
+        gamma: Discount per step.
+        lambda_: Weight of longer estimates.
+    """
+    values = values.astype(np.float64)
+    values[-1] *= not terminated
+    errors = rewards + gamma * values[1:] - values[:-1]
+    return lfilter([1.0], [1.0, -gamma * lambda_], errors[::-1])[::-1]
 
 
 class PlainPPOLearner(PPOTorchLearner):
@@ -76,17 +103,45 @@ class PlainPPOLearner(PPOTorchLearner):
         training_data.validate()
         training_data.solve_refs()
         self._weights_seq_no += 1
-        batch = self._make_batch_if_necessary(training_data=training_data)
-        steps = batch.policy_batches[DEFAULT_MODULE_ID]
-        flown = steps[Columns.LOSS_MASK]
-        rows = {key: steps[key][flown] for key in READ}
+        rows = self._rows(training_data.episodes)
+        count = len(rows[Columns.ACTIONS])
         for _ in range(num_epochs):
-            figures = self._epoch(rows, minibatch_size or int(flown.sum()))
+            figures = self._epoch(rows, minibatch_size or count)
         figures[LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY] = self._explained_variance(rows)
         self.metrics.log_dict(figures, key=DEFAULT_MODULE_ID, window=1)
-        self._log_steps_trained_metrics(batch)
+        steps = SampleBatch({Columns.ACTIONS: rows[Columns.ACTIONS]})
+        self._log_steps_trained_metrics(MultiAgentBatch({DEFAULT_MODULE_ID: steps}, env_steps=count))
         self.after_gradient_based_update(timesteps=counters)
         return self.metrics.reduce()
+
+    def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
+        """The steps of all flights, one after the other, with what the loss compares them to."""
+        config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
+        scale = config.learner_config_dict.get(REWARD_SCALE, 1.0)
+        shown = [np.asarray(episode.get_observations()) for episode in episodes]
+        ends = np.cumsum([len(observations) for observations in shown])
+        stacks = np.concatenate(shown)
+        values = module.compute_values({Columns.OBS: torch.from_numpy(stacks)}).numpy()
+        estimates = [
+            advantages(
+                of_flight, scale * episode.get_rewards(), episode.is_terminated, config.gamma, config.lambda_
+            )
+            for of_flight, episode in zip(np.split(values, ends[:-1]), episodes, strict=True)
+        ]
+        flown = np.ones(len(stacks), bool)
+        flown[ends - 1] = False
+        estimate = np.concatenate(estimates)
+        standard = (estimate - estimate.mean()) / max(LEAST_DEVIATION, estimate.std())
+        columns = {
+            Columns.OBS: stacks[flown],
+            Columns.ACTIONS: np.concatenate([episode.get_actions() for episode in episodes]),
+            Columns.ACTION_LOGP: np.concatenate(
+                [episode.get_extra_model_outputs(Columns.ACTION_LOGP) for episode in episodes]
+            ),
+            Postprocessing.ADVANTAGES: standard.astype(np.float32),
+            Postprocessing.VALUE_TARGETS: (estimate + values[flown]).astype(np.float32),
+        }
+        return {name: torch.from_numpy(column) for name, column in columns.items()}
 
     def _epoch(self, rows: dict[str, Tensor], minibatch_size: int) -> dict[str, Tensor]:
         """One pass over the rows in random order; the mean of each figure."""

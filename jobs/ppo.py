@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections import deque
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,10 @@ from ray.tune.registry import register_env
 from envs.config import sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from jobs.config import Config, ConfigError
-from jobs.learner import PlainPPOLearner
+from jobs.learner import REWARD_SCALE, PlainPPOLearner
+from jobs.runner import PlainEnvRunner
 from models.kinds import KINDS
-from models.rllib import ScaleRewards, StackFeatures, module_spec, stack_space
+from models.rllib import module_spec
 from models.weights import load_encoder
 
 ENV = "evade-corridors"
@@ -95,16 +95,16 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             num_cpus_per_env_runner=1.0 - LITTLE / max(1, runners),
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
             gym_env_vectorize_mode="vector_entry_point",
-            env_to_module_connector=partial(make_stack_features, space=stack_space(settings)),
+            env_runner_cls=PlainEnvRunner,
         )
         .resources(num_cpus_for_main_process=own_cpus)
         .learners(
             num_learners=0,
             num_cpus_per_learner=own_cpus,
             learner_class=PlainPPOLearner,
-            learner_connector=partial(make_scale_rewards, scale=algo.reward_scale),
         )
         .training(
+            learner_config_dict={REWARD_SCALE: algo.reward_scale},
             lr=learning_rate(config),
             gamma=algo.gamma,
             lambda_=algo.lambda_,
@@ -138,16 +138,6 @@ def learning_rate(config: Config) -> float | list[list[float]]:
 def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
     """The environments of one env runner."""
     return CorridorVectorEnv(context["num_envs"], context["config"])
-
-
-def make_stack_features(env: Any, spaces: Any, device: Any, *, space: Any) -> StackFeatures:
-    """RLlib's way to ask for the env-to-module connector."""
-    return StackFeatures(space=space)
-
-
-def make_scale_rewards(observation_space: Any, action_space: Any, *, scale: float) -> ScaleRewards:
-    """RLlib's way to ask for the learner connector."""
-    return ScaleRewards(scale=scale)
 
 
 def network_settings(config: Config) -> dict[str, Any]:

@@ -1,9 +1,7 @@
-"""A policy inside RLlib: a module that owns the networks and the frozen encoder, and its connectors.
+"""A policy inside RLlib: a module that owns the networks and the frozen encoder.
 
-What a policy keeps of a step (`models.features`) is made exactly once, on its way from the
-environment to the module (`StackFeatures`), and the stack of the last ones takes the
-observation's place there: PPO's epochs and its bootstrap values see stacks, and a raw window
-never reaches a learner. `models.policy` is the same policy without Ray.
+`features` makes what a policy keeps of a step (`models.features`); the networks see stacks of the
+last ones (`jobs.runner` keeps them). `models.policy` is the same policy without Ray.
 """
 
 from collections.abc import Mapping
@@ -13,14 +11,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, ValueFunctionAPI
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor, nn
 
-from models.features import feature_of, push_features
+from models.features import feature_of
 from models.frozen import read_encoder_part, tabulate
 from models.networks import PARTS, build_networks
 from models.pictures import PictureEncoder
@@ -132,64 +129,3 @@ def module_spec(
         action_space=gym.spaces.Discrete(settings["num_actions"]),
         model_config={**settings, "encoder": about, "seed": seed},
     )
-
-
-class StackFeatures(ConnectorV2):
-    """Env-to-module: replace each episode's newest observation by its stack of features."""
-
-    def __init__(
-        self,
-        input_observation_space: gym.Space | None = None,
-        input_action_space: gym.Space | None = None,
-        *,
-        space: gym.spaces.Box,
-    ) -> None:
-        """Keep the space of a stack; the others are RLlib's."""
-        self.space = space
-        super().__init__(input_observation_space, input_action_space)
-
-    def recompute_output_observation_space(
-        self, input_observation_space: gym.Space, input_action_space: gym.Space
-    ) -> gym.Space:
-        """The space of a stack of features."""
-        return self.space
-
-    def __call__(self, *, rl_module: Any, batch: dict[str, Any], episodes: list[Any], **kwargs: Any) -> Any:
-        """Make the newest features of all episodes in one call.
-
-        RLlib calls this after each step with every episode, also with those that this
-        step ended: a truncated flight's last observation is needed for its bootstrap value.
-        """
-        features = rl_module.features(np.stack([episode.get_observations(-1) for episode in episodes]))
-        first = np.array([episode.t == 0 for episode in episodes])
-        stacks = np.zeros((len(episodes), *self.space.shape), self.space.dtype)
-        for row, episode in enumerate(episodes):
-            if not first[row]:
-                stacks[row] = episode.get_observations(-2)
-        for episode, stacked in zip(episodes, push_features(stacks, features, first), strict=True):
-            episode.observation_space = self.space
-            episode.set_observations(at_indices=-1, new_data=stacked)
-        return batch
-
-
-class ScaleRewards(ConnectorV2):
-    """Learner: put scaled rewards into the train batch; episodes keep the true ones."""
-
-    def __init__(
-        self,
-        input_observation_space: gym.Space | None = None,
-        input_action_space: gym.Space | None = None,
-        *,
-        scale: float,
-    ) -> None:
-        """Keep the factor; spaces are RLlib's."""
-        self.scale = scale
-        super().__init__(input_observation_space, input_action_space)
-
-    def __call__(self, *, rl_module: Any, batch: dict[str, Any], episodes: list[Any], **kwargs: Any) -> Any:
-        """Fill the rewards column, which RLlib then leaves alone."""
-        for episode in self.single_agent_episode_iterator(episodes, agents_that_stepped_only=False):
-            count = len(episode)
-            rewards = np.asarray(episode.get_rewards(slice(0, count)), np.float32) * self.scale
-            self.add_n_batch_items(batch, Columns.REWARDS, rewards, count, episode)
-        return batch

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import torch
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
-from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+from ray.rllib.utils.postprocessing.value_predictions import compute_value_targets
 
-from jobs.learner import PlainPPOLearner
+from jobs.learner import PlainPPOLearner, advantages
 from jobs.ppo import build_ppo
+from jobs.runner import PlainEnvRunner
 from tests.test_train import SHORT, make_config, write_encoder
 
 FIGURES = ("policy_loss", "vf_loss", "entropy", "total_loss", "vf_explained_var")
@@ -24,7 +25,7 @@ def ppo(tmp_path_factory):
 @pytest.fixture(scope="module")
 def flights(ppo):
     """Three iterations of flights, cut and truncated here and there."""
-    runner = SingleAgentEnvRunner(config=ppo, worker_index=0)
+    runner = PlainEnvRunner(config=ppo, worker_index=0)
     samples = [runner.sample(num_timesteps=64) for _ in range(3)]
     yield runner.env, samples
     runner.stop()
@@ -45,15 +46,45 @@ def reduced(results, name):
     return float(value.peek() if hasattr(value, "peek") else value)
 
 
+def scaled(episodes, factor):
+    """RLlib's learner knows no scale: the same flights with other rewards."""
+    episodes = copy.deepcopy(episodes)
+    for episode in episodes:
+        episode.set_rewards(new_data=factor * episode.get_rewards())
+    return episodes
+
+
 @pytest.mark.parametrize("training", [{}, {"grad_clip": 1e-3}, {"clip_param": 0.01}, {"vf_clip_param": 0.5}])
-def test_an_update_is_rllibs_own(ppo, flights, training):
+def test_an_update_is_rllibs_own(ppo, flights, training, monkeypatch):
     env, samples = flights
+    rllibs, make_rows = {}, PlainPPOLearner._rows
     theirs, ours = (make_learner(ppo, env, kind, **training) for kind in (PPOTorchLearner, PlainPPOLearner))
     ours.set_state(theirs.get_state())
     first = weights(theirs)
+    make_batch = theirs._make_batch_if_necessary
+
+    def keep_batch(training_data):
+        batch = make_batch(training_data=training_data)
+        rllibs.update(batch.policy_batches["default_policy"])
+        return batch
+
+    def with_rllibs_advantages(learner, episodes):
+        """Ours are standardised without the rows that RLlib appends and masks: all else is alike."""
+        rows, flown = make_rows(learner, episodes), rllibs["loss_mask"]
+        for key in ("obs", "actions", "action_logp", "value_targets"):
+            torch.testing.assert_close(rows[key], rllibs[key][flown], rtol=1e-5, atol=1e-5)
+        own, theirs = rows["advantages"], rllibs["advantages"][flown]
+        assert np.corrcoef(own, theirs)[0, 1] > 1 - 1e-6
+        assert float(own.mean()) == pytest.approx(0.0, abs=1e-6)
+        assert float(own.std(correction=0)) == pytest.approx(1.0, abs=1e-5)
+        return {**rows, "advantages": theirs}
+
+    monkeypatch.setattr(theirs, "_make_batch_if_necessary", keep_batch)
+    monkeypatch.setattr(PlainPPOLearner, "_rows", with_rllibs_advantages)
     for episodes in samples:
         results = [
-            learner.update(episodes=copy.deepcopy(episodes), num_epochs=1) for learner in (theirs, ours)
+            theirs.update(episodes=scaled(episodes, 0.5), num_epochs=1),
+            ours.update(episodes=copy.deepcopy(episodes), num_epochs=1),
         ]
         for name in (NORM, *FIGURES[:4]):
             expected, found = (reduced(result, name) for result in results)
@@ -63,6 +94,22 @@ def test_an_update_is_rllibs_own(ppo, flights, training):
     apart = max(float((expected[name] - found[name]).abs().max()) for name in first)
     assert apart < 1e-3 * moved
     assert moved > 1e-5
+
+
+@pytest.mark.parametrize("terminated", [True, False])
+def test_advantages_are_those_of_a_plain_loop_and_of_rllib(terminated):
+    rng = np.random.default_rng(0)
+    values, rewards = rng.normal(size=41).astype("f4"), rng.normal(size=40)
+    found = advantages(values, rewards, terminated, 0.97, 0.9)
+    last = values[40] * (not terminated)
+    errors = rewards + 0.97 * np.append(values[1:40], last) - values[:40]
+    plain = [sum((0.97 * 0.9) ** k * error for k, error in enumerate(errors[t:])) for t in range(40)]
+    np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-6)
+    ends = np.zeros(41)
+    ends[39] = 1.0
+    flags = (ends, 0 * ends) if terminated else (0 * ends, ends)
+    targets = compute_value_targets(values, np.append(rewards, 0.0), *flags, gamma=0.97, lambda_=0.9)
+    np.testing.assert_allclose(found + values[:40], targets[:40], rtol=1e-5, atol=1e-5)
 
 
 def test_every_step_is_seen_once_an_epoch_in_another_order(ppo, flights, monkeypatch):

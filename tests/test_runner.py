@@ -1,0 +1,127 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from ray.rllib.connectors.connector_v2 import ConnectorV2
+from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+
+from jobs.ppo import build_ppo
+from jobs.runner import PlainEnvRunner
+from models.features import push_features
+from models.kinds import KINDS
+from tests.test_train import SHORT, make_config, write_encoder
+
+
+class StackFeatures(ConnectorV2):
+    """RLlib's own way: a connector that replaces each newest observation by a stack of features."""
+
+    def __init__(self, space):
+        self.space = space
+        super().__init__()
+
+    def recompute_output_observation_space(self, input_observation_space, input_action_space):
+        return self.space
+
+    def __call__(self, *, rl_module, batch, episodes, **kwargs):
+        features = rl_module.features(np.stack([episode.get_observations(-1) for episode in episodes]))
+        first = np.array([episode.t == 0 for episode in episodes])
+        stacks = np.zeros((len(episodes), *self.space.shape), self.space.dtype)
+        for row, episode in enumerate(episodes):
+            if not first[row]:
+                stacks[row] = episode.get_observations(-2)
+        for episode, stacked in zip(episodes, push_features(stacks, features, first), strict=True):
+            episode.observation_space = self.space
+            episode.set_observations(at_indices=-1, new_data=stacked)
+        return batch
+
+
+def make_runners(name, folder, *overrides):
+    """Ours, and RLlib's with the connector; both with larger logits, so that actions differ."""
+    config = make_config(*SHORT, f"model={name}", "algo.num_envs_per_env_runner=3", *overrides)
+    ppo = build_ppo(config, write_encoder(folder, config) if KINDS[name].encoder else None)
+    space = ppo.rl_module_spec.observation_space
+    theirs = ppo.copy(copy_frozen=False).env_runners(
+        env_runner_cls=SingleAgentEnvRunner,
+        env_to_module_connector=lambda env, spaces, device: StackFeatures(space),
+    )
+    runners = PlainEnvRunner(config=ppo, worker_index=0), SingleAgentEnvRunner(config=theirs, worker_index=0)
+    for runner in runners:
+        for value in runner.module.pi.parameters():
+            value.data.mul_(20.0)
+    return runners
+
+
+def samples_of(runner, sizes):
+    torch.manual_seed(0)
+    return [runner.sample(num_timesteps=size) for size in sizes]
+
+
+@pytest.mark.parametrize("name", ["brp_full", "event_columns", "event_set", "eip", "rgb"])
+def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
+    ours, theirs = make_runners(name, tmp_path)
+    for mine, other in zip(*(samples_of(runner, (40, 1, 17, 64)) for runner in (ours, theirs)), strict=True):
+        assert [len(chunk) for chunk in mine] == [len(chunk) for chunk in other]
+        for one, two in zip(mine, other, strict=True):
+            for get in ("get_observations", "get_actions", "get_rewards"):
+                found, expected = np.asarray(getattr(one, get)()), np.asarray(getattr(two, get)())
+                np.testing.assert_array_equal(found, expected, err_msg=get)
+            for key in ("action_logp", "action_dist_inputs"):
+                found, expected = (chunk.get_extra_model_outputs(key) for chunk in (one, two))
+                np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+            assert one.get_infos() == two.get_infos()
+            assert (one.is_terminated, one.is_truncated) == (two.is_terminated, two.is_truncated)
+            assert (one.t_started, one.t) == (two.t_started, two.t)
+            one.validate()
+    actions = np.concatenate([chunk.get_actions() for chunk in mine])
+    assert len(set(actions)) == 3
+    for runner in (ours, theirs):
+        runner.stop()
+
+
+def test_pieces_of_a_flight_share_its_name_and_follow_each_other(tmp_path):
+    ours, theirs = make_runners("event_columns", tmp_path)
+    theirs.stop()
+    flights = {}
+    for chunk in (chunk for sample in samples_of(ours, (10, 10, 30)) for chunk in sample):
+        flights.setdefault(chunk.id_, []).append(chunk)
+    assert max(map(len, flights.values())) >= 2
+    for pieces in flights.values():
+        assert [piece.t_started for piece in pieces] == [0, *(piece.t for piece in pieces[:-1])]
+        assert not any(piece.is_done for piece in pieces[:-1])
+        for before, after in itertools.pairwise(pieces):
+            np.testing.assert_array_equal(before.get_observations(-1), after.get_observations(0))
+    metrics = ours.get_metrics()
+    done = [pieces for pieces in flights.values() if pieces[-1].is_done]
+    expected = np.mean([sum(len(piece) for piece in pieces) for pieces in done])
+    assert metrics["episode_len_mean"].peek() == pytest.approx(expected)
+    assert metrics["num_env_steps_sampled"].peek() == sum(
+        len(piece) for pieces in flights.values() for piece in pieces
+    )
+    ours.stop()
+
+
+def test_a_reset_forgets_the_flights_in_the_air(tmp_path):
+    ours, theirs = make_runners("event_columns", tmp_path)
+    theirs.stop()
+    (first,) = samples_of(ours, (10,))
+    again = ours.sample(num_timesteps=10, force_reset=True)
+    assert {chunk.id_ for chunk in first}.isdisjoint(chunk.id_ for chunk in again)
+    assert all(chunk.t_started == 0 for chunk in again)
+    ours.stop()
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"num_episodes": 1},
+        {"num_timesteps": 4, "random_actions": True},
+        {"num_timesteps": 4, "explore": False},
+    ],
+)
+def test_what_it_cannot_fly_is_refused(asked, tmp_path):
+    ours, theirs = make_runners("event_columns", tmp_path)
+    with pytest.raises(ValueError, match="drawn actions and nothing else"):
+        ours.sample(**asked)
+    for runner in (ours, theirs):
+        runner.stop()
