@@ -8,6 +8,7 @@ each flight to bootstrap its value: it masks that row in the loss, but counts it
 and in the mean and deviation of the advantages. Here it is in neither.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -97,6 +98,8 @@ class PlainPPOLearner(PPOTorchLearner):
         Raises:
             RuntimeError: A gradient is not finite; the weights are those before it.
         """
+        # The processes that fly wait meanwhile: their cores are free, and a CNN can use them.
+        torch.set_num_threads(max(1, min(self.config.num_env_runners, os.cpu_count() or 1)))
         counters = dict(timesteps or {})
         self.before_gradient_based_update(timesteps=counters)
         training_data = training_data or TrainingData(episodes=episodes)
