@@ -25,6 +25,7 @@ ENV = "evade-corridors"
 NUM_ACTIONS = 3
 EPISODES = 100  # that a rate is averaged over
 LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
+FIRST_SAMPLE_S = 900.0  # a process that flies compiles for a minute first, on a busy machine for several
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 
 
@@ -94,6 +95,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             num_env_runners=runners,
             num_cpus_per_env_runner=1.0 - LITTLE / max(1, runners),
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
+            sample_timeout_s=FIRST_SAMPLE_S,
             gym_env_vectorize_mode="vector_entry_point",
             env_runner_cls=PlainEnvRunner,
         )
