@@ -98,8 +98,7 @@ class PlainPPOLearner(PPOTorchLearner):
         Raises:
             RuntimeError: A gradient is not finite; the weights are those before it.
         """
-        # The processes that fly wait meanwhile: their cores are free, and a CNN can use them.
-        torch.set_num_threads(max(1, min(self.config.num_env_runners, os.cpu_count() or 1)))
+        torch.set_num_threads(self._threads())
         counters = dict(timesteps or {})
         self.before_gradient_based_update(timesteps=counters)
         training_data = training_data or TrainingData(episodes=episodes)
@@ -116,6 +115,11 @@ class PlainPPOLearner(PPOTorchLearner):
         self._log_steps_trained_metrics(MultiAgentBatch({DEFAULT_MODULE_ID: steps}, env_steps=count))
         self.after_gradient_based_update(timesteps=counters)
         return self.metrics.reduce()
+
+    def _threads(self) -> int:
+        """Those of the processes that fly, which wait meanwhile; one for networks too small to share."""
+        large = any(True for _ in self.module[DEFAULT_MODULE_ID].unwrapped().trunk.parameters())
+        return max(1, min(self.config.num_env_runners, os.cpu_count() or 1)) if large else 1
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
         """The steps of all flights, one after the other, with what the loss compares them to."""
