@@ -16,11 +16,11 @@ from envs.recordings import Recording, read_recording
 from jobs.collect import collect, data_file
 from jobs.config import EVAE_SETTINGS, Config, ConfigError, ModelConfig, PretrainConfig
 from jobs.figures import reconstruction_figure
-from jobs.progress import progress
+from jobs.progress import console, progress
 from jobs.runs import Run, finish, finished, locate_run, open_run
 from jobs.tracking import Tracker, open_tracker
 from models.batch import EventBatch, Grid, batch_windows
-from models.evae import EventVAE, appendix_beta, event_targets, reconstruct, train_step, validate
+from models.evae import EventVAE, appendix_beta, collapsed, event_targets, reconstruct, train_step, validate
 from models.kinds import KINDS
 from models.weights import save_encoder
 
@@ -29,6 +29,10 @@ Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
 SHORTEST_STEPS, LONGEST_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
 PICTURE_WINDOWS = 8
+COLLAPSED = (
+    "the latent says nothing of its window (posterior collapse), a policy would see nothing; "
+    "if more iterations do not help, take a smaller pretrain.beta or pretrain.beta_schedule=constant"
+)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -82,7 +86,9 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
             losses = train_step(evae, optimizer, batch, targets, beta(settings, iteration), rng)
             last = iteration + 1 == settings.iterations
             if last or (iteration + 1) % settings.validate_every == 0:
-                latest = held_out_figures(evae, held_out)
+                before, latest = latest, held_out_figures(evae, held_out)
+                if latest["collapsed"] > before.get("collapsed", 0.0):
+                    console.print(f"Iteration {iteration + 1}: {COLLAPSED}", markup=False)
                 tracker.log(
                     iteration + 1, {f"evae/{name}": value for name, value in {**losses, **latest}.items()}
                 )
@@ -167,18 +173,18 @@ def held_out_windows(recording: Recording, settings: PretrainConfig, grid: Grid)
 
 
 def held_out_figures(evae: EventVAE, held_out: dict[str, EventBatch]) -> dict[str, float]:
-    """Figures of `models.evae.validate` for each window length, and the error explained.
-
-    `explained` is 1 - reconstruction error / error of the mean picture: 0 for a model that has
-    learnt nothing of the single window, 1 for a perfect one.
-    """
+    """Figures of `models.evae.validate` for each window length; `collapsed` is 1 if it is so at all."""
     evae.eval()
-    figures: dict[str, float] = {}
-    for name, batch in held_out.items():
-        values = validate(evae, batch, event_targets(batch, evae.target))
-        values["explained"] = 1.0 - values["reconstruction"] / values.pop("mean_picture")
-        figures |= {f"{key}_{name}": value for key, value in values.items()}
-    return figures
+    found = {
+        name: validate(evae, batch, event_targets(batch, evae.target)) for name, batch in held_out.items()
+    }
+    figures = {
+        f"{key}_{name}": value
+        for name, values in found.items()
+        for key, value in values.items()
+        if key != "mean_picture"
+    }
+    return figures | {"collapsed": float(all(map(collapsed, found.values())))}
 
 
 def freeze(

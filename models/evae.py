@@ -11,6 +11,7 @@ H W times more than the same number in front of a summed error: the appendix's s
 iterations. A weight near 1e-5 keeps it alive.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,9 @@ TARGETS = ("signed", "occupancy")
 LIMITS = {"width": 4096, "height": 4096, "context": 8192, "latent": 256, "time_bins": 65536}
 LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
 ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)
+# A latent that the KL term had emptied held 0.03 nats and explained 0.000; living ones hold 10 and more.
+EMPTY_KL = 0.1  # nats
+EMPTY_EXPLAINED = 0.01
 
 
 class EventVAE(nn.Module):
@@ -212,8 +216,11 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
     """Figures of the model on held-out windows, z = mu; the model must be in eval mode.
 
     Returns:
-        reconstruction, mean_picture (the same error for the targets' own mean picture: a model
-        that is not below it has learnt nothing of the single window), kl, active_units.
+        reconstruction (mean error of a pixel), mean_picture (the same error for the targets' own
+        mean picture), explained (1 - reconstruction / mean_picture: 0 for a model that has learnt
+        nothing of the single window, 1 for a perfect one, and 0 where all targets are the same),
+        auc (`ranking_area` of "the pixel had an event" by the picture's magnitude), kl (mean over
+        windows [nats]), active_units.
     """
     logits, mu, logvar = evae(batch)
     mean = targets.mean(0).expand_as(targets)
@@ -221,12 +228,55 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
         baseline = functional.smooth_l1_loss(mean, targets)
     else:
         baseline = functional.binary_cross_entropy(mean, targets)
+    reconstruction, mean_picture = (
+        error.item() for error in (reconstruction_loss(logits, targets, evae.target), baseline)
+    )
     return {
-        "reconstruction": reconstruction_loss(logits, targets, evae.target).item(),
-        "mean_picture": baseline.item(),
+        "reconstruction": reconstruction,
+        "mean_picture": mean_picture,
+        "explained": 1.0 - reconstruction / mean_picture if mean_picture > 0 else 0.0,
+        "auc": ranking_area(reconstruct(logits, evae.target).abs().numpy(), targets.numpy() != 0),
         "kl": kl_divergence(mu, logvar).mean().item(),
         "active_units": active_units(mu),
     }
+
+
+def ranking_area(scores: np.ndarray, positive: np.ndarray) -> float:
+    """Area under the ROC curve: how often a positive has the higher score of a random pair.
+
+    Exact: the share of the pairs (positive, negative), a tie counts half (Mann and Whitney 1947).
+
+    Args:
+        scores: Any shape, without NaN.
+        positive: bool, the same shape.
+
+    Returns:
+        0..1; 0.5, as of scores that say nothing, if all or none are positive.
+
+    Raises:
+        ValueError: A score is NaN, which has no rank.
+    """
+    if np.isnan(scores).any():
+        raise ValueError("scores must be numbers, got NaN, which has no rank; check the model's weights")
+    own, others = np.sort(scores[positive]), np.sort(scores[~positive])
+    if not len(own) or not len(others):
+        return 0.5
+    twice = sum(int(np.searchsorted(others, own, side).sum()) for side in ("left", "right"))
+    return twice / (2 * len(own) * len(others))
+
+
+def collapsed(figures: Mapping[str, float]) -> bool:
+    """Whether the posterior has fallen onto the prior, so that the latent says nothing of its window.
+
+    Nothing of the single window is decoded (`EMPTY_EXPLAINED`), and the latent is either the same
+    for every window (no active unit) or next to the prior (`EMPTY_KL`). Both are asked, because a
+    latent without a KL term may live on a small scale, and a young model decodes nothing yet.
+
+    Args:
+        figures: Of `validate`.
+    """
+    silent = figures["active_units"] == 0 or figures["kl"] < EMPTY_KL
+    return silent and figures["explained"] < EMPTY_EXPLAINED
 
 
 def active_units(mu: Tensor) -> float:

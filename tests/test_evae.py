@@ -7,8 +7,10 @@ from models.evae import (
     EventVAE,
     active_units,
     appendix_beta,
+    collapsed,
     event_targets,
     kl_divergence,
+    ranking_area,
     reconstruct,
     reconstruction_loss,
     train_step,
@@ -287,3 +289,60 @@ def test_active_units_are_those_that_vary_over_windows():
     mu[::2, 0], mu[::2, 1] = 1.0, 0.01
     assert active_units(mu) == 1
     assert active_units(mu[:1]) == 0
+
+
+@pytest.mark.parametrize("levels", [3, 10_000], ids=["many ties", "few ties"])
+def test_the_area_is_the_share_of_pairs_in_order_a_tie_half(levels):
+    rng = np.random.default_rng(levels)
+    scores, positive = rng.integers(levels, size=(9, 20)).astype(np.float32), rng.random((9, 20)) < 0.3
+    own, others = scores[positive], scores[~positive]
+    pairs = [float(mine > other) + 0.5 * float(mine == other) for mine in own for other in others]
+    assert ranking_area(scores, positive) == pytest.approx(np.mean(pairs), abs=1e-12)
+
+
+def test_the_area_is_one_for_the_truth_half_for_a_constant_and_half_where_there_is_no_pair():
+    positive = np.array([True, False, False, True])
+    assert ranking_area(positive.astype(float), positive) == 1.0
+    assert ranking_area(1.0 - positive, positive) == 0.0
+    assert ranking_area(np.ones(4), positive) == 0.5
+    assert [ranking_area(np.arange(4.0), np.full(4, every)) for every in (False, True)] == [0.5, 0.5]
+    with pytest.raises(ValueError, match="scores must be numbers, got NaN"):
+        ranking_area(np.array([0.0, np.nan]), np.array([True, False]))
+
+
+def test_the_area_of_a_signed_picture_asks_for_events_of_either_polarity():
+    evae = small().eval()
+    batch = batch_windows([(events((1, 0, 0, 1), (2, 1, 0, -1)), 0, 5)], evae.grid)
+    with torch.no_grad():
+        evae.decoder[-1].weight.zero_()
+        evae.decoder[-1].bias.zero_()
+        evae.decoder[-1].bias[:2] = torch.tensor([2.0, -2.0])
+    assert validate(evae, batch, event_targets(batch, "signed"))["auc"] == 1.0
+
+
+def test_windows_that_are_all_the_same_leave_nothing_to_explain():
+    evae = small(target="occupancy").eval()
+    empty = batch_windows([(events(), 0, 5)] * 3, evae.grid)
+    figures = validate(evae, empty, event_targets(empty, "occupancy"))
+    assert (figures["explained"], figures["auc"]) == (0.0, 0.5)
+    assert np.isfinite(list(figures.values())).all()
+
+
+@pytest.mark.parametrize(("beta", "expected"), [(1e2, True), (1e-5, False)])
+def test_an_enormous_kl_weight_collapses_the_latent_and_a_small_one_does_not(beta, expected):
+    evae, rng = small(target="occupancy"), np.random.default_rng(3)
+    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3)
+    for _ in range(80):
+        batch = bars(evae, 32, rng)
+        train_step(evae, optimizer, batch, event_targets(batch, "occupancy"), beta, rng)
+    held_out = bars(evae, 64, np.random.default_rng(99))
+    assert collapsed(validate(evae.eval(), held_out, event_targets(held_out, "occupancy"))) is expected
+
+
+def test_a_collapse_needs_a_silent_latent_and_pictures_that_explain_nothing():
+    alive = {"kl": 12.0, "active_units": 8.0, "explained": 0.2}
+    assert not collapsed(alive)
+    assert not collapsed({**alive, "explained": -0.1})  # young
+    assert not collapsed({**alive, "active_units": 0.0})  # on a small scale
+    assert collapsed({**alive, "active_units": 0.0, "explained": 0.0})
+    assert collapsed({**alive, "kl": 0.03, "explained": 0.0})

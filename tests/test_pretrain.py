@@ -21,6 +21,7 @@ from jobs.pretrain import (
 from jobs.runs import open_run
 from models.batch import batch_windows
 from models.evae import EventVAE, event_targets, train_step
+from models.weights import load_encoder
 from tests.test_runs import small_config
 
 SETTINGS = PretrainConfig(
@@ -113,6 +114,39 @@ def test_training_explains_windows_of_flights_that_it_never_saw(recording):
     after = held_out_figures(training(recording, 150)[0], held_out)
     assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]
     assert after["explained_four_steps"] > before["explained_four_steps"]
+
+
+class Listener:
+    """Takes what a tracker would."""
+
+    def __init__(self):
+        self.logged = {}
+
+    def log(self, step, figures):
+        self.logged[step] = figures
+
+    def artifact(self, *given):
+        pass
+
+    figure = artifact
+
+
+@pytest.mark.parametrize(("weight", "dead"), [(100.0, 1.0), (1e-5, 0.0)])
+def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_path, capsys, weight, dead):
+    config = small_config(tmp_path)
+    config = dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, context=64),
+        collect=dataclasses.replace(config.collect, num_steps=200, num_validation_steps=100),
+        pretrain=dataclasses.replace(config.pretrain, iterations=100, validate_every=50, beta=weight),
+    )
+    folder, listener = open_run(config), Listener()
+    file = prepare_encoder(config, folder, listener)
+    figures = [figures for step, figures in listener.logged.items() if step > 0]
+    assert sorted(listener.logged) == [0, 50, 100]
+    assert figures[-1]["evae/collapsed"] == dead
+    assert load_encoder(file)[1]["figures"]["collapsed"] == dead
+    assert capsys.readouterr().out.count("posterior collapse") == dead  # once
 
 
 def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
