@@ -1,4 +1,4 @@
-"""Fly at random through training corridors and record every event.
+"""Fly through training corridors, at random and by a policy if one is named; record every event.
 
 Run: python -m platform.launch +exp=collect
 Expect: about 3,000 control steps per second on one core; `data/train.h5` and
@@ -6,7 +6,7 @@ Expect: about 3,000 control steps per second on one core; `data/train.h5` and
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,25 @@ import numpy as np
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
+from envs.flight import NUM_ACTIONS
 from envs.recordings import Recording, write_recording
 from jobs.accuracy import achieved
-from jobs.config import Config
+from jobs.config import Config, ConfigError
+from jobs.flights import check_sensor
+from jobs.pilots import Observation, Pilot, make_pilot
 from jobs.progress import progress
-from jobs.runs import Run, finish, finished, open_run
+from jobs.runs import Run, finish, finished, locate_run, named_policy, open_run
 from jobs.tracking import Tracker, open_tracker
+from models.policy import load_policy
 
 FLIGHT_GAP_US = 1_000_000
 MEAN_HOLD_M = 2.0
+POLICY_EPISODES = 10**6  # number of a policy's first flight: corridors that no random flight came to
 
 
 def run(config: Config) -> dict[str, Any]:
     """Collect the data sets of a run; return its folder."""
+    check_policy(locate_run(config))
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:
         return collect(folder.config, folder, tracker)
@@ -38,6 +44,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     done = finished(folder, "collect")
     if done is not None:
         return done
+    policy = check_policy(folder)
     sizes = {"train": config.collect.num_steps, "validation": config.collect.num_validation_steps}
     figures: dict[str, Any] = {}
     with progress("Collect flights", sum(sizes.values()), "steps") as advance:
@@ -48,7 +55,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
                 (config.env_config(scene=scene, split=split, observation="events"), share)
                 for scene, share in zip(scenes, shares, strict=True)
             ]
-            recording = record(flights, config.seed, advance)
+            recording = record(flights, config.seed, advance, policy, config.collect.policy_share)
             write_recording(data_file(folder, split), recording)
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_flights"] = recording.about["flights"]
@@ -62,13 +69,41 @@ def data_file(folder: Run, split: str) -> Path:
     return folder.data / f"{split}.h5"
 
 
-def record(flights: list[tuple[EnvConfig, int]], seed: int, advance: Callable[[int], None]) -> Recording:
+def check_policy(folder: Run) -> Path | None:
+    """The folder of the policy that a run still has to collect flights of; None if there is none.
+
+    Raises:
+        ConfigError: `collect.policy` names none, or one that cannot fly here.
+    """
+    named = folder.config.collect.policy
+    if named is None or finished(folder, "collect") is not None:
+        return None
+    path = named_policy(named)
+    if path is None:
+        raise ConfigError(f"collect.policy: must be a run folder or a policy folder, got {named!r}")
+    try:
+        check_sensor(load_policy(path).manifest, folder.config.env_config())
+    except ValueError as error:
+        raise ConfigError(f"collect.policy: {error}") from error
+    return path
+
+
+def record(
+    flights: Sequence[tuple[EnvConfig, int]],
+    seed: int,
+    advance: Callable[[int], None],
+    policy: Path | None = None,
+    policy_share: float = 0.5,
+) -> Recording:
     """Fly each environment for a number of control steps; join all flights on one clock.
 
     Args:
         flights: Environment and number of control steps [-], one pair per scene.
         seed: Seed of corridors and actions.
         advance: Told the number of steps after each flight.
+        policy: Folder of a policy that flies a share of the steps, whole flights of its own,
+            drawing its actions as in training; None: all are random.
+        policy_share: That share, 0..1.
 
     Returns:
         Events of all flights, `FLIGHT_GAP_US` apart. `index` holds `step_t_us`, `step_end_us`
@@ -77,13 +112,16 @@ def record(flights: list[tuple[EnvConfig, int]], seed: int, advance: Callable[[i
     parts: list[np.ndarray] = []
     steps: list[tuple[int, int, int]] = []
     clock_us, flight = 0, 0
-    for config, num_steps in flights:
-        env = CorridorEnv(config)
-        rng = np.random.default_rng(np.random.SeedSequence([seed, len(parts), 1]))
+    for config, num_steps, flown_by in stints(flights, policy, policy_share):
+        actions, draws = (np.random.SeedSequence([seed, len(parts), stream]) for stream in (1, 2))
+        pilot = make_pilot(str(flown_by), "stochastic") if flown_by else HoldingPilot(actions)
+        flight_seeds = np.random.default_rng(draws)
+        env = CorridorEnv(config, observation=pilot.observation)
+        started = env.reset(seed=seed, options={"episode": POLICY_EPISODES if flown_by else 0})
         flown = 0
-        env.reset(seed=seed)
         while flown < num_steps:
-            flight_events, ends_us = fly_at_random(env, rng, num_steps - flown)
+            pilot.reset([env], [int(flight_seeds.integers(2**63))])
+            flight_events, ends_us = fly_once(env, pilot, started, num_steps - flown)
             for events in flight_events:
                 shifted = events.copy()
                 shifted["t"] += clock_us
@@ -96,7 +134,8 @@ def record(flights: list[tuple[EnvConfig, int]], seed: int, advance: Callable[[i
             flight += 1
             clock_us += ends_us[-1] + FLIGHT_GAP_US
             advance(len(ends_us))
-            env.reset()
+            started = env.reset()
+        env.close()
     start, end, number = np.array(steps, dtype=np.int64).T
     settings = sensor_settings(flights[0][0])
     about = {
@@ -106,26 +145,59 @@ def record(flights: list[tuple[EnvConfig, int]], seed: int, advance: Callable[[i
         "faults": [dataclasses.asdict(config.faults) for config, _ in flights],
         "seed": seed,
         "flights": flight,
+        "policy": None if policy is None else str(policy),
+        "policy_share": 0.0 if policy is None else policy_share,
     }
     index = {"step_t_us": start, "step_end_us": end, "step_flight": number}
     return Recording(np.concatenate([np.empty(0, EVENT), *parts]), index, about)
 
 
-def fly_at_random(
-    env: CorridorEnv, rng: np.random.Generator, most_steps: int
+def stints(
+    flights: Sequence[tuple[EnvConfig, int]], policy: Path | None, policy_share: float
+) -> list[tuple[EnvConfig, int, Path | None]]:
+    """What each pilot flies of each scene: environment, control steps, and the policy or None for random."""
+    parts = []
+    for config, num_steps in flights:
+        of_policy = 0 if policy is None else round(policy_share * num_steps)
+        parts += [(config, num_steps - of_policy, None), (config, of_policy, policy)]
+    return [part for part in parts if part[1] > 0]
+
+
+class HoldingPilot:
+    """Any action with the same probability, held for 2 m on average; for one flight at once."""
+
+    observation: Observation = "events"
+
+    def __init__(self, seed: np.random.SeedSequence) -> None:
+        """Draw the actions of all flights from one stream."""
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Draw the first action; the stream goes on from flight to flight."""
+        config = envs[0].config
+        self._hold_steps = max(1.0, MEAN_HOLD_M * config.control_hz / config.speed_mps)
+        self._action = self._rng.integers(NUM_ACTIONS)
+
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """The action, int (1,)."""
+        if self._rng.random() < 1.0 / self._hold_steps:
+            self._action = self._rng.integers(NUM_ACTIONS)
+        return np.array([self._action])
+
+
+def fly_once(
+    env: CorridorEnv, pilot: Pilot, started: tuple[np.ndarray, Mapping[str, Any]], most_steps: int
 ) -> tuple[list[np.ndarray], list[int]]:
-    """One flight of a freshly reset environment: each action is held for 2 m on average.
+    """One flight of an environment and a pilot that were just reset; `started` is what the reset gave.
 
     Returns:
         The events of each step, and the time at which each step ended [us since take-off].
     """
-    hold_steps = max(1.0, MEAN_HOLD_M * env.config.control_hz / env.config.speed_mps)
     events, ends_us = [], []
-    action = int(rng.integers(3))
+    observation, info = started
     for _ in range(most_steps):
-        if rng.random() < 1.0 / hold_steps:
-            action = int(rng.integers(3))
-        _, _, terminated, truncated, info = env.step(action)
+        action = int(pilot(observation[None], [info])[0])
+        observation, _, terminated, truncated, info = env.step(action)
         events.append(env.events)
         ends_us.append(int(info["t_us"]))
         if terminated or truncated:

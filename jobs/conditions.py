@@ -12,7 +12,7 @@ from jobs.config import Config, ConfigError, env_with
 from jobs.evaluate import find_policy
 from jobs.flights import check_sensor
 from jobs.pilots import BOUNDS
-from jobs.runs import Run
+from jobs.runs import Run, named_policy
 from models.policy import MANIFEST
 
 SHOWN_BOUNDS = ("straight", "oracle")
@@ -75,12 +75,12 @@ def swept_policy(config: Config, folder: Run) -> str:
         return str(find_policy(config, folder))
     if named in BOUNDS:
         return named
-    for path in (Path(named), Path(named) / "policy"):
-        if (path / MANIFEST).is_file():
-            return str(path.resolve())
-    raise ConfigError(
-        f"sweep.policy: must be a run folder, a policy folder or one of {BOUNDS}, got {named!r}"
-    )
+    path = named_policy(named)
+    if path is None:
+        raise ConfigError(
+            f"sweep.policy: must be a run folder, a policy folder or one of {BOUNDS}, got {named!r}"
+        )
+    return str(path)
 
 
 def plan(config: Config, policy: str) -> Sweep:

@@ -91,12 +91,15 @@ class CollectConfig:
     scenes: Annotated[list[Name], Field(min_length=1)]
     num_steps: Count
     num_validation_steps: Count
+    policy: str | None
+    policy_share: Fraction
 
 
 @dataclass(frozen=True, config=STRICT)
 class PretrainConfig:
     """How the event VAE is trained (appendix B.2)."""
 
+    encoder: str | None
     iterations: Count
     batch_windows: Count
     window_events: Count

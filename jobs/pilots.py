@@ -18,7 +18,7 @@ from envs.scene import Scene
 if TYPE_CHECKING:
     from models.policy import Policy
 
-Observation = Literal["window", "event_image", "luminance"]
+Observation = Literal["window", "event_image", "luminance", "events"]
 BOUNDS = ("straight", "random", "oracle")
 # Of one step in x and y, in step lengths: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])

@@ -11,7 +11,7 @@ from typing import Any
 
 from jobs.config import Config
 from jobs.evaluate import evaluate
-from jobs.pretrain import prepare_encoder
+from jobs.pretrain import check_sources, prepare_encoder
 from jobs.progress import console
 from jobs.runs import open_run
 from jobs.tracking import open_tracker
@@ -20,6 +20,7 @@ from jobs.train import train
 
 def run(config: Config) -> dict[str, Any]:
     """Every stage of a run that its policy needs and that is not done yet, then the table of its results."""
+    check_sources(config)
     folder = open_run(config)
     config = folder.config
     console.print(f"Run folder: {folder.path}")

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
-from jobs.collect import collect, data_file
+from jobs.collect import check_policy, collect, data_file
 from jobs.config import EVAE_SETTINGS, Config, ConfigError, ModelConfig, PretrainConfig
 from jobs.figures import reconstruction_figure
 from jobs.progress import console, progress
@@ -22,10 +23,11 @@ from jobs.tracking import Tracker, open_tracker
 from models.batch import EventBatch, Grid, batch_windows
 from models.evae import EventVAE, appendix_beta, collapsed, event_targets, reconstruct, train_step, validate
 from models.kinds import KINDS
-from models.weights import save_encoder
+from models.weights import EncoderFileError, load_encoder, save_encoder
 
 Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
 
+ENCODER, CHECKPOINT = "encoder.safetensors", "checkpoint.pt"
 SHORTEST_STEPS, LONGEST_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
 PICTURE_WINDOWS = 8
@@ -39,16 +41,57 @@ def run(config: Config) -> dict[str, Any]:
     """Collect if there is no data yet, then train the event VAE; return its figures.
 
     Raises:
-        ConfigError: The policy has no event VAE.
+        ConfigError: The policy has no event VAE, or as `check_sources`.
     """
     name = locate_run(config).config.model.name
     if not KINDS[name].encoder:
         raise ConfigError(f"model: {name} has no event VAE to pretrain; go on with job=train")
+    check_sources(config)
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:
         prepare_encoder(config, folder, tracker)
     return finished(folder, "pretrain") or {}
+
+
+def check_sources(config: Config) -> None:
+    """Check the files that collecting and pretraining begin from, before anything is made.
+
+    Raises:
+        ConfigError: `collect.policy` or `pretrain.encoder` names none, or one that does not fit.
+    """
+    folder = locate_run(config)
+    if KINDS[folder.config.model.name].encoder:
+        check_policy(folder)
+        initial_state(folder)
+
+
+def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
+    """The weights that a run's event VAE still has to begin from; None for random ones.
+
+    Raises:
+        ConfigError: `pretrain.encoder` names no encoder, or one of another model.
+    """
+    named, config = folder.config.pretrain.encoder, folder.config
+    if named is None or (folder.encoder / CHECKPOINT).exists() or finished(folder, "pretrain") is not None:
+        return None
+    path = Path(named)
+    file = path if path.suffix == ".safetensors" else path / "encoder" / ENCODER
+    try:
+        evae, _ = load_encoder(file)
+    except EncoderFileError as error:
+        rule = f"must be a run folder with an encoder, or an encoder file, got {named!r}"
+        raise ConfigError(f"pretrain.encoder: {rule}: {error}") from error
+    with torch.device("meta"):  # its settings alone, without memory for weights
+        wanted = build_evae(config.model, sensor_settings(config.env_config())).settings
+    differ = [
+        f"{name}: {evae.settings[name]!r} there, {value!r} here"
+        for name, value in wanted.items()
+        if evae.settings[name] != value
+    ]
+    if differ:
+        raise ConfigError(f"pretrain.encoder: must have the settings of the model, got {', '.join(differ)}")
+    return evae.state_dict()
 
 
 def prepare_encoder(config: Config, folder: Run, tracker: Tracker) -> Path | None:
@@ -70,12 +113,15 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     validation = read_recording(data_file(folder, "validation"))
     torch.manual_seed(config.seed)
     evae = build_evae(config.model, train.about["sensor"])
+    begin = initial_state(folder)
+    if begin is not None:
+        evae.load_state_dict(begin)
     optimizer = torch.optim.Adam(
         evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
     )
     rng = np.random.default_rng(np.random.SeedSequence([config.seed, 2]))
     held_out = held_out_windows(validation, settings, evae.grid)
-    checkpoint = folder.encoder / "checkpoint.pt"
+    checkpoint = folder.encoder / CHECKPOINT
     first = restore(checkpoint, evae, optimizer, rng)
     latest: dict[str, float] = {}
     with progress("Pretrain the event VAE", settings.iterations, "iterations", done=first) as advance:
@@ -222,7 +268,7 @@ def example_pictures(evae: EventVAE, held_out: dict[str, EventBatch]) -> tuple[n
 
 def encoder_file(folder: Run) -> Path:
     """Where the frozen encoder lives in a run folder."""
-    return folder.encoder / "encoder.safetensors"
+    return folder.encoder / ENCODER
 
 
 def save_checkpoint(

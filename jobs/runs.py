@@ -115,6 +115,12 @@ def latest_policy(runs_dir: str | Path) -> Path | None:
     return None if newest is None else newest.parent
 
 
+def named_policy(name: str) -> Path | None:
+    """The policy folder that a path names, itself or as its run folder; None if there is none."""
+    found = (path for path in (Path(name), Path(name) / "policy") if (path / "policy.json").is_file())
+    return next((path.resolve() for path in found), None)
+
+
 def provenance() -> dict[str, Any]:
     """Commit and machine: what to name beside a figure so that it can be trusted."""
     python = ".".join(map(str, sys.version_info[:3]))

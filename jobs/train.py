@@ -22,7 +22,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 from jobs.cluster import start_ray
 from jobs.config import Config, ConfigError
 from jobs.ppo import build_ppo, policy_settings
-from jobs.pretrain import prepare_encoder
+from jobs.pretrain import check_sources, prepare_encoder
 from jobs.progress import progress
 from jobs.runs import Run, finish, finished, open_run
 from jobs.tracking import open_tracker
@@ -81,6 +81,7 @@ class Relay(tune.Callback):
 
 def run(config: Config) -> dict[str, Any]:
     """Collect and pretrain where the policy needs that and it is not done; train; return the figures."""
+    check_sources(config)
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:

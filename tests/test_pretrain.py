@@ -9,6 +9,7 @@ from jobs.collect import record
 from jobs.config import ConfigError, ModelConfig, PretrainConfig
 from jobs.pretrain import (
     beta,
+    check_sources,
     cut_window,
     held_out_figures,
     held_out_windows,
@@ -21,10 +22,11 @@ from jobs.pretrain import (
 from jobs.runs import open_run
 from models.batch import batch_windows
 from models.evae import EventVAE, event_targets, train_step
-from models.weights import load_encoder
+from models.weights import load_encoder, save_encoder
 from tests.test_runs import small_config
 
 SETTINGS = PretrainConfig(
+    encoder=None,
     iterations=100,
     batch_windows=8,
     window_events=500,
@@ -147,6 +149,41 @@ def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_pat
     assert figures[-1]["evae/collapsed"] == dead
     assert load_encoder(file)[1]["figures"]["collapsed"] == dead
     assert capsys.readouterr().out.count("posterior collapse") == dead  # once
+
+
+def refreshing(tmp_path, encoder, **changes):
+    config = small_config(tmp_path)
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, **{"context": 64, **changes}),
+        collect=dataclasses.replace(config.collect, num_steps=100, num_validation_steps=50),
+        pretrain=dataclasses.replace(config.pretrain, iterations=1, lr=1e-9, encoder=encoder),
+    )
+
+
+def test_a_refresh_begins_with_the_weights_of_the_encoder_that_is_named(tmp_path):
+    torch.manual_seed(7)
+    evae, run_folder = EventVAE(context=64, target="occupancy"), tmp_path / "before"
+    save_encoder(run_folder / "encoder" / "encoder.safetensors", evae, {})
+    for named in (run_folder, run_folder / "encoder" / "encoder.safetensors"):
+        config = refreshing(tmp_path, str(named))
+        file = prepare_encoder(config, open_run(config), Listener())
+        for name, value in load_encoder(file)[0].named_parameters():
+            torch.testing.assert_close(value, evae.state_dict()[name], atol=1e-6, rtol=0)
+    (run_folder / "encoder" / "encoder.json").unlink()
+    check_sources(config)  # pretrained already: the encoder is no longer needed
+
+
+def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anything_is_made(tmp_path):
+    save_encoder(tmp_path / "encoder.safetensors", EventVAE(context=64, target="signed"), {})
+    rules = {
+        str(tmp_path): r"must be a run folder with an encoder, or an encoder file, got .*cannot be read",
+        str(tmp_path / "encoder.safetensors"): r"got context: 64 there, 32 here, target: 'signed' there",
+    }
+    for named, rule in rules.items():
+        with pytest.raises(ConfigError, match=rf"pretrain\.encoder: .*{rule}"):
+            run(refreshing(tmp_path, named, context=32))
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
