@@ -18,6 +18,7 @@ import torch
 from envs.corridor import CorridorEnv
 from jobs.accuracy import achieved
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
+from jobs.drift import DriftWatch
 from jobs.figures import Track, trajectory_figure
 from jobs.flights import Advance, Watch, Ways, check_sensor, fly, write_episodes
 from jobs.pictures import Decode, Film
@@ -88,25 +89,43 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     console.print(f"Policy: {path}", markup=False)
     tracker.tags({"policy": policy.manifest["name"]})
     plan = tasks(config)
-    flown: dict[Task, np.ndarray] = {}
-    tracks: list[Track] = []
-    with progress("Evaluate", sum(task.episodes for task in plan), "episodes") as advance:
-        for task in plan:
-            ways = Ways(SHOWN_CORRIDORS if shown(task, plan) else ())
-            note = " ".join(task.label)
-            episodes = fly_task(task, config, policy, ways.add, functools.partial(advance, note=note))
-            if episodes is not None:
-                flown[task] = episodes
-                tracks += ways.tracks(task.pilot.partition(" ")[0], episodes)
+    flown, tracks, drifts = fly_tasks(plan, config, path, policy)
     rows = [summarise(task.label, episodes) for task, episodes in flown.items()]
     write_episodes(folder.evaluation / "episodes.csv", LABELS, {task.label: flown[task] for task in flown})
     publish(folder, tracker, rows, tracks)
-    figures = tracked_figures(rows) | achieved(config.env_config(scene=HELD_OUT_SCENE))
+    figures = tracked_figures(rows) | drift_metrics(drifts)
+    figures |= achieved(config.env_config(scene=HELD_OUT_SCENE))
     tracker.log(config.train.env_steps, figures)
     if config.evaluate.video:
         seed = film_seed(flown[plan[0]])
         tracker.artifact(film(config, policy, path, seed, folder.evaluation / "episode.mp4"), "eval")
     return finish(folder, "evaluate", {"asked": asked, "figures": figures})["figures"]
+
+
+def fly_tasks(
+    plan: Sequence[Task], config: Config, path: Path, policy: Policy
+) -> tuple[dict[Task, np.ndarray], list[Track], dict[Task, dict[str, float]]]:
+    """The episodes of each task that could be flown, ways to draw, and the drift of the policy's encoder."""
+    flown: dict[Task, np.ndarray] = {}
+    tracks: list[Track] = []
+    drifts: dict[Task, dict[str, float]] = {}
+    with progress("Evaluate", sum(task.episodes for task in plan), "episodes") as advance:
+        for task in plan:
+            ways = Ways(SHOWN_CORRIDORS if shown(task, plan) else ())
+            drift = DriftWatch(path if task.of_policy else task.pilot)
+            watch = functools.partial(_watch_each, (ways.add, drift.add))
+            tell = functools.partial(advance, note=" ".join(task.label))
+            episodes = fly_task(task, config, policy, watch, tell)
+            if episodes is not None:
+                flown[task] = episodes
+                tracks += ways.tracks(task.pilot.partition(" ")[0], episodes)
+                drifts[task] = drift.figures()
+    return flown, tracks, drifts
+
+
+def _watch_each(watches: Sequence[Watch], *step: Any) -> None:
+    for watch in watches:
+        watch(*step)
 
 
 def tasks(config: Config) -> list[Task]:
@@ -185,13 +204,29 @@ def tracked_figures(rows: Sequence[Summary]) -> dict[str, float]:
     figures: dict[str, float] = {}
     first = rows[0].label
     for row in rows:
-        words = [word for word, usual in zip(row.label, first, strict=True) if word != usual]
-        if not words:
+        ending = suffix(row.label, first)
+        if not ending:
             figures |= metrics(row)
         elif row.label[0] == first[0] or row.label[1] == first[1]:
-            suffix = "_".join(words).removeprefix("policy ")
-            figures |= {f"{name}_{suffix}": metrics(row)[name] for name in VIEW_COLUMNS[::3]}
+            figures |= {f"{name}{ending}": metrics(row)[name] for name in VIEW_COLUMNS[::3]}
     return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def drift_metrics(drifts: Mapping[Task, Mapping[str, float]]) -> dict[str, float]:
+    """What the encoder made of the first task, under plain names; of the policy's others, the drift alone."""
+    figures: dict[str, float] = {}
+    first = next(iter(drifts)).label
+    for task, values in drifts.items():
+        ending = suffix(task.label, first)
+        names = [name for name in values if not ending or name == "drift"]
+        figures |= {f"evae/{name}{ending}": values[name] for name in names}
+    return figures
+
+
+def suffix(label: Sequence[str], first: Sequence[str]) -> str:
+    """What a metric's name says of its row: the words in which it differs from the first, or nothing."""
+    words = [word for word, usual in zip(label, first, strict=True) if word != usual]
+    return "".join(f"_{word.removeprefix('policy ')}" for word in words)
 
 
 def film_seed(episodes: np.ndarray) -> int:

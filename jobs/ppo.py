@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
@@ -15,15 +16,18 @@ from ray.tune.registry import register_env
 from envs.config import sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from jobs.config import Config, ConfigError
+from jobs.drift import drift_figures
 from jobs.learner import REWARD_SCALE, PlainPPOLearner
 from jobs.runner import PlainEnvRunner
+from models.evae import EventVAE
 from models.kinds import KINDS
 from models.rllib import module_spec
-from models.weights import load_encoder
+from models.weights import EncoderFileError, load_encoder
 
 ENV = "evade-corridors"
 NUM_ACTIONS = 3
 EPISODES = 100  # that a rate is averaged over
+DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
 LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
 FIRST_SAMPLE_S = 900.0  # a process that flies compiles for a minute first, on a busy machine for several
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
@@ -39,9 +43,17 @@ class FlightMetrics(RLlibCallback):
         """Begin without flights."""
         self._flights: deque[dict[str, float]] = deque(maxlen=EPISODES)
         self._unfinished: dict[str, float] = {}
+        self._rounds = 0
+        self._encoder: tuple[EventVAE, dict[str, Any]] | None = None
 
-    def on_sample_end(self, *, metrics_logger: Any, samples: Any, **kwargs: Any) -> None:
-        """Count the events of each step and the outcome of each flight that ended."""
+    def on_sample_end(
+        self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
+    ) -> None:
+        """Count the events of each step and the outcome of each flight that ended; measure drift at times."""
+        if env_runner is not None and self._rounds % DRIFT_EVERY == 0:
+            for name, value in self._drift(env_runner.module).items():
+                metrics_logger.log_value(name, value, window=1)
+        self._rounds += 1
         infos = [info for chunk in samples for info in chunk.get_infos()[1:]]
         events, dropped = (
             np.array([info[key] for info in infos]) for key in ("num_events", "dropped_events")
@@ -55,6 +67,26 @@ class FlightMetrics(RLlibCallback):
         for name in self._flights[0] if self._flights else ():
             mean = float(np.mean([flight[name] for flight in self._flights]))
             metrics_logger.log_value(name, mean, window=1)
+
+    def _drift(self, module: Any) -> dict[str, float]:
+        """The `jobs.drift.drift_figures` of the windows that the module met.
+
+        None without an encoder, or where its file is no longer there: the frozen part that
+        flies has no decoder.
+        """
+        about = module.model_config["encoder"]
+        if about is None or not module.met:
+            return {}
+        if self._encoder is None:
+            try:
+                with torch.random.fork_rng(devices=[]):  # a model is made with random weights first
+                    self._encoder = load_encoder(about["path"])
+            except EncoderFileError:
+                return {}
+        evae, manifest = self._encoder
+        if manifest["sha256"] != about["digest"]:
+            return {}
+        return drift_figures(evae, module.met, manifest.get("figures", {}))
 
 
 def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:

@@ -21,6 +21,7 @@ from envs.accuracy import measure
 from jobs.cluster import start_ray
 from jobs.conditions import Cell, Sweep, plan, read_manifest, swept_policy
 from jobs.config import Config
+from jobs.drift import DriftWatch
 from jobs.evaluate import VIEW_COLUMNS
 from jobs.figures import axis_figure
 from jobs.flights import EPISODE, check_sensor, fly, write_episodes
@@ -59,7 +60,7 @@ class KeepEpisodes(tune.Callback):
         """Keep one condition, beside the episodes that it has."""
         path = self.folder / f"{result['key']}.json"
         rows = {row[0]: row for row in [*kept_rows(path), *result["episodes"]]}
-        kept = {name: result[name] for name in ("label", "event_error", "renders_per_step")}
+        kept = {name: result[name] for name in ("label", "event_error", "renders_per_step", "encoder")}
         write_json(path, {**kept, "episodes": [rows[seed] for seed in sorted(rows)]})
         if self.advance is not None:
             self.advance(len(result["episodes"]), note=" ".join(result["label"]))
@@ -122,9 +123,10 @@ def kept_rows(path: Path) -> list[list[Any]]:
 
 
 def simulated(cell: Cell, kept: Path) -> dict[str, float]:
-    """How exact the events of a kept cell were, and how many renders that took."""
+    """How exact the events of a kept cell were, how many renders that took, and the encoder's drift."""
     values = json.loads((kept / f"{cell.key}.json").read_text())
-    return {f"sim/{name}": values[name] for name in ("event_error", "renders_per_step")}
+    drift = {f"evae/{name}": value for name, value in values.get("encoder", {}).items()}
+    return drift | {f"sim/{name}": values[name] for name in ("event_error", "renders_per_step")}
 
 
 def read_episodes(cell: Cell, kept: Path) -> np.ndarray:
@@ -153,7 +155,8 @@ def fly_cell(params: Mapping[str, Any]) -> None:
     """The trial of one cell, in a Ray worker; its result holds the episodes."""
     torch.set_num_threads(1)
     cell: Cell = params["cell"]
-    episodes = fly(make_pilot(cell.pilot, cell.action), cell.env, cell.seeds)
+    drift = DriftWatch(cell.pilot)
+    episodes = fly(make_pilot(cell.pilot, cell.action), cell.env, cell.seeds, watch=drift.add)
     accuracy = measure(cell.env)
     tune.report(
         {
@@ -162,6 +165,7 @@ def fly_cell(params: Mapping[str, Any]) -> None:
             "episodes": episodes.tolist(),
             "event_error": accuracy.error,
             "renders_per_step": accuracy.renders,
+            "encoder": drift.figures(),  # of the flights flown last
         }
     )
 

@@ -21,6 +21,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.cluster import start_ray
 from jobs.config import Config, ConfigError
+from jobs.drift import FIGURES
 from jobs.ppo import build_ppo, policy_settings
 from jobs.pretrain import check_sources, prepare_encoder
 from jobs.progress import progress
@@ -45,6 +46,7 @@ METRICS = {
     "train/gradient_norm": ("learners", "default_policy", "gradients_default_optimizer_global_norm"),
     "sim/events_per_step": ("env_runners", "events_per_step"),
     "sim/dropped_events": ("env_runners", "dropped_events"),
+    **{f"evae/{name}": ("env_runners", name) for name in FIGURES},
     "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
 }
 ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
@@ -138,12 +140,13 @@ def export_policy(
         TrainingError: If the checkpoint's encoder is not the one in the file.
     """
     module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
-    evae = None if encoder_path is None else load_encoder(encoder_path)[0]
+    evae, about = (None, {}) if encoder_path is None else load_encoder(encoder_path)
     frozen = {} if evae is None else evae.state_dict()
     flown = {} if module.encoder is None else module.encoder.state_dict()
     if not all(torch.equal(value, frozen[name]) for name, value in flown.items()):
         raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
-    save_policy(target, module.networks(), {**policy_settings(config), "figures": figures}, evae)
+    manifest = {**policy_settings(config), "figures": figures}
+    save_policy(target, module.networks(), manifest, evae, about.get("figures"))
 
 
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:

@@ -4,6 +4,7 @@ x, y, p and the time bin take finitely many values (appendix C), so that an even
 integers. Training (`EventBatch`) and the frozen table read the same addresses.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -117,8 +118,8 @@ def batch_windows(windows: list[tuple[Any, int, int]], grid: Grid) -> EventBatch
     return _join(parts, grid)
 
 
-def batch_packed(windows: np.ndarray, grid: Grid) -> EventBatch:
-    """Batch packed windows, int32 (B, capacity + 1, 4), as the environment observes them.
+def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> EventBatch:
+    """Batch packed windows, int32 (B, capacity + 1, 4) as the environment observes them, or cut short.
 
     Raises:
         ValueError: As `unpack_fields` and `index_events`.
@@ -144,6 +145,11 @@ def index_packed(window: np.ndarray, grid: Grid) -> np.ndarray:
         return np.empty((2, 0), np.int32)
     rows = window[1 : count + 1]
     return index_events((rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3]), 0, window_us, grid)
+
+
+def cut_packed(window: np.ndarray) -> np.ndarray:
+    """The used rows of a packed window, int32 (count + 1, 4), as a copy to keep."""
+    return window[: int(window[0, 0]) + 1].copy()
 
 
 def _join(parts: list[np.ndarray], grid: Grid) -> EventBatch:

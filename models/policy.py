@@ -133,7 +133,11 @@ class Policy:
 
 
 def save_policy(
-    path: str | Path, networks: nn.ModuleDict, manifest: Mapping[str, Any], evae: EventVAE | None = None
+    path: str | Path,
+    networks: nn.ModuleDict,
+    manifest: Mapping[str, Any],
+    evae: EventVAE | None = None,
+    encoder_figures: Mapping[str, float] | None = None,
 ) -> Path:
     """Write a policy folder that is sufficient alone; its manifest comes last, and seals it.
 
@@ -144,6 +148,7 @@ def save_policy(
             `hidden` (or None), `sensor` and `sensor_hash`; anything else that JSON holds,
             such as training figures.
         evae: The frozen event VAE, for a policy that has one.
+        encoder_figures: Its own held-out figures, for the encoder's manifest.
 
     Returns:
         The folder.
@@ -157,7 +162,8 @@ def save_policy(
     folder = Path(path)
     folder.mkdir(parents=True, exist_ok=True)
     if evae is not None:
-        save_encoder(folder / ENCODER, evae, {key: manifest[key] for key in ("sensor", "sensor_hash")})
+        facts = {key: manifest[key] for key in ("sensor", "sensor_hash")}
+        save_encoder(folder / ENCODER, evae, {**facts, "figures": dict(encoder_figures or {})})
     tensors = {name: value.detach().contiguous() for name, value in networks.state_dict().items()}
     write_atomic(folder / NETWORKS, safetensors.torch.save(tensors))
     sums = {name: _digest(folder / name) for name in _files(manifest["name"])}

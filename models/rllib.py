@@ -4,6 +4,7 @@
 last ones (`jobs.runner` keeps them). `models.policy` is the same policy without Ray.
 """
 
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,14 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor, nn
 
+from models.batch import cut_packed
 from models.features import feature_of
 from models.frozen import read_encoder_part, tabulate
 from models.networks import PARTS, build_networks
 from models.pictures import PictureEncoder
 from models.table import EncoderTable
 
+MET_WINDOWS = 128  # that a module remembers
 VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
 
 
@@ -39,6 +42,10 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
     The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
     checkpoint is sufficient alone. `model_config` holds what `module_spec` puts there.
+
+    Attributes:
+        met: With an encoder, the newest windows that it was shown, one of each vector step and
+            of each flight in turn, as `models.batch.cut_packed` cuts them.
     """
 
     def setup(self) -> None:
@@ -49,6 +56,8 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         networks = build_networks(settings, settings["seed"])
         self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
         self._table: EncoderTable | PictureEncoder | None = None
+        self.met: deque[np.ndarray] = deque(maxlen=MET_WINDOWS)
+        self._steps = 0
 
     def get_non_inference_attributes(self) -> list[str]:
         """What an env runner does without."""
@@ -70,8 +79,10 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     def features(self, observations: np.ndarray) -> np.ndarray:
         """Features (B, ...) of observations (B, ...)."""
         settings: Any = self.model_config
-        if self.encoder is not None and self._table is None:
-            self._table = tabulate(self.encoder, settings["encoder"]["settings"])
+        if self.encoder is not None:
+            self._table = self._table or tabulate(self.encoder, settings["encoder"]["settings"])
+            self.met.append(cut_packed(observations[self._steps % len(observations)]))
+            self._steps += 1
         return feature_of(settings).from_observations(observations, settings, self._table)
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -85,8 +96,8 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
             self._table = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the table, which is built from the encoder where it is needed."""
-        return {**self.__dict__, "_table": None}
+        """Everything but the table, which is built from the encoder where it is needed, and the windows."""
+        return {**self.__dict__, "_table": None, "met": deque(maxlen=MET_WINDOWS)}
 
     def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
         return {Columns.ACTION_DIST_INPUTS: self.pi(self.trunk(batch[Columns.OBS]))}

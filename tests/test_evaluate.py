@@ -7,6 +7,7 @@ import pytest
 from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.config import ConfigError
+from jobs.drift import FIGURES
 from jobs.evaluate import evaluate, film_seed, find_policy, tasks, tracked_figures
 from jobs.evaluate import run as run_evaluation
 from jobs.flights import EPISODE, Ways, check_sensor, fly
@@ -33,7 +34,8 @@ def save_untrained(path, env_config=HELD_OUT, name="brp_full"):
     for value in networks["pi"].parameters():
         value.data *= 1000.0
     evae = EventVAE(context=64).freeze() if kind.encoder else None
-    return save_policy(path, networks, {"name": name, **sizes, **parts, **about}, evae)
+    manifest = {"name": name, **sizes, **parts, **about}
+    return save_policy(path, networks, manifest, evae, {"reconstruction_step": 0.5})
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +194,11 @@ def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, nam
     assert (run.evaluation / "trajectories.png").stat().st_size > 10_000
     assert (run.evaluation / "episode.mp4").stat().st_size > 5_000
     assert not list(run.evaluation.glob(".*"))
+    measured = {key for key in figures if key.startswith("evae/")}
+    plain = {f"evae/{part}" for part in FIGURES}
+    others = {f"evae/drift_{row}" for row in ("deterministic", "poles", "deterministic_poles")}
+    assert measured == (plain | others if KINDS[name].encoder else set())
+    assert len(figures) <= 40
     assert (
         tracker.client.get_run(tracker.run_id).data.metrics["eval/distance_m"] == figures["eval/distance_m"]
     )

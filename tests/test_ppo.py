@@ -1,5 +1,7 @@
 import functools
 import math
+import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 
 from envs.windows import unpack_window
 from jobs.config import ConfigError
+from jobs.drift import FIGURES, drift_figures
 from jobs.ppo import build_ppo, network_settings, policy_settings
 from jobs.runner import PlainEnvRunner
 from models.features import feature_of
@@ -301,6 +304,59 @@ def test_returns_are_reported_unscaled(encoded_runner):
     assert metrics["success_rate"] == metrics["collision_rate"] == 0.0
     assert metrics["dropped_events"] == 0.0
     assert metrics["events_per_step"] > 0.0
+
+
+def test_a_module_remembers_the_newest_windows_of_all_flights_in_turn(encoded_runner):
+    module = encoded_runner.module
+    windows = np.zeros((2, 5, 4), np.int32)
+    for step in range(300):
+        windows[:, 0] = [[2, 0, 5000, step], [4, 0, 5000, 1000 + step]]
+        windows[:, 1:, 3] = 1
+        module.features(windows)
+    assert len(module.met) == 128
+    assert [int(kept[0, 3]) for kept in module.met] == [step + 1000 * (step % 2) for step in range(172, 300)]
+    assert {len(kept) for kept in module.met} == {3, 5}
+    windows[:] = 0
+    assert module.met[-1][0, 0] == 4  # a copy
+    assert len(pickle.loads(pickle.dumps(module.__getstate__()["met"]))) == 0
+
+
+def drift_of(runner, rounds=1):
+    """What a runner tells of its encoder in the last of some rounds; the samples of all."""
+    samples, told = [], {}
+    for _ in range(rounds):
+        samples += runner.sample(num_timesteps=30)
+        metrics = {
+            name: getattr(value, "peek", lambda: math.nan)() for name, value in runner.get_metrics().items()
+        }
+        told = {name: metrics[name] for name in FIGURES if not math.isnan(metrics.get(name, math.nan))}
+    return told, samples
+
+
+def test_drift_is_measured_every_tenth_round_on_what_the_policy_met(encoded_runner, encoder):
+    first, _ = drift_of(encoded_runner)
+    evae, about = load_encoder(encoder)
+    expected = drift_figures(evae, encoded_runner.module.met, {"reconstruction_step": 0.5})
+    assert first == pytest.approx(expected | {"drift": expected["policy_reconstruction"] / 0.5})
+    assert about["figures"] == {"reconstruction_step": 0.5}
+    assert drift_of(encoded_runner)[0] == drift_of(encoded_runner, 8)[0] == {}
+    assert set(drift_of(encoded_runner)[0]) == set(FIGURES)
+
+
+def test_without_its_file_an_encoder_is_flown_but_not_measured_and_nothing_else_changes(
+    encoder, tmp_path, monkeypatch
+):
+    flights = []
+    for there in (True, False):
+        path = shutil.copytree(encoder.parent, tmp_path / str(there)) / encoder.name
+        runner = PlainEnvRunner(config=make_ppo("brp_full", path, *SHORT), worker_index=0)
+        if not there:
+            path.unlink()
+        told, samples = drift_of(runner)
+        runner.stop()
+        assert bool(told) is there
+        flights.append(np.concatenate([chunk.get_actions() for chunk in samples]))
+    np.testing.assert_array_equal(*flights)
 
 
 def test_the_same_seed_gives_the_same_flights(ppo):

@@ -10,10 +10,12 @@ from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from jobs import sweep as sweeping
 from jobs.conditions import plan, read_manifest, swept_policy, with_sensor
 from jobs.config import ConfigError
+from jobs.drift import FIGURES
 from jobs.flights import EPISODE
 from jobs.runs import open_run
 from jobs.sweep import KeepEpisodes, fly_cells, read_episodes, unflown
 from jobs.tracking import open_store
+from models.kinds import KINDS
 from tests.test_evaluate import save_untrained
 from tests.test_runs import small_config
 
@@ -48,7 +50,7 @@ class StubTuner:
             rows["seed"], rows["distance_m"] = cell.seeds, 50.0
             self.flown += [(cell.key, seed) for seed in cell.seeds]
             result = {"key": cell.key, "label": list(cell.label), "episodes": rows.tolist()}
-            result |= {"event_error": 0.01, "renders_per_step": 3.0}
+            result |= {"event_error": 0.01, "renders_per_step": 3.0, "encoder": {}}
             self.keep.on_trial_result(1, [], None, result)
         return type("Results", (), {"errors": []})()
 
@@ -112,7 +114,7 @@ def test_episodes_survive_their_file_unchanged(tmp_path):
     flown = np.array([(3, True, False, False, 100.0, 200.0, 1000, 1 / 3, 2)], EPISODE)
     keep = KeepEpisodes(tmp_path)
     result = {"key": cell.key, "label": list(cell.label), "episodes": flown.tolist()}
-    keep.on_trial_result(1, [], None, result | {"event_error": 0.01, "renders_per_step": 3.0})
+    keep.on_trial_result(1, [], None, result | {"event_error": 0.01, "renders_per_step": 3.0, "encoder": {}})
     np.testing.assert_array_equal(read_episodes(cell, tmp_path), flown)
     assert unflown(cell, tmp_path).seeds == ()
 
@@ -252,6 +254,10 @@ def test_conditions_flown_as_tune_trials_come_back_with_the_policys_episodes(tmp
     assert set(sweeping.run(config).values()) == {0.0}
     kept = sorted((open_run(config).path / "sweep" / "episodes").glob("*.json"))
     before = [path.read_text() for path in kept]
+    cells = [json.loads(text) for text in before]
+    measured = [set(cell["encoder"]) for cell in cells if cell["label"][0] in AXES]
+    assert measured == 3 * [set(FIGURES) if KINDS[name].encoder else set()]
+    assert not any(cell["encoder"] for cell in cells if cell["label"][0] not in AXES)
     assert len(kept) == 5
     assert sweeping.run(config)
     assert [path.read_text() for path in kept] == before

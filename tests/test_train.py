@@ -46,7 +46,8 @@ def write_encoder(folder, config):
         parameter.data.mul_(1.5)
     sensor = sensor_settings(config.env_config())
     path = folder / "encoder.safetensors"
-    save_encoder(path, evae.freeze(), {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
+    about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {"reconstruction_step": 0.5}}
+    save_encoder(path, evae.freeze(), about)
     return path
 
 
@@ -82,7 +83,7 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
     assert metrics["train/value_loss"] == 2.0
     assert metrics["perf/env_steps_per_second"] == 1024.0
     assert math.isnan(metrics["train/success_rate"])
-    assert 12 <= len(metrics) <= 16
+    assert 12 <= len(metrics) <= 20
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
@@ -176,6 +177,9 @@ def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     steps = [json.loads(line)["env_steps"] for line in results.read_text().splitlines()]
     assert steps == sorted(set(steps))
     assert steps[-1] >= 4000
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    assert {row["evae/drift"] is None for row in rows} == {True, False}  # not measured in each iteration
+    assert json.loads((folder.policy / "encoder.json").read_text())["figures"] == {"reconstruction_step": 0.5}
     episodes = [json.loads(line)["train/episodes"] for line in results.read_text().splitlines()]
     assert episodes == sorted(episodes)  # counted on, not anew
     policy = load_policy(folder.policy)

@@ -1,0 +1,80 @@
+"""Drift: how well a frozen event VAE knows the windows that a policy meets.
+
+It was pretrained on other flights than the policy's own. `drift` is the mean reconstruction
+error of a pixel over windows of one control step that the policy met, divided by the same error
+over the held-out windows of one control step of the encoder's own recording: 1 where the policy
+meets what the encoder knows, 1.2 where a pixel's error is a fifth larger. A picture with more
+events has a larger error too; `policy_explained` and `policy_auc` say whether it is told from
+others as well as before.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from models.batch import batch_packed, cut_packed
+from models.evae import EventVAE, event_targets, validate
+from models.policy import ENCODER
+from models.weights import load_encoder
+
+FIGURES = ("policy_reconstruction", "policy_kl", "policy_explained", "policy_auc", "drift")
+MOST_WINDOWS = 512
+THINNED = 3  # not 2, which of eight flights in lock-step would keep the windows of some alone
+
+
+class DriftWatch:
+    """Keeps windows while a policy with an event VAE is flown, and says how well that knows them.
+
+    All windows at first, and of many every third, ninth, ...: at most `MOST_WINDOWS`, spread
+    evenly over all steps. Of a pilot without an encoder it keeps nothing.
+    """
+
+    def __init__(self, pilot: str | Path) -> None:
+        """Watch the policy of a folder; a bound's name stands for a pilot without encoder."""
+        self._file = Path(pilot) / ENCODER
+        self._watching = self._file.is_file()
+        self._every, self._steps = 1, 0
+        self.windows: list[np.ndarray] = []
+
+    def add(self, env: Any, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
+        """Keep the window of a step, if it is its turn (`jobs.flights.Watch`)."""
+        if not self._watching:
+            return
+        if self._steps % self._every == 0:
+            self.windows.append(cut_packed(observation))
+        self._steps += 1
+        if len(self.windows) > MOST_WINDOWS:
+            self.windows, self._every = self.windows[::THINNED], self._every * THINNED
+
+    def figures(self) -> dict[str, float]:
+        """The `drift_figures` of what was met; none if nothing was, or if a lean encoder draws nothing."""
+        if not self.windows:
+            return {}
+        evae, manifest = load_encoder(self._file)
+        if evae.decoder is None:
+            return {}
+        return drift_figures(evae, self.windows, manifest.get("figures", {}))
+
+
+def drift_figures(
+    evae: EventVAE, windows: Sequence[np.ndarray], held_out: Mapping[str, float]
+) -> dict[str, float]:
+    """Figures of an event VAE on the windows that a policy met.
+
+    Args:
+        evae: In eval mode.
+        windows: Packed windows int32 (rows, 4), at least one.
+        held_out: The encoder's own figures, of its manifest.
+
+    Returns:
+        `policy_reconstruction`, `policy_kl`, `policy_explained` and `policy_auc` as
+        `models.evae.validate` defines them, and `drift` where the encoder's own error of one
+        control step is known.
+    """
+    batch = batch_packed(windows, evae.grid)
+    values = validate(evae, batch, event_targets(batch, evae.target))
+    figures = {f"policy_{name}": values[name] for name in ("reconstruction", "kl", "explained", "auc")}
+    own = held_out.get("reconstruction_step", 0.0)
+    return figures | ({"drift": values["reconstruction"] / own} if own > 0 else {})

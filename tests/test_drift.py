@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+import torch
+
+from envs.config import EnvConfig
+from envs.events import EVENT
+from envs.windows import pack_window
+from jobs.drift import FIGURES, MOST_WINDOWS, DriftWatch, drift_figures
+from jobs.flights import fly
+from jobs.pilots import make_pilot
+from models.batch import batch_packed
+from models.evae import EventVAE, event_targets, validate
+from models.policy import ENCODER
+from models.weights import load_encoder
+from tests.test_evaluate import save_untrained
+
+
+def window(count, seed=0):
+    rng = np.random.default_rng(seed)
+    events = np.zeros(count, EVENT)
+    events["t"] = np.sort(rng.integers(1, 5001, count))
+    events["x"], events["y"], events["p"] = rng.integers(64, size=count), rng.integers(64, size=count), 1
+    return pack_window(events, 0, 5000, 4096)
+
+
+@pytest.fixture(scope="module", params=["brp_full", "eivae"])
+def evae(request):
+    torch.manual_seed(0)
+    return EventVAE(variant=request.param, context=16, target="occupancy").freeze()
+
+
+def test_the_figures_are_those_of_the_windows_and_drift_is_the_ratio_to_the_encoders_own(evae):
+    windows = np.stack([window(50 * n, n) for n in range(6)])
+    batch = batch_packed(windows, evae.grid)
+    expected = validate(evae, batch, event_targets(batch, "occupancy"))
+    figures = drift_figures(evae, windows, {"reconstruction_step": 0.25})
+    assert set(figures) == set(FIGURES)
+    assert figures["policy_auc"] == expected["auc"]
+    assert figures["policy_kl"] == expected["kl"]
+    assert figures["drift"] == pytest.approx(4 * expected["reconstruction"])
+    at_home = drift_figures(evae, windows, {"reconstruction_step": expected["reconstruction"]})
+    assert at_home["drift"] == 1.0
+    assert set(drift_figures(evae, windows, {})) == set(FIGURES) - {"drift"}
+
+
+def test_windows_without_events_have_figures_too(evae):
+    figures = drift_figures(evae, [window(0)[:1]] * 2, {"reconstruction_step": 0.2})
+    assert np.isfinite(list(figures.values())).all()
+    assert (figures["policy_auc"], figures["policy_explained"]) == (0.5, 0.0)
+
+
+def test_the_windows_kept_are_few_and_from_all_over_the_flights(tmp_path):
+    watch = DriftWatch(save_untrained(tmp_path / "policy"))
+    for step in range(10_000):
+        observation = np.zeros((3, 4), np.int32)
+        observation[0, 3] = step
+        watch.add(None, 0, observation, {})
+        assert len(watch.windows) <= MOST_WINDOWS
+    steps = np.array([int(kept[0, 3]) for kept in watch.windows])
+    assert len(steps) > MOST_WINDOWS / 3.1
+    assert len(set(np.diff(steps))) == 1
+    assert steps[-1] > 9_900
+    assert np.bincount(steps % 8).min() > 0.9 * len(steps) / 8  # of flights in lock-step, all
+
+
+def test_a_flown_policy_is_measured_by_the_encoder_of_its_folder_on_what_it_saw(tmp_path):
+    source = save_untrained(tmp_path / "policy")
+    evae, about = load_encoder(source / ENCODER)
+    watch, seen = DriftWatch(source), []
+    config = EnvConfig(time_limit_s=0.1, split="eval")
+    pilot = make_pilot(str(source))
+    fly(pilot, config, [0, 1], watch=lambda *step: (watch.add(*step), seen.append(step[2].copy())))
+    figures = drift_figures(evae, seen, {"reconstruction_step": 0.5})
+    assert watch.figures() == pytest.approx(figures, rel=1e-5)
+    assert about["figures"] == {"reconstruction_step": 0.5}
+
+
+@pytest.mark.parametrize("name", ["eip", "event_columns"])
+def test_a_pilot_without_an_event_vae_has_no_drift(tmp_path, name):
+    for pilot in (save_untrained(tmp_path / name, name=name), "straight"):
+        watch = DriftWatch(pilot)
+        fly(make_pilot(str(pilot)), EnvConfig(time_limit_s=0.05), [0], watch=watch.add)
+        assert watch.figures() == {}
+        assert watch.windows == []
+
+
+def test_a_measurement_takes_no_random_number(evae):
+    state = torch.get_rng_state()
+    drift_figures(evae, [window(20)], {})
+    assert torch.equal(torch.get_rng_state(), state)
