@@ -14,6 +14,8 @@ import numpy as np
 from models.embedding import time_bin
 
 MAX_WINDOW_US = 1 << 46
+EMPTY, ON, OFF = 0, 1, 2  # kinds of a row of events
+MAX_ROW = 1 << 15  # sides and time bins that a row of int16 holds
 
 
 class Grid(NamedTuple):
@@ -150,6 +152,90 @@ def index_packed(window: np.ndarray, grid: Grid) -> np.ndarray:
 def cut_packed(window: np.ndarray) -> np.ndarray:
     """The used rows of a packed window, int32 (count + 1, 4), as a copy to keep."""
     return window[: int(window[0, 0]) + 1].copy()
+
+
+def thin(address: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of a window's addresses (2, N), evenly over their order.
+
+    Of N > most the one in the middle of each of `most` equal parts is kept.
+    """
+    count = address.shape[1]
+    if count <= most:
+        return address
+    return address[:, ((2 * np.arange(most) + 1) * count) // (2 * most)]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def event_rows(address: np.ndarray, size: int, width: int, height: int) -> np.ndarray:
+    """A window's addresses as an array of fixed size, int16 (size, 4): [kind, time bin, x, y] each.
+
+    Args:
+        address: int32 (2, N) with N <= size; sides and time bins are at most 2^15.
+        size: Rows.
+        width: Pixels.
+        height: Pixels.
+
+    Returns:
+        kind is 1 for ON, 2 for OFF, 0 for no event: the rows after the N events.
+    """
+    rows = np.zeros((size, 4), np.int16)
+    for n in range(address.shape[1]):
+        code = address[0, n]
+        rows[n, 0] = ON if code >= width * height else OFF
+        rows[n, 1] = address[1, n]
+        rows[n, 2], rows[n, 3] = code % width, code // width % height
+    return rows
+
+
+def batch_rows(rows: np.ndarray, grid: Grid) -> EventBatch:
+    """Batch windows given as `event_rows`, integers (B, size, 4); rows without an event are left out.
+
+    Raises:
+        ValueError: A row is no event of the grid.
+    """
+    address = np.empty((2, rows.shape[0] * rows.shape[1]), np.int32)
+    offsets = np.zeros(len(rows) + 1, np.int64)
+    bad = _unroll(rows, (grid.width, grid.height, grid.time_bins), address, offsets)
+    if bad >= 0:
+        kind, time, x, y = rows.reshape(-1, 4)[bad].tolist()
+        rule = f"need kind 0, 1 or 2, time < {grid.time_bins}, x < {grid.width}, y < {grid.height}"
+        raise ValueError(f"row {bad} of events has kind={kind}, time={time}, x={x}, y={y}: {rule}")
+    code, time_bins = address[:, : offsets[-1]]
+    return EventBatch(grid, code, time_bins, offsets)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _unroll(rows, grid, address, offsets) -> int:  # type: ignore[no-untyped-def]
+    """Fill `address` and `offsets`; the index of the first refused row, or -1."""
+    width, height, time_bins = grid
+    found = 0
+    for b in range(rows.shape[0]):
+        for k in range(rows.shape[1]):
+            kind, time = np.int64(rows[b, k, 0]), np.int64(rows[b, k, 1])
+            x, y = np.int64(rows[b, k, 2]), np.int64(rows[b, k, 3])
+            if kind == EMPTY:
+                continue
+            inside = 0 <= x < width and 0 <= y < height and 0 <= time < time_bins
+            if not inside or (kind != ON and kind != OFF):
+                return b * rows.shape[1] + k
+            address[0, found] = ((kind == ON) * height + y) * width + x
+            address[1, found] = time
+            found += 1
+        offsets[b + 1] = found
+    return -1
+
+
+def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distinct non-negative integers, how often each occurs, and the place of each value among them.
+
+    Returns:
+        present (U,) in rising order, multiplicity (U,), rank int32 (N,) with present[rank] == values.
+    """
+    multiplicity = np.bincount(values)
+    present = np.flatnonzero(multiplicity)
+    rank = np.empty(len(multiplicity), np.int32)
+    rank[present] = np.arange(len(present), dtype=np.int32)
+    return present, multiplicity[present], rank[values]
 
 
 def _join(parts: list[np.ndarray], grid: Grid) -> EventBatch:

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.batch import EventBatch, Grid
+from models.batch import EventBatch, Grid, distinct
 from models.embedding import embedding_table, eventnet_phase
 
 DTYPES = (torch.float32, torch.float64)
@@ -72,13 +72,10 @@ class EventContextNetwork(nn.Module):
         if self.layers[0].weight.device.type != "cpu":
             return self.plain(batch)
         cell, bins, embedding = self._address(batch)
-        multiplicity = np.bincount(cell)
-        present = np.flatnonzero(multiplicity)
-        rank = np.empty(len(multiplicity), np.int32)
-        rank[present] = np.arange(len(present), dtype=np.int32)
-        share = self._share(multiplicity[present], len(cell))
+        present, multiplicity, rank = distinct(cell)
+        share = self._share(multiplicity, len(cell))
         h, weight, bias = self._last_layer(self._inputs(present), share, len(cell))
-        events, squash = (rank[cell], bins, batch.offsets, embedding), self.coding == "eventnet"
+        events, squash = (rank, bins, batch.offsets, embedding), self.coding == "eventnet"
         ordered = newest_first(events) if squash else events
         context, winning_bin = MaxContext.apply(h, weight, bias, ordered, squash)
         return self._rotated(context, winning_bin) if squash else context

@@ -22,7 +22,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from models.event_set import EVENTS, FIRST_OFF, TIMES
+from models.batch import OFF as OFF_ROW
+from models.batch import ON as ON_ROW
+from models.event_set import EVENTS, TIMES, EventSet
 from models.features import GAMMA, OFF, ON, feature_of
 from models.kinds import KINDS
 from models.pictures import OFF_SHARE, PictureEncoder
@@ -77,6 +79,7 @@ class FlyingPolicy(nn.Module):
         self.size = manifest["height"], manifest["width"]
         self.sees_events = feature.from_events is not None
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
+        self.read = self.trunk.plain if isinstance(self.trunk, EventSet) else self.trunk
         self.kind = KINDS[manifest["name"]].feature
         if isinstance(policy.encoder, PictureEncoder):
             self.kind, self.layers, self.latent = "picture_latent", policy.encoder.layers, manifest["latent"]
@@ -103,7 +106,7 @@ class FlyingPolicy(nn.Module):
         feature = MAKERS[self.kind](self, *seen).to(self.dtype)
         pushed = torch.cat([stack[1:], feature[None]])
         stack = torch.where(first, feature[None].expand(self.shape), pushed)
-        return self.pi(self.trunk(stack[None]))[0], stack
+        return self.pi(self.read(stack[None]))[0], stack
 
 
 def _latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
@@ -124,7 +127,7 @@ def _picture_latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> 
 
 
 def _events(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
-    """Rows of at most `EVENTS` events, evenly over their order (`models.event_set.thinned`)."""
+    """Rows of at most `EVENTS` events, evenly over their order (`models.batch.thin`)."""
     count = torch.ones_like(events[:, 0]).sum()
     kept = count.clamp(max=EVENTS)
     k = torch.arange(EVENTS)
@@ -132,7 +135,7 @@ def _events(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
     padded = torch.cat([events, torch.zeros(1, 4, dtype=torch.int64)])
     t, x, y, p = padded[torch.minimum(places, count)].unbind(1)
     bins = _bins(t, window_us, TIMES)
-    rows = torch.stack([torch.where(p > 0, 1, FIRST_OFF), bins, x, y], dim=1)
+    rows = torch.stack([torch.where(p > 0, ON_ROW, OFF_ROW), bins, x, y], dim=1)
     return torch.where((k < kept)[:, None], rows, 0)
 
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from models.batch import Grid, index_events, index_packed
-from models.event_set import EVENTS, TIMES, thinned
+from models.batch import Grid, event_rows, index_events, index_packed, thin
+from models.event_set import EVENTS, TIMES
 from models.kinds import KINDS
 
 ON, OFF = 255, 125  # picture values of polarities (appendix D.1.2)
@@ -149,13 +149,17 @@ def _columns_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray
     return column_counts(_address(step, settings), settings["width"], settings["height"])
 
 
+def _rows(address: np.ndarray, grid: Grid) -> np.ndarray:
+    return event_rows(thin(address, EVENTS), EVENTS, grid.width, grid.height)
+
+
 def _set_of_windows(windows: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
     grid = _grid(settings, TIMES)
-    return np.stack([thinned(index_packed(window, grid), grid.width, grid.height) for window in windows])
+    return np.stack([_rows(index_packed(window, grid), grid) for window in windows])
 
 
 def _set_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
-    return thinned(_address(step, settings, TIMES), settings["width"], settings["height"])
+    return _rows(_address(step, settings, TIMES), _grid(settings, TIMES))
 
 
 def _same_pictures(pictures: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:

@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from models.batch import EventBatch, Grid, batch_packed, batch_windows
+from models.batch import (
+    EventBatch,
+    Grid,
+    batch_packed,
+    batch_rows,
+    batch_windows,
+    distinct,
+    event_rows,
+    thin,
+)
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 GRID = Grid(width=5, height=3, time_bins=10)
@@ -92,3 +101,47 @@ def test_addresses_outside_of_the_tables_are_refused(changes, message):
     fields = {"code": np.array([3], np.int32), "bin": np.array([2], np.int32), "offsets": np.array([0, 1])}
     with pytest.raises(ValueError, match=message):
         EventBatch(GRID, **{**fields, **changes})
+
+
+def addresses(count, seed=0, width=40, height=30, time_bins=1024):
+    rng = np.random.default_rng(seed)
+    code = rng.integers(0, 2 * width * height, count)
+    return np.stack([code, np.sort(rng.integers(0, time_bins, count))]).astype(np.int32)
+
+
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 5000])
+def test_the_events_that_are_kept_are_spread_evenly_over_the_window(count):
+    address = np.stack([np.arange(count), np.arange(count)]).astype(np.int32)
+    kept = thin(address, 64)[0]
+    assert len(kept) == min(count, 64)
+    if count <= 64:
+        assert kept.tolist() == list(range(count))
+    else:
+        gaps = np.diff([-1, *kept, count])
+        assert gaps[1:-1].max() <= count / 64 + 1
+        assert max(gaps[0], gaps[-1]) <= count / 128 + 1.5
+
+
+def test_a_row_says_kind_time_and_place_and_empty_rows_follow():
+    address = np.array([[1200 + 5 * 40 + 7, 39], [300, 1023]], np.int32)
+    rows = event_rows(address, 4, 40, 30)
+    assert (rows.dtype, rows.tolist()) == (np.int16, [[1, 300, 7, 5], [2, 1023, 39, 0], [0] * 4, [0] * 4])
+
+
+def test_rows_hold_a_window_exactly_up_to_the_largest_sides_and_time_bins():
+    grid = Grid(1 << 9, 1 << 7, 1 << 15)
+    parts = [addresses(count, count, *grid) for count in (30, 0, 64)]
+    rows = np.stack([event_rows(part, 64, grid.width, grid.height) for part in parts])
+    batch = batch_rows(rows, grid)
+    assert batch.offsets.tolist() == [0, 30, 30, 94]
+    np.testing.assert_array_equal(np.stack([batch.code, batch.bin]), np.concatenate(parts, axis=1))
+    shuffled = rows[:, np.random.default_rng(0).permutation(64)]
+    np.testing.assert_array_equal(np.sort(batch_rows(shuffled, grid).code[:30]), np.sort(parts[0][0]))
+
+
+def test_distinct_values_are_counted_and_found_again():
+    values = np.array([7, 2, 7, 7, 0])
+    present, multiplicity, rank = distinct(values)
+    assert (present.tolist(), multiplicity.tolist()) == ([0, 2, 7], [1, 1, 3])
+    np.testing.assert_array_equal(present[rank], values)
+    assert [len(part) for part in distinct(values[:0])] == [0, 0, 0]

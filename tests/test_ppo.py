@@ -228,9 +228,9 @@ def test_training_moves_the_networks_and_never_the_encoder(name, runner, ppo, en
 
 def test_the_values_of_a_batch_are_those_of_the_loss(runner, ppo):
     learner = ppo.build_learner(env=runner.env)
-    module, space = learner.module["default_policy"], ppo.rl_module_spec.observation_space
-    space.seed(0)
-    batch = {"obs": torch.from_numpy(np.stack([space.sample() for _ in range(300)]))}
+    module, samples = learner.module["default_policy"], runner.sample(num_timesteps=300)
+    stacks = np.concatenate([chunk.get_observations() for chunk in samples])[:300]
+    batch = {"obs": torch.from_numpy(stacks)}
     targets = module.compute_values(batch)
     outputs = module.forward_train(batch)
     values = module.compute_values(batch, embeddings=outputs["embeddings"])
