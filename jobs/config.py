@@ -41,6 +41,7 @@ class ModelConfig:
     norm: Literal["batch", "none"] | None
     target: Literal["signed", "occupancy"] | None
     time_bins: Annotated[int, Field(ge=2, le=65536)] | None
+    coding: Literal["additive", "eventnet", "none"] | None
     stack: Annotated[int, Field(ge=1, le=32)]
     hidden: list[Count] | None
 
@@ -55,6 +56,9 @@ class ModelConfig:
             if wants != (value is not None):
                 rule = f"be given for {self.name}" if wants else f"be null: {self.name} has no such part"
                 raise ValueError(f"{setting} must {rule}, got {value!r}")
+        if self.coding == "eventnet" and self.name != "brp_full":
+            rule = f"must be additive or none for {self.name}, which has no time"
+            raise ValueError(f"coding {rule}, got 'eventnet'")
         return self
 
 
@@ -214,7 +218,7 @@ class Config:
         return EnvConfig(**{**self.env, **parts, **changes})
 
 
-EVAE_SETTINGS = ("context", "latent", "norm", "target", "time_bins")
+EVAE_SETTINGS = ("context", "latent", "norm", "target", "time_bins", "coding")
 HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
 ENV_PARTS = ("camera", "faults", "renderer", "fidelity")
 ENV_KEYS = [

@@ -52,9 +52,11 @@ def run(config: Config) -> dict[str, Any]:
     Raises:
         ConfigError: The policy has no encoder that reads events one by one.
     """
-    name = locate_run(config).config.model.name
-    if name not in EVENT_ENCODERS:
-        raise ConfigError(f"model: {name} has no encoder of single events; choose brp_full or brp_xy")
+    model = locate_run(config).config.model
+    if model.name not in EVENT_ENCODERS:
+        raise ConfigError(f"model: {model.name} has no encoder of single events; choose brp_full or brp_xy")
+    if model.coding == "eventnet":
+        raise ConfigError("model.coding: must be additive or none for this study, got 'eventnet'")
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:

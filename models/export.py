@@ -85,10 +85,12 @@ class FlyingPolicy(nn.Module):
             self.kind, self.layers, self.latent = "picture_latent", policy.encoder.layers, manifest["latent"]
         elif policy.encoder is not None:
             table = policy.encoder
-            self.time_bins, (self.height, self.width) = table.grid.time_bins, self.size
+            self.time_bins, self.turns = table.grid.time_bins, table.phase is not None
             arrays = {"features": table.features, "embedding": table.embedding}
             for name, (weight, bias) in {"hidden": table.hidden, "head": table.head}.items():
                 arrays |= {f"{name}_weight": weight, f"{name}_bias": bias}
+            if table.phase is not None:
+                arrays["phase"] = table.phase
             for name, array in arrays.items():
                 self.register_buffer(name, torch.from_numpy(array.copy()))
 
@@ -114,7 +116,12 @@ def _latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
     t, _, _, _ = events.unbind(1)
     bins = _bins(t, window_us, policy.time_bins)
     rows = policy.features[_code(policy, events) % len(policy.features)] + policy.embedding[bins]
-    context = torch.cat([rows, torch.zeros(1, rows.shape[1])]).amax(0)  # 0 without events
+    rows = torch.cat([rows, torch.zeros(1, rows.shape[1])])
+    context = rows.amax(0)  # 0 without events
+    if policy.turns:  # EventNet's coding: the phase of the newest event of this magnitude
+        times = torch.cat([bins, torch.zeros(1, dtype=bins.dtype)])
+        newest = torch.where(rows == context, times[:, None], 0).amax(0)
+        context = (context * policy.phase[:, newest]).flatten()
     hidden = torch.relu(policy.hidden_weight @ context + policy.hidden_bias)
     return policy.head_weight @ hidden + policy.head_bias
 

@@ -144,6 +144,13 @@ def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
             parse(changed(values, f"model.{key}", other))
 
 
+@pytest.mark.parametrize("name", ["brp_xy", "eivae"])
+def test_a_code_that_forgets_is_refused_where_there_is_no_time(composed, name):
+    with pytest.raises(ConfigError, match=f"coding must be additive or none for {name}.*got 'eventnet'"):
+        parse(composed("+exp=bytestream", f"model={name}", "model.coding=eventnet"))
+    assert parse(composed("+exp=bytestream", "model.coding=eventnet")).model.coding == "eventnet"
+
+
 def test_a_whole_number_names_the_same_run_as_its_float(composed):
     words = ("env.control_hz=100", "env.control_hz=100.0")
     assert len({run_name(parse(composed("+exp=bytestream", word))) for word in words}) == 1
@@ -200,6 +207,7 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("model.name", "snn", f"name must be one of {', '.join(KINDS)}, got 'snn'"),
         ("model.latent", None, "latent must be given for brp_full, got None"),
         ("model.hidden", None, "hidden must be given for brp_full, got None"),
+        ("model.coding", "phase", "'additive', 'eventnet' or 'none', got 'phase'"),
     ],
 )
 def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule):

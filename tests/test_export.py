@@ -44,13 +44,17 @@ def fly_exported(file, shown, shape, dtype):
     return np.array(logits)
 
 
-@pytest.fixture(scope="module", params=[*FLOWN, "brp_xy"])
+@pytest.fixture(scope="module", params=[*FLOWN, "brp_xy", "eventnet"])
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
-    if name != "brp_xy":
+    if name not in ("brp_xy", "eventnet"):
         return save(path, name)
     torch.manual_seed(0)
-    evae = EventVAE(variant=name, width=SIDE, height=SIDE, context=64, time_bins=32).freeze()
+    changes = {"variant": "brp_xy"} if name == "brp_xy" else {"coding": "eventnet"}
+    evae = EventVAE(width=SIDE, height=SIDE, context=64, time_bins=32, **changes).freeze()
+    for parameter in evae.ecn.layers.parameters():  # so that magnitudes outlive many ages
+        parameter.data.mul_(3.0)
+    name = evae.settings["variant"]
     return save_policy(path, make_networks(name), make_settings(name), evae)
 
 

@@ -6,7 +6,7 @@ import torch
 
 from envs.config import EnvConfig
 from jobs.collect import record
-from jobs.config import ConfigError, ModelConfig, PretrainConfig
+from jobs.config import EVAE_SETTINGS, ConfigError, ModelConfig, PretrainConfig
 from jobs.pretrain import (
     beta,
     check_sources,
@@ -187,9 +187,7 @@ def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anyt
 
 
 def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
-    model = ModelConfig(
-        "eip", context=None, latent=None, norm=None, target=None, time_bins=None, stack=3, hidden=None
-    )
+    model = ModelConfig(name="eip", stack=3, hidden=None, **dict.fromkeys(EVAE_SETTINGS))
     config = dataclasses.replace(small_config(tmp_path), model=model)
     with pytest.raises(ConfigError, match="model: eip has no event VAE to pretrain; go on with job=train"):
         run(config)

@@ -194,4 +194,8 @@ def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(
     config = dataclasses.replace(small_config(tmp_path, job="trade_encoder"), model=model)
     with pytest.raises(ConfigError, match="event_columns has no encoder of single events"):
         trade_encoder.run(config)
+    full = small_config(tmp_path, job="trade_encoder")
+    config = dataclasses.replace(full, model=dataclasses.replace(full.model, coding="eventnet"))
+    with pytest.raises(ConfigError, match=r"model\.coding: must be additive or none.*got 'eventnet'"):
+        trade_encoder.run(config)
     assert not list(tmp_path.iterdir())
