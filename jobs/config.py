@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, Fraction, Positive
 from jobs.refusals import JOBS_CHOOSE, explain, nearest, refused_scenes
-from models.kinds import KINDS, SMALLEST_IMAGE
+from models.kinds import FINETUNED, KINDS, MOST_TIME_BINS, SMALLEST_IMAGE
 
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -31,8 +31,8 @@ class ConfigError(ValueError):
 class ModelConfig:
     """The policy's representation and network (appendix A.1, D.1.2).
 
-    The settings of the event VAE (`EVAE_SETTINGS`) are None for a policy without one, `hidden`
-    for one whose network has fixed sizes.
+    The settings of the event VAE (`EVAE_SETTINGS`) and what PPO does with its encoder are None
+    for a policy without one, `hidden` for one whose network has fixed sizes.
     """
 
     name: str
@@ -42,6 +42,7 @@ class ModelConfig:
     target: Literal["signed", "occupancy"] | None
     time_bins: Annotated[int, Field(ge=2, le=65536)] | None
     coding: Literal["additive", "eventnet", "none"] | None
+    encoder: Literal["frozen", "finetuned"] | None
     stack: Annotated[int, Field(ge=1, le=32)]
     hidden: list[Count] | None
 
@@ -50,7 +51,7 @@ class ModelConfig:
         if self.name not in KINDS:
             raise ValueError(f"name must be one of {', '.join(KINDS)}, got {self.name!r}")
         kind = KINDS[self.name]
-        wanted = {**dict.fromkeys(EVAE_SETTINGS, kind.encoder), "hidden": kind.network == "mlp"}
+        wanted = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
         for setting, wants in wanted.items():
             value = getattr(self, setting)
             if wants != (value is not None):
@@ -59,7 +60,17 @@ class ModelConfig:
         if self.coding == "eventnet" and self.name != "brp_full":
             rule = f"must be additive or none for {self.name}, which has no time"
             raise ValueError(f"coding {rule}, got 'eventnet'")
+        if self.encoder == "finetuned":
+            self._can_be_finetuned()
         return self
+
+    def _can_be_finetuned(self) -> None:
+        if self.name not in FINETUNED:
+            rule = f"must be frozen for {self.name}; {', '.join(FINETUNED)} can be fine-tuned"
+            raise ValueError(f"encoder {rule}, got 'finetuned'")
+        if self.time_bins is None or self.time_bins > MOST_TIME_BINS:
+            rule = f"must be at most {MOST_TIME_BINS} for encoder=finetuned"
+            raise ValueError(f"time_bins {rule}, got {self.time_bins}")
 
 
 @dataclass(frozen=True, config=STRICT)

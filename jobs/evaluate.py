@@ -29,7 +29,7 @@ from jobs.runs import Run, finish, finished, latest_policy, locate_run, open_run
 from jobs.tracking import RESULTS_VIEW, Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import reconstruct
-from models.kinds import KINDS
+from models.kinds import kind_of
 from models.policy import ENCODER, Policy, load_policy
 from models.weights import load_encoder
 
@@ -237,7 +237,7 @@ def film_seed(episodes: np.ndarray) -> int:
 
 def film(config: Config, policy: Policy, source: Path, seed: int, path: Path) -> Path:
     """Film the flight of the policy in `source` through one held-out corridor; return the file."""
-    decode = decoder(source) if KINDS[policy.manifest["name"]].encoder else None
+    decode = decoder(source) if kind_of(policy.manifest).encoder else None
     pilot = PolicyPilot(policy, config.evaluate.action == "stochastic")
     env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
     with Film(path, env_config.control_hz, decode) as reel:

@@ -15,11 +15,12 @@ from ray.tune.registry import register_env
 
 from envs.config import sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
-from jobs.config import Config, ConfigError
+from jobs.config import EVAE_SETTINGS, Config, ConfigError
 from jobs.drift import drift_figures
 from jobs.learner import REWARD_SCALE, PlainPPOLearner
 from jobs.runner import PlainEnvRunner
 from models.evae import EventVAE
+from models.finetuned import evae_settings
 from models.kinds import KINDS
 from models.rllib import module_spec
 from models.weights import EncoderFileError, load_encoder
@@ -74,7 +75,7 @@ class FlightMetrics(RLlibCallback):
         None without an encoder, or where its file is no longer there: the frozen part that
         flies has no decoder.
         """
-        about = module.model_config["encoder"]
+        about = module.model_config["encoder_file"]
         if about is None or not module.met:
             return {}
         if self._encoder is None:
@@ -107,17 +108,18 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
 
     Args:
         config: The experiment.
-        encoder_path: The frozen encoder's file, for a policy that has one.
+        encoder_path: The pretrained encoder's file, for a policy that has one.
 
     Raises:
-        ConfigError: If the encoder was made for another sensor.
+        ConfigError: If the encoder was made for another sensor, or for another model than the
+            one to fine-tune.
     """
     algo, settings = config.algo, network_settings(config)
     # It learns while the processes that fly, if any, wait: together they need a core for each of these.
     runners = algo.num_env_runners
     own_cpus = LITTLE if runners else 1
     register_env(ENV, make_corridors)
-    spec = module_spec(settings, config.seed, frozen_encoder(config, encoder_path))
+    spec = module_spec(settings, config.seed, pretrained_encoder(config, encoder_path))
     flown = config.env_config(split="train", observation=KINDS[config.model.name].observation)
     return (
         PPOConfig()
@@ -181,7 +183,8 @@ def network_settings(config: Config) -> dict[str, Any]:
         "name": model.name,
         "width": camera.width,
         "height": camera.height,
-        "latent": model.latent,
+        "encoder": model.encoder,
+        **{name: getattr(model, name) for name in EVAE_SETTINGS},
         "stack": model.stack,
         "hidden": model.hidden,
         "num_actions": NUM_ACTIONS,
@@ -202,11 +205,11 @@ def policy_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def frozen_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, dict[str, Any]] | None:
+def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, dict[str, Any]] | None:
     """The encoder file with its manifest; None for a policy without one.
 
     Raises:
-        ConfigError: It was made for another sensor.
+        ConfigError: It was made for another sensor, or for another model than the one to fine-tune.
         ValueError: A policy that needs one got none, or the other way round.
     """
     name, needed = config.model.name, KINDS[config.model.name].encoder
@@ -222,4 +225,8 @@ def frozen_encoder(config: Config, path: str | Path | None) -> tuple[str | Path,
         )
         remedy = "use its settings, or pretrain an encoder for these"
         raise ConfigError(f"encoder: was made for another sensor: {values}; {remedy}")
+    if config.model.encoder == "finetuned":
+        wanted = evae_settings(network_settings(config))
+        if wanted != about["model"]:
+            raise ConfigError(f"encoder: must be one of {wanted} to be fine-tuned, got {about['model']}")
     return path, about

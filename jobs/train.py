@@ -1,4 +1,4 @@
-"""Train the policy by PPO (appendix D.1), on the frozen encoder if it has one.
+"""Train the policy by PPO (appendix D.1), on the encoder if it has one.
 
 Run: python -m platform.launch +exp=train
 Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
@@ -27,6 +27,7 @@ from jobs.pretrain import check_sources, prepare_encoder
 from jobs.progress import progress
 from jobs.runs import Run, finish, finished, open_run
 from jobs.tracking import open_tracker
+from models.kinds import kind_of
 from models.policy import save_policy
 from models.weights import load_encoder
 
@@ -97,7 +98,7 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     Args:
         config: The experiment.
         folder: The run folder.
-        encoder_path: The frozen encoder's file; None for a policy without one.
+        encoder_path: The pretrained encoder's file; None for a policy without one.
         on_result: Called with (environment steps, metrics) after each PPO iteration, in this
             process; a metric that was not measured is NaN.
 
@@ -140,12 +141,15 @@ def export_policy(
         TrainingError: If the checkpoint's encoder is not the one in the file.
     """
     module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
-    evae, about = (None, {}) if encoder_path is None else load_encoder(encoder_path)
+    settings = policy_settings(config)
+    evae, about = None, dict[str, Any]()
+    if encoder_path is not None and kind_of(settings).encoder:
+        evae, about = load_encoder(encoder_path)
     frozen = {} if evae is None else evae.state_dict()
     flown = {} if module.encoder is None else module.encoder.state_dict()
     if not all(torch.equal(value, frozen[name]) for name, value in flown.items()):
         raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
-    manifest = {**policy_settings(config), "figures": figures}
+    manifest = {**settings, "figures": figures}
     save_policy(target, module.networks(), manifest, evae, about.get("figures"))
 
 

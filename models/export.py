@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from models.batch import OFF as OFF_ROW
 from models.batch import ON as ON_ROW
 from models.event_set import EVENTS, TIMES, EventSet
-from models.features import GAMMA, OFF, ON, feature_of
+from models.features import GAMMA, OFF, ON
 from models.kinds import KINDS
 from models.pictures import OFF_SHARE, PictureEncoder
 from models.policy import Policy
@@ -72,7 +72,7 @@ class FlyingPolicy(nn.Module):
     def __init__(self, policy: Policy) -> None:
         super().__init__()
         manifest = policy.manifest
-        feature = feature_of(manifest)
+        feature = policy._feature
         self.shape = (manifest["stack"], *feature.shape(manifest))
         kept = torch.from_numpy(policy._stacks).dtype
         self.dtype = torch.int32 if kept == torch.int16 else kept  # of which onnxruntime knows more
@@ -86,6 +86,7 @@ class FlyingPolicy(nn.Module):
         elif policy.encoder is not None:
             table = policy.encoder
             self.time_bins, self.turns = table.grid.time_bins, table.phase is not None
+            self.most_events = table.most_events
             arrays = {"features": table.features, "embedding": table.embedding}
             for name, (weight, bias) in {"hidden": table.hidden, "head": table.head}.items():
                 arrays |= {f"{name}_weight": weight, f"{name}_bias": bias}
@@ -113,10 +114,12 @@ class FlyingPolicy(nn.Module):
 
 def _latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
     """Maximum over the events of table rows, then the encoder's dense layers (appendix C)."""
-    t, _, _, _ = events.unbind(1)
-    bins = _bins(t, window_us, policy.time_bins)
+    there = torch.ones_like(events[:, :1], dtype=torch.bool)
+    if policy.most_events is not None:
+        events, there = _thinned(events, policy.most_events)
+    bins = _bins(events[:, 0], window_us, policy.time_bins)
     rows = policy.features[_code(policy, events) % len(policy.features)] + policy.embedding[bins]
-    rows = torch.cat([rows, torch.zeros(1, rows.shape[1])])
+    rows = torch.cat([torch.where(there, rows, 0.0), torch.zeros(1, rows.shape[1])])
     context = rows.amax(0)  # 0 without events
     if policy.turns:  # EventNet's coding: the phase of the newest event of this magnitude
         times = torch.cat([bins, torch.zeros(1, dtype=bins.dtype)])
@@ -134,16 +137,21 @@ def _picture_latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> 
 
 
 def _events(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
-    """Rows of at most `EVENTS` events, evenly over their order (`models.batch.thin`)."""
+    """Rows of events, as `models.batch.event_rows`."""
+    events, there = _thinned(events, EVENTS)
+    t, x, y, p = events.unbind(1)
+    rows = torch.stack([torch.where(p > 0, ON_ROW, OFF_ROW), _bins(t, window_us, TIMES), x, y], dim=1)
+    return torch.where(there, rows, 0)
+
+
+def _thinned(events: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """At most so many events, evenly over their order (`models.batch.thin`), and which are any."""
     count = torch.ones_like(events[:, 0]).sum()
-    kept = count.clamp(max=EVENTS)
-    k = torch.arange(EVENTS)
+    kept = count.clamp(max=most)
+    k = torch.arange(most)
     places = torch.div((2 * k + 1) * count, 2 * kept.clamp(min=1), rounding_mode="floor")
     padded = torch.cat([events, torch.zeros(1, 4, dtype=torch.int64)])
-    t, x, y, p = padded[torch.minimum(places, count)].unbind(1)
-    bins = _bins(t, window_us, TIMES)
-    rows = torch.stack([torch.where(p > 0, ON_ROW, OFF_ROW), bins, x, y], dim=1)
-    return torch.where((k < kept)[:, None], rows, 0)
+    return padded[torch.minimum(places, count)], (k < kept)[:, None]
 
 
 def _bins(t: Tensor, window_us: Tensor, time_bins: int) -> Tensor:

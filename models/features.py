@@ -2,8 +2,8 @@
 
 `FEATURES` says for each feature its type, its shape, and how it is made, from a batch of
 observations or from the events of one step. Settings are those of a policy's manifest: "width"
-and "height" of the sensor [pixels], "latent" of the encoder. The encoder is an `EncoderTable`,
-or None where the feature needs none.
+and "height" of the sensor [pixels], "latent" and "time_bins" of the encoder. The encoder is an
+`EncoderTable`, or None where the feature needs none.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +14,8 @@ import numpy as np
 
 from models.batch import Grid, event_rows, index_events, index_packed, thin
 from models.event_set import EVENTS, TIMES
-from models.kinds import KINDS
+from models.finetuned import EVENTS as ENCODED_EVENTS
+from models.kinds import kind_of
 
 ON, OFF = 255, 125  # picture values of polarities (appendix D.1.2)
 GAMMA = 2.2
@@ -40,8 +41,8 @@ class Feature(NamedTuple):
 
 
 def feature_of(settings: Settings) -> Feature:
-    """The feature of the policy that `settings["name"]` names."""
-    return FEATURES[KINDS[settings["name"]].feature]
+    """The feature of the policy that `settings` describe."""
+    return FEATURES[kind_of(settings).feature]
 
 
 def push_features(stacks: np.ndarray, features: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -149,17 +150,32 @@ def _columns_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray
     return column_counts(_address(step, settings), settings["width"], settings["height"])
 
 
-def _rows(address: np.ndarray, grid: Grid) -> np.ndarray:
-    return event_rows(thin(address, EVENTS), EVENTS, grid.width, grid.height)
+def _rows(address: np.ndarray, grid: Grid, most: int) -> np.ndarray:
+    return event_rows(thin(address, most), most, grid.width, grid.height)
+
+
+def _rows_of_windows(windows: np.ndarray, grid: Grid, most: int) -> np.ndarray:
+    rows = np.empty((len(windows), most, 4), np.int16)
+    for row, window in zip(rows, windows, strict=True):
+        row[:] = _rows(index_packed(window, grid), grid, most)
+    return rows
 
 
 def _set_of_windows(windows: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
-    grid = _grid(settings, TIMES)
-    return np.stack([_rows(index_packed(window, grid), grid) for window in windows])
+    return _rows_of_windows(windows, _grid(settings, TIMES), EVENTS)
 
 
 def _set_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
-    return _rows(_address(step, settings, TIMES), _grid(settings, TIMES))
+    return _rows(_address(step, settings, TIMES), _grid(settings, TIMES), EVENTS)
+
+
+def _encoded_of_windows(windows: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
+    return _rows_of_windows(windows, _grid(settings, settings["time_bins"]), ENCODED_EVENTS)
+
+
+def _encoded_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
+    time_bins = settings["time_bins"]
+    return _rows(_address(step, settings, time_bins), _grid(settings, time_bins), ENCODED_EVENTS)
 
 
 def _same_pictures(pictures: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
@@ -182,6 +198,9 @@ FEATURES = {
         np.float32, lambda settings: (2 * settings["width"],), _columns_of_windows, _columns_of_step
     ),
     "events": Feature(np.int16, lambda settings: (EVENTS, 4), _set_of_windows, _set_of_step),
+    "event_rows": Feature(
+        np.int16, lambda settings: (ENCODED_EVENTS, 4), _encoded_of_windows, _encoded_of_step
+    ),
     "event_image": Feature(np.uint8, _picture_shape, _same_pictures, _picture_of_step),
     "grey": Feature(np.uint8, _picture_shape, _grey_of_luminance, None),
 }

@@ -1,4 +1,4 @@
-"""The frozen part of a policy: the half of an event VAE that flies, events to latent."""
+"""The half of an event VAE that flies, events to latent: the frozen part of a policy, and its table."""
 
 import math
 from collections.abc import Mapping
@@ -54,13 +54,13 @@ def encoder_of(evae: EventVAE) -> EncoderTable | PictureEncoder:
     return PictureEncoder(evae) if evae.settings["variant"] == "eivae" else EncoderTable.from_evae(evae)
 
 
-def tabulate(part: nn.ModuleDict, settings: Mapping[str, Any]) -> EncoderTable | PictureEncoder:
-    """The `encoder_of` an `encoder_part` of an event VAE with these settings.
+def tabulate(part: nn.Module, settings: Mapping[str, Any]) -> EncoderTable | PictureEncoder:
+    """The `encoder_of` an `encoder_part`, or a `FinetunedEncoder`, of an event VAE with these settings.
 
     Raises:
         ValueError: If the part was never given its weights.
     """
-    if not all(torch.isfinite(value).all() for value in part.buffers()):
+    if not all(torch.isfinite(value).all() for value in part.state_dict().values()):
         raise ValueError("encoder must have finite weights, got NaN: its file is missing or changed")
     evae = EventVAE(**settings)
     evae.load_state_dict({**evae.state_dict(), **part.state_dict()})

@@ -3,10 +3,11 @@
     observation --feature, once per step--> stack of the last ones --network--> logits and value
 
 The words of a row name the entries of other tables: `envs.observations`, `models.features.FEATURES`
-and `models.networks.NETWORKS`. Imports nothing, so that a configuration is checked in no time.
+and `models.networks.NETWORKS`. Imports no package, so that a configuration is checked in no time.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 
 class Kind(NamedTuple):
@@ -34,4 +35,16 @@ KINDS = {
     "eivae": Kind("window", "latent", "mlp", encoder=True),
     "rgb": Kind("luminance", "grey", "cnn", encoder=False),
 }
+# With `encoder: finetuned` the events are kept, and the encoder learns on as part of the network.
+FINETUNED = {
+    name: KINDS[name]._replace(feature="event_rows", network="finetuned", encoder=False)
+    for name in ("brp_full", "brp_xy")
+}
+MOST_TIME_BINS = 1 << 15  # of an encoder that learns on: events are kept as rows of int16
 SMALLEST_IMAGE = 36  # pixels, of the picture that leaves the third convolution of "cnn" one pixel
+
+
+def kind_of(settings: Mapping[str, Any]) -> Kind:
+    """The kind that a policy's settings (`name`, `encoder`) name; `KINDS` has it before any fine-tuning."""
+    kinds = FINETUNED if settings.get("encoder") == "finetuned" else KINDS
+    return kinds[settings["name"]]

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from models.event_set import OUTPUTS, EventSet
 from models.features import feature_of
-from models.kinds import KINDS
+from models.finetuned import FinetunedEncoder
+from models.kinds import kind_of
 
 PARTS = ("trunk", "pi", "vf")
 # Of the last layer's weights; all other layers have sqrt(2) (stable-baselines' policies).
@@ -37,7 +38,7 @@ def build_networks(settings: Mapping[str, Any], seed: int = 0) -> nn.ModuleDict:
 
 def assemble(settings: Mapping[str, Any]) -> nn.ModuleDict:
     """The parts of a policy's networks (`PARTS`); their weights mean nothing yet."""
-    build = NETWORKS[KINDS[settings["name"]].network]
+    build = NETWORKS[kind_of(settings).network]
     shape = (settings["stack"], *feature_of(settings).shape(settings))
     return nn.ModuleDict(dict(zip(PARTS, build(shape, settings), strict=True)))
 
@@ -50,7 +51,8 @@ def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
         for layer in layers:
             gain = LAST_GAIN.get(name, math.sqrt(2.0)) if layer is layers[-1] else math.sqrt(2.0)
             nn.init.orthogonal_(layer.weight, gain, generator=generator)
-            nn.init.zeros_(layer.bias)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
     return networks
 
 
@@ -94,6 +96,12 @@ def event_set(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Mod
     return trunk, nn.Linear(OUTPUTS, settings["num_actions"]), nn.Linear(OUTPUTS, 1)
 
 
+def finetuned_mlps(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
+    """The networks of `two_mlps` behind an encoder that they share, and that learns on."""
+    _, pi, vf = two_mlps((shape[0], settings["latent"]), settings)
+    return FinetunedEncoder(settings), pi, vf
+
+
 class Bytes(nn.Module):
     """Bytes to numbers in [0, 1]; here, so that pictures travel and are stored as bytes."""
 
@@ -106,4 +114,5 @@ NETWORKS: dict[str, Callable[..., tuple[nn.Module, ...]]] = {
     "mlp": two_mlps,
     "cnn": nature_cnn,
     "set": event_set,
+    "finetuned": finetuned_mlps,
 }

@@ -1,10 +1,12 @@
-"""What flies: a stack of the last features, a network, the frozen encoder if there is one; one folder.
+"""What flies: a stack of the last features, a network, the encoder if there is one; one folder.
 
 A policy folder turns observations, or events, into actions with the preprocessing of training,
 on a machine without Ray and without running anyone's code: safetensors files and their JSON
-manifests, each checked against its SHA-256 before use.
+manifests, each checked against its SHA-256 before use. An encoder that learnt on with its policy is
+in the networks' file, and flies from a table like a frozen one.
 """
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
@@ -17,9 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from models.evae import EventVAE
-from models.features import feature_of, push_features
-from models.frozen import encoder_of
-from models.kinds import KINDS, SMALLEST_IMAGE
+from models.features import FEATURES, feature_of, push_features
+from models.finetuned import EVENTS, evae_settings
+from models.frozen import encoder_of, tabulate
+from models.kinds import FINETUNED, KINDS, SMALLEST_IMAGE, kind_of
 from models.networks import assemble
 from models.pictures import PictureEncoder
 from models.table import EncoderTable
@@ -54,12 +57,15 @@ class Policy:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> None:
-        """Join the networks and the encoder, if any; a stochastic policy needs `rng`."""
+        """Join the networks and the encoder, if any; a stochastic policy needs `rng`.
+
+        With an encoder the networks read its latents, however it was trained.
+        """
         if not deterministic and rng is None:
             raise ValueError("rng must be given for a stochastic policy (deterministic=False), got None")
         self.networks, self.manifest, self.encoder = networks, manifest, encoder
         self.deterministic, self.rng = deterministic, rng
-        self._feature = feature_of(manifest)
+        self._feature = feature_of(manifest) if encoder is None else FEATURES["latent"]
         self.reset()
 
     @property
@@ -145,8 +151,9 @@ def save_policy(
         path: Folder, made if missing.
         networks: Those of `models.networks.assemble`; with the value, for those who train on.
         manifest: At least `name`, `stack`, `num_actions`, `width`, `height`, `latent` and
-            `hidden` (or None), `sensor` and `sensor_hash`; anything else that JSON holds,
-            such as training figures.
+            `hidden` (or None), `sensor` and `sensor_hash`, for an encoder that learnt on also
+            `encoder` and `models.finetuned.SETTINGS`; anything else that JSON holds, such as
+            training figures.
         evae: The frozen event VAE, for a policy that has one.
         encoder_figures: Its own held-out figures, for the encoder's manifest.
 
@@ -156,7 +163,7 @@ def save_policy(
     Raises:
         ValueError: An event VAE is missing or too many.
     """
-    needed = KINDS[manifest["name"]].encoder
+    needed = kind_of(manifest).encoder
     if needed != (evae is not None):
         raise ValueError(f"evae must be {'given' if needed else 'None'} for {manifest['name']}, got {evae!r}")
     folder = Path(path)
@@ -166,7 +173,7 @@ def save_policy(
         save_encoder(folder / ENCODER, evae, {**facts, "figures": dict(encoder_figures or {})})
     tensors = {name: value.detach().contiguous() for name, value in networks.state_dict().items()}
     write_atomic(folder / NETWORKS, safetensors.torch.save(tensors))
-    sums = {name: _digest(folder / name) for name in _files(manifest["name"])}
+    sums = {name: _digest(folder / name) for name in _files(manifest)}
     text = json.dumps({**manifest, "format": FORMAT, "sha256": sums}, indent=2, allow_nan=False)
     write_atomic(folder / MANIFEST, text.encode())
     return folder
@@ -185,14 +192,17 @@ def load_policy(
     for name, expected in manifest["sha256"].items():
         if _digest(folder / name) != expected:
             raise PolicyFileError(f"{folder / name}: SHA-256 must be {expected}: another or a damaged file")
-    table = _load_encoder(folder, manifest) if KINDS[manifest["name"]].encoder else None
+    kind = kind_of(manifest)
+    table = _load_encoder(folder, manifest) if kind.encoder else None
     networks = _load_networks(folder / NETWORKS, manifest)
+    if kind.network == "finetuned":
+        table, networks["trunk"] = _tabulated(networks["trunk"], manifest), nn.Flatten()
     return Policy(networks, manifest, table, deterministic, rng)
 
 
-def _files(name: str) -> tuple[str, ...]:
+def _files(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     """The files that a policy's manifest vouches for."""
-    return (*(ENCODER_FILES if KINDS[name].encoder else ()), NETWORKS)
+    return (*(ENCODER_FILES if kind_of(manifest).encoder else ()), NETWORKS)
 
 
 def _read_manifest(file: Path) -> dict[str, Any]:
@@ -207,10 +217,11 @@ def _read_manifest(file: Path) -> dict[str, Any]:
     if missing:
         raise PolicyFileError(f"{file}: the manifest lacks {missing}; export the policy again")
     name = manifest["name"]
-    if not isinstance(name, str) or name not in KINDS:
-        raise PolicyFileError(f"{file}: name must be one of {', '.join(KINDS)}, got {name!r}")
-    if not isinstance(manifest["sha256"], dict) or set(manifest["sha256"]) != set(_files(name)):
-        wanted = ", ".join(_files(name))
+    known = FINETUNED if manifest.get("encoder") == "finetuned" else KINDS
+    if not isinstance(name, str) or name not in known:
+        raise PolicyFileError(f"{file}: name must be one of {', '.join(known)}, got {name!r}")
+    if not isinstance(manifest["sha256"], dict) or set(manifest["sha256"]) != set(_files(manifest)):
+        wanted = ", ".join(_files(manifest))
         raise PolicyFileError(f"{file}: sha256 must name {wanted}, got {manifest['sha256']!r}")
     _check_sizes(file, manifest)
     return manifest
@@ -224,6 +235,11 @@ def _check_sizes(file: Path, manifest: Mapping[str, Any]) -> None:
     sizes = [manifest[name] for name in used] + (hidden if isinstance(hidden, list) else [None])
     if not all(type(size) is int and 1 <= size <= MAX_SIZE for size in sizes):
         raise PolicyFileError(f"{file}: {', '.join(used)} and hidden must be integers in 1..{MAX_SIZE}")
+    if kind_of(manifest).network == "finetuned":
+        try:
+            evae_settings(manifest)
+        except ValueError as error:
+            raise PolicyFileError(f"{file}: {error}") from None
     if kind.network == "cnn" and min(manifest["width"], manifest["height"]) < SMALLEST_IMAGE:
         rule = f"must be at least {SMALLEST_IMAGE} for {manifest['name']}"
         raise PolicyFileError(f"{file}: width and height {rule}")
@@ -236,6 +252,12 @@ def _load_encoder(folder: Path, manifest: Mapping[str, Any]) -> EncoderTable | P
     if ours != theirs:
         raise PolicyFileError(f"{folder / ENCODER}: must be the encoder of {ours}, got one of {theirs}")
     return encoder_of(evae)
+
+
+def _tabulated(trunk: nn.Module, manifest: Mapping[str, Any]) -> EncoderTable | PictureEncoder:
+    """The table of an encoder that learnt on; it sees windows thinned as in training."""
+    table: Any = tabulate(trunk, evae_settings(manifest))
+    return dataclasses.replace(table, most_events=EVENTS)
 
 
 def _load_networks(file: Path, manifest: Mapping[str, Any]) -> nn.ModuleDict:
@@ -255,6 +277,9 @@ def _load_networks(file: Path, manifest: Mapping[str, Any]) -> nn.ModuleDict:
     bad = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
     if bad:
         raise PolicyFileError(f"{file}: weights must be finite, those of {bad} are not")
+    bad = [name for name, value in tensors.items() if name.endswith("running_var") and (value < 0).any()]
+    if bad:
+        raise PolicyFileError(f"{file}: variances must not be negative, those of {bad} are")
     networks.load_state_dict(tensors, assign=True)
     return networks.requires_grad_(False)
 

@@ -1,4 +1,4 @@
-"""A policy inside RLlib: a module that owns the networks and the frozen encoder.
+"""A policy inside RLlib: a module that owns the networks and the encoder.
 
 `features` makes what a policy keeps of a step (`models.features`); the networks see stacks of the
 last ones (`jobs.runner` keeps them). `models.policy` is the same policy without Ray.
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from models.batch import cut_packed
 from models.features import feature_of
 from models.frozen import read_encoder_part, tabulate
+from models.kinds import kind_of
 from models.networks import PARTS, build_networks
 from models.pictures import PictureEncoder
 from models.table import EncoderTable
@@ -41,19 +42,24 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     """Frozen encoder, where the policy has one, and the networks.
 
     The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
-    checkpoint is sufficient alone. `model_config` holds what `module_spec` puts there.
+    checkpoint is sufficient alone. An encoder that learns on is the networks' trunk instead.
+    `model_config` holds what `module_spec` puts there.
 
     Attributes:
-        met: With an encoder, the newest windows that it was shown, one of each vector step and
-            of each flight in turn, as `models.batch.cut_packed` cuts them.
+        met: With a frozen encoder, the newest windows that it was shown, one of each vector step
+            and of each flight in turn, as `models.batch.cut_packed` cuts them.
     """
 
     def setup(self) -> None:
         """Build the parts; called once by RLlib."""
         settings: Any = self.model_config
-        about = settings["encoder"]
-        self.encoder = None if about is None else read_encoder_part(**about)
+        about = settings["encoder_file"]
+        part = None if about is None else read_encoder_part(**about)
         networks = build_networks(settings, settings["seed"])
+        if part is not None and not kind_of(settings).encoder:
+            networks["trunk"].load_state_dict(part.state_dict())
+            part = None
+        self.encoder = part
         self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
         self._table: EncoderTable | PictureEncoder | None = None
         self.met: deque[np.ndarray] = deque(maxlen=MET_WINDOWS)
@@ -64,7 +70,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return ["vf"]
 
     def train(self, mode: bool = True) -> "PolicyModule":
-        """Keep every part as it is: the encoder stays frozen, the networks have no modes.
+        """Keep every part as it is: an encoder stays in eval mode, the other networks have no modes.
 
         RLlib toggles the mode around every forward pass; a walk through all parts each
         time would take longer than the pass, and would let running statistics move.
@@ -80,7 +86,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         """Features (B, ...) of observations (B, ...)."""
         settings: Any = self.model_config
         if self.encoder is not None:
-            self._table = self._table or tabulate(self.encoder, settings["encoder"]["settings"])
+            self._table = self._table or tabulate(self.encoder, settings["encoder_file"]["settings"])
             self.met.append(cut_packed(observations[self._steps % len(observations)]))
             self._steps += 1
         return feature_of(settings).from_observations(observations, settings, self._table)
@@ -128,7 +134,7 @@ def module_spec(
     Args:
         settings: What `models.networks.build_networks` reads.
         seed: Of the networks' initial weights.
-        encoder: The frozen encoder's file and its manifest; None for a policy without one.
+        encoder: The pretrained encoder's file and its manifest; None for a policy without one.
     """
     about = None
     if encoder is not None:
@@ -138,5 +144,5 @@ def module_spec(
         module_class=PolicyModule,
         observation_space=stack_space(settings),
         action_space=gym.spaces.Discrete(settings["num_actions"]),
-        model_config={**settings, "encoder": about, "seed": seed},
+        model_config={**settings, "encoder_file": about, "seed": seed},
     )

@@ -20,7 +20,7 @@ import numba
 import numpy as np
 import torch
 
-from models.batch import Grid, index_events, index_packed
+from models.batch import Grid, index_events, index_packed, thin
 from models.embedding import bin_centres, eventnet_phase, time_code
 from models.evae import EventVAE
 
@@ -40,6 +40,8 @@ class EncoderTable:
             takes a context in the units of the rows.
         head: Weight (latent, 256) and bias (latent,) of mu.
         phase: Of each time bin, real and imaginary part (2, time_bins), for EventNet's coding.
+        most_events: A whole window is thinned to so many before it is encoded
+            (`models.batch.thin`), None: never. `update` takes every event of a stream.
     """
 
     grid: Grid
@@ -48,6 +50,7 @@ class EncoderTable:
     hidden: tuple[np.ndarray, np.ndarray]
     head: tuple[np.ndarray, np.ndarray]
     phase: np.ndarray | None = None
+    most_events: int | None = None
 
     @classmethod
     def from_evae(
@@ -141,7 +144,8 @@ class EncoderTable:
         Raises:
             ValueError: As `models.batch.index_events`.
         """
-        return self.latent(self.update(self.empty(), events, start_us, window_us))
+        address = index_events(tuple(events[name] for name in "txyp"), start_us, window_us, self.grid)
+        return self._encode(address)
 
     def encode_windows(self, windows: np.ndarray) -> np.ndarray:
         """Latents (B, latent) of packed windows, int32 (B, capacity + 1, 4); each as `encode`'s, bit for bit.
@@ -151,10 +155,14 @@ class EncoderTable:
         """
         latents = np.empty((len(windows), len(self.head[1])), self.head[1].dtype)
         for row, window in enumerate(windows):
-            context = self.empty()
-            self._raise(index_packed(window, self.grid), context)
-            latents[row] = self.latent(context)
+            latents[row] = self._encode(index_packed(window, self.grid))
         return latents
+
+    def _encode(self, address: np.ndarray) -> np.ndarray:
+        """Latent mu (latent,) of the addressed events (2, N) of one window."""
+        context = self.empty()
+        self._raise(address if self.most_events is None else thin(address, self.most_events), context)
+        return self.latent(context)
 
 
 def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:

@@ -27,6 +27,7 @@ CONF = Path(__file__).resolve().parent.parent / "conf"
 
 POLICIES = {
     "bytestream": "brp_full",
+    "bytestream_finetuned": "brp_full",
     "bytestream_xy": "brp_xy",
     "event_columns": "event_columns",
     "event_set": "event_set",
@@ -136,7 +137,7 @@ def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_i
 def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
     values = composed("+exp=bytestream", f"model={name}")
     kind = KINDS[name]
-    needed = {**dict.fromkeys(EVAE_SETTINGS, kind.encoder), "hidden": kind.network == "mlp"}
+    needed = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
     usual = composed("+exp=bytestream")["model"]
     for key, wanted in needed.items():
         other, rule = (None, f"be given for {name}") if wanted else (usual[key], f"be null: {name} has no")
@@ -149,6 +150,14 @@ def test_a_code_that_forgets_is_refused_where_there_is_no_time(composed, name):
     with pytest.raises(ConfigError, match=f"coding must be additive or none for {name}.*got 'eventnet'"):
         parse(composed("+exp=bytestream", f"model={name}", "model.coding=eventnet"))
     assert parse(composed("+exp=bytestream", "model.coding=eventnet")).model.coding == "eventnet"
+
+
+def test_an_encoder_learns_on_only_where_its_events_can_be_kept(composed):
+    assert parse(composed("+exp=bytestream_finetuned")).model.encoder == "finetuned"
+    with pytest.raises(ConfigError, match="encoder must be frozen for eivae; brp_full, brp_xy can be"):
+        parse(composed("+exp=event_image_vae", "model.encoder=finetuned"))
+    with pytest.raises(ConfigError, match="time_bins must be at most 32768 for encoder=finetuned, got 40000"):
+        parse(composed("+exp=bytestream_finetuned", "model.time_bins=40000"))
 
 
 def test_a_whole_number_names_the_same_run_as_its_float(composed):

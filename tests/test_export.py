@@ -26,7 +26,7 @@ def make_events(count, rng):
 def steps():
     """Events of the steps of a flight: none, one, a few, many, twice in a pixel, at the edges."""
     rng = np.random.default_rng(0)
-    yield from (make_events(count, rng) for count in (0, 1, 40, 700, 0, 3))
+    yield from (make_events(count, rng) for count in (0, 1, 40, 700, 1500, 0, 3))
     many = make_events(500, rng)
     many["x"], many["y"] = many["x"] % 3, many["y"] % 2
     yield many

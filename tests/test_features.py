@@ -9,8 +9,8 @@ from envs.corridor import CorridorEnv
 from envs.events import EVENT
 from envs.windows import event_image, pack_window
 from jobs.pilots import Observation
-from models.features import feature_of, grey_picture, push_features
-from models.kinds import KINDS
+from models.features import FEATURES, feature_of, grey_picture, push_features
+from models.kinds import FINETUNED, KINDS
 from models.networks import NETWORKS, build_networks
 from models.policy import Policy
 
@@ -150,8 +150,9 @@ def test_each_kind_takes_what_the_environment_shows_it(name):
 
 
 def test_the_table_of_kinds_names_what_there_is():
-    assert {kind.network for kind in KINDS.values()} == set(NETWORKS)
-    for name, kind in KINDS.items():
-        assert feature_of({"name": name})
+    rows = [*KINDS.values(), *FINETUNED.values()]
+    assert {kind.network for kind in rows} == set(NETWORKS)
+    assert {kind.feature for kind in rows} == set(FEATURES)
+    for kind in rows:
         assert kind.observation in get_args(Observation)
         EnvConfig(observation=kind.observation)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from mlflow import MlflowClient
 
 from envs.config import EnvConfig
@@ -75,6 +76,22 @@ def test_a_policy_without_an_event_vae_trains_and_evaluates_at_once(tmp_path, ex
     assert (stored.info.status, stored.data.tags["policy"]) == ("FINISHED", policy.manifest["name"])
     assert stored.info.run_name == run.name
     assert all(any(name.startswith(section) for name in stored.data.metrics) for section in SECTIONS[1:])
+
+
+@pytest.mark.slow
+def test_an_encoder_that_learns_on_goes_through_every_stage_and_the_sweep(tmp_path):
+    launch(tmp_path, "+exp=bytestream_finetuned", *FEW_STEPS)
+    (run,) = (tmp_path / "runs").iterdir()
+    assert {path.stem for path in (run / "stages").iterdir()} == {"collect", "pretrain", "train", "evaluate"}
+    assert {path.name for path in (run / "policy").iterdir()} == {"policy.json", "networks.safetensors"}
+    pretrained = safetensors.numpy.load_file(run / "encoder" / "encoder.safetensors")
+    learnt = safetensors.numpy.load_file(run / "policy" / "networks.safetensors")
+    for name, value in pretrained.items():
+        if not name.startswith("decoder."):
+            moved = not np.array_equal(learnt[f"trunk.{name}"], value)
+            assert moved is not ("running" in name or "num_batches" in name), name
+    printed = launch(tmp_path, "+exp=robustness", "sweep.trials=1", "sweep.axes={faults.sparsity: [0.5]}")
+    assert "sparsity" in printed
 
 
 def stored_run(folder: Path):

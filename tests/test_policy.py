@@ -11,7 +11,7 @@ from torch import nn
 from models.evae import EventVAE
 from models.features import feature_of
 from models.frozen import encoder_of
-from models.kinds import KINDS
+from models.kinds import KINDS, kind_of
 from models.networks import build_networks
 from models.policy import (
     ENCODER,
@@ -24,7 +24,7 @@ from models.policy import (
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 SIDE = 40
 SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789ab"}
-FLOWN = ("brp_full", "event_columns", "event_set", "eip", "eivae", "rgb")
+FLOWN = ("brp_full", "event_columns", "event_set", "eip", "eivae", "rgb", "finetuned")
 
 
 def make_evae(seed=0, variant="brp_full"):
@@ -33,6 +33,11 @@ def make_evae(seed=0, variant="brp_full"):
 
 
 def make_settings(name):
+    """Of a kind of policy, or of "finetuned": brp_full with an encoder that learnt on."""
+    if name == "finetuned":
+        evae = make_evae().settings
+        own = {key: evae[key] for key in ("context", "norm", "target", "time_bins", "coding")}
+        return {**make_settings("brp_full"), **own, "encoder": "finetuned"}
     kind = KINDS[name]
     sizes = {"width": SIDE, "height": SIDE, "stack": 3, "num_actions": 3}
     parts = {
@@ -44,13 +49,13 @@ def make_settings(name):
 
 def make_networks(name):
     networks = build_networks(make_settings(name), seed=3)
-    for value in networks["pi"].parameters():
-        value.data.mul_(100.0)  # so that actions differ
+    *_, last = networks["pi"].modules()
+    last.weight.data.mul_(100.0)  # so that actions differ
     return networks
 
 
 def save(path, name):
-    evae = make_evae(variant=name) if KINDS[name].encoder else None
+    evae = make_evae(variant=name) if kind_of(make_settings(name)).encoder else None
     return save_policy(path, make_networks(name), make_settings(name), evae)
 
 
@@ -82,7 +87,7 @@ def make_windows(rng, count, capacity=40, side=16):
 
 def make_observations(name, rng, count):
     """What an environment might show, (count, ...)."""
-    if KINDS[name].observation == "window":
+    if kind_of(make_settings(name)).observation == "window":
         return make_windows(rng, count, side=SIDE)
     pictures = rng.choice([0, 0, 0, 125, 255], (count, SIDE, SIDE)).astype(np.uint8)
     return pictures if name == "eip" else (pictures / 255).astype(np.float32)
@@ -100,7 +105,7 @@ def step_events(window, start_us):
 def expected_logits(name, flights):
     """Logits after the last of each flight's observations (B, T, ...), by a plain loop."""
     settings, networks = make_settings(name), make_networks(name)
-    table = encoder_of(make_evae(variant=name)) if KINDS[name].encoder else None
+    table = encoder_of(make_evae(variant=name)) if kind_of(settings).encoder else None
     stacks = []
     for observations in flights:
         features = list(feature_of(settings).from_observations(observations, settings, table))
@@ -119,14 +124,14 @@ def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(nam
         np.testing.assert_allclose(logits, expected_logits(name, flights[:, :t]), rtol=1e-5, atol=1e-5)
     assert np.ptp(logits, axis=0).max() > 1e-2
     assert policy.manifest["figures"] == {"return": 1.5}
-    assert policy.observation == KINDS[name].observation
+    assert policy.observation == kind_of(make_settings(name)).observation
 
 
 def test_the_same_policy_is_saved_as_the_same_bytes_and_each_file_has_its_sum(name, folder, tmp_path):
     again = save(tmp_path / "again", name)
     files = sorted(path.name for path in folder.iterdir())
     assert files == sorted(path.name for path in again.iterdir())
-    assert (ENCODER in files) is KINDS[name].encoder
+    assert (ENCODER in files) is kind_of(make_settings(name)).encoder
     for file in files:
         assert (folder / file).read_bytes() == (again / file).read_bytes()
     sums = json.loads((folder / MANIFEST).read_text())["sha256"]
@@ -151,7 +156,7 @@ def test_a_restarted_flight_forgets_and_its_neighbours_remember(name, folder):
     np.testing.assert_allclose(part[1], alone.logits(steps[3][1:2])[0], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["brp_full", "event_columns", "eip"])
+@pytest.mark.parametrize("name", ["brp_full", "event_columns", "eip", "finetuned"])
 def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path, name):
     folder = save(tmp_path, name)
     windows = make_windows(np.random.default_rng(2), 30, side=SIDE)

@@ -90,6 +90,8 @@ def first_format(folder):
         (change_manifest(hidden=None), "must be integers in 1"),
         (change_manifest(latent=None), "must be integers in 1"),
         (change_manifest(sha256={}), "sha256 must name encoder"),
+        (change_manifest(encoder="finetuned"), r"sha256 must name networks\.safetensors, got"),
+        (change_manifest(encoder="finetuned", name="eip"), "name must be one of brp_full, brp_xy, got 'eip'"),
     ],
 )
 def test_a_folder_that_is_not_the_one_exported_is_refused_by_name(folder, spoil, message):
@@ -116,6 +118,36 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, name):
         weight[0, 3] = torch.nan
     folder = save_policy(tmp_path, networks, make_settings(name))
     with pytest.raises(PolicyFileError, match=r"weights must be finite.*pi\."):
+        load_policy(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"context": 63}, "context must be even"),
+        ({"context": 128}, "not the networks of this policy"),
+        ({"coding": "phase"}, "coding must be one of"),
+        ({"norm": ["batch"]}, "norm must be one of"),
+        ({"time_bins": 40_000}, "time_bins must be at most 32768 to be kept, got 40000"),
+        ({"encoder": "frozen"}, r"sha256 must name encoder\.safetensors"),
+    ],
+)
+def test_an_encoder_that_learnt_on_is_checked_as_an_encoder_file_is(tmp_path, change, message):
+    folder = save(tmp_path, "finetuned")
+    change_manifest(**change)(folder)
+    with pytest.raises(PolicyFileError, match=message):
+        load_policy(folder)
+
+
+def test_an_encoder_that_learnt_on_needs_its_settings_and_variances(tmp_path):
+    folder = save(tmp_path / "one", "finetuned")
+    forget("coding")(folder)
+    with pytest.raises(PolicyFileError, match="a fine-tuned encoder needs coding"):
+        load_policy(folder)
+    networks = build_networks(make_settings("finetuned"))
+    networks["trunk"].ecn.norms[0].running_var[3] = -1.0
+    folder = save_policy(tmp_path / "other", networks, make_settings("finetuned"))
+    with pytest.raises(PolicyFileError, match=r"variances must not be negative.*norms\.0\.running_var"):
         load_policy(folder)
 
 

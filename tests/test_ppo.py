@@ -21,10 +21,13 @@ from models.table import EncoderTable
 from models.weights import EncoderFileError, load_encoder
 from tests.test_train import SHORT, make_config, write_encoder
 
-FLOWN = ("brp_full", "event_columns", "event_set", "eip", "rgb")
+FLOWN = ("brp_full", "event_columns", "event_set", "eip", "rgb", "finetuned")
 CNN_WEIGHTS = 32 * (3 * 64 + 1) + 64 * (32 * 16 + 1) + 64 * (64 * 9 + 1) + 512 * (1024 + 1)
+HEADS = 2 * (24 * 64 + 64 + 64 * 64 + 64) + 64 * 4 + 4
+CONTEXT_WEIGHTS = 3 * 64 + 64 * 128 + 128 * 1024 + 2 * (64 + 128 + 1024)
 WEIGHTS = {
-    "brp_full": 2 * (24 * 64 + 64 + 64 * 64 + 64) + 64 * 4 + 4,
+    "brp_full": HEADS,
+    "finetuned": HEADS + CONTEXT_WEIGHTS + 256 * (1024 + 1) + 16 * (256 + 1),
     "event_columns": 2 * (384 * 64 + 64 + 64 * 64 + 64) + 64 * 4 + 4,
     "event_set": 64 * (23 + 1 + 64 + 1 + 2) + 128 * (3 * 129 + 1) + 128 * 4 + 4,
     "eip": CNN_WEIGHTS + 512 * 4 + 4,
@@ -37,8 +40,19 @@ def encoder(tmp_path_factory):
     return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
 
 
+def make_own(name, *overrides):
+    """The configuration of a kind of policy, or of "finetuned": brp_full with an encoder that learns on."""
+    words = ("model.encoder=finetuned",) if name == "finetuned" else (f"model={name}",)
+    return make_config(*overrides, *words)
+
+
 def make_ppo(name, encoder, *overrides):
-    return build_ppo(make_config(*overrides, f"model={name}"), encoder if KINDS[name].encoder else None)
+    config = make_own(name, *overrides)
+    return build_ppo(config, encoder if KINDS[config.model.name].encoder else None)
+
+
+def is_frozen(name):
+    return name == "brp_full"
 
 
 @pytest.fixture(scope="module", params=FLOWN)
@@ -79,11 +93,12 @@ def plain_feature(name, observation, encoder):
         counts = np.zeros((2, 64))
         np.add.at(counts, ((events["p"] < 0).astype(int), events["x"]), 1)
         return np.log(1 + counts).ravel()
-    if name == "event_set":
+    if name in ("event_set", "finetuned"):
+        most = 256 if name == "event_set" else 1024
         events, window_us = unpack_window(observation)
-        kept = min(len(events), 256)
+        kept = min(len(events), most)
         events = events[[int((k + 0.5) * len(events) / kept) for k in range(kept)]]
-        rows = np.zeros((256, 4), np.int16)
+        rows = np.zeros((most, 4), np.int16)
         times = np.minimum(events["t"] * 1024 // window_us, 1023)
         rows[:kept] = np.stack([np.where(events["p"] > 0, 1, 2), times, events["x"], events["y"]], axis=1)
         return rows
@@ -158,6 +173,7 @@ def test_the_settings_are_those_of_the_appendix(name, encoder):
     assert {key: getattr(learner.config, key) for key in stated} == stated
     space = learner.module["default_policy"].observation_space
     spaces = {"brp_full": ((3, 8), "f4"), "event_columns": ((3, 128), "f4"), "event_set": ((3, 256, 4), "i2")}
+    spaces["finetuned"] = (3, 1024, 4), "i2"
     spaces |= dict.fromkeys(("eip", "rgb"), ((3, 64, 64), "u1"))
     assert (space.shape, space.dtype) == spaces[name]
 
@@ -171,8 +187,10 @@ def test_a_training_asks_for_a_core_per_process_that_flies_or_one_in_all(encoder
 def test_the_networks_are_built_from_what_the_configuration_says():
     sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
     bytestream, image = (network_settings(make_config(f"model={name}")) for name in ("brp_xy", "eip"))
-    assert bytestream == {"name": "brp_xy", "latent": 8, "hidden": [64, 64], **sizes}
-    assert image == {"name": "eip", "latent": None, "hidden": None, **sizes}
+    evae = {"context": 1024, "latent": 8, "norm": "batch", "target": "occupancy", "time_bins": 1024}
+    evae |= {"coding": "none", "encoder": "frozen"}
+    assert bytestream == {"name": "brp_xy", "hidden": [64, 64], **evae, **sizes}
+    assert image == {"name": "eip", "hidden": None, **dict.fromkeys(evae), **sizes}
 
 
 def test_the_feature_of_each_observation_is_made_exactly_once(runner):
@@ -198,14 +216,14 @@ def test_the_learner_sees_the_features_of_what_was_shown(name, runner, ppo, enco
         cut += sum(not chunk.is_done for chunk in samples)
         batch = learner_batch(learner, samples, monkeypatch)
         stacks = recorder.stacks(name, encoder)
-        assert batch["obs"].numpy().dtype == feature_of({"name": name}).dtype
+        assert batch["obs"].numpy().dtype == feature_of(network_settings(make_own(name))).dtype
         np.testing.assert_allclose(batch["obs"].numpy(), [stacks[key] for key in shown], rtol=1e-6)
     assert truncated >= 6
     assert cut >= 3
     assert len({stack.tobytes() for stack in stacks.values()}) > 30
 
 
-def test_training_moves_the_networks_and_never_the_encoder(name, runner, ppo, encoder):
+def test_training_moves_the_networks_and_never_a_frozen_encoder(name, runner, ppo, encoder):
     learner = ppo.build_learner(env=runner.env)
     module = learner.module["default_policy"]
     before = {name: value.clone() for name, value in module.state_dict().items()}
@@ -213,17 +231,19 @@ def test_training_moves_the_networks_and_never_the_encoder(name, runner, ppo, en
     runner.set_state({"rl_module": learner.get_state(components="rl_module")["rl_module"]})
     after, flying = module.state_dict(), runner.module.state_dict()
     whole = load_encoder(encoder)[0].state_dict()
-    assert any(key.startswith("encoder.") for key in before) is KINDS[name].encoder
+    assert any(key.startswith("encoder.") for key in before) is is_frozen(name)
     for key, value in before.items():
         frozen = key.startswith("encoder.")
-        assert torch.equal(after[key], value) is frozen, key
-        if frozen:
-            assert torch.equal(value, whole[key.removeprefix("encoder.")]), key
+        statistic = "running_" in key or "num_batches" in key
+        assert torch.equal(after[key], value) is (frozen or statistic), key
+        if frozen or (name == "finetuned" and key.startswith("trunk.")):
+            assert torch.equal(value, whole[key.partition(".")[2]]), key
         if key in flying:
             assert torch.equal(flying[key], after[key]), key
     assert {key for key in before if key not in flying} == {key for key in before if key.startswith("vf.")}
     assert sum(value.numel() for value in module.parameters()) == WEIGHTS[name]
-    assert not any(part.training for part in (module.encoder.modules() if KINDS[name].encoder else ()))
+    encoder_parts = (module.encoder if is_frozen(name) else module.trunk).modules()
+    assert name not in ("brp_full", "finetuned") or not any(part.training for part in encoder_parts)
 
 
 def test_the_values_of_a_batch_are_those_of_the_loss(runner, ppo):
@@ -273,8 +293,8 @@ def test_the_exported_policy_gives_the_logits_of_the_path_through_rllib(name, ru
     for part in (module.pi, runner.module.pi):
         for value in part.parameters():
             value.data.mul_(20.0)  # so that logits differ
-    evae = load_encoder(encoder)[0] if KINDS[name].encoder else None
-    manifest = policy_settings(make_config(*SHORT, f"model={name}"))
+    evae = load_encoder(encoder)[0] if is_frozen(name) else None
+    manifest = policy_settings(make_own(name, *SHORT))
     policy = load_policy(save_policy(tmp_path, module.networks(), manifest, evae))
     assert policy.observation == runner.env.unwrapped.envs[0].config.observation
     recorder = Recorder(runner)
@@ -373,6 +393,11 @@ def test_the_same_seed_gives_the_same_flights(ppo):
 def test_an_encoder_of_another_sensor_is_refused_with_both_values(encoder):
     with pytest.raises(ConfigError, match=r"another sensor.*contrast_threshold: 0\.2 there, 0\.3 here"):
         build_ppo(make_config("camera.contrast_threshold=0.3"), encoder)
+
+
+def test_an_encoder_of_another_model_is_not_fine_tuned(encoder):
+    with pytest.raises(ConfigError, match=r"encoder: must be one of .*'eventnet'.* to be fine-tuned, got"):
+        build_ppo(make_own("finetuned", "model.coding=eventnet"), encoder)
 
 
 def test_a_policy_gets_an_encoder_if_and_only_if_it_has_one(encoder):

@@ -20,9 +20,9 @@ from jobs import train as training
 from jobs.cluster import use_token
 from jobs.config import parse
 from jobs.ppo import FlightMetrics
+from jobs.pretrain import build_evae
 from jobs.runs import open_run
 from jobs.train import TrainingError, read_metrics, reported_so_far
-from models.evae import EventVAE
 from models.policy import load_policy
 from models.weights import save_encoder
 
@@ -41,10 +41,10 @@ def make_config(*overrides):
 
 def write_encoder(folder, config):
     torch.manual_seed(0)
-    evae = EventVAE(variant=config.model.name)
+    sensor = sensor_settings(config.env_config())
+    evae = build_evae(config.model, sensor)
     for parameter in evae.ecn.parameters():  # random weights see little; make latents differ
         parameter.data.mul_(1.5)
-    sensor = sensor_settings(config.env_config())
     path = folder / "encoder.safetensors"
     about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {"reconstruction_step": 0.5}}
     save_encoder(path, evae.freeze(), about)

@@ -28,7 +28,7 @@ from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.bench.throughput import composed
 from jobs.cluster import start_ray
-from jobs.config import Config
+from jobs.config import EVAE_SETTINGS, Config
 from jobs.ppo import build_ppo
 from jobs.progress import console
 from models.evae import EventVAE
@@ -155,9 +155,13 @@ def against_others(folder: Path) -> dict[str, Callable[[], object]]:
 def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
     """One iteration of our learner for each kind of policy."""
     work: dict[str, Callable[[], object]] = {}
-    for name, kind in KINDS.items():
-        config = composed(f"model={name}", CONSTANT)
-        evae = EventVAE(name, context=config.model.context or 8).freeze() if kind.encoder else None
+    rows = {name: [f"model={name}"] for name in KINDS}
+    rows["brp_full, fine-tuned"] = ["model=brp_full", "model.encoder=finetuned"]
+    for name, words in rows.items():
+        config = composed(*words, CONSTANT)
+        model = config.model
+        settings = {key: getattr(model, key) for key in EVAE_SETTINGS}
+        evae = EventVAE(model.name, **settings).freeze() if KINDS[model.name].encoder else None
         path = encoder_file(evae, folder) if evae else None
         work[name] = build_ppo(config, path).build_algo().train
     return work
