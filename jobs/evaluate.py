@@ -28,7 +28,7 @@ from jobs.report import Summary, columns, markdown, metrics, show, summarise, ta
 from jobs.runs import Run, finish, finished, latest_policy, locate_run, open_run, write_atomic
 from jobs.tracking import RESULTS_VIEW, Tracker, open_tracker
 from models.batch import batch_packed
-from models.evae import reconstruct
+from models.evae import pictures, reconstruct
 from models.kinds import kind_of
 from models.policy import ENCODER, Policy, load_policy
 from models.weights import load_encoder
@@ -258,6 +258,6 @@ def decoder(source: Path) -> Decode:
     @torch.no_grad()
     def decode(window: np.ndarray) -> np.ndarray:
         logits = evae(batch_packed(window[None], evae.grid))[0]
-        return reconstruct(logits, evae.target).reshape(evae.grid.height, evae.grid.width).numpy()
+        return pictures(reconstruct(logits, evae.target), evae.target, evae.grid)[0].numpy()
 
     return decode

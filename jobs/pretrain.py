@@ -21,7 +21,16 @@ from jobs.progress import console, progress
 from jobs.runs import Run, finish, finished, locate_run, open_run
 from jobs.tracking import Tracker, open_tracker
 from models.batch import EventBatch, Grid, batch_windows
-from models.evae import EventVAE, appendix_beta, collapsed, event_targets, reconstruct, train_step, validate
+from models.evae import (
+    EventVAE,
+    appendix_beta,
+    collapsed,
+    event_targets,
+    pictures,
+    reconstruct,
+    train_step,
+    validate,
+)
 from models.kinds import KINDS
 from models.weights import EncoderFileError, load_encoder, save_encoder
 
@@ -262,8 +271,8 @@ def example_pictures(evae: EventVAE, held_out: dict[str, EventBatch]) -> tuple[n
     """Target pictures and their reconstructions, the first few of each length: (K, H, W) each."""
     targets = [event_targets(batch, evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
     drawn = [reconstruct(evae(batch)[0], evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
-    shape = (-1, evae.grid.height, evae.grid.width)
-    return torch.cat(targets).reshape(shape).numpy(), torch.cat(drawn).reshape(shape).numpy()
+    shown = [pictures(torch.cat(values), evae.target, evae.grid).numpy() for values in (targets, drawn)]
+    return shown[0], shown[1]
 
 
 def encoder_file(folder: Run) -> Path:

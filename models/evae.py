@@ -2,7 +2,7 @@
 
 Loss of one batch, both terms on a stated scale:
 
-    loss = mean over windows and pixels of the reconstruction error
+    loss = mean over windows and outputs of the reconstruction error
          + beta * mean over windows of KL( q(z | events) || N(0, 1) ), summed over the latent
 
 The mean over pixels is 1 / (H W) of the sum in an evidence lower bound, so `beta` here weighs
@@ -11,6 +11,7 @@ H W times more than the same number in front of a summed error: the appendix's s
 iterations. A weight near 1e-5 keeps it alive.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,11 +23,13 @@ from torch.nn import functional
 from models.batch import EventBatch, Grid
 from models.context import EventContextNetwork
 from models.embedding import CODINGS
-from models.pictures import PictureContextNetwork, last_polarity
+from models.pictures import PictureContextNetwork, cell_counts, last_polarity, newest_time
 
 VARIANTS = ("brp_full", "brp_xy", "eivae")
 NORMS = ("batch", "none")
-TARGETS = ("signed", "occupancy")
+TARGETS = ("signed", "occupancy", "aged", "counts")
+CELLS = 8  # each way, of the target "counts"
+COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events
 LIMITS = {"width": 4096, "height": 4096, "context": 8192, "latent": 256, "time_bins": 65536}
 LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
 ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)
@@ -45,8 +48,8 @@ class EventVAE(nn.Module):
         context: Features of the context vector, even.
         latent: Size of z.
         norm: "batch" or "none": normalisation of the context network.
-        target: What is reconstructed: "signed" (Tanh, smooth L1) or "occupancy" (Sigmoid,
-            binary cross entropy); see `event_targets`.
+        target: What is reconstructed: "signed" (Tanh, smooth L1), "occupancy" or "aged" (Sigmoid,
+            binary cross entropy), or "counts" (linear, mean squared error); see `event_targets`.
         time_bins: Resolution of time within a window, part of the model.
         coding: How the time of an event enters the context: "additive" (sines and cosines),
             "eventnet" (decay and rotation, twice the numbers) or "none"; "brp_xy" has no time
@@ -88,7 +91,7 @@ class EventVAE(nn.Module):
             nn.ReLU(),
             nn.Linear(256, 1024),
             nn.ReLU(),
-            nn.Linear(1024, width * height),
+            nn.Linear(1024, math.prod(target_shape(target, self.grid))),
         )
 
     def forward(self, batch: EventBatch, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -99,7 +102,8 @@ class EventVAE(nn.Module):
             noise: Standard normal (B, latent) for z = mu + noise exp(logvar / 2); None: z = mu.
 
         Returns:
-            Logits (B, H W) before Tanh or Sigmoid, mu (B, latent), logvar (B, latent).
+            Logits (B, outputs) of `reconstruct`, mu (B, latent), logvar (B, latent); there are
+            as many outputs as `target_shape` holds.
         """
         mu, logvar = self.encoder(self.ecn(batch)).chunk(2, dim=-1)
         z = mu if noise is None else mu + noise * torch.exp(0.5 * logvar.clamp(-30.0, LOGVAR_LIMIT))
@@ -131,30 +135,58 @@ def check_settings(settings: dict[str, Any]) -> None:
         raise ValueError(f"coding {rule}, got 'eventnet'")
 
 
+def target_shape(target: str, grid: Grid) -> tuple[int, ...]:
+    """Shape of one window's target: a picture (H, W), or for "counts" (2, CELLS, CELLS), OFF and ON."""
+    return (2, CELLS, CELLS) if target == "counts" else (grid.height, grid.width)
+
+
 def event_targets(batch: EventBatch, target: str) -> Tensor:
-    """Pictures that the decoder learns, float32 (B, H W), row-major.
+    """Pictures that the decoder learns, float32 (B, outputs), row-major (`target_shape`).
 
     "signed": polarity of each pixel's last event, -1, 0 or +1. "occupancy": 1 where the pixel
-    had any event, else 0. Both follow from the set of events alone, as the context does: an
+    had any event, else 0. "aged": where it had any, the time of its newest one in (0, 1), newest
+    near 1, else 0. These follow from the set of events alone, as the context does: an
     event that occurs twice counts once. Events of a window are taken in their given (time) order.
+    "counts": log2(1 + count) / COUNTED_BITS of the OFF, then the ON events of each cell.
     """
+    if target == "counts":
+        return torch.from_numpy(np.log2(1.0 + cell_counts(batch, CELLS)) / np.float32(COUNTED_BITS))
+    if target == "aged":
+        return torch.from_numpy(newest_time(batch))
     last = last_polarity(batch)
     return torch.from_numpy(last if target == "signed" else np.abs(last))
 
 
 def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
-    """Mean over windows and pixels: smooth L1 of tanh(logits), or binary cross entropy of the logits.
+    """Mean over windows and outputs of the target's error, see `EventVAE`.
 
     The cross entropy takes logits because sigmoid followed by log is infinite from 17 on.
     """
     if target == "signed":
         return functional.smooth_l1_loss(torch.tanh(logits), targets)
+    if target == "counts":
+        return functional.mse_loss(logits, targets)
     return functional.binary_cross_entropy_with_logits(logits, targets)
 
 
 def reconstruct(logits: Tensor, target: str) -> Tensor:
-    """Picture from logits: Tanh in [-1, 1] or Sigmoid in [0, 1] (appendix A.1)."""
+    """Target's values from logits: Tanh in [-1, 1], Sigmoid in [0, 1] (appendix A.1), or as they are."""
+    if target == "counts":
+        return logits
     return torch.tanh(logits) if target == "signed" else torch.sigmoid(logits)
+
+
+def pictures(values: Tensor, target: str, grid: Grid) -> Tensor:
+    """Values of a target (B, outputs) as pictures to look at, (B, H, W) in about [-1, 1].
+
+    Of "counts" each pixel shows its cell: the larger of ON and, below 0, OFF.
+    """
+    shaped = values.reshape(-1, *target_shape(target, grid))
+    if target != "counts":
+        return shaped
+    off, on = shaped.unbind(1)
+    rows, columns = (torch.arange(side) * CELLS // side for side in (grid.height, grid.width))
+    return torch.where(on >= off, on, -off)[:, rows[:, None], columns]
 
 
 def kl_divergence(mu: Tensor, logvar: Tensor) -> Tensor:
@@ -218,14 +250,17 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
     Returns:
         reconstruction (mean error of a pixel), mean_picture (the same error for the targets' own
         mean picture), explained (1 - reconstruction / mean_picture: 0 for a model that has learnt
-        nothing of the single window, 1 for a perfect one, and 0 where all targets are the same),
-        auc (`ranking_area` of "the pixel had an event" by the picture's magnitude), kl (mean over
+        nothing of the single window, 1 for a perfect one, and 0 where all targets are the same;
+        of "aged" none reaches 1: the cross entropy keeps the entropy of times between 0 and 1),
+        auc (`ranking_area` of "the target is not 0" by the picture's magnitude), kl (mean over
         windows [nats]), active_units.
     """
     logits, mu, logvar = evae(batch)
     mean = targets.mean(0).expand_as(targets)
     if evae.target == "signed":
         baseline = functional.smooth_l1_loss(mean, targets)
+    elif evae.target == "counts":
+        baseline = functional.mse_loss(mean, targets)
     else:
         baseline = functional.binary_cross_entropy(mean, targets)
     reconstruction, mean_picture = (

@@ -63,6 +63,36 @@ def last_polarity(batch: EventBatch) -> np.ndarray:
     return picture
 
 
+def newest_time(batch: EventBatch) -> np.ndarray:
+    """Time of each pixel's newest event within its window, 0 where there is none: float32 (B, H W).
+
+    Times are the centres of their bins, in (0, 1), newest near 1.
+    """
+    pixels = batch.grid.width * batch.grid.height
+    picture = np.zeros((len(batch), pixels), np.float32)
+    time = ((batch.bin + 0.5) / batch.grid.time_bins).astype(np.float32)
+    np.maximum.at(picture, (_window(batch), batch.code % pixels), time)
+    return picture
+
+
+def cell_counts(batch: EventBatch, cells: int) -> np.ndarray:
+    """OFF, then ON events in each of cells x cells equal parts of the sensor: float32 (B, 2 cells cells).
+
+    A pixel (x, y) belongs to column x cells // width and row y cells // height; row-major.
+    """
+    row, x = np.divmod(batch.code, batch.grid.width)
+    sign, y = np.divmod(row, batch.grid.height)
+    cell = (sign * cells + y * cells // batch.grid.height) * cells + x * cells // batch.grid.width
+    size = 2 * cells * cells
+    counts = np.bincount(_window(batch) * size + cell, minlength=len(batch) * size)
+    return counts.reshape(len(batch), size).astype(np.float32)
+
+
+def _window(batch: EventBatch) -> np.ndarray:
+    """The window of each event, int64 (N,)."""
+    return np.repeat(np.arange(len(batch)), np.diff(batch.offsets))
+
+
 def event_pictures(batch: EventBatch) -> Tensor:
     """Event images float32 (B, 1, H, W) on a scale where ON is 1."""
     last = torch.from_numpy(last_polarity(batch))
