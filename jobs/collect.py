@@ -6,7 +6,7 @@ Expect: about 3,000 control steps per second on one core; `data/train.h5` and
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -194,12 +194,24 @@ def fly_once(
         The events of each step, and the time at which each step ended [us since take-off].
     """
     events, ends_us = [], []
+    for end_us in steps_of(env, pilot, started, most_steps):
+        events.append(env.events)
+        ends_us.append(end_us)
+    return events, ends_us
+
+
+def steps_of(
+    env: CorridorEnv, pilot: Pilot, started: tuple[np.ndarray, Mapping[str, Any]], most_steps: int
+) -> Iterator[int]:
+    """The steps of such a flight, for who wants to look at the environment after each one.
+
+    Yields:
+        The time at which the step ended [us since take-off].
+    """
     observation, info = started
     for _ in range(most_steps):
         action = int(pilot(observation[None], [info])[0])
         observation, _, terminated, truncated, info = env.step(action)
-        events.append(env.events)
-        ends_us.append(int(info["t_us"]))
+        yield int(info["t_us"])
         if terminated or truncated:
             break
-    return events, ends_us

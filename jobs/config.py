@@ -21,6 +21,9 @@ from models.kinds import FINETUNED, KINDS, MOST_TIME_BINS, SMALLEST_IMAGE
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
 Name = Annotated[str, Field(min_length=1)]
+Latent = Annotated[int, Field(ge=1, le=256)]
+Stack = Annotated[int, Field(ge=1, le=32)]
+Target = Literal["signed", "occupancy", "aged", "counts"]  # models.evae.TARGETS
 
 
 class ConfigError(ValueError):
@@ -37,13 +40,13 @@ class ModelConfig:
 
     name: str
     context: Annotated[int, Field(ge=8, le=8192, multiple_of=2)] | None
-    latent: Annotated[int, Field(ge=1, le=256)] | None
+    latent: Latent | None
     norm: Literal["batch", "none"] | None
-    target: Literal["signed", "occupancy"] | None
+    target: Target | None
     time_bins: Annotated[int, Field(ge=2, le=65536)] | None
     coding: Literal["additive", "eventnet", "none"] | None
     encoder: Literal["frozen", "finetuned"] | None
-    stack: Annotated[int, Field(ge=1, le=32)]
+    stack: Stack
     hidden: list[Count] | None
 
     @pydantic.model_validator(mode="after")
@@ -178,6 +181,19 @@ class TradeEncoderConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class ProbeConfig:
+    """On how many steps representations are probed, and which event VAEs are trained for that."""
+
+    num_steps: Count
+    num_validation_steps: Count
+    iterations: Count
+    seeds: Count
+    latents: Annotated[list[Latent], Field(min_length=1, max_length=8)]
+    targets: Annotated[list[Target], Field(min_length=1, max_length=4)]
+    stacks: Annotated[list[Stack], Field(min_length=1, max_length=8)]
+
+
+@dataclass(frozen=True, config=STRICT)
 class ClusterConfig:
     """Where Ray runs."""
 
@@ -199,8 +215,9 @@ class Config:
     """One experiment, checked."""
 
     job: Literal[
-        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "trade_simulator", "trade_encoder"
-    ]
+        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "trade_simulator", "trade_encoder",
+        "probe",
+    ]  # fmt: skip
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
@@ -220,6 +237,7 @@ class Config:
     sweep: SweepConfig
     trade: TradeConfig
     trade_encoder: TradeEncoderConfig
+    probe: ProbeConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -30,23 +31,35 @@ def trained(config: Config, folder: Run, changes: dict[str, Any], seed: int) -> 
     The same seed gives the same windows, whatever is changed. A training that was finished
     before is read from the run folder.
     """
-    sensor = sensor_settings(config.env_config())
+    settings = trial_settings(config, changes)
     iterations = config.trade_encoder.iterations
-    settings = build_evae(config.model, sensor).settings | changes
     name = f"{settings['variant']}-{settings['coding']}-{settings['context']}-s{seed}-{iterations}"
     file = folder.path / "trade" / "encoders" / f"{name}.safetensors"
+    return kept(config, folder, file, settings, seed, iterations)
+
+
+def trial_settings(config: Config, changes: dict[str, Any]) -> dict[str, Any]:
+    """The settings of the run's event VAE with some of them changed."""
+    return build_evae(config.model, sensor_settings(config.env_config())).settings | changes
+
+
+def kept(
+    config: Config, folder: Run, file: Path, settings: dict[str, Any], seed: int, iterations: int
+) -> EventVAE:
+    """The frozen event VAE of a file, trained briefly on the run's recordings if it is not there yet."""
     if not file.with_suffix(".json").exists():
         train = read_recording(data_file(folder, "train"))
-        evae = train_short(config, train, settings, seed, f"Train {name}")
+        evae = train_short(config, train, settings, seed, iterations, f"Train {file.stem}")
+        sensor = sensor_settings(config.env_config())
         save_encoder(file, evae, {"sensor": sensor, "iterations": iterations})
     return load_encoder(file)[0]
 
 
 def train_short(
-    config: Config, train: Recording, settings: dict[str, Any], seed: int, title: str
+    config: Config, train: Recording, settings: dict[str, Any], seed: int, iterations: int, title: str
 ) -> EventVAE:
-    """`trade_encoder.iterations` updates as `jobs.pretrain` makes them, without its checkpoints."""
-    pretrain, iterations = config.pretrain, config.trade_encoder.iterations
+    """So many updates as `jobs.pretrain` makes them, without its checkpoints."""
+    pretrain = config.pretrain
     torch.manual_seed(seed)
     evae = EventVAE(**settings)
     optimizer = torch.optim.Adam(

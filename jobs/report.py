@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.markup import escape
@@ -9,6 +10,12 @@ from rich.table import Table
 from scipy.stats import binomtest
 
 from jobs.progress import console
+from jobs.runs import Run, write_atomic
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from jobs.tracking import Tracker
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -157,3 +164,30 @@ def metrics(row: Summary) -> dict[str, float]:
         "sim/events_per_step": row.events_per_step,
         "sim/dropped_events": float(row.dropped),
     }
+
+
+def publish_table(
+    folder: Run,
+    tracker: "Tracker",
+    name: str,
+    title: str,
+    head: Sequence[str],
+    lines: Sequence[Sequence[str]],
+) -> None:
+    """Print a table, and write it as Markdown, `name`.md, into the run folder and the tracker."""
+    table = Table(title=title, title_justify="left")
+    for place, heading in enumerate(head):
+        table.add_column(heading, justify="right" if place else "left")
+    for line in lines:
+        table.add_row(*line)
+    show(table)
+    rule = ["---:" if place else "---" for place in range(len(head))]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in (head, rule, *lines)) + "\n"
+    write_atomic(folder.path / f"{name}.md", text)
+    tracker.text(f"{name}.md", text)
+
+
+def draw_figure(folder: Run, tracker: "Tracker", name: str, figure: "Figure") -> None:
+    """Write a figure as `name`.png into the run folder and the tracker."""
+    figure.savefig(folder.path / f"{name}.png", dpi=120)
+    tracker.figure(f"{name}.png", figure)

@@ -20,7 +20,10 @@ from jobs.config import Config, ConfigError, as_dict, parse
 
 # Where a run is computed and written down, and how its policy is flown afterwards, does not
 # change what is trained.
-UNNAMED = ("job", "resume", "runs_dir", "cluster", "tracking", "evaluate", "sweep", "trade", "trade_encoder")
+UNNAMED = (
+    "job", "resume", "runs_dir", "cluster", "tracking",
+    "evaluate", "sweep", "trade", "trade_encoder", "probe",
+)  # fmt: skip
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 

@@ -7,11 +7,10 @@ and figures of what the latent holds, in the run folder under `trade/` and in ML
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from rich.table import Table
 
 from envs.recordings import read_recording
 from jobs.collect import data_file, record
@@ -21,17 +20,14 @@ from jobs.encoder_figures import coding_figure, cost_figure, embedding_figure, p
 from jobs.encoder_trials import DENSE_EVENTS, MOST_EVENTS, control_steps, draw, held_out, spread, trained
 from jobs.pretrain import encoder_file, held_out_windows, prepare_encoder
 from jobs.progress import progress
-from jobs.report import show
-from jobs.runs import Run, finish, locate_run, open_run, write_atomic
+from jobs.report import draw_figure, publish_table
+from jobs.runs import Run, finish, locate_run, open_run
 from jobs.tracking import Tracker, open_tracker
 from jobs.trade_figures import pareto
 from models.batch import EventBatch
 from models.embedding import CODINGS
-from models.evae import EventVAE, event_targets, reconstruct
+from models.evae import EventVAE, event_targets, pictures, reconstruct
 from models.weights import load_encoder
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 EVENT_ENCODERS = ("brp_full", "brp_xy")
 CONTEXTS = (128, 256, 512, 1024)
@@ -82,9 +78,10 @@ def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVA
         rows = measure(forms, usual, timed, trade.rounds, advance)
     front = fronts(rows)
     lines = [cells(row, rows[1].dense_us, place in front) for place, row in enumerate(rows)]
-    publish(folder, tracker, "inference", "Encoding a window, one setting changed at a time", HEADINGS, lines)
+    title = "Encoding a window, one setting changed at a time"
+    publish_table(folder, tracker, "trade/inference", title, HEADINGS, lines)
     tracker.table("trade/inference", columns(rows))
-    draw_figure(folder, tracker, "inference", cost_figure(rows, front))
+    draw_figure(folder, tracker, "trade/inference", cost_figure(rows, front))
     first, network = rows[:2]
     return {
         "perf/encode_step_us": first.step_us,
@@ -114,10 +111,10 @@ def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
     }
     lines = [(coding, *map(percent, own.values())) for coding, own in spreads.items()]
     title = f"Explained [%] by coding of time, mean and 95 % interval over {trade.seeds} trainings"
-    publish(folder, tracker, "coding", title, ("Coding", *conditions), lines)
-    draw_figure(folder, tracker, "coding", coding_figure(spreads))
+    publish_table(folder, tracker, "trade/coding", title, ("Coding", *conditions), lines)
+    draw_figure(folder, tracker, "trade/coding", coding_figure(spreads))
     rows = {name: side_by_side(models, conditions[name]) for name in SHOWN}
-    draw_figure(folder, tracker, "coding_pictures", picture_grid(rows, ("events", *CODINGS) * 2))
+    draw_figure(folder, tracker, "trade/coding_pictures", picture_grid(rows, ("events", *CODINGS) * 2))
     return {
         f"evae/explained_{coding}_{name.replace(' ', '_')}": mean
         for coding, own in spreads.items()
@@ -127,11 +124,11 @@ def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
 
 def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
     """Figures of the code of time, of the way between two latents, and of scenes never trained on."""
-    draw_figure(folder, tracker, "embedding", embedding_figure())
+    draw_figure(folder, tracker, "trade/embedding", embedding_figure())
     validation = read_recording(data_file(folder, "validation"))
     batch = held_out_windows(validation, config.pretrain, evae.grid)["four_steps"]
     heads = ("events", *(f"{share:.2f}" for share in np.linspace(0, 1, STEPS_BETWEEN)), "events")
-    draw_figure(folder, tracker, "interpolation", picture_grid(between(evae, batch), heads))
+    draw_figure(folder, tracker, "trade/interpolation", picture_grid(between(evae, batch), heads))
     scenes = {" and ".join(config.collect.scenes): batch}
     steps = 10 * config.trade_encoder.windows
     with progress("Fly in other scenes", steps * len(OTHER_SCENES), "steps") as advance:
@@ -144,7 +141,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
         f"{scene}\n{shares[scene]:.0%} explained": side_by_side({"": evae}, batch, PICTURES)
         for scene, batch in scenes.items()
     }
-    draw_figure(folder, tracker, "scenes", picture_grid(rows, ("events", "decoded") * PICTURES))
+    draw_figure(folder, tracker, "trade/scenes", picture_grid(rows, ("events", "decoded") * PICTURES))
     return {f"evae/explained_in_{scene.replace(' ', '_')}": share for scene, share in shares.items()}
 
 
@@ -154,16 +151,15 @@ def side_by_side(models: Mapping[str, EventVAE], batch: EventBatch, count: int =
     places = np.argsort(-np.diff(batch.offsets), kind="stable")[: max(count, len(batch) // 2)]
     chosen = places[:: len(places) // count][:count]  # of the fuller half, from the fullest on
     first = next(iter(models.values()))
-    parts = [event_targets(batch, first.target)]
-    parts += [reconstruct(evae(batch)[0], evae.target) for evae in models.values()]
-    shape = batch.grid.height, batch.grid.width
-    return [part[place].reshape(shape).numpy() for place in chosen for part in parts]
+    parts = [pictures(event_targets(batch, first.target), first.target, batch.grid)]
+    for evae in models.values():
+        parts.append(pictures(reconstruct(evae(batch)[0], evae.target), evae.target, batch.grid))
+    return [part[place].numpy() for place in chosen for part in parts]
 
 
 @torch.no_grad()
 def between(evae: EventVAE, batch: EventBatch) -> dict[str, list[np.ndarray]]:
     """For pairs of full windows whose latents lie far apart: pictures along the line between them."""
-    shape = batch.grid.height, batch.grid.width
     mu, targets = evae(batch)[1], event_targets(batch, evae.target)
     full = np.argsort(-np.diff(batch.offsets), kind="stable")[:40]
     distance = torch.cdist(mu[full], mu[full]).numpy()
@@ -173,10 +169,9 @@ def between(evae: EventVAE, batch: EventBatch) -> dict[str, list[np.ndarray]]:
         distance[list(ends)] = distance[:, list(ends)] = -1.0
         a, b = (int(full[end]) for end in ends)
         share = torch.linspace(0, 1, STEPS_BETWEEN)[:, None]
-        pictures = reconstruct(evae.decoder(torch.lerp(mu[a], mu[b], share)), evae.target)
-        rows[f"pair {pair + 1}"] = [
-            part.reshape(shape).numpy() for part in (targets[a], *pictures, targets[b])
-        ]
+        way = reconstruct(evae.decoder(torch.lerp(mu[a], mu[b], share)), evae.target)
+        shown = pictures(torch.cat([targets[a][None], way, targets[b][None]]), evae.target, batch.grid)
+        rows[f"pair {pair + 1}"] = list(shown.numpy())
     return rows
 
 
@@ -212,25 +207,3 @@ def percent(spread_of: tuple[float, float]) -> str:
     """A mean and half its interval in percent."""
     mean, half = spread_of
     return f"{100 * mean:.0f}" + ("" if np.isnan(half) else f" ± {100 * half:.0f}")
-
-
-def publish(
-    folder: Run, tracker: Tracker, name: str, title: str, head: Sequence[str], lines: Sequence[Sequence[str]]
-) -> None:
-    """Print a table, and write it as Markdown into the run folder and the tracker."""
-    table = Table(title=title, title_justify="left")
-    for place, heading in enumerate(head):
-        table.add_column(heading, justify="right" if place else "left")
-    for line in lines:
-        table.add_row(*line)
-    show(table)
-    rule = ["---:" if place else "---" for place in range(len(head))]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in (head, rule, *lines)) + "\n"
-    write_atomic(folder.path / "trade" / f"{name}.md", text)
-    tracker.text(f"trade/{name}.md", text)
-
-
-def draw_figure(folder: Run, tracker: Tracker, name: str, figure: "Figure") -> None:
-    """Write a figure into the run folder and the tracker."""
-    figure.savefig(folder.path / "trade" / f"{name}.png", dpi=120)
-    tracker.figure(f"trade/{name}.png", figure)

@@ -26,6 +26,7 @@ JOBS = {
     "sweep": "jobs.sweep",
     "trade_simulator": "jobs.trade_simulator",
     "trade_encoder": "jobs.trade_encoder",
+    "probe": "jobs.probe",
 }
 
 # Two threads beside other busy processes ran ten times slower than one.
