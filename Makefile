@@ -4,6 +4,9 @@ PYTHON ?= python3.11
 VENV ?= .venv
 ARGS ?=
 
+SEEDS ?= 0 1 2
+POLICIES ?= bytestream bytestream_xy event_columns event_image_vae event_set event_image rgb
+
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
@@ -16,7 +19,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream sweep-robustness mlflow test lint check bench docs lock clean
+.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -43,6 +46,12 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 
 bytestream: setup ## from nothing to an evaluated policy (half an hour; ARGS="budget=smoke": a minute)
 	$(LAUNCH) +exp=bytestream $(ARGS)
+
+train-all: setup ## every policy with three seeds into models/pretrained (hours; a stopped one continues)
+	for seed in $(SEEDS); do for exp in $(POLICIES); do \
+	    $(LAUNCH) +exp=$$exp job=train algo=ppo_fast seed=$$seed $(ARGS) || exit 1; \
+	done; done
+	$(LAUNCH) +exp=ship
 
 sweep-robustness: setup ## fly the trained policy at other rates, thresholds and with sensor faults
 	$(LAUNCH) +exp=robustness $(ARGS)

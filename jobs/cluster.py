@@ -5,7 +5,8 @@ import os
 import secrets
 from pathlib import Path
 
-from jobs.config import ClusterConfig, ConfigError
+from jobs.config import ConfigError
+from jobs.settings import ClusterConfig
 
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",

@@ -1,4 +1,4 @@
-"""Every setting of an experiment: names, units and ranges; the values are in conf/.
+"""Every setting of an experiment, checked; the values are in conf/, their ranges in `jobs.settings`.
 
 `parse` turns the composed configuration into one frozen `Config`, or raises one
 `ConfigError` that lists each refused key with its value and the rule. Nothing has been
@@ -14,16 +14,24 @@ import pydantic
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, Fraction, Positive
+from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from jobs.refusals import JOBS_CHOOSE, explain, nearest, refused_scenes
-from models.kinds import FINETUNED, KINDS, MOST_TIME_BINS, SMALLEST_IMAGE
-
-Count = Annotated[int, Field(ge=1)]
-NonNegative = Annotated[float, Field(ge=0)]
-Name = Annotated[str, Field(min_length=1)]
-Latent = Annotated[int, Field(ge=1, le=256)]
-Stack = Annotated[int, Field(ge=1, le=32)]
-Target = Literal["signed", "occupancy", "aged", "counts"]  # models.evae.TARGETS
+from jobs.settings import (
+    AlgoConfig,
+    ClusterConfig,
+    CollectConfig,
+    EvaluateConfig,
+    ModelConfig,
+    Name,
+    PretrainConfig,
+    ProbeConfig,
+    SweepConfig,
+    TrackingConfig,
+    TradeConfig,
+    TradeEncoderConfig,
+    TrainConfig,
+)
+from models.kinds import KINDS, SMALLEST_IMAGE
 
 
 class ConfigError(ValueError):
@@ -31,192 +39,12 @@ class ConfigError(ValueError):
 
 
 @dataclass(frozen=True, config=STRICT)
-class ModelConfig:
-    """The policy's representation and network (appendix A.1, D.1.2).
-
-    The settings of the event VAE (`EVAE_SETTINGS`) and what PPO does with its encoder are None
-    for a policy without one, `hidden` for one whose network has fixed sizes.
-    """
-
-    name: str
-    context: Annotated[int, Field(ge=8, le=8192, multiple_of=2)] | None
-    latent: Latent | None
-    norm: Literal["batch", "none"] | None
-    target: Target | None
-    time_bins: Annotated[int, Field(ge=2, le=65536)] | None
-    coding: Literal["additive", "eventnet", "none"] | None
-    encoder: Literal["frozen", "finetuned"] | None
-    stack: Stack
-    hidden: list[Count] | None
-
-    @pydantic.model_validator(mode="after")
-    def _fits_its_kind(self) -> "ModelConfig":
-        if self.name not in KINDS:
-            raise ValueError(f"name must be one of {', '.join(KINDS)}, got {self.name!r}")
-        kind = KINDS[self.name]
-        wanted = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
-        for setting, wants in wanted.items():
-            value = getattr(self, setting)
-            if wants != (value is not None):
-                rule = f"be given for {self.name}" if wants else f"be null: {self.name} has no such part"
-                raise ValueError(f"{setting} must {rule}, got {value!r}")
-        if self.coding == "eventnet" and self.name != "brp_full":
-            rule = f"must be additive or none for {self.name}, which has no time"
-            raise ValueError(f"coding {rule}, got 'eventnet'")
-        if self.encoder == "finetuned":
-            self._can_be_finetuned()
-        return self
-
-    def _can_be_finetuned(self) -> None:
-        if self.name not in FINETUNED:
-            rule = f"must be frozen for {self.name}; {', '.join(FINETUNED)} can be fine-tuned"
-            raise ValueError(f"encoder {rule}, got 'finetuned'")
-        if self.time_bins is None or self.time_bins > MOST_TIME_BINS:
-            rule = f"must be at most {MOST_TIME_BINS} for encoder=finetuned"
-            raise ValueError(f"time_bins {rule}, got {self.time_bins}")
-
-
-@dataclass(frozen=True, config=STRICT)
-class AlgoConfig:
-    """PPO, each word as RLlib spells it (appendix D.1.2)."""
-
-    lr: Positive
-    lr_schedule: Literal["constant", "linear"]
-    gamma: Fraction
-    lambda_: Fraction
-    clip_param: Positive
-    num_epochs: Count
-    minibatch_size: Count
-    train_batch_size_per_learner: Count
-    vf_loss_coeff: NonNegative
-    entropy_coeff: NonNegative
-    grad_clip: Positive
-    reward_scale: Positive
-    num_envs_per_env_runner: Count
-    num_env_runners: Annotated[int, Field(ge=0, le=10_000)]
-
-    @pydantic.model_validator(mode="after")
-    def _minibatch_fits(self) -> "AlgoConfig":
-        if self.minibatch_size > self.train_batch_size_per_learner:
-            raise ValueError("minibatch_size must not exceed train_batch_size_per_learner")
-        return self
-
-
-@dataclass(frozen=True, config=STRICT)
-class CollectConfig:
-    """Which flights fill the data set of the event VAE."""
-
-    scenes: Annotated[list[Name], Field(min_length=1)]
-    num_steps: Count
-    num_validation_steps: Count
-    policy: str | None
-    policy_share: Fraction
-
-
-@dataclass(frozen=True, config=STRICT)
-class PretrainConfig:
-    """How the event VAE is trained (appendix B.2)."""
-
-    encoder: str | None
-    iterations: Count
-    batch_windows: Count
-    window_events: Count
-    windows: Literal["mixed", "count"]
-    lr: Positive
-    weight_decay: NonNegative
-    beta: NonNegative
-    beta_schedule: Literal["appendix", "constant"]
-    validate_every: Count
-    checkpoint_every: Count
-
-
-@dataclass(frozen=True, config=STRICT)
-class TrainConfig:
-    """How long the policy is trained and how often it is saved."""
-
-    env_steps: Count
-    checkpoint_every: Count
-
-
-@dataclass(frozen=True, config=STRICT)
-class EvaluateConfig:
-    """On how many held-out corridors, and drawn by which renderers."""
-
-    episodes: Count
-    renderers: Annotated[list[Literal["raycast", "pyrender"]], Field(min_length=1)]
-    pyrender_episodes: Count
-    action: Literal["deterministic", "stochastic"]
-    video: bool
-
-
-@dataclass(frozen=True, config=STRICT)
-class SweepConfig:
-    """The axes of the robustness sweep: configuration key -> values, each flown `trials` times."""
-
-    scene: Name
-    axes: dict[str, Annotated[list[float], Field(min_length=1)]]
-    trials: Count
-    policy: str | None
-
-
-@dataclass(frozen=True, config=STRICT)
-class TradeConfig:
-    """What the simulator's accuracy is measured on, and how often its cost."""
-
-    scenes: Annotated[list[Name], Field(min_length=1)]
-    control_hz: Annotated[list[Positive], Field(min_length=1)]
-    flights: Count
-    steps: Count
-    rounds: Count
-
-
-@dataclass(frozen=True, config=STRICT)
-class TradeEncoderConfig:
-    """How long the encoders that are compared are trained, and on what they are measured."""
-
-    iterations: Count
-    seeds: Count
-    windows: Annotated[int, Field(ge=4)]
-    rounds: Count
-
-
-@dataclass(frozen=True, config=STRICT)
-class ProbeConfig:
-    """On how many steps representations are probed, and which event VAEs are trained for that."""
-
-    num_steps: Count
-    num_validation_steps: Count
-    iterations: Count
-    seeds: Count
-    latents: Annotated[list[Latent], Field(min_length=1, max_length=8)]
-    targets: Annotated[list[Target], Field(min_length=1, max_length=4)]
-    stacks: Annotated[list[Stack], Field(min_length=1, max_length=8)]
-
-
-@dataclass(frozen=True, config=STRICT)
-class ClusterConfig:
-    """Where Ray runs."""
-
-    name: Literal["local", "ray"]
-    address: str | None
-    num_cpus: Count | None
-
-
-@dataclass(frozen=True, config=STRICT)
-class TrackingConfig:
-    """Where results are recorded."""
-
-    uri: Name
-    experiment: Name
-
-
-@dataclass(frozen=True, config=STRICT)
 class Config:
     """One experiment, checked."""
 
     job: Literal[
-        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "trade_simulator", "trade_encoder",
-        "probe",
+        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "ship", "trade_simulator",
+        "trade_encoder", "probe",
     ]  # fmt: skip
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
@@ -247,7 +75,6 @@ class Config:
         return EnvConfig(**{**self.env, **parts, **changes})
 
 
-EVAE_SETTINGS = ("context", "latent", "norm", "target", "time_bins", "coding")
 HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
 ENV_PARTS = ("camera", "faults", "renderer", "fidelity")
 ENV_KEYS = [

@@ -190,3 +190,52 @@ def _draw_way(panel: Axes, track: Track) -> None:
     panel.plot(y_m[0], x_m[0], "o", color=colour, ms=4, zorder=4)
     if track.outcome == "collision":
         panel.plot(y_m[-1], x_m[-1], "X", color=OUTCOMES["collision"], ms=10, mec="white", mew=1, zorder=5)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """How one training of an experiment went: environment steps, and means over the last flights (n,)."""
+
+    exp: str
+    seed: int
+    env_steps: np.ndarray
+    success_rate: np.ndarray
+    distance_m: np.ndarray
+
+
+def learning_figure(curves: Sequence[Curve]) -> Figure:
+    """Success in training against steps: a line per training, their mean in bold, a panel per experiment.
+
+    The mean is drawn where every training has a point before and after.
+    """
+    names = list(dict.fromkeys(curve.exp for curve in curves))
+    across = min(4, len(names))
+    down = -(-len(names) // across)
+    figure = Figure(figsize=(2.9 * across + 0.4, 2.3 * down + 0.5), layout="constrained")
+    panels = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    for panel, name in zip(panels.flat, names, strict=False):
+        own = [curve for curve in curves if curve.exp == name and curve.env_steps.size]
+        for curve in own:
+            panel.plot(curve.env_steps / 1e3, 100 * curve.success_rate, color=POLICY, lw=0.8, alpha=0.5)
+        if own:
+            steps = np.linspace(
+                max(curve.env_steps[0] for curve in own), min(curve.env_steps[-1] for curve in own), 100
+            )
+            every = [np.interp(steps, curve.env_steps, curve.success_rate) for curve in own]
+            mean = 100 * np.mean(every, axis=0)
+            panel.plot(steps / 1e3, mean, color=POLICY, lw=2.2)
+            panel.annotate(
+                f"{mean[-1]:.0f} %", (steps[-1] / 1e3, mean[-1]), (-2, 5), textcoords="offset points",
+                ha="right", fontsize=9, color=INK,
+            )  # fmt: skip
+        plural = "s" if len(own) != 1 else ""
+        panel.set_title(f"{name}, {len(own)} training{plural}", loc="left", fontsize=9, color=INK)
+        panel.grid(axis="y", color=GRID)
+        panel.set(ylim=(-3, 103))
+        panel.tick_params(labelsize=8)
+        panel.spines[["top", "right"]].set_visible(False)
+    for panel in panels.flat[len(names) :]:
+        panel.set_visible(False)
+    figure.supxlabel("Environment steps [thousands]", fontsize=9)
+    figure.supylabel("Success of the last 100 flights [%]", fontsize=9)
+    return figure

@@ -15,10 +15,11 @@ from ray.tune.registry import register_env
 
 from envs.config import sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
-from jobs.config import EVAE_SETTINGS, Config, ConfigError
+from jobs.config import Config, ConfigError
 from jobs.drift import drift_figures
 from jobs.learner import REWARD_SCALE, PlainPPOLearner
 from jobs.runner import PlainEnvRunner
+from jobs.settings import EVAE_SETTINGS
 from models.evae import EventVAE
 from models.finetuned import evae_settings
 from models.kinds import KINDS

@@ -15,10 +15,11 @@ import torch
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
 from jobs.collect import check_policy, collect, data_file
-from jobs.config import EVAE_SETTINGS, Config, ConfigError, ModelConfig, PretrainConfig
+from jobs.config import Config, ConfigError
 from jobs.figures import reconstruction_figure
 from jobs.progress import console, progress
 from jobs.runs import Run, finish, finished, locate_run, open_run
+from jobs.settings import EVAE_SETTINGS, ModelConfig, PretrainConfig
 from jobs.tracking import Tracker, open_tracker
 from models.batch import EventBatch, Grid, batch_windows
 from models.evae import (

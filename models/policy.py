@@ -26,7 +26,7 @@ from models.kinds import FINETUNED, KINDS, SMALLEST_IMAGE, kind_of
 from models.networks import assemble
 from models.pictures import PictureEncoder
 from models.table import EncoderTable
-from models.weights import load_encoder, save_encoder, write_atomic
+from models.weights import lean_tensors, load_encoder, save_encoder, write_atomic
 
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
 ENCODER_FILES = (ENCODER, "encoder.json")
@@ -144,6 +144,7 @@ def save_policy(
     manifest: Mapping[str, Any],
     evae: EventVAE | None = None,
     encoder_figures: Mapping[str, float] | None = None,
+    lean: bool = False,
 ) -> Path:
     """Write a policy folder that is sufficient alone; its manifest comes last, and seals it.
 
@@ -156,6 +157,7 @@ def save_policy(
             training figures.
         evae: The frozen event VAE, for a policy that has one.
         encoder_figures: Its own held-out figures, for the encoder's manifest.
+        lean: Weights in float16 and no decoder, a fraction of the size: it flies, but draws nothing.
 
     Returns:
         The folder.
@@ -170,13 +172,27 @@ def save_policy(
     folder.mkdir(parents=True, exist_ok=True)
     if evae is not None:
         facts = {key: manifest[key] for key in ("sensor", "sensor_hash")}
-        save_encoder(folder / ENCODER, evae, {**facts, "figures": dict(encoder_figures or {})})
+        save_encoder(folder / ENCODER, evae, {**facts, "figures": dict(encoder_figures or {})}, lean)
     tensors = {name: value.detach().contiguous() for name, value in networks.state_dict().items()}
-    write_atomic(folder / NETWORKS, safetensors.torch.save(tensors))
+    write_atomic(folder / NETWORKS, safetensors.torch.save(lean_tensors(tensors) if lean else tensors))
     sums = {name: _digest(folder / name) for name in _files(manifest)}
     text = json.dumps({**manifest, "format": FORMAT, "sha256": sums}, indent=2, allow_nan=False)
     write_atomic(folder / MANIFEST, text.encode())
     return folder
+
+
+def save_lean_policy(source: str | Path, path: str | Path, about: Mapping[str, Any]) -> Path:
+    """Write the policy of a folder once more, lean, with `about` added to its manifest; return the new one.
+
+    Raises:
+        PolicyFileError: As `load_policy`.
+    """
+    folder = Path(source)
+    load_policy(folder)  # checks every file
+    manifest = _read_manifest(folder / MANIFEST)
+    evae, own = load_encoder(folder / ENCODER) if kind_of(manifest).encoder else (None, {})
+    networks = _load_networks(folder / NETWORKS, manifest)
+    return save_policy(path, networks, {**manifest, **about}, evae, own.get("figures"), lean=True)
 
 
 def load_policy(
@@ -267,9 +283,10 @@ def _load_networks(file: Path, manifest: Mapping[str, Any]) -> nn.ModuleDict:
     bear out cost nothing.
     """
     try:
-        tensors = safetensors.torch.load(_read(file))
+        read = safetensors.torch.load(_read(file))
     except safetensors.SafetensorError as error:
         raise PolicyFileError(f"{file}: not a safetensors file: {error}") from None
+    tensors = {name: value.float() if value.dtype == torch.half else value for name, value in read.items()}
     with torch.device("meta"):
         networks = assemble(manifest)
     if _forms(tensors) != _forms(networks.state_dict()):

@@ -24,6 +24,7 @@ JOBS = {
     "train": "jobs.train",
     "evaluate": "jobs.evaluate",
     "sweep": "jobs.sweep",
+    "ship": "jobs.ship",
     "trade_simulator": "jobs.trade_simulator",
     "trade_encoder": "jobs.trade_encoder",
     "probe": "jobs.probe",

@@ -8,19 +8,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from envs.config import EnvConfig
-from jobs.config import (
-    ENV_PARTS,
-    EVAE_SETTINGS,
-    SECTIONS,
-    Config,
-    ConfigError,
-    as_dict,
-    env_with,
-    known_keys,
-    parse,
-)
+from jobs.config import ENV_PARTS, SECTIONS, Config, ConfigError, as_dict, env_with, known_keys, parse
 from jobs.refusals import JOBS_CHOOSE
 from jobs.runs import run_name
+from jobs.settings import EVAE_SETTINGS
 from models.kinds import KINDS
 
 CONF = Path(__file__).resolve().parent.parent / "conf"

@@ -6,7 +6,7 @@ import torch
 
 from envs.config import EnvConfig
 from jobs.collect import record
-from jobs.config import EVAE_SETTINGS, ConfigError, ModelConfig, PretrainConfig
+from jobs.config import ConfigError
 from jobs.pretrain import (
     beta,
     check_sources,
@@ -20,6 +20,7 @@ from jobs.pretrain import (
     save_checkpoint,
 )
 from jobs.runs import open_run
+from jobs.settings import EVAE_SETTINGS, ModelConfig, PretrainConfig
 from models.batch import batch_windows
 from models.evae import EventVAE, event_targets, train_step
 from models.weights import load_encoder, save_encoder
@@ -187,7 +188,7 @@ def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anyt
 
 
 def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
-    model = ModelConfig(name="eip", stack=3, hidden=None, **dict.fromkeys(EVAE_SETTINGS))
+    model = ModelConfig(name="eip", stack=3, hidden=None, encoder=None, **dict.fromkeys(EVAE_SETTINGS))
     config = dataclasses.replace(small_config(tmp_path), model=model)
     with pytest.raises(ConfigError, match="model: eip has no event VAE to pretrain; go on with job=train"):
         run(config)

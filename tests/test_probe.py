@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from jobs import probe
-from jobs.config import EVAE_SETTINGS, ConfigError, ModelConfig
+from jobs.config import ConfigError
 from jobs.probe import Form, Row, as_columns, cells_of, headings, key, probe_figure
 from jobs.probes import Scores
 from jobs.runs import locate_run
+from jobs.settings import EVAE_SETTINGS, ModelConfig
 from tests.test_runs import small_config
 
 

@@ -103,7 +103,7 @@ except RuntimeError as error:
 def test_workers_of_ray_draw_the_same_bytes_at_the_same_time(expected, tmp_path):
     ray = pytest.importorskip("ray")
     from jobs.cluster import start_ray
-    from jobs.config import ClusterConfig
+    from jobs.settings import ClusterConfig
 
     class Worker:
         def draw(self, times: int) -> list[bytes]:

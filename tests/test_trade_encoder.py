@@ -6,7 +6,7 @@ import torch
 
 from jobs import encoder_costs, trade_encoder
 from jobs.bench.encoder import compare
-from jobs.config import EVAE_SETTINGS, ConfigError, ModelConfig
+from jobs.config import ConfigError
 from jobs.encoder_costs import (
     Form,
     Row,
@@ -20,6 +20,7 @@ from jobs.encoder_costs import (
 )
 from jobs.encoder_trials import spread, squeezed
 from jobs.runs import locate_run
+from jobs.settings import EVAE_SETTINGS, ModelConfig
 from jobs.trade_encoder import cells, columns, fronts, percent
 from models.batch import EventBatch, batch_windows
 from models.evae import EventVAE, event_targets, reconstruct

@@ -28,9 +28,10 @@ from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.bench.throughput import composed
 from jobs.cluster import start_ray
-from jobs.config import EVAE_SETTINGS, Config
+from jobs.config import Config
 from jobs.ppo import build_ppo
 from jobs.progress import console
+from jobs.settings import EVAE_SETTINGS
 from models.evae import EventVAE
 from models.features import push_features
 from models.kinds import KINDS

@@ -1,0 +1,128 @@
+"""Put trained policies where a fresh clone finds them, and draw how they learnt.
+
+Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=ship
+Expect: seconds. In models/pretrained a folder <exp>-s<seed> for the newest training of each
+experiment and seed in `runs_dir` that the configured budget names, a few hundred kilobytes each
+(weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`.
+"""
+
+import csv
+import io
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs.config import settings_hash
+from jobs.config import Config, ConfigError
+from jobs.figures import Curve, learning_figure
+from jobs.progress import console
+from jobs.runs import REPOSITORY, open_run, write_atomic
+from jobs.tracking import open_tracker
+from models.policy import load_policy, save_lean_policy
+
+PRETRAINED = REPOSITORY / "models" / "pretrained"
+FIGURE = REPOSITORY / "docs" / "images" / "learning.png"
+COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
+POINTS = 50  # of a curve
+
+
+@dataclass(frozen=True)
+class Training:
+    """A finished training: its run folder, configuration, and what its stage's marker says."""
+
+    path: Path
+    config: Mapping[str, Any]
+    marker: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Of the shipped folder."""
+        return f"{self.config['exp']}-s{self.config['seed']}"
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Ship the finished trainings; return how many of each experiment.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    trainings = newest_trainings(Path(config.runs_dir).resolve(), config.budget)
+    if not trainings:
+        where = str(Path(config.runs_dir).resolve())
+        raise ConfigError(f"runs_dir: no finished training with budget={config.budget} in {where!r}")
+    for training in trainings:
+        target = ship(training, PRETRAINED)
+        size = sum(file.stat().st_size for file in target.iterdir())
+        console.print(f"{target.relative_to(REPOSITORY)}: {size / 1024:,.0f} KiB", markup=False)
+    curves = [curve(training) for training in trainings]
+    write_atomic(PRETRAINED / "curves.csv", as_csv(curves))
+    figure = learning_figure(curves)
+    figure.savefig(FIGURE, dpi=120)
+    folder = open_run(config)
+    with open_tracker(folder.config, folder) as tracker:
+        tracker.figure("train/learning.png", figure)
+        tracker.text("train/curves.csv", as_csv(curves))
+    counts: dict[str, int] = defaultdict(int)
+    for training in trainings:
+        counts[training.config["exp"]] += 1
+    return dict(counts)
+
+
+def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
+    """The training of each experiment and seed that was finished last, by experiment and seed."""
+    found: dict[tuple[str, int], tuple[int, Training]] = {}
+    for marker in runs_dir.glob("*/stages/train.json"):
+        path = marker.parent.parent
+        config = json.loads((path / "config.json").read_text())
+        if config["budget"] != budget or not (path / "policy" / "policy.json").is_file():
+            continue
+        key, when = (config["exp"], config["seed"]), marker.stat().st_mtime_ns
+        if key not in found or when > found[key][0]:
+            found[key] = when, Training(path, config, json.loads(marker.read_text()))
+    return [found[key][1] for key in sorted(found)]
+
+
+def ship(training: Training, folder: Path) -> Path:
+    """Write the policy of a training into `folder`, and what made it into its manifest."""
+    about = {
+        "exp": training.config["exp"],
+        "run": training.path.name,
+        "commit": training.marker["commit"],
+        "config_hash": settings_hash(dict(training.config)),
+        "train": training.config["train"],
+        "pretrain": training.config["pretrain"],
+        "collect": training.config["collect"],
+    }
+    target = save_lean_policy(training.path / "policy", folder / training.name, about)
+    load_policy(target)
+    return target
+
+
+def curve(training: Training) -> Curve:
+    """How a training went, at about `POINTS` of its iterations."""
+    lines = (training.path / "train" / "results.jsonl").read_text().splitlines()
+    rows = [json.loads(line) for line in lines]
+    rows = [row for row in rows if row["train/success_rate"] is not None]
+    kept = np.unique(np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).astype(int))
+    values = [
+        [row[name] for name in ("env_steps", "train/success_rate", "train/distance_m")]
+        for row in (rows[k] for k in kept)
+    ]
+    env_steps, success, distance_m = np.array(values, float).reshape(-1, 3).T
+    return Curve(training.config["exp"], training.config["seed"], env_steps, success, distance_m)
+
+
+def as_csv(curves: Sequence[Curve]) -> str:
+    """The curves as one table, a row per point."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for one in curves:
+        for point in zip(one.env_steps, one.success_rate, one.distance_m, strict=True):
+            writer.writerow([one.exp, one.seed, int(point[0]), f"{point[1]:.3f}", f"{point[2]:.2f}"])
+    return text.getvalue()
