@@ -372,7 +372,8 @@ def test_without_its_file_an_encoder_is_flown_but_not_measured_and_nothing_else_
         runner = PlainEnvRunner(config=make_ppo("brp_full", path, *SHORT), worker_index=0)
         if not there:
             path.unlink()
-        told, samples = drift_of(runner)
+        told, _ = drift_of(runner)
+        _, samples = drift_of(runner)  # what follows a measurement
         runner.stop()
         assert bool(told) is there
         flights.append(np.concatenate([chunk.get_actions() for chunk in samples]))
