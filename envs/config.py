@@ -154,7 +154,8 @@ class EnvConfig:
         vehicle_radius_m: The vehicle is a disc of this radius [m].
         camera_height_m: Height of the camera above the ground [m].
         time_limit_s: Flight time after which the episode is truncated [s].
-        observation: "window", "event_image", "luminance" or "events".
+        observation: "window", "event_image", "luminance", "events", or "none": nothing is
+            rendered, for a pilot that looks at nothing.
         window_capacity: Most events that one window holds; the oldest beyond it are
             dropped and counted.
         split: Which corridors: those of one split never occur in another, whatever the seed.
@@ -168,7 +169,7 @@ class EnvConfig:
     vehicle_radius_m: Annotated[float, Field(ge=0, le=10)] = 0.3
     camera_height_m: Annotated[float, Field(ge=0, le=1000)] = 2.0
     time_limit_s: Positive = 10.0
-    observation: Literal["window", "event_image", "luminance", "events"] = "window"
+    observation: Literal["window", "event_image", "luminance", "events", "none"] = "window"
     window_capacity: Annotated[int, Field(ge=1, le=10_000_000)] = 4096
     split: Literal["train", "validation", "eval"] = "train"
     renderer: Literal["auto", "raycast", "pyrender"] = "auto"

@@ -15,7 +15,8 @@ def observation_space(config: EnvConfig) -> spaces.Space:
 
     Returns:
         "window": int32 (capacity + 1, 4), see `envs.windows.pack_window`; "event_image":
-        uint8 (H, W); "luminance": float32 (H, W); "events": rows [t [us], x, y, p], int64.
+        uint8 (H, W); "luminance": float32 (H, W); "events": rows [t [us], x, y, p], int64;
+        "none": uint8 (0,).
     """
     shape = (config.camera.height, config.camera.width)
     if config.observation == "window":
@@ -24,6 +25,8 @@ def observation_space(config: EnvConfig) -> spaces.Space:
         return spaces.Box(0, 255, shape, np.uint8)
     if config.observation == "luminance":
         return spaces.Box(0.0, np.inf, shape, np.float32)
+    if config.observation == "none":
+        return spaces.Box(0, 255, (0,), np.uint8)
     return spaces.Sequence(spaces.Box(-1, 2**53, (4,), np.int64), stack=True)
 
 
@@ -46,6 +49,8 @@ def observe(
         return event_image(events, config.camera.width, config.camera.height), 0
     if config.observation == "luminance":
         return luminance.copy(), 0
+    if config.observation == "none":
+        return np.empty(0, np.uint8), 0
     return np.stack([events[name].astype(np.int64) for name in EVENT.fields or ()], axis=1), 0
 
 

@@ -16,7 +16,7 @@ TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
 
 
 class Sensor:
-    """Renderer, event camera and faults of one vehicle.
+    """Renderer, event camera and faults of one vehicle; with observation "none" a clock alone.
 
     Attributes:
         events: EVENT array of the last step, faults included.
@@ -38,6 +38,10 @@ class Sensor:
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
         """Look at a new scene from `place` (x, y) [m] at `t_us`; `rng` draws the faults. No events."""
         camera, self._rng = self._config.camera, rng
+        if self._config.observation == "none":
+            self.luminance = np.zeros((camera.height, camera.width), np.float32)
+            self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
+            return
         self._set_renderer(scene)
         self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
         self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
@@ -58,6 +62,9 @@ class Sensor:
         Raises:
             ValueError: The renderer gave something that is not luminance.
         """
+        if self._config.observation == "none":
+            self.t_us = end_us
+            return
         start_us = self.t_us
         moving_us = round(outcome.flown * (end_us - start_us))
         way_m = outcome.flown * self._config.speed_mps / self._config.control_hz

@@ -25,7 +25,7 @@ from jobs.pictures import Decode, Film
 from jobs.pilots import BOUNDS, PolicyPilot, make_pilot
 from jobs.progress import console, progress
 from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
-from jobs.runs import Run, finish, finished, latest_policy, locate_run, open_run, write_atomic
+from jobs.runs import Run, finish, finished, latest_policies, locate_run, open_run, write_atomic
 from jobs.tracking import RESULTS_VIEW, Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import pictures, reconstruct
@@ -86,7 +86,7 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     if done is not None and done["asked"] == asked:
         console.print((folder.evaluation / "table.md").read_text(), markup=False)
         return done["figures"]
-    console.print(f"Policy: {path}", markup=False)
+    announce(config, folder, path)
     tracker.tags({"policy": policy.manifest["name"]})
     plan = tasks(config)
     flown, tracks, drifts = fly_tasks(plan, config, path, policy)
@@ -172,17 +172,27 @@ def fly_task(task: Task, config: Config, policy: Policy, watch: Watch, advance: 
 
 
 def find_policy(config: Config, folder: Run) -> Path:
-    """The run's own policy, or the newest of all runs.
+    """The run's own policy, or the newest one of its model.
 
     Raises:
-        ConfigError: If there is none.
+        ConfigError: If there is none; the message names the models that have one.
     """
-    own = folder.policy if (folder.policy / "policy.json").is_file() else None
-    path = own or latest_policy(config.runs_dir)
-    if path is None:
-        where = str(Path(config.runs_dir).resolve())
-        raise ConfigError(f"no trained policy in {where!r}: run python -m platform.launch +exp=bytestream")
-    return path
+    if (folder.policy / "policy.json").is_file():
+        return folder.policy
+    name, there = folder.config.model.name, latest_policies(config.runs_dir)
+    if name not in there:
+        where = f"no trained policy of {name} in {str(Path(config.runs_dir).resolve())!r}"
+        others = f" (there is one of {', '.join(sorted(there))}: take model=)" if there else ""
+        train = "run python -m platform.launch +exp=bytestream"
+        raise ConfigError(f"{where}{others}: {train} model={name}")
+    return there[name]
+
+
+def announce(config: Config, folder: Run, path: Path) -> None:
+    """Say which policy is flown."""
+    newest = f"the newest of {folder.config.model.name} in {config.runs_dir}"
+    which = "this run's own" if path == folder.policy else newest
+    console.print(f"Policy: {path}, {which}", markup=False)
 
 
 def publish(folder: Run, tracker: Tracker, rows: Sequence[Summary], tracks: Sequence[Track]) -> None:

@@ -18,7 +18,7 @@ from envs.scene import Scene
 if TYPE_CHECKING:
     from models.policy import Policy
 
-Observation = Literal["window", "event_image", "luminance", "events"]
+Observation = Literal["window", "event_image", "luminance", "events", "none"]
 BOUNDS = ("straight", "random", "oracle")
 # Of one step in x and y, in step lengths: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])
@@ -68,7 +68,7 @@ def make_pilot(name: str, action: str = "deterministic") -> Pilot:
 class StraightPilot:
     """Always ahead."""
 
-    observation: Observation = "window"
+    observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Nothing to remember."""
@@ -81,7 +81,7 @@ class StraightPilot:
 class RandomPilot:
     """Any action with the same probability at each step, drawn from the flight's own stream."""
 
-    observation: Observation = "window"
+    observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """One stream per flight, so that no flight depends on its neighbours."""
@@ -117,7 +117,7 @@ class PolicyPilot:
 class OraclePilot:
     """Plans on a lattice with the true geometry, then follows the plan."""
 
-    observation: Observation = "window"
+    observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Plan one way per flight."""

@@ -34,7 +34,7 @@ class Summary:
         success: Fraction that reached the goal line, with its Wilson interval.
         distance_m: Mean forward distance without collision [m], with its bootstrap interval
             (None for a single episode).
-        events_per_step: Mean events of a control step [-].
+        events_per_step: Mean events of a control step [-]; 0 for a pilot that looks at nothing.
         dropped: Events that did not fit into a window or a pixel, all episodes [-].
     """
 
@@ -105,7 +105,9 @@ def cells(row: Summary) -> tuple[str, ...]:
     near, far = row.distance_interval or (None, None)
     distance = f"{row.distance_m:.1f}" + ("" if near is None else f" [{near:.1f}, {far:.1f}]")
     success = f"{100 * row.success:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
-    return (*row.label, str(row.episodes), success, distance, f"{row.events_per_step:.0f}", str(row.dropped))
+    # No events at all were not counted: nothing was rendered for a pilot that looks at nothing.
+    events = (f"{row.events_per_step:.0f}", str(row.dropped)) if row.events_per_step > 0 else ("-", "-")
+    return (*row.label, str(row.episodes), success, distance, *events)
 
 
 def headings(names: Sequence[str]) -> tuple[str, ...]:
@@ -161,7 +163,7 @@ def metrics(row: Summary) -> dict[str, float]:
         "eval/distance_m": row.distance_m,
         "eval/distance_m_low": low,
         "eval/distance_m_high": high,
-        "sim/events_per_step": row.events_per_step,
+        "sim/events_per_step": row.events_per_step or float("nan"),
         "sim/dropped_events": float(row.dropped),
     }
 

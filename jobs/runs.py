@@ -111,11 +111,11 @@ def finish(run: Run, stage: str, figures: dict[str, Any]) -> dict[str, Any]:
     return figures
 
 
-def latest_policy(runs_dir: str | Path) -> Path | None:
-    """The policy folder that was finished last, or None if there is none."""
+def latest_policies(runs_dir: str | Path) -> dict[str, Path]:
+    """The policy folder that was finished last of each kind: name of the model -> folder."""
     manifests = Path(runs_dir).resolve().glob("*/policy/policy.json")
-    newest = max(manifests, key=lambda path: path.stat().st_mtime_ns, default=None)
-    return None if newest is None else newest.parent
+    ordered = sorted(manifests, key=lambda path: path.stat().st_mtime_ns)
+    return {json.loads(path.read_text()).get("name", ""): path.parent for path in ordered}
 
 
 def named_policy(name: str) -> Path | None:

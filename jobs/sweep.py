@@ -83,7 +83,8 @@ def run(config: Config) -> dict[str, Any]:
 
 def announce(policy: str, sweep: Sweep) -> None:
     """Say which policy is flown, and where its sensor replaces the configured one."""
-    console.print(f"Policy: {policy}", markup=False)
+    name = read_manifest(policy).get("name", "a bound")
+    console.print(f"Policy: {policy}, {name}", markup=False)
     if sweep.differ:
         flown = ", ".join(
             f"{name} = {own!r} instead of {ours!r}" for name, (own, ours) in sweep.differ.items()

@@ -44,7 +44,7 @@ def flight_bytes(env, seed, actions):
     return seen
 
 
-@pytest.mark.parametrize("observation", ["window", "event_image", "luminance", "events"])
+@pytest.mark.parametrize("observation", ["window", "event_image", "luminance", "events", "none"])
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_environment_passes_the_checkers(observation):
     env = CorridorEnv(camera=SMALL, observation=observation, render_mode="rgb_array")

@@ -6,9 +6,10 @@ import pytest
 
 from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
+from envs.sensor import Sensor
 from jobs.config import ConfigError
 from jobs.drift import FIGURES
-from jobs.evaluate import evaluate, film_seed, find_policy, tasks, tracked_figures
+from jobs.evaluate import announce, evaluate, film_seed, find_policy, tasks, tracked_figures
 from jobs.evaluate import run as run_evaluation
 from jobs.flights import EPISODE, Ways, check_sensor, fly
 from jobs.pilots import PolicyPilot, make_pilot
@@ -56,7 +57,7 @@ def test_a_policy_of_each_kind_flies_the_same_corridors_by_what_it_sees(tmp_path
         fly(make_pilot(pilot), short, [3, 4], watch=watch)
     assert [len(seen) for seen in corridors.values()] == [1, 1]
     shape = (4097, 4) if KINDS[name].observation == "window" else (64, 64)
-    assert shapes == {"window": {(4097, 4)}, KINDS[name].observation: {shape}}
+    assert shapes == {"none": {(0,)}, KINDS[name].observation: {shape}}
 
 
 @pytest.mark.parametrize("action", ["deterministic", "stochastic"])
@@ -99,7 +100,21 @@ def test_an_episode_ends_as_success_collision_or_truncation_and_counts_its_way()
     np.testing.assert_array_equal(flown["steps"], 100)
     np.testing.assert_allclose(flown["distance_m"], 10.0)
     np.testing.assert_allclose(flown["return"], 10.0)
-    assert (flown["events_per_step"] > 1).all()
+
+
+@pytest.mark.parametrize("scene", ["poles_eval", "dynamic"])
+@pytest.mark.parametrize("name", ["straight", "random", "oracle"])
+def test_a_pilot_that_looks_at_nothing_flies_the_same_bits_without_a_render(name, scene, monkeypatch):
+    config, seeds = dataclasses.replace(HELD_OUT, scene=scene), range(3)
+    looking = make_pilot(name)
+    looking.observation = "window"
+    rendered = fly(looking, config, seeds)
+    monkeypatch.delattr(Sensor, "_set_renderer")
+    blind = fly(make_pilot(name), config, seeds)
+    for field in ("seed", "success", "collision", "truncated", "distance_m", "return", "steps"):
+        assert blind[field].tobytes() == rendered[field].tobytes(), field
+    assert (rendered["events_per_step"] > 1).all()
+    assert not blind["events_per_step"].any()
 
 
 def test_conditions_fly_the_same_corridors():
@@ -125,19 +140,33 @@ def test_another_sensor_than_the_policys_is_refused_with_both_values():
 def test_without_a_policy_the_message_says_how_to_get_one(tmp_path):
     config = small_config(tmp_path)
     with pytest.raises(
-        ConfigError, match=r"no trained policy in .*run python -m platform.launch \+exp=bytestream"
+        ConfigError,
+        match=r"no trained policy of brp_full in .*run python -m platform.launch \+exp=bytestream",
     ):
         run_evaluation(config)
     assert not (tmp_path / "runs").exists()  # refused before anything was made
 
 
-def test_a_runs_own_policy_comes_before_a_newer_one(tmp_path):
+def test_the_newest_policy_of_another_model_is_not_taken_but_named(tmp_path):
+    config = small_config(tmp_path)
+    for name in ("rgb", "event_set"):
+        write_json(tmp_path / "runs" / name / "policy" / "policy.json", {"name": name})
+    rule = r"no trained policy of brp_full in .*\(there is one of event_set, rgb: take model=\): run .*"
+    with pytest.raises(ConfigError, match=rule + "model=brp_full"):
+        run_evaluation(config)
+
+
+def test_a_runs_own_policy_comes_before_a_newer_one(tmp_path, capsys):
     config = small_config(tmp_path)
     run = open_run(config)
-    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {})
+    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {"name": "brp_full"})
     assert find_policy(config, run) == tmp_path / "runs" / "other" / "policy"
-    write_json(run.policy / "policy.json", {})
-    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {})
+    announce(config, run, find_policy(config, run))
+    assert "other/policy, the newest of brp_full in" in capsys.readouterr().out
+    write_json(run.policy / "policy.json", {"name": "brp_full"})
+    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {"name": "brp_full"})
+    announce(config, run, find_policy(config, run))
+    assert "policy, this run's own" in capsys.readouterr().out
     assert find_policy(config, run) == run.policy
 
 

@@ -54,6 +54,15 @@ def test_values_that_are_no_numbers_are_refused(values):
         bootstrap_interval(np.array(values), np.random.default_rng(0))
 
 
+def test_what_a_pilot_did_not_look_at_is_not_counted():
+    flown = episodes(3, 20)
+    flown["events_per_step"] = 0.0
+    row = summarise(("straight",), flown)
+    assert markdown(["Pilot"], [row]).splitlines()[-1].endswith("| - | - |")
+    assert np.isnan(metrics(row)["sim/events_per_step"])
+    assert metrics(summarise(("a",), episodes(3, 20)))["sim/events_per_step"] == 300.0
+
+
 def test_the_same_episodes_give_the_same_summary():
     assert summarise(("a",), episodes(3, 20)) == summarise(("a",), episodes(3, 20))
 

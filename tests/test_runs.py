@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from jobs.config import Config, ConfigError
-from jobs.runs import finish, finished, git_commit, latest_policy, open_run, run_name, write_json
+from jobs.runs import finish, finished, git_commit, latest_policies, open_run, run_name, write_json
 
 
 @pytest.fixture
@@ -79,13 +79,14 @@ def test_a_marker_with_nan_is_refused_and_leaves_no_file(config):
     assert not list(run.path.glob("stages/*"))
 
 
-def test_the_latest_policy_is_the_one_finished_last(tmp_path):
-    assert latest_policy(tmp_path) is None
-    for name in ("a", "c", "b"):
-        write_json(tmp_path / name / "policy" / "policy.json", {})
+def test_the_latest_policy_of_a_kind_is_the_one_finished_last(tmp_path):
+    assert latest_policies(tmp_path) == {}
+    for name, kind in (("a", "brp_full"), ("c", "brp_full"), ("b", "brp_full"), ("e", "rgb")):
+        write_json(tmp_path / name / "policy" / "policy.json", {"name": kind})
         time.sleep(0.01)
     (tmp_path / "d" / "policy").mkdir(parents=True)
-    assert latest_policy(tmp_path) == tmp_path / "b" / "policy"
+    newest = {"brp_full": tmp_path / "b" / "policy", "rgb": tmp_path / "e" / "policy"}
+    assert latest_policies(tmp_path) == newest
 
 
 def test_the_stored_configuration_is_readable_as_yaml_and_json(config):

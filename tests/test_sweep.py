@@ -168,8 +168,8 @@ def test_a_sensor_unlike_the_configured_one_is_named_in_one_line(tmp_path, capsy
     for policy in (same, slow):
         sweeping.announce(policy, plan(config, policy))
         lines[policy] = capsys.readouterr().out.splitlines()
-    assert lines[same] == [f"Policy: {same}"]
-    assert lines[slow][0] == f"Policy: {slow}"
+    assert lines[same] == [f"Policy: {same}, brp_full"]
+    assert lines[slow][0] == f"Policy: {slow}, brp_full"
     assert lines[slow][1:] == ["Flown with the policy's own sensor: control_hz = 100.0 instead of 200.0"]
 
 
