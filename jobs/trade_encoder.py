@@ -18,7 +18,7 @@ from jobs.config import Config, ConfigError
 from jobs.encoder_costs import Row, default_forms, explained, measure, size_form
 from jobs.encoder_figures import coding_figure, cost_figure, embedding_figure, picture_grid
 from jobs.encoder_trials import DENSE_EVENTS, MOST_EVENTS, control_steps, draw, held_out, spread, trained
-from jobs.pretrain import encoder_file, held_out_windows, prepare_encoder
+from jobs.pretrain import check_sources, encoder_file, held_out_windows, prepare_encoder
 from jobs.progress import progress
 from jobs.report import draw_figure, publish_table
 from jobs.runs import Run, finish, locate_run, open_run
@@ -53,6 +53,7 @@ def run(config: Config) -> dict[str, Any]:
         raise ConfigError(f"model: {model.name} has no encoder of single events; choose brp_full or brp_xy")
     if model.coding == "eventnet":
         raise ConfigError("model.coding: must be additive or none for this study, got 'eventnet'")
+    check_sources(config)
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:

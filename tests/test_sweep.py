@@ -249,8 +249,8 @@ def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differ
 @pytest.mark.parametrize("name", ["brp_full", "eip"])
 def test_conditions_flown_as_tune_trials_come_back_with_the_policys_episodes(tmp_path, name):
     config = sweep_config(tmp_path)
-    save_untrained(tmp_path / "runs" / "trained" / "policy", config.env_config(), name)
-    config = dataclasses.replace(config, sweep=dataclasses.replace(config.sweep, policy=None))
+    policy = save_untrained(tmp_path / "runs" / "trained" / "policy", config.env_config(), name)
+    config = dataclasses.replace(config, sweep=dataclasses.replace(config.sweep, policy=str(policy)))
     assert set(sweeping.run(config).values()) == {0.0}
     kept = sorted((open_run(config).path / "sweep" / "episodes").glob("*.json"))
     before = [path.read_text() for path in kept]
