@@ -5,6 +5,7 @@ VENV ?= .venv
 ARGS ?=
 
 SEEDS ?= 0 1 2
+STEPS ?= 500000
 POLICIES ?= bytestream bytestream_xy event_columns event_image_vae event_set event_image rgb
 
 BIN := $(VENV)/bin
@@ -49,7 +50,7 @@ bytestream: setup ## from nothing to an evaluated policy (half an hour; ARGS="bu
 
 train-all: setup ## every policy with three seeds into models/pretrained (hours; a stopped one continues)
 	for seed in $(SEEDS); do for exp in $(POLICIES); do \
-	    $(LAUNCH) +exp=$$exp job=train algo=ppo_fast seed=$$seed $(ARGS) || exit 1; \
+	    $(LAUNCH) +exp=$$exp job=train seed=$$seed train.env_steps=$(STEPS) $(ARGS) || exit 1; \
 	done; done
 	$(LAUNCH) +exp=ship
 

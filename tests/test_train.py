@@ -33,7 +33,8 @@ SHORT = ("env.time_limit_s=0.035", "algo.num_envs_per_env_runner=2", "algo.rewar
 
 def make_config(*overrides):
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        composed = hydra.compose("config", ["+exp=train", *overrides])
+        chosen = [] if any(word.startswith("algo=") for word in overrides) else ["algo=ppo"]
+        composed = hydra.compose("config", ["+exp=train", *chosen, *overrides])
     values = OmegaConf.to_container(composed, resolve=True)
     values.pop("hydra", None)
     return parse(values)
