@@ -45,7 +45,13 @@ def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, 
         *(f"{target}, latent 4" for target in targets),
     ]  # fmt: skip
     assert lines[0][1:3] == [" Numbers a step ", " Ridge, 3 steps "]
-    assert [line[1].strip() for line in lines[2:]] == ["1", "128", "128", "512", "8"] + 4 * ["4"]
+    assert [line[1].strip() for line in lines[2:]] == [
+        "1",
+        "128",
+        "128",
+        "512",
+        str(config.model.latent),
+    ] + 4 * ["4"]
     assert {"evae/probe_r2_nothing", "evae/probe_r2_runs_encoder", "evae/probe_r2_counts_latent_4"} <= set(
         figures
     )
@@ -61,7 +67,9 @@ def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, 
 
 
 def test_a_policy_without_an_event_vae_is_refused_before_anything_is_written(tmp_path):
-    model = ModelConfig(name="event_columns", stack=3, hidden=[64, 64], **dict.fromkeys(EVAE_SETTINGS))
+    model = ModelConfig(
+        name="event_columns", stack=3, hidden=[64, 64], encoder=None, **dict.fromkeys(EVAE_SETTINGS)
+    )
     config = dataclasses.replace(small_config(tmp_path, job="probe"), model=model)
     with pytest.raises(ConfigError, match="event_columns has no event VAE to probe"):
         probe.run(config)

@@ -84,14 +84,37 @@ def test_make_help_lists_every_target():
         return subprocess.check_output(["make", *words], cwd=ROOT, env=environment, text=True)
 
     listed = make("help")
-    targets = {"setup", "bytestream", "sweep-robustness", "mlflow", "test", "lint", "check", "bench", "docs"}
+    targets = {
+        "setup",
+        "bytestream",
+        "train-all",
+        "sweep-robustness",
+        "mlflow",
+        "test",
+        "lint",
+        "check",
+        "bench",
+        "docs",
+    }
     assert {line.split()[0] for line in listed.splitlines()[1:]} == targets | {"lock", "clean", "help"}
     assert make() == listed
 
 
 @pytest.mark.parametrize(
     "target",
-    ["setup", "bytestream", "sweep-robustness", "mlflow", "lint", "check", "bench", "docs", "lock", "clean"],
+    [
+        "setup",
+        "bytestream",
+        "train-all",
+        "sweep-robustness",
+        "mlflow",
+        "lint",
+        "check",
+        "bench",
+        "docs",
+        "lock",
+        "clean",
+    ],
 )
 def test_make_knows_how_to_reach_every_target(target):
     subprocess.run(["make", "--dry-run", target], cwd=ROOT, check=True, capture_output=True)

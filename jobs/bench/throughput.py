@@ -150,8 +150,9 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
 
 
 def composed(*words: str) -> Config:
-    """The default experiment with some words of the command line, as the launcher composes it."""
-    command = [sys.executable, "-m", "platform.launch", "+exp=train", *words, "--cfg", "job"]
+    """A training by the paper's PPO with some words of the command line, as the launcher composes it."""
+    algo = [] if any(word.startswith("algo=") for word in words) else ["algo=ppo"]
+    command = [sys.executable, "-m", "platform.launch", "+exp=train", *algo, *words, "--cfg", "job"]
     return parse(yaml.safe_load(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
 
 
