@@ -88,7 +88,7 @@ def test_every_value_says_its_unit_or_source_in_a_comment(file):
 
 
 def test_ppo_is_the_papers(composed):
-    algo = parse(composed("+exp=bytestream", "budget=paper")).algo
+    algo = parse(composed("+exp=bytestream", "budget=paper", "algo=ppo")).algo
     assert dataclasses.asdict(algo) == {
         "lr": 3e-4,
         "lr_schedule": "constant",

@@ -202,7 +202,6 @@ def test_the_tracked_figures_name_pilot_scene_and_renderer(tmp_path):
         "eval/success_rate_pyrender",
         "eval/success_rate_oracle",
         "eval/distance_m_straight",
-        "sim/events_per_step",
     } <= set(figures)
     assert len(figures) <= 40
 

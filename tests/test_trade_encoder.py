@@ -191,7 +191,7 @@ def test_the_table_is_tens_of_times_faster_than_the_network_and_as_fast_as_memor
 
 def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(tmp_path):
     nothing = dict.fromkeys(EVAE_SETTINGS)
-    model = ModelConfig(name="event_columns", stack=3, hidden=[64, 64], **nothing)
+    model = ModelConfig(name="event_columns", stack=3, hidden=[64, 64], encoder=None, **nothing)
     config = dataclasses.replace(small_config(tmp_path, job="trade_encoder"), model=model)
     with pytest.raises(ConfigError, match="event_columns has no encoder of single events"):
         trade_encoder.run(config)
