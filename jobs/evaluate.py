@@ -261,9 +261,14 @@ def film(config: Config, policy: Policy, source: Path, seed: int, path: Path) ->
     return path
 
 
-def decoder(source: Path) -> Decode:
-    """What draws, from an event window, the picture that the latents of the policy in `source` hold."""
+def decoder(source: Path) -> Decode | None:
+    """What draws, from an event window, the picture that the latents of the policy in `source` hold.
+
+    None for a lean policy, which has no decoder.
+    """
     evae, _ = load_encoder(source / ENCODER)
+    if evae.decoder is None:
+        return None
 
     @torch.no_grad()
     def decode(window: np.ndarray) -> np.ndarray:

@@ -1,9 +1,11 @@
 """Put trained policies where a fresh clone finds them, and draw how they learnt.
 
 Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=ship
-Expect: seconds. In models/pretrained a folder <exp>-s<seed> for the newest training of each
-experiment and seed in `runs_dir` that the configured budget names, a few hundred kilobytes each
-(weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`.
+Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each
+experiment, length and seed in `runs_dir` with the configured budget, a few hundred kilobytes each
+(weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`. A group is an
+experiment; trainings of another length than the one that all are compared at have its thousands
+of steps behind their name: bytestream_1500k.
 """
 
 import csv
@@ -29,6 +31,7 @@ PRETRAINED = REPOSITORY / "models" / "pretrained"
 FIGURE = REPOSITORY / "docs" / "images" / "learning.png"
 COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
 POINTS = 50  # of a curve
+COMPARED_STEPS = 500_000  # the paper's; of every training that is compared with others
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,15 @@ class Training:
     marker: Mapping[str, Any]
 
     @property
-    def name(self) -> str:
-        """Of the shipped folder."""
-        return f"{self.config['exp']}-s{self.config['seed']}"
+    def group(self) -> str:
+        """What it is one training of."""
+        steps = self.config["train"]["env_steps"]
+        return self.config["exp"] + ("" if steps == COMPARED_STEPS else f"_{steps // 1000}k")
+
+    @property
+    def seed(self) -> int:
+        """Of corridors, networks and encoder."""
+        return int(self.config["seed"])
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -69,28 +78,29 @@ def run(config: Config) -> dict[str, Any]:
         tracker.text("train/curves.csv", as_csv(curves))
     counts: dict[str, int] = defaultdict(int)
     for training in trainings:
-        counts[training.config["exp"]] += 1
+        counts[training.group] += 1
     return dict(counts)
 
 
 def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
-    """The training of each experiment and seed that was finished last, by experiment and seed."""
-    found: dict[tuple[str, int], tuple[int, Training]] = {}
+    """The training of each group and seed that was finished last, by group and seed."""
+    found: dict[tuple[str, int], tuple[int, Training]] = {}  # (group, seed): when, which
     for marker in runs_dir.glob("*/stages/train.json"):
         path = marker.parent.parent
         config = json.loads((path / "config.json").read_text())
         if config["budget"] != budget or not (path / "policy" / "policy.json").is_file():
             continue
-        key, when = (config["exp"], config["seed"]), marker.stat().st_mtime_ns
+        training, when = Training(path, config, json.loads(marker.read_text())), marker.stat().st_mtime_ns
+        key = training.group, training.seed
         if key not in found or when > found[key][0]:
-            found[key] = when, Training(path, config, json.loads(marker.read_text()))
+            found[key] = when, training
     return [found[key][1] for key in sorted(found)]
 
 
 def ship(training: Training, folder: Path) -> Path:
     """Write the policy of a training into `folder`, and what made it into its manifest."""
     about = {
-        "exp": training.config["exp"],
+        "exp": training.group,
         "run": training.path.name,
         "commit": training.marker["commit"],
         "config_hash": settings_hash(dict(training.config)),
@@ -98,7 +108,8 @@ def ship(training: Training, folder: Path) -> Path:
         "pretrain": training.config["pretrain"],
         "collect": training.config["collect"],
     }
-    target = save_lean_policy(training.path / "policy", folder / training.name, about)
+    target = folder / f"{training.group}-s{training.seed}"
+    save_lean_policy(training.path / "policy", target, about)
     load_policy(target)
     return target
 
@@ -114,7 +125,7 @@ def curve(training: Training) -> Curve:
         for row in (rows[k] for k in kept)
     ]
     env_steps, success, distance_m = np.array(values, float).reshape(-1, 3).T
-    return Curve(training.config["exp"], training.config["seed"], env_steps, success, distance_m)
+    return Curve(training.group, training.seed, env_steps, success, distance_m)
 
 
 def as_csv(curves: Sequence[Curve]) -> str:

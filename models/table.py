@@ -169,7 +169,7 @@ def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
     """The model in float64, with another resolution of time unless that is None."""
     settings = evae.settings if time_bins is None else {**evae.settings, "time_bins": time_bins}
     exact = EventVAE(**settings).double()
-    exact.load_state_dict(evae.state_dict())
+    exact.load_state_dict({**exact.state_dict(), **evae.state_dict()})  # a lean file's has no decoder
     return exact
 
 
