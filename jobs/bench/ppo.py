@@ -136,7 +136,8 @@ def seconds_of(work: dict[str, Callable[[], object]], rounds: int) -> dict[str, 
 
 def against_others(folder: Path) -> dict[str, Callable[[], object]]:
     """One iteration on bytestream of our learner, RLlib's and stable-baselines3's."""
-    evae = EventVAE("brp_full").freeze()
+    flown = composed().model
+    evae = EventVAE(flown.name, **{key: getattr(flown, key) for key in EVAE_SETTINGS}).freeze()
     path, table = encoder_file(evae, folder), EncoderTable.from_evae(evae)
     work: dict[str, Callable[[], object]] = {}
     for size in MINIBATCHES:

@@ -26,6 +26,7 @@ from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
 from jobs.config import Config, parse
 from jobs.progress import console
+from jobs.settings import EVAE_SETTINGS
 from models.evae import EventVAE
 from models.table import EncoderTable
 from models.weights import save_encoder
@@ -39,7 +40,8 @@ def main() -> None:
     """Measure and print both tables."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    evae = EventVAE().freeze()
+    model = composed().model
+    evae = EventVAE(model.name, **{key: getattr(model, key) for key in EVAE_SETTINGS}).freeze()
     parts = [*frame_rows(), *step_rows(evae)]
     with TemporaryDirectory() as folder:
         loops = loop_rows(evae, Path(folder))
@@ -123,11 +125,10 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
 
 
 def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
-    """Seconds per environment step of RLlib's sampling, and of whole PPO iterations."""
-    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
-
+    """Seconds per environment step of sampling, and of whole PPO iterations."""
     from jobs.cluster import start_ray
     from jobs.ppo import build_ppo
+    from jobs.runner import PlainEnvRunner
 
     sensor = sensor_settings(CONFIG)
     path = folder / "encoder.safetensors"
@@ -139,12 +140,12 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
         minibatch: build_ppo(replace(config, algo=replace(config.algo, minibatch_size=minibatch)), path)
         for minibatch in (32, 256)
     }
-    runner = SingleAgentEnvRunner(config=ppo[32], worker_index=0)
+    runner = PlainEnvRunner(config=ppo[32], worker_index=0)
     algorithms = {minibatch: settings.build_algo() for minibatch, settings in ppo.items()}
     work: dict[str, Callable[[], object]] = {
         "training loop, the paper's minibatch of 32": algorithms[32].train,
         "training loop, minibatch of 256": algorithms[256].train,
-        "sampling in RLlib": lambda: runner.sample(num_timesteps=size),
+        "sampling: flights, networks, episodes": lambda: runner.sample(num_timesteps=size),
     }
     return [(name, seconds / size) for name, seconds in interleaved(work).items()]
 
