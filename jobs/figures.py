@@ -212,7 +212,7 @@ def learning_figure(curves: Sequence[Curve]) -> Figure:
     across = min(4, len(names))
     down = -(-len(names) // across)
     figure = Figure(figsize=(2.9 * across + 0.4, 2.3 * down + 0.5), layout="constrained")
-    panels = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    panels = figure.subplots(down, across, squeeze=False, sharey=True)
     for panel, name in zip(panels.flat, names, strict=False):
         own = [curve for curve in curves if curve.exp == name and curve.env_steps.size]
         for curve in own:
@@ -225,7 +225,7 @@ def learning_figure(curves: Sequence[Curve]) -> Figure:
             mean = 100 * np.mean(every, axis=0)
             panel.plot(steps / 1e3, mean, color=POLICY, lw=2.2)
             panel.annotate(
-                f"{mean[-1]:.0f} %", (steps[-1] / 1e3, mean[-1]), (-2, 5), textcoords="offset points",
+                f"{mean[-1]:.0f} %", (steps[-1] / 1e3, mean[-1]), (-2, -14), textcoords="offset points",
                 ha="right", fontsize=9, color=INK,
             )  # fmt: skip
         plural = "s" if len(own) != 1 else ""
