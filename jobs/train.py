@@ -128,7 +128,7 @@ def check_cpus(config: Config) -> None:
     """Refuse more env runners than a local Ray has CPUs for: Tune would wait for them forever."""
     needed, cpus = config.algo.num_env_runners, int(ray.cluster_resources().get("CPU", 0))
     if config.cluster.name == "local" and needed > cpus:
-        rule = f"needs as many CPUs, and Ray has {cpus}"
+        rule = f"needs as many CPUs, and Ray has {cpus} (algo=ppo needs one)"
         raise ConfigError(f"algo.num_env_runners: {rule}, got {config.algo.num_env_runners}")
 
 
