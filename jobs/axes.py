@@ -82,7 +82,9 @@ def refused_axes(axes: Mapping[str, Mapping[str, Sequence[Any]]], config: EnvCon
 def _refused_axis(settings: Mapping[str, Sequence[Any]], config: EnvConfig) -> list[str]:
     unknown = {key: list(values) for key, values in settings.items() if key not in KEYS}
     if unknown:
-        return [f"{key}: no such setting, got {values}{nearest(key, KEYS)}" for key, values in unknown.items()]
+        return [
+            f"{key}: no such setting, got {values}{nearest(key, KEYS)}" for key, values in unknown.items()
+        ]
     try:
         points = axis_points(settings)
     except ValueError as error:

@@ -57,7 +57,8 @@ def fly(
 
     Returns:
         EPISODE (n,), in the order of the seeds. `distance_m` is the way along y without
-        collision [m], `x_m` where across the corridor it ended [m], `dropped` what neither pixel nor window could hold.
+        collision [m], `x_m` where across the corridor it ended [m], `dropped` what neither
+        pixel nor window could hold.
     """
     config = dataclasses.replace(config, observation=pilot.observation)
     envs = [CorridorEnv(config) for _ in range(min(num_envs, len(seeds)))]

@@ -104,7 +104,9 @@ def paired_difference(ours: np.ndarray, theirs: np.ndarray, rng: np.random.Gener
     """
     ours, theirs = _checked(ours, "ours"), _checked(theirs, "theirs")
     if ours.shape[1] != theirs.shape[1]:
-        raise ValueError(f"both must have flown the same corridors, got {ours.shape[1]} and {theirs.shape[1]}")
+        raise ValueError(
+            f"both must have flown the same corridors, got {ours.shape[1]} and {theirs.shape[1]}"
+        )
     value = float(ours.mean() - theirs.mean())
     if ours.size == theirs.size == 1:
         return Estimate(value, None)

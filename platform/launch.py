@@ -24,6 +24,7 @@ JOBS = {
     "train": "jobs.train",
     "evaluate": "jobs.evaluate",
     "sweep": "jobs.sweep",
+    "report": "jobs.results",
     "trade_simulator": "jobs.trade_simulator",
     "trade_encoder": "jobs.trade_encoder",
 }

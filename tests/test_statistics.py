@@ -52,9 +52,12 @@ def test_values_that_are_no_numbers_are_refused(values):
 def studies(number, trainings, corridors, rng, spread=(1.0, 1.0, 1.0)):
     """Simulated studies whose true mean is 0: effects of training, of corridor, and of the flight."""
     for _ in range(number):
-        of_training, of_corridor, noise = (rng.normal(0.0, sigma, size) for sigma, size in zip(
-            spread, ((trainings, 1), (1, corridors), (trainings, corridors)), strict=True
-        ))
+        of_training, of_corridor, noise = (
+            rng.normal(0.0, sigma, size)
+            for sigma, size in zip(
+                spread, ((trainings, 1), (1, corridors), (trainings, corridors)), strict=True
+            )
+        )
         yield of_training + of_corridor + noise
 
 
@@ -121,7 +124,8 @@ def test_a_paired_difference_is_narrower_than_one_of_other_corridors():
     corridors = rng.normal(0.0, 10.0, size=(1, 20))
     ours, theirs = (corridors + rng.normal(size=(3, 20)) for _ in range(2))
     paired, apart = (
-        np.ptp(paired_difference(ours, other, rng).interval) for other in (theirs, rng.permuted(theirs, axis=1))
+        np.ptp(paired_difference(ours, other, rng).interval)
+        for other in (theirs, rng.permuted(theirs, axis=1))
     )
     assert paired < 0.5 * apart
 
@@ -141,7 +145,9 @@ def test_the_same_generator_gives_the_same_interval():
     assert first == again
 
 
-@pytest.mark.parametrize("values", [np.zeros((0, 3)), np.zeros(3), np.array([[np.nan]]), np.array([[np.inf]])])
+@pytest.mark.parametrize(
+    "values", [np.zeros((0, 3)), np.zeros(3), np.array([[np.nan]]), np.array([[np.inf]])]
+)
 def test_flights_that_are_no_table_of_numbers_are_refused(values):
     for refuse in (two_stage_estimate, lambda bad, rng: paired_difference(bad, np.zeros((1, 3)), rng)):
         with pytest.raises(ValueError, match=r"must be finite numbers of shape \(trainings, corridors\)"):
