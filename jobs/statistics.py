@@ -69,7 +69,7 @@ def two_stage_estimate(values: np.ndarray, rng: np.random.Generator, statistic: 
     """A statistic over trainings and corridors, its interval from a two-stage bootstrap.
 
     Trainings are drawn first, then corridors, which all trainings share (as they flew the same).
-    Of n there are n - 1 draws, which makes the variance of the resamples that of the mean
+    Of n trainings n - 1 are drawn, which makes the variance of the resamples that of the mean
     (Rao and Wu 1988); n draws would make intervals over three trainings a fifth too narrow.
 
     Args:
@@ -84,7 +84,7 @@ def two_stage_estimate(values: np.ndarray, rng: np.random.Generator, statistic: 
     value = float(statistic(values.reshape(1, -1))[0])
     if values.size == 1:
         return Estimate(value, None)
-    rows, columns = (_draws(count, rng) for count in values.shape)
+    rows, columns = _trainings(len(values), rng), _corridors(values.shape[1], rng)
     drawn = values[rows[:, :, None], columns[:, None, :]].reshape(TWO_STAGE_RESAMPLES, -1)
     return Estimate(value, _percentiles(statistic(drawn)))
 
@@ -110,10 +110,10 @@ def paired_difference(ours: np.ndarray, theirs: np.ndarray, rng: np.random.Gener
     value = float(ours.mean() - theirs.mean())
     if ours.size == theirs.size == 1:
         return Estimate(value, None)
-    columns = _draws(ours.shape[1], rng)
+    columns = _corridors(ours.shape[1], rng)
     sides = []
     for values in (ours, theirs):
-        rows = _draws(len(values), rng)
+        rows = _trainings(len(values), rng)
         sides.append(values[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2)))
     return Estimate(value, _percentiles(sides[0] - sides[1]))
 
@@ -126,9 +126,14 @@ def _checked(values: np.ndarray, name: str) -> np.ndarray:
     return values
 
 
-def _draws(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Which of `count` each resample holds, (resamples, count - 1); the one, where there is one."""
+def _trainings(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Which trainings each resample holds, (resamples, count - 1); the one, where there is one."""
     return rng.integers(count, size=(TWO_STAGE_RESAMPLES, max(count - 1, 1)))
+
+
+def _corridors(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Which corridors each resample holds, (resamples, count)."""
+    return rng.integers(count, size=(TWO_STAGE_RESAMPLES, count))
 
 
 def _percentiles(resampled: np.ndarray) -> Interval:
