@@ -44,7 +44,7 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 bytestream: setup ## from nothing to an evaluated policy (half an hour; ARGS="budget=smoke": a minute)
 	$(LAUNCH) +exp=bytestream $(ARGS)
 
-sweep-robustness: setup ## fly the trained policy at other rates, thresholds and with sensor faults
+sweep-robustness: setup ## fly trained policies at other rates, thresholds, in other worlds, with faults
 	$(LAUNCH) +exp=robustness $(ARGS)
 
 mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine only

@@ -267,8 +267,8 @@ def parse(values: Mapping[str, Any]) -> Config:
         named += [("evaluate", HELD_OUT_SCENE)]
         named += [("trade.scenes", name) for name in config.trade.scenes]
         named += [("collect.scenes", name) for name in config.collect.scenes]
-        swept = [axis.get("env.scene", []) for axis in config.sweep.axes.values()]
-        named += [("sweep.axes", name) for name in itertools.chain(*swept) if isinstance(name, str)]
+        swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
+        named += [("sweep.axes", name) for name in dict.fromkeys(swept) if isinstance(name, str)]
         vehicle = config.env["vehicle_radius_m"], config.env["camera_height_m"]
         refused = _refused_picture(config) + refused_axes(config.sweep.axes, config.env_config())
         refused += refused_scenes(named, config.env["layout"], vehicle)

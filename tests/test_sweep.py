@@ -136,6 +136,7 @@ def test_cells_can_be_sent_to_workers(tmp_path):
     assert cell.simulation == pickle.loads(pickle.dumps(cell)).simulation
 
 
+@pytest.mark.timeout(900)  # where no kernel is compiled yet
 def test_a_cell_is_flown_as_its_policy_alone_and_measured_where_asked(tmp_path):
     config = sweep_config(tmp_path)
     path = save_training(tmp_path / "policy", "a", 0, config.env_config())

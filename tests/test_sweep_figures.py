@@ -34,7 +34,7 @@ def test_numbers_are_lines_and_each_group_has_its_own_with_a_band():
     [
         ({name: {"env.scene": name} for name in ("poles", "shape_change")}, ["poles", "shape\nchange"]),
         (
-            {str(hz): {"env.control_hz": hz, "faults.sparsity": dead} for hz, dead in ((200, 0.0), (45, 0.5))},
+            {str(hz): {"env.control_hz": hz, "faults.sparsity": off} for hz, off in ((200, 0.0), (45, 0.5))},
             ["control_hz 200\nsparsity 0", "control_hz 45\nsparsity 0.5"],
         ),
     ],
