@@ -54,7 +54,7 @@ train-all: setup ## every policy with three seeds into models/pretrained (hours;
 	done; done
 	$(LAUNCH) +exp=ship
 
-sweep-robustness: setup ## fly the trained policy at other rates, thresholds and with sensor faults
+sweep-robustness: setup ## fly trained policies at other rates, thresholds, in other worlds, with faults
 	$(LAUNCH) +exp=robustness $(ARGS)
 
 mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine only

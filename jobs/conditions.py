@@ -1,109 +1,216 @@
-"""What a sweep flies: one setting changed at a time, each as a cell with an identity of its own."""
+"""What a sweep flies: policies and conditions, each pair as a cell with an identity of its own."""
 
 import dataclasses
+import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envs.config import CameraConfig, EnvConfig, FidelityConfig, settings_hash
-from jobs.config import Config, ConfigError, env_with
+import pydantic
+
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, settings_hash
+from jobs.axes import axis_points, env_with
+from jobs.config import Config, ConfigError
 from jobs.evaluate import find_policy
-from jobs.flights import check_sensor
+from jobs.flights import EPISODE, check_sensor
 from jobs.pilots import BOUNDS
-from jobs.runs import Run, named_policy
+from jobs.runs import REPOSITORY, Run, named_policy
 from models.policy import MANIFEST
 
-SHOWN_BOUNDS = ("straight", "oracle")
+PRETRAINED = REPOSITORY / "models" / "pretrained"
 CAMERA_SETTINGS = {field.name for field in dataclasses.fields(CameraConfig)}
 FIDELITY_SETTINGS = {field.name for field in dataclasses.fields(FidelityConfig)}
+NOMINAL = "nominal"  # the axis of the one condition that changes nothing
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A pilot that takes part in a sweep.
+
+    Attributes:
+        pilot: Path of a policy folder, or a bound's name.
+        group: What was trained; policies of one group differ in their training seed alone.
+        training: The training seed; None for a bound.
+        identity: Hash of its manifest, unique by its SHA-256 sums.
+        sensor: Sensor settings that it was trained with; none for a bound.
+    """
+
+    pilot: str
+    group: str
+    training: int | None
+    identity: str
+    sensor: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One pilot under one condition, through corridors that all conditions share.
+    """One pilot under one condition, through corridors that all share.
 
     Attributes:
         label: Axis and value; several axes share a cell where they hold the same value.
         key: Hash of all that decides an episode but its seed: simulation, policy, choice of action.
+        entry: Who flies.
+        action: How a policy chooses.
+        env: The simulation.
         seeds: One corridor each.
     """
 
     label: tuple[str, str]
     key: str
-    pilot: str
+    entry: Entry
     action: str
     env: EnvConfig
     seeds: tuple[int, ...]
 
+    @functools.cached_property
+    def simulation(self) -> str:
+        """Hash of what decides how exact its events are: the simulation without its faults."""
+        return settings_hash(dataclasses.asdict(dataclasses.replace(self.env, faults=FaultsConfig())))
+
 
 @dataclass(frozen=True)
 class Sweep:
-    """All cells of a sweep.
+    """All that a sweep flies.
 
     Attributes:
-        differ: Sensor setting -> (the policy's value, which is flown; the configured), if unequal.
-        axes: Axis -> (value, cell of the policy), ascending.
-        bounds: Pilot that bounds the policy -> its cell, without any change.
+        entries: Who flies, groups together in the order in which they were named.
+        differ: Pilot -> sensor setting -> (its own value, which is flown; the configured), if unequal.
+        axes: Axis -> value as text -> settings that it changes; the first axis is `NOMINAL`.
+        cells: One for each condition and entry; two may share a key.
     """
 
-    differ: dict[str, tuple[Any, Any]]
-    axes: dict[str, list[tuple[float, Cell]]]
-    bounds: dict[str, Cell]
+    entries: tuple[Entry, ...]
+    differ: dict[str, dict[str, tuple[Any, Any]]]
+    axes: dict[str, dict[str, dict[str, Any]]]
+    cells: tuple[Cell, ...]
 
     @property
     def identity(self) -> str:
-        """Hash of all that decides its figures: policy, conditions and corridors."""
-        return settings_hash({"cells": [[*cell.label, cell.key, *cell.seeds] for cell in self.cells()]})
+        """Hash of all that decides its figures: policies, conditions and corridors."""
+        return settings_hash({"cells": [[*cell.label, cell.key, *cell.seeds] for cell in self.cells]})
 
-    def cells(self) -> list[Cell]:
-        """Every cell; two may share a key."""
-        return [cell for points in self.axes.values() for _, cell in points] + list(self.bounds.values())
+    @property
+    def groups(self) -> dict[str, list[int | None]]:
+        """Group -> its trainings."""
+        names = dict.fromkeys(entry.group for entry in self.entries)
+        return {name: [entry.training for entry in self.entries if entry.group == name] for name in names}
+
+    @property
+    def conditions(self) -> list[tuple[str, str]]:
+        """Axis and value of each condition."""
+        return [(axis, value) for axis, points in self.axes.items() for value in points]
 
 
-def swept_policy(config: Config, folder: Run) -> str:
-    """What is swept: the policy that `sweep.policy` names, else the run's own or the newest one.
-
-    A policy is named by its folder, its run folder, or as a bound ("oracle").
+def find_entries(config: Config, folder: Run, pretrained: Path = PRETRAINED) -> tuple[Entry, ...]:
+    """Who flies: what `sweep.policies` names, each once.
 
     Raises:
-        ConfigError: If there is no such policy.
+        ConfigError: If there is no such policy, or two have the same group and training seed.
     """
-    named = config.sweep.policy
-    if named is None:
-        return str(find_policy(config, folder))
-    if named in BOUNDS:
-        return named
-    path = named_policy(named)
+    paths = [path for name in config.sweep.policies for path in _named(name, config, folder, pretrained)]
+    entries = list({entry.identity: entry for entry in map(read_entry, paths)}.values())
+    held: dict[tuple[str, int | None], Entry] = {}
+    for entry in entries:
+        other = held.setdefault((entry.group, entry.training), entry)
+        if other is not entry:
+            raise ConfigError(
+                f"sweep.policies: two policies are {entry.group} with training seed {entry.training}, got "
+                f"{other.pilot!r} and {entry.pilot!r}; leave one out, or train one with another seed"
+            )
+    order = list(dict.fromkeys(entry.group for entry in entries))
+    return tuple(sorted(entries, key=lambda entry: (order.index(entry.group), entry.training or 0)))
+
+
+def _named(name: str, config: Config, folder: Run, pretrained: Path) -> list[str]:
+    """Paths and bounds that one entry of `sweep.policies` names."""
+    if name == "pretrained":
+        found = sorted(str(path.parent) for path in pretrained.glob(f"*/{MANIFEST}"))
+        if not found:
+            raise ConfigError(
+                f"sweep.policies: 'pretrained' means the policies in {str(pretrained)!r}, which holds none; "
+                "train one (python -m platform.launch +exp=bytestream) and name it: sweep.policies=[newest]"
+            )
+        return found
+    if name == "newest":
+        return [str(find_policy(config, folder))]
+    if name in BOUNDS:
+        return [name]
+    path = named_policy(name)
     if path is None:
-        raise ConfigError(
-            f"sweep.policy: must be a run folder, a policy folder or one of {BOUNDS}, got {named!r}"
-        )
-    return str(path)
+        words = f"'pretrained', 'newest', one of {BOUNDS}, a policy folder or a run folder"
+        raise ConfigError(f"sweep.policies: each must be {words}, got {name!r}")
+    return [str(path)]
 
 
-def plan(config: Config, policy: str) -> Sweep:
-    """The cells of a sweep: a policy flies its own sensor, and each axis changes one setting of that."""
-    manifest = read_manifest(policy)
-    identity = settings_hash(manifest) if manifest else policy
+def read_entry(pilot: str) -> Entry:
+    """What a policy folder says about itself; of a bound, its name.
+
+    Raises:
+        ConfigError: If the folder's manifest lacks what tells one training from another.
+    """
+    if pilot in BOUNDS:
+        return Entry(pilot, pilot, None, pilot, {})
+    manifest: dict[str, Any] = json.loads((Path(pilot) / MANIFEST).read_text())
+    missing = [name for name in ("name", "seed", "sensor") if name not in manifest]
+    if missing:
+        raise ConfigError(f"sweep.policies: the manifest of {pilot!r} lacks {missing}; train it anew")
+    group = str(manifest.get("exp", manifest["name"]))
+    return Entry(pilot, group, int(manifest["seed"]), settings_hash(manifest), manifest["sensor"])
+
+
+def plan(config: Config, entries: Sequence[Entry]) -> Sweep:
+    """The cells of a sweep: a policy flies its own sensor, and each condition changes settings of that.
+
+    Raises:
+        ConfigError: If a policy's own sensor and a changed setting exclude each other.
+    """
     configured = config.env_config(scene=config.sweep.scene, split="eval")
-    differ = check_sensor(manifest, configured, allow_mismatch=True) if manifest else {}
-    base = with_sensor(configured, manifest.get("sensor", {}))
+    axes: dict[str, dict[str, dict[str, Any]]] = {NOMINAL: {config.sweep.scene: {}}}
+    for axis, settings in config.sweep.axes.items():
+        axes[axis] = {text(next(iter(point.values()))): point for point in axis_points(settings)}
+    differ = {entry.pilot: _differences(entry, configured) for entry in entries}
+    cells = []
+    for entry in entries:
+        own = with_sensor(configured, entry.sensor)
+        for axis, points in axes.items():
+            for value, point in points.items():
+                cells.append(_cell(config, entry, (axis, value), own, point))
+    return Sweep(
+        tuple(entries), {pilot: found for pilot, found in differ.items() if found}, axes, tuple(cells)
+    )
 
-    def cell(label: tuple[str, str], pilot: str, name: str, env: EnvConfig) -> Cell:
-        action, seeds = config.evaluate.action, tuple(range(config.sweep.trials))
-        key = settings_hash({"env": dataclasses.asdict(env), "pilot": name, "action": action})
-        return Cell(label, key, pilot, action, env, seeds)
 
-    def point(axis: str, value: float) -> tuple[float, Cell]:
-        return value, cell((axis, f"{value:g}"), policy, identity, env_with(base, axis, value))
+def _cell(
+    config: Config, entry: Entry, label: tuple[str, str], own: EnvConfig, point: Mapping[str, Any]
+) -> Cell:
+    try:
+        env = env_with(own, point)
+    except pydantic.ValidationError as error:
+        reason = error.errors()[0]["msg"]
+        raise ConfigError(
+            f"sweep.axes.{label[0]}: {dict(point)} with the sensor of {entry.pilot!r}: {reason}"
+        ) from None
+    action = config.evaluate.action
+    facts = {"env": dataclasses.asdict(env), "pilot": entry.identity, "action": action}
+    key = settings_hash({**facts, "kept": list(EPISODE.names or ())})  # other columns, other files
+    return Cell(label, key, entry, action, env, tuple(range(config.sweep.trials)))
 
-    axes = {
-        axis: [point(axis, value) for value in sorted(set(values))]
-        for axis, values in config.sweep.axes.items()
-    }
-    return Sweep(differ, axes, {name: cell((name, "-"), name, name, base) for name in SHOWN_BOUNDS})
+
+def _differences(entry: Entry, configured: EnvConfig) -> dict[str, tuple[Any, Any]]:
+    """Where a policy's own sensor is not the configured one."""
+    if not entry.sensor:
+        return {}
+    return check_sensor({"sensor": entry.sensor}, configured, allow_mismatch=True)
+
+
+def text(value: float | str | None) -> str:
+    """A value of an axis as its label."""
+    if not isinstance(value, int | float):
+        return "null" if value is None else value
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
 
 
 def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
@@ -122,11 +229,3 @@ def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
         fidelity=dataclasses.replace(env.fidelity, **fidelity),
         **rest,
     )
-
-
-def read_manifest(policy: str) -> dict[str, Any]:
-    """What a policy folder says about itself, unique by its SHA-256 sums; of a bound, nothing."""
-    if policy in BOUNDS:
-        return {}
-    manifest: dict[str, Any] = json.loads((Path(policy) / MANIFEST).read_text())
-    return manifest

@@ -6,6 +6,7 @@ started or written by then.
 """
 
 import dataclasses
+import itertools
 import typing
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
@@ -15,6 +16,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
+from jobs.axes import refused_axes
 from jobs.refusals import JOBS_CHOOSE, explain, nearest, refused_scenes
 from jobs.settings import (
     AlgoConfig,
@@ -43,8 +45,8 @@ class Config:
     """One experiment, checked."""
 
     job: Literal[
-        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "ship", "trade_simulator",
-        "trade_encoder", "probe",
+        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "report", "ship",
+        "trade_simulator", "trade_encoder", "probe",
     ]  # fmt: skip
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
@@ -108,26 +110,14 @@ def parse(values: Mapping[str, Any]) -> Config:
         named += [("evaluate", HELD_OUT_SCENE)]
         named += [("trade.scenes", name) for name in config.trade.scenes]
         named += [("collect.scenes", name) for name in config.collect.scenes]
+        swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
+        named += [("sweep.axes", name) for name in dict.fromkeys(swept) if isinstance(name, str)]
         vehicle = config.env["vehicle_radius_m"], config.env["camera_height_m"]
-        refused = _refused_picture(config) + _refused_axes(config)
+        refused = _refused_picture(config) + refused_axes(config.sweep.axes, config.env_config())
         refused += refused_scenes(named, config.env["layout"], vehicle)
     if refused:
         raise ConfigError("\n".join(refused))
     return typing.cast(Config, config)
-
-
-def env_with(config: EnvConfig, key: str, value: Any) -> EnvConfig:
-    """The simulation with one setting replaced, such as `camera.memory` or `env.control_hz`.
-
-    Raises:
-        pydantic.ValidationError: If the setting is unknown or refuses the value.
-    """
-    section, _, name = key.rpartition(".")
-    if section in ENV_PARTS:  # a group of settings
-        name, value = section, dataclasses.replace(getattr(config, section), **{name: value})
-    elif section != "env":
-        name = key
-    return dataclasses.replace(config, **{name: value})
 
 
 def known_keys() -> list[str]:
@@ -168,14 +158,3 @@ def _refused_picture(config: Config) -> list[str]:
     sides = {name: getattr(config.camera, name) for name in ("width", "height")}
     rule = f"must be at least {SMALLEST_IMAGE} for the network of {config.model.name}"
     return [f"camera.{name}: {rule}, got {side}" for name, side in sides.items() if side < SMALLEST_IMAGE]
-
-
-def _refused_axes(config: Config) -> list[str]:
-    """What the simulation would refuse of a sweep, hours later."""
-    refused = []
-    for key, value in [(key, value) for key, axis in config.sweep.axes.items() for value in axis]:
-        try:
-            env_with(config.env_config(), key, value)
-        except pydantic.ValidationError as error:
-            refused += [f"sweep.axes: {key}={value!r}: {problem['msg']}" for problem in error.errors()]
-    return refused

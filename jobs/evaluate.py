@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
+from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from jobs.accuracy import achieved
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
@@ -29,7 +30,6 @@ from jobs.runs import Run, finish, finished, latest_policies, locate_run, open_r
 from jobs.tracking import RESULTS_VIEW, Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import pictures, reconstruct
-from models.kinds import kind_of
 from models.policy import ENCODER, Policy, load_policy
 from models.weights import load_encoder
 
@@ -98,7 +98,9 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     tracker.log(config.train.env_steps, figures)
     if config.evaluate.video:
         seed = film_seed(flown[plan[0]])
-        tracker.artifact(film(config, policy, path, seed, folder.evaluation / "episode.mp4"), "eval")
+        env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
+        file = folder.evaluation / "episode.mp4"
+        tracker.artifact(film(str(path), config.evaluate.action, env_config, seed, file), "eval")
     return finish(folder, "evaluate", {"asked": asked, "figures": figures})["figures"]
 
 
@@ -245,24 +247,22 @@ def film_seed(episodes: np.ndarray) -> int:
     return int(episodes["seed"][order[0]])
 
 
-def film(config: Config, policy: Policy, source: Path, seed: int, path: Path) -> Path:
-    """Film the flight of the policy in `source` through one held-out corridor; return the file."""
-    decode = decoder(source) if kind_of(policy.manifest).encoder else None
-    pilot = PolicyPilot(policy, config.evaluate.action == "stochastic")
-    env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
+def film(source: str, action: str, env_config: EnvConfig, seed: int, path: Path) -> Path:
+    """Film a flight of a policy's folder, or of a bound, through one corridor; return the file."""
+    decode = decoder(Path(source)) if (Path(source) / ENCODER).is_file() else None
     with Film(path, env_config.control_hz, decode) as reel:
 
         def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
-            caption = f"{HELD_OUT_SCENE} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
+            caption = f"{env_config.scene} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
             ending = "   goal" if info["success"] else "   collision" if info["collision"] else ""
             reel.step(env.luminance, env.events, observation, f"{caption}{ending}")
 
-        fly(pilot, env_config, [seed], watch=watch)
+        fly(make_pilot(source, action), env_config, [seed], watch=watch)
     return path
 
 
 def decoder(source: Path) -> Decode | None:
-    """What draws, from an event window, the picture that the latents of the policy in `source` hold.
+    """What draws, from an event window, the picture that a policy's latents hold.
 
     None for a lean policy, which has no decoder.
     """

@@ -1,6 +1,6 @@
-"""Figures of results: one axis of a sweep, ways seen from above, event pictures and their copies."""
+"""Figures of results: ways seen from above, event pictures and their copies."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
 from envs.scene import Scene
-from jobs.report import Summary
 
 OFF_COLOUR, NONE_COLOUR, ON_COLOUR = "#f97316", "#15181f", "#60a5fa"
 EVENT_COLOURS = LinearSegmentedColormap.from_list("events", [OFF_COLOUR, NONE_COLOUR, ON_COLOUR])
@@ -20,75 +19,6 @@ INK, MUTED, GRID = "#1f2430", "#6b7280", "#e5e7eb"
 POLICY, ORACLE, STRAIGHT = "#2563eb", "#059669", "#b45309"
 PILOT_COLOURS = {"oracle": ORACLE, "straight": STRAIGHT}
 OUTCOMES = {"goal": POLICY, "collision": "#dc2626", "time limit": STRAIGHT}
-AXES = {
-    "env.control_hz": ("Control rate [Hz]", "log"),
-    "env.speed_mps": ("Speed [m/s]", "linear"),
-    "camera.contrast_threshold": ("Contrast threshold [log intensity]", "log"),
-    "faults.sparsity": ("Dead pixels [fraction]", "linear"),
-    "faults.background_activity": ("Background activity [fraction of true events]", "linear"),
-    "faults.background_activity_hz": ("Background activity [Hz per pixel]", "linear"),
-}
-Measure = Callable[[Summary], tuple[float, float, float]]
-
-
-def axis_figure(
-    axis: str,
-    values: Sequence[float],
-    rows: Sequence[Summary],
-    bounds: Mapping[str, Summary],
-    trained: float | None,
-) -> Figure:
-    """How success and distance change along one axis of the sweep.
-
-    Args:
-        axis: Configuration key, such as "camera.contrast_threshold".
-        values: Value of each row, shape (n,), ascending.
-        rows: The policy's summaries, one per value.
-        bounds: Summaries of pilots that bound the policy, by name; drawn as levels.
-        trained: The value the policy was trained at, or None.
-    """
-    label, scale = AXES.get(axis, (axis, "linear"))
-    figure = Figure(figsize=(9.6, 3.9), layout="constrained")
-    success, distance = figure.subplots(1, 2)
-    for panel, measure in ((success, _success_percent), (distance, _distance_m)):
-        _draw_bounds(panel, bounds, measure)
-        points = np.array([measure(row) for row in rows])
-        spread = np.abs(points[:, 1:] - points[:, :1]).T
-        style = {"color": POLICY, "lw": 1.8, "marker": "o", "ms": 6, "capsize": 4}
-        panel.errorbar(values, points[:, 0], yerr=spread, label="policy", **style)
-        panel.set_xscale(scale)
-        panel.set_xticks(values, [f"{value:g}" for value in values])
-        panel.set_xticks([], minor=True)
-        panel.margins(x=0.12)
-        panel.set_xlabel(label)
-        panel.grid(axis="y", color=GRID)
-        panel.spines[["top", "right"]].set_visible(False)
-        if trained is not None and trained in values:
-            panel.axvline(trained, color=MUTED, lw=1, ls=":", zorder=0, label="trained here")
-    success.set(ylim=(-3, 103), ylabel="Flights that reached the goal [%]")
-    distance.set(ylim=(0, None), ylabel="Mean distance without collision [m]")
-    handles, entries = success.get_legend_handles_labels()
-    figure.legend(handles, entries, loc="outside upper center", ncols=len(entries), frameon=False)
-    trials = " to ".join(f"{count}" for count in sorted({row.episodes for row in rows}))
-    figure.supxlabel(f"{trials} flights each, 95 % intervals", x=0.995, ha="right", fontsize=7, color=MUTED)
-    return figure
-
-
-def _draw_bounds(panel: Axes, bounds: Mapping[str, Summary], measure: Measure) -> None:
-    """A dashed level with its interval for each pilot that bounds the policy."""
-    for name, row in bounds.items():
-        colour = PILOT_COLOURS.get(name, MUTED)
-        middle, low, high = measure(row)
-        panel.axhspan(low, high, color=colour, alpha=0.10, lw=0)
-        panel.axhline(middle, color=colour, lw=1.4, ls="--", label=name)
-
-
-def _success_percent(row: Summary) -> tuple[float, float, float]:
-    return 100 * row.success, 100 * row.success_interval[0], 100 * row.success_interval[1]
-
-
-def _distance_m(row: Summary) -> tuple[float, float, float]:
-    return row.distance_m, *(row.distance_interval or (row.distance_m, row.distance_m))
 
 
 def reconstruction_figure(targets: np.ndarray, pictures: np.ndarray) -> Figure:

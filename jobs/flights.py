@@ -23,6 +23,7 @@ EPISODE = np.dtype(
         ("collision", "?"),
         ("truncated", "?"),
         ("distance_m", "f8"),
+        ("x_m", "f8"),
         ("return", "f8"),
         ("steps", "i8"),
         ("events_per_step", "f8"),
@@ -56,7 +57,8 @@ def fly(
 
     Returns:
         EPISODE (n,), in the order of the seeds. `distance_m` is the way along y without
-        collision [m], `dropped` what neither pixel nor window could hold.
+        collision [m], `x_m` where across the corridor it ended [m], `dropped` what neither
+        pixel nor window could hold.
     """
     config = dataclasses.replace(config, observation=pilot.observation)
     envs = [CorridorEnv(config) for _ in range(min(num_envs, len(seeds)))]
@@ -104,7 +106,7 @@ def _fly_batch(
 def _count(episodes: np.ndarray, row: int, reward: float, truncated: bool, info: Mapping[str, Any]) -> None:
     """Add one step to an episode; `events_per_step` holds the sum until the end."""
     episode = episodes[row]
-    for name in ("success", "collision", "distance_m"):
+    for name in ("success", "collision", "distance_m", "x_m"):
         episode[name] = info[name]
     episode["truncated"] = truncated
     episode["return"] += reward

@@ -196,6 +196,7 @@ def policy_settings(config: Config) -> dict[str, Any]:
     """What a policy must be flown with, for its manifest."""
     sensor = sensor_settings(config.env_config())
     return {
+        "exp": config.exp,
         "observation": KINDS[config.model.name].observation,
         "window_capacity": config.env_config().window_capacity,
         "sensor": sensor,

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from scipy.linalg import cho_factor, cho_solve
 
-from jobs.report import CONFIDENCE, RESAMPLES
 from jobs.sightings import Sightings
+from jobs.statistics import CONFIDENCE, RESAMPLES
 from models.networks import mlp
 
 INNER_SHARE = 0.2  # of the training flights, the last ones, choose the penalty and when to stop

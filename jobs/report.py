@@ -7,21 +7,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
-from scipy.stats import binomtest
 
 from jobs.progress import console
 from jobs.runs import Run, write_atomic
+from jobs.statistics import Interval, bootstrap_interval, wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from jobs.tracking import Tracker
 
-CONFIDENCE = 0.95
-RESAMPLES = 10_000
 FILE_WIDTH = 140
-
-Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -46,38 +42,6 @@ class Summary:
     distance_interval: Interval | None
     events_per_step: float
     dropped: int
-
-
-def wilson_interval(successes: int, trials: int) -> Interval:
-    """95 % interval of a success rate (Wilson 1927); it also holds at 0 and at all of them.
-
-    Raises:
-        ValueError: If there are no trials, or more successes than trials.
-    """
-    if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"need 0 <= successes <= trials and a trial, got {successes} of {trials}; fly first")
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
-
-
-def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval | None:
-    """95 % percentile bootstrap interval of the mean; None for a single value.
-
-    Args:
-        values: One number per episode, shape (n,).
-        rng: Draws the resamples.
-
-    Raises:
-        ValueError: If there is no value, or one is NaN or infinite.
-    """
-    values = np.asarray(values, dtype=np.float64)
-    if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
-        raise ValueError(f"values must be a list of finite numbers, got {values!r}; leave out what failed")
-    if values.size == 1:
-        return None
-    means = values[rng.integers(values.size, size=(RESAMPLES, values.size))].mean(axis=1)
-    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)
 
 
 def summarise(label: Sequence[str], episodes: np.ndarray) -> Summary:
@@ -133,9 +97,13 @@ def show(results: Table) -> None:
 
 def markdown(names: Sequence[str], rows: Sequence[Summary]) -> str:
     """The rows as a Markdown table."""
-    head = headings(names)
-    lines = [head, ["---" if place < len(names) else "---:" for place in range(len(head))], *map(cells, rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return markdown_table(headings(names), [cells(row) for row in rows], len(names))
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str:
+    """Rows of text as a Markdown table; all but the first `words` columns are numbers."""
+    rules = ["---" if place < words else "---:" for place in range(len(head))]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, rules, *rows)) + "\n"
 
 
 def columns(names: Sequence[str], rows: Sequence[Summary]) -> dict[str, list[str | float]]:

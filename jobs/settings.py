@@ -7,6 +7,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
+from jobs.axes import Axis, AxisName
 from models.kinds import FINETUNED, KINDS, MOST_TIME_BINS
 
 Count = Annotated[int, Field(ge=1)]
@@ -139,12 +140,21 @@ class EvaluateConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class SweepConfig:
-    """The axes of the robustness sweep: configuration key -> values, each flown `trials` times."""
+    """Which policies fly through which changes, `trials` corridors for each training.
+
+    Attributes:
+        scene: Where they fly unless an axis changes it.
+        policies: Each "pretrained" (all of models/pretrained), "newest", a bound, or a path.
+        axes: Name -> setting -> values. The first setting names the points of the axis; others
+            have as many values, or one that stays.
+        reference: The group that paired differences are taken against.
+    """
 
     scene: Name
-    axes: dict[str, Annotated[list[float], Field(min_length=1)]]
+    policies: Annotated[list[Name], Field(min_length=1)]
+    axes: dict[AxisName, Axis]
     trials: Count
-    policy: str | None
+    reference: Name
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from envs.config import settings_hash
+from jobs.conditions import PRETRAINED
 from jobs.config import Config, ConfigError
 from jobs.figures import Curve, learning_figure
 from jobs.progress import console
@@ -27,7 +28,6 @@ from jobs.runs import REPOSITORY, open_run, write_atomic
 from jobs.tracking import open_tracker
 from models.policy import load_policy, save_lean_policy
 
-PRETRAINED = REPOSITORY / "models" / "pretrained"
 FIGURE = REPOSITORY / "docs" / "images" / "learning.png"
 COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
 POINTS = 50  # of a curve

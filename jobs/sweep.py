@@ -1,14 +1,16 @@
-"""Change one thing at a time and see how far the trained policy bears it (appendix D.3).
+"""Fly policies of several trainings through every condition, and say what each group bears (appendix D.3).
 
 Run: python -m platform.launch +exp=robustness
-Expect: a few minutes for nine conditions of 20 flights on two cores; a table with intervals
-and one figure per axis in the run folder under `sweep/`. Every condition flies the same
-corridors. A stopped sweep continues when the same command is given again: conditions that
-were flown are read back, never flown twice.
+Expect: about a quarter of a second of one core for each flight (20 for each policy and
+condition); in the run folder under `sweep/` a figure per axis, tables with intervals and every
+episode. All fly the same corridors. A stopped sweep continues when the same command is given
+again: what was flown is read back, never flown twice; what failed is tried again.
 """
 
 import dataclasses
+import functools
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,97 +21,133 @@ from ray import tune
 
 from envs.accuracy import measure
 from jobs.cluster import start_ray
-from jobs.conditions import Cell, Sweep, plan, read_manifest, swept_policy
+from jobs.conditions import Cell, Sweep, find_entries, plan
 from jobs.config import Config
 from jobs.drift import DriftWatch
-from jobs.evaluate import VIEW_COLUMNS
-from jobs.figures import axis_figure
-from jobs.flights import EPISODE, check_sensor, fly, write_episodes
-from jobs.pilots import make_pilot
+from jobs.flights import EPISODE, fly
+from jobs.pilots import Pilot, make_pilot
 from jobs.progress import console, progress
-from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
-from jobs.runs import Run, finish, locate_run, open_run, write_atomic, write_json
-from jobs.tracking import Tracker, open_child, open_tracker
+from jobs.runs import Run, finish, git_commit, locate_run, open_run, write_json
+from jobs.sweep_report import accuracy_file, report
+from jobs.tracking import open_tracker
 
-LABELS = ("Axis", "Value")
 MAX_FAILURES = 2
-FRACTION_STEPS = 1000  # MLflow's steps are whole numbers: fractional axes are logged in 1/1000
+MOST_ENVS = 32  # flights in lock-step
+# Kept episodes are what a stopped sweep continues from. Tune's own picture of all trials, written
+# at each result, would cost more than the flights.
+TUNE_SNAPSHOT_S = "3600"
 
 
 class SweepError(RuntimeError):
-    """A sweep stopped; the message says why in one line and how to go on."""
+    """A sweep of which nothing could be flown; the message says why in one line."""
 
 
 class KeepEpisodes(tune.Callback):
-    """Writes the episodes of a condition the moment it is flown; in the driver, which has the run folder.
+    """Writes the episodes of a cell the moment it is flown; in the driver, which has the run folder.
 
     Tune pickles its callbacks, and a progress bar cannot be pickled: it stays behind.
+
+    Attributes:
+        failed: Key of a cell that raised -> the reason.
     """
 
     def __init__(self, folder: Path, advance: Callable[..., None] | None = None) -> None:
         """Keep episodes in a folder, and tell `advance` how many."""
-        self.folder, self.advance = folder, advance
+        self.folder, self.advance, self.commit = folder, advance, git_commit()
+        self.failed: dict[str, str] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the progress bar."""
-        return {"folder": self.folder, "advance": None}
+        return {**self.__dict__, "advance": None}
 
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
     ) -> None:
-        """Keep one condition, beside the episodes that it has."""
+        """Keep one cell, beside the episodes that it has."""
+        note = " ".join(result["label"])
+        if "failed" in result:
+            self.failed[result["key"]] = result["failed"]
+            console.print(f"Not flown: {note}: {result['failed']}", markup=False)
+            return
         path = self.folder / f"{result['key']}.json"
         rows = {row[0]: row for row in [*kept_rows(path), *result["episodes"]]}
-        kept = {name: result[name] for name in ("label", "event_error", "renders_per_step", "encoder")}
+        kept = {"label": result["label"], "commit": self.commit, "encoder": result["encoder"]}
         write_json(path, {**kept, "episodes": [rows[seed] for seed in sorted(rows)]})
+        if result["accuracy"] is not None:
+            write_json(accuracy_file(self.folder.parent, result["simulation"]), result["accuracy"])
         if self.advance is not None:
-            self.advance(len(result["episodes"]), note=" ".join(result["label"]))
+            self.advance(len(result["episodes"]), note=note)
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Fly every condition that is not flown yet; report, and return the policy's figures."""
-    policy = swept_policy(config, locate_run(config))
+    """Fly every cell that is not flown yet; report, and return each group's success rate by condition."""
+    entries = find_entries(config, locate_run(config))
     folder = open_run(config)
     config = folder.config
-    sweep = plan(config, policy)
-    announce(policy, sweep)
+    sweep = plan(config, entries)
+    announce(sweep)
     with open_tracker(config, folder, key=f"sweep {sweep.identity[:8]}") as tracker:
-        tracker.tags({"kind": "sweep", "policy": read_manifest(policy).get("name", policy)})
-        episodes = fly_cells(config, folder, sweep.cells())
-        figures = report(folder, tracker, policy, sweep, episodes)
+        tracker.tags({"kind": "sweep", "groups": ", ".join(sweep.groups)})
+        episodes, failed = fly_cells(config, folder, sweep.cells)
+        kept = {key: read_kept(episodes_folder(folder), key) for key in episodes}
+        figures = report(config, folder, tracker, sweep, episodes, kept, failed)
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "sweep", figures)
 
 
-def announce(policy: str, sweep: Sweep) -> None:
-    """Say which policy is flown, and where its sensor replaces the configured one."""
-    name = read_manifest(policy).get("name", "a bound")
-    console.print(f"Policy: {policy}, {name}", markup=False)
-    if sweep.differ:
-        flown = ", ".join(
-            f"{name} = {own!r} instead of {ours!r}" for name, (own, ours) in sweep.differ.items()
-        )
-        console.print(f"Flown with the policy's own sensor: {flown}", markup=False)
+def announce(sweep: Sweep) -> None:
+    """Say who flies, and where a policy's own sensor replaces the configured one."""
+    for group, trainings in sweep.groups.items():
+        seeds = ", ".join(str(seed) for seed in trainings if seed is not None)
+        console.print(f"Group: {group}" + (f" (training seeds {seeds})" if seeds else ""), markup=False)
+    for pilot, differ in sweep.differ.items():
+        flown = ", ".join(f"{name} = {own!r} instead of {ours!r}" for name, (own, ours) in differ.items())
+        console.print(f"Flown with its own sensor: {pilot}: {flown}", markup=False)
 
 
-def fly_cells(config: Config, folder: Run, every: Sequence[Cell]) -> dict[str, np.ndarray]:
-    """The episodes of each cell by its key: read back where they are kept, else flown as a Tune trial.
+def fly_cells(
+    config: Config, folder: Run, every: Sequence[Cell]
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The episodes of each cell by its key, read back where they are kept, else flown as a Tune trial.
+
+    Returns:
+        Key -> EPISODE of the cells that could be flown, and key -> reason of the others.
 
     Raises:
-        SweepError: If a cell could not be flown.
+        SweepError: If none could be flown.
     """
-    kept = folder.path / "sweep" / "episodes"
+    kept = episodes_folder(folder)
     unique = {cell.key: cell for cell in every}
     missing = [cell for cell in (unflown(cell, kept) for cell in unique.values()) if cell.seeds]
+    failed: dict[str, str] = {}
     if missing:
         total, left = (sum(len(cell.seeds) for cell in some) for some in (unique.values(), missing))
         start_ray(config.cluster, folder.path)
+        os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = TUNE_SNAPSHOT_S
         with progress("Sweep", total, "flights", done=total - left) as advance:
-            results = _tuner(folder, missing, KeepEpisodes(kept, advance)).fit()
-        if results.errors:
-            reason = str(results.errors[0]).strip().splitlines()[-1]
-            raise SweepError(f"the sweep stopped: {reason}; the same command flies what is missing")
-    return {key: read_episodes(cell, kept) for key, cell in unique.items()}
+            keep = KeepEpisodes(kept, advance)
+            _tuner(folder, missing, unmeasured(missing, kept), keep).fit()
+        lost = f"its process ended {MAX_FAILURES + 1} times"
+        failed = {cell.key: keep.failed.get(cell.key, lost) for cell in missing if unflown(cell, kept).seeds}
+    if len(failed) == len(unique):
+        reason = next(iter(failed.values()))
+        raise SweepError(f"nothing could be flown: {reason}; the same command tries again")
+    flown = {key: read_episodes(cell, kept) for key, cell in unique.items() if key not in failed}
+    return flown, failed
+
+
+def episodes_folder(folder: Run) -> Path:
+    """Where a run folder keeps the episodes of its sweeps, one file per cell."""
+    return folder.path / "sweep" / "episodes"
+
+
+def unmeasured(cells: Sequence[Cell], kept: Path) -> set[str]:
+    """Keys of the cells that measure their simulation's accuracy: the first of each that is not known."""
+    first: dict[str, str] = {}
+    for cell in cells:
+        if not accuracy_file(kept.parent, cell.simulation).is_file():
+            first.setdefault(cell.simulation, cell.key)
+    return set(first.values())
 
 
 def unflown(cell: Cell, kept: Path) -> Cell:
@@ -123,11 +161,13 @@ def kept_rows(path: Path) -> list[list[Any]]:
     return json.loads(path.read_text())["episodes"] if path.is_file() else []
 
 
-def simulated(cell: Cell, kept: Path) -> dict[str, float]:
-    """How exact the events of a kept cell were, how many renders that took, and the encoder's drift."""
-    values = json.loads((kept / f"{cell.key}.json").read_text())
-    drift = {f"evae/{name}": value for name, value in values.get("encoder", {}).items()}
-    return drift | {f"sim/{name}": values[name] for name in ("event_error", "renders_per_step")}
+def read_kept(kept: Path, key: str) -> dict[str, Any]:
+    """What is kept of a cell beside its episodes: the commit that flew it, and its encoder's drift."""
+    return {
+        name: value
+        for name, value in json.loads((kept / f"{key}.json").read_text()).items()
+        if name != "episodes"
+    }
 
 
 def read_episodes(cell: Cell, kept: Path) -> np.ndarray:
@@ -136,12 +176,13 @@ def read_episodes(cell: Cell, kept: Path) -> np.ndarray:
     return np.array([rows[seed] for seed in cell.seeds], EPISODE)
 
 
-def _tuner(folder: Run, missing: Sequence[Cell], keep: KeepEpisodes) -> tune.Tuner:
+def _tuner(folder: Run, missing: Sequence[Cell], measured: set[str], keep: KeepEpisodes) -> tune.Tuner:
     """One trial per cell, one core each."""
+    trials = [{"cell": cell, "measured": cell.key in measured} for cell in missing]
     return tune.Tuner(
         tune.with_resources(fly_cell, {"cpu": 1}),
         tune_config=tune.TuneConfig(reuse_actors=True),  # a new worker imports for seconds
-        param_space={"cell": tune.grid_search(list(missing))},
+        param_space={"trial": tune.grid_search(trials)},
         run_config=tune.RunConfig(
             name="tune",
             storage_path=str(folder.path / "sweep"),
@@ -153,90 +194,38 @@ def _tuner(folder: Run, missing: Sequence[Cell], keep: KeepEpisodes) -> tune.Tun
 
 
 def fly_cell(params: Mapping[str, Any]) -> None:
-    """The trial of one cell, in a Ray worker; its result holds the episodes."""
+    """The trial of one cell, in a Ray worker; a cell that raises is reported, and stops no other."""
     torch.set_num_threads(1)
-    cell: Cell = params["cell"]
-    drift = DriftWatch(cell.pilot)
-    episodes = fly(make_pilot(cell.pilot, cell.action), cell.env, cell.seeds, watch=drift.add)
-    accuracy = measure(cell.env)
-    tune.report(
-        {
-            "key": cell.key,
-            "label": list(cell.label),
-            "episodes": episodes.tolist(),
-            "event_error": accuracy.error,
-            "renders_per_step": accuracy.renders,
-            "encoder": drift.figures(),  # of the flights flown last
-        }
+    cell: Cell = params["trial"]["cell"]
+    label = [
+        *cell.label,
+        cell.entry.group,
+        *([] if cell.entry.training is None else [f"s{cell.entry.training}"]),
+    ]
+    try:
+        result = flown(cell, params["trial"]["measured"])
+    except Exception as error:
+        result = {"failed": " ".join(f"{type(error).__name__}: {error}".split())}
+    tune.report({"key": cell.key, "label": label, **result})
+
+
+def flown(cell: Cell, measured: bool) -> dict[str, Any]:
+    """The episodes of a cell, the drift of its policy's encoder, and how exact its simulation is."""
+    pilot = cell.entry.pilot
+    drift = DriftWatch(pilot)
+    episodes = fly(
+        loaded(pilot, cell.action), cell.env, cell.seeds, min(len(cell.seeds), MOST_ENVS), drift.add
     )
-
-
-def report(
-    folder: Run, tracker: Tracker, policy: str, sweep: Sweep, episodes: Mapping[str, np.ndarray]
-) -> dict[str, float]:
-    """Tables, figures and tracked runs of a flown sweep; the policy's success rate by condition."""
-    levels = {name: summarise(cell.label, episodes[cell.key]) for name, cell in sweep.bounds.items()}
-    sensor = read_manifest(policy).get("sensor", {})
-    rows: list[tuple[Cell, Summary]] = []
-    for axis, points in sweep.axes.items():
-        flown = [summarise(cell.label, episodes[cell.key]) for _, cell in points]
-        values = [value for value, _ in points]
-        trained = sensor.get(axis.rpartition(".")[2], 0.0 if axis.startswith("faults.") else None)
-        figure = axis_figure(axis, values, flown, levels, trained)
-        figure.savefig(folder.path / "sweep" / f"{axis}.png", dpi=120)
-        tracker.figure(f"sweep/{axis}.png", figure)
-        track_axis(tracker, axis, values, flown)
-        rows += [(cell, row) for (_, cell), row in zip(points, flown, strict=True)]
-    for cell, row in rows:
-        track_cell(folder, tracker, cell, row, sensor)
-    publish(folder, tracker, policy, [*(row for _, row in rows), *levels.values()])
-    flights = {cell.label: episodes[cell.key] for cell, _ in rows}
-    write_episodes(folder.path / "sweep" / "episodes.csv", LABELS, flights)
-    return {"=".join(row.label): row.success for _, row in rows}
-
-
-def track_axis(tracker: Tracker, axis: str, values: Sequence[float], rows: Sequence[Summary]) -> None:
-    """One curve per axis in the parent run: its steps are the axis, in 1/1000 where it has fractions."""
-    scale = 1 if all(float(value).is_integer() for value in values) else FRACTION_STEPS
-    for value, row in zip(values, rows, strict=True):
-        figures = metrics(row)
-        curve = {f"sweep/{name.partition('/')[2]}.{axis}": figures[name] for name in VIEW_COLUMNS}
-        log_once(tracker, round(value * scale), curve)
-
-
-def log_once(tracker: Tracker, step: int, figures: Mapping[str, float]) -> None:
-    """Log the points that the MLflow run does not hold yet: MLflow would draw a repeated one twice."""
-    client, run_id = tracker.client, tracker.run_id
-    held = {
-        (name, point.step, point.value)
-        for name in client.get_run(run_id).data.metrics.keys() & figures.keys()
-        for point in client.get_metric_history(run_id, name)
+    accuracy = measure(cell.env) if measured else None
+    return {
+        "episodes": episodes.tolist(),
+        "encoder": drift.figures(),  # of the flights flown last
+        "simulation": cell.simulation,
+        "accuracy": accuracy and {"event_error": accuracy.error, "renders_per_step": accuracy.renders},
     }
-    tracker.log(step, {name: value for name, value in figures.items() if (name, step, value) not in held})
 
 
-def track_cell(folder: Run, parent: Tracker, cell: Cell, row: Summary, sensor: Mapping[str, Any]) -> None:
-    """A child run for one condition, with what differs from the sensor the policy was trained with."""
-    differ = check_sensor({"sensor": sensor}, cell.env, allow_mismatch=True) if sensor else {}
-    axis, value = cell.label
-    slot = f"condition {parent.run_id} {axis} {cell.key}"  # a parent's conditions are its own
-    with open_child(parent, folder, slot, f"{axis}={value}", "condition") as child:
-        child.params({"axis": axis, "value": value, "pilot": cell.pilot, "env": dataclasses.asdict(cell.env)})
-        child.tags({"differs_from_training": json.dumps(differ)})
-        log_once(child, 0, metrics(row) | simulated(cell, folder.path / "sweep" / "episodes"))
-
-
-def publish(folder: Run, tracker: Tracker, policy: str, rows: Sequence[Summary]) -> None:
-    """Show, store and track the table."""
-    text = markdown(LABELS, rows)
-    show(table("One setting changed at a time", LABELS, rows))
-    write_atomic(folder.path / "sweep" / "table.md", text)
-    tracker.text("sweep/table.md", text)
-    if "sweep/results.json" not in {
-        file.path for file in tracker.client.list_artifacts(tracker.run_id, "sweep")
-    }:
-        tracker.table("sweep/results", columns(LABELS, rows))  # MLflow appends to a table that is there
-    shown = [f"metrics.`{name}`" for name in VIEW_COLUMNS]
-    search = f"tags.`mlflow.parentRunId` = '{tracker.run_id}'"
-    view = tracker.save_view("sweep", "Sweep", [*shown, "params.`axis`", "params.`value`"], search)
-    tracker.describe(f"Policy: {policy}\n\n[Conditions as a table]({view})\n\n{text}")
+@functools.lru_cache(maxsize=2)
+def loaded(pilot: str, action: str) -> Pilot:
+    """A pilot, kept by a worker from cell to cell: it forgets its flights when it is reset."""
+    return make_pilot(pilot, action)

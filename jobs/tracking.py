@@ -17,9 +17,10 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
+from envs.config import settings_hash
 from jobs.config import Config, as_dict
 from jobs.runs import Run, provenance, write_json
 from jobs.store import check_metrics, dashboard_command, flatten, page, store_uri
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
+MOST_CHILDREN = 10_000  # of one run
 WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
 VIEW_TAG = "mlflow.sharedViewState"  # MLflow's own name for stored views
 RESULTS_VIEW = "results"
@@ -63,6 +65,15 @@ class Tracker:
         written = [Metric(name, value, now_ms, step) for name, value in values.items() if name not in missing]
         tags = [RunTag("not_measured", f"step {step}: {', '.join(missing)}")] if missing else []
         self.client.log_batch(self.run_id, metrics=written, tags=tags)
+
+    def log_once(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Write only what the run does not hold yet: MLflow would draw a repeated point twice."""
+        held = {
+            (name, point.step, point.value)
+            for name in self.client.get_run(self.run_id).data.metrics.keys() & metrics.keys()
+            for point in self.client.get_metric_history(self.run_id, name)
+        }
+        self.log(step, {name: value for name, value in metrics.items() if (name, step, value) not in held})
 
     def params(self, values: Mapping[str, Any]) -> None:
         """Write settings that the run does not have yet, nested mappings as `outer.inner`."""
@@ -164,6 +175,47 @@ def open_child(parent: Tracker, folder: Run, key: str, name: str, kind: str) -> 
     child = _continue_or_create(parent, folder, key, name, tags)
     with _ended(child):
         yield child
+
+
+class Child(NamedTuple):
+    """A finished run below another, with all that it holds."""
+
+    name: str
+    params: Mapping[str, Any]
+    tags: Mapping[str, str]
+    metrics: Mapping[str, float]
+
+
+def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> None:
+    """Write finished runs below `parent`: three calls each, and none for one that is there unchanged.
+
+    One whose content has changed takes the place of the run of the same name.
+    """
+    from mlflow.entities import Metric, Param, RunTag
+
+    client = parent.client
+    search = f"tags.`mlflow.parentRunId` = '{parent.run_id}' and tags.kind = '{kind}'"
+    found = client.search_runs([parent.experiment_id], search, max_results=MOST_CHILDREN)
+    known = {run.info.run_name: run for run in found}
+    for child in children:
+        content = settings_hash(
+            {"params": flatten(child.params), "tags": child.tags, "metrics": child.metrics}
+        )
+        old = known.get(child.name)
+        if old is not None and old.data.tags.get("content") == content:
+            continue
+        if old is not None:
+            client.delete_run(old.info.run_id)
+        facts = {"kind": kind, "mlflow.parentRunId": parent.run_id}
+        run_id = client.create_run(parent.experiment_id, tags=facts, run_name=child.name).info.run_id
+        now_ms = int(time.time() * 1000)
+        client.log_batch(
+            run_id,
+            metrics=[Metric(name, value, now_ms, 0) for name, value in check_metrics(child.metrics).items()],
+            params=[Param(key, value) for key, value in flatten(child.params).items()],
+            tags=[RunTag(key, value) for key, value in {**child.tags, "content": content}.items()],
+        )
+        client.set_terminated(run_id)
 
 
 @contextlib.contextmanager

@@ -18,7 +18,8 @@ from rich.table import Table
 from envs.accuracy import Accuracy, measure
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
-from jobs.config import Config, env_with
+from jobs.axes import env_with
+from jobs.config import Config
 from jobs.progress import console, progress
 from jobs.report import show
 from jobs.runs import Run, finish, open_run, write_atomic
@@ -110,7 +111,7 @@ def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
             steps = max(1, round(config.trade.steps * hz / min(rates_hz) / 4))
             for memory in MEMORIES:
                 default = config.env_config(control_hz=hz, split="validation")
-                accuracy = measure(env_with(default, "camera.memory", memory), config.trade.flights, steps)
+                accuracy = measure(env_with(default, {"camera.memory": memory}), config.trade.flights, steps)
                 events_hz[memory].append(accuracy.events[0] * hz)
                 advance(1, note=memory)
     figure = memory_figure(rates_hz, events_hz)
@@ -155,7 +156,7 @@ def _changed(default: EnvConfig, setting: dict[str, Any]) -> EnvConfig:
             fidelity = dataclasses.replace(default.fidelity, max_step_m=step_m / value)
             default = dataclasses.replace(default, fidelity=fidelity)
         else:
-            default = env_with(default, key, value)
+            default = env_with(default, {key: value})
     return default
 
 

@@ -25,6 +25,7 @@ JOBS = {
     "evaluate": "jobs.evaluate",
     "sweep": "jobs.sweep",
     "ship": "jobs.ship",
+    "report": "jobs.results",
     "trade_simulator": "jobs.trade_simulator",
     "trade_encoder": "jobs.trade_encoder",
     "probe": "jobs.probe",

@@ -163,10 +163,10 @@ def test_the_same_command_again_repeats_nothing(flown):
 
 
 def test_a_sweep_flies_the_policy_just_trained_and_a_rerun_flies_nothing(flown):
-    printed = launch(flown[0], "+exp=robustness", "sweep.trials=1")
+    printed = launch(flown[0], "+exp=robustness", "sweep.policies=[newest]", "sweep.trials=1")
     for axis in ("control_hz", "contrast_threshold", "sparsity", "background_activity"):
         assert axis in printed
-    again = launch(flown[0], "+exp=robustness", "sweep.trials=1")
+    again = launch(flown[0], "+exp=robustness", "sweep.policies=[newest]", "sweep.trials=1")
     assert "Sweep:" not in again
     client = MlflowClient(f"sqlite:///{flown[0] / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("evade").experiment_id

@@ -8,7 +8,7 @@ import pytest
 from jobs.config import ConfigError
 from jobs.runs import Run, open_run
 from jobs.store import check_metrics, flatten, store_uri
-from jobs.tracking import open_child, open_store, open_tracker
+from jobs.tracking import Child, open_child, open_store, open_tracker, write_children
 from tests.test_runs import small_config
 
 
@@ -125,3 +125,21 @@ def test_processes_that_start_together_make_one_store(tmp_path):
     uri = f"sqlite:///{tmp_path}/mlflow.db"
     with ProcessPoolExecutor(3) as pool:
         assert len(set(pool.map(open_new_store, [uri] * 3))) == 1
+
+
+def test_children_are_written_once_and_replaced_where_their_content_has_changed(folder):
+    def child(name, success):
+        return Child(name, {"axis": "rate", "env": {"hz": 45}}, {"note": "x"}, {"eval/success_rate": success})
+
+    with open_tracker(folder.config, folder, key="children") as parent:
+        search = [parent.experiment_id], f"tags.`mlflow.parentRunId` = '{parent.run_id}'"
+        write_children(parent, "condition", [child("a", 0.5), child("b", 0.5)])
+        before = {run.info.run_name: run for run in parent.client.search_runs(*search)}
+        write_children(parent, "condition", [child("a", 0.5), child("b", 1.0)])
+        after = {run.info.run_name: run for run in parent.client.search_runs(*search)}
+    assert set(after) == {"a", "b"}
+    assert after["a"].info.run_id == before["a"].info.run_id
+    assert after["b"].info.run_id != before["b"].info.run_id
+    assert after["b"].data.metrics == {"eval/success_rate": 1.0}
+    assert after["b"].data.params == {"axis": "rate", "env.hz": "45"}
+    assert after["b"].info.status == "FINISHED"

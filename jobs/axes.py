@@ -1,0 +1,99 @@
+"""The axes of a sweep: settings of the simulation that change together, point by point."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import pydantic
+from pydantic import Field, PlainValidator
+
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
+from jobs.refusals import JOBS_CHOOSE, nearest
+
+GROUPS = {"camera": CameraConfig, "faults": FaultsConfig, "fidelity": FidelityConfig}
+PLAIN = ("renderer",)  # named without a group in a configuration
+KEYS = [
+    *(f"env.{part.name}" for part in dataclasses.fields(EnvConfig)
+      if part.name not in (*GROUPS, *PLAIN, *JOBS_CHOOSE, "layout")),
+    *(f"{name}.{part.name}" for name, group in GROUPS.items() for part in dataclasses.fields(group)),
+    *PLAIN,
+]  # fmt: skip
+
+
+def _number_or_word(value: Any) -> float | str | None:
+    """One rule and one message, where a union of types would give several."""
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"must be a finite number, a word or null, got {value!r}")
+    return value
+
+
+Setting = Annotated[float | str | None, PlainValidator(_number_or_word)]
+AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Values = Annotated[list[Setting], Field(min_length=1)]
+Axis = Annotated[dict[str, Values], Field(min_length=1)]
+
+
+def env_with(config: EnvConfig, changes: Mapping[str, Any]) -> EnvConfig:
+    """The simulation with settings replaced together, such as {"camera.memory": "frame"}.
+
+    Raises:
+        pydantic.ValidationError: If a setting is unknown or refuses its value.
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    fields: dict[str, Any] = {}
+    for key, value in changes.items():
+        section, _, name = key.rpartition(".")
+        if section in GROUPS:
+            groups.setdefault(section, {})[name] = value
+        else:
+            fields[name if section == "env" else key] = value
+    parts = {name: dataclasses.replace(getattr(config, name), **values) for name, values in groups.items()}
+    return dataclasses.replace(config, **{**fields, **parts})
+
+
+def axis_points(settings: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """The points of an axis, each as setting -> value: settings have equally many values, or one for all.
+
+    Raises:
+        ValueError: If the lengths differ, or two points have the same first value.
+    """
+    lengths = {key: len(values) for key, values in settings.items()}
+    if len({*lengths.values()} - {1}) > 1:
+        raise ValueError(f"settings must have equally many values, or one, got {lengths}")
+    count = max(lengths.values())
+    key, first = next(iter(settings.items()))
+    if len(set(first)) < count:
+        rule = f"{key} comes first, so it must differ at each of {count} points"
+        raise ValueError(f"{rule}, got {list(first)}")
+    return [{key: values[place % len(values)] for key, values in settings.items()} for place in range(count)]
+
+
+def refused_axes(axes: Mapping[str, Mapping[str, Sequence[Any]]], config: EnvConfig) -> list[str]:
+    """One line for each thing that the simulation would refuse of a sweep, hours later."""
+    refused = []
+    for axis, settings in axes.items():
+        refused += [f"sweep.axes.{axis}: {reason}" for reason in _refused_axis(settings, config)]
+    return refused
+
+
+def _refused_axis(settings: Mapping[str, Sequence[Any]], config: EnvConfig) -> list[str]:
+    unknown = {key: list(values) for key, values in settings.items() if key not in KEYS}
+    if unknown:
+        return [
+            f"{key}: no such setting, got {values}{nearest(key, KEYS)}" for key, values in unknown.items()
+        ]
+    try:
+        points = axis_points(settings)
+    except ValueError as error:
+        return [str(error)]
+    refused = []
+    for point in points:
+        try:
+            env_with(config, point)
+        except pydantic.ValidationError as error:
+            named = ", ".join(f"{key}={value!r}" for key, value in point.items())
+            refused += [f"{named}: {problem['msg']}" for problem in error.errors()]
+    return refused

@@ -1,0 +1,191 @@
+"""Write docs/results.md from a flown sweep: its tables and figures, and what they say of the paper's claims.
+
+Run: python -m platform.launch +exp=report
+Expect: seconds; docs/results.md and docs/images/results_*.png, of the newest sweep or of the run
+folder that `resume` names.
+"""
+
+import csv
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jobs.claims import CLAIMS, RULE, UNTESTED, Claim, Finding, judge
+from jobs.config import Config, ConfigError
+from jobs.flights import EPISODE
+from jobs.groups import LABELS, Condition, Flights, details, estimate_text, matrix, summarise_group
+from jobs.progress import console
+from jobs.report import markdown_table
+from jobs.runs import REPOSITORY, write_atomic
+
+Flown = dict[tuple[Condition, str], dict[int | None, np.ndarray]]
+PER_CENT = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
+TITLES = {
+    "control_hz": "Control rate",
+    "control_hz_dense": "Control rate among more poles",
+    "contrast_threshold": "Contrast threshold",
+    "sparsity": "Dead pixels",
+    "background_activity": "Background activity",
+    "sensor_noise": "Noise of a real sensor: none, by day, by night",
+    "world": "Other worlds",
+    "memory": "Memory of the pixels",
+    "memory_400hz": "Memory of the pixels at 400 Hz",
+    "speed": "Speed",
+    "worst": "Several at once",
+    "contacts": "Where flights end in contact",
+}
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Write the results of the newest sweep, or of the one in `resume`, into docs/."""
+    file = write_results(find_sweep(config), REPOSITORY / "docs")
+    console.print(f"Written: {file.relative_to(REPOSITORY)}", markup=False)
+    return {}
+
+
+def find_sweep(config: Config) -> Path:
+    """The folder `sweep` of the run folder in `resume`, else of the one whose sweep was flown last.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    runs = Path(config.runs_dir)
+    found = (
+        list(runs.glob("*/sweep/about.json"))
+        if config.resume is None
+        else [Path(config.resume, "sweep/about.json")]
+    )
+    newest = max(
+        (path for path in found if path.is_file()), key=lambda path: path.stat().st_mtime_ns, default=None
+    )
+    if newest is None:
+        where = config.resume or config.runs_dir
+        raise ConfigError(
+            f"resume: no finished sweep in {where!r}: run python -m platform.launch +exp=robustness"
+        )
+    return newest.parent
+
+
+def write_results(sweep: Path, docs: Path) -> Path:
+    """Write results.md and copy the figures.
+
+    Args:
+        sweep: The folder that a sweep has left in its run folder.
+        docs: Where results.md goes, its pictures into `images`.
+
+    Returns:
+        The file.
+    """
+    about = json.loads((sweep / "about.json").read_text())
+    flown = read_flights(sweep / "episodes.csv")
+    pictures = {path.stem: path for path in sorted(sweep.glob("*.png"))}
+    shown = [name for name in (*about["axes"], "contacts") if name in pictures]
+    (docs / "images").mkdir(parents=True, exist_ok=True)
+    for name in shown:
+        shutil.copyfile(pictures[name], docs / "images" / f"results_{name}.png")
+    text = "\n".join([*opening(about), *claims(flown), *tables(about, flown), *figures(about, shown)])
+    write_atomic(docs / "results.md", text)
+    return docs / "results.md"
+
+
+def read_flights(file: Path) -> Flown:
+    """EPISODE by condition, group and training seed, from the sweep's episodes.csv."""
+    rows: dict[tuple[Condition, str], dict[int | None, list[tuple[Any, ...]]]] = {}
+    with file.open() as stream:
+        for row in csv.DictReader(stream):
+            axis, value, group, training = (row[name] for name in LABELS)
+            place = rows.setdefault(((axis, value), group), {})
+            place.setdefault(int(training) if training else None, []).append(_episode(row))
+    return {key: {seed: np.array(own, EPISODE) for seed, own in parts.items()} for key, parts in rows.items()}
+
+
+def _episode(row: Mapping[str, str]) -> tuple[Any, ...]:
+    kinds: dict[str, Callable[[str], Any]] = {"b": "True".__eq__, "i": int, "f": float}
+    return tuple(kinds[EPISODE[name].kind](row[name]) for name in EPISODE.names or ())
+
+
+def opening(about: Mapping[str, Any]) -> list[str]:
+    """What was flown, by which command, at which commit."""
+    groups = ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items())
+    return [
+        "# Results",
+        "",
+        f"Made on {about['date']} by `{about['command']}`, then `python -m platform.launch +exp=report`; "
+        f"run `{about['run']}`, sweep `{about['identity']}`, flown at commit {', '.join(about['flown_at'])}.",
+        "",
+        f"Groups, with their number of trainings: {groups}. Each training flies the same {about['trials']} "
+        f"held-out corridors of `{about['scene']}` under each condition; actions are {about['action']}. "
+        "Intervals are 95 %. Those of distances and differences come from a two-stage bootstrap (trainings, "
+        "then corridors); those of success also hold Wilson's interval of all flights. With few trainings "
+        "they are rather too narrow. The middle half is the interquartile mean.",
+        "",
+    ]
+
+
+def claims(flown: Flown) -> list[str]:
+    """The paper's claims with our findings."""
+
+    def find(condition: Condition, group: str) -> Flights:
+        return flown.get((condition, group), {})
+
+    lines = [_claim_line(claim, judge(claim, find)) for claim in CLAIMS]
+    lines += [(text, source, "", "not tested", reason, "") for text, source, reason in UNTESTED]
+    head = ("The paper says of", "Source", "Against", "Finding", "Difference, all conditions", "By condition")
+    return ["## The paper's claims", "", RULE, "", markdown_table(head, lines, len(head))]
+
+
+def _claim_line(claim: Claim, finding: Finding) -> tuple[str, ...]:
+    scale, form, unit = PER_CENT[claim.measure]
+    each = [
+        f"{axis} {value}: {estimate_text(found, scale, form)}"
+        for (axis, value), found in finding.conditions.items()
+    ]
+    overall = (
+        f"{estimate_text(finding.overall, scale, form)}{unit}"
+        if finding.overall
+        else "one of them did not fly"
+    )
+    return (
+        f"`{claim.ours}`: {claim.text}",
+        claim.source,
+        f"`{claim.theirs}`",
+        finding.verdict,
+        overall,
+        "; ".join(each),
+    )
+
+
+def tables(about: Mapping[str, Any], flown: Flown) -> list[str]:
+    """Success of all groups under all conditions, and every estimate."""
+    conditions = [(axis, value) for axis, points in about["axes"].items() for value in points]
+    groups, reference = list(about["groups"]), about["reference"]
+    rows = [
+        summarise_group(
+            at, group, flown[at, group], flown.get((at, reference)) if group != reference else None
+        )
+        for at in conditions
+        for group in groups
+        if (at, group) in flown
+    ]
+    head, lines = matrix(rows, conditions, groups, {})
+    success = ["## Success [%]", "", markdown_table(head, lines, 2)]
+    note = (
+        f"Differences are taken against `{reference}` on the same corridors (success in points of per cent)."
+    )
+    return [*success, "## Every estimate", "", note, "", details(rows, reference)]
+
+
+def figures(about: Mapping[str, Any], names: list[str]) -> list[str]:
+    """Each picture with what made it."""
+    made = (
+        f"`{about['command']}`, run `{about['run']}`, commit {', '.join(about['flown_at'])}, {about['date']}"
+    )
+    lines = []
+    for name in names:
+        title = TITLES.get(name, name)
+        lines += [f"## {title}", "", f"![{title}](images/results_{name}.png)", "", f"({made})", ""]
+    return lines

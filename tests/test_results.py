@@ -1,0 +1,90 @@
+import dataclasses
+import json
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jobs.config import ConfigError
+from jobs.flights import write_episodes
+from jobs.groups import LABELS
+from jobs.results import find_sweep, read_flights, write_results
+from tests.test_groups import flights
+from tests.test_runs import small_config
+
+ABOUT = {
+    "run": "robustness-short-s0-1",
+    "identity": "abc",
+    "command": "python -m platform.launch +exp=robustness",
+    "commit": "c0ffee",
+    "flown_at": ["c0ffee"],
+    "date": "2026-01-02",
+    "scene": "poles_eval",
+    "trials": 20,
+    "reference": "event_columns",
+    "action": "stochastic",
+    "groups": {"bytestream": [0, 1], "event_image": [0], "oracle": [None]},
+    "axes": {"nominal": {"poles_eval": {}}, "sparsity": {"0.2": {}, "0.5": {}}},
+}
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    """The folder that a sweep leaves, made of constructed episodes."""
+    folder = tmp_path / "runs" / "robustness-short-s0-1" / "sweep"
+    won = {"bytestream": 16, "event_image": 4, "oracle": 20}
+    flown = {
+        (axis, value, group, "" if seed is None else str(seed)): flights(won[group])
+        for axis, points in ABOUT["axes"].items()
+        for value in points
+        for group, seeds in ABOUT["groups"].items()
+        for seed in seeds
+    }
+    write_episodes(folder / "episodes.csv", LABELS, flown)
+    (folder / "about.json").write_text(json.dumps(ABOUT))
+    for name in ("sparsity", "contacts", "left_over"):
+        Image.new("RGB", (4, 4)).save(folder / f"{name}.png")
+    return folder
+
+
+def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_path):
+    text = write_results(sweep, tmp_path / "docs").read_text()
+    assert "Made on 2026-01-02 by `python -m platform.launch +exp=robustness`, then" in text
+    assert "flown at commit c0ffee" in text
+    assert "bytestream (2), event_image (1), oracle (1)" in text
+    assert "| `bytestream`: bears dead pixels | D.3 | `event_image` | holds |" in text
+    assert (
+        "| `bytestream`: adapts to other control rates | abstract, D.3 | `event_image` | not tested |" in text
+    )
+    assert "| Training is faster than on event images | abstract |  | not tested |" in text
+    assert "| nominal | poles_eval | 80 [" in text
+    assert text.count("(images/results_") == 2
+    assert {path.name for path in (tmp_path / "docs" / "images").iterdir()} == {
+        "results_sparsity.png", "results_contacts.png"
+    }  # fmt: skip
+    assert str(tmp_path) not in text
+
+
+def test_flights_survive_their_file(sweep):
+    found = read_flights(sweep / "episodes.csv")
+    assert set(found[("sparsity", "0.2"), "bytestream"]) == {0, 1}
+    np.testing.assert_array_equal(found[("sparsity", "0.5"), "oracle"][None], flights(20))
+
+
+def test_the_newest_sweep_is_found_unless_one_is_named(sweep, tmp_path):
+    older = tmp_path / "runs" / "older"
+    (older / "sweep").mkdir(parents=True)
+    (older / "sweep" / "about.json").write_text("{}")
+    os.utime(older / "sweep" / "about.json", (1, 1))
+    config = small_config(tmp_path, job="report")
+    assert find_sweep(config) == sweep
+    assert find_sweep(dataclasses.replace(config, resume=str(older))) == older / "sweep"
+
+
+def test_no_sweep_is_refused_with_the_remedy(tmp_path):
+    config = small_config(tmp_path, job="report")
+    with pytest.raises(
+        ConfigError, match=r"^resume: no finished sweep in .*: run python -m platform\.launch"
+    ):
+        find_sweep(config)

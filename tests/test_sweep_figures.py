@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+
+from jobs.flights import EPISODE
+from jobs.groups import summarise_group
+from jobs.sweep_figures import BOUNDS, STYLES, axis_figure, collision_figure, style_of
+from tests.test_groups import flights
+
+
+def rows_of(axis, values, groups):
+    return [
+        summarise_group((axis, value), group, {0: flights(5 * place), 1: flights(4 * place)})
+        for place, value in enumerate(values)
+        for group in groups
+    ]
+
+
+def test_numbers_are_lines_and_each_group_has_its_own_with_a_band():
+    points = {value: {"env.control_hz": float(value), "env.scene": "poles"} for value in ("45", "200", "400")}
+    figure = axis_figure("rate", points, rows_of("rate", points, ("bytestream", "event_image")))
+    panel = figure.axes[0]
+    assert [label.get_text() for label in panel.get_xticklabels()] == ["45", "200", "400"]
+    assert panel.get_xscale() == "log"
+    assert panel.get_xlabel() == "Control rate [Hz]"
+    assert panel.get_legend_handles_labels()[1] == ["bytestream", "event_image"]
+    assert len(panel.collections) == 2
+    assert (
+        "scene poles; 40 flights of 2 trainings" in figure.texts[-1].get_text() + figure._supxlabel.get_text()
+    )
+
+
+@pytest.mark.parametrize(
+    ("points", "ticks"),
+    [
+        ({name: {"env.scene": name} for name in ("poles", "shape_change")}, ["poles", "shape\nchange"]),
+        (
+            {str(hz): {"env.control_hz": hz, "faults.sparsity": off} for hz, off in ((200, 0.0), (45, 0.5))},
+            ["control_hz 200\nsparsity 0", "control_hz 45\nsparsity 0.5"],
+        ),
+    ],
+)  # fmt: skip
+def test_words_and_settings_that_change_together_are_bars(points, ticks):
+    panel = axis_figure("here", points, rows_of("here", points, ("a", "b", "c"))).axes[0]
+    assert [label.get_text() for label in panel.get_xticklabels()] == ticks
+    heights = [bar.get_height() for bar in panel.patches]
+    assert heights == pytest.approx([0, 22.5] * 3)
+
+
+def test_a_condition_that_was_not_flown_leaves_a_gap():
+    points = {name: {"env.scene": name} for name in ("poles", "dynamic")}
+    rows = rows_of("world", points, ("a", "b"))[:-1]
+    assert len(axis_figure("world", points, rows).axes[0].patches) == 3
+
+
+def test_every_experiment_has_a_colour_and_marker_of_its_own():
+    looks = [style_of(group) for group in (*STYLES, *BOUNDS)]
+    assert len({colour for colour, _ in looks}) == len(looks)
+    assert len({marker for _, marker in looks[: len(STYLES)]}) == len(STYLES)
+    assert style_of("mine") == style_of("mine")
+
+
+def test_the_map_shows_contacts_alone():
+    flown = np.zeros(4, EPISODE)
+    flown["collision"] = [True, True, False, True]
+    flown["distance_m"], flown["x_m"] = [10.0, 20.0, 100.0, 30.0], [1.0, -2.0, 0.0, 3.0]
+    panel = collision_figure({"bytestream": (flown, flown[:1])}, 100.0, 25.0).axes[0]
+    usual, changed = (np.asarray(dots.get_offsets()) for dots in panel.collections[:2])
+    np.testing.assert_array_equal(usual, [[10.0, 1.0], [20.0, -2.0], [30.0, 3.0]])
+    assert len(changed) == 1
+    assert panel.get_title("left") == "bytestream: contacts unchanged 3 of 4, changed 1 of 1"

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from jobs.conditions import plan, read_entry
+from jobs.flights import EPISODE
+from jobs.runs import open_run
+from jobs.sweep import flown
+from jobs.sweep_report import about, contacts, encoder_means, film_crashes, summarise_sweep, typical_crashes
+from tests.test_conditions import planned, save_training, sweep_config
+from tests.test_groups import flights
+
+
+def test_groups_are_compared_with_the_reference_under_the_same_condition(tmp_path):
+    sweep = planned(sweep_config(tmp_path), "straight", "oracle", "random")
+    won = {"straight": 5, "oracle": 20, "random": 0}
+    episodes = {cell.key: flights(won[cell.entry.group]) for cell in sweep.cells}
+    rows = summarise_sweep(sweep, episodes, "straight")
+    assert [(row.condition, row.group) for row in rows[:4]] == [
+        (("nominal", "poles_eval"), "straight"),
+        (("nominal", "poles_eval"), "oracle"),
+        (("nominal", "poles_eval"), "random"),
+        (("sparsity", "0"), "straight"),
+    ]
+    assert [row.success_difference and row.success_difference.value for row in rows[:3]] == [
+        None,
+        0.75,
+        -0.25,
+    ]
+    assert all(row.success_difference is None for row in summarise_sweep(sweep, episodes, "nobody"))
+
+
+def test_a_group_of_which_nothing_was_flown_has_no_row(tmp_path):
+    sweep = planned(sweep_config(tmp_path), "straight", "oracle")
+    episodes = {cell.key: flights(3) for cell in sweep.cells if cell.entry.group == "straight"}
+    assert {row.group for row in summarise_sweep(sweep, episodes, "oracle")} == {"straight"}
+
+
+def test_contacts_of_the_sweeps_scene_are_told_by_what_was_changed_and_counted_once(tmp_path):
+    axes = {"sparsity": {"faults.sparsity": [0.0, 0.5]}, "world": {"env.scene": ["poles_eval", "poles"]}}
+    sweep = planned(sweep_config(tmp_path, axes=axes), "straight")
+    usual, changed = contacts(sweep, "straight", {cell.key: flights(3) for cell in sweep.cells})
+    assert (len(usual), len(changed)) == (20, 20)
+
+
+def test_typical_crashes_are_those_in_the_middle():
+    rows = np.zeros(6, EPISODE)
+    rows["seed"], rows["collision"] = np.arange(6), [True, True, True, True, True, False]
+    rows["distance_m"] = [5.0, 50.0, 48.0, 52.0, 90.0, 50.0]
+    assert typical_crashes(rows) == [1, 2, 3]
+    assert typical_crashes(rows[5:]) == []
+
+
+def test_crashes_of_the_first_group_are_filmed_once(tmp_path):
+    config = sweep_config(tmp_path)
+    pilot = save_training(tmp_path / "policy", "a", 0, config.env_config())
+    sweep = plan(config, [read_entry(pilot)])
+    cell = sweep.cells[0]
+    rows = np.array([tuple(row) for row in flown(cell, False)["episodes"]], EPISODE)
+    rows["collision"] = True
+    paths = film_crashes(tmp_path / "sweep", sweep, {cell.key: rows})
+    assert [path.name for path in paths] == [f"a-{cell.key[:8]}-corridor{seed}.mp4" for seed in (0, 1)]
+    before = [path.stat().st_mtime_ns for path in paths]
+    film_crashes(tmp_path / "sweep", sweep, {cell.key: rows})
+    assert [path.stat().st_mtime_ns for path in paths] == before
+
+
+def test_what_made_a_sweep_is_told_without_a_place_of_this_machine(tmp_path, monkeypatch):
+    words = ["x", "+exp=robustness", "sweep.trials=2", f"runs_dir={tmp_path}", "tracking.uri=sqlite:///a.db"]
+    monkeypatch.setattr("sys.argv", words)
+    config = sweep_config(tmp_path)
+    found = about(config, open_run(config), planned(config, "straight"), ["c0ffee"])
+    assert found["command"] == "python -m platform.launch +exp=robustness sweep.trials=2"
+    assert str(tmp_path) not in str(found)
+
+
+def test_encoder_figures_are_means_of_the_trainings_that_have_them():
+    kept = [{"encoder": {"drift": 1.0}}, {"encoder": {"drift": 2.0}}, {"encoder": {}}]
+    assert encoder_means(kept) == {"evae/drift": pytest.approx(1.5)}
