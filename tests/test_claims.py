@@ -20,6 +20,7 @@ def found(*pairs):
         (((18, 4), (18, 6)), "holds"),
         (((18, 4), (10, 10)), "holds"),
         (((19, 2), (4, 16)), "holds partly"),
+        (((20, 0), (6, 12)), "holds partly"),
         (((10, 10), (12, 12)), "does not hold"),
         (((4, 18), (6, 18)), "does not hold"),
         (((18, 4),), "holds"),
