@@ -22,7 +22,7 @@ STYLES = {
     "rgb": ("#cc79a7", "X"),
 }
 BOUNDS = {"oracle": ("#6b7280", "."), "straight": ("#9ca3af", "."), "random": ("#c4c9d1", ".")}
-OTHERS = (("#7a5195", "<"), ("#8c564b", ">"), ("#666666", "h"))
+OTHERS = (("#7a5195", "<"), ("#8c564b", ">"), ("#a6761d", "h"))
 SCALES = {
     "env.control_hz": ("Control rate [Hz]", "log"),
     "env.speed_mps": ("Speed [m/s]", "linear"),

@@ -65,11 +65,12 @@ def test_crashes_of_the_first_group_are_filmed_once(tmp_path):
 
 
 def test_what_made_a_sweep_is_told_without_a_place_of_this_machine(tmp_path, monkeypatch):
-    words = ["x", "+exp=robustness", "sweep.trials=2", f"runs_dir={tmp_path}", "tracking.uri=sqlite:///a.db"]
+    named = f"sweep.policies=[{tmp_path}/mine,oracle]"
+    words = ["x", "+exp=robustness", named, f"runs_dir={tmp_path}", "tracking.uri=sqlite:///a.db"]
     monkeypatch.setattr("sys.argv", words)
     config = sweep_config(tmp_path)
     found = about(config, open_run(config), planned(config, "straight"), ["c0ffee"])
-    assert found["command"] == "python -m platform.launch +exp=robustness sweep.trials=2"
+    assert found["command"] == "python -m platform.launch +exp=robustness 'sweep.policies=[mine,oracle]'"
     assert str(tmp_path) not in str(found)
 
 
