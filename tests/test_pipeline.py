@@ -119,7 +119,7 @@ def test_the_store_holds_settings_figures_and_pictures(flown):
     client, run = stored_run(flown[0])
     assert run.info.status == "FINISHED"
     assert run.data.params["camera.contrast_threshold"] == "0.2"
-    assert run.data.params["algo.minibatch_size"] == "32"
+    assert run.data.params["algo.minibatch_size"] == "256"
     assert all(any(name.startswith(section) for name in run.data.metrics) for section in SECTIONS)
     assert np.isfinite(list(run.data.metrics.values())).all()
     steps = [point.step for point in client.get_metric_history(run.info.run_id, "train/entropy")]

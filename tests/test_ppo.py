@@ -23,11 +23,11 @@ from tests.test_train import SHORT, make_config, write_encoder
 
 FLOWN = ("brp_full", "event_columns", "event_set", "eip", "rgb", "finetuned")
 CNN_WEIGHTS = 32 * (3 * 64 + 1) + 64 * (32 * 16 + 1) + 64 * (64 * 9 + 1) + 512 * (1024 + 1)
-HEADS = 2 * (24 * 64 + 64 + 64 * 64 + 64) + 64 * 4 + 4
-CONTEXT_WEIGHTS = 3 * 64 + 64 * 128 + 128 * 1024 + 2 * (64 + 128 + 1024)
+HEADS = 2 * (96 * 64 + 64 + 64 * 64 + 64) + 64 * 4 + 4
+CONTEXT_WEIGHTS = 3 * 64 + 64 * 128 + 128 * 256 + 2 * (64 + 128 + 256)
 WEIGHTS = {
     "brp_full": HEADS,
-    "finetuned": HEADS + CONTEXT_WEIGHTS + 256 * (1024 + 1) + 16 * (256 + 1),
+    "finetuned": HEADS + CONTEXT_WEIGHTS + 256 * (256 + 1) + 64 * (256 + 1),
     "event_columns": 2 * (384 * 64 + 64 + 64 * 64 + 64) + 64 * 4 + 4,
     "event_set": 64 * (23 + 1 + 64 + 1 + 2) + 128 * (3 * 129 + 1) + 128 * 4 + 4,
     "eip": CNN_WEIGHTS + 512 * 4 + 4,
@@ -172,7 +172,11 @@ def test_the_settings_are_those_of_the_appendix(name, encoder):
     learner = built.build_learner(spaces={"default_policy": (spec.observation_space, spec.action_space)})
     assert {key: getattr(learner.config, key) for key in stated} == stated
     space = learner.module["default_policy"].observation_space
-    spaces = {"brp_full": ((3, 8), "f4"), "event_columns": ((3, 128), "f4"), "event_set": ((3, 256, 4), "i2")}
+    spaces = {
+        "brp_full": ((3, 32), "f4"),
+        "event_columns": ((3, 128), "f4"),
+        "event_set": ((3, 256, 4), "i2"),
+    }
     spaces["finetuned"] = (3, 1024, 4), "i2"
     spaces |= dict.fromkeys(("eip", "rgb"), ((3, 64, 64), "u1"))
     assert (space.shape, space.dtype) == spaces[name]
@@ -187,7 +191,7 @@ def test_a_training_asks_for_a_core_per_process_that_flies_or_one_in_all(encoder
 def test_the_networks_are_built_from_what_the_configuration_says():
     sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
     bytestream, image = (network_settings(make_config(f"model={name}")) for name in ("brp_xy", "eip"))
-    evae = {"context": 1024, "latent": 8, "norm": "batch", "target": "occupancy", "time_bins": 1024}
+    evae = {"context": 256, "latent": 32, "norm": "batch", "target": "occupancy", "time_bins": 1024}
     evae |= {"coding": "none", "encoder": "frozen"}
     assert bytestream == {"name": "brp_xy", "hidden": [64, 64], **evae, **sizes}
     assert image == {"name": "eip", "hidden": None, **dict.fromkeys(evae), **sizes}

@@ -89,7 +89,7 @@ def test_beta_follows_its_schedule():
 def training(recording, iterations, checkpoint=None):
     """An event VAE after some iterations, interrupted and continued at `checkpoint` if given."""
     torch.manual_seed(0)
-    evae = EventVAE(context=64, target="occupancy")
+    evae = EventVAE(context=64, latent=32, target="occupancy")
     optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3)
     rng = np.random.default_rng(0)
     first = 0 if checkpoint is None else restore(checkpoint, evae, optimizer, rng)
@@ -111,7 +111,7 @@ def test_an_interrupted_training_ends_with_the_same_weights(recording, tmp_path)
 def test_training_explains_windows_of_flights_that_it_never_saw(recording):
     unseen = record([(EnvConfig(observation="events", split="validation"), 300)], 0, lambda count: None)
     torch.manual_seed(0)
-    untrained = EventVAE(context=64, target="occupancy")
+    untrained = EventVAE(context=64, latent=32, target="occupancy")
     held_out = held_out_windows(unseen, SETTINGS, untrained.grid)
     before = held_out_figures(untrained, held_out)
     after = held_out_figures(training(recording, 150)[0], held_out)
@@ -164,7 +164,7 @@ def refreshing(tmp_path, encoder, **changes):
 
 def test_a_refresh_begins_with_the_weights_of_the_encoder_that_is_named(tmp_path):
     torch.manual_seed(7)
-    evae, run_folder = EventVAE(context=64, target="occupancy"), tmp_path / "before"
+    evae, run_folder = EventVAE(context=64, latent=32, target="occupancy"), tmp_path / "before"
     save_encoder(run_folder / "encoder" / "encoder.safetensors", evae, {})
     for named in (run_folder, run_folder / "encoder" / "encoder.safetensors"):
         config = refreshing(tmp_path, str(named))
@@ -176,7 +176,7 @@ def test_a_refresh_begins_with_the_weights_of_the_encoder_that_is_named(tmp_path
 
 
 def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anything_is_made(tmp_path):
-    save_encoder(tmp_path / "encoder.safetensors", EventVAE(context=64, target="signed"), {})
+    save_encoder(tmp_path / "encoder.safetensors", EventVAE(context=64, latent=32, target="signed"), {})
     rules = {
         str(tmp_path): r"must be a run folder with an encoder, or an encoder file, got .*cannot be read",
         str(tmp_path / "encoder.safetensors"): r"got context: 64 there, 32 here, target: 'signed' there",
