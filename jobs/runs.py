@@ -4,7 +4,6 @@ A folder is named after the configuration that fills it, so that the same comman
 the same folder and continues there. Each finished stage leaves a marker with its figures.
 """
 
-import dataclasses
 import json
 import os
 import subprocess
@@ -89,8 +88,8 @@ def reopen(path: Path, config: Config) -> Run:
             f"resume: must be a run folder (one that holds config.json), got {str(path)!r}; "
             f"run folders are in {str(Path(config.runs_dir).resolve())!r}"
         )
-    here = {name: getattr(config, name) for name in UNNAMED}
-    return Run(stored.parent, dataclasses.replace(parse(json.loads(stored.read_text())), **here))
+    here = {name: value for name, value in as_dict(config).items() if name in UNNAMED}
+    return Run(stored.parent, parse({**json.loads(stored.read_text()), **here}))
 
 
 def run_name(config: Config) -> str:

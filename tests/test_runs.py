@@ -101,3 +101,17 @@ def test_the_stored_configuration_is_readable_as_yaml_and_json(config):
 def test_without_git_the_commit_is_unknown(monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert git_commit() == "unknown"
+
+
+def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):
+    run = open_run(config)
+    stored = json.loads((run.path / "config.json").read_text())
+    del stored["probe"]
+    stored["sweep"] = {"axes": "of another version"}
+    (run.path / "config.json").write_text(json.dumps(stored))
+    again = open_run(dataclasses.replace(config, resume=str(run.path), seed=7))
+    assert again.config == dataclasses.replace(config, resume=str(run.path))
+    del stored["algo"]
+    (run.path / "config.json").write_text(json.dumps(stored))
+    with pytest.raises(ConfigError, match="algo: must be a group of settings"):
+        open_run(dataclasses.replace(config, resume=str(run.path)))
