@@ -1,7 +1,7 @@
 """From nothing to a policy: collect, pretrain, train, evaluate (appendix B and D).
 
 Run: python -m platform.launch +exp=bytestream
-Expect: about 30 minutes on two cores with budget=short; a table of success rates and
+Expect: about 20 minutes on two cores with budget=short; a table of success rates and
 distances with intervals, and the command that opens the dashboard. A policy without an event
 VAE, such as +exp=event_columns, begins with its training. A stopped run continues where it
 was when the same command is given again.
