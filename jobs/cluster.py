@@ -1,8 +1,12 @@
 """Start or join Ray: quietly, authenticated, one thread per worker."""
 
+import contextlib
+import fcntl
 import logging
 import os
 import secrets
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from jobs.config import ConfigError
@@ -60,13 +64,26 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         "configure_logging": True,
     }
     if cluster.name == "local":
-        ray.init(address="local", num_cpus=cluster.num_cpus, include_dashboard=False, **settings)
+        with one_at_a_time():
+            ray.init(address="local", num_cpus=cluster.num_cpus, include_dashboard=False, **settings)
         return
     try:
         ray.init(address=cluster.address or "auto", **settings)
     except (ConnectionError, ray.exceptions.RayError) as error:
         reason = str(error).strip().splitlines()[0]
         raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
+
+
+@contextlib.contextmanager
+def one_at_a_time() -> Iterator[None]:
+    """Let one process of this user after the other start a local Ray.
+
+    Two that started within seconds of each other have been seen to wait for each other forever.
+    """
+    lock = Path(tempfile.gettempdir()) / f"evade-start-ray-{os.getuid()}.lock"
+    with lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # let go of when the file is closed, or the process ends
+        yield
 
 
 def use_token(file: Path) -> None:
