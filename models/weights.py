@@ -39,7 +39,7 @@ def save_encoder(path: str | Path, evae: EventVAE, manifest: dict[str, Any], lea
         evae: float32 model.
         manifest: What else to record, as JSON values: sensor settings, hash, figures.
         lean: Leave the decoder out and round the weights to float16: it flies, but draws no
-            pictures, in a fortieth of the space.
+            pictures, in a fraction of the space.
 
     Raises:
         EncoderFileError: A tensor is not finite or not float32, or the manifest holds a
