@@ -62,7 +62,7 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine onl
 	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
 
 test: setup ## the quick tests (ARGS="-m slow" for the slow ones)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 lint: setup ## style, format, types, and who imports whom
 	$(BIN)/ruff check .

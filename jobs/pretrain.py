@@ -150,8 +150,8 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
                 )
             if last or (iteration + 1) % settings.checkpoint_every == 0:
                 save_checkpoint(checkpoint, evae, optimizer, rng, iteration + 1)
-            explained = latest.get("explained_step", 0.0)
-            advance(1, note=f"loss {losses['loss']:.4f}, held out {explained:.0%} explained")
+            measured = f", held out {latest['explained_step']:.0%} explained" if latest else ""
+            advance(1, note=f"loss {losses['loss']:.4f}{measured}")
     return freeze(config, folder, tracker, evae, train.about, held_out)
 
 
