@@ -126,7 +126,7 @@ def read_aedat4(request: Request) -> EventFile:
         end = table if start + size <= table <= len(raw) else len(raw)
         parts, count = [], 0
         for body in _packets(raw, start + size, end, stream):
-            parts.append(_events(_unpacked(body, codec)))
+            parts.append(_events(_unpacked(body, codec)).copy())  # lets go of the rest of its packet
             count += len(parts[-1])
             request.check_count(count)
     except (struct.error, ElementTree.ParseError, UnicodeDecodeError, OSError, ValueError) as error:
