@@ -17,7 +17,17 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from envs.eventfile import EventFile, Request, assemble, check_order, finish, replaced
+from envs.eventfile import (
+    MAX_BYTES,
+    EventFile,
+    Request,
+    assemble,
+    check_declared,
+    check_file,
+    check_order,
+    finish,
+    replaced,
+)
 from envs.events import EVENT
 
 MAX_EVENTS = 2_000_000_000
@@ -75,9 +85,11 @@ def read_recording(path: Path) -> Recording:
             more events than `MAX_EVENTS`; nothing is allocated before that is known.
     """
     try:
+        check_file(path, MAX_BYTES)
         with h5py.File(path, "r") as file:
             events = _columns(Request(path, max_events=MAX_EVENTS), file)
             index = {}
+            _check_own(file, "index")
             for name in file["index"]:
                 _declared_length(file, f"index/{name}", MAX_INDEX)
                 index[name] = file[f"index/{name}"][:]
@@ -176,14 +188,14 @@ def _declared_length(file: h5py.File, name: str, most: int) -> int:
     length = len(file[name])
     if length > most:
         raise ValueError(f"{name} declares {length} entries; at most {most} are read")
+    check_declared(Path(file.filename), name, length * file[name].dtype.itemsize)
     return length
 
 
 def _check_plain(file: h5py.File, name: str, shape: tuple[None, ...]) -> None:
     """Refuse links, virtual and external data, other types than numbers, and huge chunks."""
-    for part in (name.split("/")[0], name):
-        if not isinstance(file.get(part, getlink=True), h5py.HardLink):
-            raise ValueError(f"{part} is missing or a link")
+    _check_own(file, name.split("/")[0])
+    _check_own(file, name)
     data = file[name]
     if not isinstance(data, h5py.Dataset) or data.ndim != len(shape) or data.external or data.is_virtual:
         raise ValueError(f"{name} is not a plain data set of {len(shape)} dimensions")
@@ -192,6 +204,12 @@ def _check_plain(file: h5py.File, name: str, shape: tuple[None, ...]) -> None:
     if data.chunks and int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize > MAX_CHUNK_BYTES:
         raise ValueError(f"{name} has chunks of more than {MAX_CHUNK_BYTES} bytes")
     _check_filters(data, name)
+
+
+def _check_own(file: h5py.File, name: str) -> None:
+    """Refuse a name that leads elsewhere, before it is followed: another file would be opened."""
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{name} is missing or a link")
 
 
 def _check_filters(data: h5py.Dataset, name: str) -> None:

@@ -19,6 +19,8 @@ from envs.events import EVENT, T_LIMIT_US
 MAX_EVENTS = 200_000_000
 MAX_BYTES = 8 << 30
 MAX_DISORDER_US = 1_000_000
+MOST_PACKED = 1000  # times a file's size that it may unpack to; events pack to a tenth
+SMALL_BYTES = 1 << 26  # what any file may unpack to
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,13 +102,15 @@ def check_file(path: Path, max_bytes: int) -> int:
     """The size of a regular file [bytes]; nothing is opened, so a FIFO cannot block.
 
     Raises:
-        ValueError: There is no such file, it is a directory, device or pipe, it is empty,
+        ValueError: There is no such file, it is a link, directory, device or pipe, it is empty,
             or it is larger than `max_bytes`.
     """
     try:
-        info = path.stat()
+        info = path.lstat()
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be opened ({error}); check the path") from None
+    if stat.S_ISLNK(info.st_mode):
+        raise ValueError(f"{path}: is a link, which could name any file; give the path of the file itself")
     if not stat.S_ISREG(info.st_mode):
         raise ValueError(f"{path}: is no regular file; give the path of one recording")
     if info.st_size == 0:
@@ -117,6 +121,17 @@ def check_file(path: Path, max_bytes: int) -> int:
             "raise max_bytes or cut the file"
         )
     return info.st_size
+
+
+def check_declared(path: Path, name: str, declared_bytes: int) -> None:
+    """Refuse what a file says it holds if it is far too small for that, before memory is taken.
+
+    Raises:
+        ValueError: `declared_bytes` are more than `MOST_PACKED` times the file's size.
+    """
+    size = path.stat().st_size
+    if declared_bytes > max(SMALL_BYTES, MOST_PACKED * size):
+        raise ValueError(f"{name} declares {declared_bytes} bytes in a file of {size}; write it again")
 
 
 def polarity(request: Request, values: np.ndarray) -> np.ndarray:

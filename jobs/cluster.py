@@ -5,6 +5,7 @@ import fcntl
 import logging
 import os
 import secrets
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,11 +50,15 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         folder: Where the token of a local Ray is kept.
 
     Raises:
-        ConfigError: If the cluster cannot be joined.
+        ConfigError: If the cluster cannot be joined, others can read the token, or nothing is
+            said of the token of a cluster that is joined.
     """
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
+    check_mode(cluster)
     if cluster.name == "local":
         use_token(folder / ".ray" / "token")
+    elif os.environ.get("RAY_AUTH_TOKEN_PATH") and not os.environ.get("RAY_AUTH_TOKEN"):
+        check_private(Path(os.environ["RAY_AUTH_TOKEN_PATH"]))
     import ray
 
     if ray.is_initialized():
@@ -89,21 +94,71 @@ def one_at_a_time() -> Iterator[None]:
         yield
 
 
+def check_mode(cluster: ClusterConfig) -> None:
+    """Refuse a Ray that would ask nobody for a token, unless a cluster is said to be one.
+
+    Raises:
+        ConfigError: RAY_AUTH_MODE turns a local Ray's token off, or is not given for another.
+    """
+    mode = os.environ.get("RAY_AUTH_MODE")
+    if cluster.name == "local" and mode not in (None, "token"):
+        rule = "must be token, or not set, for cluster=local: without it, anyone who reaches Ray runs code"
+        raise ConfigError(f"RAY_AUTH_MODE: {rule}, got {mode!r}; unset it")
+    if cluster.name == "ray" and mode not in ("token", "disabled"):
+        remedy = (
+            "set it to token, and RAY_AUTH_TOKEN_PATH to the file with the cluster's token "
+            "(disabled joins a cluster that asks nobody for one)"
+        )
+        raise ConfigError(f"RAY_AUTH_MODE: must be token or disabled for cluster=ray, got {mode!r}; {remedy}")
+
+
 def use_token(file: Path) -> None:
     """Let this process's Ray authenticate by the token in a private file, made if missing.
 
     A token that the environment already names is kept. RAY_AUTH_MODE stays as it is: a Ray
     that starts without it turns authentication on, whereas a Ray that is already imported
     would not notice it.
+
+    Raises:
+        ConfigError: If the file is another user's, or others can read it.
     """
-    if os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH"):
+    if os.environ.get("RAY_AUTH_TOKEN"):
         return
-    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    if not os.environ.get("RAY_AUTH_TOKEN_PATH"):
+        make_token(file)
+        os.environ["RAY_AUTH_TOKEN_PATH"] = str(file)
+    check_private(Path(os.environ["RAY_AUTH_TOKEN_PATH"]))
+
+
+def make_token(file: Path) -> None:
+    """Write a new token to a file that nobody else can read; one that is there stays."""
+    if file.exists():
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.parent.chmod(0o700)
+    handle, part = tempfile.mkstemp(dir=file.parent)  # for its owner alone
+    with os.fdopen(handle, "w") as stream:
+        stream.write(secrets.token_hex(32))
+    with contextlib.suppress(FileExistsError):
+        os.link(part, file)  # whole or not at all, and never over one that another process made
+    Path(part).unlink()
+
+
+def check_private(file: Path) -> None:
+    """Refuse a token that anyone but this user could read.
+
+    Raises:
+        ConfigError: If there is no such file, it is another user's, or its mode lets others in.
+    """
     try:
-        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError:
-        pass
-    else:
-        with os.fdopen(handle, "w") as stream:
-            stream.write(secrets.token_hex(32))
-    os.environ["RAY_AUTH_TOKEN_PATH"] = str(file)
+        info = file.stat()
+    except OSError as error:
+        raise ConfigError(f"RAY_AUTH_TOKEN_PATH: {str(file)!r} cannot be read: {error.strerror}") from None
+    mode = stat.S_IMODE(info.st_mode)
+    if not stat.S_ISREG(info.st_mode) or info.st_uid != os.getuid() or mode & 0o077:
+        rule = "must be a file that its owner alone can read, and yours"
+        found = f"mode {mode:04o} of user {info.st_uid}"
+        raise ConfigError(
+            f"RAY_AUTH_TOKEN_PATH: {rule}, got {found} ({str(file)!r}); if nobody else has read it, "
+            f"run `chmod 600 {file}`, else delete it for a new one"
+        )

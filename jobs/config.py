@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from jobs.axes import refused_axes
-from jobs.refusals import JOBS_CHOOSE, explain, nearest, refused_scenes
+from jobs.refusals import JOBS_CHOOSE, explain, nearest, redacted, refused_scenes
 from jobs.settings import (
     AlgoConfig,
     ClusterConfig,
@@ -129,8 +129,10 @@ def known_keys() -> list[str]:
 
 
 def as_dict(config: Config) -> dict[str, Any]:
-    """The configuration as plain containers, for files and trackers."""
-    return dataclasses.asdict(typing.cast(Any, config))
+    """The configuration as plain containers, for files and trackers: without the tracker's password."""
+    values = dataclasses.asdict(typing.cast(Any, config))
+    values["tracking"]["uri"] = redacted(config.tracking.uri)
+    return values
 
 
 def _build(section: Any, values: Any, name: str, refused: list[str], skip: Collection[str] = ()) -> Any:

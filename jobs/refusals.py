@@ -1,12 +1,24 @@
-"""What a refused configuration says: the key, the rule, the value received, the nearest key."""
+"""What a refused configuration says: the key, the rule, the value received, the nearest key; no password."""
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pydantic
 
 JOBS_CHOOSE = ("observation", "split")  # of `env`: training must never fly the corridors of evaluation
+HIDDEN = "***"
+# Up to the last @: SQLAlchemy takes a password with a slash in it as it stands.
+USER_AND_PASSWORD = re.compile(r"""(?<=://)(?:[^\s/'"@:]*:[^\s'"]*|[^\s/'"]+)@""")
+SECRET_PARAMETER = re.compile(
+    r"""([?&][^\s=&]*(?:pass|secret|token|api_?key)[^\s=&]*=)[^\s&'"]+""", re.IGNORECASE
+)
+
+
+def redacted(text: str) -> str:
+    """The text with `***` for the user, password and secret parameters of each address in it."""
+    return SECRET_PARAMETER.sub(rf"\1{HIDDEN}", USER_AND_PASSWORD.sub(f"{HIDDEN}@", text))
 
 
 def explain(error: pydantic.ValidationError, section: str, keys: Sequence[str]) -> list[str]:

@@ -4,6 +4,7 @@ A folder is named after the configuration that fills it, so that the same comman
 the same folder and continues there. Each finished stage leaves a marker with its figures.
 """
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -89,7 +90,8 @@ def reopen(path: Path, config: Config) -> Run:
             f"run folders are in {str(Path(config.runs_dir).resolve())!r}"
         )
     here = {name: value for name, value in as_dict(config).items() if name in UNNAMED}
-    return Run(stored.parent, parse({**json.loads(stored.read_text()), **here}))
+    run = parse({**json.loads(stored.read_text()), **here})
+    return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
 
 
 def run_name(config: Config) -> str:
@@ -141,7 +143,9 @@ def _git(*arguments: str) -> str | None:
     """What git prints, or None when there is no git or no repository."""
     try:
         command = ["git", "-C", str(REPOSITORY), *arguments]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+        result = subprocess.run(  # noqa: S603  own words, no shell
+            command, capture_output=True, text=True, timeout=20, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return result.stdout.strip()

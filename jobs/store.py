@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jobs.config import Config, ConfigError
+from jobs.refusals import HIDDEN, redacted
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -19,27 +20,40 @@ def store_uri(config: Config) -> str:
     """The store's address; a relative SQLite file lies in the folder that holds `runs_dir`.
 
     Raises:
-        ConfigError: If the address is of a kind that MLflow does not keep runs in.
+        ConfigError: If the address is of a kind that MLflow does not keep runs in, or one that
+            was written down here, without its password.
     """
     uri = config.tracking.uri
+    if HIDDEN in uri:
+        remedy = (
+            "give it again, or leave it out and set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD "
+            "(of a server) or PGPASSFILE (of PostgreSQL)"
+        )
+        raise ConfigError(f"tracking.uri: must hold the password itself, got {uri!r}; {remedy}")
     if uri.startswith("sqlite:///"):
         return f"sqlite:///{Path(config.runs_dir).resolve().parent / uri.removeprefix('sqlite:///')}"
     if uri.startswith(("http://", "https://", "postgresql", "mysql")):
         return uri
-    raise ConfigError(f"tracking.uri: must begin with sqlite:/// or http:// or https://, got {uri!r}")
+    raise ConfigError(
+        f"tracking.uri: must begin with sqlite:/// or http:// or https://, got {redacted(uri)!r}"
+    )
 
 
 def page(uri: str) -> str:
-    """Where a browser finds a tracking store."""
-    return uri.rstrip("/") if uri.startswith("http") else LOCAL_PAGE
+    """Where a browser finds a tracking store; it will ask for the password."""
+    return redacted(uri).replace(f"{HIDDEN}@", "").rstrip("/") if uri.startswith("http") else LOCAL_PAGE
 
 
 def dashboard_command(uri: str) -> str:
     """The command that serves a store to browsers of this machine only."""
     if uri == f"sqlite:///{REPOSITORY / 'mlflow.db'}":
         return "make mlflow"
-    lean = "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true"
-    return f"{lean} mlflow server --workers 1 --host 127.0.0.1 --port 5000 --backend-store-uri {uri}"
+    lean = (
+        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true "
+        "MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false"
+    )
+    server = "mlflow server --workers 1 --host 127.0.0.1 --port 5000"
+    return f"{lean} {server} --backend-store-uri {redacted(uri)}"
 
 
 def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:

@@ -151,7 +151,11 @@ def typical_crashes(flown: np.ndarray) -> list[int]:
 
 def about(config: Config, folder: Run, sweep: Sweep, commits: Sequence[str]) -> dict[str, Any]:
     """What made the figures: command, commits and date, policies and axes; no path of a machine."""
-    words = [re.sub(r"/[^\s,\]]*/", "", word) for word in sys.argv[1:] if not word.startswith(ELSEWHERE)]
+    words = [
+        re.sub(r"/[^\s,\]]*/", "", word)
+        for word in sys.argv[1:]
+        if not word.lstrip("+").startswith(ELSEWHERE)
+    ]
     return {
         "run": folder.path.name,
         "identity": sweep.identity,

@@ -22,6 +22,7 @@ from urllib.parse import quote
 
 from envs.config import settings_hash
 from jobs.config import Config, as_dict
+from jobs.refusals import redacted
 from jobs.runs import Run, provenance, write_json
 from jobs.store import check_metrics, dashboard_command, flatten, page, store_uri
 
@@ -38,7 +39,7 @@ RESULTS_VIEW = "results"
 
 @dataclass(frozen=True)
 class Tracker:
-    """One MLflow run that is being written."""
+    """One MLflow run that is being written; `uri` is where, without a password."""
 
     client: "MlflowClient"
     uri: str
@@ -133,7 +134,7 @@ class Tracker:
 
     def dashboard(self) -> str:
         """The command that opens the dashboard, and the addresses to open in it."""
-        lines = [] if page(self.uri) == self.uri else [f"Dashboard: {dashboard_command(self.uri)}"]
+        lines = [] if self.uri.startswith("http") else [f"Dashboard: {dashboard_command(self.uri)}"]
         stored = self.client.get_experiment(self.experiment_id).tags
         view = RESULTS_VIEW if f"{VIEW_TAG}.{RESULTS_VIEW}" in stored else None
         return "\n".join([*lines, f"This run:  {self.link()}", f"All runs:  {experiment_page(self, view)}"])
@@ -160,7 +161,9 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
     client, experiment_id = open_store(uri, config.tracking.experiment)
     name = folder.path.name if key == "run" else f"{folder.path.name} {key}"
     facts = {"run_folder": folder.path, "job": config.job, **provenance()}
-    tracker = _continue_or_create(Tracker(client, uri, experiment_id, ""), folder, key, name, {"kind": key})
+    tracker = _continue_or_create(
+        Tracker(client, redacted(uri), experiment_id, ""), folder, key, name, {"kind": key}
+    )
     with _ended(tracker):
         tracker.params(as_dict(folder.config))
         tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})

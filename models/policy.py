@@ -26,7 +26,14 @@ from models.kinds import FINETUNED, KINDS, SMALLEST_IMAGE, kind_of
 from models.networks import assemble
 from models.pictures import PictureEncoder
 from models.table import EncoderTable
-from models.weights import lean_tensors, load_encoder, save_encoder, write_atomic
+from models.weights import (
+    EncoderFileError,
+    lean_tensors,
+    load_encoder,
+    read_limited,
+    save_encoder,
+    write_atomic,
+)
 
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
 ENCODER_FILES = (ENCODER, "encoder.json")
@@ -311,9 +318,6 @@ def _digest(file: Path) -> str:
 
 def _read(file: Path) -> bytes:
     try:
-        size = file.stat().st_size
-        if size > MAX_BYTES:
-            raise PolicyFileError(f"{file}: {size} bytes, at most {MAX_BYTES} are read")
-        return file.read_bytes()
-    except OSError as error:
-        raise PolicyFileError(f"{file}: cannot be read: {error.strerror}") from None
+        return read_limited(file, MAX_BYTES)
+    except EncoderFileError as error:
+        raise PolicyFileError(str(error)) from None

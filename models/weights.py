@@ -6,9 +6,11 @@ hash and figures. Everything is checked before use: size, digest, names, shapes,
 values. No pickle is read or written.
 """
 
+import errno
 import hashlib
 import json
 import os
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -178,16 +180,22 @@ def read_limited(path: Path, limit: int) -> bytes:
     """The bytes of a file of at most `limit` bytes.
 
     Raises:
-        EncoderFileError: It cannot be read or is larger; its size is known before it is opened.
+        EncoderFileError: It cannot be read, is a link, a pipe or a device, or is larger; that is
+            known before a byte is read.
     """
     try:
-        size = path.stat().st_size
-        if size > limit:
-            raise EncoderFileError(f"{path}: {size} bytes, at most {limit} are expected")
-        with path.open("rb") as file:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # a pipe would block
+        with os.fdopen(handle, "rb") as file:
+            info = os.fstat(handle)
+            if not stat.S_ISREG(info.st_mode):
+                raise EncoderFileError(f"{path}: cannot be read: no regular file")
+            if info.st_size > limit:
+                raise EncoderFileError(f"{path}: {info.st_size} bytes, at most {limit} are read")
             return file.read(limit)
     except OSError as error:
-        raise EncoderFileError(f"{path}: cannot be read: {error.strerror}") from None
+        is_link = error.errno == errno.ELOOP
+        reason = "a link, which could name any file; copy the file itself" if is_link else error.strerror
+        raise EncoderFileError(f"{path}: cannot be read: {reason}") from None
 
 
 def write_atomic(path: Path, data: bytes) -> None:

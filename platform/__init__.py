@@ -18,7 +18,7 @@ def _become_the_standard_library_module():
             namespace = globals()
             del namespace["_become_the_standard_library_module"]
             namespace.update(__file__=spec.origin, __cached__=spec.cached)
-            exec(spec.loader.get_code(__name__), namespace)
+            exec(spec.loader.get_code(__name__), namespace)  # noqa: S102  the standard library's own text
             return
     raise ImportError(f"The standard library's module {__name__!r} is not on sys.path: {sys.path}")
 

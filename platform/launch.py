@@ -5,7 +5,9 @@ Expect: exit status 0 when the job is done, 2 with one message when a value is r
 when the job fails, 130 after Ctrl+C.
 """
 
+import contextlib
 import importlib
+import io
 import os
 import re
 import sys
@@ -76,11 +78,13 @@ def compose(words: list[str]) -> dict[str, Any] | None:
     from omegaconf.errors import OmegaConfBaseException
 
     from jobs.config import ConfigError
+    from jobs.refusals import redacted
 
     reasons = refused_words(words)
     if reasons:
         raise ConfigError("\n".join(reasons))
-    composed = []
+    composed: list[Any] = []
+    answer = io.StringIO()
 
     def keep(config: Any) -> None:
         composed.append(OmegaConf.to_container(config, resolve=False))
@@ -88,10 +92,12 @@ def compose(words: list[str]) -> dict[str, Any] | None:
     verbose = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing and leaving
     try:
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(keep)()
+        with contextlib.redirect_stdout(answer):
+            hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(keep)()
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(explain(error, words)) from error
     finally:
+        print(redacted(answer.getvalue()), end="")
         os.environ.pop("HYDRA_FULL_ERROR")
         if verbose is not None:
             os.environ["HYDRA_FULL_ERROR"] = verbose
@@ -169,14 +175,17 @@ def report(error: Exception) -> int:
     """Say what went wrong, with a traceback where it helps; return the exit status.
 
     A ValueError that this repository raises is a refused value, a RuntimeError a documented
-    failure: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback of those too.
+    failure: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback of those too. No
+    password of an address is shown.
     """
+    from jobs.refusals import redacted
+
     ours = raised_here(error)
     refused = isinstance(error, ValueError) and ours
     documented = refused or (isinstance(error, RuntimeError) and ours)
     if "HYDRA_FULL_ERROR" in os.environ or not documented:
-        traceback.print_exception(error)
-    message = str(error) if documented else f"{type(error).__name__}: {error}"
+        print(redacted("".join(traceback.format_exception(error))), end="", file=sys.stderr)
+    message = redacted(str(error) if documented else f"{type(error).__name__}: {error}")
     message = "\n  ".join(["", *message.splitlines()]) if "\n" in message else f" {message}"
     print(f"evade: {'refused' if refused else 'failed'}:{message}", file=sys.stderr)
     return REFUSED if refused else FAILED

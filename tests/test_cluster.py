@@ -1,8 +1,23 @@
 import multiprocessing
+import os
+import stat
+import subprocess
+import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
 
-from jobs.cluster import one_at_a_time
+import pytest
+
+from jobs.cluster import check_mode, check_private, make_token, one_at_a_time, use_token
+from jobs.config import ConfigError
+from jobs.settings import ClusterConfig
+
+ROOT = Path(__file__).resolve().parent.parent
+LOCAL = ClusterConfig(name="local", address=None, num_cpus=1)
+JOINED = ClusterConfig(name="ray", address="127.0.0.1:1", num_cpus=None)
 
 
 def start(results, name):
@@ -36,3 +51,134 @@ def test_a_process_that_dies_lets_go(tmp_path, monkeypatch):
     process.join()
     with one_at_a_time():
         pass
+
+
+@pytest.fixture
+def no_token(monkeypatch):
+    """An environment that names no token; what a test adds to it is undone."""
+    for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_AUTH_MODE"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+
+
+def test_the_token_of_a_local_ray_can_be_read_by_its_owner_alone(tmp_path, monkeypatch, no_token):
+    monkeypatch.setenv("HOME", "/nowhere")
+    file = tmp_path / ".ray" / "token"
+    use_token(file)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
+    assert list(file.parent.iterdir()) == [file]
+    assert os.environ["RAY_AUTH_TOKEN_PATH"] == str(file)
+    token = file.read_text()
+    use_token(tmp_path / "other")
+    assert file.read_text() == token
+    assert len(token) == 64
+    assert not (tmp_path / "other").exists()
+
+
+def test_who_makes_a_token_at_the_same_time_finds_the_same_one(tmp_path):
+    gate = Barrier(8)
+
+    def make(file: Path) -> str:
+        gate.wait()
+        make_token(file)
+        return file.read_text()
+
+    for number in range(20):
+        file = tmp_path / str(number) / "token"
+        with ThreadPoolExecutor(8) as pool:
+            tokens = set(pool.map(make, [file] * 8))
+        assert len(tokens) == 1
+        assert len(tokens.pop()) == 64
+        assert list(file.parent.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620])
+@pytest.mark.parametrize("is_given", [True, False])
+def test_a_token_that_others_can_read_is_refused_with_the_remedy(
+    tmp_path, monkeypatch, no_token, mode, is_given
+):
+    file = tmp_path / "token"
+    file.write_text("x" * 64)
+    file.chmod(mode)
+    if is_given:
+        monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(file))
+    with pytest.raises(ConfigError, match=rf"got mode {mode:04o} .* run `chmod 600 {file}`"):
+        use_token(tmp_path / "other" if is_given else file)
+    file.chmod(0o600)
+    use_token(file)
+
+
+def test_a_token_that_is_missing_or_of_another_user_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match=r"RAY_AUTH_TOKEN_PATH: .* cannot be read: No such file"):
+        check_private(tmp_path / "token")
+    make_token(tmp_path / "token")
+    owner = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    with pytest.raises(ConfigError, match=f"mode 0600 of user {owner}"):
+        check_private(tmp_path / "token")
+
+
+@pytest.mark.parametrize("mode", ["disabled", "", "Token"])
+def test_the_token_of_a_local_ray_cannot_be_turned_off(monkeypatch, mode):
+    monkeypatch.setenv("RAY_AUTH_MODE", mode)
+    with pytest.raises(ConfigError, match=rf"RAY_AUTH_MODE: must be token, .* got '{mode}'; unset it"):
+        check_mode(LOCAL)
+
+
+def test_a_cluster_is_joined_without_a_token_only_when_that_is_said(monkeypatch, no_token):
+    check_mode(LOCAL)
+    with pytest.raises(ConfigError, match=r"RAY_AUTH_MODE: must be token or disabled .* got None; set it to"):
+        check_mode(JOINED)
+    for mode in ("token", "disabled"):
+        monkeypatch.setenv("RAY_AUTH_MODE", mode)
+        check_mode(JOINED)
+
+
+# Serves until its standard input ends; the first line it prints is the address.
+HEAD = """
+import sys
+from pathlib import Path
+from jobs.cluster import start_ray
+from jobs.settings import ClusterConfig
+start_ray(ClusterConfig(name="local", address=None, num_cpus=1), Path(sys.argv[1]))
+import ray
+@ray.remote
+def whoami():
+    import os
+    return os.environ["RAY_AUTH_MODE"]
+assert ray.get(whoami.remote()) == "token"
+print(ray.get_runtime_context().gcs_address, flush=True)
+sys.stdin.read()
+"""
+CLIENT = """
+import sys
+import ray
+ray.init(address=sys.argv[1], log_to_driver=False, logging_level="ERROR")
+print("joined")
+"""
+
+
+def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_token):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # of joining; Ray's own 20 take as many seconds
+
+    def join(**more: str) -> str:
+        command = [sys.executable, "-c", CLIENT, address]
+        client = subprocess.run(
+            command, env=environment | more, capture_output=True, text=True, timeout=100, check=False
+        )
+        return client.stdout.strip() or client.stderr
+
+    command = [sys.executable, "-c", HEAD, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as head:
+        address = head.stdout.readline().strip()
+        token = (tmp_path / ".ray" / "token").read_text()
+        assert "joined" not in (without := join(RAY_AUTH_MODE="disabled"))
+        assert "joined" not in (wrong := join(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64))
+        assert join(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=token) == "joined"
+        head.stdin.close()
+        assert head.wait(60) == 0
+    assert "uthenticat" in without
+    assert "uthenticat" in wrong

@@ -2,6 +2,7 @@ import base64
 import os
 import resource
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -219,6 +220,22 @@ def test_a_packet_that_unpacks_to_gigabytes_takes_no_memory(codec, name, tmp_pat
     with pytest.raises(ValueError, match="at most 268435456 are unpacked"):
         read_events(large)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 64 << 10
+
+
+def test_packets_that_hold_one_event_and_megabytes_of_nothing_are_let_go(tmp_path):
+    size, number = 16 << 20, 12
+    one = packet([(5, 1, 2, 1)])
+    sink = pyarrow.BufferOutputStream()
+    with pyarrow.CompressedOutputStream(sink, "zstd") as out:
+        out.write(struct.pack("<I", size) + one[4:] + bytes(size - len(one) + 4))
+    path = aedat4(tmp_path / "a.aedat4", [(0, sink.getvalue().to_pybytes())] * number, 3)
+    assert path.stat().st_size < 1 << 20
+    tracemalloc.start()
+    try:
+        assert read_events(path).events.tolist() == [(5, 1, 2, 1)] * number
+        assert tracemalloc.get_traced_memory()[1] < 3 * size
+    finally:
+        tracemalloc.stop()
 
 
 def test_another_reader_gives_the_same_events(tmp_path):

@@ -1,4 +1,5 @@
 import json
+import os
 
 import pytest
 import torch
@@ -34,6 +35,16 @@ def drop_networks(folder):
 def grow_networks(folder):
     with (folder / NETWORKS).open("r+b") as file:
         file.truncate(MAX_BYTES + 1)  # a hole: takes no space
+
+
+def link_networks(folder):
+    (folder / NETWORKS).rename(folder.parent / "elsewhere")
+    (folder / NETWORKS).symlink_to(folder.parent / "elsewhere")
+
+
+def pipe_networks(folder):
+    (folder / NETWORKS).unlink()
+    os.mkfifo(folder / NETWORKS)
 
 
 def cut_manifest(folder):
@@ -73,6 +84,8 @@ def first_format(folder):
         (swap_encoder, r"encoder\.safetensors: SHA-256 must be"),
         (drop_networks, r"networks\.safetensors: cannot be read: No such file"),
         (grow_networks, rf"networks\.safetensors: {MAX_BYTES + 1} bytes, at most {MAX_BYTES} are read"),
+        (link_networks, r"networks\.safetensors: cannot be read: a link, which could name any file; copy"),
+        (pipe_networks, r"networks\.safetensors: cannot be read: no regular file"),
         (cut_manifest, r"policy\.json: not a JSON file"),
         (first_format, r"policy\.json: format 1, this version reads 2; train it anew$"),
         (change_manifest(format=3), r"format 3, this version reads 2"),

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import h5py
@@ -81,6 +82,47 @@ def test_a_link_to_another_file_is_not_followed(recording, tmp_path):
         file.attrs["about"] = "{}"
     with pytest.raises(ValueError, match="events is missing or a link"):
         read_recording(tmp_path / "b.h5")
+
+
+@pytest.mark.parametrize("kind", ["other", "itself", "soft"])
+def test_an_index_that_leads_elsewhere_is_not_even_listed(recording, tmp_path, kind):
+    write_recording(tmp_path / "a.h5", recording)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file.create_group("index")
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["index"]
+        name = {"other": "other.h5", "itself": "a.h5"}.get(kind)
+        file["index"] = h5py.SoftLink("/empty") if name is None else h5py.ExternalLink(name, "/empty")
+        file.create_group("empty")
+    with h5py.File(tmp_path / "other.h5", "a") as file:
+        file.create_group("empty")
+    with pytest.raises(ValueError, match="index is missing or a link"):
+        read_recording(tmp_path / "a.h5")
+
+
+def test_more_than_a_file_of_this_size_could_hold_is_refused_before_it_is_read(recording, tmp_path):
+    for name, options in (("unwritten", {"fillvalue": 1}), ("unwritten_packed", {"compression": "gzip"})):
+        path = tmp_path / f"{name}.h5"
+        with h5py.File(path, "w") as file:
+            for column in "txyp":  # nothing of it is stored
+                file.create_dataset(f"events/{column}", (10**8,), "i8", chunks=(1024,), **options)
+        assert path.stat().st_size < 1 << 16
+        for read in (read_recording, read_events):
+            with pytest.raises(ValueError, match="events/t declares 800000000 bytes in a file of"):
+                read(path)
+    same = np.zeros(1 << 20, EVENT)  # packs as well as events can
+    same["p"] = 1
+    write_recording(tmp_path / "same.h5", Recording(same, {}, {}))
+    assert np.array_equal(read_recording(tmp_path / "same.h5").events, same)
+
+
+def test_a_recording_that_is_no_regular_file_is_refused_without_being_opened(recording, tmp_path):
+    write_recording(tmp_path / "a.h5", recording)
+    (tmp_path / "link.h5").symlink_to("a.h5")
+    os.mkfifo(tmp_path / "pipe.h5")
+    for name, rule in (("link.h5", "is a link"), ("pipe.h5", "is no regular file")):
+        with pytest.raises(ValueError, match=rule):
+            read_recording(tmp_path / name)
 
 
 DSEC = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}

@@ -3,7 +3,6 @@ import json
 import math
 import os
 import signal
-import stat
 import subprocess
 import sys
 import time
@@ -17,7 +16,6 @@ from omegaconf import OmegaConf
 
 from envs.config import sensor_settings, settings_hash
 from jobs import train as training
-from jobs.cluster import use_token
 from jobs.config import parse
 from jobs.ppo import FlightMetrics
 from jobs.pretrain import build_evae
@@ -125,22 +123,6 @@ def test_a_step_is_reported_once_even_after_a_restart(tmp_path):
     assert [json.loads(line)["env_steps"] for line in lines] == seen
     assert json.loads(lines[0])["train/success_rate"] is None
     assert training._LISTENERS == {}
-
-
-def test_the_token_of_a_local_ray_can_be_read_by_its_owner_alone(tmp_path, monkeypatch):
-    monkeypatch.delenv("RAY_AUTH_TOKEN_PATH", raising=False)
-    monkeypatch.delenv("RAY_AUTH_TOKEN", raising=False)
-    monkeypatch.setenv("HOME", "/nowhere")
-    file = tmp_path / ".ray" / "token"
-    use_token(file)
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
-    assert os.environ["RAY_AUTH_TOKEN_PATH"] == str(file)
-    token = file.read_text()
-    use_token(tmp_path / "other")
-    assert file.read_text() == token
-    assert len(token) == 64
-    assert not (tmp_path / "other").exists()
 
 
 TINY = (

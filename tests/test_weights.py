@@ -1,5 +1,6 @@
 import hashlib
 import json
+import os
 
 import numpy as np
 import pytest
@@ -140,6 +141,19 @@ def test_a_huge_manifest_is_refused_before_it_is_read(path):
     with path.with_suffix(".json").open("r+b") as file:
         file.truncate(1 << 33)
     with pytest.raises(EncoderFileError, match=f"at most {MAX_MANIFEST_BYTES}"):
+        load_encoder(path)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".safetensors"])
+def test_a_link_or_a_pipe_is_refused_before_it_is_read(path, suffix):
+    file = path.with_suffix(suffix)
+    file.rename(file.with_name("elsewhere"))
+    file.symlink_to("elsewhere")
+    with pytest.raises(EncoderFileError, match=rf"encoder\{suffix}: cannot be read: a link, .*; copy"):
+        load_encoder(path)
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(EncoderFileError, match=rf"encoder\{suffix}: cannot be read: no regular file"):
         load_encoder(path)
 
 
