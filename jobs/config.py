@@ -29,8 +29,8 @@ from jobs.settings import (
     ProbeConfig,
     SweepConfig,
     TrackingConfig,
-    TradeConfig,
     TradeEncoderConfig,
+    TradeSimulatorConfig,
     TrainConfig,
 )
 from models.kinds import KINDS, SMALLEST_IMAGE
@@ -65,7 +65,7 @@ class Config:
     train: TrainConfig
     evaluate: EvaluateConfig
     sweep: SweepConfig
-    trade: TradeConfig
+    trade_simulator: TradeSimulatorConfig
     trade_encoder: TradeEncoderConfig
     probe: ProbeConfig
     cluster: ClusterConfig
@@ -108,7 +108,7 @@ def parse(values: Mapping[str, Any]) -> Config:
     if not refused:
         named = [("env.scene", config.env["scene"]), ("sweep.scene", config.sweep.scene)]
         named += [("evaluate", HELD_OUT_SCENE)]
-        named += [("trade.scenes", name) for name in config.trade.scenes]
+        named += [("trade_simulator.scenes", name) for name in config.trade_simulator.scenes]
         named += [("collect.scenes", name) for name in config.collect.scenes]
         swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
         named += [("sweep.axes", name) for name in dict.fromkeys(swept) if isinstance(name, str)]

@@ -158,7 +158,7 @@ class SweepConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
-class TradeConfig:
+class TradeSimulatorConfig:
     """What the simulator's accuracy is measured on, and how often its cost."""
 
     scenes: Annotated[list[Name], Field(min_length=1)]
