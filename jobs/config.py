@@ -29,6 +29,7 @@ from jobs.settings import (
     ProbeConfig,
     SweepConfig,
     TrackingConfig,
+    TradeConfig,
     TradeEncoderConfig,
     TradeSimulatorConfig,
     TrainConfig,
@@ -46,7 +47,7 @@ class Config:
 
     job: Literal[
         "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "report", "ship",
-        "trade_simulator", "trade_encoder", "probe",
+        "trade", "trade_simulator", "trade_encoder", "probe",
     ]  # fmt: skip
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
@@ -65,6 +66,7 @@ class Config:
     train: TrainConfig
     evaluate: EvaluateConfig
     sweep: SweepConfig
+    trade: TradeConfig
     trade_simulator: TradeSimulatorConfig
     trade_encoder: TradeEncoderConfig
     probe: ProbeConfig
