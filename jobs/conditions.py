@@ -55,6 +55,8 @@ class Cell:
         action: How a policy chooses.
         env: The simulation.
         seeds: One corridor each.
+        table: Settings of `EncoderTable.from_evae` that the policy's encoder is tabulated with; empty:
+            as the policy does.
     """
 
     label: tuple[str, str]
@@ -63,6 +65,7 @@ class Cell:
     action: str
     env: EnvConfig
     seeds: tuple[int, ...]
+    table: tuple[tuple[str, Any], ...] = ()
 
     @functools.cached_property
     def simulation(self) -> str:
@@ -109,7 +112,10 @@ def find_entries(config: Config, folder: Run, pretrained: Path = PRETRAINED) -> 
     Raises:
         ConfigError: If there is no such policy, or two have the same group and training seed.
     """
-    paths = [path for name in config.sweep.policies for path in _named(name, config, folder, pretrained)]
+    names = config.sweep.policies
+    paths = [
+        path for name in names for path in find_pilots("sweep.policies", name, config, folder, pretrained)
+    ]
     entries = list({entry.identity: entry for entry in map(read_entry, paths)}.values())
     held: dict[tuple[str, int | None], Entry] = {}
     for entry in entries:
@@ -123,24 +129,28 @@ def find_entries(config: Config, folder: Run, pretrained: Path = PRETRAINED) -> 
     return tuple(sorted(entries, key=lambda entry: (order.index(entry.group), entry.training or 0)))
 
 
-def _named(name: str, config: Config, folder: Run, pretrained: Path) -> list[str]:
-    """Paths and bounds that one entry of `sweep.policies` names."""
+def find_pilots(key: str, name: str, config: Config, folder: Run, pretrained: Path = PRETRAINED) -> list[str]:
+    """Paths and bounds that a name stands for, which a configuration has under `key`.
+
+    Raises:
+        ConfigError: If there is no such policy.
+    """
     if name == "pretrained":
         found = sorted(str(path.parent) for path in pretrained.glob(f"*/{MANIFEST}"))
         if not found:
             raise ConfigError(
-                f"sweep.policies: 'pretrained' means the policies in {str(pretrained)!r}, which holds none; "
-                "train one (python -m platform.launch +exp=bytestream) and name it: sweep.policies=[newest]"
+                f"{key}: 'pretrained' means the policies in {str(pretrained)!r}, which holds none; "
+                f"train one (python -m platform.launch +exp=bytestream) and name it: {key}=[newest]"
             )
         return found
     if name == "newest":
         return [str(find_policy(config, folder))]
     if name in BOUNDS:
         return [name]
-    path = named_policy(name)
+    path = named_policy(name) or named_policy(str(pretrained / name))
     if path is None:
-        words = f"'pretrained', 'newest', one of {BOUNDS}, a policy folder or a run folder"
-        raise ConfigError(f"sweep.policies: each must be {words}, got {name!r}")
+        places = "a name in models/pretrained, a policy folder or a run folder"
+        raise ConfigError(f"{key}: must be 'pretrained', 'newest', one of {BOUNDS}, {places}, got {name!r}")
     return [str(path)]
 
 
@@ -192,10 +202,22 @@ def _cell(
         raise ConfigError(
             f"sweep.axes.{label[0]}: {dict(point)} with the sensor of {entry.pilot!r}: {reason}"
         ) from None
-    action = config.evaluate.action
+    return make_cell(label, entry, config.evaluate.action, env, config.sweep.trials)
+
+
+def make_cell(
+    label: tuple[str, str],
+    entry: Entry,
+    action: str,
+    env: EnvConfig,
+    trials: int,
+    table: Mapping[str, Any] | None = None,
+) -> Cell:
+    """The cell of the first `trials` corridors, see `Cell`, with its key."""
     facts = {"env": dataclasses.asdict(env), "pilot": entry.identity, "action": action}
+    facts |= {"table": dict(table)} if table else {}  # what was kept before there were tables stays valid
     key = settings_hash({**facts, "kept": list(EPISODE.names or ())})  # other columns, other files
-    return Cell(label, key, entry, action, env, tuple(range(config.sweep.trials)))
+    return Cell(label, key, entry, action, env, tuple(range(trials)), tuple((table or {}).items()))
 
 
 def _differences(entry: Entry, configured: EnvConfig) -> dict[str, tuple[Any, Any]]:

@@ -31,6 +31,7 @@ from jobs.settings import (
     TrackingConfig,
     TradeConfig,
     TradeEncoderConfig,
+    TradeSimulatorConfig,
     TrainConfig,
 )
 from models.kinds import KINDS, SMALLEST_IMAGE
@@ -46,7 +47,7 @@ class Config:
 
     job: Literal[
         "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "report", "ship",
-        "trade_simulator", "trade_encoder", "probe",
+        "trade", "trade_simulator", "trade_encoder", "probe",
     ]  # fmt: skip
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
@@ -66,6 +67,7 @@ class Config:
     evaluate: EvaluateConfig
     sweep: SweepConfig
     trade: TradeConfig
+    trade_simulator: TradeSimulatorConfig
     trade_encoder: TradeEncoderConfig
     probe: ProbeConfig
     cluster: ClusterConfig
@@ -108,7 +110,7 @@ def parse(values: Mapping[str, Any]) -> Config:
     if not refused:
         named = [("env.scene", config.env["scene"]), ("sweep.scene", config.sweep.scene)]
         named += [("evaluate", HELD_OUT_SCENE)]
-        named += [("trade.scenes", name) for name in config.trade.scenes]
+        named += [("trade_simulator.scenes", name) for name in config.trade_simulator.scenes]
         named += [("collect.scenes", name) for name in config.collect.scenes]
         swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
         named += [("sweep.axes", name) for name in dict.fromkeys(swept) if isinstance(name, str)]

@@ -46,12 +46,14 @@ class Pilot(Protocol):
         """Actions (B,) for observations (B, ...) and the flights' infos."""
 
 
-def make_pilot(name: str, action: str = "deterministic") -> Pilot:
+def make_pilot(name: str, action: str = "deterministic", table: Mapping[str, Any] | None = None) -> Pilot:
     """A bound by its name, or the policy of a folder.
 
     Args:
         name: "straight", "random", "oracle", or the path of a policy folder.
         action: "deterministic" or "stochastic": how a policy chooses.
+        table: Settings of `EncoderTable.from_evae` for a policy whose frozen encoder reads single
+            events; None: those of the policy.
     """
     bounds: dict[str, Callable[[], Pilot]] = {
         "straight": StraightPilot,
@@ -60,9 +62,15 @@ def make_pilot(name: str, action: str = "deterministic") -> Pilot:
     }
     if name in bounds:
         return bounds[name]()
-    from models.policy import load_policy  # here, because the bounds need no network
+    # Here, because the bounds need no network.
+    from models.policy import ENCODER, load_policy
+    from models.table import EncoderTable
+    from models.weights import load_encoder
 
-    return PolicyPilot(load_policy(Path(name)), action == "stochastic")
+    policy = load_policy(Path(name))
+    if table:
+        policy.encoder = EncoderTable.from_evae(load_encoder(Path(name) / ENCODER)[0], **table)
+    return PolicyPilot(policy, action == "stochastic")
 
 
 class StraightPilot:

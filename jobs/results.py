@@ -1,8 +1,8 @@
-"""Write docs/results.md from a flown sweep: its tables and figures, and what they say of the paper's claims.
+"""Write docs/results.md from a flown sweep, and docs/trade.md from a trade; what a sweep says of the paper.
 
 Run: python -m platform.launch +exp=report
-Expect: seconds; docs/results.md and docs/images/results_*.png, of the newest sweep or of the run
-folder that `resume` names.
+Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
+docs/images/trade.png of the newest trade; with `resume` of what that run folder holds.
 """
 
 import csv
@@ -41,33 +41,51 @@ TITLES = {
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Write the results of the newest sweep, or of the one in `resume`, into docs/."""
-    file = write_results(find_sweep(config), REPOSITORY / "docs")
-    console.print(f"Written: {file.relative_to(REPOSITORY)}", markup=False)
+    """Write what the newest sweep and the newest trade found, or those of the run in `resume`, into docs/.
+
+    Raises:
+        ConfigError: If there is neither.
+    """
+    writers = {"sweep": write_results, "trade": write_trade}
+    found = {name: find_study(config, name) for name in writers}
+    if not any(found.values()):
+        where = config.resume or config.runs_dir
+        commands = " or ".join(f"python -m platform.launch +exp={exp}" for exp in ("robustness", "trade"))
+        raise ConfigError(f"resume: no finished sweep or trade in {where!r}: run {commands}")
+    for name, folder in found.items():
+        if folder is not None:
+            file = writers[name](folder, REPOSITORY / "docs")
+            console.print(f"Written: {file.relative_to(REPOSITORY)}", markup=False)
     return {}
 
 
-def find_sweep(config: Config) -> Path:
-    """The folder `sweep` of the run folder in `resume`, else of the one whose sweep was flown last.
+def find_study(config: Config, name: str) -> Path | None:
+    """The folder `name` of the run folder in `resume`, else the newest of all runs; None: there is none.
 
-    Raises:
-        ConfigError: If there is none.
+    Args:
+        config: The experiment.
+        name: "sweep" or "trade".
     """
-    runs = Path(config.runs_dir)
-    found = (
-        list(runs.glob("*/sweep/about.json"))
-        if config.resume is None
-        else [Path(config.resume, "sweep/about.json")]
-    )
-    newest = max(
-        (path for path in found if path.is_file()), key=lambda path: path.stat().st_mtime_ns, default=None
-    )
-    if newest is None:
-        where = config.resume or config.runs_dir
-        raise ConfigError(
-            f"resume: no finished sweep in {where!r}: run python -m platform.launch +exp=robustness"
-        )
-    return newest.parent
+    where = Path(config.runs_dir).glob("*") if config.resume is None else [Path(config.resume)]
+    found = [path for path in (run / name / "about.json" for run in where) if path.is_file()]
+    newest = max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
+    return newest and newest.parent
+
+
+def write_trade(trade: Path, docs: Path) -> Path:
+    """Copy the page of a trade and its figure.
+
+    Args:
+        trade: The folder that the job has left in its run folder.
+        docs: Where trade.md goes, its picture into `images`.
+
+    Returns:
+        The file.
+    """
+    (docs / "images").mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(trade / "images" / "trade.png", docs / "images" / "trade.png")
+    write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
+    return docs / "trade.md"
 
 
 def write_results(sweep: Path, docs: Path) -> Path:

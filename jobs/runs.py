@@ -22,7 +22,7 @@ from jobs.config import Config, ConfigError, as_dict, parse
 # change what is trained.
 UNNAMED = (
     "job", "resume", "runs_dir", "cluster", "tracking",
-    "evaluate", "sweep", "trade", "trade_encoder", "probe",
+    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe",
 )  # fmt: skip
 REPOSITORY = Path(__file__).resolve().parent.parent
 

@@ -144,7 +144,7 @@ class SweepConfig:
 
     Attributes:
         scene: Where they fly unless an axis changes it.
-        policies: Each "pretrained" (all of models/pretrained), "newest", a bound, or a path.
+        policies: Each "pretrained" (all of models/pretrained), a name there, "newest", a bound, or a path.
         axes: Name -> setting -> values. The first setting names the points of the axis; others
             have as many values, or one that stays.
         reference: The group that paired differences are taken against.
@@ -159,6 +159,23 @@ class SweepConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TradeConfig:
+    """Which policy flies under every setting of simulator and encoder, and how often.
+
+    Attributes:
+        policy: A name in models/pretrained, "newest", or a path.
+        trials: Corridors flown under each setting,
+        pyrender_trials: and under those that pyrender draws.
+        replays: Flights on which costs and errors are measured.
+    """
+
+    policy: Name
+    trials: Count
+    pyrender_trials: Count
+    replays: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class TradeSimulatorConfig:
     """What the simulator's accuracy is measured on, and how often its cost."""
 
     scenes: Annotated[list[Name], Field(min_length=1)]

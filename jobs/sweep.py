@@ -27,7 +27,7 @@ from jobs.drift import DriftWatch
 from jobs.flights import EPISODE, fly
 from jobs.pilots import Pilot, make_pilot
 from jobs.progress import console, progress
-from jobs.runs import Run, finish, git_commit, locate_run, open_run, write_json
+from jobs.runs import finish, git_commit, locate_run, open_run, write_json
 from jobs.sweep_report import accuracy_file, report
 from jobs.tracking import open_tracker
 
@@ -88,8 +88,8 @@ def run(config: Config) -> dict[str, Any]:
     announce(sweep)
     with open_tracker(config, folder, key=f"sweep {sweep.identity[:8]}") as tracker:
         tracker.tags({"kind": "sweep", "groups": ", ".join(sweep.groups)})
-        episodes, failed = fly_cells(config, folder, sweep.cells)
-        kept = {key: read_kept(episodes_folder(folder), key) for key in episodes}
+        episodes, failed = fly_cells(config, folder.path / "sweep", sweep.cells)
+        kept = {key: read_kept(episodes_folder(folder.path / "sweep"), key) for key in episodes}
         figures = report(config, folder, tracker, sweep, episodes, kept, failed)
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "sweep", figures)
@@ -106,9 +106,15 @@ def announce(sweep: Sweep) -> None:
 
 
 def fly_cells(
-    config: Config, folder: Run, every: Sequence[Cell]
+    config: Config, place: Path, every: Sequence[Cell], measuring: bool = True
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """The episodes of each cell by its key, read back where they are kept, else flown as a Tune trial.
+
+    Args:
+        config: Says where Ray runs.
+        place: The folder of a run folder that keeps them.
+        every: The cells; of those that share a key one is flown.
+        measuring: Whether the accuracy of each simulation is measured too.
 
     Returns:
         Key -> EPISODE of the cells that could be flown, and key -> reason of the others.
@@ -116,17 +122,18 @@ def fly_cells(
     Raises:
         SweepError: If none could be flown.
     """
-    kept = episodes_folder(folder)
+    kept = episodes_folder(place)
     unique = {cell.key: cell for cell in every}
     missing = [cell for cell in (unflown(cell, kept) for cell in unique.values()) if cell.seeds]
     failed: dict[str, str] = {}
     if missing:
         total, left = (sum(len(cell.seeds) for cell in some) for some in (unique.values(), missing))
-        start_ray(config.cluster, folder.path)
+        start_ray(config.cluster, place.parent)
         os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = TUNE_SNAPSHOT_S
-        with progress("Sweep", total, "flights", done=total - left) as advance:
+        measured = unmeasured(missing, kept) if measuring else set()
+        with progress(place.name.capitalize(), total, "flights", done=total - left) as advance:
             keep = KeepEpisodes(kept, advance)
-            _tuner(folder, missing, unmeasured(missing, kept), keep).fit()
+            _tuner(place, missing, measured, keep).fit()
         lost = f"its process ended {MAX_FAILURES + 1} times"
         failed = {cell.key: keep.failed.get(cell.key, lost) for cell in missing if unflown(cell, kept).seeds}
     if len(failed) == len(unique):
@@ -136,9 +143,9 @@ def fly_cells(
     return flown, failed
 
 
-def episodes_folder(folder: Run) -> Path:
-    """Where a run folder keeps the episodes of its sweeps, one file per cell."""
-    return folder.path / "sweep" / "episodes"
+def episodes_folder(place: Path) -> Path:
+    """Where flown episodes are kept, one file per cell."""
+    return place / "episodes"
 
 
 def unmeasured(cells: Sequence[Cell], kept: Path) -> set[str]:
@@ -176,7 +183,7 @@ def read_episodes(cell: Cell, kept: Path) -> np.ndarray:
     return np.array([rows[seed] for seed in cell.seeds], EPISODE)
 
 
-def _tuner(folder: Run, missing: Sequence[Cell], measured: set[str], keep: KeepEpisodes) -> tune.Tuner:
+def _tuner(place: Path, missing: Sequence[Cell], measured: set[str], keep: KeepEpisodes) -> tune.Tuner:
     """One trial per cell, one core each."""
     trials = [{"cell": cell, "measured": cell.key in measured} for cell in missing]
     return tune.Tuner(
@@ -185,7 +192,7 @@ def _tuner(folder: Run, missing: Sequence[Cell], measured: set[str], keep: KeepE
         param_space={"trial": tune.grid_search(trials)},
         run_config=tune.RunConfig(
             name="tune",
-            storage_path=str(folder.path / "sweep"),
+            storage_path=str(place),
             verbose=0,
             callbacks=[keep],
             failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
@@ -213,9 +220,8 @@ def flown(cell: Cell, measured: bool) -> dict[str, Any]:
     """The episodes of a cell, the drift of its policy's encoder, and how exact its simulation is."""
     pilot = cell.entry.pilot
     drift = DriftWatch(pilot)
-    episodes = fly(
-        loaded(pilot, cell.action), cell.env, cell.seeds, min(len(cell.seeds), MOST_ENVS), drift.add
-    )
+    together = min(len(cell.seeds), MOST_ENVS)
+    episodes = fly(loaded(pilot, cell.action, cell.table), cell.env, cell.seeds, together, drift.add)
     accuracy = measure(cell.env) if measured else None
     return {
         "episodes": episodes.tolist(),
@@ -226,6 +232,6 @@ def flown(cell: Cell, measured: bool) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=2)
-def loaded(pilot: str, action: str) -> Pilot:
+def loaded(pilot: str, action: str, table: tuple[tuple[str, Any], ...] = ()) -> Pilot:
     """A pilot, kept by a worker from cell to cell: it forgets its flights when it is reset."""
-    return make_pilot(pilot, action)
+    return make_pilot(pilot, action, dict(table))

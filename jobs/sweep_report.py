@@ -151,18 +151,13 @@ def typical_crashes(flown: np.ndarray) -> list[int]:
 
 def about(config: Config, folder: Run, sweep: Sweep, commits: Sequence[str]) -> dict[str, Any]:
     """What made the figures: command, commits and date, policies and axes; no path of a machine."""
-    words = [
-        re.sub(r"/[^\s,\]]*/", "", word)
-        for word in sys.argv[1:]
-        if not word.lstrip("+").startswith(ELSEWHERE)
-    ]
     return {
         "run": folder.path.name,
         "identity": sweep.identity,
-        "command": f"python -m platform.launch {shlex.join(words)}",
+        "command": command(),
         "commit": git_commit(),
         "flown_at": list(commits),
-        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "date": today(),
         "budget": config.budget,
         "scene": config.sweep.scene,
         "trials": config.sweep.trials,
@@ -171,6 +166,21 @@ def about(config: Config, folder: Run, sweep: Sweep, commits: Sequence[str]) -> 
         "groups": sweep.groups,
         "axes": sweep.axes,
     }
+
+
+def command() -> str:
+    """The command that is running, without where it runs and writes: no path of a machine."""
+    words = [
+        re.sub(r"/[^\s,\]]*/", "", word)
+        for word in sys.argv[1:]
+        if not word.lstrip("+").startswith(ELSEWHERE)
+    ]
+    return f"python -m platform.launch {shlex.join(words)}"
+
+
+def today() -> str:
+    """The date, UTC."""
+    return datetime.now(UTC).strftime("%Y-%m-%d")
 
 
 def write_tables(

@@ -1,6 +1,7 @@
 """Figures of what accuracy costs: cost against error with its Pareto front, events against control rate."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,8 +17,31 @@ COLOURS = {
     "encoding": "#db2777",
     "culling": "#0891b2",
     "memory": "#dc2626",
+    "precision": "#65a30d",
+    "time bins": "#9333ea",
+    "newest events": "#b45309",
+    "together": "#64748b",
+    "most exact": "#111827",
 }
+SHAPES = {"default": "*", "most exact": "D", "precision": "s", "time bins": "s", "newest events": "s"}
+SPEEDS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000)
 FLOOR = 1e-3  # of an error that is drawn on a logarithmic axis
+
+
+class Panel(NamedTuple):
+    """What one panel shows of n settings.
+
+    Attributes:
+        label: Of the axis.
+        values: n numbers, NaN where there is none.
+        intervals: Around them; None: there are none.
+        front: Places on the Pareto front.
+    """
+
+    label: str
+    values: Sequence[float]
+    intervals: Sequence[tuple[float, ...]] | None
+    front: Sequence[int]
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -54,6 +78,43 @@ def trade_figure(
     panel.grid(color=GRID)
     panel.spines[["top", "right"]].set_visible(False)
     panel.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def choice_figure(settings: Sequence[tuple[str, str, float]], panels: Sequence[Panel]) -> Figure:
+    """A panel each of values over the speed of settings (knob, setting, steps/s); the fronts are named."""
+    figure = Figure(figsize=(4.6 * len(panels), 5.4), layout="constrained")
+    speed = np.array([steps_per_s for *_, steps_per_s in settings])
+    for place, (axes, panel) in enumerate(zip(figure.subplots(1, len(panels)), panels, strict=True)):
+        values, front = np.array(panel.values), list(panel.front)
+        axes.plot(speed[front], values[front], color=MUTED, lw=1.2, ls="--", zorder=1, label="Pareto front")
+        if panel.intervals is not None:
+            spread = np.abs(np.array(panel.intervals).T - values)
+            axes.errorbar(
+                speed, values, spread, fmt="none", ecolor=MUTED, elinewidth=0.7, alpha=0.5, zorder=2
+            )
+        for knob in dict.fromkeys(setting[0] for setting in settings):
+            own = [row for row, setting in enumerate(settings) if setting[0] == knob]
+            size = 240 if knob == "default" else 34
+            look = {"marker": SHAPES.get(knob, "o"), "color": COLOURS.get(knob, INK), "s": size, "zorder": 3}
+            axes.scatter(speed[own], values[own], label=knob, **look)
+        for row in front:
+            name = settings[row][1] or settings[row][0]
+            axes.annotate(name, (speed[row], values[row]), (5, 5), textcoords="offset points", fontsize=7)
+        axes.set(xscale="log", xlabel="Environment steps per second", ylabel=panel.label)
+        ticks = [tick for tick in SPEEDS if 0.8 * speed.min() < tick < 1.25 * speed.max()]
+        axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+        axes.set_xticks([], minor=True)
+        if panel.intervals is None:  # errors, many of them small
+            axes.set_yscale("symlog", linthresh=1.0)
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.set_ylim(-0.1, None)
+        axes.grid(color=GRID)
+        axes.spines[["top", "right"]].set_visible(False)
+        if place == 0:
+            figure.legend(
+                *axes.get_legend_handles_labels(), loc="outside lower center", ncols=8, frameon=False
+            )
     return figure
 
 

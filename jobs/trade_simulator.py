@@ -9,7 +9,7 @@ the same flights, see `envs.accuracy`; a cost is process time of `CorridorEnv.st
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,7 +61,7 @@ def run(config: Config) -> dict[str, Any]:
     config = folder.config
     with open_tracker(config, folder) as tracker:
         figures: dict[str, float] = {}
-        for scene in config.trade.scenes:
+        for scene in config.trade_simulator.scenes:
             figures |= trade_scene(config, folder, tracker, scene)
         figures |= trade_memory(config, folder, tracker)
         tracker.log(0, figures)
@@ -74,14 +74,14 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
     default = config.env_config(scene=scene, split="validation", observation="events")
     named = [("default", "", default)]
     for knob, settings in KNOBS.items():
-        named += [(knob, _text(setting), _changed(default, setting)) for setting in settings]
-    trade = config.trade
+        named += [(knob, setting_text(setting), changed(default, setting)) for setting in settings]
+    trade = config.trade_simulator
     with progress(f"Trade in {scene}", len(named), "settings") as advance:
         accuracies = []
-        for knob, _, changed in named:
-            accuracies.append(measure(changed, trade.flights, trade.steps))
+        for knob, _, simulation in named:
+            accuracies.append(measure(simulation, trade.flights, trade.steps))
             advance(1, note=knob)
-    costs = step_costs_us([changed for *_, changed in named], trade.steps, trade.rounds)
+    costs = step_costs_us([simulation for *_, simulation in named], trade.steps, trade.rounds)
     rows = [
         Row(knob, setting, cost, accuracy)
         for (knob, setting, _), cost, accuracy in zip(named, costs, accuracies, strict=True)
@@ -103,15 +103,16 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
 
 def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     """Events per second of flight at each control rate, for each memory mode; those at 200 Hz as figures."""
-    rates_hz = config.trade.control_hz
+    trade = config.trade_simulator
+    rates_hz = trade.control_hz
     events_hz: dict[str, list[float]] = {memory: [] for memory in MEMORIES}
     with progress("Memory modes", len(rates_hz) * len(MEMORIES), "simulations") as advance:
         for hz in rates_hz:
             # The same way at every rate: as many steps as fit into the time of the slowest.
-            steps = max(1, round(config.trade.steps * hz / min(rates_hz) / 4))
+            steps = max(1, round(trade.steps * hz / min(rates_hz) / 4))
             for memory in MEMORIES:
                 default = config.env_config(control_hz=hz, split="validation")
-                accuracy = measure(env_with(default, {"camera.memory": memory}), config.trade.flights, steps)
+                accuracy = measure(env_with(default, {"camera.memory": memory}), trade.flights, steps)
                 events_hz[memory].append(accuracy.events[0] * hz)
                 advance(1, note=memory)
     figure = memory_figure(rates_hz, events_hz)
@@ -148,8 +149,8 @@ def step_costs_us(configs: Sequence[EnvConfig], steps: int, rounds: int) -> list
     return (1e6 * np.median(costs[1:], axis=0)).tolist()
 
 
-def _changed(default: EnvConfig, setting: dict[str, Any]) -> EnvConfig:
-    """The default with some settings replaced; "renders" is a number per control step."""
+def changed(default: EnvConfig, setting: Mapping[str, Any]) -> EnvConfig:
+    """The default with the settings of a knob replaced; "renders" is a number per control step."""
     for key, value in setting.items():
         if key == "renders":
             step_m = default.speed_mps / default.control_hz
@@ -160,7 +161,8 @@ def _changed(default: EnvConfig, setting: dict[str, Any]) -> EnvConfig:
     return default
 
 
-def _text(setting: dict[str, Any]) -> str:
+def setting_text(setting: Mapping[str, Any]) -> str:
+    """The settings of a knob as text, such as "tolerance 0.1"."""
     return ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in setting.items())
 
 

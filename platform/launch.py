@@ -28,6 +28,7 @@ JOBS = {
     "sweep": "jobs.sweep",
     "ship": "jobs.ship",
     "report": "jobs.results",
+    "trade": "jobs.trade",
     "trade_simulator": "jobs.trade_simulator",
     "trade_encoder": "jobs.trade_encoder",
     "probe": "jobs.probe",

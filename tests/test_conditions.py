@@ -149,6 +149,13 @@ def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_pat
         assert entry.pilot == path
 
 
+def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
+    config = sweep_config(tmp_path, policies=["one"])
+    path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env_config())
+    (entry,) = find_entries(config, open_run(config), tmp_path / "pretrained")
+    assert entry.pilot == path
+
+
 def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
     folder = open_run(sweep_config(tmp_path))
 
@@ -160,7 +167,7 @@ def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
     assert refusal("pretrained").startswith("sweep.policies: 'pretrained' means the policies in ")
     assert "train one (python -m platform.launch +exp=bytestream)" in refusal("pretrained")
     assert refusal("pretrained").endswith("sweep.policies=[newest]")
-    assert refusal(str(tmp_path)).startswith("sweep.policies: each must be 'pretrained', 'newest', ")
+    assert refusal(str(tmp_path)).startswith("sweep.policies: must be 'pretrained', 'newest', ")
     assert refusal(str(tmp_path)).endswith(f"got {str(tmp_path)!r}")
     one, two = (save_training(tmp_path / name, "a", 0, EnvConfig(), kind) for name, kind in (
         ("one", "event_columns"), ("two", "eip")

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jobs import results
 from jobs.config import ConfigError
 from jobs.flights import write_episodes
 from jobs.groups import LABELS
-from jobs.results import find_sweep, read_flights, write_results
+from jobs.results import find_study, read_flights, write_results, write_trade
 from tests.test_groups import flights
 from tests.test_runs import small_config
 
@@ -72,19 +73,43 @@ def test_flights_survive_their_file(sweep):
     np.testing.assert_array_equal(found[("sparsity", "0.5"), "oracle"][None], flights(20))
 
 
-def test_the_newest_sweep_is_found_unless_one_is_named(sweep, tmp_path):
+def test_the_newest_study_is_found_unless_one_is_named(sweep, tmp_path):
     older = tmp_path / "runs" / "older"
     (older / "sweep").mkdir(parents=True)
     (older / "sweep" / "about.json").write_text("{}")
     os.utime(older / "sweep" / "about.json", (1, 1))
     config = small_config(tmp_path, job="report")
-    assert find_sweep(config) == sweep
-    assert find_sweep(dataclasses.replace(config, resume=str(older))) == older / "sweep"
+    assert find_study(config, "sweep") == sweep
+    assert find_study(dataclasses.replace(config, resume=str(older)), "sweep") == older / "sweep"
+    assert find_study(config, "trade") is None
 
 
-def test_no_sweep_is_refused_with_the_remedy(tmp_path):
+@pytest.fixture
+def trade(tmp_path):
+    """The folder that a trade leaves."""
+    folder = tmp_path / "runs" / "trade-short-s0-1" / "trade"
+    (folder / "images").mkdir(parents=True)
+    (folder / "trade.md").write_text("# A page\n![](images/trade.png)\n")
+    Image.new("RGB", (4, 4)).save(folder / "images" / "trade.png")
+    (folder / "about.json").write_text("{}")
+    return folder
+
+
+def test_the_page_of_a_trade_is_copied_with_its_picture(trade, tmp_path):
+    text = write_trade(trade, tmp_path / "docs").read_text()
+    assert text == (trade / "trade.md").read_text()
+    copy = tmp_path / "docs" / "images" / "trade.png"
+    assert copy.read_bytes() == (trade / "images" / "trade.png").read_bytes()
+
+
+def test_what_there_is_is_written_and_nothing_else(trade, tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "REPOSITORY", tmp_path)
+    results.run(small_config(tmp_path, job="report"))
+    assert [path.name for path in (tmp_path / "docs").glob("*.md")] == ["trade.md"]
+
+
+def test_nothing_finished_is_refused_with_the_remedy(tmp_path):
     config = small_config(tmp_path, job="report")
-    with pytest.raises(
-        ConfigError, match=r"^resume: no finished sweep in .*: run python -m platform\.launch"
-    ):
-        find_sweep(config)
+    rule = r"^resume: no finished sweep or trade in .*: run python -m platform\.launch \+exp=robustness or "
+    with pytest.raises(ConfigError, match=rule):
+        results.run(config)

@@ -24,7 +24,7 @@ class StubTuner:
     measured: list[str] = []  # noqa: RUF012
     broken: dict[tuple[str, str], str] = {}  # noqa: RUF012
 
-    def __init__(self, folder, missing, measured, keep):
+    def __init__(self, place, missing, measured, keep):
         self.missing, self.keep = missing, keep
         self.measured += measured
 
@@ -53,11 +53,11 @@ def stub(monkeypatch):
 
 def test_a_second_run_flies_nothing_twice(tmp_path, stub):
     config = sweep_config(tmp_path)
-    folder, cells = open_run(config), planned(config, "straight", "oracle").cells
-    first, failed = fly_cells(config, folder, cells)
+    place, cells = open_run(config).path / "sweep", planned(config, "straight", "oracle").cells
+    first, failed = fly_cells(config, place, cells)
     assert len(stub.flown) == len(set(stub.flown)) == 12
     assert not failed
-    again, _ = fly_cells(config, folder, cells)
+    again, _ = fly_cells(config, place, cells)
     assert len(stub.flown) == 12
     for key, episodes in first.items():
         np.testing.assert_array_equal(episodes, again[key])
@@ -65,55 +65,55 @@ def test_a_second_run_flies_nothing_twice(tmp_path, stub):
 
 def test_more_trials_fly_only_the_new_corridors(tmp_path, stub):
     few, many = sweep_config(tmp_path, trials=2), sweep_config(tmp_path, trials=5)
-    folder = open_run(few)
-    fly_cells(few, folder, planned(few, "straight").cells)
+    place = open_run(few).path / "sweep"
+    fly_cells(few, place, planned(few, "straight").cells)
     stub.flown.clear()
-    episodes, _ = fly_cells(many, folder, planned(many, "straight").cells)
+    episodes, _ = fly_cells(many, place, planned(many, "straight").cells)
     assert sorted({seed for _, seed in stub.flown}) == [2, 3, 4]
     assert all(list(rows["seed"]) == [0, 1, 2, 3, 4] for rows in episodes.values())
 
 
 def test_a_sweep_that_was_stopped_flies_what_is_missing(tmp_path, stub):
     config = sweep_config(tmp_path)
-    folder, cells = open_run(config), planned(config, "straight").cells
-    fly_cells(config, folder, cells)
-    kept = folder.path / "sweep" / "episodes"
+    place, cells = open_run(config).path / "sweep", planned(config, "straight").cells
+    fly_cells(config, place, cells)
+    kept = place / "episodes"
     (kept / f"{cells[2].key}.json").unlink()
     stub.flown.clear()
-    fly_cells(config, folder, cells)
+    fly_cells(config, place, cells)
     assert stub.flown == [(cells[2].key, 0), (cells[2].key, 1)]
 
 
 def test_each_simulation_is_measured_once_whoever_flies_it(tmp_path, stub):
     config = sweep_config(tmp_path)
-    folder, cells = open_run(config), planned(config, "straight", "oracle").cells
-    fly_cells(config, folder, cells)
+    place, cells = open_run(config).path / "sweep", planned(config, "straight", "oracle").cells
+    fly_cells(config, place, cells)
     assert len(stub.measured) == len({cell.simulation for cell in cells}) == 2
     more = planned(sweep_config(tmp_path, trials=3), "straight", "oracle", "random").cells
-    assert unmeasured(more, folder.path / "sweep" / "episodes") == set()
+    assert unmeasured(more, place / "episodes") == set()
 
 
 def test_what_raises_or_dies_stops_no_other_and_is_flown_by_the_next_run(tmp_path, stub):
     config = sweep_config(tmp_path)
-    folder, cells = open_run(config), planned(config, "straight").cells
+    place, cells = open_run(config).path / "sweep", planned(config, "straight").cells
     keys = {cell.label: cell.key for cell in cells}
     raised, died = ("sparsity", "0.5"), ("rate", "100")
     stub.broken = {raised: "ValueError: no", died: ""}
-    episodes, failed = fly_cells(config, folder, cells)
+    episodes, failed = fly_cells(config, place, cells)
     assert failed == {keys[raised]: "ValueError: no", keys[died]: "its process ended 3 times"}
     assert set(episodes) == {keys["sparsity", "0"]}
     stub.broken = {}
     stub.flown.clear()
-    assert fly_cells(config, folder, cells)[1] == {}
+    assert fly_cells(config, place, cells)[1] == {}
     assert {key for key, _ in stub.flown} == {keys[raised], keys[died]}
 
 
 def test_a_sweep_of_which_nothing_flies_stops_with_the_reason(tmp_path, stub):
     config = sweep_config(tmp_path)
-    folder, cells = open_run(config), planned(config, "straight").cells
+    place, cells = open_run(config).path / "sweep", planned(config, "straight").cells
     stub.broken = {cell.label: "ValueError: no" for cell in cells}
     with pytest.raises(SweepError, match=r"^nothing could be flown: ValueError: no; the same command"):
-        fly_cells(config, folder, cells)
+        fly_cells(config, place, cells)
 
 
 def test_episodes_survive_their_file_unchanged(tmp_path):
@@ -160,10 +160,10 @@ def test_who_flies_and_whose_sensor_differs_is_said(tmp_path, capsys):
     ]
 
 
-def tracked_sweeps(config):
-    """Client, and the children by name of each sweep's parent run."""
+def tracked_sweeps(config, kind="sweep"):
+    """Client, and the children by name of each sweep's parent run, or of each run of another kind."""
     client, experiment = open_store(config.tracking.uri, config.tracking.experiment)
-    parents = client.search_runs([experiment], "tags.kind = 'sweep'")
+    parents = client.search_runs([experiment], f"tags.kind = '{kind}'")
     below = "tags.`mlflow.parentRunId` = '{}'"
     children = {
         run.info.run_id: client.search_runs([experiment], below.format(run.info.run_id)) for run in parents
