@@ -102,15 +102,13 @@ def check_file(path: Path, max_bytes: int) -> int:
     """The size of a regular file [bytes]; nothing is opened, so a FIFO cannot block.
 
     Raises:
-        ValueError: There is no such file, it is a link, directory, device or pipe, it is empty,
+        ValueError: There is no such file, it is a directory, device or pipe, it is empty,
             or it is larger than `max_bytes`.
     """
     try:
-        info = path.lstat()
+        info = path.stat()
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be opened ({error}); check the path") from None
-    if stat.S_ISLNK(info.st_mode):
-        raise ValueError(f"{path}: is a link, which could name any file; give the path of the file itself")
     if not stat.S_ISREG(info.st_mode):
         raise ValueError(f"{path}: is no regular file; give the path of one recording")
     if info.st_size == 0:

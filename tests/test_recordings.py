@@ -118,11 +118,11 @@ def test_more_than_a_file_of_this_size_could_hold_is_refused_before_it_is_read(r
 
 def test_a_recording_that_is_no_regular_file_is_refused_without_being_opened(recording, tmp_path):
     write_recording(tmp_path / "a.h5", recording)
-    (tmp_path / "link.h5").symlink_to("a.h5")
+    (tmp_path / "link.h5").symlink_to("a.h5")  # as data sets on a shared disk are laid out
+    assert np.array_equal(read_recording(tmp_path / "link.h5").events, recording.events)
     os.mkfifo(tmp_path / "pipe.h5")
-    for name, rule in (("link.h5", "is a link"), ("pipe.h5", "is no regular file")):
-        with pytest.raises(ValueError, match=rule):
-            read_recording(tmp_path / name)
+    with pytest.raises(ValueError, match="is no regular file"):
+        read_recording(tmp_path / "pipe.h5")
 
 
 DSEC = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}
