@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import os
 import re
 from pathlib import Path
 
@@ -190,6 +191,12 @@ def test_no_secret_reaches_run_folders_the_tracker_or_what_is_printed(tmp_path, 
     assert [path for path in written if PASSWORD.encode() in path.read_bytes()] == []
     again = open_run(dataclasses.replace(config, resume=str(folder.path)))
     assert store_uri(again.config) == uri  # from the command, not from the folder
+
+
+def test_mlflow_does_not_print_the_address_with_its_password_either(tmp_path, monkeypatch):
+    monkeypatch.setenv("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "false")
+    tracking.open_store(f"sqlite:///{tmp_path}/mlflow.db", "evade")
+    assert os.environ["MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT"] == "true"
 
 
 def test_an_address_that_was_written_down_without_its_password_is_refused(tmp_path):
