@@ -71,6 +71,20 @@ def axis_points(settings: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     return [{key: values[place % len(values)] for key, values in settings.items()} for place in range(count)]
 
 
+def moving_settings(points: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The settings that change along an axis; points by their value as text."""
+    every = list(points.values())
+    return [key for key in every[0] if len({str(point[key]) for point in every}) > 1]
+
+
+def axis_numbers(points: Mapping[str, Mapping[str, Any]]) -> dict[str, float] | None:
+    """The number that each point of an axis stands for; None for words, or if several settings change."""
+    firsts = [next(iter(point.values()), None) for point in points.values()]
+    if len(moving_settings(points)) > 1 or not all(isinstance(first, int | float) for first in firsts):
+        return None
+    return {value: float(first) for value, first in zip(points, firsts, strict=True) if first is not None}
+
+
 def refused_axes(axes: Mapping[str, Mapping[str, Sequence[Any]]], config: EnvConfig) -> list[str]:
     """One line for each thing that the simulation would refuse of a sweep, hours later."""
     refused = []

@@ -27,7 +27,7 @@ from jobs.pilots import BOUNDS, PolicyPilot, make_pilot
 from jobs.progress import console, progress
 from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
 from jobs.runs import Run, finish, finished, latest_policies, locate_run, open_run, write_atomic
-from jobs.tracking import RESULTS_VIEW, Tracker, open_tracker
+from jobs.tracking import Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import pictures, reconstruct
 from models.policy import ENCODER, Policy, load_policy
@@ -204,8 +204,6 @@ def publish(folder: Run, tracker: Tracker, rows: Sequence[Summary], tracks: Sequ
     write_atomic(folder.evaluation / "table.md", text)
     tracker.text("eval/table.md", text)
     tracker.table("eval/results", columns(LABELS, rows))
-    tracker.describe(f"Held-out corridors, 95 % intervals in brackets.\n\n{text}")
-    tracker.save_view(RESULTS_VIEW, "Results", [f"metrics.`{name}`" for name in VIEW_COLUMNS])
     figure = trajectory_figure(tracks)
     figure.savefig(folder.evaluation / "trajectories.png", dpi=120)
     tracker.figure("eval/trajectories.png", figure)

@@ -1,5 +1,6 @@
 """What the trainings of a group achieved under each condition of a sweep, as rows, tables and metrics."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -209,6 +210,29 @@ def metrics(row: Row) -> dict[str, float]:
         return {**figures, "sweep/value": float(row.condition[1])}  # the x axis of a chart over runs
     except ValueError:  # the value is a word
         return figures
+
+
+def axis_curves(axis: str, numbers: Mapping[str, float], rows: Sequence[Row]) -> dict[str, dict[int, float]]:
+    """Success and distance of one group along an axis, as curves of a tracker, whose steps are integers.
+
+    Args:
+        axis: Its name.
+        numbers: Value as text -> number, as `jobs.axes.axis_numbers` gives them.
+        rows: Of this axis and one group.
+
+    Returns:
+        Metric -> step -> value. The step is the axis value, in per cent or per mille where it must
+        be to be whole, which the metric's name then says; no curve if even these are not.
+    """
+    for scale, unit in ((1, ""), (100, "_percent"), (1000, "_permille")):
+        steps = {value: round(scale * number) for value, number in numbers.items()}
+        if all(math.isclose(steps[value], scale * numbers[value]) for value in numbers):
+            points = {steps[row.condition[1]]: row for row in rows}
+            return {
+                f"sweep/success_by_{axis}{unit}": {x: row.success.value for x, row in points.items()},
+                f"sweep/distance_m_by_{axis}{unit}": {x: row.distance_m.value for x, row in points.items()},
+            }
+    return {}
 
 
 def _named(name: str, estimate: Estimate | None) -> dict[str, float]:

@@ -2,7 +2,8 @@
 
 Run: python -m platform.launch +exp=bytestream
 Expect: about 20 minutes on two cores with budget=short; a table of success rates and
-distances with intervals, and the command that opens the dashboard. A policy without an event
+distances with intervals, the name of the policy in MLflow's model registry, and the command that
+opens the dashboard. A policy without an event
 VAE, such as +exp=event_columns, begins with its training. A stopped run continues where it
 was when the same command is given again.
 """
@@ -13,6 +14,7 @@ from jobs.config import Config
 from jobs.evaluate import evaluate
 from jobs.pretrain import check_sources, prepare_encoder
 from jobs.progress import console
+from jobs.registry import register_training
 from jobs.runs import open_run
 from jobs.tracking import open_tracker
 from jobs.train import train
@@ -27,5 +29,6 @@ def run(config: Config) -> dict[str, Any]:
     with open_tracker(config, folder) as tracker:
         train(config, folder, prepare_encoder(config, folder, tracker), tracker.log)
         figures = evaluate(config, folder, tracker)
+        console.print(f"Registered: {register_training(tracker, folder.path)}")
         console.print(tracker.dashboard())
     return figures

@@ -25,6 +25,7 @@ UNNAMED = (
     "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe",
 )  # fmt: skip
 REPOSITORY = Path(__file__).resolve().parent.parent
+COMPARED_STEPS = 500_000  # the paper's; of every training that is compared with others
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,11 @@ def run_name(config: Config) -> str:
     """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained."""
     settings = {name: value for name, value in as_dict(config).items() if name not in UNNAMED}
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
+
+
+def group_name(exp: str, env_steps: int) -> str:
+    """What a training is one of: its experiment, with its length if that is not the compared one."""
+    return exp + ("" if env_steps == COMPARED_STEPS else f"_{env_steps // 1000}k")
 
 
 def finished(run: Run, stage: str) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@ Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest tr
 experiment, length and seed in `runs_dir` with the configured budget, a few hundred kilobytes each
 (weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`. A group is an
 experiment; trainings of another length than the one that all are compared at have its thousands
-of steps behind their name: bytestream_1500k.
+of steps behind their name: bytestream_1500k. Each becomes a version in MLflow's model registry.
 """
 
 import csv
@@ -24,14 +24,14 @@ from jobs.conditions import PRETRAINED
 from jobs.config import Config, ConfigError
 from jobs.figures import Curve, learning_figure
 from jobs.progress import console
-from jobs.runs import REPOSITORY, open_run, write_atomic
+from jobs.registry import register_training
+from jobs.runs import REPOSITORY, group_name, open_run, write_atomic
 from jobs.tracking import open_tracker
 from models.policy import load_policy, save_lean_policy
 
 FIGURE = REPOSITORY / "docs" / "images" / "learning.png"
 COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
 POINTS = 50  # of a curve
-COMPARED_STEPS = 500_000  # the paper's; of every training that is compared with others
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,7 @@ class Training:
     @property
     def group(self) -> str:
         """What it is one training of."""
-        steps = self.config["train"]["env_steps"]
-        return self.config["exp"] + ("" if steps == COMPARED_STEPS else f"_{steps // 1000}k")
+        return group_name(self.config["exp"], self.config["train"]["env_steps"])
 
     @property
     def seed(self) -> int:
@@ -76,6 +75,8 @@ def run(config: Config) -> dict[str, Any]:
     with open_tracker(folder.config, folder) as tracker:
         tracker.figure("train/learning.png", figure)
         tracker.text("train/curves.csv", as_csv(curves))
+        for training in trainings:
+            register_training(tracker.of(training.path), training.path)
     counts: dict[str, int] = defaultdict(int)
     for training in trainings:
         counts[training.group] += 1

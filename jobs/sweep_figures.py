@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jobs.axes import axis_numbers, moving_settings
 from jobs.figures import GRID, INK, MUTED
 from jobs.groups import Row
 from jobs.statistics import Interval
@@ -56,8 +57,7 @@ def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Seq
     """
     first = next(iter(next(iter(points.values()))))
     label, scale = SCALES.get(first, (first, "linear"))
-    moving = [key for key in next(iter(points.values())) if len({str(p[key]) for p in points.values()}) > 1]
-    words = any(isinstance(point[first], str) for point in points.values()) or len(moving) > 1
+    moving, words = moving_settings(points), axis_numbers(points) is None
     groups = list(dict.fromkeys(row.group for row in rows))
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     panels = figure.subplots(1, 2)

@@ -15,11 +15,25 @@ from rich.markup import escape
 from rich.table import Table
 
 from envs.scene import make_scene
+from jobs.axes import axis_numbers
 from jobs.conditions import NOMINAL, Cell, Sweep
 from jobs.config import Config
+from jobs.dashboard import chart_view, table_view
 from jobs.evaluate import VIEW_COLUMNS, film
 from jobs.flights import EPISODE, check_sensor, write_episodes
-from jobs.groups import LABELS, Condition, Row, columns, details, matrix, metrics, name_of, summarise_group
+from jobs.groups import (
+    LABELS,
+    Condition,
+    Row,
+    axis_curves,
+    columns,
+    details,
+    matrix,
+    metrics,
+    name_of,
+    success_text,
+    summarise_group,
+)
 from jobs.progress import console
 from jobs.report import markdown_table, show
 from jobs.runs import Run, git_commit, write_atomic, write_json
@@ -27,6 +41,11 @@ from jobs.sweep_figures import axis_figure, collision_figure
 from jobs.tracking import Child, Tracker, write_children
 
 FILMED = 3
+CHILD_PARAMS = ("axis", "value", "group")
+CURVES_NOTE = (
+    "One group along every axis of numbers: the step of a metric is the axis value. See the parent run."
+)
+FIGURE_NAMES = {"success": "Success", "distance_m": "Distance [m]"}
 TITLE = "Success [%] with 95 % intervals; rows: what is changed, columns: who flies"
 ELSEWHERE = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say where, not what
 Episodes = Mapping[str, np.ndarray]
@@ -217,15 +236,6 @@ def write_tables(
         file.path for file in tracker.client.list_artifacts(tracker.run_id, "sweep")
     }:
         tracker.table("sweep/results", columns(rows))  # MLflow appends to a table that is there
-    columns_shown = [
-        *(f"metrics.`{name}`" for name in VIEW_COLUMNS),
-        "params.`axis`",
-        "params.`value`",
-        "params.`group`",
-    ]
-    search = f"tags.`mlflow.parentRunId` = '{tracker.run_id}'"
-    view = tracker.save_view("sweep", "Sweep", columns_shown, search)
-    tracker.describe(f"[Conditions as a table]({view})\n\n{text}")
 
 
 def track_rows(
@@ -251,7 +261,8 @@ def track_rows(
         )
         seeds = ", ".join("-" if seed is None else str(seed) for seed in row.trainings)
         params = {"axis": axis, "value": value, "group": row.group, "seeds": seeds, "flights": row.flights}
-        tags = {"differs_from_training": json.dumps(differ)}
+        note = f"Success [%] of {row.group} with {axis} = {value}: {success_text(row)}. See the parent run."
+        tags = {"differs_from_training": json.dumps(differ), "mlflow.note.content": note}
         reasons = [failed[cell.key] for cell in cells if cell.key in failed]
         tags |= {"not_flown": "; ".join(reasons)} if reasons else {}
         simulated = accuracy(place, cells[0]) | encoder_means(
@@ -266,9 +277,55 @@ def track_rows(
             )
         )
     write_children(tracker, "condition", children)
+    along = {row.group: group_curves(sweep, row.group, rows) for row in rows}
+    write_children(
+        tracker,
+        "group",
+        [
+            Child(group, {"group": group}, {"mlflow.note.content": CURVES_NOTE}, {}, curves)
+            for group, curves in along.items()
+        ],
+    )
+    save_views(tracker, list(dict.fromkeys(name for curves in along.values() for name in curves)))
+    errors = [found["sim/event_error"] for cell in sweep.cells if (found := accuracy(place, cell))]
+    worst = {"sim/event_error": errors[0], "sim/event_error_max": max(errors)} if errors else {}
     flights = sum(row.flights for row in rows)
     tracker.log_once(0, {"sweep/conditions": len(sweep.conditions), "sweep/groups": len(sweep.groups),
-                         "sweep/flights": flights, "sweep/failed_cells": len(failed)})  # fmt: skip
+                         "sweep/flights": flights, "sweep/failed_cells": len(failed), **worst})  # fmt: skip
+
+
+def group_curves(sweep: Sweep, group: str, rows: Sequence[Row]) -> dict[str, dict[int, float]]:
+    """Success and distance of a group along every axis of numbers: metric -> axis value -> figure."""
+    curves: dict[str, dict[int, float]] = {}
+    for axis, points in sweep.axes.items():
+        numbers = axis_numbers(points)
+        own = [row for row in rows if row.group == group and row.condition[0] == axis]
+        if numbers and own:
+            curves |= axis_curves(axis, numbers, own)
+    return curves
+
+
+def save_views(tracker: Tracker, curves: Sequence[str]) -> None:
+    """Store what shows a sweep's children: charts over the axes, and a table of all conditions."""
+    below = f"tags.`mlflow.parentRunId` = '{tracker.run_id}' and tags.kind = "
+    columns_shown = [
+        *(f"metrics.`{name}`" for name in VIEW_COLUMNS),
+        *(f"params.`{name}`" for name in CHILD_PARAMS),
+    ]
+    name = f"Sweep {tracker.run_id[:6]}"
+    tracker.save_view(
+        f"table-{tracker.run_id}", f"{name}: conditions", table_view(f"{below}'condition'", columns_shown)
+    )
+    titles = {curve: title_of(curve) for curve in sorted(curves, key=lambda name: "success" not in name)}
+    tracker.save_view(f"charts-{tracker.run_id}", f"{name}: charts", chart_view(f"{below}'group'", titles))
+
+
+def title_of(curve: str) -> str:
+    """A curve's name in words: "Success over sparsity [%]"."""
+    figure, _, axis = curve.removeprefix("sweep/").partition("_by_")
+    for ending, unit in (("_percent", " [%]"), ("_permille", " [‰]")):
+        axis = axis.removesuffix(ending) + unit if axis.endswith(ending) else axis
+    return f"{FIGURE_NAMES[figure]} over {axis}"
 
 
 def accuracy_file(place: Path, simulation: str) -> Path:

@@ -5,15 +5,15 @@ writes, and it writes in batches: hundreds of single writes cost seconds, a batc
 hundredths of one.
 """
 
-import base64
 import contextlib
+import dataclasses
 import fcntl
 import json
 import logging
 import math
 import os
+import tempfile
 import time
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,19 @@ from urllib.parse import quote
 
 from envs.config import settings_hash
 from jobs.config import Config, as_dict
+from jobs.dashboard import (
+    PREVIEWS,
+    VIEW_TAG,
+    Page,
+    experiment_note,
+    packed_view,
+    preview,
+    run_address,
+    run_note,
+    stored_views,
+    usual_views,
+    view_address,
+)
 from jobs.refusals import redacted
 from jobs.runs import Run, provenance, write_json
 from jobs.store import check_metrics, dashboard_command, flatten, page, store_uri
@@ -32,9 +45,8 @@ if TYPE_CHECKING:
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
 MOST_CHILDREN = 10_000  # of one run
-WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
-VIEW_TAG = "mlflow.sharedViewState"  # MLflow's own name for stored views
-RESULTS_VIEW = "results"
+NOTE = "mlflow.note.content"  # MLflow's own name for the text on a page
+KNOWN_RUNS = "tracking.json"  # in a run folder
 
 
 @dataclass(frozen=True)
@@ -91,10 +103,6 @@ class Tracker:
 
         self.client.log_batch(self.run_id, tags=[RunTag(key, str(value)) for key, value in values.items()])
 
-    def describe(self, markdown: str) -> None:
-        """Write the text that stands at the top of the run's page."""
-        self.tags({"mlflow.note.content": markdown})
-
     def figure(self, name: str, figure: "Figure") -> None:
         """Write a figure as a picture file called `name`."""
         self.client.log_figure(self.run_id, figure, name, save_kwargs={"dpi": 120})
@@ -111,39 +119,64 @@ class Tracker:
         """Write a file, as it is, into a folder of the run's artifacts."""
         self.client.log_artifact(self.run_id, str(path), folder)
 
-    def link(self) -> str:
-        """Address of the run's page."""
-        return f"{page(self.uri)}/#/experiments/{self.experiment_id}/runs/{self.run_id}?{WORKFLOW}"
+    def of(self, path: Path) -> "Tracker":
+        """The MLflow run of another run folder in the same store; this one, if that has none."""
+        run_id = _known_runs(path).get(_slot(self, "run"), self.run_id)
+        return dataclasses.replace(self, run_id=run_id)
 
-    def save_view(self, key: str, name: str, columns: Sequence[str], search: str = "") -> str:
-        """Store a view of the experiment's runs under "Views", and return its address.
+    def save_view(self, key: str, name: str, state: Mapping[str, Any]) -> None:
+        """Store a view of the experiment's runs under "Views", unless it is there unchanged.
 
         Args:
             key: Identity of the view; the same key replaces it.
             name: What the menu calls it.
-            columns: Shown columns, such as "metrics.`eval/success_rate`"; the first orders the rows.
-            search: Filter, such as "tags.kind = 'condition'".
+            state: As `jobs.dashboard.table_view` or `chart_view` makes it.
         """
-        order = {"orderByKey": columns[0], "orderByAsc": False}
-        state = {"searchFilter": search, **order, "selectedColumns": list(columns)}
-        now_ms = int(time.time() * 1000)
-        packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
-        view = {"name": name, "createdAt": now_ms, "updatedAt": now_ms, "state": packed}
-        self.client.set_experiment_tag(self.experiment_id, f"{VIEW_TAG}.{key}", json.dumps(view))
-        return experiment_page(self, key)
+        tag, view = f"{VIEW_TAG}.{key}", packed_view(name, state, int(time.time() * 1000))
+        old = json.loads(self.client.get_experiment(self.experiment_id).tags.get(tag, "{}"))
+        if old.get("state") != json.loads(view)["state"]:
+            self.client.set_experiment_tag(self.experiment_id, tag, view)
+
+    def describe_experiment(self) -> None:
+        """Store the usual views, and write the text above the table of runs, unless it is there."""
+        for key, name, state in usual_views():
+            self.save_view(key, name, state)
+        tags = self.client.get_experiment(self.experiment_id).tags
+        note = experiment_note(self.experiment_id, tags)
+        if tags.get(NOTE) != note:
+            self.client.set_experiment_tag(self.experiment_id, NOTE, note)
+
+    def write_page(self) -> None:
+        """Write the text at the top of the run's page anew, with small copies of all its pictures."""
+        files = [path for path in self.files() if not path.startswith(f"{PREVIEWS}/")]
+        with tempfile.TemporaryDirectory() as place:
+            pictures = [path for path in files if path.endswith(".png")]
+            for path in pictures:
+                small = preview(Path(self.client.download_artifacts(self.run_id, path, place)).read_bytes())
+                self.client.log_image(self.run_id, small, artifact_file=f"{PREVIEWS}/{path}")
+            tables = {
+                path: Path(self.client.download_artifacts(self.run_id, path, place)).read_text()
+                for path in files
+                if path.endswith(".md")
+            }
+        run, views = self.client.get_run(self.run_id), self.client.get_experiment(self.experiment_id).tags
+        own = {key: name for key, name in stored_views(views).items() if key.endswith(self.run_id)}
+        small_ones = [f"{PREVIEWS}/{path}" for path in pictures]
+        facts = run.data.params, run.data.tags, run.data.metrics
+        shown = Page(self.experiment_id, self.run_id, *facts, [*files, *small_ones], tables, own)
+        self.tags({NOTE: run_note(shown)})
+
+    def files(self, folder: str | None = None) -> list[str]:
+        """Paths of all artifacts of the run."""
+        found = self.client.list_artifacts(self.run_id, folder)
+        return [path for file in found for path in (self.files(file.path) if file.is_dir else [file.path])]
 
     def dashboard(self) -> str:
         """The command that opens the dashboard, and the addresses to open in it."""
         lines = [] if self.uri.startswith("http") else [f"Dashboard: {dashboard_command(self.uri)}"]
-        stored = self.client.get_experiment(self.experiment_id).tags
-        view = RESULTS_VIEW if f"{VIEW_TAG}.{RESULTS_VIEW}" in stored else None
-        return "\n".join([*lines, f"This run:  {self.link()}", f"All runs:  {experiment_page(self, view)}"])
-
-
-def experiment_page(tracker: Tracker, view: str | None = None) -> str:
-    """Address of the table of runs, in a stored view (without one, it shows no figures)."""
-    shown = "" if view is None else f"&viewStateShareKey={quote(view)}"
-    return f"{page(tracker.uri)}/#/experiments/{tracker.experiment_id}/runs?{WORKFLOW}{shown}"
+        own = run_address(self.experiment_id, self.run_id), view_address(self.experiment_id, "results")
+        this, every = (f"{page(self.uri)}/{address}" for address in own)
+        return "\n".join([*lines, f"This run:  {this}", f"All runs:  {every}"])
 
 
 @contextlib.contextmanager
@@ -168,7 +201,11 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
         tracker.params(as_dict(folder.config))
         tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
         tracker.artifact(folder.path / "config.yaml")
+        tracker.describe_experiment()
+        tracker.write_page()
         yield tracker
+        tracker.describe_experiment()
+        tracker.write_page()
 
 
 @contextlib.contextmanager
@@ -187,6 +224,7 @@ class Child(NamedTuple):
     params: Mapping[str, Any]
     tags: Mapping[str, str]
     metrics: Mapping[str, float]
+    curves: Mapping[str, Mapping[int, float]] = {}  # metric -> its value at each step
 
 
 def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> None:
@@ -201,9 +239,7 @@ def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> Non
     found = client.search_runs([parent.experiment_id], search, max_results=MOST_CHILDREN)
     known = {run.info.run_name: run for run in found}
     for child in children:
-        content = settings_hash(
-            {"params": flatten(child.params), "tags": child.tags, "metrics": child.metrics}
-        )
+        content = settings_hash(child._asdict() | {"params": flatten(child.params)})
         old = known.get(child.name)
         if old is not None and old.data.tags.get("content") == content:
             continue
@@ -214,11 +250,18 @@ def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> Non
         now_ms = int(time.time() * 1000)
         client.log_batch(
             run_id,
-            metrics=[Metric(name, value, now_ms, 0) for name, value in check_metrics(child.metrics).items()],
+            metrics=[Metric(name, value, now_ms, step) for name, step, value in _points(child)],
             params=[Param(key, value) for key, value in flatten(child.params).items()],
             tags=[RunTag(key, value) for key, value in {**child.tags, "content": content}.items()],
         )
         client.set_terminated(run_id)
+
+
+def _points(child: Child) -> list[tuple[str, int, float]]:
+    """Name, step and value of everything that a child measured; what is no curve is at step 0."""
+    curves = {name: {0: value} for name, value in child.metrics.items()} | dict(child.curves)
+    check_metrics({name: sum(points.values()) for name, points in curves.items()})
+    return [(name, step, value) for name, points in curves.items() for step, value in points.items()]
 
 
 @contextlib.contextmanager
@@ -239,9 +282,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
     """The MLflow run that the folder remembers under `key`, or a new one that it will remember."""
     from mlflow.exceptions import MlflowException
 
-    file = folder.path / "tracking.json"
-    known = json.loads(file.read_text()) if file.is_file() else {}
-    slot = f"{near.uri} {near.experiment_id} {key}"
+    known, slot = _known_runs(folder.path), _slot(near, key)
     run_id = known.get(slot)
     if run_id is not None:
         with contextlib.suppress(MlflowException):  # the run was deleted: begin a new one
@@ -249,8 +290,19 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
             near.client.log_batch(run_id, tags=[])
             return Tracker(near.client, near.uri, near.experiment_id, run_id)
     run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
-    write_json(file, {**known, slot: run.info.run_id})
+    write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})
     return Tracker(near.client, near.uri, near.experiment_id, run.info.run_id)
+
+
+def _known_runs(path: Path) -> dict[str, str]:
+    """The MLflow runs that a run folder remembers: id by slot."""
+    file = path / KNOWN_RUNS
+    return json.loads(file.read_text()) if file.is_file() else {}
+
+
+def _slot(near: Tracker, key: str) -> str:
+    """The name of one MLflow run of a folder: it has others in other stores."""
+    return f"{near.uri} {near.experiment_id} {key}"
 
 
 def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:

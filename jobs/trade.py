@@ -208,7 +208,6 @@ def publish(folder: Run, tracker: Tracker, rows: Sequence[Row], facts: Mapping[s
     text = page(facts, rows)
     write_atomic(place / "trade.md", text)
     tracker.text("trade/trade.md", text)
-    tracker.describe(text)
     children = [
         Child(row.name, {"knob": row.knob, "setting": row.setting}, {"verdict": verdict(row)}, metrics(row))
         for row in rows

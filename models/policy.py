@@ -102,11 +102,16 @@ class Policy:
         """
         return self._choose(self.logits(observations, restarted))
 
-    def act(self, events: np.ndarray, start_us: int, window_us: int) -> int:
-        """Choose the action of one flight from the events of its control step.
+    def act(self, events: Any, start_us: int, window_us: int) -> int:
+        """Choose the action of one flight from the events of its control step; see `event_logits`."""
+        return int(self._choose(self.event_logits(events, start_us, window_us)[None])[0])
+
+    def event_logits(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
+        """Unnormalised log-probabilities float32 (actions,) of one flight's next step, from its events.
 
         Args:
-            events: EVENT array of the step in time order, t in (start_us, start_us + window_us].
+            events: Integer arrays t, x, y, p by name, such as an EVENT array: the events of the
+                step in time order, t in (start_us, start_us + window_us].
             start_us: Start of the step on the clock of the events [us].
             window_us: Length of the step [us].
 
@@ -117,7 +122,7 @@ class Policy:
             rule = f"a policy that sees {self.observation}: call it with observations"
             raise ValueError(f"events say nothing to {rule}")
         feature = self._feature.from_events((events, start_us, window_us), self.manifest, self.encoder)
-        return int(self._choose(self._logits(feature[None], None))[0])
+        return self._logits(feature[None], None)[0]
 
     def logits(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
         """Unnormalised log-probabilities float32 (B, actions); arguments as in a call."""

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from mlflow import MlflowClient
 
 from jobs import ship as shipping
 from jobs.config import ConfigError, as_dict
@@ -101,3 +102,7 @@ def test_the_job_writes_policies_curves_and_their_figure(tmp_path, monkeypatch):
     names = sorted(path.name for path in (tmp_path / "pretrained").iterdir())
     assert names == ["bytestream-s0", "bytestream-s1", "curves.csv", "event_set-s0"]
     assert (tmp_path / "learning.png").stat().st_size > 10_000
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    versions = client.search_model_versions("name = 'evade-bytestream'")
+    assert sorted(version.tags["seed"] for version in versions) == ["0", "1"]
+    assert {version.tags["commit"] for version in versions} == {"abc"}

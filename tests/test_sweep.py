@@ -160,13 +160,16 @@ def test_who_flies_and_whose_sensor_differs_is_said(tmp_path, capsys):
     ]
 
 
-def tracked_sweeps(config, kind="sweep"):
-    """Client, and the children by name of each sweep's parent run, or of each run of another kind."""
+def tracked_sweeps(config, kind="condition", parent="sweep"):
+    """Client, and the children of a kind by name of each sweep's parent run, or of each of another kind."""
     client, experiment = open_store(config.tracking.uri, config.tracking.experiment)
-    parents = client.search_runs([experiment], f"tags.kind = '{kind}'")
+    parents = client.search_runs([experiment], f"tags.kind = '{parent}'")
     below = "tags.`mlflow.parentRunId` = '{}'"
     children = {
-        run.info.run_id: client.search_runs([experiment], below.format(run.info.run_id)) for run in parents
+        run.info.run_id: client.search_runs(
+            [experiment], f"{below.format(run.info.run_id)} and tags.kind = '{kind}'"
+        )
+        for run in parents
     }
     return client, {parent: {run.info.run_name: run for run in runs} for parent, runs in children.items()}
 
@@ -210,6 +213,14 @@ def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_reru
     assert child.data.metrics["sim/event_error"] == 0.01
     assert child.data.metrics["sweep/success_difference"] == 0.0
     assert [point.value for point in client.get_metric_history(parent, "sweep/conditions")] == [5.0]
+    assert client.get_run(parent).data.metrics["sim/event_error_max"] == 0.01
+    (groups,) = tracked_sweeps(config, "group")[1].values()
+    assert set(groups) == {"straight", "oracle"}
+    curve = client.get_metric_history(groups["oracle"].info.run_id, "sweep/distance_m_by_sparsity_percent")
+    assert [(point.step, point.value) for point in curve] == [(0, 50.0), (50, 50.0)]
+    note = client.get_run(parent).data.tags["mlflow.note.content"]
+    order = ("charts-", "page/sweep/sparsity.png", "| rate | 100 |")
+    assert sorted(map(note.index, order)) == list(map(note.index, order))
     table = client.download_artifacts(parent, "sweep/results.json", str(tmp_path))
     assert len(json.loads(Path(table).read_text())["data"]) == len(figures)
 

@@ -4,8 +4,11 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
 from jobs.config import ConfigError
+from jobs.dashboard import PAGE_WIDTH, chart_view
 from jobs.runs import Run, open_run
 from jobs.store import check_metrics, flatten, store_uri
 from jobs.tracking import Child, open_child, open_store, open_tracker, write_children
@@ -24,7 +27,6 @@ def test_what_is_logged_can_be_read_back(folder, tmp_path):
         tracker.text("eval/table.md", "| a |")
         tracker.table("eval/results", {"pilot": ["policy", "oracle"], "success_rate": [0.2, 1.0]})
         tracker.artifact(tmp_path / "note.txt", "eval")
-        tracker.describe("**what** it is")
     run = tracker.client.get_run(tracker.run_id)
     assert run.info.status == "FINISHED"
     assert run.info.run_name == folder.path.name
@@ -34,7 +36,7 @@ def test_what_is_logged_can_be_read_back(folder, tmp_path):
     ] == [(3, 0.25)]
     assert run.data.params["camera.contrast_threshold"] == "0.2"
     assert run.data.tags["run_folder"] == str(folder.path)
-    assert run.data.tags["mlflow.note.content"] == "**what** it is"
+    assert run.data.tags["mlflow.note.content"].endswith("| a |")
     assert "eval/distance_m" in run.data.tags["not_measured"]
     assert {file.path for file in tracker.client.list_artifacts(tracker.run_id, "eval")} == {
         "eval/table.md", "eval/results.json", "eval/note.txt"
@@ -69,13 +71,35 @@ def test_children_name_their_parent_and_are_continued(folder):
     assert found[0].info.status == "FINISHED"
 
 
-def test_a_saved_view_stands_in_the_experiments_tags(folder):
+def test_a_saved_view_stands_in_the_experiments_tags_and_its_text_leads_there(folder):
     with open_tracker(folder.config, folder) as tracker:
-        address = tracker.save_view("results", "Results", ["metrics.`eval/success_rate`"])
-    experiment = tracker.client.get_experiment(tracker.experiment_id)
-    assert '"name": "Results"' in experiment.tags["mlflow.sharedViewState.results"]
-    assert "workflowType=machine_learning" in address
-    assert address.endswith("viewStateShareKey=results")
+        tracker.save_view("charts-x", "Sweep x: charts", chart_view("", {"sweep/success_by_rate": "Success"}))
+        before = tracker.client.get_experiment(tracker.experiment_id).tags
+        tracker.save_view("charts-x", "Sweep x: charts", chart_view("", {"sweep/success_by_rate": "Success"}))
+        assert tracker.client.get_experiment(tracker.experiment_id).tags == before
+    tags = tracker.client.get_experiment(tracker.experiment_id).tags
+    assert '"name": "Results"' in tags["mlflow.sharedViewState.results"]
+    first = tags["mlflow.note.content"].splitlines()[0]
+    for key in ("results", "sweeps", "charts-learning", "charts-x"):
+        assert f"viewStateShareKey={key}" in first
+    assert tracker.dashboard().endswith("runs?workflowType=machine_learning&viewStateShareKey=results")
+
+
+def test_the_page_of_a_run_shows_small_copies_of_its_pictures_and_its_tables(folder):
+    figure = Figure(figsize=(20, 4))
+    with open_tracker(folder.config, folder, key="page") as tracker:
+        tracker.figure("eval/trajectories.png", figure)
+        tracker.text("eval/table.md", "| success |")
+        started = tracker.client.get_run(tracker.run_id).data.tags["mlflow.note.content"]
+    note = tracker.client.get_run(tracker.run_id).data.tags["mlflow.note.content"]
+    assert "eval/" not in started
+    small = f"get-artifact?path=page/eval/trajectories.png&run_uuid={tracker.run_id}"
+    assert note.index(small) < note.index("| success |")
+    file = tracker.client.download_artifacts(tracker.run_id, "page/eval/trajectories.png")
+    assert Image.open(file).size[0] == PAGE_WIDTH
+    with open_tracker(folder.config, folder, key="page"):  # copies of copies are not made
+        pass
+    assert "page/page" not in " ".join(tracker.files())
 
 
 def test_the_store_lies_beside_the_runs_folder_whatever_the_working_folder(folder, tmp_path, monkeypatch):
@@ -129,7 +153,9 @@ def test_processes_that_start_together_make_one_store(tmp_path):
 
 def test_children_are_written_once_and_replaced_where_their_content_has_changed(folder):
     def child(name, success):
-        return Child(name, {"axis": "rate", "env": {"hz": 45}}, {"note": "x"}, {"eval/success_rate": success})
+        curves = {"sweep/success_by_rate": {45: success, 100: 1.0}}
+        params = {"axis": "rate", "env": {"hz": 45}}
+        return Child(name, params, {"note": "x"}, {"eval/success_rate": success}, curves)
 
     with open_tracker(folder.config, folder, key="children") as parent:
         search = [parent.experiment_id], f"tags.`mlflow.parentRunId` = '{parent.run_id}'"
@@ -140,6 +166,8 @@ def test_children_are_written_once_and_replaced_where_their_content_has_changed(
     assert set(after) == {"a", "b"}
     assert after["a"].info.run_id == before["a"].info.run_id
     assert after["b"].info.run_id != before["b"].info.run_id
-    assert after["b"].data.metrics == {"eval/success_rate": 1.0}
+    assert after["b"].data.metrics == {"eval/success_rate": 1.0, "sweep/success_by_rate": 1.0}
+    curve = parent.client.get_metric_history(after["b"].info.run_id, "sweep/success_by_rate")
+    assert [(point.step, point.value) for point in curve] == [(45, 1.0), (100, 1.0)]
     assert after["b"].data.params == {"axis": "rate", "env.hz": "45"}
     assert after["b"].info.status == "FINISHED"

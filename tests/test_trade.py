@@ -127,7 +127,7 @@ def test_the_job_leaves_table_figure_and_page_and_a_second_run_flies_only_what_f
     stub.flown.clear()
     trade.run(config)
     assert stub.flown == []
-    _, runs = tracked_sweeps(config, "trade")
+    _, runs = tracked_sweeps(config, "setting", "trade")
     ((_, children),) = runs.items()
     assert len(children) == len(table)
     assert children["most exact"].data.metrics["sim/event_error"] == 0.0

@@ -1,0 +1,70 @@
+"""Draw the pages of docs/dashboard.md from a filled store.
+
+Run from the repository root: python -m docs.draw_dashboard [mlflow.db]
+Needs Chromium and a store with a sweep and a registered policy. Writes docs/images/dashboard_*.png of
+the newest of each, in `COLOURS` colours.
+"""
+
+import io
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from PIL import Image
+
+from jobs.dashboard import run_address, view_address
+from jobs.tracking import open_store
+from tests.browser import Browser, served
+
+IMAGES = Path(__file__).resolve().parent / "images"
+COLOURS = 48
+SETTLE_S = 5.0  # until charts are drawn
+FOLDED = ("sweep", "training")  # pages whose text MLflow folds
+
+
+def main() -> None:
+    """Open each page, unfold its text, and write what the window shows."""
+    store = Path(sys.argv[1] if len(sys.argv) > 1 else "mlflow.db").resolve()
+    uri = f"sqlite:///{store}"
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+        served(uri, Path(sys.executable).parent) as address,
+    ):
+        browser = Browser(Path(profile), 1500, 1100)
+        for name, (place, text) in pages(uri).items():
+            browser.open(f"{address}/{place}", text)
+            if name in FOLDED:
+                browser.click("Show more")
+            time.sleep(SETTLE_S)
+            picture = Image.open(io.BytesIO(browser.picture())).convert("RGB")
+            small = picture.quantize(COLOURS, dither=Image.Dither.NONE)
+            small.save(IMAGES / f"dashboard_{name}.png", optimize=True)
+        browser.close()
+
+
+def pages(uri: str) -> dict[str, tuple[str, str]]:
+    """Name -> address of each page, and a text that it shows once it is there."""
+    client, experiment = open_store(uri, "evade")
+    newest = {}
+    for kind, search in {
+        "sweep": "tags.kind = 'sweep'",
+        "training": "metrics.`eval/success_rate` >= 0 and tags.kind = 'run'",
+    }.items():
+        found = client.search_runs(
+            [experiment], search, order_by=["attributes.start_time DESC"], max_results=1
+        )
+        newest[kind] = found[0].info.run_id
+    version = max(client.search_model_versions(), key=lambda version: version.creation_timestamp)
+    model = f"#/models/{version.name}/versions/{version.version}?workflowType=machine_learning"
+    return {
+        "runs": (view_address(experiment, "results"), "matching run"),
+        "sweep": (run_address(experiment, newest["sweep"]), "Description"),
+        "charts": (view_address(experiment, f"charts-{newest['sweep']}"), "Success over"),
+        "training": (run_address(experiment, newest["training"]), "Description"),
+        "model": (model, "Schema"),
+    }
+
+
+if __name__ == "__main__":
+    main()
