@@ -5,7 +5,7 @@ it comes to the same places: whatever differs is the setting's doing.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from models.batch import cut_packed
 from models.evae import EventVAE
 from models.table import EncoderTable
 
+TURN = 50  # steps: a few hundredths of a second, in which a table is soon back in the cache
 Setting = tuple[EnvConfig, PolicyPilot]
 
 
@@ -38,6 +39,9 @@ class Replay(NamedTuple):
     windows: list[np.ndarray]
     events: np.ndarray
     step_us: float
+
+
+Flight = Generator[None, None, Replay]
 
 
 class Measured(NamedTuple):
@@ -71,7 +75,7 @@ def measure(
 ) -> list[Measured]:
     """Record one flight per seed under the first setting, and fly it again under each.
 
-    The settings take turns flight by flight, so that a busy machine hits all alike. A policy that
+    The settings take turns every `TURN` steps, so that a busy machine hits all alike. A policy that
     draws its actions draws with the same numbers under each.
 
     Args:
@@ -84,13 +88,12 @@ def measure(
     notes: list[list[_Note]] = [[] for _ in settings]
     for seed in seeds:
         actions = replay(*settings[0], seed).actions
-        reference = replay(*settings[-1], seed, actions)
+        flown = take_turns([steps(*setting, seed, actions) for setting in settings], advance)
+        reference = flown[-1]
         windows = [unpack_window(window) for window in reference.windows]
         exact.append(exact_latents(evae, [(events, 0, window_us) for events, window_us in windows])[0])
-        for own, setting in zip(notes, settings, strict=True):
-            flown = reference if setting is settings[-1] else replay(*setting, seed, actions)
-            own.append(_note(flown, reference, *setting))
-            advance(1)
+        for notes_of, own, setting in zip(notes, flown, settings, strict=True):
+            notes_of.append(_note(own, reference, *setting))
     return [_measured(own, np.concatenate(exact)) for own in notes]
 
 
@@ -112,12 +115,32 @@ def _measured(notes: Sequence[_Note], exact: np.ndarray) -> Measured:
     )
 
 
+def take_turns(flights: Sequence[Flight], advance: Callable[[int], None]) -> list[Replay]:
+    """Fly all to their ends, one turn of each after the other; `advance` is told 1 at each end."""
+    done: dict[int, Replay] = {}
+    while len(done) < len(flights):
+        for place, flight in enumerate(flights):
+            if place in done:
+                continue
+            try:
+                next(flight)
+            except StopIteration as end:
+                done[place] = end.value
+                advance(1)
+    return [done[place] for place in range(len(flights))]
+
+
 def replay(config: EnvConfig, pilot: PolicyPilot, seed: int, actions: np.ndarray | None = None) -> Replay:
-    """Fly the corridor of a seed.
+    """Fly a flight of `steps` in one go."""
+    return take_turns([steps(config, pilot, seed, actions)], lambda count: None)[0]
+
+
+def steps(config: EnvConfig, pilot: PolicyPilot, seed: int, actions: np.ndarray | None = None) -> Flight:
+    """Fly the corridor of a seed, in turns of `TURN` steps.
 
     Args:
         config: The simulation.
-        pilot: Chooses at every step.
+        pilot: Chooses at every step; it remembers one flight at a time.
         seed: Of the corridor.
         actions: Flown in place of those that the pilot chooses, int64 (T,); None: its own, until the
             flight ends.
@@ -138,6 +161,8 @@ def replay(config: EnvConfig, pilot: PolicyPilot, seed: int, actions: np.ndarray
             seconds += time.process_time() - start
             events.append(env.events)
             over = terminated or truncated
+            if len(chosen) % TURN == 0:
+                yield
     finally:
         env.close()
     return Replay(np.array(chosen), windows, np.concatenate(events), 1e6 * seconds / len(chosen))

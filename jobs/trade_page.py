@@ -44,8 +44,8 @@ class Row(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Knob and setting in one."""
-        return f"{self.knob}: {self.setting}" if self.setting else self.knob
+        """Knob and setting in one, such as "precision int8"; the knob is not said twice."""
+        return self.setting if self.knob in self.setting else f"{self.knob} {self.setting}".strip()
 
     @property
     def steps_per_s(self) -> float:

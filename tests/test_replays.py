@@ -6,9 +6,10 @@ import pytest
 from envs.accuracy import converged
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
+from jobs import replays
 from jobs.axes import env_with
 from jobs.pilots import make_pilot
-from jobs.replays import latent_error, latents_of, measure, replay
+from jobs.replays import latent_error, latents_of, measure, replay, steps, take_turns
 from models.policy import ENCODER
 from models.weights import load_encoder
 from tests.test_evaluate import save_untrained
@@ -47,6 +48,18 @@ def test_given_actions_are_flown_whatever_the_pilot_would_do(policy):
         env.step(int(action))
     assert not np.array_equal(flown.actions, turns)
     np.testing.assert_array_equal(flown.events["t"][-5:], env.events["t"][-5:])
+
+
+def test_flights_that_take_turns_are_flown_as_each_alone(policy, monkeypatch):
+    monkeypatch.setattr(replays, "TURN", 7)
+    turns = np.array([1, 2] * 10)
+    told = []
+    flown = take_turns([steps(SHORT, pilot_of(policy), seed, turns) for seed in (0, 1)], told.append)
+    assert told == [1, 1]
+    for seed, own in enumerate(flown):
+        alone = replay(SHORT, pilot_of(policy), seed, turns)
+        np.testing.assert_array_equal(own.actions, alone.actions)
+        np.testing.assert_array_equal(own.events, alone.events)
 
 
 def test_latents_are_those_of_the_table_that_flies(policy):
