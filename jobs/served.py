@@ -25,7 +25,10 @@ class ServedPolicy(PythonModel):
         """Read the policy that was registered."""
         self.loaded = load_policy(context.artifacts["policy"])
 
-    def predict(self, context: Any, model_input: Any, params: dict[str, Any] | None = None) -> pd.DataFrame:
+    # Annotated as a table alone: any other annotation makes MLflow warn, or change the input.
+    def predict(
+        self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None
+    ) -> pd.DataFrame:
         """The likeliest action of each control step of one flight, with the logits of all.
 
         Args:
