@@ -58,6 +58,7 @@ sweep-robustness: setup ## fly trained policies at other rates, thresholds, in o
 	$(LAUNCH) +exp=robustness $(ARGS)
 
 mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine only
+	@echo "Open http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=results"
 	$(MLFLOW_ENV) $(BIN)/mlflow server --workers 1 --host 127.0.0.1 --port 5000 \
 	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
 

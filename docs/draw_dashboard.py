@@ -18,9 +18,11 @@ from jobs.tracking import open_store
 from tests.browser import Browser, served
 
 IMAGES = Path(__file__).resolve().parent / "images"
-COLOURS = 48
-SETTLE_S = 5.0  # until charts are drawn
-FOLDED = ("sweep", "training")  # pages whose text MLflow folds
+COLOURS = 160
+SETTLE_S = 6.0
+DRAWN = "document.querySelectorAll('.js-plotly-plot .scatterlayer .trace').length > 3"
+# What MLflow folds and a click unfolds.
+FOLDED = {"sweep": ["Show more"], "training": ["Show more"], "model": ["Inputs (4)", "Outputs (5)"]}
 
 
 def main() -> None:
@@ -32,10 +34,12 @@ def main() -> None:
         served(uri, Path(sys.executable).parent) as address,
     ):
         browser = Browser(Path(profile), 1500, 1100)
-        for name, (place, text) in pages(uri).items():
-            browser.open(f"{address}/{place}", text)
-            if name in FOLDED:
-                browser.click("Show more")
+        for name, (place, shown) in pages(uri).items():
+            browser.open(f"{address}/{place}", shown)
+            for text in FOLDED.get(name, []):
+                browser.click(text)
+            if name == "charts":
+                browser.wait(DRAWN, "the charts")
             time.sleep(SETTLE_S)
             picture = Image.open(io.BytesIO(browser.picture())).convert("RGB")
             small = picture.quantize(COLOURS, dither=Image.Dither.NONE)
@@ -58,9 +62,9 @@ def pages(uri: str) -> dict[str, tuple[str, str]]:
     version = max(client.search_model_versions(), key=lambda version: version.creation_timestamp)
     model = f"#/models/{version.name}/versions/{version.version}?workflowType=machine_learning"
     return {
-        "runs": (view_address(experiment, "results"), "matching run"),
+        "runs": (view_address(experiment, "results"), "train/success_rate"),
         "sweep": (run_address(experiment, newest["sweep"]), "Description"),
-        "charts": (view_address(experiment, f"charts-{newest['sweep']}"), "Success over"),
+        "charts": (view_address(experiment, f"charts-{newest['sweep']}"), "_success"),
         "training": (run_address(experiment, newest["training"]), "Description"),
         "model": (model, "Schema"),
     }

@@ -16,7 +16,8 @@ from typing import Any
 from PIL import Image
 
 WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
-VIEW_TAG = "mlflow.sharedViewState"  # MLflow's own name for stored views
+# MLflow's own names: of the text on a page, of a run's colour in charts, of stored views.
+NOTE, COLOUR, VIEW_TAG = "mlflow.note.content", "mlflow.runColor", "mlflow.sharedViewState"
 MOST_CHARACTERS = 8000  # of a run's page; MLflow cuts what is longer, and does not say so
 PAGE_WIDTH = 860  # pixels of a picture beside MLflow's side panels on a screen of 1600
 PREVIEWS = "page"
@@ -39,9 +40,9 @@ FIGURES = {  # metric: what it is, how it is written
     "eval/distance_m": ("distance without collision", "{:.1f} m"),
     "train/success_rate": ("success in training", "{:.0%}"),
     "evae/explained_step": ("reconstruction explained by the latent", "{:.0%}"),
-    "sweep/conditions": ("conditions", "{:.0f}"),
-    "sweep/groups": ("groups of policies", "{:.0f}"),
-    "sweep/flights": ("flights", "{:.0f}"),
+    "sweep/conditions": ("", "{:.0f} conditions"),
+    "sweep/groups": ("", "{:.0f} groups of policies"),
+    "sweep/flights": ("", "{:.0f} flights"),
 }
 FIRST = ("eval/", "sweep/control_hz.", "sweep/contrast_threshold.", "sweep/sparsity.",
          "sweep/background_activity.", "sweep/", "train/")  # fmt: skip
@@ -54,10 +55,7 @@ COLUMNS = {  # view: name, filter, columns; the first column orders the runs
         "metrics.`sweep/conditions`", "metrics.`sweep/groups`", "metrics.`sweep/flights`", "tags.`groups`",
     )),
 }  # fmt: skip
-CURVES = {
-    "train/success_rate": "Success in training over environment steps",
-    "train/distance_m": "Distance without collision [m] in training over environment steps",
-}
+CURVES = ("train/success_rate", "train/distance_m")  # of trainings, over environment steps
 READING = """
 | job | what its runs hold |
 |---|---|
@@ -66,7 +64,7 @@ READING = """
 A row of **Results** is a run folder: its page begins with its figures and holds the resolved settings
 (Parameters), commit and host (Tags), and tables and films (Artifacts). Of a **sweep**, the page shows the
 figures with 95 % intervals; below it lie a run for each condition and group, named `axis=value group`, and a
-run for each group, whose metrics `sweep/success_by_...` are curves with the axis as their step. **Model
+run for each group, whose metrics `sweep/AXIS_success` are curves with the axis as their step. **Model
 registry**, on the left, has the trained policies: a model for each group, a version for each training.
 
 Success is the fraction of flights that reach the goal at 100 m, distance what is flown without a
@@ -95,24 +93,25 @@ def table_view(search: str, columns: Sequence[str]) -> dict[str, Any]:
         columns: Such as "metrics.`eval/success_rate`"; the first orders the rows.
     """
     order = {"orderByKey": columns[0], "orderByAsc": False}
-    widths = dict.fromkeys(columns, 190)
-    return {"searchFilter": search, **order, "selectedColumns": list(columns), "columnWidths": widths}
+    return {"searchFilter": search, **order, "selectedColumns": list(columns)}
 
 
-def chart_view(search: str, charts: Mapping[str, str]) -> dict[str, Any]:
-    """The state of a page of line charts: metric -> title; x is the metric's step."""
+def chart_view(search: str, metrics: Sequence[str]) -> dict[str, Any]:
+    """The state of a page of line charts, one for each metric; x is the metric's step."""
     section = {"uuid": "charts", "name": "Charts", "display": True, "isReordered": True}
     cards = [
         {
-            "uuid": metric, "type": "LINE", "metricKey": metric, "selectedMetricKeys": [metric],
-            "displayName": title, "metricSectionId": "charts", "runsCountToCompare": 30, "deleted": False,
-            "isGenerated": False, "xAxisKey": "step", "displayPoints": True, "range": {},
-            "lineSmoothness": 0, "scaleType": "linear", "xAxisScaleType": "linear",
+            "uuid": metric, "type": "LINE", "metricKey": metric, "metricSectionId": "charts",
+            "runsCountToCompare": 30, "deleted": False, "isGenerated": False, "xAxisKey": "step",
+            "displayPoints": True, "range": {}, "lineSmoothness": 0, "scaleType": "linear",
+            "xAxisScaleType": "linear",
         }
-        for metric, title in charts.items()
+        for metric in metrics
     ]  # fmt: skip
+    # In the order of time, MLflow would show the runs' parents, with the runs folded below.
+    order = {"orderByKey": f"metrics.`{metrics[0]}`" if metrics else "", "orderByAsc": False}
     return {
-        "searchFilter": search, "compareRunCharts": cards, "compareRunSections": [section],
+        "searchFilter": search, **order, "compareRunCharts": cards, "compareRunSections": [section],
         "isAccordionReordered": True, "runsHiddenMode": "SHOW_ALL", "hideEmptyCharts": True,
     }  # fmt: skip
 
@@ -148,8 +147,8 @@ def experiment_note(experiment_id: str, tags: Mapping[str, str]) -> str:
     newest = [key for key in views if key not in usual][:2]  # of the newest sweep
     links = " · ".join(f"[{views[key]}]({view_address(experiment_id, key)})" for key in (*usual, *newest))
     kinds = "\n".join(f"| `{job}` | {text} |" for job, text in KINDS.items())
-    title = "**Evade**: policies that fly through obstacles seeing only the events of an event camera."
-    return f"{title} Open: {links}\n{READING.format(kinds=kinds)}"
+    title = "**Evade**: policies that fly by the events of an event camera."
+    return f"{title} Open {links}\n{READING.format(kinds=kinds)}"
 
 
 @dataclass(frozen=True)
@@ -204,7 +203,8 @@ def _figure(page: Page, name: str) -> str:
     text, form = FIGURES[name]
     bounds = [page.metrics.get(f"{name}_{end}") for end in ("low", "high")]
     known = [form.format(bound) for bound in bounds if bound is not None]
-    return f"{text} {form.format(page.metrics[name])}" + (f" [{', '.join(known)}]" if len(known) == 2 else "")
+    value = f"{text} {form.format(page.metrics[name])}".strip()
+    return value + (f" [{', '.join(known)}]" if len(known) == 2 else "")
 
 
 def links(page: Page) -> str:

@@ -229,8 +229,8 @@ def axis_curves(axis: str, numbers: Mapping[str, float], rows: Sequence[Row]) ->
         if all(math.isclose(steps[value], scale * numbers[value]) for value in numbers):
             points = {steps[row.condition[1]]: row for row in rows}
             return {
-                f"sweep/success_by_{axis}{unit}": {x: row.success.value for x, row in points.items()},
-                f"sweep/distance_m_by_{axis}{unit}": {x: row.distance_m.value for x, row in points.items()},
+                f"sweep/{axis}{unit}_success": {x: row.success.value for x, row in points.items()},
+                f"sweep/{axis}{unit}_distance_m": {x: row.distance_m.value for x, row in points.items()},
             }
     return {}
 

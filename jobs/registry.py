@@ -35,6 +35,11 @@ the artifacts of the model, `artifacts/policy`, for `models.policy.load_policy`.
 """
 
 
+INTERFACE = (
+    "What one flight has seen, from its start: events t [us], x, y, p (-1 or +1), or pictures of luminance. "
+    "Out come, for its start and after each control step, the likeliest action (0 forward, 1 left, 2 right) "
+    "and the logits of all."
+)
 SHOWN = ("eval/success_rate", "eval/success_rate_low", "eval/success_rate_high", "eval/distance_m",
          "train/success_rate", "sim/event_error")  # fmt: skip
 
@@ -97,7 +102,7 @@ def _add_version(tracker: Tracker, policy: Path, name: str, manifest: Mapping[st
         shutil.copytree(
             REPOSITORY / "models", code, ignore=lambda _, names: {n for n in names if not n.endswith(".py")}
         )
-        with warnings.catch_warnings():  # it would infer from annotations what the signature says
+        with warnings.catch_warnings():  # it asks for an example, to check the signature by
             warnings.simplefilter("ignore", UserWarning)
             pyfunc.save_model(
                 files,
@@ -112,7 +117,12 @@ def _add_version(tracker: Tracker, policy: Path, name: str, manifest: Mapping[st
     client.finalize_logged_model(model.model_id, "READY")
     client.log_outputs(tracker.run_id, [LoggedModelOutput(model.model_id, step=0)])
     return client.create_model_version(
-        name, model.artifact_location, tracker.run_id, model_id=model.model_id, await_creation_for=None
+        name,
+        model.artifact_location,
+        tracker.run_id,
+        model_id=model.model_id,
+        description=INTERFACE,
+        await_creation_for=None,
     )
 
 

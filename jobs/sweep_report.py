@@ -18,7 +18,7 @@ from envs.scene import make_scene
 from jobs.axes import axis_numbers
 from jobs.conditions import NOMINAL, Cell, Sweep
 from jobs.config import Config
-from jobs.dashboard import chart_view, table_view
+from jobs.dashboard import COLOUR, NOTE, chart_view, table_view
 from jobs.evaluate import VIEW_COLUMNS, film
 from jobs.flights import EPISODE, check_sensor, write_episodes
 from jobs.groups import (
@@ -37,7 +37,7 @@ from jobs.groups import (
 from jobs.progress import console
 from jobs.report import markdown_table, show
 from jobs.runs import Run, git_commit, write_atomic, write_json
-from jobs.sweep_figures import axis_figure, collision_figure
+from jobs.sweep_figures import axis_figure, collision_figure, style_of
 from jobs.tracking import Child, Tracker, write_children
 
 FILMED = 3
@@ -45,7 +45,6 @@ CHILD_PARAMS = ("axis", "value", "group")
 CURVES_NOTE = (
     "One group along every axis of numbers: the step of a metric is the axis value. See the parent run."
 )
-FIGURE_NAMES = {"success": "Success", "distance_m": "Distance [m]"}
 TITLE = "Success [%] with 95 % intervals; rows: what is changed, columns: who flies"
 ELSEWHERE = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say where, not what
 Episodes = Mapping[str, np.ndarray]
@@ -262,7 +261,7 @@ def track_rows(
         seeds = ", ".join("-" if seed is None else str(seed) for seed in row.trainings)
         params = {"axis": axis, "value": value, "group": row.group, "seeds": seeds, "flights": row.flights}
         note = f"Success [%] of {row.group} with {axis} = {value}: {success_text(row)}. See the parent run."
-        tags = {"differs_from_training": json.dumps(differ), "mlflow.note.content": note}
+        tags = {"differs_from_training": json.dumps(differ), NOTE: note, COLOUR: style_of(row.group)[0]}
         reasons = [failed[cell.key] for cell in cells if cell.key in failed]
         tags |= {"not_flown": "; ".join(reasons)} if reasons else {}
         simulated = accuracy(place, cells[0]) | encoder_means(
@@ -282,7 +281,7 @@ def track_rows(
         tracker,
         "group",
         [
-            Child(group, {"group": group}, {"mlflow.note.content": CURVES_NOTE}, {}, curves)
+            Child(group, {"group": group}, {NOTE: CURVES_NOTE, COLOUR: style_of(group)[0]}, {}, curves)
             for group, curves in along.items()
         ],
     )
@@ -316,16 +315,8 @@ def save_views(tracker: Tracker, curves: Sequence[str]) -> None:
     tracker.save_view(
         f"table-{tracker.run_id}", f"{name}: conditions", table_view(f"{below}'condition'", columns_shown)
     )
-    titles = {curve: title_of(curve) for curve in sorted(curves, key=lambda name: "success" not in name)}
-    tracker.save_view(f"charts-{tracker.run_id}", f"{name}: charts", chart_view(f"{below}'group'", titles))
-
-
-def title_of(curve: str) -> str:
-    """A curve's name in words: "Success over sparsity [%]"."""
-    figure, _, axis = curve.removeprefix("sweep/").partition("_by_")
-    for ending, unit in (("_percent", " [%]"), ("_permille", " [‰]")):
-        axis = axis.removesuffix(ending) + unit if axis.endswith(ending) else axis
-    return f"{FIGURE_NAMES[figure]} over {axis}"
+    charts = sorted(curves, key=lambda curve: not curve.endswith("_success"))
+    tracker.save_view(f"charts-{tracker.run_id}", f"{name}: charts", chart_view(f"{below}'group'", charts))
 
 
 def accuracy_file(place: Path, simulation: str) -> Path:

@@ -23,6 +23,7 @@ from urllib.parse import quote
 from envs.config import settings_hash
 from jobs.config import Config, as_dict
 from jobs.dashboard import (
+    NOTE,
     PREVIEWS,
     VIEW_TAG,
     Page,
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
 MOST_CHILDREN = 10_000  # of one run
-NOTE = "mlflow.note.content"  # MLflow's own name for the text on a page
 KNOWN_RUNS = "tracking.json"  # in a run folder
 
 

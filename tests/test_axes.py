@@ -2,7 +2,7 @@ import pydantic
 import pytest
 
 from envs.config import EnvConfig
-from jobs.axes import KEYS, axis_points, env_with, refused_axes
+from jobs.axes import KEYS, axis_numbers, axis_points, env_with, moving_settings, refused_axes
 
 
 def refusals(axis):
@@ -77,3 +77,11 @@ def test_every_key_that_an_axis_may_hold_is_a_field_of_the_simulation():
         section, _, name = key.rpartition(".")
         owner = EnvConfig() if section in ("", "env") else getattr(EnvConfig(), section)
         assert hasattr(owner, name), key
+
+
+def test_an_axis_of_numbers_changes_one_setting_and_no_words():
+    slow, fast = {"env.control_hz": 45, "env.scene": "poles"}, {"env.control_hz": 200, "env.scene": "poles"}
+    assert axis_numbers({"45": slow, "200": fast}) == {"45": 45.0, "200": 200.0}
+    assert moving_settings({"45": slow, "200": fast}) == ["env.control_hz"]
+    assert axis_numbers({"45": slow, "200": {**fast, "env.scene": "dynamic"}}) is None
+    assert axis_numbers({"poles": {"env.scene": "poles"}, "dynamic": {"env.scene": "dynamic"}}) is None

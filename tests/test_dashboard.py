@@ -61,7 +61,7 @@ def test_the_experiments_first_line_leads_to_the_newest_sweep():
         "table-2": "T",
     }
     tags = {
-        f"mlflow.sharedViewState.{key}": packed_view(name, chart_view("", {}), now_ms)
+        f"mlflow.sharedViewState.{key}": packed_view(name, chart_view("", []), now_ms)
         for now_ms, (key, name) in enumerate(views.items())
     }
     first = experiment_note("1", tags).splitlines()[0]
@@ -166,9 +166,8 @@ def in_browser(test):
 def test_the_experiment_says_what_it_is_and_shows_results_by_run(pages):
     browser, at = pages
     browser.open(
-        at["runs"], "Evade: policies that fly through obstacles", "Results", "Learning curves", "Sweeps",
-        "bytestream-smoke-s0-", "eval/success_rate", "eval/distance_m", "train/success_rate",
-        "sim/event_error",
+        at["runs"], "Evade: policies that fly by the events", "Results", "Learning curves", "Sweeps",
+        "bytestream-smoke-s0-", "eval/success_rate", "eval/distance_m", "sim/event_error",
     )  # fmt: skip
 
 
@@ -197,14 +196,21 @@ def test_a_sweeps_page_shows_its_report_figures_first_and_its_children_by_condit
 @in_browser
 def test_charts_show_each_group_over_each_axis(pages):
     browser, at = pages
-    browser.open(at["charts"], "Success over control_hz", "Success over sparsity [%]", "2 matching runs")
+    browser.open(
+        at["charts"], "sweep/control_hz_success", "sweep/sparsity_percent_success", "2 matching runs"
+    )
     browser.shows("straight")
 
 
 @in_browser
 def test_the_registered_model_shows_its_signature(pages):
     browser, at = pages
-    browser.open(at["model"], "evade-bytestream_4k", "Version 1", "Schema", "Inputs", "Outputs")
+    browser.open(
+        at["model"], "evade-bytestream_4k", "Version 1", "events t [us], x, y, p", "eval/success_rate"
+    )
+    browser.click("Inputs (4)")
+    browser.click("Outputs (5)")
+    browser.shows("t (required)", "p (required)", "long", "action", "forward", "left", "right", "float")
 
 
 @in_browser

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jobs.flights import EPISODE
-from jobs.groups import columns, details, matrix, metrics, summarise_group
+from jobs.groups import axis_curves, columns, details, matrix, metrics, summarise_group
 from jobs.report import markdown_table
 from jobs.store import check_metrics
 
@@ -91,3 +91,26 @@ def test_the_first_column_of_a_tracked_table_is_unique():
     first, *others = columns(rows).values()
     assert len(set(first)) == 2
     assert {len(values) for values in others} == {2}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "steps", "unit"),
+    [
+        ([25.0, 800.0], [25, 800], ""),
+        ([0.05, 0.4], [5, 40], "_percent"),
+        ([0.0, 0.125], [0, 125], "_permille"),
+    ],
+)
+def test_a_curve_has_the_axis_as_whole_steps_and_says_their_unit(numbers, steps, unit):
+    values = {str(number): number for number in numbers}
+    rows = [
+        summarise_group(("a", value), "g", {0: flights(won)})
+        for won, value in zip((5, 20), values, strict=True)
+    ]
+    curves = axis_curves("a", values, rows)
+    assert set(curves) == {f"sweep/a{unit}_success", f"sweep/a{unit}_distance_m"}
+    assert curves[f"sweep/a{unit}_success"] == dict(zip(steps, [0.25, 1.0], strict=True))
+
+
+def test_an_axis_too_fine_for_whole_steps_has_no_curve():
+    assert axis_curves("a", {"1e-05": 1e-5}, []) == {}

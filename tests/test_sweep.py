@@ -216,7 +216,7 @@ def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_reru
     assert client.get_run(parent).data.metrics["sim/event_error_max"] == 0.01
     (groups,) = tracked_sweeps(config, "group")[1].values()
     assert set(groups) == {"straight", "oracle"}
-    curve = client.get_metric_history(groups["oracle"].info.run_id, "sweep/distance_m_by_sparsity_percent")
+    curve = client.get_metric_history(groups["oracle"].info.run_id, "sweep/sparsity_percent_distance_m")
     assert [(point.step, point.value) for point in curve] == [(0, 50.0), (50, 50.0)]
     note = client.get_run(parent).data.tags["mlflow.note.content"]
     order = ("charts-", "page/sweep/sparsity.png", "| rate | 100 |")

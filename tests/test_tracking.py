@@ -73,9 +73,9 @@ def test_children_name_their_parent_and_are_continued(folder):
 
 def test_a_saved_view_stands_in_the_experiments_tags_and_its_text_leads_there(folder):
     with open_tracker(folder.config, folder) as tracker:
-        tracker.save_view("charts-x", "Sweep x: charts", chart_view("", {"sweep/success_by_rate": "Success"}))
+        tracker.save_view("charts-x", "Sweep x: charts", chart_view("", ["sweep/rate_success"]))
         before = tracker.client.get_experiment(tracker.experiment_id).tags
-        tracker.save_view("charts-x", "Sweep x: charts", chart_view("", {"sweep/success_by_rate": "Success"}))
+        tracker.save_view("charts-x", "Sweep x: charts", chart_view("", ["sweep/rate_success"]))
         assert tracker.client.get_experiment(tracker.experiment_id).tags == before
     tags = tracker.client.get_experiment(tracker.experiment_id).tags
     assert '"name": "Results"' in tags["mlflow.sharedViewState.results"]
@@ -153,7 +153,7 @@ def test_processes_that_start_together_make_one_store(tmp_path):
 
 def test_children_are_written_once_and_replaced_where_their_content_has_changed(folder):
     def child(name, success):
-        curves = {"sweep/success_by_rate": {45: success, 100: 1.0}}
+        curves = {"sweep/rate_success": {45: success, 100: 1.0}}
         params = {"axis": "rate", "env": {"hz": 45}}
         return Child(name, params, {"note": "x"}, {"eval/success_rate": success}, curves)
 
@@ -166,8 +166,8 @@ def test_children_are_written_once_and_replaced_where_their_content_has_changed(
     assert set(after) == {"a", "b"}
     assert after["a"].info.run_id == before["a"].info.run_id
     assert after["b"].info.run_id != before["b"].info.run_id
-    assert after["b"].data.metrics == {"eval/success_rate": 1.0, "sweep/success_by_rate": 1.0}
-    curve = parent.client.get_metric_history(after["b"].info.run_id, "sweep/success_by_rate")
+    assert after["b"].data.metrics == {"eval/success_rate": 1.0, "sweep/rate_success": 1.0}
+    curve = parent.client.get_metric_history(after["b"].info.run_id, "sweep/rate_success")
     assert [(point.step, point.value) for point in curve] == [(45, 1.0), (100, 1.0)]
     assert after["b"].data.params == {"axis": "rate", "env.hz": "45"}
     assert after["b"].info.status == "FINISHED"
