@@ -20,7 +20,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test lint check bench docs lock clean
+.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-faults lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -63,6 +63,9 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine onl
 
 test: setup ## the quick tests (ARGS="-m slow" for the slow ones)
 	$(BIN)/python -m pytest $(ARGS)
+
+test-faults: setup ## inject faults into running jobs, and print what was lost (20 minutes)
+	$(BIN)/python -m pytest -m faults tests/faults $(ARGS)
 
 lint: setup ## style, format, types, and who imports whom
 	$(BIN)/ruff check .

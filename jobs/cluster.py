@@ -33,6 +33,8 @@ QUIET = {
     # that newer ones have replaced.
     "TUNE_GLOBAL_CHECKPOINT_S": "0",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    # Tune would take Ctrl+C for the end of a training.
+    "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }
 

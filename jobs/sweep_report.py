@@ -22,7 +22,7 @@ from jobs.flights import EPISODE, check_sensor, write_episodes
 from jobs.groups import LABELS, Condition, Row, columns, details, matrix, metrics, name_of, summarise_group
 from jobs.progress import console
 from jobs.report import markdown_table, show
-from jobs.runs import Run, git_commit, write_atomic, write_json
+from jobs.runs import Run, git_commit, read_json, write_atomic, write_json
 from jobs.sweep_figures import axis_figure, collision_figure
 from jobs.tracking import Child, Tracker, write_children
 
@@ -253,8 +253,14 @@ def track_rows(
         )
     write_children(tracker, "condition", children)
     flights = sum(row.flights for row in rows)
-    tracker.log_once(0, {"sweep/conditions": len(sweep.conditions), "sweep/groups": len(sweep.groups),
-                         "sweep/flights": flights, "sweep/failed_cells": len(failed)})  # fmt: skip
+    figures = {
+        "conditions": len(sweep.conditions),
+        "groups": len(sweep.groups),
+        "flights": flights,
+        "failed_cells": len(failed),
+        "restarts": sum(cell.get("restarts", 0) for cell in kept.values()),
+    }
+    tracker.log_once(0, {f"sweep/{name}": value for name, value in figures.items()})
 
 
 def accuracy_file(place: Path, simulation: str) -> Path:
@@ -265,7 +271,7 @@ def accuracy_file(place: Path, simulation: str) -> Path:
 def accuracy(place: Path, cell: Cell) -> dict[str, float]:
     """The same of a cell's simulation, if it was measured, under the names of a tracker."""
     file = accuracy_file(place, cell.simulation)
-    values = json.loads(file.read_text()) if file.is_file() else {}
+    values = read_json(file) if file.is_file() else {}
     return {f"sim/{name}": value for name, value in values.items()}
 
 

@@ -3,6 +3,10 @@
 One process creates the store (two at once break an SQLite file for good), the driver alone
 writes, and it writes in batches: hundreds of single writes cost seconds, a batch a few
 hundredths of one.
+
+A store that does not answer holds up no training: curves wait in the run folder and are delivered
+when it is back. All else (tables, figures, the runs themselves) waits for it two minutes, then
+stops with what is computed in the run folder, from where the same command records it.
 """
 
 import base64
@@ -15,14 +19,16 @@ import os
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
 from envs.config import settings_hash
 from jobs.config import Config, as_dict
-from jobs.runs import Run, provenance, write_json
+from jobs.outbox import PATIENT, QUICK, Outbox, calls
+from jobs.progress import console
+from jobs.runs import Run, holding, provenance, read_json, write_json
 from jobs.store import check_metrics, dashboard_command, flatten, page, store_uri
 
 if TYPE_CHECKING:
@@ -34,6 +40,15 @@ MOST_CHILDREN = 10_000  # of one run
 WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
 VIEW_TAG = "mlflow.sharedViewState"  # MLflow's own name for stored views
 RESULTS_VIEW = "results"
+AWAY = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # codes of MLflow's that another attempt may not meet
+
+
+class TrackingError(RuntimeError):
+    """The tracking store does not answer; the message says where the results are."""
+
+
+class StoreAway(Exception):
+    """One call was not answered."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +59,10 @@ class Tracker:
     uri: str
     experiment_id: str
     run_id: str
+    outbox: Outbox
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Write metrics of one step in one batch.
+        """Write metrics of one step in one batch, now or when the store answers again.
 
         Args:
             step: Position on the run's own axis, such as environment steps [-].
@@ -57,14 +73,35 @@ class Tracker:
             ValueError: If a value is infinite (MLflow would store 1.8e308 without a word),
                 a name is in no known section, or there are more than `jobs.store.MOST_METRICS`.
         """
-        from mlflow.entities import Metric, RunTag
-
         values = check_metrics(metrics)
-        now_ms = int(time.time() * 1000)
         missing = sorted(name for name, value in values.items() if math.isnan(value))
-        written = [Metric(name, value, now_ms, step) for name, value in values.items() if name not in missing]
+        measured = {name: value for name, value in values.items() if name not in missing}
+        row = {"step": step, "time_ms": int(time.time() * 1000), "metrics": measured, "missing": missing}
+        with calls(QUICK):
+            reason = self.outbox.deliver([row], self._send, StoreAway)
+        if reason is not None:
+            console.print(
+                f"{self.uri} does not answer, results wait in {self.outbox.file}: {reason}", markup=False
+            )
+
+    def _send(self, row: Mapping[str, Any]) -> None:
+        """Write what `log` was told; the same row twice is the same points once, as their times are equal.
+
+        Raises:
+            StoreAway: The store does not answer.
+        """
+        from mlflow.entities import Metric, RunTag
+        from mlflow.exceptions import MlflowException
+
+        step, missing = row["step"], row["missing"]
+        metrics = [Metric(name, value, row["time_ms"], step) for name, value in row["metrics"].items()]
         tags = [RunTag("not_measured", f"step {step}: {', '.join(missing)}")] if missing else []
-        self.client.log_batch(self.run_id, metrics=written, tags=tags)
+        try:
+            self.client.log_batch(self.run_id, metrics=metrics, tags=tags)
+        except MlflowException as error:
+            if error.error_code not in AWAY:
+                raise
+            raise StoreAway(_reason(error)) from error
 
     def log_once(self, step: int, metrics: Mapping[str, float]) -> None:
         """Write only what the run does not hold yet: MLflow would draw a repeated point twice."""
@@ -149,30 +186,39 @@ def experiment_page(tracker: Tracker, view: str | None = None) -> str:
 def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Tracker]:
     """Write to the MLflow run of a run folder: the one it had before, or a new one.
 
-    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C.
+    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C. Whoever writes
+    to it works in the run folder: no other process may.
 
     Args:
         config: Names the store and the experiment; its settings become parameters.
         folder: The run folder; it remembers the MLflow run's id.
         key: Which of the folder's MLflow runs.
+
+    Raises:
+        RunError: Another process works in the run folder.
+        TrackingError: The store does not answer.
     """
     uri = store_uri(config)
-    client, experiment_id = open_store(uri, config.tracking.experiment)
     name = folder.path.name if key == "run" else f"{folder.path.name} {key}"
     facts = {"run_folder": folder.path, "job": config.job, **provenance()}
-    tracker = _continue_or_create(Tracker(client, uri, experiment_id, ""), folder, key, name, {"kind": key})
-    with _ended(tracker):
-        tracker.params(as_dict(folder.config))
-        tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
-        tracker.artifact(folder.path / "config.yaml")
-        yield tracker
+    with holding(folder), _answering(uri, folder):
+        client, experiment_id = open_store(uri, config.tracking.experiment)
+        waiting = folder.path / f"undelivered-{quote(key, safe='')}.jsonl"
+        store = Tracker(client, uri, experiment_id, "", Outbox(waiting))
+        tracker = _continue_or_create(store, folder, key, name, {"kind": key})
+        with _ended(tracker):
+            tracker.params(as_dict(folder.config))
+            tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
+            tracker.artifact(folder.path / "config.yaml")
+            yield tracker
 
 
 @contextlib.contextmanager
 def open_child(parent: Tracker, folder: Run, key: str, name: str, kind: str) -> Iterator[Tracker]:
     """Write to a run below `parent`; the same key continues the same run."""
     tags = {"kind": kind, "mlflow.parentRunId": parent.run_id}
-    child = _continue_or_create(parent, folder, key, name, tags)
+    waiting = Outbox(folder.path / f"undelivered-{quote(key, safe='')}.jsonl")
+    child = _continue_or_create(replace(parent, outbox=waiting), folder, key, name, tags)
     with _ended(child):
         yield child
 
@@ -219,17 +265,42 @@ def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> Non
 
 
 @contextlib.contextmanager
+def _answering(uri: str, folder: Run) -> Iterator[None]:
+    """Stop with one clear error where the store does not answer."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        with calls(PATIENT):
+            yield
+    except (MlflowException, StoreAway) as error:
+        if isinstance(error, MlflowException) and error.error_code not in AWAY:
+            raise
+        rest = f"what was computed is in {folder.path}, the same command records it"
+        raise TrackingError(f"tracking.uri: {uri} does not answer ({_reason(error)}); {rest}") from error
+
+
+def _reason(error: Exception) -> str:
+    """The cause, as the last words of what MLflow says."""
+    return str(error).strip().splitlines()[0].rpartition("Caused by ")[2][:200]
+
+
+@contextlib.contextmanager
 def _ended(tracker: Tracker) -> Iterator[None]:
-    """End the run as what its block turned out to be."""
-    status = "FAILED"
+    """End the run as what its block turned out to be; deliver what waits before it is finished."""
+    from mlflow.exceptions import MlflowException
+
     try:
         yield
-        status = "FINISHED"
-    except KeyboardInterrupt:
-        status = "KILLED"
+        for row in tracker.outbox.rows():
+            tracker._send(row)
+        tracker.outbox.file.unlink(missing_ok=True)
+        tracker.client.set_terminated(tracker.run_id, "FINISHED")
+    except BaseException as error:
+        status = "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
+        # A store that does not answer must not hide why the block ended.
+        with contextlib.suppress(MlflowException), calls(QUICK):
+            tracker.client.set_terminated(tracker.run_id, status)
         raise
-    finally:
-        tracker.client.set_terminated(tracker.run_id, status)
 
 
 def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
@@ -237,17 +308,20 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
     from mlflow.exceptions import MlflowException
 
     file = folder.path / "tracking.json"
-    known = json.loads(file.read_text()) if file.is_file() else {}
+    known = read_json(file) if file.is_file() else {}
     slot = f"{near.uri} {near.experiment_id} {key}"
     run_id = known.get(slot)
     if run_id is not None:
-        with contextlib.suppress(MlflowException):  # the run was deleted: begin a new one
+        try:
             near.client.update_run(run_id, status="RUNNING")
             near.client.log_batch(run_id, tags=[])
-            return Tracker(near.client, near.uri, near.experiment_id, run_id)
+            return replace(near, run_id=run_id)
+        except MlflowException as error:  # the run was deleted: begin a new one
+            if error.error_code in AWAY:
+                raise
     run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
     write_json(file, {**known, slot: run.info.run_id})
-    return Tracker(near.client, near.uri, near.experiment_id, run.info.run_id)
+    return replace(near, run_id=run.info.run_id)
 
 
 def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:

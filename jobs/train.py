@@ -2,8 +2,10 @@
 
 Run: python -m platform.launch +exp=train
 Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
-`train/results.jsonl`. A stopped run continues from its last checkpoint when the same command
-is given again; an environment step that was reported once is not reported twice.
+`train/results.jsonl`. A stopped run continues from its last whole checkpoint when the same
+command is given again; an environment step that was reported once is not reported twice. What
+a lost process or machine ends is tried again at once, what the code raises is not: it would
+raise the same again.
 """
 
 import contextlib
@@ -13,18 +15,21 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import pyarrow.fs
 import ray
 import torch
 from ray import tune
+from ray.exceptions import RayError, RayTaskError
 from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 
+from jobs.checkpoints import mend, seal
 from jobs.cluster import start_ray
 from jobs.config import Config, ConfigError
 from jobs.drift import FIGURES
 from jobs.ppo import build_ppo, policy_settings
 from jobs.pretrain import check_sources, prepare_encoder
-from jobs.progress import progress
+from jobs.progress import console, progress
 from jobs.runs import Run, finish, finished, open_run
 from jobs.tracking import open_tracker
 from models.kinds import kind_of
@@ -49,6 +54,7 @@ METRICS = {
     "sim/dropped_events": ("env_runners", "dropped_events"),
     **{f"evae/{name}": ("env_runners", name) for name in FIGURES},
     "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
+    "perf/trial_restarts": ("trial_restarts",),
 }
 ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
 ENV_STEPS = "num_env_steps_sampled_lifetime"
@@ -78,8 +84,22 @@ class Relay(tune.Callback):
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
     ) -> None:
-        """Pass one result on."""
-        _LISTENERS[self.name](result)
+        """Pass one result on, with the number of restarts before it."""
+        _LISTENERS[self.name]({**result, "trial_restarts": trial.num_failures})
+
+    def on_checkpoint(
+        self, iteration: int, trials: list[Any], trial: Any, checkpoint: tune.Checkpoint, **info: Any
+    ) -> None:
+        """Seal one; an object store checks what it keeps itself."""
+        if isinstance(checkpoint.filesystem, pyarrow.fs.LocalFileSystem):
+            seal(Path(checkpoint.path))
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Say that the training goes on, or stop it if its code raised."""
+        error = trial.get_pickled_error()
+        if isinstance(error, RayTaskError) and not isinstance(error.cause, RayError):
+            raise TrainingError(stopped(error))
+        console.print(f"Cut off, goes on from its last checkpoint: {last_line(error)}", markup=False)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -116,12 +136,22 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     with _listening(config, folder, on_result) as last:
         results = _tuner(config, folder, algorithm).fit()
     if results.errors:
-        reason = str(results.errors[0]).strip().splitlines()[-1]
-        raise TrainingError(f"training stopped: {reason}; the same command continues from its checkpoint")
+        raise TrainingError(stopped(results.errors[0]))
     figures = {name: value for name, value in last.items() if math.isfinite(value)}
     export_policy(config, Path(results[0].checkpoint.path), encoder_path, folder.policy, figures)
     finish(folder, "train", figures)
     return folder.policy
+
+
+def stopped(error: Exception) -> str:
+    """What to say of a training that an error ended."""
+    return f"training stopped: {last_line(error)}; the same command continues from its last checkpoint"
+
+
+def last_line(error: Exception) -> str:
+    """The line of a worker's error that names its cause."""
+    lines = str(error).strip().splitlines()
+    return lines[-1].strip() if lines else type(error).__name__
 
 
 def check_cpus(config: Config) -> None:
@@ -158,7 +188,11 @@ def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
     path = folder.train
     # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
     if tune.Tuner.can_restore(path) and any(path.glob("experiment_state-*.json")):
-        return tune.Tuner.restore(str(path), PPO, resume_errored=True, param_space=algorithm)
+        stopped_at = restored(path, algorithm).get_results()[0].checkpoint
+        said = mend(Path(stopped_at.path)) if stopped_at else None
+        if said:
+            console.print(said, markup=False)
+        return restored(path, algorithm)
     return tune.Tuner(
         PPO,
         param_space=algorithm,
@@ -176,6 +210,11 @@ def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
             ),
         ),
     )
+
+
+def restored(path: Path, algorithm: Any) -> tune.Tuner:
+    """The experiment of a folder, to go on."""
+    return tune.Tuner.restore(str(path), PPO, resume_errored=True, param_space=algorithm)
 
 
 @contextlib.contextmanager
@@ -232,6 +271,9 @@ def read_metrics(result: Mapping[str, Any]) -> dict[str, float]:
     metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
     seconds = float(result["time_this_iter_s"])
     steps = _lookup(result, ("env_runners", "num_env_steps_sampled"))
+    if not steps > 0:
+        ended = f"the processes that fly have ended {metrics['perf/env_runner_restarts']:.0f} times"
+        raise TrainingError(f"no step was flown: {ended}; their logs are in /tmp/ray/session_latest/logs")
     metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
     bad = [f"{name} = {metrics[name]}" for name in ALWAYS_FINITE if not math.isfinite(metrics[name])]
     if bad:

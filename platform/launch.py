@@ -8,6 +8,7 @@ when the job fails, 130 after Ctrl+C.
 import importlib
 import os
 import re
+import shlex
 import sys
 import traceback
 from collections.abc import Iterator
@@ -59,6 +60,11 @@ def main() -> int:
     except Exception as error:
         return report(error)
     return DONE
+
+
+def command(words: list[str]) -> str:
+    """What a shell in the repository's root takes to do the same again."""
+    return shlex.join([sys.executable, "-m", "platform.launch", *words])
 
 
 def compose(words: list[str]) -> dict[str, Any] | None:
@@ -146,6 +152,7 @@ def run(values: dict[str, Any]) -> None:
     if reasons:
         raise ConfigError("\n".join(reasons))
     config = parse(values)
+    print(f"If this is stopped, it continues with: {command(sys.argv[1:])}", flush=True)
     importlib.import_module(JOBS[config.job]).run(config)
 
 

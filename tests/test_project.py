@@ -91,6 +91,7 @@ def test_make_help_lists_every_target():
         "sweep-robustness",
         "mlflow",
         "test",
+        "test-faults",
         "lint",
         "check",
         "bench",
