@@ -79,6 +79,27 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
 
 
+def storage(cluster: ClusterConfig, folder: Path) -> str:
+    """Where the nodes of a cluster leave what belongs into a folder of a run: a path or an address.
+
+    Args:
+        cluster: Names the storage, if it is not the run folder itself.
+        folder: A folder of the run, `<runs_dir>/<run>/<name>`.
+    """
+    if cluster.storage is None:
+        return str(folder)
+    return f"{cluster.storage.rstrip('/')}/{folder.parent.name}/{folder.name}"
+
+
+def holds(place: str, start: str) -> bool:
+    """Whether a path or an address holds a file whose name begins so."""
+    import pyarrow.fs
+
+    system, root = pyarrow.fs.FileSystem.from_uri(place)
+    inside = system.get_file_info(pyarrow.fs.FileSelector(root, allow_not_found=True))
+    return any(info.base_name.startswith(start) for info in inside)
+
+
 @contextlib.contextmanager
 def one_at_a_time() -> Iterator[None]:
     """Let one process of this user after the other start a local Ray.

@@ -23,7 +23,7 @@ import torch
 from ray import tune
 
 from envs.accuracy import measure
-from jobs.cluster import start_ray
+from jobs.cluster import start_ray, storage
 from jobs.conditions import Cell, Sweep, find_entries, plan
 from jobs.config import Config
 from jobs.drift import DriftWatch
@@ -111,8 +111,8 @@ class KeepEpisodes(tune.Callback):
 
     def lost(self, cell: Cell) -> str:
         """Why a cell that did not raise is not flown."""
-        why = f" or took longer than its limit of {limit_s(cell):.0f} s" if cell.key in self.late else ""
-        return f"its process ended{why} {self.restarts[cell.key]} times"
+        late = f" (it may take {limit_s(cell):.0f} s)" if cell.key in self.late else ""
+        return f"its process ended{late} {self.restarts[cell.key]} times"
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -162,7 +162,9 @@ def fly_cells(
         os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = TUNE_SNAPSHOT_S
         with progress("Sweep", total, "flights", done=total - left) as advance:
             keep = KeepEpisodes(kept, advance)
-            _tuner(folder, missing, unmeasured(missing, kept), keep).fit()
+            _tuner(
+                storage(config.cluster, folder.path / "sweep"), missing, unmeasured(missing, kept), keep
+            ).fit()
         failed = {
             cell.key: keep.failed.get(cell.key, keep.lost(cell))
             for cell in missing
@@ -221,7 +223,7 @@ def read_episodes(cell: Cell, kept: Path) -> np.ndarray:
     return np.array([rows[seed] for seed in cell.seeds], EPISODE)
 
 
-def _tuner(folder: Run, missing: Sequence[Cell], measured: set[str], keep: KeepEpisodes) -> tune.Tuner:
+def _tuner(place: str, missing: Sequence[Cell], measured: set[str], keep: KeepEpisodes) -> tune.Tuner:
     """One trial per cell, one core each."""
     trials = [{"cell": cell, "measured": cell.key in measured, "limit_s": limit_s(cell)} for cell in missing]
     return tune.Tuner(
@@ -230,7 +232,7 @@ def _tuner(folder: Run, missing: Sequence[Cell], measured: set[str], keep: KeepE
         param_space={"trial": tune.grid_search(trials)},
         run_config=tune.RunConfig(
             name="tune",
-            storage_path=str(folder.path / "sweep"),
+            storage_path=place,
             verbose=0,
             callbacks=[keep],
             failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),

@@ -202,7 +202,7 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
     name = folder.path.name if key == "run" else f"{folder.path.name} {key}"
     facts = {"run_folder": folder.path, "job": config.job, **provenance()}
     with holding(folder), _answering(uri, folder):
-        client, experiment_id = open_store(uri, config.tracking.experiment)
+        client, experiment_id = open_store(uri, config.tracking.experiment, config.cluster.storage)
         waiting = folder.path / f"undelivered-{quote(key, safe='')}.jsonl"
         store = Tracker(client, uri, experiment_id, "", Outbox(waiting))
         tracker = _continue_or_create(store, folder, key, name, {"kind": key})
@@ -324,8 +324,11 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
     return replace(near, run_id=run.info.run_id)
 
 
-def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
-    """A client of the store and the id of the experiment; both are created if they are not there."""
+def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["MlflowClient", str]:
+    """A client of the store and the id of the experiment; both are created if they are not there.
+
+    `storage` keeps a new experiment's artifacts; None: beside an SQLite file, or the server's own.
+    """
     os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
     os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
     os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
@@ -340,6 +343,8 @@ def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
             location = (file.parent / "mlartifacts" / quote(experiment, safe="")).as_uri()
             lock = stack.enter_context(file.with_suffix(".lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX)
+        if storage is not None:
+            location = f"{storage.rstrip('/')}/mlartifacts/{quote(experiment, safe='')}"
         client = MlflowClient(tracking_uri=uri)
         known = client.get_experiment_by_name(experiment)
         return client, known.experiment_id if known else client.create_experiment(experiment, location)

@@ -24,7 +24,7 @@ from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.checkpoints import mend, seal
-from jobs.cluster import start_ray
+from jobs.cluster import holds, start_ray, storage
 from jobs.config import Config, ConfigError
 from jobs.drift import FIGURES
 from jobs.ppo import build_ppo, policy_settings
@@ -90,8 +90,8 @@ class Relay(tune.Callback):
     def on_checkpoint(
         self, iteration: int, trials: list[Any], trial: Any, checkpoint: tune.Checkpoint, **info: Any
     ) -> None:
-        """Seal one; an object store checks what it keeps itself."""
-        if isinstance(checkpoint.filesystem, pyarrow.fs.LocalFileSystem):
+        """Seal one."""
+        if on_disk(checkpoint):
             seal(Path(checkpoint.path))
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -138,7 +138,8 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     if results.errors:
         raise TrainingError(stopped(results.errors[0]))
     figures = {name: value for name, value in last.items() if math.isfinite(value)}
-    export_policy(config, Path(results[0].checkpoint.path), encoder_path, folder.policy, figures)
+    with results[0].checkpoint.as_directory() as checkpoint:
+        export_policy(config, Path(checkpoint), encoder_path, folder.policy, figures)
     finish(folder, "train", figures)
     return folder.policy
 
@@ -185,11 +186,11 @@ def export_policy(
 
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
     """The experiment in the run folder: continued if it is there, else new."""
-    path = folder.train
+    path = storage(config.cluster, folder.train)
     # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
-    if tune.Tuner.can_restore(path) and any(path.glob("experiment_state-*.json")):
+    if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
         stopped_at = restored(path, algorithm).get_results()[0].checkpoint
-        said = mend(Path(stopped_at.path)) if stopped_at else None
+        said = mend(Path(stopped_at.path)) if stopped_at and on_disk(stopped_at) else None
         if said:
             console.print(said, markup=False)
         return restored(path, algorithm)
@@ -197,8 +198,8 @@ def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
         PPO,
         param_space=algorithm,
         run_config=tune.RunConfig(
-            name=path.name,
-            storage_path=str(path.parent),
+            name=folder.train.name,
+            storage_path=path.rpartition("/")[0],
             stop={ENV_STEPS: config.train.env_steps},
             verbose=0,
             callbacks=[Relay(LISTENER)],
@@ -212,9 +213,14 @@ def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
     )
 
 
-def restored(path: Path, algorithm: Any) -> tune.Tuner:
+def on_disk(checkpoint: tune.Checkpoint) -> bool:
+    """Whether a checkpoint lies in a folder; an object store checks what it keeps itself."""
+    return isinstance(checkpoint.filesystem, pyarrow.fs.LocalFileSystem)
+
+
+def restored(path: str, algorithm: Any) -> tune.Tuner:
     """The experiment of a folder, to go on."""
-    return tune.Tuner.restore(str(path), PPO, resume_errored=True, param_space=algorithm)
+    return tune.Tuner.restore(path, PPO, resume_errored=True, param_space=algorithm)
 
 
 @contextlib.contextmanager

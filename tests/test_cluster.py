@@ -2,7 +2,35 @@ import multiprocessing
 import tempfile
 import time
 
-from jobs.cluster import one_at_a_time
+import pydantic
+import pytest
+
+from jobs.cluster import holds, one_at_a_time, storage
+from jobs.settings import ClusterConfig
+
+
+def cluster(place):
+    return ClusterConfig(name="ray", address="auto", num_cpus=None, storage=place)
+
+
+def test_what_nodes_write_lies_in_the_run_folder_or_under_its_name_in_the_storage(tmp_path):
+    folder = tmp_path / "runs" / "a-smoke-s0-1" / "train"
+    assert storage(cluster(None), folder) == str(folder)
+    assert storage(cluster("/nfs/evade/"), folder) == "/nfs/evade/a-smoke-s0-1/train"
+    assert storage(cluster("s3://bucket/evade"), folder) == "s3://bucket/evade/a-smoke-s0-1/train"
+
+
+def test_a_storage_that_other_machines_would_look_for_elsewhere_is_refused():
+    with pytest.raises(pydantic.ValidationError, match="must be an absolute folder"):
+        cluster("checkpoints")
+
+
+def test_a_folder_is_searched_by_its_path_and_by_its_address(tmp_path):
+    (tmp_path / "experiment_state-1.json").touch()
+    for place in (str(tmp_path), tmp_path.as_uri()):
+        assert holds(place, "experiment_state-")
+        assert not holds(place, "tuner")
+        assert not holds(f"{place}/none", "experiment_state-")
 
 
 def start(results, name):

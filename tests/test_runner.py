@@ -1,4 +1,6 @@
 import itertools
+import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -125,3 +127,27 @@ def test_what_it_cannot_fly_is_refused(asked, tmp_path):
         ours.sample(**asked)
     for runner in (ours, theirs):
         runner.stop()
+
+
+class Broken(PlainEnvRunner):
+    """One whose flights raise; made without a process of its own."""
+
+    def __init__(self):
+        self.error = ValueError("episode 3, step 7, seed 0: the reward must be finite; got nan")
+
+    def sample(self, **asked):
+        raise FlightError(f"ValueError: {self.error}")
+
+
+def test_what_a_flight_raises_is_raised_again_where_its_sample_is_used():
+    sent = Broken().apply(lambda runner: (runner.sample(), runner.get_metrics()))
+    received = pickle.loads(pickle.dumps(sent))
+    with pytest.raises(FlightError, match="step 7, seed 0: the reward must be finite; got nan"):
+        received[0]
+
+
+def test_any_other_error_ends_the_process_as_rllib_has_it():
+    runner = Broken()
+    runner.config = SimpleNamespace(restart_failed_env_runners=False)
+    with pytest.raises(SystemExit):
+        runner.apply(lambda runner: runner.no_such_method())

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from ray.exceptions import ActorDiedError, RayTaskError
 
 from envs.config import sensor_settings, settings_hash
 from jobs import train as training
@@ -75,6 +76,7 @@ def result(**learner):
         },
         "learners": {"default_policy": losses | learner},
         "fault_tolerance": {"num_remote_worker_restarts": 0},
+        "trial_restarts": 0,
     }
 
 
@@ -91,6 +93,34 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
 def test_a_loss_that_is_not_finite_stops_the_training(bad):
     with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
         read_metrics(result(vf_loss=bad))
+
+
+def test_an_iteration_without_a_step_says_how_often_processes_ended():
+    empty = {**result(), "env_runners": {}, "fault_tolerance": {"num_remote_worker_restarts": 3}}
+    with pytest.raises(TrainingError, match="no step was flown: the processes that fly have ended 3 times"):
+        read_metrics(empty)
+
+
+class Trial:
+    """A trial that ended with an error."""
+
+    num_failures = 1
+
+    def __init__(self, error):
+        self.error = error
+
+    def get_pickled_error(self):
+        return self.error
+
+
+def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(capsys):
+    relay = training.Relay("name")
+    raised = RayTaskError("train", "Traceback\nValueError: no", ValueError("no"))
+    with pytest.raises(TrainingError, match=r"^training stopped: ValueError: no; the same command continues"):
+        relay.on_trial_recover(1, [], Trial(raised))
+    for lost in (ActorDiedError(), RayTaskError("train", "Traceback\nActorDiedError", ActorDiedError())):
+        relay.on_trial_recover(1, [], Trial(lost))
+    assert capsys.readouterr().out.count("goes on from its last checkpoint") == 2
 
 
 def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):
