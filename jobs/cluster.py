@@ -8,6 +8,7 @@ import secrets
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from jobs.config import ConfigError
 from jobs.settings import ClusterConfig
@@ -37,6 +38,11 @@ QUIET = {
     "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }
+STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a machine that is busy
+
+
+class ClusterError(RuntimeError):
+    """Ray could not be started; the message says why in one line, and what to do."""
 
 
 def start_ray(cluster: ClusterConfig, folder: Path) -> None:
@@ -52,6 +58,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
 
     Raises:
         ConfigError: If the cluster cannot be joined.
+        ClusterError: If this machine is too busy to start one.
     """
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
     if cluster.name == "local":
@@ -70,13 +77,27 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     }
     if cluster.name == "local":
         with one_at_a_time():
-            ray.init(address="local", num_cpus=cluster.num_cpus, include_dashboard=False, **settings)
+            _start_local({"num_cpus": cluster.num_cpus, **settings})
         return
     try:
         ray.init(address=cluster.address or "auto", **settings)
     except (ConnectionError, ray.exceptions.RayError) as error:
         reason = str(error).strip().splitlines()[0]
         raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
+
+
+def _start_local(settings: dict[str, Any]) -> None:
+    import ray
+
+    for _ in range(STARTS):
+        try:
+            ray.init(address="local", include_dashboard=False, **settings)
+            return
+        except Exception as error:  # Ray's own has no type of its own
+            if "timed out during startup" not in str(error):
+                raise
+            ray.shutdown()
+    raise ClusterError(f"Ray did not start in {STARTS} times 30 s: the machine is too busy; try again later")
 
 
 def storage(cluster: ClusterConfig, folder: Path) -> str:

@@ -4,8 +4,10 @@ import time
 
 import pydantic
 import pytest
+import ray
 
-from jobs.cluster import holds, one_at_a_time, storage
+from jobs import cluster as joining
+from jobs.cluster import ClusterError, holds, one_at_a_time, storage
 from jobs.settings import ClusterConfig
 
 
@@ -64,3 +66,33 @@ def test_a_process_that_dies_lets_go(tmp_path, monkeypatch):
     process.join()
     with one_at_a_time():
         pass
+
+
+@pytest.mark.parametrize("failures", [0, 1, joining.STARTS])
+def test_a_busy_machine_gets_more_than_one_chance_to_start_ray(monkeypatch, failures):
+    calls = []
+
+    def init(**settings):
+        calls.append(settings)
+        if calls.count(settings) <= failures:
+            raise Exception("The current node timed out during startup. ...")
+
+    monkeypatch.setattr(ray, "init", init)
+    monkeypatch.setattr(ray, "shutdown", lambda: calls.append("shutdown"))
+    if failures < joining.STARTS:
+        joining._start_local({"num_cpus": 1})
+        assert calls == [{"address": "local", "include_dashboard": False, "num_cpus": 1}] + (
+            ["shutdown", calls[0]] * failures
+        )
+    else:
+        with pytest.raises(ClusterError, match="the machine is too busy"):
+            joining._start_local({"num_cpus": 1})
+
+
+def test_another_error_of_ray_is_raised_as_it_is(monkeypatch):
+    def init(**settings):
+        raise ValueError("no such setting")
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ValueError, match="no such setting"):
+        joining._start_local({})
