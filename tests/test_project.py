@@ -92,6 +92,7 @@ def test_make_help_lists_every_target():
         "mlflow",
         "test",
         "test-faults",
+        "test-cluster",
         "lint",
         "check",
         "bench",
