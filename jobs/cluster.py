@@ -29,6 +29,8 @@ QUIET = {
     "RAY_DEDUP_LOGS": "1",
     # Ray's own 15 leaves a worker a thirtieth of a core that any other program wants.
     "RAY_worker_niceness": "0",
+    # A busy machine starts a worker in minutes; after a minute, Ray would start another beside it.
+    "RAY_worker_register_timeout_seconds": "600",
     "RAY_AIR_NEW_OUTPUT": "0",
     # Write down at once which checkpoint is the newest: a kill must not leave the name of one
     # that newer ones have replaced.

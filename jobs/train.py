@@ -11,6 +11,7 @@ raise the same again.
 import contextlib
 import json
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,8 @@ class Relay(tune.Callback):
         error = trial.get_pickled_error()
         if isinstance(error, RayTaskError) and not isinstance(error.cause, RayError):
             raise TrainingError(stopped(error))
-        console.print(f"Cut off, goes on from its last checkpoint: {last_line(error)}", markup=False)
+        reason = "its process could not be started" if error is None else last_line(error)
+        console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -230,13 +232,14 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(whole_lines(file))
     reported, last = reported_so_far(file)
-    total = config.train.env_steps
+    total, since_s = config.train.env_steps, time.monotonic()
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
         def listen(result: Mapping[str, Any]) -> None:
-            nonlocal reported
-            env_steps = int(result[ENV_STEPS])
-            last.update(read_metrics(result))
+            nonlocal reported, since_s
+            env_steps, now_s = int(result[ENV_STEPS]), time.monotonic()
+            last.update(read_metrics(result, now_s - since_s))
+            since_s = now_s
             if env_steps <= reported:
                 return
             row = {name: value if math.isfinite(value) else None for name, value in last.items()}
@@ -268,14 +271,15 @@ def whole_lines(file: Path) -> bytes:
     return text[: text.rfind(b"\n") + 1]
 
 
-def read_metrics(result: Mapping[str, Any]) -> dict[str, float]:
+def read_metrics(result: Mapping[str, Any], seconds: float) -> dict[str, float]:
     """The metrics worth keeping of an RLlib result; NaN where nothing was measured.
+
+    `seconds` have passed since the one before it, on a clock that does not jump as RLlib's may.
 
     Raises:
         TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
     """
     metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
-    seconds = float(result["time_this_iter_s"])
     steps = _lookup(result, ("env_runners", "num_env_steps_sampled"))
     if not steps > 0:
         ended = f"the processes that fly have ended {metrics['perf/env_runner_restarts']:.0f} times"

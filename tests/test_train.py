@@ -68,7 +68,6 @@ def result(**learner):
     }
     return {
         "num_env_steps_sampled_lifetime": 4096,
-        "time_this_iter_s": 2.0,
         "env_runners": {
             "num_env_steps_sampled": 2048,
             "flight_return": 12.5,
@@ -81,7 +80,7 @@ def result(**learner):
 
 
 def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
-    metrics = read_metrics(result())
+    metrics = read_metrics(result(), 2.0)
     assert metrics["train/episode_return"] == 12.5
     assert metrics["train/value_loss"] == 2.0
     assert metrics["perf/env_steps_per_second"] == 1024.0
@@ -92,13 +91,13 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_the_training(bad):
     with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
-        read_metrics(result(vf_loss=bad))
+        read_metrics(result(vf_loss=bad), 2.0)
 
 
 def test_an_iteration_without_a_step_says_how_often_processes_ended():
     empty = {**result(), "env_runners": {}, "fault_tolerance": {"num_remote_worker_restarts": 3}}
     with pytest.raises(TrainingError, match="no step was flown: the processes that fly have ended 3 times"):
-        read_metrics(empty)
+        read_metrics(empty, 2.0)
 
 
 class Trial:
@@ -118,9 +117,13 @@ def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(capsys
     raised = RayTaskError("train", "Traceback\nValueError: no", ValueError("no"))
     with pytest.raises(TrainingError, match=r"^training stopped: ValueError: no; the same command continues"):
         relay.on_trial_recover(1, [], Trial(raised))
-    for lost in (ActorDiedError(), RayTaskError("train", "Traceback\nActorDiedError", ActorDiedError())):
+    for lost in (
+        None,
+        ActorDiedError(),
+        RayTaskError("train", "Traceback\nActorDiedError", ActorDiedError()),
+    ):
         relay.on_trial_recover(1, [], Trial(lost))
-    assert capsys.readouterr().out.count("goes on from its last checkpoint") == 2
+    assert capsys.readouterr().out.count("goes on from its last checkpoint") == 3
 
 
 def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):
