@@ -102,6 +102,16 @@ def _start_local(settings: dict[str, Any]) -> None:
     raise ClusterError(f"Ray did not start in {STARTS} times 30 s: the machine is too busy; try again later")
 
 
+def fit(tuner: Any) -> Any:
+    """Run a Tuner; what its callbacks raise comes out as it is, and not as the text of a traceback."""
+    from ray.tune import TuneError
+
+    try:
+        return tuner.fit()
+    except TuneError as error:
+        raise (error.__context__ or error) from None
+
+
 def storage(cluster: ClusterConfig, folder: Path) -> str:
     """Where the nodes of a cluster leave what belongs into a folder of a run: a path or an address.
 

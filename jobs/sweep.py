@@ -23,7 +23,7 @@ import torch
 from ray import tune
 
 from envs.accuracy import measure
-from jobs.cluster import start_ray, storage
+from jobs.cluster import fit, start_ray, storage
 from jobs.conditions import Cell, Sweep, find_entries, plan
 from jobs.config import Config
 from jobs.drift import DriftWatch
@@ -162,9 +162,8 @@ def fly_cells(
         os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = TUNE_SNAPSHOT_S
         with progress("Sweep", total, "flights", done=total - left) as advance:
             keep = KeepEpisodes(kept, advance)
-            _tuner(
-                storage(config.cluster, folder.path / "sweep"), missing, unmeasured(missing, kept), keep
-            ).fit()
+            place = storage(config.cluster, folder.path / "sweep")
+            fit(_tuner(place, missing, unmeasured(missing, kept), keep))
         failed = {
             cell.key: keep.failed.get(cell.key, keep.lost(cell))
             for cell in missing

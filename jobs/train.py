@@ -25,10 +25,10 @@ from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.checkpoints import mend, seal
-from jobs.cluster import holds, start_ray, storage
+from jobs.cluster import fit, holds, start_ray, storage
 from jobs.config import Config, ConfigError
 from jobs.drift import FIGURES
-from jobs.ppo import build_ppo, policy_settings
+from jobs.ppo import MAX_RESTARTS, build_ppo, policy_settings
 from jobs.pretrain import check_sources, prepare_encoder
 from jobs.progress import console, progress
 from jobs.runs import Run, finish, finished, open_run
@@ -59,6 +59,8 @@ METRICS = {
 }
 ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
 ENV_STEPS = "num_env_steps_sampled_lifetime"
+FLOWN = ("env_runners", "num_env_steps_sampled")
+LONGEST_PAUSE_S = 600.0  # while every process that flies starts again: a busy machine takes minutes
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
@@ -136,7 +138,7 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     check_cpus(config)
     algorithm = build_ppo(config, encoder_path)
     with _listening(config, folder, on_result) as last:
-        results = _tuner(config, folder, algorithm).fit()
+        results = fit(_tuner(config, folder, algorithm))
     if results.errors:
         raise TrainingError(stopped(results.errors[0]))
     figures = {name: value for name, value in last.items() if math.isfinite(value)}
@@ -233,11 +235,17 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     file.write_bytes(whole_lines(file))
     reported, last = reported_so_far(file)
     total, since_s = config.train.env_steps, time.monotonic()
+    paused_s: float | None = None
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
         def listen(result: Mapping[str, Any]) -> None:
-            nonlocal reported, since_s
-            env_steps, now_s = int(result[ENV_STEPS]), time.monotonic()
+            nonlocal reported, since_s, paused_s
+            now_s = time.monotonic()
+            if not _lookup(result, FLOWN) > 0:
+                paused_s = now_s if paused_s is None else paused_s
+                check_pause(now_s - paused_s)
+                return
+            paused_s, env_steps = None, int(result[ENV_STEPS])
             last.update(read_metrics(result, now_s - since_s))
             since_s = now_s
             if env_steps <= reported:
@@ -254,6 +262,19 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             yield last
         finally:
             del _LISTENERS[LISTENER]
+
+
+def check_pause(seconds: float) -> None:
+    """Let a training wait for processes that fly and have ended, unless they do not come back.
+
+    Raises:
+        TrainingError: After `LONGEST_PAUSE_S`.
+    """
+    if seconds > LONGEST_PAUSE_S:
+        ended = f"every process that flies has ended, some {MAX_RESTARTS + 1} times"
+        raise TrainingError(
+            f"no step was flown for {seconds:.0f} s: {ended}; see /tmp/ray/session_latest/logs"
+        )
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
@@ -280,10 +301,7 @@ def read_metrics(result: Mapping[str, Any], seconds: float) -> dict[str, float]:
         TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
     """
     metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
-    steps = _lookup(result, ("env_runners", "num_env_steps_sampled"))
-    if not steps > 0:
-        ended = f"the processes that fly have ended {metrics['perf/env_runner_restarts']:.0f} times"
-        raise TrainingError(f"no step was flown: {ended}; their logs are in /tmp/ray/session_latest/logs")
+    steps = _lookup(result, FLOWN)
     metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
     bad = [f"{name} = {metrics[name]}" for name in ALWAYS_FINITE if not math.isfinite(metrics[name])]
     if bad:

@@ -5,6 +5,7 @@ Expect: exit status 0 when the job is done, 2 with one message when a value is r
 when the job fails, 130 after Ctrl+C.
 """
 
+import errno
 import importlib
 import os
 import re
@@ -176,11 +177,13 @@ def report(error: Exception) -> int:
     """Say what went wrong, with a traceback where it helps; return the exit status.
 
     A ValueError that this repository raises is a refused value, a RuntimeError a documented
-    failure: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback of those too.
+    failure, and so is a full disk: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback
+    of those too.
     """
     ours = raised_here(error)
     refused = isinstance(error, ValueError) and ours
-    documented = refused or (isinstance(error, RuntimeError) and ours)
+    full = getattr(error, "errno", None) == errno.ENOSPC
+    documented = refused or (isinstance(error, RuntimeError) and ours) or full
     if "HYDRA_FULL_ERROR" in os.environ or not documented:
         traceback.print_exception(error)
     message = str(error) if documented else f"{type(error).__name__}: {error}"

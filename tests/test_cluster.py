@@ -5,6 +5,7 @@ import time
 import pydantic
 import pytest
 import ray
+from ray.tune import TuneError
 
 from jobs import cluster as joining
 from jobs.cluster import ClusterError, holds, one_at_a_time, storage
@@ -96,3 +97,15 @@ def test_another_error_of_ray_is_raised_as_it_is(monkeypatch):
     monkeypatch.setattr(ray, "init", init)
     with pytest.raises(ValueError, match="no such setting"):
         joining._start_local({})
+
+
+def test_what_a_callback_raises_comes_out_of_tune_as_it_is():
+    class Tuner:
+        def fit(self):
+            try:
+                raise ClusterError("the reason")
+            except ClusterError:
+                raise TuneError("Traceback ...")  # noqa: B904
+
+    with pytest.raises(ClusterError, match="the reason"):
+        joining.fit(Tuner())

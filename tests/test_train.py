@@ -94,10 +94,22 @@ def test_a_loss_that_is_not_finite_stops_the_training(bad):
         read_metrics(result(vf_loss=bad), 2.0)
 
 
-def test_an_iteration_without_a_step_says_how_often_processes_ended():
-    empty = {**result(), "env_runners": {}, "fault_tolerance": {"num_remote_worker_restarts": 3}}
-    with pytest.raises(TrainingError, match="no step was flown: the processes that fly have ended 3 times"):
-        read_metrics(empty, 2.0)
+def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
+    folder, seen = open_run(make_config(f"runs_dir={tmp_path}")), []
+    empty = {**result(), "env_runners": {}, "learners": {}}
+    with training._listening(folder.config, folder, lambda step, metrics: seen.append(step)):
+        listen = training._LISTENERS[training.LISTENER]
+        for seconds in (100.0, 400.0, 400.0, 300.0, 300.0):
+            now[0] += seconds
+            listen(result() if seconds == 400.0 and not seen else empty)
+        now[0] += 1.0
+        with pytest.raises(
+            TrainingError, match="no step was flown for 601 s: every process that flies has ended"
+        ):
+            listen(empty)
+    assert seen == [4096]
 
 
 class Trial:

@@ -158,7 +158,7 @@ def start(
         process = subprocess.Popen(
             command,
             cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": path, "HYDRA_FULL_ERROR": "", **variables},
+            env={**os.environ, "PYTHONPATH": path, **variables},
             stdout=file,
             stderr=subprocess.STDOUT,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
