@@ -16,11 +16,13 @@ LAUNCH := $(BIN)/python -m platform.launch
 MLFLOW_ENV := MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true \
 	MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false
 
+PSYCOPG := 'psycopg[binary]>=3.2'
+
 export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test lint check bench docs lock clean
+.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-faults test-cluster lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -64,6 +66,16 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine onl
 
 test: setup ## the quick tests (ARGS="-m slow" for the slow ones)
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
+
+test-faults: setup ## inject faults into running jobs, and print what was lost (20 minutes)
+	$(BIN)/python -m pytest -m faults tests/faults $(ARGS)
+
+test-cluster: setup ## the same sweep on a Ray cluster, and eight at once into PostgreSQL (20 minutes)
+	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 \
+	|| { [ "$$(id -u)" = 0 ] && apt-get update && apt-get install --yes --no-install-recommends postgresql; } \
+	|| echo "warning: no PostgreSQL, so its test is left out; apt-get install postgresql"
+	$(BIN)/python -c 'import psycopg' 2>/dev/null || $(BIN)/python -m pip install --quiet $(PSYCOPG)
+	$(BIN)/python -m pytest -m cluster -rs tests/cluster $(ARGS)
 
 lint: setup ## style, format, types, and who imports whom
 	$(BIN)/ruff check .

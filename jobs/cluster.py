@@ -9,6 +9,7 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from jobs.config import ConfigError
 from jobs.settings import ClusterConfig
@@ -29,13 +30,22 @@ QUIET = {
     "RAY_DEDUP_LOGS": "1",
     # Ray's own 15 leaves a worker a thirtieth of a core that any other program wants.
     "RAY_worker_niceness": "0",
+    # A busy machine starts a worker in minutes; after a minute, Ray would start another beside it.
+    "RAY_worker_register_timeout_seconds": "600",
     "RAY_AIR_NEW_OUTPUT": "0",
     # Write down at once which checkpoint is the newest: a kill must not leave the name of one
     # that newer ones have replaced.
     "TUNE_GLOBAL_CHECKPOINT_S": "0",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    # Tune would take Ctrl+C for the end of a training.
+    "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }
+STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a machine that is busy
+
+
+class ClusterError(RuntimeError):
+    """Ray could not be started; the message says why in one line, and what to do."""
 
 
 def start_ray(cluster: ClusterConfig, folder: Path) -> None:
@@ -52,6 +62,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     Raises:
         ConfigError: If the cluster cannot be joined, others can read the token, or nothing is
             said of the token of a cluster that is joined.
+        ClusterError: If this machine is too busy to start one.
     """
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
     check_mode(cluster)
@@ -73,13 +84,58 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     }
     if cluster.name == "local":
         with one_at_a_time():
-            ray.init(address="local", num_cpus=cluster.num_cpus, include_dashboard=False, **settings)
+            _start_local({"num_cpus": cluster.num_cpus, **settings})
         return
     try:
         ray.init(address=cluster.address or "auto", **settings)
     except (ConnectionError, ray.exceptions.RayError) as error:
         reason = str(error).strip().splitlines()[0]
         raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
+
+
+def _start_local(settings: dict[str, Any]) -> None:
+    import ray
+
+    for _ in range(STARTS):
+        try:
+            ray.init(address="local", include_dashboard=False, **settings)
+            return
+        except Exception as error:  # Ray's own has no type of its own
+            if "timed out during startup" not in str(error):
+                raise
+            ray.shutdown()
+    raise ClusterError(f"Ray did not start in {STARTS} times 30 s: the machine is too busy; try again later")
+
+
+def fit(tuner: Any) -> Any:
+    """Run a Tuner; what its callbacks raise comes out as it is, and not as the text of a traceback."""
+    from ray.tune import TuneError
+
+    try:
+        return tuner.fit()
+    except TuneError as error:
+        raise (error.__context__ or error) from None
+
+
+def storage(cluster: ClusterConfig, folder: Path) -> str:
+    """Where the nodes of a cluster leave what belongs into a folder of a run: a path or an address.
+
+    Args:
+        cluster: Names the storage, if it is not the run folder itself.
+        folder: A folder of the run, `<runs_dir>/<run>/<name>`.
+    """
+    if cluster.storage is None:
+        return str(folder)
+    return f"{cluster.storage.rstrip('/')}/{folder.parent.name}/{folder.name}"
+
+
+def holds(place: str, start: str) -> bool:
+    """Whether a path or an address holds a file whose name begins so."""
+    import pyarrow.fs
+
+    system, root = pyarrow.fs.FileSystem.from_uri(place)
+    inside = system.get_file_info(pyarrow.fs.FileSelector(root, allow_not_found=True))
+    return any(info.base_name.startswith(start) for info in inside)
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from envs.corridor import CorridorVectorEnv
 from jobs.config import Config, ConfigError
 from jobs.drift import drift_figures
 from jobs.learner import REWARD_SCALE, PlainPPOLearner
-from jobs.runner import PlainEnvRunner
+from jobs.runner import LONGEST_SAMPLE_S, PlainEnvRunner
 from jobs.settings import EVAE_SETTINGS
 from models.evae import EventVAE
 from models.finetuned import evae_settings
@@ -31,7 +31,6 @@ NUM_ACTIONS = 3
 EPISODES = 100  # that a rate is averaged over
 DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
 LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
-FIRST_SAMPLE_S = 900.0  # a process that flies compiles for a minute first, on a busy machine for several
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 
 
@@ -130,7 +129,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             num_env_runners=runners,
             num_cpus_per_env_runner=1.0 - LITTLE / max(1, runners),
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
-            sample_timeout_s=FIRST_SAMPLE_S,
+            sample_timeout_s=LONGEST_SAMPLE_S + 60.0,  # a process that hangs ends itself before
             gym_env_vectorize_mode="vector_entry_point",
             env_runner_cls=PlainEnvRunner,
         )

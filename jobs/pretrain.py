@@ -6,6 +6,8 @@ with its manifest, and `encoder/reconstructions.png`, in the run folder. A kille
 continues from its last checkpoint.
 """
 
+import hashlib
+import io
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from jobs.collect import check_policy, collect, data_file
 from jobs.config import Config, ConfigError
 from jobs.figures import reconstruction_figure
 from jobs.progress import console, progress
-from jobs.runs import Run, finish, finished, locate_run, open_run
+from jobs.runs import Run, finish, finished, locate_run, open_run, write_atomic
 from jobs.settings import EVAE_SETTINGS, ModelConfig, PretrainConfig
 from jobs.tracking import Tracker, open_tracker
 from models.batch import EventBatch, Grid, batch_windows
@@ -37,7 +39,8 @@ from models.weights import EncoderFileError, load_encoder, save_encoder
 
 Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
 
-ENCODER, CHECKPOINT = "encoder.safetensors", "checkpoint.pt"
+ENCODER, CHECKPOINTS = "encoder.safetensors", "checkpoint-*.pt"
+CHECKPOINTS_KEPT = 2  # should the newest be damaged
 SHORTEST_STEPS, LONGEST_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
 PICTURE_WINDOWS = 8
@@ -83,7 +86,7 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
         ConfigError: `pretrain.encoder` names no encoder, or one of another model.
     """
     named, config = folder.config.pretrain.encoder, folder.config
-    if named is None or (folder.encoder / CHECKPOINT).exists() or finished(folder, "pretrain") is not None:
+    if named is None or checkpoints(folder.encoder) or finished(folder, "pretrain") is not None:
         return None
     path = Path(named)
     file = path if path.suffix == ".safetensors" else path / "encoder" / ENCODER
@@ -131,8 +134,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     )
     rng = np.random.default_rng(np.random.SeedSequence([config.seed, 2]))
     held_out = held_out_windows(validation, settings, evae.grid)
-    checkpoint = folder.encoder / CHECKPOINT
-    first = restore(checkpoint, evae, optimizer, rng)
+    first = restore(folder.encoder, evae, optimizer, rng)
     latest: dict[str, float] = {}
     with progress("Pretrain the event VAE", settings.iterations, "iterations", done=first) as advance:
         for iteration in range(first, settings.iterations):
@@ -149,7 +151,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
                     iteration + 1, {f"evae/{name}": value for name, value in {**losses, **latest}.items()}
                 )
             if last or (iteration + 1) % settings.checkpoint_every == 0:
-                save_checkpoint(checkpoint, evae, optimizer, rng, iteration + 1)
+                save_checkpoint(folder.encoder, evae, optimizer, rng, iteration + 1)
             measured = f", held out {latest['explained_step']:.0%} explained" if latest else ""
             advance(1, note=f"loss {losses['loss']:.4f}{measured}")
     return freeze(config, folder, tracker, evae, train.about, held_out)
@@ -281,12 +283,15 @@ def encoder_file(folder: Run) -> Path:
     return folder.encoder / ENCODER
 
 
+def checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of a pretraining, the newest first."""
+    return sorted(folder.glob(CHECKPOINTS), reverse=True)
+
+
 def save_checkpoint(
-    path: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator, iteration: int
+    folder: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator, iteration: int
 ) -> None:
-    """Write everything that a killed training needs to go on; whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
+    """Write everything that a killed training needs to go on; its name holds its SHA-256."""
     state = {
         "evae": evae.state_dict(),
         "optimizer": optimizer.state_dict(),
@@ -294,17 +299,26 @@ def save_checkpoint(
         "torch_rng": torch.get_rng_state(),
         "iteration": iteration,
     }
-    torch.save(state, part)
-    part.replace(path)
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    content = buffer.getvalue()
+    write_atomic(folder / f"checkpoint-{iteration:09d}-{hashlib.sha256(content).hexdigest()}.pt", content)
+    for old in checkpoints(folder)[CHECKPOINTS_KEPT:]:
+        old.unlink()
 
 
-def restore(path: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator) -> int:
-    """Load a checkpoint if there is one; return the number of iterations already done."""
-    if not path.exists():
-        return 0
-    state = torch.load(path, weights_only=True)
-    evae.load_state_dict(state["evae"])
-    optimizer.load_state_dict(state["optimizer"])
-    rng.bit_generator.state = state["rng"]
-    torch.set_rng_state(state["torch_rng"])
-    return int(state["iteration"])
+def restore(folder: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator) -> int:
+    """Load the newest checkpoint that is whole; return the number of iterations already done."""
+    for path in checkpoints(folder):
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != path.stem.rpartition("-")[2]:
+            console.print(f"Checkpoint damaged, the one before it is taken: {path}", markup=False)
+            path.unlink()
+            continue
+        state = torch.load(io.BytesIO(content), weights_only=True)
+        evae.load_state_dict(state["evae"])
+        optimizer.load_state_dict(state["optimizer"])
+        rng.bit_generator.state = state["rng"]
+        torch.set_rng_state(state["torch_rng"])
+        return int(state["iteration"])
+    return 0

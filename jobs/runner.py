@@ -13,6 +13,7 @@ stacks, and a raw window never leaves the process that flew.
 
 import uuid
 from collections import defaultdict
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,10 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
+from jobs.watchdog import ending_after
 from models.features import push_features
+
+LONGEST_SAMPLE_S = 900.0  # a process that flies compiles for a minute first, on a busy machine for several
 
 
 class Step(NamedTuple):
@@ -51,11 +55,54 @@ class Step(NamedTuple):
     over: np.ndarray
 
 
+class FlightError(RuntimeError):
+    """What the simulation or the policy raised in a process that flies."""
+
+
+class Raised:
+    """A sample that could not be flown, on its way to the process that learns, where it raises."""
+
+    def __init__(self, reason: str) -> None:
+        """Remember why."""
+        self.reason = reason
+
+    def __getitem__(self, index: int) -> Any:
+        """Raise it."""
+        raise FlightError(self.reason)
+
+
 class PlainEnvRunner(SingleAgentEnvRunner):
-    """Flies the corridors of one process, whose module makes the features, without connectors."""
+    """Flies the corridors of one process, whose module makes the features, without connectors.
+
+    RLlib starts a process anew that has ended or hangs, and that is right. It would also do so
+    where the code raised, hide the reason in a log, and meet the same again: that is told instead.
+    """
 
     _needs_initial_reset: bool
     _ongoing_episodes_for_metrics: dict[str, list[SingleAgentEpisode]]
+
+    def sample(self, **asked: Any) -> list[SingleAgentEpisode]:
+        """Fly as asked, in less than `LONGEST_SAMPLE_S`.
+
+        Raises:
+            FlightError: With the type and text of whatever was raised.
+        """
+        try:
+            with ending_after(LONGEST_SAMPLE_S):
+                return super().sample(**asked)
+        except Exception as error:
+            raise FlightError(" ".join(f"{type(error).__name__}: {error}".split())) from error
+
+    def apply(self, func: Callable[..., Any], *values: Any, **named: Any) -> Any:
+        """As RLlib's, which ends the process where `func` raises; but a flight's error is handed on."""
+
+        def handed_on(runner: Any, *values: Any, **named: Any) -> Any:
+            try:
+                return func(runner, *values, **named)
+            except FlightError as error:
+                return Raised(str(error))
+
+        return super().apply(handed_on, *values, **named)
 
     def _sample(
         self,

@@ -4,11 +4,14 @@ A folder is named after the configuration that fills it, so that the same comman
 the same folder and continues there. Each finished stage leaves a marker with its figures.
 """
 
+import contextlib
 import dataclasses
+import fcntl
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,10 @@ UNNAMED = (
 )  # fmt: skip
 REPOSITORY = Path(__file__).resolve().parent.parent
 COMPARED_STEPS = 500_000  # the paper's; of every training that is compared with others
+
+
+class RunError(RuntimeError):
+    """A run folder that cannot be worked in; the message says why in one line, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +98,31 @@ def reopen(path: Path, config: Config) -> Run:
             f"run folders are in {str(Path(config.runs_dir).resolve())!r}"
         )
     here = {name: value for name, value in as_dict(config).items() if name in UNNAMED}
-    run = parse({**json.loads(stored.read_text()), **here})
+    run = parse({**read_json(stored), **here})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
+
+
+@contextlib.contextmanager
+def holding(run: Run) -> Iterator[None]:
+    """Work in a run folder as the only process: two would do everything twice, and mix their results.
+
+    A process that is killed lets go.
+
+    Raises:
+        RunError: Another process holds the folder.
+    """
+    run.path.mkdir(parents=True, exist_ok=True)
+    with (run.path / ".lock").open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            who = file.read() or "another process"
+            raise RunError(f"{run.path}: {who} works there; wait until it has ended") from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} of {os.uname().nodename}")
+        file.flush()
+        yield
 
 
 def run_name(config: Config) -> str:
@@ -109,7 +139,7 @@ def group_name(exp: str, env_steps: int) -> str:
 def finished(run: Run, stage: str) -> dict[str, Any] | None:
     """The figures of a finished stage, or None while it is not finished."""
     marker = run.path / "stages" / f"{stage}.json"
-    return json.loads(marker.read_text())["figures"] if marker.is_file() else None
+    return read_json(marker)["figures"] if marker.is_file() else None
 
 
 def finish(run: Run, stage: str, figures: dict[str, Any]) -> dict[str, Any]:
@@ -162,9 +192,32 @@ def write_json(path: Path, values: Any) -> None:
     write_atomic(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
-def write_atomic(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old content or the new one, never a part."""
+def read_json(path: Path) -> Any:
+    """What `write_json` wrote.
+
+    Raises:
+        RunError: The file is damaged.
+    """
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        remedy = "delete it, and the same command makes it anew"
+        raise RunError(f"{path}: must be JSON, got a damaged file ({error}); {remedy}") from None
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write a file so that a reader sees the old content or the new one, never a part.
+
+    On the disk too: the content is there before its name, and a full disk leaves the old file.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_text(text)
-    part.replace(path)
+    try:
+        with part.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise

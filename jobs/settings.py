@@ -210,11 +210,24 @@ class ProbeConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class ClusterConfig:
-    """Where Ray runs."""
+    """Where Ray runs, and where its nodes leave what they write.
+
+    Attributes:
+        storage: A folder that every node sees (NFS), or an address such as s3://bucket/evade;
+            None for the run folder, where there is but one machine.
+    """
 
     name: Literal["local", "ray"]
     address: str | None
     num_cpus: Count | None
+    storage: str | None
+
+    @pydantic.field_validator("storage")
+    @classmethod
+    def _seen_from_everywhere(cls, storage: str | None) -> str | None:
+        if storage is not None and not storage.startswith("/") and "://" not in storage:
+            raise ValueError("must be an absolute folder, an address such as s3://bucket/evade, or null")
+        return storage
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from envs.scene import make_scene
 from jobs.axes import axis_numbers
+from jobs.children import Child, write_children
 from jobs.conditions import NOMINAL, Cell, Sweep
 from jobs.config import Config
 from jobs.dashboard import COLOUR, NOTE, chart_view, table_view
@@ -36,9 +37,9 @@ from jobs.groups import (
 )
 from jobs.progress import console
 from jobs.report import markdown_table, show
-from jobs.runs import Run, git_commit, write_atomic, write_json
+from jobs.runs import Run, git_commit, read_json, write_atomic, write_json
 from jobs.sweep_figures import axis_figure, collision_figure, style_of
-from jobs.tracking import Child, Tracker, write_children
+from jobs.tracking import Tracker
 
 FILMED = 3
 CHILD_PARAMS = ("axis", "value", "group")
@@ -289,8 +290,14 @@ def track_rows(
     errors = [found["sim/event_error"] for cell in sweep.cells if (found := accuracy(place, cell))]
     worst = {"sim/event_error": errors[0], "sim/event_error_max": max(errors)} if errors else {}
     flights = sum(row.flights for row in rows)
-    tracker.log_once(0, {"sweep/conditions": len(sweep.conditions), "sweep/groups": len(sweep.groups),
-                         "sweep/flights": flights, "sweep/failed_cells": len(failed), **worst})  # fmt: skip
+    figures = {
+        "conditions": len(sweep.conditions),
+        "groups": len(sweep.groups),
+        "flights": flights,
+        "failed_cells": len(failed),
+        "restarts": sum(cell.get("restarts", 0) for cell in kept.values()),
+    }
+    tracker.log_once(0, {f"sweep/{name}": value for name, value in figures.items()} | worst)
 
 
 def group_curves(sweep: Sweep, group: str, rows: Sequence[Row]) -> dict[str, dict[int, float]]:
@@ -327,7 +334,7 @@ def accuracy_file(place: Path, simulation: str) -> Path:
 def accuracy(place: Path, cell: Cell) -> dict[str, float]:
     """The same of a cell's simulation, if it was measured, under the names of a tracker."""
     file = accuracy_file(place, cell.simulation)
-    values = json.loads(file.read_text()) if file.is_file() else {}
+    values = read_json(file) if file.is_file() else {}
     return {f"sim/{name}": value for name, value in values.items()}
 
 

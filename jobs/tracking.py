@@ -3,6 +3,10 @@
 One process creates the store (two at once break an SQLite file for good), the driver alone
 writes, and it writes in batches: hundreds of single writes cost seconds, a batch a few
 hundredths of one.
+
+A store that does not answer holds up no training: curves wait in the run folder and are delivered
+when it is back. All else (tables, figures, the runs themselves) waits for it two minutes, then
+stops with what is computed in the run folder, from where the same command records it.
 """
 
 import contextlib
@@ -15,12 +19,11 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from envs.config import settings_hash
 from jobs.config import Config, as_dict
 from jobs.dashboard import (
     NOTE,
@@ -36,8 +39,10 @@ from jobs.dashboard import (
     usual_views,
     view_address,
 )
+from jobs.outbox import PATIENT, QUICK, Outbox, calls
+from jobs.progress import console
 from jobs.refusals import redacted
-from jobs.runs import Run, provenance, write_json
+from jobs.runs import Run, holding, provenance, read_json, write_json
 from jobs.store import check_metrics, dashboard_command, flatten, page, store_uri
 
 if TYPE_CHECKING:
@@ -45,8 +50,16 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
-MOST_CHILDREN = 10_000  # of one run
 KNOWN_RUNS = "tracking.json"  # in a run folder
+AWAY = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # codes of MLflow's that another attempt may not meet
+
+
+class TrackingError(RuntimeError):
+    """The tracking store does not answer; the message says where the results are."""
+
+
+class StoreAway(Exception):
+    """One call was not answered."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +70,10 @@ class Tracker:
     uri: str
     experiment_id: str
     run_id: str
+    outbox: Outbox
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Write metrics of one step in one batch.
+        """Write metrics of one step in one batch, now or when the store answers again.
 
         Args:
             step: Position on the run's own axis, such as environment steps [-].
@@ -70,14 +84,35 @@ class Tracker:
             ValueError: If a value is infinite (MLflow would store 1.8e308 without a word),
                 a name is in no known section, or there are more than `jobs.store.MOST_METRICS`.
         """
-        from mlflow.entities import Metric, RunTag
-
         values = check_metrics(metrics)
-        now_ms = int(time.time() * 1000)
         missing = sorted(name for name, value in values.items() if math.isnan(value))
-        written = [Metric(name, value, now_ms, step) for name, value in values.items() if name not in missing]
+        measured = {name: value for name, value in values.items() if name not in missing}
+        row = {"step": step, "time_ms": int(time.time() * 1000), "metrics": measured, "missing": missing}
+        with calls(QUICK):
+            reason = self.outbox.deliver([row], self._send, StoreAway)
+        if reason is not None:
+            console.print(
+                f"{self.uri} does not answer, results wait in {self.outbox.file}: {reason}", markup=False
+            )
+
+    def _send(self, row: Mapping[str, Any]) -> None:
+        """Write what `log` was told; the same row twice is the same points once, as their times are equal.
+
+        Raises:
+            StoreAway: The store does not answer.
+        """
+        from mlflow.entities import Metric, RunTag
+        from mlflow.exceptions import MlflowException
+
+        step, missing = row["step"], row["missing"]
+        metrics = [Metric(name, value, row["time_ms"], step) for name, value in row["metrics"].items()]
         tags = [RunTag("not_measured", f"step {step}: {', '.join(missing)}")] if missing else []
-        self.client.log_batch(self.run_id, metrics=written, tags=tags)
+        try:
+            self.client.log_batch(self.run_id, metrics=metrics, tags=tags)
+        except MlflowException as error:
+            if error.error_code not in AWAY:
+                raise
+            raise StoreAway(_reason(error)) from error
 
     def log_once(self, step: int, metrics: Mapping[str, float]) -> None:
         """Write only what the run does not hold yet: MLflow would draw a repeated point twice."""
@@ -183,99 +218,76 @@ class Tracker:
 def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Tracker]:
     """Write to the MLflow run of a run folder: the one it had before, or a new one.
 
-    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C.
+    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C. Whoever writes
+    to it works in the run folder: no other process may.
 
     Args:
         config: Names the store and the experiment; its settings become parameters.
         folder: The run folder; it remembers the MLflow run's id.
         key: Which of the folder's MLflow runs.
+
+    Raises:
+        RunError: Another process works in the run folder.
+        TrackingError: The store does not answer.
     """
     uri = store_uri(config)
-    client, experiment_id = open_store(uri, config.tracking.experiment)
     name = folder.path.name if key == "run" else f"{folder.path.name} {key}"
     facts = {"run_folder": folder.path, "job": config.job, **provenance()}
-    tracker = _continue_or_create(
-        Tracker(client, redacted(uri), experiment_id, ""), folder, key, name, {"kind": key}
-    )
-    with _ended(tracker):
-        tracker.params(as_dict(folder.config))
-        tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
-        tracker.artifact(folder.path / "config.yaml")
-        tracker.describe_experiment()
-        tracker.write_page()
-        yield tracker
-        tracker.describe_experiment()
-        tracker.write_page()
+    with holding(folder), _answering(uri, folder):
+        client, experiment_id = open_store(uri, config.tracking.experiment, config.cluster.storage)
+        waiting = folder.path / f"undelivered-{quote(key, safe='')}.jsonl"
+        store = Tracker(client, redacted(uri), experiment_id, "", Outbox(waiting))
+        tracker = _continue_or_create(store, folder, key, name, {"kind": key})
+        with _ended(tracker):
+            tracker.params(as_dict(folder.config))
+            tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
+            tracker.artifact(folder.path / "config.yaml")
+            tracker.describe_experiment()
+            tracker.write_page()
+            yield tracker
+            tracker.describe_experiment()
+            tracker.write_page()
 
 
 @contextlib.contextmanager
-def open_child(parent: Tracker, folder: Run, key: str, name: str, kind: str) -> Iterator[Tracker]:
-    """Write to a run below `parent`; the same key continues the same run."""
-    tags = {"kind": kind, "mlflow.parentRunId": parent.run_id}
-    child = _continue_or_create(parent, folder, key, name, tags)
-    with _ended(child):
-        yield child
+def _answering(uri: str, folder: Run) -> Iterator[None]:
+    """Stop with one clear error where the store does not answer."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        with calls(PATIENT):
+            yield
+    except (MlflowException, StoreAway) as error:
+        if isinstance(error, MlflowException) and error.error_code not in AWAY:
+            raise
+        rest = f"what was computed is in {folder.path}, the same command records it"
+        raise TrackingError(
+            f"tracking.uri: {redacted(uri)} does not answer ({_reason(error)}); {rest}"
+        ) from error
 
 
-class Child(NamedTuple):
-    """A finished run below another, with all that it holds."""
-
-    name: str
-    params: Mapping[str, Any]
-    tags: Mapping[str, str]
-    metrics: Mapping[str, float]
-    curves: Mapping[str, Mapping[int, float]] = {}  # metric -> its value at each step
-
-
-def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> None:
-    """Write finished runs below `parent`: three calls each, and none for one that is there unchanged.
-
-    One whose content has changed takes the place of the run of the same name.
-    """
-    from mlflow.entities import Metric, Param, RunTag
-
-    client = parent.client
-    search = f"tags.`mlflow.parentRunId` = '{parent.run_id}' and tags.kind = '{kind}'"
-    found = client.search_runs([parent.experiment_id], search, max_results=MOST_CHILDREN)
-    known = {run.info.run_name: run for run in found}
-    for child in children:
-        content = settings_hash(child._asdict() | {"params": flatten(child.params)})
-        old = known.get(child.name)
-        if old is not None and old.data.tags.get("content") == content:
-            continue
-        if old is not None:
-            client.delete_run(old.info.run_id)
-        facts = {"kind": kind, "mlflow.parentRunId": parent.run_id}
-        run_id = client.create_run(parent.experiment_id, tags=facts, run_name=child.name).info.run_id
-        now_ms = int(time.time() * 1000)
-        client.log_batch(
-            run_id,
-            metrics=[Metric(name, value, now_ms, step) for name, step, value in _points(child)],
-            params=[Param(key, value) for key, value in flatten(child.params).items()],
-            tags=[RunTag(key, value) for key, value in {**child.tags, "content": content}.items()],
-        )
-        client.set_terminated(run_id)
-
-
-def _points(child: Child) -> list[tuple[str, int, float]]:
-    """Name, step and value of everything that a child measured; what is no curve is at step 0."""
-    curves = {name: {0: value} for name, value in child.metrics.items()} | dict(child.curves)
-    check_metrics({name: sum(points.values()) for name, points in curves.items()})
-    return [(name, step, value) for name, points in curves.items() for step, value in points.items()]
+def _reason(error: Exception) -> str:
+    """The cause, as the last words of what MLflow says."""
+    return str(error).strip().splitlines()[0].rpartition("Caused by ")[2][:200]
 
 
 @contextlib.contextmanager
 def _ended(tracker: Tracker) -> Iterator[None]:
-    """End the run as what its block turned out to be."""
-    status = "FAILED"
+    """End the run as what its block turned out to be; deliver what waits before it is finished."""
+    from mlflow.exceptions import MlflowException
+
     try:
         yield
-        status = "FINISHED"
-    except KeyboardInterrupt:
-        status = "KILLED"
+        for row in tracker.outbox.rows():
+            tracker._send(row)
+        tracker.outbox.file.unlink(missing_ok=True)
+        tracker.client.set_terminated(tracker.run_id, "FINISHED")
+    except BaseException as error:
+        status = "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
+        # A store that does not answer must not hide why the block ended.
+        with contextlib.suppress(MlflowException), calls(QUICK):
+            tracker.client.set_terminated(tracker.run_id, status)
         raise
-    finally:
-        tracker.client.set_terminated(tracker.run_id, status)
 
 
 def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
@@ -285,19 +297,22 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
     known, slot = _known_runs(folder.path), _slot(near, key)
     run_id = known.get(slot)
     if run_id is not None:
-        with contextlib.suppress(MlflowException):  # the run was deleted: begin a new one
+        try:
             near.client.update_run(run_id, status="RUNNING")
             near.client.log_batch(run_id, tags=[])
-            return Tracker(near.client, near.uri, near.experiment_id, run_id)
+            return replace(near, run_id=run_id)
+        except MlflowException as error:  # the run was deleted: begin a new one
+            if error.error_code in AWAY:
+                raise
     run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
     write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})
-    return Tracker(near.client, near.uri, near.experiment_id, run.info.run_id)
+    return dataclasses.replace(near, run_id=run.info.run_id)
 
 
 def _known_runs(path: Path) -> dict[str, str]:
     """The MLflow runs that a run folder remembers: id by slot."""
     file = path / KNOWN_RUNS
-    return json.loads(file.read_text()) if file.is_file() else {}
+    return read_json(file) if file.is_file() else {}
 
 
 def _slot(near: Tracker, key: str) -> str:
@@ -305,8 +320,11 @@ def _slot(near: Tracker, key: str) -> str:
     return f"{near.uri} {near.experiment_id} {key}"
 
 
-def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
-    """A client of the store and the id of the experiment; both are created if they are not there."""
+def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["MlflowClient", str]:
+    """A client of the store and the id of the experiment; both are created if they are not there.
+
+    `storage` keeps a new experiment's artifacts; None: beside an SQLite file, or the server's own.
+    """
     os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
     os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
     os.environ["MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT"] = "true"  # with the password that is in it
@@ -322,6 +340,8 @@ def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
             location = (file.parent / "mlartifacts" / quote(experiment, safe="")).as_uri()
             lock = stack.enter_context(file.with_suffix(".lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX)
+        if storage is not None:
+            location = f"{storage.rstrip('/')}/mlartifacts/{quote(experiment, safe='')}"
         client = MlflowClient(tracking_uri=uri)
         known = client.get_experiment_by_name(experiment)
         return client, known.experiment_id if known else client.create_experiment(experiment, location)

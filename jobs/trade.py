@@ -19,6 +19,7 @@ import torch
 from envs.accuracy import converged
 from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
+from jobs.children import Child, write_children
 from jobs.conditions import Cell, Entry, find_pilots, make_cell, read_entry, with_sensor
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError
 from jobs.encoder_costs import CAPS, TIME_BINS
@@ -30,7 +31,7 @@ from jobs.runs import Run, finish, locate_run, open_run, provenance, write_atomi
 from jobs.statistics import paired_rate_difference
 from jobs.sweep import fly_cells
 from jobs.sweep_report import command, today
-from jobs.tracking import Child, Tracker, open_tracker, write_children
+from jobs.tracking import Tracker, open_tracker
 from jobs.trade_encoder import EVENT_ENCODERS
 from jobs.trade_figures import choice_figure
 from jobs.trade_page import DEFAULT, EXACT, HEADINGS, Row, lines, metrics, page, panels, verdict

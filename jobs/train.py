@@ -2,29 +2,35 @@
 
 Run: python -m platform.launch +exp=train
 Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
-`train/results.jsonl`. A stopped run continues from its last checkpoint when the same command
-is given again; an environment step that was reported once is not reported twice.
+`train/results.jsonl`. A stopped run continues from its last whole checkpoint when the same
+command is given again; an environment step that was reported once is not reported twice. What
+a lost process or machine ends is tried again at once, what the code raises is not: it would
+raise the same again.
 """
 
 import contextlib
 import json
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import pyarrow.fs
 import ray
 import torch
 from ray import tune
+from ray.exceptions import RayError, RayTaskError
 from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 
-from jobs.cluster import start_ray
+from jobs.checkpoints import mend, seal
+from jobs.cluster import fit, holds, start_ray, storage
 from jobs.config import Config, ConfigError
 from jobs.drift import FIGURES
-from jobs.ppo import build_ppo, policy_settings
+from jobs.ppo import MAX_RESTARTS, build_ppo, policy_settings
 from jobs.pretrain import check_sources, prepare_encoder
-from jobs.progress import progress
+from jobs.progress import console, progress
 from jobs.runs import Run, finish, finished, open_run
 from jobs.tracking import open_tracker
 from models.kinds import kind_of
@@ -49,9 +55,12 @@ METRICS = {
     "sim/dropped_events": ("env_runners", "dropped_events"),
     **{f"evae/{name}": ("env_runners", name) for name in FIGURES},
     "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
+    "perf/trial_restarts": ("trial_restarts",),
 }
 ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
 ENV_STEPS = "num_env_steps_sampled_lifetime"
+FLOWN = ("env_runners", "num_env_steps_sampled")
+LONGEST_PAUSE_S = 600.0  # while every process that flies starts again: a busy machine takes minutes
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
@@ -78,8 +87,23 @@ class Relay(tune.Callback):
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
     ) -> None:
-        """Pass one result on."""
-        _LISTENERS[self.name](result)
+        """Pass one result on, with the number of restarts before it."""
+        _LISTENERS[self.name]({**result, "trial_restarts": trial.num_failures})
+
+    def on_checkpoint(
+        self, iteration: int, trials: list[Any], trial: Any, checkpoint: tune.Checkpoint, **info: Any
+    ) -> None:
+        """Seal one."""
+        if on_disk(checkpoint):
+            seal(Path(checkpoint.path))
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Say that the training goes on, or stop it if its code raised."""
+        error = trial.get_pickled_error()
+        if isinstance(error, RayTaskError) and not isinstance(error.cause, RayError):
+            raise TrainingError(stopped(error))
+        reason = "its process could not be started" if error is None else last_line(error)
+        console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -114,14 +138,25 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     check_cpus(config)
     algorithm = build_ppo(config, encoder_path)
     with _listening(config, folder, on_result) as last:
-        results = _tuner(config, folder, algorithm).fit()
+        results = fit(_tuner(config, folder, algorithm))
     if results.errors:
-        reason = str(results.errors[0]).strip().splitlines()[-1]
-        raise TrainingError(f"training stopped: {reason}; the same command continues from its checkpoint")
+        raise TrainingError(stopped(results.errors[0]))
     figures = {name: value for name, value in last.items() if math.isfinite(value)}
-    export_policy(config, Path(results[0].checkpoint.path), encoder_path, folder.policy, figures)
+    with results[0].checkpoint.as_directory() as checkpoint:
+        export_policy(config, Path(checkpoint), encoder_path, folder.policy, figures)
     finish(folder, "train", figures)
     return folder.policy
+
+
+def stopped(error: Exception) -> str:
+    """What to say of a training that an error ended."""
+    return f"training stopped: {last_line(error)}; the same command continues from its last checkpoint"
+
+
+def last_line(error: Exception) -> str:
+    """The line of a worker's error that names its cause."""
+    lines = str(error).strip().splitlines()
+    return lines[-1].strip() if lines else type(error).__name__
 
 
 def check_cpus(config: Config) -> None:
@@ -155,16 +190,20 @@ def export_policy(
 
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
     """The experiment in the run folder: continued if it is there, else new."""
-    path = folder.train
+    path = storage(config.cluster, folder.train)
     # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
-    if tune.Tuner.can_restore(path) and any(path.glob("experiment_state-*.json")):
-        return tune.Tuner.restore(str(path), PPO, resume_errored=True, param_space=algorithm)
+    if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
+        stopped_at = restored(path, algorithm).get_results()[0].checkpoint
+        said = mend(Path(stopped_at.path)) if stopped_at and on_disk(stopped_at) else None
+        if said:
+            console.print(said, markup=False)
+        return restored(path, algorithm)
     return tune.Tuner(
         PPO,
         param_space=algorithm,
         run_config=tune.RunConfig(
-            name=path.name,
-            storage_path=str(path.parent),
+            name=folder.train.name,
+            storage_path=path.rpartition("/")[0],
             stop={ENV_STEPS: config.train.env_steps},
             verbose=0,
             callbacks=[Relay(LISTENER)],
@@ -178,6 +217,16 @@ def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
     )
 
 
+def on_disk(checkpoint: tune.Checkpoint) -> bool:
+    """Whether a checkpoint lies in a folder; an object store checks what it keeps itself."""
+    return isinstance(checkpoint.filesystem, pyarrow.fs.LocalFileSystem)
+
+
+def restored(path: str, algorithm: Any) -> tune.Tuner:
+    """The experiment of a folder, to go on."""
+    return tune.Tuner.restore(path, PPO, resume_errored=True, param_space=algorithm)
+
+
 @contextlib.contextmanager
 def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
     """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
@@ -185,13 +234,20 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(whole_lines(file))
     reported, last = reported_so_far(file)
-    total = config.train.env_steps
+    total, since_s = config.train.env_steps, time.monotonic()
+    paused_s: float | None = None
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
         def listen(result: Mapping[str, Any]) -> None:
-            nonlocal reported
-            env_steps = int(result[ENV_STEPS])
-            last.update(read_metrics(result))
+            nonlocal reported, since_s, paused_s
+            now_s = time.monotonic()
+            if not _lookup(result, FLOWN) > 0:
+                paused_s = now_s if paused_s is None else paused_s
+                check_pause(now_s - paused_s)
+                return
+            paused_s, env_steps = None, int(result[ENV_STEPS])
+            last.update(read_metrics(result, now_s - since_s))
+            since_s = now_s
             if env_steps <= reported:
                 return
             row = {name: value if math.isfinite(value) else None for name, value in last.items()}
@@ -206,6 +262,19 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             yield last
         finally:
             del _LISTENERS[LISTENER]
+
+
+def check_pause(seconds: float) -> None:
+    """Let a training wait for processes that fly and have ended, unless they do not come back.
+
+    Raises:
+        TrainingError: After `LONGEST_PAUSE_S`.
+    """
+    if seconds > LONGEST_PAUSE_S:
+        ended = f"every process that flies has ended, some {MAX_RESTARTS + 1} times"
+        raise TrainingError(
+            f"no step was flown for {seconds:.0f} s: {ended}; see /tmp/ray/session_latest/logs"
+        )
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
@@ -223,15 +292,16 @@ def whole_lines(file: Path) -> bytes:
     return text[: text.rfind(b"\n") + 1]
 
 
-def read_metrics(result: Mapping[str, Any]) -> dict[str, float]:
+def read_metrics(result: Mapping[str, Any], seconds: float) -> dict[str, float]:
     """The metrics worth keeping of an RLlib result; NaN where nothing was measured.
+
+    `seconds` have passed since the one before it, on a clock that does not jump as RLlib's may.
 
     Raises:
         TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
     """
     metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
-    seconds = float(result["time_this_iter_s"])
-    steps = _lookup(result, ("env_runners", "num_env_steps_sampled"))
+    steps = _lookup(result, FLOWN)
     metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
     bad = [f"{name} = {metrics[name]}" for name in ALWAYS_FINITE if not math.isfinite(metrics[name])]
     if bad:

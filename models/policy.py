@@ -139,7 +139,10 @@ class Policy:
         self._stacks = push_features(self._stacks, features, first)
         self._first = np.zeros(len(features), bool)
         with torch.inference_mode():
-            return self.networks["pi"](self.networks["trunk"](torch.from_numpy(self._stacks))).numpy()
+            logits = self.networks["pi"](self.networks["trunk"](torch.from_numpy(self._stacks))).numpy()
+        if not np.isfinite(logits).all():
+            raise ValueError("the policy's logits must be finite, got NaN or infinity; train it anew")
+        return logits
 
     def _choose(self, logits: np.ndarray) -> np.ndarray:
         if self.deterministic or self.rng is None:

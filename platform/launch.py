@@ -6,10 +6,12 @@ when the job fails, 130 after Ctrl+C.
 """
 
 import contextlib
+import errno
 import importlib
 import io
 import os
 import re
+import shlex
 import sys
 import traceback
 from collections.abc import Iterator
@@ -62,6 +64,11 @@ def main() -> int:
     except Exception as error:
         return report(error)
     return DONE
+
+
+def command(words: list[str]) -> str:
+    """What a shell in the repository's root takes to do the same again."""
+    return shlex.join([sys.executable, "-m", "platform.launch", *words])
 
 
 def compose(words: list[str]) -> dict[str, Any] | None:
@@ -153,6 +160,7 @@ def run(values: dict[str, Any]) -> None:
     if reasons:
         raise ConfigError("\n".join(reasons))
     config = parse(values)
+    print(f"If this is stopped, it continues with: {command(sys.argv[1:])}", flush=True)
     importlib.import_module(JOBS[config.job]).run(config)
 
 
@@ -176,14 +184,15 @@ def report(error: Exception) -> int:
     """Say what went wrong, with a traceback where it helps; return the exit status.
 
     A ValueError that this repository raises is a refused value, a RuntimeError a documented
-    failure: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback of those too. No
-    password of an address is shown.
+    failure, and so is a full disk: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback
+    of those too. No password of an address is shown.
     """
     from jobs.refusals import redacted
 
     ours = raised_here(error)
     refused = isinstance(error, ValueError) and ours
-    documented = refused or (isinstance(error, RuntimeError) and ours)
+    full = getattr(error, "errno", None) == errno.ENOSPC
+    documented = refused or (isinstance(error, RuntimeError) and ours) or full
     if "HYDRA_FULL_ERROR" in os.environ or not documented:
         print(redacted("".join(traceback.format_exception(error))), end="", file=sys.stderr)
     message = redacted(str(error) if documented else f"{type(error).__name__}: {error}")

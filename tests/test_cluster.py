@@ -9,15 +9,52 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier
 
+import pydantic
 import pytest
+import ray
+from ray.tune import TuneError
 
-from jobs.cluster import check_mode, check_private, make_token, one_at_a_time, use_token
+from jobs import cluster as joining
+from jobs.cluster import (
+    ClusterError,
+    check_mode,
+    check_private,
+    holds,
+    make_token,
+    one_at_a_time,
+    storage,
+    use_token,
+)
 from jobs.config import ConfigError
 from jobs.settings import ClusterConfig
 
 ROOT = Path(__file__).resolve().parent.parent
-LOCAL = ClusterConfig(name="local", address=None, num_cpus=1)
-JOINED = ClusterConfig(name="ray", address="127.0.0.1:1", num_cpus=None)
+LOCAL = ClusterConfig(name="local", address=None, num_cpus=1, storage=None)
+JOINED = ClusterConfig(name="ray", address="127.0.0.1:1", num_cpus=None, storage=None)
+
+
+def cluster(place):
+    return ClusterConfig(name="ray", address="auto", num_cpus=None, storage=place)
+
+
+def test_what_nodes_write_lies_in_the_run_folder_or_under_its_name_in_the_storage(tmp_path):
+    folder = tmp_path / "runs" / "a-smoke-s0-1" / "train"
+    assert storage(cluster(None), folder) == str(folder)
+    assert storage(cluster("/nfs/evade/"), folder) == "/nfs/evade/a-smoke-s0-1/train"
+    assert storage(cluster("s3://bucket/evade"), folder) == "s3://bucket/evade/a-smoke-s0-1/train"
+
+
+def test_a_storage_that_other_machines_would_look_for_elsewhere_is_refused():
+    with pytest.raises(pydantic.ValidationError, match="must be an absolute folder"):
+        cluster("checkpoints")
+
+
+def test_a_folder_is_searched_by_its_path_and_by_its_address(tmp_path):
+    (tmp_path / "experiment_state-1.json").touch()
+    for place in (str(tmp_path), tmp_path.as_uri()):
+        assert holds(place, "experiment_state-")
+        assert not holds(place, "tuner")
+        assert not holds(f"{place}/none", "experiment_state-")
 
 
 def start(results, name):
@@ -141,7 +178,7 @@ import sys
 from pathlib import Path
 from jobs.cluster import start_ray
 from jobs.settings import ClusterConfig
-start_ray(ClusterConfig(name="local", address=None, num_cpus=1), Path(sys.argv[1]))
+start_ray(ClusterConfig(name="local", address=None, num_cpus=1, storage=None), Path(sys.argv[1]))
 import ray
 @ray.remote
 def whoami():
@@ -182,3 +219,45 @@ def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_
         assert head.wait(60) == 0
     assert "uthenticat" in without
     assert "uthenticat" in wrong
+
+
+@pytest.mark.parametrize("failures", [0, 1, joining.STARTS])
+def test_a_busy_machine_gets_more_than_one_chance_to_start_ray(monkeypatch, failures):
+    calls = []
+
+    def init(**settings):
+        calls.append(settings)
+        if calls.count(settings) <= failures:
+            raise Exception("The current node timed out during startup. ...")
+
+    monkeypatch.setattr(ray, "init", init)
+    monkeypatch.setattr(ray, "shutdown", lambda: calls.append("shutdown"))
+    if failures < joining.STARTS:
+        joining._start_local({"num_cpus": 1})
+        assert calls == [{"address": "local", "include_dashboard": False, "num_cpus": 1}] + (
+            ["shutdown", calls[0]] * failures
+        )
+    else:
+        with pytest.raises(ClusterError, match="the machine is too busy"):
+            joining._start_local({"num_cpus": 1})
+
+
+def test_another_error_of_ray_is_raised_as_it_is(monkeypatch):
+    def init(**settings):
+        raise ValueError("no such setting")
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ValueError, match="no such setting"):
+        joining._start_local({})
+
+
+def test_what_a_callback_raises_comes_out_of_tune_as_it_is():
+    class Tuner:
+        def fit(self):
+            try:
+                raise ClusterError("the reason")
+            except ClusterError:
+                raise TuneError("Traceback ...")  # noqa: B904
+
+    with pytest.raises(ClusterError, match="the reason"):
+        joining.fit(Tuner())

@@ -1,6 +1,7 @@
 import importlib.util
 import os
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -188,7 +189,12 @@ def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folde
         "renderer=raycast",
         "resume=runs/x",
     ]
-    assert launch("+exp=train", *words) == (0, "", "")
+    status, out, err = launch("+exp=train", *words)
+    assert (status, err) == (0, "")
+    (line,) = out.splitlines()
+    said, _, command = line.partition(": ")
+    assert said == "If this is stopped, it continues with"
+    assert shlex.split(command) == [sys.executable, "-m", "platform.launch", "+exp=train", *words]
     (config,) = given
     assert isinstance(config, Config)
     assert (config.job, config.seed, config.renderer, config.resume) == ("train", 3, "raycast", "runs/x")

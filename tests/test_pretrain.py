@@ -10,6 +10,7 @@ from jobs.config import ConfigError
 from jobs.pretrain import (
     beta,
     check_sources,
+    checkpoints,
     cut_window,
     held_out_figures,
     held_out_windows,
@@ -102,10 +103,24 @@ def training(recording, iterations, checkpoint=None):
 def test_an_interrupted_training_ends_with_the_same_weights(recording, tmp_path):
     whole = training(recording, 20)[0]
     evae, optimizer, rng = training(recording, 12)
-    save_checkpoint(tmp_path / "checkpoint.pt", evae, optimizer, rng, 12)
-    continued = training(recording, 20, tmp_path / "checkpoint.pt")[0]
+    save_checkpoint(tmp_path, evae, optimizer, rng, 12)
+    continued = training(recording, 20, tmp_path)[0]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, continued.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(
+    "harm", [lambda content: content[:-9], lambda content: content[:900] + b"!" + content[901:]]
+)
+def test_a_damaged_checkpoint_is_left_for_the_one_before_it(recording, tmp_path, capsys, harm):
+    evae, optimizer, rng = training(recording, 1)
+    for iteration in (10, 20, 30):
+        save_checkpoint(tmp_path, evae, optimizer, rng, iteration)
+    newest, before = checkpoints(tmp_path)
+    newest.write_bytes(harm(newest.read_bytes()))
+    assert restore(tmp_path, evae, optimizer, rng) == 20
+    assert capsys.readouterr().out == f"Checkpoint damaged, the one before it is taken: {newest}\n"
+    assert checkpoints(tmp_path) == [before]
 
 
 def test_training_explains_windows_of_flights_that_it_never_saw(recording):

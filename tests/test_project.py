@@ -91,6 +91,8 @@ def test_make_help_lists_every_target():
         "sweep-robustness",
         "mlflow",
         "test",
+        "test-faults",
+        "test-cluster",
         "lint",
         "check",
         "bench",

@@ -1,4 +1,6 @@
 import itertools
+import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 from jobs.ppo import build_ppo
-from jobs.runner import PlainEnvRunner
+from jobs.runner import FlightError, PlainEnvRunner
 from models.features import push_features
 from models.kinds import KINDS
 from tests.test_train import SHORT, make_config, write_encoder
@@ -121,7 +123,31 @@ def test_a_reset_forgets_the_flights_in_the_air(tmp_path):
 )
 def test_what_it_cannot_fly_is_refused(asked, tmp_path):
     ours, theirs = make_runners("event_columns", tmp_path)
-    with pytest.raises(ValueError, match="drawn actions and nothing else"):
+    with pytest.raises(FlightError, match=r"ValueError: .*drawn actions and nothing else"):
         ours.sample(**asked)
     for runner in (ours, theirs):
         runner.stop()
+
+
+class Broken(PlainEnvRunner):
+    """One whose flights raise; made without a process of its own."""
+
+    def __init__(self):
+        self.error = ValueError("episode 3, step 7, seed 0: the reward must be finite; got nan")
+
+    def sample(self, **asked):
+        raise FlightError(f"ValueError: {self.error}")
+
+
+def test_what_a_flight_raises_is_raised_again_where_its_sample_is_used():
+    sent = Broken().apply(lambda runner: (runner.sample(), runner.get_metrics()))
+    received = pickle.loads(pickle.dumps(sent))
+    with pytest.raises(FlightError, match="step 7, seed 0: the reward must be finite; got nan"):
+        received[0]
+
+
+def test_any_other_error_ends_the_process_as_rllib_has_it():
+    runner = Broken()
+    runner.config = SimpleNamespace(restart_failed_env_runners=False)
+    with pytest.raises(SystemExit):
+        runner.apply(lambda runner: runner.no_such_method())

@@ -1,12 +1,26 @@
 import dataclasses
+import errno
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from jobs import runs
 from jobs.config import Config, ConfigError
-from jobs.runs import finish, finished, git_commit, latest_policies, open_run, run_name, write_json
+from jobs.runs import (
+    RunError,
+    finish,
+    finished,
+    git_commit,
+    holding,
+    latest_policies,
+    open_run,
+    run_name,
+    write_json,
+)
 
 
 @pytest.fixture
@@ -96,6 +110,55 @@ def test_the_stored_configuration_is_readable_as_yaml_and_json(config):
     assert yaml.safe_load((run.path / "config.yaml").read_text()) == json.loads(
         (run.path / "config.json").read_text()
     )
+
+
+def test_a_damaged_marker_is_named_with_its_remedy(config):
+    run = open_run(config)
+    finish(run, "train", {})
+    (run.path / "stages" / "train.json").write_text('{"fig')
+    with pytest.raises(
+        RunError, match=r"train\.json: must be JSON, got a damaged file .*; delete it, and the same"
+    ):
+        finished(run, "train")
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_part(config, monkeypatch):
+    run = open_run(config)
+    finish(run, "train", {"loss": 1.0})
+
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(runs.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        finish(run, "train", {"loss": 2.0})
+    assert finished(run, "train") == {"loss": 1.0}
+    assert [path.name for path in (run.path / "stages").iterdir()] == ["train.json"]
+
+
+def test_one_process_works_in_a_run_folder_and_lets_go_when_it_is_killed(config):
+    run = open_run(config)
+    code = f"""
+import sys
+from pathlib import Path
+from jobs.runs import Run, holding
+with holding(Run(Path({str(run.path)!r}), None)):
+    print("in", flush=True)
+    sys.stdin.read()
+"""
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=runs.REPOSITORY
+    ) as other:
+        other.stdout.readline()
+        with (
+            pytest.raises(RunError, match=rf"process {other.pid} of .* works there; wait until"),
+            holding(run),
+        ):
+            pass
+        other.kill()
+    with holding(run):
+        pass
 
 
 def test_without_git_the_commit_is_unknown(monkeypatch):

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import pickle
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +35,8 @@ class StubTuner:
             if cell.label in self.broken:
                 if self.broken[cell.label]:
                     self.keep.on_trial_result(1, [], None, {**result, "failed": self.broken[cell.label]})
+                else:
+                    self.die(cell)
                 continue
             rows = np.zeros(len(cell.seeds), EPISODE)
             rows["seed"], rows["distance_m"] = cell.seeds, 50.0
@@ -41,6 +44,12 @@ class StubTuner:
             accuracy = {"event_error": 0.01, "renders_per_step": 3.0} if cell.key in self.measured else None
             result |= {"simulation": cell.simulation, "accuracy": accuracy}
             self.keep.on_trial_result(1, [], None, {**result, "encoder": {}, "episodes": rows.tolist()})
+
+    def die(self, cell):
+        trial = SimpleNamespace(config={"trial": {"cell": cell}})
+        for hook in [self.keep.on_trial_recover] * sweeping.MAX_FAILURES + [self.keep.on_trial_error]:
+            self.keep.on_trial_start(1, [], trial)
+            hook(1, [], trial)
 
 
 @pytest.fixture

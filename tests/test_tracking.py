@@ -5,13 +5,17 @@ from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
+from mlflow.exceptions import MlflowException
+from mlflow.protos.databricks_pb2 import INTERNAL_ERROR
 from PIL import Image
 
+from jobs import outbox, tracking
+from jobs.children import Child, write_children
 from jobs.config import ConfigError
 from jobs.dashboard import PAGE_WIDTH, chart_view
-from jobs.runs import Run, open_run
+from jobs.runs import Run, RunError, holding, open_run
 from jobs.store import check_metrics, flatten, store_uri
-from jobs.tracking import Child, open_child, open_store, open_tracker, write_children
+from jobs.tracking import TrackingError, open_store, open_tracker
 from tests.test_runs import small_config
 
 
@@ -57,18 +61,6 @@ def test_a_run_that_raises_ends_as_failed(folder):
     with pytest.raises(ZeroDivisionError), open_tracker(folder.config, folder, key="broken") as tracker:
         raise ZeroDivisionError
     assert tracker.client.get_run(tracker.run_id).info.status == "FAILED"
-
-
-def test_children_name_their_parent_and_are_continued(folder):
-    with open_tracker(folder.config, folder, key="sweep") as parent:
-        for _ in range(2):
-            with open_child(parent, folder, "child 1", "faults.sparsity=0.2", "condition") as child:
-                child.log(0, {"eval/success_rate": 1.0})
-        found = parent.client.search_runs(
-            [parent.experiment_id], f"tags.`mlflow.parentRunId` = '{parent.run_id}'"
-        )
-    assert [run.info.run_id for run in found] == [child.run_id]
-    assert found[0].info.status == "FINISHED"
 
 
 def test_a_saved_view_stands_in_the_experiments_tags_and_its_text_leads_there(folder):
@@ -171,3 +163,55 @@ def test_children_are_written_once_and_replaced_where_their_content_has_changed(
     assert [(point.step, point.value) for point in curve] == [(45, 1.0), (100, 1.0)]
     assert after["b"].data.params == {"axis": "rate", "env.hz": "45"}
     assert after["b"].info.status == "FINISHED"
+
+
+def test_curves_wait_while_the_store_is_away_and_are_delivered_before_the_run_ends(folder, monkeypatch):
+    monkeypatch.setattr(outbox, "REST_S", 0.0)
+    with open_tracker(folder.config, folder, key="away") as tracker:
+        answer = tracker.client.log_batch
+
+        def silent(*given, **named):
+            raise MlflowException("API request failed", error_code=INTERNAL_ERROR)
+
+        tracker.log(1, {"train/episode_return": 1.0})
+        monkeypatch.setattr(tracker.client, "log_batch", silent)
+        tracker.log(2, {"train/episode_return": 2.0})
+        tracker.log(3, {"train/episode_return": math.nan})
+        assert len(tracker.outbox.rows()) == 2
+        monkeypatch.setattr(tracker.client, "log_batch", answer)
+    assert not tracker.outbox.file.exists()
+    history = tracker.client.get_metric_history(tracker.run_id, "train/episode_return")
+    assert [(point.step, point.value) for point in history] == [(1, 1.0), (2, 2.0)]
+    run = tracker.client.get_run(tracker.run_id)
+    assert run.data.tags["not_measured"] == "step 3: train/episode_return"
+    assert run.info.status == "FINISHED"
+
+
+def test_the_same_row_twice_is_the_same_point_once(folder):
+    with open_tracker(folder.config, folder, key="twice") as tracker:
+        row = {"step": 1, "time_ms": 5, "metrics": {"train/episode_return": 1.0}, "missing": []}
+        tracker._send(row)
+        tracker._send(row)
+        assert len(tracker.client.get_metric_history(tracker.run_id, "train/episode_return")) == 1
+
+
+def test_a_store_that_does_not_answer_stops_with_one_error_that_says_where_the_results_are(
+    folder, monkeypatch
+):
+    monkeypatch.setitem(tracking.PATIENT, "MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    nowhere = dataclasses.replace(folder.config.tracking, uri="http://127.0.0.1:9")
+    config = dataclasses.replace(folder.config, tracking=nowhere)
+    with (
+        pytest.raises(TrackingError, match=rf"127\.0\.0\.1:9 does not answer \(.*refused.*{folder.path}"),
+        open_tracker(config, folder),
+    ):
+        pass
+
+
+def test_a_second_process_is_kept_out_of_the_run_folder(folder):
+    with (
+        holding(folder),
+        pytest.raises(RunError, match=r"works there; wait until it has ended"),
+        open_tracker(folder.config, folder),
+    ):
+        pass

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from ray.exceptions import ActorDiedError, RayTaskError
 
 from envs.config import sensor_settings, settings_hash
 from jobs import train as training
@@ -65,7 +66,6 @@ def result(**learner):
     }
     return {
         "num_env_steps_sampled_lifetime": 4096,
-        "time_this_iter_s": 2.0,
         "env_runners": {
             "num_env_steps_sampled": 2048,
             "flight_return": 12.5,
@@ -73,11 +73,12 @@ def result(**learner):
         },
         "learners": {"default_policy": losses | learner},
         "fault_tolerance": {"num_remote_worker_restarts": 0},
+        "trial_restarts": 0,
     }
 
 
 def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
-    metrics = read_metrics(result())
+    metrics = read_metrics(result(), 2.0)
     assert metrics["train/episode_return"] == 12.5
     assert metrics["train/value_loss"] == 2.0
     assert metrics["perf/env_steps_per_second"] == 1024.0
@@ -88,7 +89,51 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_the_training(bad):
     with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
-        read_metrics(result(vf_loss=bad))
+        read_metrics(result(vf_loss=bad), 2.0)
+
+
+def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
+    folder, seen = open_run(make_config(f"runs_dir={tmp_path}")), []
+    empty = {**result(), "env_runners": {}, "learners": {}}
+    with training._listening(folder.config, folder, lambda step, metrics: seen.append(step)):
+        listen = training._LISTENERS[training.LISTENER]
+        for seconds in (100.0, 400.0, 400.0, 300.0, 300.0):
+            now[0] += seconds
+            listen(result() if seconds == 400.0 and not seen else empty)
+        now[0] += 1.0
+        with pytest.raises(
+            TrainingError, match="no step was flown for 601 s: every process that flies has ended"
+        ):
+            listen(empty)
+    assert seen == [4096]
+
+
+class Trial:
+    """A trial that ended with an error."""
+
+    num_failures = 1
+
+    def __init__(self, error):
+        self.error = error
+
+    def get_pickled_error(self):
+        return self.error
+
+
+def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(capsys):
+    relay = training.Relay("name")
+    raised = RayTaskError("train", "Traceback\nValueError: no", ValueError("no"))
+    with pytest.raises(TrainingError, match=r"^training stopped: ValueError: no; the same command continues"):
+        relay.on_trial_recover(1, [], Trial(raised))
+    for lost in (
+        None,
+        ActorDiedError(),
+        RayTaskError("train", "Traceback\nActorDiedError", ActorDiedError()),
+    ):
+        relay.on_trial_recover(1, [], Trial(lost))
+    assert capsys.readouterr().out.count("goes on from its last checkpoint") == 3
 
 
 def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):

@@ -1,0 +1,23 @@
+"""The same command on one machine and on a Ray cluster: the same episodes."""
+
+import pytest
+
+from tests.faults.harness import SWEEP, launch
+from tests.faults.test_fault_node import SMALL, cluster, on  # noqa: F401
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
+AXIS = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}"
+WORDS = (*SWEEP, "~sweep.axes", AXIS, "sweep.policies=[straight,random]")
+
+
+def test_a_sweep_on_a_cluster_gives_the_bytes_of_a_sweep_on_one_machine(tmp_path, cluster):  # noqa: F811
+    for _ in range(2):
+        cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"])
+    far = launch(tmp_path / "far", *WORDS, *on(cluster), f"cluster.storage={tmp_path / 'shared'}")
+    assert far.end() == 0, far.said
+    near = launch(tmp_path / "near", *WORDS)
+    assert near.end() == 0, near.said
+    assert near.run.name == far.run.name
+    assert near.kept() == far.kept()
+    for name in ("episodes.csv", "table.md"):
+        assert (near.run / "sweep" / name).read_bytes() == (far.run / "sweep" / name).read_bytes()

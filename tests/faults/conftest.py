@@ -1,0 +1,33 @@
+import subprocess
+
+import pytest
+
+from tests.faults.harness import TABLE
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if "tests/faults" in str(item.path):
+            item.add_marker(pytest.mark.timeout(3600))
+
+
+def pytest_terminal_summary(terminalreporter):
+    if not TABLE:
+        return
+    head = ("fault", "outcome", "lost")
+    wide = [max(len(row[column]) for row in [head, *TABLE]) for column in range(3)]
+    terminalreporter.section("faults")
+    for row in [head, *TABLE]:
+        terminalreporter.line("  ".join(text.ljust(width) for text, width in zip(row, wide, strict=True)))
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 64 MiB of its own."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a full disk needs a small file system, and mounting one is not permitted")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)

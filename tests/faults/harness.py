@@ -1,0 +1,190 @@
+"""Runs the launcher as a user does, injects a fault into its processes, and keeps the table of outcomes.
+
+A fault is code in a `sitecustomize.py` on the path of the launcher, which every process of its
+Ray inherits: it is run after the module that it names is imported, in whichever process.
+"""
+
+import dataclasses
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+DEADLINE_S = 1200.0  # of one step of a test: a starved machine starts Ray in minutes
+TABLE: list[tuple[str, str, str]] = []
+
+# The smallest training: two flights at once, cut after seven steps, 64 steps to a checkpoint.
+TRAIN = (
+    "+exp=event_columns",
+    "job=train",
+    "budget=smoke",
+    "algo.num_env_runners=1",
+    "algo.num_envs_per_env_runner=2",
+    "algo.train_batch_size_per_learner=64",
+    "algo.minibatch_size=64",
+    "algo.num_epochs=1",
+    "env.time_limit_s=0.035",
+)
+SWEEP = ("+exp=robustness", "budget=smoke", "env.time_limit_s=0.2", "sweep.reference=straight")
+
+HOOK = """
+import importlib.abc, importlib.machinery, sys, threading
+AFTER = {after!r}
+
+
+class Loader(importlib.abc.Loader):
+    def __init__(self, inner):
+        self.inner = inner
+
+    def create_module(self, spec):
+        return self.inner.create_module(spec)
+
+    def exec_module(self, module):
+        self.inner.exec_module(module)
+        exec(AFTER[module.__name__], module.__dict__)
+
+
+class Finder(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name not in AFTER:
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(name, path)
+        spec.loader = Loader(spec.loader)
+        return spec
+
+
+sys.meta_path.insert(0, Finder())
+exec({first!r})
+"""
+
+
+def outcome(fault: str, what: str, lost: str) -> None:
+    """Add a row to the table that is printed at the end."""
+    TABLE.append((fault, what, lost))
+
+
+@dataclasses.dataclass
+class Job:
+    """A launcher that is running in a folder of the test's own, or has ended."""
+
+    process: subprocess.Popen
+    log: Path
+    runs: Path
+
+    @property
+    def said(self) -> str:
+        """What it has printed so far."""
+        return self.log.read_text()
+
+    @property
+    def run(self) -> Path:
+        """Its run folder."""
+        (folder,) = self.runs.iterdir()
+        return folder
+
+    def rows(self) -> list[dict]:
+        """The results of its training, whole lines."""
+        files = list(self.runs.glob("*/train/results.jsonl"))
+        lines = files[0].read_text().split("\n")[:-1] if files else []
+        return [json.loads(line) for line in lines]
+
+    def steps(self) -> int:
+        """How many environment steps its training has reported."""
+        rows = self.rows()
+        return rows[-1]["env_steps"] if rows else 0
+
+    def kept(self) -> dict[str, list]:
+        """The episodes of its sweep that are kept, by cell."""
+        files = self.runs.glob("*/sweep/episodes/*.json")
+        return {path.stem: json.loads(path.read_text())["episodes"] for path in files}
+
+    def wait(self, condition: Callable[[], object]) -> None:
+        """Wait until something has become true; the job must not end before."""
+        deadline = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert self.process.poll() is None, self.said
+            assert time.monotonic() < deadline, self.said
+            time.sleep(0.05)
+
+    def end(self) -> int:
+        """Wait for its end; the exit status."""
+        return self.process.wait(DEADLINE_S)
+
+    def kill(self) -> None:
+        """End the launcher by SIGKILL, and wait until all that it started has gone with it."""
+        below = list(descendants(self.process.pid))
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+        deadline = time.monotonic() + DEADLINE_S
+        while any(Path(f"/proc/{pid}").exists() for pid in below):
+            assert time.monotonic() < deadline, below
+            time.sleep(0.1)
+
+    def workers(self, title: str) -> list[int]:
+        """Its Ray workers whose title begins so."""
+        return [pid for pid in descendants(self.process.pid) if command_line(pid).startswith(title)]
+
+    def printed_command(self) -> list[str]:
+        """The command that it said continues it."""
+        (line,) = re.findall(r"^If this is stopped, it continues with: (.*)$", self.said, re.MULTILINE)
+        return shlex.split(line)
+
+
+def launch(
+    folder: Path, *words: str, first: str = "", after: dict[str, str] | None = None, **variables: str
+) -> Job:
+    """Start the launcher, with code to run first and after modules are imported, and variables set."""
+    place = [f"runs_dir={folder / 'runs'}"]
+    return start(folder, [sys.executable, "-m", "platform.launch", *words, *place], first, after, **variables)
+
+
+def start(
+    folder: Path, command: list[str], first: str = "", after: dict[str, str] | None = None, **variables: str
+) -> Job:
+    """The same from a whole command."""
+    hook = folder / "hook"
+    hook.mkdir(parents=True, exist_ok=True)
+    (hook / "sitecustomize.py").write_text(HOOK.format(after=after or {}, first=first))
+    path = os.pathsep.join([str(hook), str(ROOT)])
+    log = folder / f"log-{time.monotonic_ns()}"
+    with log.open("w") as file:
+        process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": path, **variables},
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+    return Job(process, log, folder / "runs")
+
+
+def descendants(pid: int) -> Iterator[int]:
+    """All processes below one."""
+    parents: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            text = stat.read_text()
+        except OSError:
+            continue
+        parents.setdefault(int(text.rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+    below = parents.get(pid, [])
+    while below:
+        child = below.pop()
+        yield child
+        below += parents.get(child, [])
+
+
+def command_line(pid: int) -> str:
+    """The command line of a process, which Ray's workers make their title; empty if it has gone."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
+    except OSError:
+        return ""

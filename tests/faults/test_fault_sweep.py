@@ -1,0 +1,122 @@
+"""Faults beside a sweep: every (condition, policy, seed) is flown once, and what cannot be is named."""
+
+import csv
+import signal
+from collections import Counter
+
+import pytest
+
+from jobs.tracking import open_store
+from tests.faults.harness import SWEEP, launch, outcome, start
+
+pytestmark = pytest.mark.faults
+SPARSITIES = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}"
+WORDS = (*SWEEP, "~sweep.axes", SPARSITIES, "sweep.policies=[straight,oracle]")
+CELLS = 4 * 2  # the nominal condition is that of sparsity 0
+# Writes down each flight, and takes its time.
+NOTED = """
+import time
+whole_fly = fly
+def fly(pilot, config, seeds, *given, **named):
+    episodes = whole_fly(pilot, config, seeds, *given, **named)
+    with open({file!r}, "a") as notes:
+        for seed in seeds:
+            notes.write(f"{{type(pilot).__name__}} {{config.faults.sparsity}} {{seed}}\\n")
+    time.sleep(1.0)
+    return episodes
+"""
+
+
+def noting(tmp_path):
+    return {"jobs.sweep": NOTED.format(file=str(tmp_path / "flights"))}
+
+
+def check_once(job, tmp_path, again_at_most):
+    """Each episode stands once in the results; flown twice is at most what was in flight at the fault."""
+    with (job.run / "sweep" / "episodes.csv").open() as file:
+        rows = [tuple(row.values()) for row in csv.DictReader(file)]
+    assert len(rows) == len(set(rows))
+    kept = [(key, row[0]) for key, rows in job.kept().items() for row in rows]
+    assert len(kept) == len(set(kept)) == CELLS * 2
+    flown = Counter((tmp_path / "flights").read_text().splitlines())
+    assert len(flown) == CELLS * 2
+    assert sum(flown.values()) - len(flown) <= again_at_most
+
+
+def test_a_killed_driver_continues_by_the_printed_command(tmp_path):
+    job = launch(tmp_path, *WORDS, after=noting(tmp_path))
+    job.wait(lambda: len(job.kept()) >= 3)
+    job.kill()
+    before = job.kept()
+    assert len(before) < CELLS
+    again = start(tmp_path, job.printed_command(), after=noting(tmp_path))
+    assert again.end() == 0, again.said
+    assert before.items() <= again.kept().items()
+    check_once(again, tmp_path, again_at_most=2 * 2)  # two cells of two flights
+    outcome(
+        "driver killed, sweep", "the printed command continues; each flight counts once", "0 kept flights"
+    )
+
+
+def test_ctrl_c_stops_a_sweep_that_the_same_command_continues(tmp_path):
+    job = launch(tmp_path, *WORDS, after=noting(tmp_path))
+    job.wait(lambda: len(job.kept()) >= 2)
+    job.process.send_signal(signal.SIGINT)
+    assert job.end() == 130, job.said
+    assert "interrupted; the same command continues where it stopped" in job.said
+    assert not (job.run / "stages" / "sweep.json").exists()
+    again = start(tmp_path, job.printed_command(), after=noting(tmp_path))
+    assert again.end() == 0, again.said
+    check_once(again, tmp_path, again_at_most=2 * 2)
+    outcome("Ctrl+C, sweep", "status 130; the same command continues", "0 kept flights")
+
+
+BROKEN = """
+LONGEST_START_S, LONGEST_STEP_S, MAX_FAILURES = 40.0, 0.0, 1
+whole_fly = fly
+def fly(pilot, config, seeds, *given, **named):
+    if config.faults.sparsity == 0.25:
+        raise ZeroDivisionError("no")
+    if config.faults.sparsity == 0.5:
+        time.sleep(10**6)
+    episodes = whole_fly(pilot, config, seeds, *given, **named)
+    if config.faults.sparsity == 0.75:
+        episodes["distance_m"][1] = math.nan
+    return episodes
+"""
+
+
+def test_a_cell_that_raises_hangs_returns_nan_or_has_no_opengl_stops_no_other(tmp_path):
+    renderers = "+sweep.axes.renderer={renderer:[raycast,pyrender]}"
+    words = (*SWEEP, "~sweep.axes", SPARSITIES, renderers, "sweep.policies=[straight]")
+    job = launch(tmp_path, *words, after={"jobs.sweep": BROKEN}, EGL_DEVICE_ID="999")
+    assert job.end() == 0, job.said
+    table = (job.run / "sweep" / "table.md").read_text()
+    reasons = {
+        "sparsity | 0.25 | straight |  | ZeroDivisionError: no |": "a trial that raises",
+        "sparsity | 0.5 | straight |  | its process ended (it may take 40 s) 2 times": "a trial that hangs",
+        "sparsity | 0.75 | straight |  | ValueError: episodes must be finite": "a trial that returns NaN",
+        "renderer | pyrender | straight |  | RuntimeError: ": "no OpenGL context in a worker",
+    }
+    for line, fault in reasons.items():
+        assert line in table, table
+        outcome(fault, "named in the table, tried again by the next run; the others fly", "that cell")
+    assert "its process ended (it may take 40 s) 1 times, tried again: sparsity 0.5 straight" in job.said
+    assert len(job.kept()) == 2 - 1
+
+
+def test_two_sweeps_started_at_once_share_a_store_but_not_a_run_folder(tmp_path):
+    words = (*SWEEP, "~sweep.axes", SPARSITIES, "sweep.policies=[straight]")
+    first, other = (launch(tmp_path, *words, f"seed={seed}") for seed in (0, 1))
+    first.wait(lambda: "Sweep: " in first.said)
+    same = launch(tmp_path, *words, "seed=0")
+    assert same.end() == 1
+    assert "works there; wait until it has ended" in same.said
+    assert first.end() == 0, first.said
+    assert other.end() == 0, other.said
+    assert len(first.kept()) == 2 * 4
+    client, experiment = open_store(f"sqlite:///{tmp_path}/mlflow.db", "evade")
+    runs = client.search_runs([experiment])
+    assert {run.info.status for run in runs} == {"FINISHED"}
+    assert Counter(run.data.tags["kind"] for run in runs) == {"sweep": 2, "condition": 2 * 5}
+    outcome("two sweeps at once, one store", "both complete; a second of the same run is refused", "nothing")
