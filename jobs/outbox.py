@@ -17,6 +17,10 @@ PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "6"}  # 0, 4, 8, 16, 32 and 64 s a
 QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
 
 
+class StoreAway(Exception):
+    """One call was not answered."""
+
+
 @contextlib.contextmanager
 def calls(how: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables, which MLflow reads at each call, for a while."""
@@ -47,15 +51,12 @@ class Outbox:
         text = self.file.read_text() if self.file.is_file() else ""
         return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
 
-    def deliver(
-        self, new: Sequence[dict[str, Any]], send: Callable[[dict[str, Any]], None], away: type[Exception]
-    ) -> str | None:
+    def deliver(self, new: Sequence[dict[str, Any]], send: Callable[[dict[str, Any]], None]) -> str | None:
         """Send what waits and what is new, in order; keep what could not be sent.
 
         Args:
             new: Rows to send after those that wait.
-            send: Sends one; may be told the same row twice.
-            away: What it raises while the store does not answer.
+            send: Sends one, or raises StoreAway; may be told the same row twice.
 
         Returns:
             Why rows wait from now on; None if none wait, or if they waited before.
@@ -68,7 +69,7 @@ class Outbox:
         for sent, row in enumerate(rows):
             try:
                 send(row)
-            except away as error:
+            except StoreAway as error:
                 self._keep(rows[sent:])
                 self._next_s = time.monotonic() + REST_S
                 return None if waited else str(error)

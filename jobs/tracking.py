@@ -1,8 +1,7 @@
 """What happened, written to MLflow; the only file that talks to it.
 
-One process creates the store (two at once break an SQLite file for good), the driver alone
-writes, and it writes in batches: hundreds of single writes cost seconds, a batch a few
-hundredths of one.
+One process creates the store (two at once break it), the driver alone writes, and it writes in
+batches: hundreds of single writes cost seconds, a batch a few hundredths of one.
 
 A store that does not answer holds up no training: curves wait in the run folder and are delivered
 when it is back. All else (tables, figures, the runs themselves) waits for it two minutes, then
@@ -39,7 +38,7 @@ from jobs.dashboard import (
     usual_views,
     view_address,
 )
-from jobs.outbox import PATIENT, QUICK, Outbox, calls
+from jobs.outbox import PATIENT, QUICK, Outbox, StoreAway, calls
 from jobs.progress import console
 from jobs.refusals import redacted
 from jobs.runs import Run, holding, provenance, read_json, write_json
@@ -56,10 +55,6 @@ AWAY = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # codes of MLflow's that a
 
 class TrackingError(RuntimeError):
     """The tracking store does not answer; the message says where the results are."""
-
-
-class StoreAway(Exception):
-    """One call was not answered."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ class Tracker:
         measured = {name: value for name, value in values.items() if name not in missing}
         row = {"step": step, "time_ms": int(time.time() * 1000), "metrics": measured, "missing": missing}
         with calls(QUICK):
-            reason = self.outbox.deliver([row], self._send, StoreAway)
+            reason = self.outbox.deliver([row], self._send)
         if reason is not None:
             console.print(
                 f"{self.uri} does not answer, results wait in {self.outbox.file}: {reason}", markup=False
@@ -332,16 +327,17 @@ def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["
     from mlflow import MlflowClient
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    location = None
-    with contextlib.ExitStack() as stack:
-        if uri.startswith("sqlite:///"):
-            file = Path(uri.removeprefix("sqlite:///"))
-            file.parent.mkdir(parents=True, exist_ok=True)
-            location = (file.parent / "mlartifacts" / quote(experiment, safe="")).as_uri()
-            lock = stack.enter_context(file.with_suffix(".lock").open("w"))
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        if storage is not None:
-            location = f"{storage.rstrip('/')}/mlartifacts/{quote(experiment, safe='')}"
+    location, name = None, f"evade-store-{os.getuid()}-{settings_hash({'uri': uri})[:8]}.lock"
+    lock = Path(tempfile.gettempdir(), name)
+    if uri.startswith("sqlite:///"):
+        file = Path(uri.removeprefix("sqlite:///"))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lock, beside = file.with_suffix(".lock"), file.parent / "mlartifacts"
+        location = (beside / quote(experiment, safe="")).as_uri()
+    if storage is not None:
+        location = f"{storage.rstrip('/')}/mlartifacts/{quote(experiment, safe='')}"
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
         client = MlflowClient(tracking_uri=uri)
         known = client.get_experiment_by_name(experiment)
         return client, known.experiment_id if known else client.create_experiment(experiment, location)

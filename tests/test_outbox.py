@@ -1,7 +1,7 @@
 import pytest
 
 from jobs import outbox
-from jobs.outbox import Outbox, calls
+from jobs.outbox import Outbox, StoreAway, calls
 
 
 class Store:
@@ -13,7 +13,7 @@ class Store:
     def send(self, row):
         self.asked += 1
         if self.away:
-            raise ConnectionError("refused")
+            raise StoreAway("refused")
         self.rows.append(row["step"])
 
 
@@ -28,7 +28,7 @@ def test_what_a_store_misses_is_delivered_once_and_in_order_when_it_is_back(tmp_
     store, box = Store(), Outbox(tmp_path / "waiting.jsonl")
 
     def log(step):
-        return box.deliver([{"step": step}], store.send, ConnectionError)
+        return box.deliver([{"step": step}], store.send)
 
     assert log(1) is None
     store.away = True
@@ -48,11 +48,11 @@ def test_what_a_store_misses_is_delivered_once_and_in_order_when_it_is_back(tmp_
 def test_what_waits_outlives_the_process_and_half_a_line(tmp_path, clock):
     store, file = Store(), tmp_path / "waiting.jsonl"
     store.away = True
-    Outbox(file).deliver([{"step": 1}, {"step": 2}], store.send, ConnectionError)
+    Outbox(file).deliver([{"step": 1}, {"step": 2}], store.send)
     with file.open("a") as lines:
         lines.write('{"st')
     store.away = False
-    Outbox(file).deliver([{"step": 3}], store.send, ConnectionError)
+    Outbox(file).deliver([{"step": 3}], store.send)
     assert store.rows == [1, 2, 3]
 
 
@@ -61,7 +61,7 @@ def test_another_error_than_absence_is_raised(tmp_path):
         raise ValueError("no such metric")
 
     with pytest.raises(ValueError, match="no such metric"):
-        Outbox(tmp_path / "waiting.jsonl").deliver([{"step": 1}], refuse, ConnectionError)
+        Outbox(tmp_path / "waiting.jsonl").deliver([{"step": 1}], refuse)
 
 
 def test_settings_of_calls_are_put_back(monkeypatch):

@@ -99,7 +99,8 @@ def iteration_s(costs: Costs, cores: int) -> tuple[float, float, float]:
 
 def bytes_sent(*words: str) -> tuple[float, float]:
     """Bytes of a step's sample and of the weights, as they travel between processes."""
-    runner = PlainEnvRunner(config=build_ppo(composed(*words)), worker_index=0)
+    here = build_ppo(composed(*words, "algo.num_env_runners=0"))
+    runner = PlainEnvRunner(config=here, worker_index=0)
     episodes = runner.sample(num_timesteps=STEPS)
     weights = runner.get_state(components="rl_module", inference_only=True)
     runner.stop()
