@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from envs.config import settings_hash
 from jobs.config import Config, as_dict
 from jobs.dashboard import (
     NOTE,
