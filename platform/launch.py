@@ -155,12 +155,13 @@ def run(values: dict[str, Any]) -> None:
         ConfigError: If a value is refused; nothing has been started or written by then.
     """
     from jobs.config import ConfigError, parse
+    from jobs.refusals import redacted
 
     reasons = dict.fromkeys(refused_values(values))
     if reasons:
         raise ConfigError("\n".join(reasons))
     config = parse(values)
-    print(f"If this is stopped, it continues with: {command(sys.argv[1:])}", flush=True)
+    print(f"If this is stopped, it continues with: {redacted(command(sys.argv[1:]))}", flush=True)
     importlib.import_module(JOBS[config.job]).run(config)
 
 

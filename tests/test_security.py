@@ -34,6 +34,7 @@ RUNS_CODE = re.compile(
 DOORS = {
     ("platform/__init__.py", "exec"),
     ("platform/__main__.py", "runpy.run_path"),
+    ("jobs/registry.py", "mlflow.pyfunc.save_model"),  # a script's path and plain files, no pickle
 }
 
 
@@ -170,9 +171,9 @@ def test_no_secret_reaches_run_folders_the_tracker_or_what_is_printed(tmp_path, 
     open_store = tracking.open_store
     stores = []
 
-    def open_local_store(asked: str, experiment: str):
+    def open_local_store(asked: str, experiment: str, storage: str | None):
         stores.append(asked)
-        return open_store(f"sqlite:///{tmp_path}/mlflow.db", experiment)
+        return open_store(f"sqlite:///{tmp_path}/mlflow.db", experiment, storage)
 
     monkeypatch.setattr(tracking, "open_store", open_local_store)
     config = with_address(small_config(tmp_path), uri)
