@@ -9,7 +9,7 @@ from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from jobs.registry import register
 from jobs.runs import open_run
-from jobs.served import ACTIONS, control_steps
+from jobs.served import ACTIONS
 from jobs.tracking import open_tracker
 from models.policy import load_policy
 from tests.test_conditions import save_training
@@ -90,19 +90,3 @@ def test_a_model_holds_the_policys_own_files_and_the_code_that_reads_them_and_no
     assert own == {Path(path).name for path in kept if path.startswith("artifacts/")}
     assert {"served.py", "code/models/policy.py", "MLmodel", "requirements.txt"} <= kept
     assert {Path(path).suffix for path in kept} <= {".py", ".json", ".safetensors", ".yaml", ".txt", ""}
-
-
-def test_a_flight_is_cut_at_the_ends_of_its_control_steps():
-    events = pd.DataFrame({"t": [1, 5000, 5001, 20000], "x": [1, 2, 3, 4], "y": 0, "p": 1})
-    cut = [(list(fields["x"]), start, window) for fields, start, window in control_steps(events, 5000)]
-    assert cut == [
-        ([], -5000, 5000), ([1, 2], 0, 5000), ([3], 5000, 5000), ([], 10000, 5000), ([4], 15000, 5000)
-    ]  # fmt: skip
-    assert len(list(control_steps(events[:0], 5000))) == 1
-
-
-@pytest.mark.parametrize("t", [[0, 1], [2, 1], [-1, 2]])
-def test_events_before_the_flight_or_out_of_order_are_refused(t):
-    events = pd.DataFrame({"t": t, "x": 0, "y": 0, "p": 1})
-    with pytest.raises(ValueError, match="t must begin above 0"):
-        list(control_steps(events, 5000))
