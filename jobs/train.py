@@ -156,7 +156,7 @@ def stopped(error: Exception) -> str:
 def last_line(error: Exception) -> str:
     """The line of a worker's error that names its cause."""
     lines = str(error).strip().splitlines()
-    return lines[-1].strip() if lines else type(error).__name__
+    return lines[-1].strip().removeprefix("jobs.runner.FlightError: ") if lines else type(error).__name__
 
 
 def check_cpus(config: Config) -> None:
