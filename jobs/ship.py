@@ -3,9 +3,10 @@
 Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=ship
 Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each
 experiment, length and seed in `runs_dir` with the configured budget, a few hundred kilobytes each
-(weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`. A group is an
-experiment; trainings of another length than the one that all are compared at have its thousands
-of steps behind their name: bytestream_1500k. Each becomes a version in MLflow's model registry.
+(weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`; what was shipped
+before stays. A group is an experiment; trainings of another length than the one that all are
+compared at have its thousands of steps behind their name: bytestream_1500k. Each becomes a
+version in MLflow's model registry.
 """
 
 import csv
@@ -27,7 +28,7 @@ from jobs.progress import console
 from jobs.registry import register_training
 from jobs.runs import REPOSITORY, group_name, open_run, write_atomic
 from jobs.tracking import open_tracker
-from models.policy import load_policy, save_lean_policy
+from models.policy import MANIFEST, load_policy, save_lean_policy
 
 FIGURE = REPOSITORY / "docs" / "images" / "learning.png"
 COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
@@ -67,7 +68,9 @@ def run(config: Config) -> dict[str, Any]:
         target = ship(training, PRETRAINED)
         size = sum(file.stat().st_size for file in target.iterdir())
         console.print(f"{target.relative_to(REPOSITORY)}: {size / 1024:,.0f} KiB", markup=False)
-    curves = [curve(training) for training in trainings]
+    shipped = read_curves(PRETRAINED)  # of trainings elsewhere, or whose run folders are gone
+    curves = list((shipped | {(one.exp, one.seed): one for one in map(curve, trainings)}).values())
+    curves.sort(key=lambda one: (one.exp, one.seed))
     write_atomic(PRETRAINED / "curves.csv", as_csv(curves))
     figure = learning_figure(curves)
     figure.savefig(FIGURE, dpi=120)
@@ -127,6 +130,20 @@ def curve(training: Training) -> Curve:
     ]
     env_steps, success, distance_m = np.array(values, float).reshape(-1, 3).T
     return Curve(training.group, training.seed, env_steps, success, distance_m)
+
+
+def read_curves(folder: Path) -> dict[tuple[str, int], Curve]:
+    """Experiment and seed -> curve, of `curves.csv` in `folder`, as far as their policies are there too."""
+    file = folder / "curves.csv"
+    rows = csv.DictReader(io.StringIO(file.read_text() if file.is_file() else ""))
+    found: dict[tuple[str, int], list[list[float]]] = defaultdict(list)
+    for row in rows:
+        found[row["exp"], int(row["seed"])].append([float(row[name]) for name in COLUMNS[2:]])
+    return {
+        key: Curve(*key, *np.array(points).T)
+        for key, points in found.items()
+        if (folder / f"{key[0]}-s{key[1]}" / MANIFEST).is_file()
+    }
 
 
 def as_csv(curves: Sequence[Curve]) -> str:

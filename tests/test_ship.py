@@ -8,7 +8,7 @@ from mlflow import MlflowClient
 
 from jobs import ship as shipping
 from jobs.config import ConfigError, as_dict
-from jobs.ship import as_csv, curve, newest_trainings, ship
+from jobs.ship import as_csv, curve, newest_trainings, read_curves, ship
 from models.policy import load_policy
 from tests.test_evaluate import save_untrained
 from tests.test_runs import small_config
@@ -84,6 +84,22 @@ def test_a_curve_keeps_both_ends_and_the_order_and_leaves_out_what_was_not_measu
     assert len(rows) == shipping.POINTS
     assert list(rows[-1]) == ["exp", "seed", "env_steps", "success_rate", "distance_m"]
     assert list(rows[-1].values()) == ["bytestream", "0", str(120 * 2048), "0.992", "119.00"]
+
+
+def test_curves_are_read_back_as_written_if_their_policies_are_still_there(tmp_path):
+    finish_training(tmp_path, "run")
+    finish_training(tmp_path, "other", exp="event_set", seed=3)
+    finish_training(tmp_path, "gone", exp="rgb")
+    trainings = newest_trainings(tmp_path / "runs", "smoke")
+    assert read_curves(tmp_path) == {}
+    (tmp_path / "curves.csv").write_text(as_csv([curve(training) for training in trainings]))
+    for training in trainings:
+        if training.group != "rgb":
+            ship(training, tmp_path)
+    found = read_curves(tmp_path)
+    assert list(found) == [("bytestream", 0), ("event_set", 3)]
+    kept = [training for training in trainings if training.group != "rgb"]
+    assert as_csv(list(found.values())) == as_csv([curve(training) for training in kept])
 
 
 def test_nothing_to_ship_is_said_with_where_it_was_sought(tmp_path):
