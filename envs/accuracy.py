@@ -50,7 +50,12 @@ def measure(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0)
         flights: How many.
         steps: Control steps of each.
         seed: Of corridors and ways.
+
+    Raises:
+        ValueError: The simulation has observation "none", which simulates no camera.
     """
+    if config.observation == "none":
+        raise ValueError("observation must be one that has a camera for its error to be measured; got 'none'")
     pairs = [_flight(config, steps, np.random.default_rng([ENTROPY, seed, i])) for i in range(flights)]
     tolerance_us = TIME_SHARE * 1e6 / config.control_hz
     weights = [events.size + converged.size for events, converged, _ in pairs]

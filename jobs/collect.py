@@ -1,5 +1,7 @@
 """Fly through training corridors, at random and by a policy if one is named; record every event.
 
+Recordings of real cameras (`collect.recordings`) are data beside the flights, or instead of them.
+
 Run: python -m platform.launch +exp=collect
 Expect: about 3,000 control steps per second on one core; `data/train.h5` and
 `data/validation.h5` in the run folder, each of whole flights that no other file shares.
@@ -22,6 +24,7 @@ from jobs.config import Config, ConfigError
 from jobs.flights import check_sensor
 from jobs.pilots import Observation, Pilot, make_pilot
 from jobs.progress import progress
+from jobs.recorded import Recorded, no_flights, read_recorded, with_recorded
 from jobs.runs import Run, finish, finished, locate_run, named_policy, open_run
 from jobs.tracking import Tracker, open_tracker
 from models.policy import load_policy
@@ -33,7 +36,7 @@ POLICY_EPISODES = 10**6  # number of a policy's first flight: corridors that no 
 
 def run(config: Config) -> dict[str, Any]:
     """Collect the data sets of a run; return its folder."""
-    check_policy(locate_run(config))
+    check_collect(locate_run(config))
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:
         return collect(folder.config, folder, tracker)
@@ -44,22 +47,29 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     done = finished(folder, "collect")
     if done is not None:
         return done
-    policy = check_policy(folder)
+    policy, recorded = check_collect(folder)
     sizes = {"train": config.collect.num_steps, "validation": config.collect.num_validation_steps}
     figures: dict[str, Any] = {}
     with progress("Collect flights", sum(sizes.values()), "steps") as advance:
         for split, num_steps in sizes.items():
             scenes = config.collect.scenes
-            shares = [len(part) for part in np.array_split(np.arange(num_steps), len(scenes))]
+            parts = np.array_split(np.arange(num_steps), len(scenes) + len(recorded))
+            shares = [len(part) for part in parts]
             flights = [
                 (config.env_config(scene=scene, split=split, observation="events"), share)
-                for scene, share in zip(scenes, shares, strict=True)
+                for scene, share in zip(scenes, shares, strict=False)
             ]
-            recording = record(flights, config.seed, advance, policy, config.collect.policy_share)
+            recording = no_flights(config.env_config())
+            if flights:
+                recording = record(flights, config.seed, advance, policy, config.collect.policy_share)
+            if recorded:
+                taken = [part[split] for part in recorded]
+                recording = with_recorded(recording, list(zip(taken, shares[len(scenes) :], strict=True)))
             write_recording(data_file(folder, split), recording)
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_flights"] = recording.about["flights"]
-    figures |= achieved(config.env_config(scene=config.collect.scenes[0]))
+    if config.collect.scenes:
+        figures |= achieved(config.env_config(scene=config.collect.scenes[0]))
     tracker.log(0, figures)
     return finish(folder, "collect", figures)
 
@@ -67,6 +77,23 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
 def data_file(folder: Run, split: str) -> Path:
     """Where the recording of a split lives in a run folder."""
     return folder.data / f"{split}.h5"
+
+
+def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
+    """The policy and the recordings that a run still has to collect; none if it has collected.
+
+    Raises:
+        ConfigError: `collect.policy` or `collect.recordings` names one that does not fit.
+    """
+    policy, config = check_policy(folder), folder.config
+    if finished(folder, "collect") is not None:
+        return None, []
+    settings = config.collect
+    share = settings.num_validation_steps / (settings.num_steps + settings.num_validation_steps)
+    try:
+        return policy, [read_recorded(path, config.env_config(), share) for path in settings.recordings]
+    except ValueError as error:
+        raise ConfigError(f"collect.recordings: {error}") from error
 
 
 def check_policy(folder: Run) -> Path | None:

@@ -116,6 +116,8 @@ def parse(values: Mapping[str, Any]) -> Config:
         named += [("sweep.axes", name) for name in dict.fromkeys(swept) if isinstance(name, str)]
         vehicle = config.env["vehicle_radius_m"], config.env["camera_height_m"]
         refused = _refused_picture(config) + refused_axes(config.sweep.axes, config.env_config())
+        if not config.collect.scenes and not config.collect.recordings:
+            refused.append("collect.scenes: must name a scene where collect.recordings is empty, got []")
         refused += refused_scenes(named, config.env["layout"], vehicle)
     if refused:
         raise ConfigError("\n".join(refused))

@@ -16,7 +16,7 @@ import torch
 
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
-from jobs.collect import check_policy, collect, data_file
+from jobs.collect import check_collect, collect, data_file
 from jobs.config import Config, ConfigError
 from jobs.figures import reconstruction_figure
 from jobs.progress import console, progress
@@ -71,11 +71,11 @@ def check_sources(config: Config) -> None:
     """Check the files that collecting and pretraining begin from, before anything is made.
 
     Raises:
-        ConfigError: `collect.policy` or `pretrain.encoder` names none, or one that does not fit.
+        ConfigError: `collect.policy`, `collect.recordings` or `pretrain.encoder` names one that does not fit.
     """
     folder = locate_run(config)
     if KINDS[folder.config.model.name].encoder:
-        check_policy(folder)
+        check_collect(folder)
         initial_state(folder)
 
 

@@ -93,9 +93,15 @@ class AlgoConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class CollectConfig:
-    """Which flights fill the data set of the event VAE."""
+    """Which flights and recordings fill the data set of the event VAE; each gets an equal share of the steps.
 
-    scenes: Annotated[list[Name], Field(min_length=1)]
+    Attributes:
+        scenes: Layouts flown.
+        recordings: Event files of real cameras; each gives what it has, if that is less.
+    """
+
+    scenes: list[Name]
+    recordings: list[Name]
     num_steps: Count
     num_validation_steps: Count
     policy: str | None

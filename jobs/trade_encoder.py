@@ -7,6 +7,7 @@ and figures of what the latent holds, in the run folder under `trade/` and in ML
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,8 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
     batch = held_out_windows(validation, config.pretrain, evae.grid)["four_steps"]
     heads = ("events", *(f"{share:.2f}" for share in np.linspace(0, 1, STEPS_BETWEEN)), "events")
     draw_figure(folder, tracker, "trade/interpolation", picture_grid(between(evae, batch), heads))
-    scenes = {" and ".join(config.collect.scenes): batch}
+    names = [*config.collect.scenes, *(Path(path).name for path in config.collect.recordings)]
+    scenes = {" and ".join(names): batch}
     steps = 10 * config.trade_encoder.windows
     with progress("Fly in other scenes", steps * len(OTHER_SCENES), "steps") as advance:
         for scene in OTHER_SCENES:

@@ -169,3 +169,8 @@ def test_a_job_says_what_it_achieves_and_whether_that_is_less_than_asked(monkeyp
     text = " ".join(capsys.readouterr().out.split())
     assert f"{error:.1%} (asked: at most 5.0%)" in text
     assert ("more than asked" in text) == says
+
+
+def test_a_simulation_without_a_camera_is_not_said_to_be_exact():
+    with pytest.raises(ValueError, match="observation must be one that has a camera"):
+        measure(EnvConfig(observation="none"))

@@ -217,6 +217,7 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
             ["poles", "moon"],
             "collect.scenes: must be one of cones, dynamic, gates, poles, ",
         ),
+        ("collect.scenes", [], "must name a scene where collect.recordings is empty, got []"),
         ("env.layout", {"num_obstacles": 100_000}, "num_obstacles=100000 cannot be placed 2.0 m apart"),
         ("env.layout", {"num_obstacles": 2.5}, "num_obstacles must be a whole number"),
         ("env.layout", {"num_pole": 3}, "has no 'num_pole'"),

@@ -1,7 +1,5 @@
 import functools
 import math
-import pickle
-import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 
 from envs.windows import unpack_window
 from jobs.config import ConfigError
-from jobs.drift import FIGURES, drift_figures
 from jobs.ppo import build_ppo, network_settings, policy_settings
 from jobs.runner import PlainEnvRunner
 from models.features import feature_of
@@ -68,13 +65,6 @@ def ppo(name, encoder):
 @pytest.fixture
 def runner(ppo):
     runner = PlainEnvRunner(config=ppo, worker_index=0)
-    yield runner
-    runner.stop()
-
-
-@pytest.fixture
-def encoded_runner(encoder):
-    runner = PlainEnvRunner(config=make_ppo("brp_full", encoder, *SHORT), worker_index=0)
     yield runner
     runner.stop()
 
@@ -264,18 +254,6 @@ def test_the_values_of_a_batch_are_those_of_the_loss(runner, ppo):
     assert targets.shape == (300,)
 
 
-def test_a_weight_sync_keeps_the_table_and_another_encoder_replaces_it(encoded_runner):
-    module, windows = encoded_runner.module, np.zeros((1, 4097, 4), np.int32)
-    windows[0, :2] = [1, 0, 5000, 0], [4000, 20, 30, 1]
-    latent = module.features(windows)
-    table, state = module._table, module.get_state()
-    module.set_state(state)
-    assert module._table is table
-    state["encoder.encoder.2.bias"] = state["encoder.encoder.2.bias"] + 1
-    module.set_state(state)
-    np.testing.assert_allclose(module.features(windows), latent + 1, atol=1e-5)
-
-
 def test_a_module_checkpoint_alone_restores_encoder_and_networks(runner, ppo, tmp_path, monkeypatch):
     module = ppo.build_learner(env=runner.env).module["default_policy"]
     module.save_to_path(tmp_path / "module")
@@ -315,73 +293,6 @@ def test_the_exported_policy_gives_the_logits_of_the_path_through_rllib(name, ru
             compared.append(own)
     assert len(compared) >= 80
     assert np.ptp(compared, axis=0).max() > 1e-3
-
-
-def test_returns_are_reported_unscaled(encoded_runner):
-    done = [chunk for chunk in encoded_runner.sample(num_timesteps=16) if chunk.is_done]
-    metrics = encoded_runner.get_metrics()
-    metrics = {name: getattr(value, "peek", lambda value=value: value)() for name, value in metrics.items()}
-    assert metrics["flight_return"] == pytest.approx(np.mean([chunk.get_return() for chunk in done]))
-    distances = [chunk.get_infos(-1)["distance_m"] for chunk in done]
-    assert metrics["distance_m"] == pytest.approx(np.mean(distances))
-    assert metrics["flight_return"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
-    assert metrics["success_rate"] == metrics["collision_rate"] == 0.0
-    assert metrics["dropped_events"] == 0.0
-    assert metrics["events_per_step"] > 0.0
-
-
-def test_a_module_remembers_the_newest_windows_of_all_flights_in_turn(encoded_runner):
-    module = encoded_runner.module
-    windows = np.zeros((2, 5, 4), np.int32)
-    for step in range(300):
-        windows[:, 0] = [[2, 0, 5000, step], [4, 0, 5000, 1000 + step]]
-        windows[:, 1:, 3] = 1
-        module.features(windows)
-    assert len(module.met) == 128
-    assert [int(kept[0, 3]) for kept in module.met] == [step + 1000 * (step % 2) for step in range(172, 300)]
-    assert {len(kept) for kept in module.met} == {3, 5}
-    windows[:] = 0
-    assert module.met[-1][0, 0] == 4  # a copy
-    assert len(pickle.loads(pickle.dumps(module.__getstate__()["met"]))) == 0
-
-
-def drift_of(runner, rounds=1):
-    """What a runner tells of its encoder in the last of some rounds; the samples of all."""
-    samples, told = [], {}
-    for _ in range(rounds):
-        samples += runner.sample(num_timesteps=30)
-        metrics = {
-            name: getattr(value, "peek", lambda: math.nan)() for name, value in runner.get_metrics().items()
-        }
-        told = {name: metrics[name] for name in FIGURES if not math.isnan(metrics.get(name, math.nan))}
-    return told, samples
-
-
-def test_drift_is_measured_every_tenth_round_on_what_the_policy_met(encoded_runner, encoder):
-    first, _ = drift_of(encoded_runner)
-    evae, about = load_encoder(encoder)
-    expected = drift_figures(evae, encoded_runner.module.met, {"reconstruction_step": 0.5})
-    assert first == pytest.approx(expected | {"drift": expected["policy_reconstruction"] / 0.5})
-    assert about["figures"] == {"reconstruction_step": 0.5}
-    assert drift_of(encoded_runner)[0] == drift_of(encoded_runner, 8)[0] == {}
-    assert set(drift_of(encoded_runner)[0]) == set(FIGURES)
-
-
-def test_without_its_file_an_encoder_is_flown_but_not_measured_and_nothing_else_changes(
-    encoder, tmp_path, monkeypatch
-):
-    flights = []
-    for there in (True, False):
-        path = shutil.copytree(encoder.parent, tmp_path / str(there)) / encoder.name
-        runner = PlainEnvRunner(config=make_ppo("brp_full", path, *SHORT), worker_index=0)
-        if not there:
-            path.unlink()
-        told, _ = drift_of(runner)
-        _, samples = drift_of(runner)  # what follows a measurement
-        runner.stop()
-        assert bool(told) is there
-        flights.append(np.concatenate([chunk.get_actions() for chunk in samples]))
-    np.testing.assert_array_equal(*flights)
 
 
 def test_the_same_seed_gives_the_same_flights(ppo):

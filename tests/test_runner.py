@@ -1,5 +1,7 @@
 import itertools
+import math
 import pickle
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,10 +10,12 @@ import torch
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
+from jobs.drift import FIGURES, drift_figures
 from jobs.ppo import build_ppo
 from jobs.runner import FlightError, PlainEnvRunner
 from models.features import push_features
 from models.kinds import KINDS
+from models.weights import load_encoder
 from tests.test_train import SHORT, make_config, write_encoder
 
 
@@ -151,3 +155,94 @@ def test_any_other_error_ends_the_process_as_rllib_has_it():
     runner.config = SimpleNamespace(restart_failed_env_runners=False)
     with pytest.raises(SystemExit):
         runner.apply(lambda runner: runner.no_such_method())
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory):
+    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
+
+
+@pytest.fixture
+def encoded_runner(encoder):
+    runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), encoder), worker_index=0)
+    yield runner
+    runner.stop()
+
+
+def test_a_weight_sync_keeps_the_table_and_another_encoder_replaces_it(encoded_runner):
+    module, windows = encoded_runner.module, np.zeros((1, 4097, 4), np.int32)
+    windows[0, :2] = [1, 0, 5000, 0], [4000, 20, 30, 1]
+    latent = module.features(windows)
+    table, state = module._table, module.get_state()
+    module.set_state(state)
+    assert module._table is table
+    state["encoder.encoder.2.bias"] = state["encoder.encoder.2.bias"] + 1
+    module.set_state(state)
+    np.testing.assert_allclose(module.features(windows), latent + 1, atol=1e-5)
+
+
+def test_returns_are_reported_unscaled(encoded_runner):
+    done = [chunk for chunk in encoded_runner.sample(num_timesteps=16) if chunk.is_done]
+    metrics = encoded_runner.get_metrics()
+    metrics = {name: getattr(value, "peek", lambda value=value: value)() for name, value in metrics.items()}
+    assert metrics["flight_return"] == pytest.approx(np.mean([chunk.get_return() for chunk in done]))
+    distances = [chunk.get_infos(-1)["distance_m"] for chunk in done]
+    assert metrics["distance_m"] == pytest.approx(np.mean(distances))
+    assert metrics["flight_return"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
+    assert metrics["success_rate"] == metrics["collision_rate"] == 0.0
+    assert metrics["dropped_events"] == 0.0
+    assert metrics["events_per_step"] > 0.0
+
+
+def test_a_module_remembers_the_newest_windows_of_all_flights_in_turn(encoded_runner):
+    module = encoded_runner.module
+    windows = np.zeros((2, 5, 4), np.int32)
+    for step in range(300):
+        windows[:, 0] = [[2, 0, 5000, step], [4, 0, 5000, 1000 + step]]
+        windows[:, 1:, 3] = 1
+        module.features(windows)
+    assert len(module.met) == 128
+    assert [int(kept[0, 3]) for kept in module.met] == [step + 1000 * (step % 2) for step in range(172, 300)]
+    assert {len(kept) for kept in module.met} == {3, 5}
+    windows[:] = 0
+    assert module.met[-1][0, 0] == 4  # a copy
+    assert len(pickle.loads(pickle.dumps(module.__getstate__()["met"]))) == 0
+
+
+def drift_of(runner, rounds=1):
+    """What a runner tells of its encoder in the last of some rounds; the samples of all."""
+    samples, told = [], {}
+    for _ in range(rounds):
+        samples += runner.sample(num_timesteps=30)
+        metrics = {
+            name: getattr(value, "peek", lambda: math.nan)() for name, value in runner.get_metrics().items()
+        }
+        told = {name: metrics[name] for name in FIGURES if not math.isnan(metrics.get(name, math.nan))}
+    return told, samples
+
+
+def test_drift_is_measured_every_tenth_round_on_what_the_policy_met(encoded_runner, encoder):
+    first, _ = drift_of(encoded_runner)
+    evae, about = load_encoder(encoder)
+    expected = drift_figures(evae, encoded_runner.module.met, {"reconstruction_step": 0.5})
+    assert first == pytest.approx(expected | {"drift": expected["policy_reconstruction"] / 0.5})
+    assert about["figures"] == {"reconstruction_step": 0.5}
+    assert drift_of(encoded_runner)[0] == drift_of(encoded_runner, 8)[0] == {}
+    assert set(drift_of(encoded_runner)[0]) == set(FIGURES)
+
+
+def test_without_its_file_an_encoder_is_flown_but_not_measured_and_nothing_else_changes(
+    encoder, tmp_path, monkeypatch
+):
+    flights = []
+    for there in (True, False):
+        path = shutil.copytree(encoder.parent, tmp_path / str(there)) / encoder.name
+        runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), path), worker_index=0)
+        if not there:
+            path.unlink()
+        told, _ = drift_of(runner)
+        _, samples = drift_of(runner)  # what follows a measurement
+        runner.stop()
+        assert bool(told) is there
+        flights.append(np.concatenate([chunk.get_actions() for chunk in samples]))
+    np.testing.assert_array_equal(*flights)
