@@ -116,10 +116,15 @@ def _draw_bars(
 
 
 def _tick(point: Mapping[str, object], moving: Sequence[str]) -> str:
-    """What a point is; where several settings change, each on a line of its own."""
+    """What a point is; where several settings change, each on a line of its own, numbers with their names."""
     if len(moving) < 2:
         return str(next(iter(point.values()))).replace("_", "\n")
-    return "\n".join(f"{key.rpartition('.')[2]} {point[key]:g}" for key in moving)
+    return "\n".join(_named(key.rpartition(".")[2], point[key]) for key in moving)
+
+
+def _named(name: str, value: Any) -> str:
+    """A number behind its name; a word, which says itself what it is, alone and in short lines."""
+    return f"{name} {value:g}" if isinstance(value, int | float) else str(value).replace("_", "\n")
 
 
 def _note(

@@ -1,8 +1,12 @@
 import numpy as np
 import pytest
+import yaml
 
+from jobs.axes import axis_points
+from jobs.conditions import text
 from jobs.flights import EPISODE
 from jobs.groups import summarise_group
+from jobs.runs import REPOSITORY
 from jobs.sweep_figures import BOUNDS, STYLES, axis_figure, collision_figure, style_of
 from tests.test_groups import flights
 
@@ -37,6 +41,11 @@ def test_numbers_are_lines_and_each_group_has_its_own_with_a_band():
             {str(hz): {"env.control_hz": hz, "faults.sparsity": off} for hz, off in ((200, 0.0), (45, 0.5))},
             ["control_hz 200\nsparsity 0", "control_hz 45\nsparsity 0.5"],
         ),
+        (
+            {name: {"env.scene": name, "fidelity.tolerance": asked}
+             for name, asked in (("poles", 0.05), ("shape_change", 0.2))},
+            ["poles\ntolerance 0.05", "shape\nchange\ntolerance 0.2"],
+        ),
     ],
 )  # fmt: skip
 def test_words_and_settings_that_change_together_are_bars(points, ticks):
@@ -44,6 +53,14 @@ def test_words_and_settings_that_change_together_are_bars(points, ticks):
     assert [label.get_text() for label in panel.get_xticklabels()] == ticks
     heights = [bar.get_height() for bar in panel.patches]
     assert heights == pytest.approx([0, 22.5] * 3)
+
+
+def test_every_axis_of_the_default_sweep_can_be_drawn():
+    axes = yaml.safe_load((REPOSITORY / "conf" / "sweep" / "robustness.yaml").read_text())["axes"]
+    for axis, settings in axes.items():
+        points = {text(next(iter(point.values()))): point for point in axis_points(settings)}
+        panel = axis_figure(axis, points, rows_of(axis, points, ("a", "b"))).axes[0]
+        assert len(panel.get_xticklabels()) == len(points), axis
 
 
 def test_a_condition_that_was_not_flown_leaves_a_gap():

@@ -1,37 +1,46 @@
 """How training and sweeps grow with cores: measured on simulated nodes of this machine, then a model.
 
-Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.scaling
-Expect: four tables in about ten minutes; the machine should be quiet. Nodes beyond this machine's
-cores share them, so that measured rates stop to grow there; the model says what they would be
-alone. Its inputs are the measured ones: seconds of a core for a step flown, seconds of the learner
-and bytes through the object store for a step learnt, seconds of the driver for a trial.
+Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.scaling [docs/images/scaling.png]
+Expect: five tables in about ten minutes, and their figure if a file is named; the machine should be
+quiet. Nodes beyond this machine's cores share them, so that measured rates stop to grow there; the
+model says what they would be alone. Its inputs are the measured ones: seconds of a core for a step
+flown, seconds of the learner and bytes through the object store for a step learnt, seconds of a
+core for a condition, seconds of the driver for a trial.
 """
 
 import contextlib
 import os
 import pickle
 import statistics
+import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import ray
+from matplotlib.figure import Figure
 from ray import tune
 from ray.cluster_utils import Cluster
 from rich.table import Table
 
+from envs.config import EnvConfig
 from jobs.bench.throughput import composed
 from jobs.cluster import ONE_THREAD, QUIET
+from jobs.conditions import PRETRAINED
+from jobs.config import HELD_OUT_SCENE
+from jobs.flights import fly
 from jobs.ppo import build_ppo
 from jobs.progress import console
 from jobs.runner import PlainEnvRunner
+from jobs.sweep import loaded
 
 STEPS = 2048  # of an iteration (appendix D.1.2)
 ROUNDS = 3
 TRIALS = 1000
-CELL_S = 5.0  # of a core, for the 20 flights of a condition (docs/guide.md)
+CELLS, CELL_FLIGHTS = 12, 7  # conditions flown to measure their rate; flights of one in the default sweep
+POLICY = "event_columns-s0"
 BANDWIDTH = 1e9  # of the network between nodes [bytes/s]: 10 Gbit/s
 CORES = (1, 2, 10, 100, 1000)
 OBJECT_STORE = 150 * 2**20
@@ -45,6 +54,7 @@ class Costs(NamedTuple):
         learn_s: Of the learner, for a step learnt; all runners wait [s].
         step_bytes: Through the object store, for a step.
         weight_bytes: To each runner, for an iteration.
+        cell_s: Of a core, for a condition of a sweep [s].
         trial_s: Of the driver, for a trial of a sweep [s].
     """
 
@@ -52,6 +62,7 @@ class Costs(NamedTuple):
     learn_s: float
     step_bytes: float
     weight_bytes: float
+    cell_s: float
     trial_s: float
 
 
@@ -60,7 +71,13 @@ def main() -> None:
     settings = ["model=event_columns", "algo=ppo_fast", "algo.lr_schedule=constant"]
     step_bytes, weight_bytes = bytes_sent(*settings)
     rates: dict[tuple[int, int], float] = {}
+    sweeps: dict[int, float] = {}
     with tempfile.TemporaryDirectory() as folder:
+        for nodes, cores in ((1, 1), (1, 2), (2, 2)):
+            with simulated(nodes, cores):
+                sweeps[nodes * cores] = CELLS / seconds_of(
+                    fly_condition, CELLS, Path(folder) / f"{nodes}{cores}"
+                )
         for nodes in (1, 2):
             with simulated(nodes, cores=2):
                 for runners in (0, 1, 2, 4)[: 3 if nodes == 1 else 4]:
@@ -69,10 +86,24 @@ def main() -> None:
                     if runners == 0:
                         alone = step_s, learn_s
         with simulated(1, cores=2):
-            trial_s = trial_seconds(TRIALS, Path(folder))
+            trial_s = seconds_of(do_nothing, TRIALS, Path(folder) / "nothing") / TRIALS
+    costs = Costs(*alone, step_bytes, weight_bytes, 1 / sweeps[1], trial_s)
+    show_measured(rates, sweeps)
+    show_model(costs)
+    if sys.argv[1:]:
+        scaling_figure(costs, rates, sweeps).savefig(sys.argv[1], dpi=120)
+
+
+def show_measured(rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]) -> None:
+    """Print what was measured on this machine."""
     show("Training, measured", ("nodes", "env runners", "env steps/s"),
          [(n, r, f"{rate:,.0f}") for (n, r), rate in rates.items()])  # fmt: skip
-    costs = Costs(*alone, step_bytes, weight_bytes, trial_s)
+    show("A sweep, measured", ("cores by Ray's account", "conditions/h"),
+         [(cores, f"{3600 * rate:,.0f}") for cores, rate in sweeps.items()])  # fmt: skip
+
+
+def show_model(costs: Costs) -> None:
+    """Print the costs, and what they come to on more cores."""
     show("Costs", ("of", "is"), [(name, f"{value:.3g}") for name, value in costs._asdict().items()])
     show(
         "Training, the model",
@@ -83,9 +114,39 @@ def main() -> None:
     show(
         "A sweep, the model",
         ("cores", "conditions/h", "saturates first"),
-        [(cores, f"{3600 * min(cores / CELL_S, 1 / trial_s):,.0f}",
-          "cores" if cores / CELL_S < 1 / trial_s else "the driver") for cores in CORES],
+        [(cores, f"{3600 * conditions_per_s(costs, cores):,.0f}",
+          "cores" if cores / costs.cell_s < 1 / costs.trial_s else "the driver") for cores in CORES],
     )  # fmt: skip
+
+
+def conditions_per_s(costs: Costs, cores: int) -> float:
+    """Conditions of a sweep per second: cores share nothing, until the driver is busy all the time."""
+    return min(cores / costs.cell_s, 1 / costs.trial_s)
+
+
+def scaling_figure(
+    costs: Costs, rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]
+) -> Figure:
+    """Rates over cores: the model as a line, what was measured on this machine as points."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    cores = range(1, max(CORES) + 1)
+    left.plot(cores, [STEPS / sum(iteration_s(costs, count)) for count in cores], label="model")
+    left.axhline(1 / costs.learn_s, color="0.5", linestyle="--", label="the learner alone")
+    for nodes in sorted({nodes for nodes, _ in rates}):
+        own = {runners: rate for (n, runners), rate in rates.items() if n == nodes and runners}
+        name = f"measured, {nodes} simulated node{'s' * (nodes > 1)}"
+        left.plot(list(own), list(own.values()), "os"[nodes - 1], label=name)
+    left.set(xlabel="Cores that fly", ylabel="Environment steps per second", title="Training")
+    right.plot(cores, [3600 * conditions_per_s(costs, count) for count in cores], label="model")
+    right.axhline(3600 / costs.trial_s, color="0.5", linestyle="--", label="the driver alone")
+    right.plot(list(sweeps), [3600 * rate for rate in sweeps.values()], "o", label="measured on two cores")
+    right.set(xlabel="Cores", ylabel="Conditions per hour", title="A sweep")
+    for axes in (left, right):
+        axes.set(xscale="log", yscale="log")
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=8)
+    return figure
 
 
 def iteration_s(costs: Costs, cores: int) -> tuple[float, float, float]:
@@ -124,25 +185,38 @@ def training_rate(*words: str) -> tuple[float, float, float]:
     return statistics.median(rates), flying, learning
 
 
-def trial_seconds(count: int, folder: Path) -> float:
-    """Wall time of a trial that does nothing, among `count`, scheduled as the sweep's are [s]."""
-    tuner = tune.Tuner(
-        tune.with_resources(_nothing, {"cpu": 1}),
-        tune_config=tune.TuneConfig(reuse_actors=True),
-        param_space={"trial": tune.grid_search(list(range(count)))},
-        run_config=tune.RunConfig(name="tune", storage_path=str(folder), verbose=0),
-    )
+def seconds_of(trial: Callable[[dict[str, Any]], None], count: int, folder: Path) -> float:
+    """Wall time of so many trials, scheduled as a sweep's are, once a worker per core is there [s]."""
     os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = "3600"
-    start = time.perf_counter()
-    results = tuner.fit()
-    seconds = time.perf_counter() - start
-    done = sum(result.metrics is not None and "key" in result.metrics for result in results)
-    if done != count:
-        raise RuntimeError(f"{count} trials must report, got {done}")
-    return seconds / count
+    cores = int(ray.cluster_resources()["CPU"])
+    for number, name in ((cores, "first"), (count, "timed")):
+        tuner = tune.Tuner(
+            tune.with_resources(trial, {"cpu": 1}),
+            tune_config=tune.TuneConfig(reuse_actors=True),
+            param_space={"trial": tune.grid_search(list(range(number)))},
+            run_config=tune.RunConfig(name=name, storage_path=str(folder), verbose=0),
+        )
+        start = time.perf_counter()
+        results = tuner.fit()
+        seconds = time.perf_counter() - start
+        done = sum(result.metrics is not None and "key" in result.metrics for result in results)
+        if done != number:
+            raise RuntimeError(f"{number} trials must report, got {done}")
+    return seconds
 
 
-def _nothing(params: dict[str, Any]) -> None:
+def do_nothing(params: dict[str, Any]) -> None:
+    """A trial that costs its scheduling alone."""
+    tune.report({"key": params["trial"]})
+
+
+def fly_condition(params: dict[str, Any]) -> None:
+    """A trial that flies what a policy flies under the default condition."""
+    first = CELL_FLIGHTS * params["trial"]
+    pilot = loaded(str(PRETRAINED / POLICY), "stochastic")
+    fly(
+        pilot, EnvConfig(scene=HELD_OUT_SCENE, split="eval"), range(first, first + CELL_FLIGHTS), CELL_FLIGHTS
+    )
     tune.report({"key": params["trial"]})
 
 
