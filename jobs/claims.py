@@ -12,13 +12,15 @@ RULE = (
     "A claim is tested on the paper's own values, by the difference of two groups on the same corridors "
     "with its paired 95 % bootstrap interval. It *holds* if the interval of the mean over all conditions "
     "lies above 0 and no single condition's lies below; it *holds partly* if that interval or a single "
-    "condition's lies above 0; else it *does not hold*."
+    "condition's lies above 0; it *does not hold* if the interval of the mean excludes a gain of 10 points "
+    "of success, or of 5 m; else it is *undecided*: more flights or trainings would tell."
 )
+GAIN = {"success": 0.1, "distance_m": 5.0}  # the least that a claim has to mean
 UNTESTED = (
     ("Training is faster than on event images", "abstract", "a sweep flies finished policies"),
     ("An autoencoder over event images reaches no acceptable policy", "appendix D.1.2", "no bound is stated"),
 )
-Verdict = Literal["holds", "holds partly", "does not hold", "not tested"]
+Verdict = Literal["holds", "holds partly", "does not hold", "undecided", "not tested"]
 Measure = Literal["success", "distance_m"]
 Find = Callable[[Condition, str], Flights]  # flights of a group under a condition; empty if there are none
 
@@ -104,7 +106,9 @@ def judge(claim: Claim, find: Find) -> Finding:
     ours, theirs = ([table_of(pair[side], claim.measure) for pair in both.values()] for side in (0, 1))
     single = [paired_difference(*pair, np.random.default_rng(0)) for pair in zip(ours, theirs, strict=True)]
     overall = paired_difference(_over_conditions(ours), _over_conditions(theirs), np.random.default_rng(0))
-    return Finding(_verdict(overall, single), overall, dict(zip(both, single, strict=True)))
+    return Finding(
+        _verdict(overall, single, GAIN[claim.measure]), overall, dict(zip(both, single, strict=True))
+    )
 
 
 def _over_conditions(tables: list[np.ndarray]) -> np.ndarray:
@@ -114,9 +118,11 @@ def _over_conditions(tables: list[np.ndarray]) -> np.ndarray:
     return np.mean(tables, axis=0)
 
 
-def _verdict(overall: Estimate, single: list[Estimate]) -> Verdict:
+def _verdict(overall: Estimate, single: list[Estimate], gain: float) -> Verdict:
     above = [found.interval is not None and found.interval[0] > 0 for found in (overall, *single)]
     below = [found.interval is not None and found.interval[1] < 0 for found in single]
     if above[0] and not any(below):
         return "holds"
-    return "holds partly" if any(above) else "does not hold"
+    if any(above):
+        return "holds partly"
+    return "does not hold" if overall.interval is not None and overall.interval[1] < gain else "undecided"

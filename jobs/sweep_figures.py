@@ -36,6 +36,8 @@ SCALES = {
     "faults.shot_noise_hz": ("Shot noise in black [Hz per pixel]", "linear"),
     "renderer": ("Renderer", "linear"),
 }
+MOST_BANDS = 4  # of groups in one panel; more would cover each other, and become bars on points set apart
+DODGE = 0.012  # between such points, as a share of the axis
 MOST_ACROSS = 2  # panels of the collision map side by side
 Measure = Callable[[Row], tuple[float, Interval]]
 
@@ -65,7 +67,7 @@ def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Seq
     for panel, measure in zip(panels, (_success_percent, _distance_m), strict=True):
         if words:
             _draw_bars(panel, list(points), groups, rows, measure)
-            panel.set_xticks(range(len(points)), ticks, fontsize=8)
+            panel.set_xticks(range(len(points)), ticks, fontsize=8 if len(moving) < 2 else 7)
         else:
             _draw_lines(panel, groups, rows, measure, scale)
         panel.set_xlabel(label if len(moving) < 2 else f"{label}, and what changes with it")
@@ -83,22 +85,36 @@ def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Seq
 def _draw_lines(
     panel: Axes, groups: Sequence[str], rows: Sequence[Row], measure: Measure, scale: str
 ) -> None:
-    """A line with its band for each group, named at its end too."""
+    """A line for each group with its intervals: a band, or bars where there are many groups."""
+    seen = [group for group in groups if group not in BOUNDS]
+    crowded = len(seen) > MOST_BANDS
+    panel.set_xscale(scale)
     ticks = sorted({float(row.condition[1]) for row in rows})
     for group in groups:
         own = sorted((row for row in rows if row.group == group), key=lambda row: float(row.condition[1]))
         colour, marker = style_of(group)
-        x = [float(row.condition[1]) for row in own]
+        x = np.array([float(row.condition[1]) for row in own])
+        if crowded and group in seen:
+            x = _set_apart(x, ticks, scale, seen.index(group) - (len(seen) - 1) / 2)
         y, low, high = np.array([(value, *interval) for value, interval in map(measure, own)]).T
         dashes = "--" if group in BOUNDS else "-"
         panel.plot(
             x, y, color=colour, marker=marker, ms=6, lw=1.8, ls=dashes, mec="white", mew=0.6, label=group
         )
-        panel.fill_between(x, low, high, color=colour, alpha=0.10, lw=0)
-    panel.set_xscale(scale)
+        if not crowded:
+            panel.fill_between(x, low, high, color=colour, alpha=0.10, lw=0)
+        elif group in seen:
+            panel.vlines(x, low, high, color=colour, alpha=0.5, lw=1.2, zorder=1)
     panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     panel.set_xticks([], minor=True)
     panel.margins(x=0.05)
+
+
+def _set_apart(x: np.ndarray, ticks: Sequence[float], scale: str, places: float) -> np.ndarray:
+    """Points of an axis moved to the side by so many places of `DODGE`."""
+    if scale == "log":
+        return x * (ticks[-1] / ticks[0]) ** (DODGE * places)
+    return x + (ticks[-1] - ticks[0]) * DODGE * places
 
 
 def _draw_bars(

@@ -34,6 +34,20 @@ def test_numbers_are_lines_and_each_group_has_its_own_with_a_band():
 
 
 @pytest.mark.parametrize(
+    ("key", "values"), [("env.control_hz", (45, 200, 400)), ("faults.sparsity", (0, 0.5, 1))]
+)
+def test_many_groups_get_bars_beside_each_other_in_order_and_none_for_bounds(key, values):
+    points = {f"{value:g}": {key: float(value)} for value in values}
+    groups = ("a", "b", "c", "d", "e", "straight")
+    panel = axis_figure("rate", points, rows_of("rate", points, groups)).axes[0]
+    assert len(panel.collections) == 5
+    lines = np.array([line.get_xdata() for line in panel.lines])
+    assert (np.diff(lines[:5], axis=0) > 0).all()
+    np.testing.assert_allclose(lines[[2, 5]], [values] * 2)
+    assert np.ptp(lines, axis=0).max() < 0.3 * np.diff(values).min()
+
+
+@pytest.mark.parametrize(
     ("points", "ticks"),
     [
         ({name: {"env.scene": name} for name in ("poles", "shape_change")}, ["poles", "shape\nchange"]),
