@@ -8,6 +8,7 @@ events has a larger error too; `policy_explained` and `policy_auc` say whether i
 others as well as before.
 """
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -78,3 +79,14 @@ def drift_figures(
     figures = {f"policy_{name}": values[name] for name in ("reconstruction", "kl", "explained", "auc")}
     own = held_out.get("reconstruction_step", 0.0)
     return figures | ({"drift": values["reconstruction"] / own} if own > 0 else {})
+
+
+def mean_figures(kept: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Mean over trainings of what each policy's encoder made of its flights; none without encoders."""
+    names = dict.fromkeys(name for values in kept for name in values["encoder"])
+    return {
+        f"evae/{name}": statistics.fmean(
+            values["encoder"][name] for values in kept if name in values["encoder"]
+        )
+        for name in names
+    }

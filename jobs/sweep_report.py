@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-import statistics
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -20,6 +19,7 @@ from jobs.children import Child, write_children
 from jobs.conditions import NOMINAL, Cell, Sweep
 from jobs.config import Config
 from jobs.dashboard import COLOUR, NOTE, chart_view, table_view
+from jobs.drift import mean_figures
 from jobs.evaluate import VIEW_COLUMNS, film
 from jobs.flights import EPISODE, check_sensor, write_episodes
 from jobs.groups import (
@@ -184,7 +184,18 @@ def about(config: Config, folder: Run, sweep: Sweep, commits: Sequence[str]) -> 
         "action": config.evaluate.action,
         "groups": sweep.groups,
         "axes": sweep.axes,
+        "exactness": exactness(folder.path / "sweep", sweep),
     }
+
+
+def exactness(place: Path, sweep: Sweep) -> list[dict[str, Any]]:
+    """How exact each condition was simulated: asked and achieved, as far as it was measured."""
+    first = {cell.label: cell for cell in reversed(sweep.cells)}
+    return [
+        {"condition": list(label), "asked": cell.env.fidelity.tolerance, **read_json(file)}
+        for label, cell in ((label, first[label]) for label in sweep.conditions)
+        if (file := accuracy_file(place, cell.simulation)).is_file()
+    ]
 
 
 def command() -> str:
@@ -265,7 +276,7 @@ def track_rows(
         tags = {"differs_from_training": json.dumps(differ), NOTE: note, COLOUR: style_of(row.group)[0]}
         reasons = [failed[cell.key] for cell in cells if cell.key in failed]
         tags |= {"not_flown": "; ".join(reasons)} if reasons else {}
-        simulated = accuracy(place, cells[0]) | encoder_means(
+        simulated = accuracy(place, cells[0]) | mean_figures(
             [kept[cell.key] for cell in cells if cell.key in kept]
         )
         children.append(
@@ -336,14 +347,3 @@ def accuracy(place: Path, cell: Cell) -> dict[str, float]:
     file = accuracy_file(place, cell.simulation)
     values = read_json(file) if file.is_file() else {}
     return {f"sim/{name}": value for name, value in values.items()}
-
-
-def encoder_means(kept: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Mean over trainings of what each policy's encoder made of its flights; none without encoders."""
-    names = dict.fromkeys(name for values in kept for name in values["encoder"])
-    return {
-        f"evae/{name}": statistics.fmean(
-            values["encoder"][name] for values in kept if name in values["encoder"]
-        )
-        for name in names
-    }

@@ -5,7 +5,7 @@ import torch
 from envs.config import EnvConfig
 from envs.events import EVENT
 from envs.windows import pack_window
-from jobs.drift import FIGURES, MOST_WINDOWS, DriftWatch, drift_figures
+from jobs.drift import FIGURES, MOST_WINDOWS, DriftWatch, drift_figures, mean_figures
 from jobs.flights import fly
 from jobs.pilots import make_pilot
 from models.batch import batch_packed
@@ -88,3 +88,8 @@ def test_a_measurement_takes_no_random_number(evae):
     state = torch.get_rng_state()
     drift_figures(evae, [window(20)], {})
     assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_encoder_figures_are_means_of_the_trainings_that_have_them():
+    kept = [{"encoder": {"drift": 1.0}}, {"encoder": {"drift": 2.0}}, {"encoder": {}}]
+    assert mean_figures(kept) == {"evae/drift": pytest.approx(1.5)}

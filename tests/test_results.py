@@ -26,6 +26,9 @@ ABOUT = {
     "reference": "event_columns",
     "action": "stochastic",
     "groups": {"bytestream": [0, 1], "event_image": [0], "oracle": [None]},
+    "exactness": [
+        {"condition": ["sparsity", "0.5"], "asked": 0.05, "event_error": 0.0163, "renders_per_step": 5.0}
+    ],
     "axes": {"nominal": {"poles_eval": {}}, "sparsity": {"0.2": {}, "0.5": {}}},
 }
 
@@ -54,6 +57,8 @@ def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_pa
     assert "Made on 2026-01-02 by `python -m platform.launch +exp=robustness`, then" in text
     assert "flown at commit c0ffee" in text
     assert "bytestream (2), event_image (1), oracle (1)" in text
+    assert "| sparsity | 0.5 | 5 | 1.6 | 5 |" in text
+    assert text.index("(images/results_sparsity.png)") < text.index("## Success [%]")
     assert "| `bytestream`: bears dead pixels | D.3 | `event_image` | holds |" in text
     assert (
         "| `bytestream`: adapts to other control rates | abstract, D.3 | `event_image` | not tested |" in text

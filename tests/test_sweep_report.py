@@ -1,11 +1,18 @@
 import numpy as np
-import pytest
 
 from jobs.conditions import plan, read_entry
 from jobs.flights import EPISODE
-from jobs.runs import open_run
+from jobs.runs import open_run, write_json
 from jobs.sweep import flown
-from jobs.sweep_report import about, contacts, encoder_means, film_crashes, summarise_sweep, typical_crashes
+from jobs.sweep_report import (
+    about,
+    accuracy_file,
+    contacts,
+    exactness,
+    film_crashes,
+    summarise_sweep,
+    typical_crashes,
+)
 from tests.test_conditions import planned, save_training, sweep_config
 from tests.test_groups import flights
 
@@ -74,6 +81,13 @@ def test_what_made_a_sweep_is_told_without_a_place_of_this_machine(tmp_path, mon
     assert str(tmp_path) not in str(found)
 
 
-def test_encoder_figures_are_means_of_the_trainings_that_have_them():
-    kept = [{"encoder": {"drift": 1.0}}, {"encoder": {"drift": 2.0}}, {"encoder": {}}]
-    assert encoder_means(kept) == {"evae/drift": pytest.approx(1.5)}
+def test_how_exact_a_condition_was_is_told_once_it_was_measured(tmp_path):
+    sweep = planned(sweep_config(tmp_path), "straight", "oracle")
+    assert exactness(tmp_path, sweep) == []
+    cell = next(cell for cell in sweep.cells if cell.label[0] != "nominal")
+    values = {"event_error": 0.01, "renders_per_step": 5.0}
+    write_json(accuracy_file(tmp_path, cell.simulation), values)
+    found = exactness(tmp_path, sweep)
+    assert {"condition": list(cell.label), "asked": 0.05, **values} in found
+    told = [one.simulation == cell.simulation for one in sweep.cells if one.entry == cell.entry]
+    assert len(found) == sum(told)
