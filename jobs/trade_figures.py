@@ -1,9 +1,10 @@
 """Figures of what accuracy costs: cost against error with its Pareto front, events against control rate."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jobs.figures import GRID, INK, MUTED
@@ -25,6 +26,7 @@ COLOURS = {
 }
 SHAPES = {"default": "*", "most exact": "D", "precision": "s", "time bins": "s", "newest events": "s"}
 SPEEDS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000)
+LETTER, LINE = 0.017, 0.035  # size of small print, as shares of a panel
 FLOOR = 1e-3  # of an error that is drawn on a logarithmic axis
 
 
@@ -98,9 +100,6 @@ def choice_figure(settings: Sequence[tuple[str, str, float]], panels: Sequence[P
             size = 240 if knob == "default" else 34
             look = {"marker": SHAPES.get(knob, "o"), "color": COLOURS.get(knob, INK), "s": size, "zorder": 3}
             axes.scatter(speed[own], values[own], label=knob, **look)
-        for row in front:
-            name = settings[row][1] or settings[row][0]
-            axes.annotate(name, (speed[row], values[row]), (5, 5), textcoords="offset points", fontsize=7)
         axes.set(xscale="log", xlabel="Environment steps per second", ylabel=panel.label)
         ticks = [tick for tick in SPEEDS if 0.8 * speed.min() < tick < 1.25 * speed.max()]
         axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
@@ -108,14 +107,32 @@ def choice_figure(settings: Sequence[tuple[str, str, float]], panels: Sequence[P
         if panel.intervals is None:  # errors, many of them small
             axes.set_yscale("symlog", linthresh=1.0)
             axes.yaxis.set_major_formatter("{x:g}")
-            axes.set_ylim(-0.1, None)
+            axes.set_ylim(-0.1, 1.6 * np.nanmax(values))
         axes.grid(color=GRID)
+        _name(axes, [(settings[row][1] or settings[row][0], speed[row], values[row]) for row in front])
         axes.spines[["top", "right"]].set_visible(False)
         if place == 0:
             figure.legend(
                 *axes.get_legend_handles_labels(), loc="outside lower center", ncols=8, frameon=False
             )
     return figure
+
+
+def _name(axes: Axes, points: Sequence[tuple[str, float, float]]) -> None:
+    """Names beside points, towards the middle; of names that would cover each other, the first."""
+    taken: list[tuple[float, float, float]] = []
+    for name, x, y in points:
+        at, above = axes.transAxes.inverted().transform(axes.transData.transform((x, y)))
+        left = at > 0.5
+        wide = LETTER * len(name)
+        begin = at - wide if left else at
+        if any(
+            begin < end and start < begin + wide and abs(above - line) < LINE for start, end, line in taken
+        ):
+            continue
+        taken.append((begin, begin + wide, above))
+        look: dict[str, Any] = {"ha": "right" if left else "left", "va": "center", "fontsize": 7}
+        axes.annotate(name, (x, y), (-7 if left else 7, 0), textcoords="offset points", **look)
 
 
 def memory_figure(rates_hz: Sequence[float], events_hz: Mapping[str, Sequence[float]]) -> Figure:

@@ -11,6 +11,7 @@ from jobs.trade_figures import Panel, pareto
 
 DEFAULT, EXACT = "default", "most exact"
 ENCODER_KNOBS = ("precision", "time bins", "newest events")  # they change no event
+CAMERA_KNOB = "memory"  # another camera, not a coarser simulation of the same
 MARGIN = 0.1  # of success: what may be lost
 RULE = (
     "A setting is *as good* as the default if the 95 % interval of its success minus the default's, on the "
@@ -200,12 +201,23 @@ def advice(rows: Sequence[Row]) -> list[str]:
     default, exact = rows[0], rows[-1]
     found = {name: [row for row in rows if verdict(row) == name] for name in get_args(Verdict)}
     good = found["default"] + found["as good"]
-    said = [_fastest(_fast(good), default), _exact(exact, default)]
-    coarsest = max(good, key=lambda row: row.event_error or 0.0)
+    same = [row for row in good if row.knob != CAMERA_KNOB]
+    said = [_fastest(_fast(same), default), _exact(exact, default)]
+    coarsest = max(same, key=lambda row: row.event_error or 0.0)
     said.append(
         f"**Events may differ.** Of the settings as good as the default, it included, {coarsest.name} has "
         f"the largest event error: {event_text(coarsest)} %."
     )
+    cameras = [row for row in rows if row.knob == CAMERA_KNOB]
+    if cameras:
+        named = "; ".join(
+            f"{row.name}: {event_text(row)} % of the events differ, success {difference_text(row)} points, "
+            f"{verdict(row)}"
+            for row in cameras
+        )
+        said.append(
+            f"**Another camera** is no coarser simulation of this one, and not advised for it. {named}."
+        )
     encoders = [row for row in good if row.knob in ENCODER_KNOBS]
     if encoders:
         fastest = _fast(encoders)

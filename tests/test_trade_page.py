@@ -79,6 +79,14 @@ def test_advice_names_the_fastest_of_the_good_and_what_to_leave_alone():
     assert "Of 5 verdicts" in said
 
 
+def test_another_camera_is_reported_and_never_advised():
+    as_good = make_row("memory", "memory legacy", 100.0, 0.8)
+    said = advice([DEFAULT, COARSE, as_good, EXACT])
+    assert said[0].startswith("**To fly fast**, choose tolerance 0.5")
+    assert "tolerance 0.5 has the largest event error" in said[2]
+    assert "memory legacy: 80 % of the events differ, success +0 [-5, +5] points, as good." in said[3]
+
+
 def test_where_nothing_faster_is_as_good_the_default_stays():
     said = advice([DEFAULT, FORGETFUL, EXACT])
     assert said[0] == "**To fly fast**, keep the default: no faster setting is known to be as good."
