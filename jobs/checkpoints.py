@@ -11,6 +11,7 @@ from pathlib import Path
 from jobs.runs import RunError, read_json, write_json
 
 SEAL = "sha256.json"
+UNSEALED = "not sealed"
 
 
 def seal(checkpoint: Path) -> None:
@@ -21,12 +22,12 @@ def seal(checkpoint: Path) -> None:
 def damage(checkpoint: Path) -> str | None:
     """What is wrong with a checkpoint, in a few words; None if it is what was written.
 
-    One without a seal was cut off by a kill before it got one, after all its files: it is taken.
+    One without a seal was cut off by a kill before it got one: it may be whole, but nothing says so.
     """
     if not checkpoint.is_dir():
         return "missing"
     if not (checkpoint / SEAL).is_file():
-        return None if any(checkpoint.iterdir()) else "empty"
+        return UNSEALED if any(checkpoint.iterdir()) else "empty"
     try:
         sealed = read_json(checkpoint / SEAL)
     except RunError:
@@ -38,6 +39,8 @@ def damage(checkpoint: Path) -> str | None:
 
 def mend(checkpoint: Path) -> str | None:
     """Put the newest whole checkpoint beside a damaged one into its place; what was done, None if nothing.
+
+    One without a seal, which may be whole, is taken only where none has one.
 
     Args:
         checkpoint: The one that a training would continue from, `checkpoint_<number>`.
@@ -51,7 +54,10 @@ def mend(checkpoint: Path) -> str | None:
     others = sorted(
         (path for path in checkpoint.parent.glob("checkpoint_*") if path != checkpoint), reverse=True
     )
-    good = next((path for path in others if damage(path) is None), None)
+    wrong = {path: damage(path) for path in others}
+    good = next((path for wanted in (None, UNSEALED) for path in others if wrong[path] == wanted), None)
+    if reason == UNSEALED and (good is None or wrong[good] == UNSEALED):
+        return None
     if good is None:
         experiment = checkpoint.parent.parent
         remedy = f"delete {experiment}, and the same command trains anew"

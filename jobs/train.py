@@ -19,7 +19,7 @@ from typing import Any
 import pyarrow.fs
 import ray
 import torch
-from ray import tune
+from ray import cloudpickle, tune
 from ray.exceptions import RayError, RayTaskError
 from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
@@ -99,11 +99,21 @@ class Relay(tune.Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Say that the training goes on, or stop it if its code raised."""
-        error = trial.get_pickled_error()
+        error = newest_error(trial)
         if isinstance(error, RayTaskError) and not isinstance(error.cause, RayError):
             raise TrainingError(stopped(error))
         reason = "its process could not be started" if error is None else last_line(error)
         console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
+
+
+def newest_error(trial: Any) -> Exception | None:
+    """What ended a trial last; None if it was no error of its process.
+
+    Tune writes it into a folder of the driver's first; `Trial.get_pickled_error` reads the storage,
+    where it may not be yet.
+    """
+    file = trial.pickled_error_file
+    return cloudpickle.loads(Path(file).read_bytes()) if file and Path(file).is_file() else None
 
 
 def run(config: Config) -> dict[str, Any]:

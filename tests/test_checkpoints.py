@@ -1,8 +1,9 @@
 import json
+import shutil
 
 import pytest
 
-from jobs.checkpoints import SEAL, damage, mend, seal
+from jobs.checkpoints import SEAL, UNSEALED, damage, mend, seal
 from jobs.runs import RunError
 
 
@@ -45,10 +46,22 @@ def test_a_checkpoint_is_whole_until_anything_in_it_changes(tmp_path, name):
     assert damage(path) == reason
 
 
-def test_a_checkpoint_without_a_seal_is_taken_unless_there_is_nothing_in_it(tmp_path):
-    path = checkpoint(tmp_path, 1)
-    (path / SEAL).unlink()
-    assert damage(path) is None
+def test_a_checkpoint_without_a_seal_is_taken_only_where_none_has_one(tmp_path):
+    first, second, third = (checkpoint(tmp_path, number) for number in (1, 2, 3))
+    for path in (first, third):
+        (path / SEAL).unlink()
+    assert damage(third) == UNSEALED
+    cut(third)
+    assert "(not sealed), checkpoint_000002 takes its place" in mend(third)
+    assert damage(third) is None
+    for path in (second, third):
+        (path / SEAL).unlink()
+    assert mend(third) is None
+    shutil.rmtree(third)
+    assert "(missing), checkpoint_000002 takes its place" in mend(third)
+
+
+def test_a_checkpoint_of_which_nothing_is_there_is_damaged(tmp_path):
     assert damage(tmp_path / "none") == "missing"
     (tmp_path / "none").mkdir()
     assert damage(tmp_path / "none") == "empty"

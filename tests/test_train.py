@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from ray import cloudpickle
 from ray.exceptions import ActorDiedError, RayTaskError
 
 from envs.config import sensor_settings, settings_hash
@@ -111,28 +112,27 @@ def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_pat
 
 
 class Trial:
-    """A trial that ended with an error."""
+    """A trial that ended with an error, which Tune has written down."""
 
     num_failures = 1
 
-    def __init__(self, error):
-        self.error = error
+    def __init__(self, folder, error):
+        self.pickled_error_file = str(folder / "error.pkl") if error is not None else None
+        if error is not None:
+            (folder / "error.pkl").write_bytes(cloudpickle.dumps(error))
 
-    def get_pickled_error(self):
-        return self.error
 
-
-def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(capsys):
+def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_path, capsys):
     relay = training.Relay("name")
     raised = RayTaskError("train", "Traceback\nValueError: no", ValueError("no"))
     with pytest.raises(TrainingError, match=r"^training stopped: ValueError: no; the same command continues"):
-        relay.on_trial_recover(1, [], Trial(raised))
+        relay.on_trial_recover(1, [], Trial(tmp_path, raised))
     for lost in (
         None,
         ActorDiedError(),
         RayTaskError("train", "Traceback\nActorDiedError", ActorDiedError()),
     ):
-        relay.on_trial_recover(1, [], Trial(lost))
+        relay.on_trial_recover(1, [], Trial(tmp_path, lost))
     assert capsys.readouterr().out.count("goes on from its last checkpoint") == 3
 
 

@@ -118,5 +118,9 @@ def test_two_sweeps_started_at_once_share_a_store_but_not_a_run_folder(tmp_path)
     client, experiment = open_store(f"sqlite:///{tmp_path}/mlflow.db", "evade")
     runs = client.search_runs([experiment])
     assert {run.info.status for run in runs} == {"FINISHED"}
-    assert Counter(run.data.tags["kind"] for run in runs) == {"sweep": 2, "condition": 2 * 5}
+    assert Counter(run.data.tags["kind"] for run in runs) == {
+        "sweep": 2,
+        "condition": 2 * 5,
+        "group": 2,
+    }
     outcome("two sweeps at once, one store", "both complete; a second of the same run is refused", "nothing")
