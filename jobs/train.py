@@ -253,7 +253,7 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             now_s = time.monotonic()
             if not _lookup(result, FLOWN) > 0:
                 paused_s = now_s if paused_s is None else paused_s
-                check_pause(now_s - paused_s)
+                check_pause(now_s - paused_s, result, config.algo.num_env_runners)
                 return
             paused_s, env_steps = None, int(result[ENV_STEPS])
             last.update(read_metrics(result, now_s - since_s))
@@ -274,13 +274,15 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             del _LISTENERS[LISTENER]
 
 
-def check_pause(seconds: float) -> None:
+def check_pause(seconds: float, result: Mapping[str, Any], env_runners: int) -> None:
     """Let a training wait for processes that fly and have ended, unless they do not come back.
 
     Raises:
-        TrainingError: After `LONGEST_PAUSE_S`.
+        TrainingError: All have been started as often as they may be, or after `LONGEST_PAUSE_S`.
     """
-    if seconds > LONGEST_PAUSE_S:
+    known = result.get("fault_tolerance", {})
+    restarts, alive = known.get("num_remote_worker_restarts", 0), known.get("num_healthy_workers", 1)
+    if seconds > LONGEST_PAUSE_S or (alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)):
         ended = f"every process that flies has ended, some {MAX_RESTARTS + 1} times"
         raise TrainingError(
             f"no step was flown for {seconds:.0f} s: {ended}; see /tmp/ray/session_latest/logs"

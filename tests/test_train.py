@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import hydra
@@ -91,6 +92,16 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
 def test_a_loss_that_is_not_finite_stops_the_training(bad):
     with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
         read_metrics(result(vf_loss=bad), 2.0)
+
+
+@pytest.mark.parametrize(
+    ("runners", "alive", "restarts", "stops"),
+    [(1, 0, 3, True), (2, 0, 6, True), (1, 0, 2, False), (2, 0, 5, False), (2, 1, 6, False)],
+)
+def test_a_training_stops_at_once_when_nothing_that_flies_is_started_again(runners, alive, restarts, stops):
+    known = {"fault_tolerance": {"num_healthy_workers": alive, "num_remote_worker_restarts": restarts}}
+    with pytest.raises(TrainingError, match="every process that flies") if stops else nullcontext():
+        training.check_pause(1.0, known, runners)
 
 
 def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_path, monkeypatch):
