@@ -7,12 +7,12 @@ docs/images/trade.png of the newest trade; with `resume` of what that run folder
 
 import csv
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from jobs.claims import CLAIMS, RULE, UNTESTED, Claim, Finding, judge
 from jobs.config import Config, ConfigError
@@ -23,6 +23,7 @@ from jobs.report import markdown_table
 from jobs.runs import REPOSITORY, write_atomic
 
 Flown = dict[tuple[Condition, str], dict[int | None, np.ndarray]]
+COLOURS = 128  # of a copied figure
 PER_CENT = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
 TITLES = {
     "control_hz": "Control rate",
@@ -83,7 +84,7 @@ def write_trade(trade: Path, docs: Path) -> Path:
         The file.
     """
     (docs / "images").mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(trade / "images" / "trade.png", docs / "images" / "trade.png")
+    copy_small(trade / "images" / "trade.png", docs / "images" / "trade.png")
     write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
     return docs / "trade.md"
 
@@ -104,7 +105,7 @@ def write_results(sweep: Path, docs: Path) -> Path:
     shown = [name for name in (*about["axes"], "contacts") if name in pictures]
     (docs / "images").mkdir(parents=True, exist_ok=True)
     for name in shown:
-        shutil.copyfile(pictures[name], docs / "images" / f"results_{name}.png")
+        copy_small(pictures[name], docs / "images" / f"results_{name}.png")
     parts = [
         *opening(about),
         *claims(flown),
@@ -115,6 +116,13 @@ def write_results(sweep: Path, docs: Path) -> Path:
     text = "\n".join(parts)
     write_atomic(docs / "results.md", text)
     return docs / "results.md"
+
+
+def copy_small(picture: Path, target: Path) -> None:
+    """A figure in `COLOURS` colours, a third of the size: enough for lines and print."""
+    with Image.open(picture) as whole:
+        small = whole.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    small.save(target, optimize=True)
 
 
 def read_flights(file: Path) -> Flown:
