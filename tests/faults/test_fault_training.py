@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import tempfile
 
 import pytest
 
@@ -177,15 +178,22 @@ def test_a_home_that_cannot_be_written_is_not_needed(tmp_path):
     outcome("HOME not writable", "trains, evaluates and films as ever", "nothing")
 
 
-def test_a_disk_that_is_full_stops_with_its_reason_and_the_same_command_continues(tmp_path, small_disk):
-    job = launch(small_disk, *TRAIN, "train.env_steps=960", "train.checkpoint_every=1", TMPDIR=str(tmp_path))
+@pytest.fixture
+def short_folder():
+    """A folder on another file system than the small one, whose name leaves room for Ray's sockets."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        yield folder
+
+
+def test_a_disk_that_is_full_stops_with_its_reason_and_the_same_command_continues(small_disk, short_folder):
+    job = launch(small_disk, *TRAIN, "train.env_steps=960", "train.checkpoint_every=1", TMPDIR=short_folder)
     filler = small_disk / "filler"
     job.wait(lambda: job.steps() >= 256)
     fill(filler)
     assert job.end() == 1, job.said
     assert "No space left on device" in job.said
     filler.unlink()
-    check_complete(start(small_disk, job.printed_command(), TMPDIR=str(tmp_path)))
+    check_complete(start(small_disk, job.printed_command(), TMPDIR=short_folder))
     outcome(
         "disk full, training",
         "stops with the reason; with room, the same command continues",
