@@ -13,10 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from jobs import sweep as sweeping
 from jobs.tracking import open_store
 from tests.test_conditions import sweep_config
-from tests.test_sweep import StubTuner
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
 WRITERS = 8
@@ -77,6 +75,11 @@ def in_store(folder, uri, seed):
 
 def report(folder, uri, seed):
     """A sweep whose flights are made up, and everything else is not."""
+    # Here, in a process of its own: Ray reads its token once, when it is imported, and another
+    # test of this run names one later.
+    from jobs import sweep as sweeping
+    from tests.test_sweep import StubTuner
+
     sweeping._tuner, sweeping.start_ray = StubTuner, lambda *given: None
     sweeping.run(in_store(folder, uri, seed))
 
@@ -91,10 +94,14 @@ def test_eight_sweeps_report_at_once_and_all_is_read_back(tmp_path, postgres):
     assert [writer.exitcode for writer in writers] == [0] * WRITERS
     client, experiment = open_store(postgres, "evade")
     runs = client.search_runs([experiment], max_results=1000)
-    assert Counter(run.data.tags["kind"] for run in runs) == {"sweep": WRITERS, "condition": WRITERS * 5 * 2}
+    assert Counter(run.data.tags["kind"] for run in runs) == {
+        "sweep": WRITERS,
+        "condition": WRITERS * 5 * 2,
+        "group": WRITERS * 2,
+    }
     assert {run.info.status for run in runs} == {"FINISHED"}
     parents = Counter(run.data.tags.get("mlflow.parentRunId") for run in runs)
-    assert sorted(parents.values()) == [WRITERS] + [10] * WRITERS
+    assert sorted(parents.values()) == [WRITERS] + [12] * WRITERS
     for run in runs:
         if run.data.tags["kind"] == "condition":
             assert run.data.metrics["eval/distance_m"] == 50.0
