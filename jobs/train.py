@@ -11,6 +11,7 @@ raise the same again.
 import contextlib
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -19,8 +20,7 @@ from typing import Any
 import pyarrow.fs
 import ray
 import torch
-from ray import cloudpickle, tune
-from ray.exceptions import RayError, RayTaskError
+from ray import tune
 from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 
@@ -65,6 +65,8 @@ MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
 LISTENER = "train"
+FAILURE = re.compile(r"^Failure # \d+ .*$", re.MULTILINE)  # begins each error that Tune writes about a trial
+RAISED = re.compile(r"^(?:\w+\.)*\w+(?:Error|Exception|Exit|Interrupt)\b.*$", re.MULTILINE)
 
 _LISTENERS: dict[str, Callable[[Mapping[str, Any]], None]] = {}
 
@@ -99,21 +101,22 @@ class Relay(tune.Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Say that the training goes on, or stop it if its code raised."""
-        error = newest_error(trial)
-        if isinstance(error, RayTaskError) and not isinstance(error.cause, RayError):
+        error = newest_error(trial.error_file)
+        raised = RAISED.findall(error)
+        if raised and not raised[-1].startswith("ray.exceptions."):
             raise TrainingError(stopped(error))
-        reason = "its process could not be started" if error is None else last_line(error)
+        reason = last_line(error) if error else "its process could not be started"
         console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
 
 
-def newest_error(trial: Any) -> Exception | None:
-    """What ended a trial last; None if it was no error of its process.
+def newest_error(file: str | None) -> str:
+    """The newest of the errors that Tune has written about a trial, as text; empty if there is none.
 
-    Tune writes it into a folder of the driver's first; `Trial.get_pickled_error` reads the storage,
-    where it may not be yet.
+    Tune keeps the error itself too, pickled, but where another user of the machine may write.
     """
-    file = trial.pickled_error_file
-    return cloudpickle.loads(Path(file).read_bytes()) if file and Path(file).is_file() else None
+    if file is None or not Path(file).is_file():
+        return ""
+    return FAILURE.split(Path(file).read_text())[-1].strip()
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -158,12 +161,12 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     return folder.policy
 
 
-def stopped(error: Exception) -> str:
+def stopped(error: Exception | str) -> str:
     """What to say of a training that an error ended."""
     return f"training stopped: {last_line(error)}; the same command continues from its last checkpoint"
 
 
-def last_line(error: Exception) -> str:
+def last_line(error: Exception | str) -> str:
     """The line of a worker's error that names its cause."""
     lines = str(error).strip().splitlines()
     return lines[-1].strip().removeprefix("jobs.runner.FlightError: ") if lines else type(error).__name__

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
-from ray import cloudpickle
 from ray.exceptions import ActorDiedError, RayTaskError
 
 from envs.config import sensor_settings, settings_hash
@@ -123,28 +122,37 @@ def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_pat
 
 
 class Trial:
-    """A trial that ended with an error, which Tune has written down."""
+    """A trial whose errors Tune has written down, the newest last."""
 
     num_failures = 1
 
-    def __init__(self, folder, error):
-        self.pickled_error_file = str(folder / "error.pkl") if error is not None else None
-        if error is not None:
-            (folder / "error.pkl").write_bytes(cloudpickle.dumps(error))
+    def __init__(self, folder, *errors):
+        self.error_file = str(folder / "error.txt") if errors else None
+        texts = [
+            f"Failure # {k} (occurred at 2026-01-01_00-00-00)\n{text}\n" for k, text in enumerate(errors)
+        ]
+        (folder / "error.txt").write_text("".join(texts))
 
 
 def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_path, capsys):
     relay = training.Relay("name")
-    raised = RayTaskError("train", "Traceback\nValueError: no", ValueError("no"))
-    with pytest.raises(TrainingError, match=r"^training stopped: ValueError: no; the same command continues"):
-        relay.on_trial_recover(1, [], Trial(tmp_path, raised))
-    for lost in (
-        None,
-        ActorDiedError(),
-        RayTaskError("train", "Traceback\nActorDiedError", ActorDiedError()),
+    raised = str(RayTaskError("train", "ray::PPO.train()\n  File 'a'\nValueError: no", ValueError("no")))
+    lost = str(ActorDiedError())
+    within = str(
+        RayTaskError("train", "ray::PPO.train()\nray.exceptions.ActorDiedError: gone", ActorDiedError())
+    )
+    for errors in (
+        (raised,),
+        (lost, raised),
+        (raised.replace("ValueError", "jobs.runner.FlightError: KeyError"),),
     ):
-        relay.on_trial_recover(1, [], Trial(tmp_path, lost))
-    assert capsys.readouterr().out.count("goes on from its last checkpoint") == 3
+        with pytest.raises(
+            TrainingError, match=r"^training stopped: \w+Error: no; the same command continues"
+        ):
+            relay.on_trial_recover(1, [], Trial(tmp_path, *errors))
+    for errors in ((), (lost,), (within,), (raised, lost)):
+        relay.on_trial_recover(1, [], Trial(tmp_path, *errors))
+    assert capsys.readouterr().out.count("goes on from its last checkpoint") == 4
 
 
 def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):
