@@ -1,7 +1,7 @@
 """How training and sweeps grow with cores: measured on simulated nodes of this machine, then a model.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.scaling [docs/images/scaling.png]
-Expect: five tables in about ten minutes, and their figure if a file is named; the machine should be
+Expect: five tables in about five minutes, and their figure if a file is named; the machine should be
 quiet. Nodes beyond this machine's cores share them, so that measured rates stop to grow there; the
 model says what they would be alone. Its inputs are the measured ones: seconds of a core for a step
 flown, seconds of the learner and bytes through the object store for a step learnt, seconds of a
@@ -9,6 +9,7 @@ core for a condition, seconds of the driver for a trial.
 """
 
 import contextlib
+import logging
 import os
 import pickle
 import statistics
@@ -188,6 +189,9 @@ def training_rate(*words: str) -> tuple[float, float, float]:
 def seconds_of(trial: Callable[[dict[str, Any]], None], count: int, folder: Path) -> float:
     """Wall time of so many trials, scheduled as a sweep's are, once a worker per core is there [s]."""
     os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = "3600"
+    logging.getLogger("ray.tune").setLevel(
+        logging.ERROR
+    )  # else a line for each trial without a file of its own
     cores = int(ray.cluster_resources()["CPU"])
     for number, name in ((cores, "first"), (count, "timed")):
         tuner = tune.Tuner(
