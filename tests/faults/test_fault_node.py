@@ -30,7 +30,9 @@ def on(cluster):
 
 def test_a_training_whose_machine_is_lost_goes_on_elsewhere_from_its_checkpoint(tmp_path, cluster):
     first = cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"])
-    job = launch(tmp_path, *TRAIN, *FINE, *on(cluster), f"cluster.storage={tmp_path / 'shared'}")
+    # Long enough to be still at work when the other machine has joined.
+    length = "train.env_steps=6400"
+    job = launch(tmp_path, *TRAIN, *FINE, length, *on(cluster), f"cluster.storage={tmp_path / 'shared'}")
     job.wait(lambda: job.steps() >= 256)
     cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"])
     cluster.remove_node(first, allow_graceful=False)
