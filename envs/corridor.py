@@ -10,6 +10,7 @@ of its own, made of (split, seed, episode): a corridor of one split never occurs
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -170,18 +171,32 @@ class CorridorVectorEnv(VectorEnv):
     metadata = {**CorridorEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
-        self, num_envs: int = 1, config: EnvConfig | None = None, render_mode: Any = None, **fields: Any
+        self,
+        num_envs: int = 1,
+        config: EnvConfig | Sequence[EnvConfig] | None = None,
+        render_mode: Any = None,
+        **fields: Any,
     ) -> None:
-        """Make `num_envs` environments alike; the other arguments are those of `CorridorEnv`.
+        """Make `num_envs` environments; the arguments not named here are those of `CorridorEnv`.
+
+        Args:
+            num_envs: Flights at once.
+            config: One for all, or several, which the environments take in turn.
+            render_mode: See `CorridorEnv`.
+            fields: To replace in every config.
 
         Raises:
-            ValueError: A setting is refused, or `num_envs` is below 1.
+            ValueError: A setting is refused, `num_envs` is below 1, or configs have different observations.
         """
         self.envs: list[CorridorEnv] = []  # first, because Gymnasium closes what failed to start
         if num_envs < 1:
             raise ValueError(f"num_envs must be >= 1; got {num_envs}.")
         self.num_envs, self.render_mode = num_envs, render_mode
-        self.envs = [CorridorEnv(config, render_mode, **fields) for _ in range(num_envs)]
+        configs = config if isinstance(config, Sequence) else [config]
+        self.envs = [CorridorEnv(configs[k % len(configs)], render_mode, **fields) for k in range(num_envs)]
+        spaces_seen = {repr(env.observation_space) for env in self.envs}
+        if len(spaces_seen) > 1:
+            raise ValueError(f"configs must have one observation space; got {sorted(spaces_seen)}.")
         self.metadata = {**self.metadata, "render_fps": self.envs[0].metadata["render_fps"]}
         self.single_observation_space = self.envs[0].observation_space
         self.single_action_space = self.envs[0].action_space

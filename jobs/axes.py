@@ -1,4 +1,4 @@
-"""The axes of a sweep: settings of the simulation that change together, point by point."""
+"""Axes and conditions: settings of the simulation that change together, point by point."""
 
 import dataclasses
 import math
@@ -19,6 +19,7 @@ KEYS = [
     *(f"{name}.{part.name}" for name, group in GROUPS.items() for part in dataclasses.fields(group)),
     *PLAIN,
 ]  # fmt: skip
+OF_THE_NETWORK = ("camera.width", "camera.height", "env.window_capacity")  # what it is built for
 
 
 def _number_or_word(value: Any) -> float | str | None:
@@ -34,6 +35,7 @@ Setting = Annotated[float | str | None, PlainValidator(_number_or_word)]
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Values = Annotated[list[Setting], Field(min_length=1)]
 Axis = Annotated[dict[str, Values], Field(min_length=1)]
+Condition = dict[str, Setting]
 
 
 def env_with(config: EnvConfig, changes: Mapping[str, Any]) -> EnvConfig:
@@ -93,21 +95,42 @@ def refused_axes(axes: Mapping[str, Mapping[str, Sequence[Any]]], config: EnvCon
     return refused
 
 
-def _refused_axis(settings: Mapping[str, Sequence[Any]], config: EnvConfig) -> list[str]:
-    unknown = {key: list(values) for key, values in settings.items() if key not in KEYS}
-    if unknown:
-        return [
-            f"{key}: no such setting, got {values}{nearest(key, KEYS)}" for key, values in unknown.items()
+def refused_conditions(conditions: Sequence[Mapping[str, Any]], config: EnvConfig) -> list[str]:
+    """One line for each thing that the simulation would refuse of the conditions of a training."""
+    refused = []
+    for place, condition in enumerate(conditions):
+        reasons = _refused_keys(condition) or _refused_point(condition, config)
+        reasons += [
+            f"{key}: must be the same for all of a training, got {condition[key]!r}"
+            for key in OF_THE_NETWORK
+            if key in condition
         ]
+        refused += [f"train.conditions[{place}]: {reason}" for reason in reasons]
+    return refused
+
+
+def _refused_axis(settings: Mapping[str, Sequence[Any]], config: EnvConfig) -> list[str]:
+    unknown = _refused_keys(settings)
+    if unknown:
+        return unknown
     try:
         points = axis_points(settings)
     except ValueError as error:
         return [str(error)]
-    refused = []
-    for point in points:
-        try:
-            env_with(config, point)
-        except pydantic.ValidationError as error:
-            named = ", ".join(f"{key}={value!r}" for key, value in point.items())
-            refused += [f"{named}: {problem['msg']}" for problem in error.errors()]
-    return refused
+    return [reason for point in points for reason in _refused_point(point, config)]
+
+
+def _refused_keys(settings: Mapping[str, Any]) -> list[str]:
+    """One line for each key that is no setting of the simulation."""
+    unknown = {key: value for key, value in settings.items() if key not in KEYS}
+    return [f"{key}: no such setting, got {value}{nearest(key, KEYS)}" for key, value in unknown.items()]
+
+
+def _refused_point(point: Mapping[str, Any], config: EnvConfig) -> list[str]:
+    """One line for each value that the simulation refuses of settings that are replaced together."""
+    try:
+        env_with(config, point)
+    except pydantic.ValidationError as error:
+        named = ", ".join(f"{key}={value!r}" for key, value in point.items())
+        return [f"{named}: {problem['msg']}" for problem in error.errors()]
+    return []

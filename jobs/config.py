@@ -16,7 +16,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
-from jobs.axes import refused_axes
+from jobs.axes import refused_axes, refused_conditions
 from jobs.refusals import JOBS_CHOOSE, explain, nearest, redacted, refused_scenes
 from jobs.settings import (
     AlgoConfig,
@@ -112,10 +112,17 @@ def parse(values: Mapping[str, Any]) -> Config:
         named += [("evaluate", HELD_OUT_SCENE)]
         named += [("trade_simulator.scenes", name) for name in config.trade_simulator.scenes]
         named += [("collect.scenes", name) for name in config.collect.scenes]
+        trained = [condition.get("env.scene") for condition in config.train.conditions]
+        named += [("train.conditions", name) for name in trained if isinstance(name, str)]
         swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
         named += [("sweep.axes", name) for name in dict.fromkeys(swept) if isinstance(name, str)]
         vehicle = config.env["vehicle_radius_m"], config.env["camera_height_m"]
         refused = _refused_picture(config) + refused_axes(config.sweep.axes, config.env_config())
+        refused += refused_conditions(config.train.conditions, config.env_config())
+        at_once, wanted = config.algo.num_envs_per_env_runner, len(config.train.conditions)
+        if wanted > at_once:
+            rule = f"must be at most the {at_once} of algo.num_envs_per_env_runner"
+            refused.append(f"train.conditions: {rule}, got {wanted}")
         if not config.collect.scenes and not config.collect.recordings:
             refused.append("collect.scenes: must name a scene where collect.recordings is empty, got []")
         refused += refused_scenes(named, config.env["layout"], vehicle)

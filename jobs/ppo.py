@@ -13,8 +13,9 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
 
-from envs.config import sensor_differences, sensor_settings, settings_hash
+from envs.config import EnvConfig, sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
+from jobs.axes import env_with
 from jobs.config import Config, ConfigError
 from jobs.drift import drift_figures
 from jobs.learner import REWARD_SCALE, PlainPPOLearner
@@ -120,10 +121,10 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
     own_cpus = LITTLE if runners else 1
     register_env(ENV, make_corridors)
     spec = module_spec(settings, config.seed, pretrained_encoder(config, encoder_path))
-    flown = config.env_config(split="train", observation=KINDS[config.model.name].observation)
+    flown = training_worlds(config)
     return (
         PPOConfig()
-        .environment(ENV, env_config={"config": flown}, disable_env_checking=True)
+        .environment(ENV, env_config={"configs": flown}, disable_env_checking=True)
         .framework("torch")
         .env_runners(
             num_env_runners=runners,
@@ -173,7 +174,13 @@ def learning_rate(config: Config) -> float | list[list[float]]:
 
 def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
     """The environments of one env runner."""
-    return CorridorVectorEnv(context["num_envs"], context["config"])
+    return CorridorVectorEnv(context["num_envs"], context["configs"])
+
+
+def training_worlds(config: Config) -> tuple[EnvConfig, ...]:
+    """The simulations of `train.conditions`, which the corridors flown at once take in turn."""
+    own = config.env_config(split="train", observation=KINDS[config.model.name].observation)
+    return tuple(env_with(own, condition) for condition in config.train.conditions)
 
 
 def network_settings(config: Config) -> dict[str, Any]:

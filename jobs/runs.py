@@ -27,6 +27,8 @@ UNNAMED = (
     "job", "resume", "runs_dir", "cluster", "tracking",
     "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe",
 )  # fmt: skip
+# Settings that older run folders lack, with the value that does what they did.
+LATER: dict[str, dict[str, Any]] = {"collect": {"recordings": []}, "train": {"conditions": [{}]}}
 REPOSITORY = Path(__file__).resolve().parent.parent
 COMPARED_STEPS = 500_000  # the paper's; of every training that is compared with others
 
@@ -98,7 +100,9 @@ def reopen(path: Path, config: Config) -> Run:
             f"run folders are in {str(Path(config.runs_dir).resolve())!r}"
         )
     here = {name: value for name, value in as_dict(config).items() if name in UNNAMED}
-    run = parse({**read_json(stored), **here})
+    values = read_json(stored)
+    values |= {section: {**late, **values[section]} for section, late in LATER.items()}
+    run = parse({**values, **here})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
 
 
@@ -126,8 +130,14 @@ def holding(run: Run) -> Iterator[None]:
 
 
 def run_name(config: Config) -> str:
-    """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained."""
+    """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained.
+
+    A setting of `LATER` counts only where it changes something, so that older folders keep their names.
+    """
     settings = {name: value for name, value in as_dict(config).items() if name not in UNNAMED}
+    for section, late in LATER.items():
+        values = settings[section].items()
+        settings[section] = {name: value for name, value in values if late.get(name, ...) != value}
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
 
 

@@ -7,7 +7,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
-from jobs.axes import Axis, AxisName
+from jobs.axes import Axis, AxisName, Condition
 from models.kinds import FINETUNED, KINDS, MOST_TIME_BINS
 
 Count = Annotated[int, Field(ge=1)]
@@ -127,10 +127,16 @@ class PretrainConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TrainConfig:
-    """How long the policy is trained and how often it is saved."""
+    """How long the policy is trained, how often it is saved, and what it meets meanwhile.
+
+    Attributes:
+        conditions: Settings of the simulation that are replaced together, as a sweep replaces
+            them; the corridors flown at once take them in turn. [{}] changes nothing.
+    """
 
     env_steps: Count
     checkpoint_every: Count
+    conditions: Annotated[list[Condition], Field(min_length=1)]
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -2,7 +2,15 @@ import pydantic
 import pytest
 
 from envs.config import EnvConfig
-from jobs.axes import KEYS, axis_numbers, axis_points, env_with, moving_settings, refused_axes
+from jobs.axes import (
+    KEYS,
+    axis_numbers,
+    axis_points,
+    env_with,
+    moving_settings,
+    refused_axes,
+    refused_conditions,
+)
 
 
 def refusals(axis):
@@ -85,3 +93,13 @@ def test_an_axis_of_numbers_changes_one_setting_and_no_words():
     assert moving_settings({"45": slow, "200": fast}) == ["env.control_hz"]
     assert axis_numbers({"45": slow, "200": {**fast, "env.scene": "dynamic"}}) is None
     assert axis_numbers({"poles": {"env.scene": "poles"}, "dynamic": {"env.scene": "dynamic"}}) is None
+
+
+def test_conditions_of_a_training_are_refused_line_by_line_and_keep_the_networks_picture():
+    conditions = [{}, {"faults.sparsity": 2.0}, {"env.hz": 5}, {"camera.width": 32}]
+    assert refused_conditions(conditions, EnvConfig()) == [
+        "train.conditions[1]: faults.sparsity=2.0: Input should be less than or equal to 1",
+        "train.conditions[2]: env.hz: no such setting, got 5; --cfg job shows every key",
+        "train.conditions[3]: camera.width: must be the same for all of a training, got 32",
+    ]
+    assert refused_conditions([{}, {"faults.sparsity": 0.5, "env.control_hz": 100}], EnvConfig()) == []

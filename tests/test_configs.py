@@ -19,6 +19,7 @@ CONF = Path(__file__).resolve().parent.parent / "conf"
 POLICIES = {
     "bytestream": "brp_full",
     "bytestream_finetuned": "brp_full",
+    "bytestream_robust": "brp_full",
     "bytestream_xy": "brp_xy",
     "event_columns": "event_columns",
     "event_set": "event_set",
@@ -225,6 +226,13 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("model.name", "snn", f"name must be one of {', '.join(KINDS)}, got 'snn'"),
         ("model.latent", None, "latent must be given for brp_full, got None"),
         ("model.hidden", None, "hidden must be given for brp_full, got None"),
+        (
+            "train.conditions",
+            [{"env.scene": "moon"}],
+            "train.conditions: must be one of cones, ",
+        ),
+        ("train.conditions", [{}] * 17, "must be at most the 16 of algo.num_envs_per_env_runner, got 17"),
+        ("train.conditions", [], "at least 1 item"),
         ("model.coding", "phase", "'additive', 'eventnet' or 'none', got 'phase'"),
     ],
 )

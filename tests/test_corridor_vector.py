@@ -75,3 +75,21 @@ def test_no_environment_of_a_vector_flies_what_another_flies_later():
         alone.reset()
     assert several.envs[0].scene.obstacles.tobytes() in later
     assert not any(env.scene.obstacles.tobytes() in later for env in several.envs[1:])
+
+
+def test_several_configs_are_flown_in_turn():
+    configs = [
+        EnvConfig(camera=SMALL),
+        EnvConfig(camera=SMALL, faults=FAULTY, scene="cones", control_hz=100.0),
+    ]
+    many, seeds = CorridorVectorEnv(3, configs), [4, 5, 6]
+    observations = many.reset(seed=seeds)[0], many.step(np.array([0, 1, 2]))[0]
+    for i, config in enumerate([configs[0], configs[1], configs[0]]):
+        alone = CorridorEnv(config)
+        assert observations[0][i].tobytes() == alone.reset(seed=seeds[i])[0].tobytes()
+        assert observations[1][i].tobytes() == alone.step(i)[0].tobytes()
+
+
+def test_configs_that_show_different_things_are_refused():
+    with pytest.raises(ValueError, match="one observation space"):
+        CorridorVectorEnv(2, [EnvConfig(window_capacity=8), EnvConfig(window_capacity=9)])

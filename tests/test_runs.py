@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from envs.config import settings_hash
 from jobs import runs
 from jobs.config import Config, ConfigError
 from jobs.runs import (
+    UNNAMED,
     RunError,
     finish,
     finished,
@@ -164,6 +166,18 @@ with holding(Run(Path({str(run.path)!r}), None)):
 def test_without_git_the_commit_is_unknown(monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert git_commit() == "unknown"
+
+
+def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(config):
+    run = open_run(config)
+    stored = json.loads((run.path / "config.json").read_text())
+    del stored["collect"]["recordings"], stored["train"]["conditions"]
+    (run.path / "config.json").write_text(json.dumps(stored))
+    assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
+    settings = {name: value for name, value in stored.items() if name not in UNNAMED}
+    assert run.path.name.endswith(settings_hash(settings)[:8])
+    noisy = dataclasses.replace(config.train, conditions=[{"faults.sparsity": 0.5}])
+    assert run_name(dataclasses.replace(config, train=noisy)) != run.path.name
 
 
 def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):
