@@ -41,7 +41,7 @@ from jobs.runs import Run, git_commit, read_json, write_atomic, write_json
 from jobs.sweep_figures import axis_figure, collision_figure, style_of
 from jobs.tracking import Tracker
 
-FILMED = 3
+FILMED = 2
 CHILD_PARAMS = ("axis", "value", "group")
 CURVES_NOTE = (
     "One group along every axis of numbers: the step of a metric is the axis value. See the parent run."
@@ -146,16 +146,15 @@ def contacts(sweep: Sweep, group: str, episodes: Episodes) -> tuple[np.ndarray, 
 
 
 def film_crashes(place: Path, sweep: Sweep, episodes: Episodes) -> list[Path]:
-    """Films of contacts of the first group's first training where nothing is changed."""
-    cell = sweep.cells[0]
-    if cell.key not in episodes:
-        return []
+    """Films of contacts of each group's first training where nothing is changed; bounds have none."""
+    usual = [cell for cell in sweep.cells if cell.label[0] == NOMINAL and cell.key in episodes]
+    first = {cell.entry.group: cell for cell in reversed(usual) if cell.entry.training is not None}
     paths = []
-    for seed in typical_crashes(episodes[cell.key]):
-        path = place / "crashes" / f"{cell.entry.group}-{cell.key[:8]}-corridor{seed}.mp4"
-        if not path.is_file():
-            film(cell.entry.pilot, cell.action, cell.env, seed, path)
-        paths.append(path)
+    for group, cell in sorted(first.items()):
+        for seed in typical_crashes(episodes[cell.key]):
+            paths.append(place / "crashes" / f"{group}-{cell.key[:8]}-corridor{seed}.mp4")
+            if not paths[-1].is_file():
+                film(cell.entry.pilot, cell.action, cell.env, seed, paths[-1])
     return paths
 
 

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from jobs import results
 from jobs.config import ConfigError
 from jobs.flights import write_episodes
 from jobs.groups import LABELS
-from jobs.results import find_study, read_flights, write_results, write_trade
+from jobs.results import breaks, find_study, read_flights, write_results, write_trade
 from tests.test_groups import flights
 from tests.test_runs import small_config
 
@@ -121,3 +122,21 @@ def test_nothing_finished_is_refused_with_the_remedy(tmp_path):
     rule = r"^resume: no finished sweep or trade in .*: run python -m platform\.launch \+exp=robustness or "
     with pytest.raises(ConfigError, match=rule):
         results.run(config)
+
+
+def test_a_condition_breaks_a_policy_where_its_own_loss_is_certain(sweep, tmp_path):
+    flown = read_flights(sweep / "episodes.csv")
+    for seed in (0, 1):
+        flown[("sparsity", "0.5"), "bytestream"][seed]["success"][:10] = False
+        flown[("sparsity", "0.2"), "bytestream"][seed]["success"][:1] = False
+    flown[("sparsity", "0.5"), "event_image"][0]["success"] = True
+    text = "\n".join(breaks(ABOUT, flown))
+    assert re.search(r"\| `bytestream` \| 80 \| sparsity 0.5: -50 \[-\d+, -\d+\] \|", text)
+    assert "| `event_image` | 20 | none is certain |" in text
+    assert "oracle" not in text
+
+
+def test_the_figure_of_a_trade_is_shown_where_there_is_one(sweep, trade, tmp_path):
+    assert "Success against cost" not in write_results(sweep, tmp_path / "docs").read_text()
+    write_trade(trade, tmp_path / "docs")
+    assert "![Success against cost](images/trade.png)" in write_results(sweep, tmp_path / "docs").read_text()

@@ -53,21 +53,27 @@ def test_typical_crashes_are_those_in_the_middle():
     rows = np.zeros(6, EPISODE)
     rows["seed"], rows["collision"] = np.arange(6), [True, True, True, True, True, False]
     rows["distance_m"] = [5.0, 50.0, 48.0, 52.0, 90.0, 50.0]
-    assert typical_crashes(rows) == [1, 2, 3]
+    assert typical_crashes(rows) == [1, 2]
     assert typical_crashes(rows[5:]) == []
 
 
-def test_crashes_of_the_first_group_are_filmed_once(tmp_path):
+def test_crashes_of_each_groups_first_training_are_filmed_once(tmp_path):
     config = sweep_config(tmp_path)
-    pilot = save_training(tmp_path / "policy", "a", 0, config.env_config())
-    sweep = plan(config, [read_entry(pilot)])
-    cell = sweep.cells[0]
-    rows = np.array([tuple(row) for row in flown(cell, False)["episodes"]], EPISODE)
-    rows["collision"] = True
-    paths = film_crashes(tmp_path / "sweep", sweep, {cell.key: rows})
-    assert [path.name for path in paths] == [f"a-{cell.key[:8]}-corridor{seed}.mp4" for seed in (0, 1)]
+    pilots = [
+        save_training(tmp_path / f"{group}{seed}", group, seed, config.env_config())
+        for group, seed in (("a", 0), ("a", 1), ("b", 4))
+    ]
+    sweep = plan(config, [read_entry(pilot) for pilot in (*pilots, "straight")])
+    usual = [cell for cell in sweep.cells if cell.label[0] == "nominal"]
+    rows = np.array([tuple(row) for row in flown(usual[0], False)["episodes"]], EPISODE)
+    rows["collision"] = [True, False]
+    episodes = {cell.key: rows for cell in usual}
+    paths = film_crashes(tmp_path / "sweep", sweep, episodes)
+    assert [path.name for path in paths] == [
+        f"{cell.entry.group}-{cell.key[:8]}-corridor0.mp4" for cell in (usual[0], usual[2])
+    ]
     before = [path.stat().st_mtime_ns for path in paths]
-    film_crashes(tmp_path / "sweep", sweep, {cell.key: rows})
+    film_crashes(tmp_path / "sweep", sweep, episodes)
     assert [path.stat().st_mtime_ns for path in paths] == before
 
 

@@ -11,13 +11,24 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.timeout(3600))
 
 
+def pytest_sessionfinish(session):
+    """A worker of pytest-xdist hands its rows to the process that prints the table."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["faults"] = TABLE
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    TABLE.extend(tuple(row) for row in getattr(node, "workeroutput", {}).get("faults", []))
+
+
 def pytest_terminal_summary(terminalreporter):
     if not TABLE:
         return
     head = ("fault", "outcome", "lost")
     wide = [max(len(row[column]) for row in [head, *TABLE]) for column in range(3)]
     terminalreporter.section("faults")
-    for row in [head, *TABLE]:
+    for row in [head, *sorted(TABLE)]:
         terminalreporter.line("  ".join(text.ljust(width) for text, width in zip(row, wide, strict=True)))
 
 
