@@ -8,6 +8,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 project = "Evade"
 copyright = "The Evade authors"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+myst_heading_anchors = 3  # links to #headings, as on GitHub
 html_theme = "furo"
 html_title = "Evade"
 autodoc_default_options = {"members": True, "member-order": "bysource"}

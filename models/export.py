@@ -1,13 +1,16 @@
 """A policy as one ONNX file: events or a picture in, logits and the next stack of features out.
 
-For robots without Python. The graph holds the whole of it, with the preprocessing of training:
+For robots without Python. The graph holds the whole of it, with the preprocessing of training. It takes::
 
     events       int64 (N, 4), t since the window's start [us], x, y [pixels], p (-1 or +1), in time order
     window_us    int64 (), length of the window [us]        (policies that see events)
     luminance    float32 (H, W), linear                     (policies that see luminance)
     last_stack   (stack, ...), what the step before gave as next_stack; for a flight's first step anything
     first        bool (), whether this is a flight's first step
- -> logits       float32 (actions,), unnormalised log-probabilities
+
+and gives::
+
+    logits       float32 (actions,), unnormalised log-probabilities
     next_stack   as last_stack: float32, uint8 for pictures, int32 for sets of events
 
 `tests/test_export.py` compares it with `models.policy.Policy` in onnxruntime. Needs the extra
