@@ -124,7 +124,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
     flown = training_worlds(config)
     return (
         PPOConfig()
-        .environment(ENV, env_config={"configs": flown}, disable_env_checking=True)
+        .environment(ENV, env_config={"config": flown}, disable_env_checking=True)
         .framework("torch")
         .env_runners(
             num_env_runners=runners,
@@ -174,7 +174,7 @@ def learning_rate(config: Config) -> float | list[list[float]]:
 
 def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
     """The environments of one env runner."""
-    return CorridorVectorEnv(context["num_envs"], context["configs"])
+    return CorridorVectorEnv(context["num_envs"], context["config"])
 
 
 def training_worlds(config: Config) -> tuple[EnvConfig, ...]:

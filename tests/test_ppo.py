@@ -191,7 +191,7 @@ def test_the_corridors_flown_at_once_take_the_conditions_of_training_in_turn():
     conditions = "train.conditions=[{},{faults.sparsity: 0.5, env.control_hz: 100}]"
     worlds = training_worlds(make_config("model=event_columns", conditions))
     assert [(world.faults.sparsity, world.control_hz) for world in worlds] == [(0.0, 200.0), (0.5, 100.0)]
-    corridors = make_corridors({"num_envs": 3, "configs": worlds})
+    corridors = make_corridors({"num_envs": 3, "config": worlds})
     assert [env.config for env in corridors.envs] == [worlds[0], worlds[1], worlds[0]]
     assert {world.split for world in worlds} == {"train"}
 
