@@ -19,6 +19,7 @@ CONF = Path(__file__).resolve().parent.parent / "conf"
 POLICIES = {
     "bytestream": "brp_full",
     "bytestream_finetuned": "brp_full",
+    "bytestream_paper": "brp_full",
     "bytestream_robust": "brp_full",
     "bytestream_xy": "brp_xy",
     "event_columns": "event_columns",
@@ -119,7 +120,7 @@ def test_the_stages_of_an_experiment_share_its_run_folder(composed):
 )
 def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_its_name(composed, exp, name):
     jobs = ("pipeline", "train", "evaluate", "sweep")
-    configs = [parse(composed(f"+exp={exp}", f"job={job}")) for job in jobs]
+    configs = [parse(composed(f"+exp={exp}", f"job={job}", "budget=short")) for job in jobs]
     assert [(config.job, config.model.name) for config in configs] == [(job, name) for job in jobs]
     (folder,) = {run_name(config) for config in configs}
     assert folder.startswith(f"{exp}-short-s0-")
