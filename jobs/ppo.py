@@ -13,7 +13,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
 
-from envs.config import EnvConfig, sensor_differences, sensor_settings, settings_hash
+from envs.config import sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from jobs.axes import env_with
 from jobs.config import Config, ConfigError
@@ -121,10 +121,9 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
     own_cpus = LITTLE if runners else 1
     register_env(ENV, make_corridors)
     spec = module_spec(settings, config.seed, pretrained_encoder(config, encoder_path))
-    flown = training_worlds(config)
     return (
         PPOConfig()
-        .environment(ENV, env_config={"config": flown}, disable_env_checking=True)
+        .environment(ENV, env_config=corridor_settings(config), disable_env_checking=True)
         .framework("torch")
         .env_runners(
             num_env_runners=runners,
@@ -172,15 +171,24 @@ def learning_rate(config: Config) -> float | list[list[float]]:
     return [[0, config.algo.lr], [config.train.env_steps, 0.0]]
 
 
+def corridor_settings(config: Config) -> dict[str, Any]:
+    """What `make_corridors` makes the flights of a training from.
+
+    Tune continues a stopped training only under the keys and kinds of values that it began with,
+    so a setting of later versions appears only where it is used.
+    """
+    settings: dict[str, Any] = {
+        "config": config.env_config(split="train", observation=KINDS[config.model.name].observation)
+    }
+    if config.train.conditions != [{}]:
+        settings["conditions"] = config.train.conditions
+    return settings
+
+
 def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
-    """The environments of one env runner."""
-    return CorridorVectorEnv(context["num_envs"], context["config"])
-
-
-def training_worlds(config: Config) -> tuple[EnvConfig, ...]:
-    """The simulations of `train.conditions`, which the corridors flown at once take in turn."""
-    own = config.env_config(split="train", observation=KINDS[config.model.name].observation)
-    return tuple(env_with(own, condition) for condition in config.train.conditions)
+    """The environments of one env runner, which take the conditions of the training in turn."""
+    worlds = [env_with(context["config"], condition) for condition in context.get("conditions", [{}])]
+    return CorridorVectorEnv(context["num_envs"], worlds)
 
 
 def network_settings(config: Config) -> dict[str, Any]:

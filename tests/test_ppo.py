@@ -9,7 +9,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 
 from envs.windows import unpack_window
 from jobs.config import ConfigError
-from jobs.ppo import build_ppo, make_corridors, network_settings, policy_settings, training_worlds
+from jobs.ppo import build_ppo, corridor_settings, make_corridors, network_settings, policy_settings
 from jobs.runner import PlainEnvRunner
 from models.features import feature_of
 from models.kinds import KINDS
@@ -189,11 +189,15 @@ def test_the_networks_are_built_from_what_the_configuration_says():
 
 def test_the_corridors_flown_at_once_take_the_conditions_of_training_in_turn():
     conditions = "train.conditions=[{},{faults.sparsity: 0.5, env.control_hz: 100}]"
-    worlds = training_worlds(make_config("model=event_columns", conditions))
-    assert [(world.faults.sparsity, world.control_hz) for world in worlds] == [(0.0, 200.0), (0.5, 100.0)]
-    corridors = make_corridors({"num_envs": 3, "config": worlds})
-    assert [env.config for env in corridors.envs] == [worlds[0], worlds[1], worlds[0]]
+    settings = corridor_settings(make_config("model=event_columns", conditions))
+    worlds = [env.config for env in make_corridors({**settings, "num_envs": 3}).envs]
+    changed = [(world.faults.sparsity, world.control_hz) for world in worlds]
+    assert changed == [(0.0, 200.0), (0.5, 100.0), (0.0, 200.0)]
     assert {world.split for world in worlds} == {"train"}
+
+
+def test_a_training_without_conditions_has_the_keys_of_those_begun_before_there_were_any():
+    assert corridor_settings(make_config("model=event_columns")).keys() == {"config"}
 
 
 def test_the_feature_of_each_observation_is_made_exactly_once(runner):
