@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from ray.rllib.algorithms.ppo import PPO as RLlibPPO
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
@@ -26,6 +27,41 @@ from models.finetuned import evae_settings
 from models.kinds import KINDS
 from models.rllib import module_spec
 from models.weights import EncoderFileError, load_encoder
+
+
+class PPO(RLlibPPO):
+    """RLlib's PPO; what its construction raises is raised by the first iteration instead.
+
+    Ray ends a process whose construction failed once all that it owns is released, which processes
+    that fly never do: the launcher would wait forever. Its name is RLlib's, because Tune
+    continues a training only under the name that it began with.
+    """
+
+    _refused: Exception | None = None
+
+    def setup(self, config: Any) -> None:
+        """Build it."""
+        try:
+            super().setup(config)
+        except Exception as error:
+            self._refused = error
+
+    def load_checkpoint(self, checkpoint: Any) -> None:
+        """Go on from a checkpoint; one that could not be built says so in its first iteration."""
+        if self._refused is None:
+            super().load_checkpoint(checkpoint)
+
+    def step(self) -> Any:
+        """One iteration."""
+        if self._refused is not None:
+            raise self._refused
+        return super().step()
+
+    def cleanup(self) -> None:
+        """Let go of what was built."""
+        if self._refused is None:
+            super().cleanup()
+
 
 ENV = "evade-corridors"
 NUM_ACTIONS = 3

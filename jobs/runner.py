@@ -59,6 +59,11 @@ class FlightError(RuntimeError):
     """What the simulation or the policy raised in a process that flies."""
 
 
+def one_line(error: Exception) -> str:
+    """Type and text of an error."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
 class Raised:
     """A sample that could not be flown, on its way to the process that learns, where it raises."""
 
@@ -81,17 +86,48 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     _needs_initial_reset: bool
     _ongoing_episodes_for_metrics: dict[str, list[SingleAgentEpisode]]
 
+    def __init__(self, **settings: Any) -> None:
+        """Build the environments and the policy.
+
+        In a process of its own what that raises is kept for whoever asks for anything: RLlib would go on
+        without the process, and fail for lack of it.
+        """
+        self._refused = ""
+        try:
+            super().__init__(**settings)
+        except Exception as error:
+            if not settings.get("worker_index"):
+                raise
+            self._refused = one_line(error)
+
+    def assert_healthy(self) -> None:
+        """As RLlib's; a process that could not be built answers too."""
+        if not self._refused:
+            super().assert_healthy()
+
+    def get_spaces(self) -> Any:
+        """As RLlib's, which asks this first.
+
+        Raises:
+            FlightError: The process could not be built.
+        """
+        if self._refused:
+            raise FlightError(self._refused)
+        return super().get_spaces()
+
     def sample(self, **asked: Any) -> list[SingleAgentEpisode]:
         """Fly as asked, in less than `LONGEST_SAMPLE_S`.
 
         Raises:
             FlightError: With the type and text of whatever was raised.
         """
+        if self._refused:
+            raise FlightError(self._refused)
         try:
             with ending_after(LONGEST_SAMPLE_S):
                 return super().sample(**asked)
         except Exception as error:
-            raise FlightError(" ".join(f"{type(error).__name__}: {error}".split())) from error
+            raise FlightError(one_line(error)) from error
 
     def apply(self, func: Callable[..., Any], *values: Any, **named: Any) -> Any:
         """As RLlib's, which ends the process where `func` raises; but a flight's error is handed on."""

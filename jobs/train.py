@@ -21,14 +21,13 @@ import pyarrow.fs
 import ray
 import torch
 from ray import tune
-from ray.rllib.algorithms.ppo import PPO
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.checkpoints import mend, seal
 from jobs.cluster import fit, holds, start_ray, storage
 from jobs.config import Config, ConfigError
 from jobs.drift import FIGURES
-from jobs.ppo import MAX_RESTARTS, build_ppo, policy_settings
+from jobs.ppo import MAX_RESTARTS, PPO, build_ppo, policy_settings
 from jobs.pretrain import check_sources, prepare_encoder
 from jobs.progress import console, progress
 from jobs.runs import Run, finish, finished, open_run

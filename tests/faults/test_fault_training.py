@@ -132,6 +132,25 @@ def test_a_bug_in_the_simulation_stops_at_once_with_its_reason(tmp_path, runners
     )
 
 
+NO_WORLD = """
+def refuse(self, *values):
+    raise TypeError("there is no such world")
+CorridorVectorEnv.__init__ = refuse
+"""
+
+
+@pytest.mark.parametrize("runners", [0, 2])
+def test_a_world_that_cannot_be_made_stops_at_once_with_its_reason(tmp_path, runners):
+    job = launch(
+        tmp_path, *TRAIN, *FINE, f"algo.num_env_runners={runners}", after={"envs.corridor": NO_WORLD}
+    )
+    assert job.end() == 1
+    reason = "evade: failed: training stopped: TypeError: there is no such world; the same command"
+    assert job.said.splitlines()[-1].startswith(reason)
+    assert job.said.count("goes on") == 0
+    outcome(f"no world, {runners} env runners", "stops at once, with its reason", "nothing")
+
+
 def test_a_bug_that_ends_the_process_each_time_stops_after_a_few_restarts(tmp_path):
     job = launch(tmp_path, *TRAIN, *FINE, after={"envs.corridor": CRASH})
     assert job.end() == 1
@@ -191,7 +210,8 @@ def test_a_disk_that_is_full_stops_with_its_reason_and_the_same_command_continue
     job.wait(lambda: job.steps() >= 256)
     fill(filler)
     assert job.end() == 1, job.said
-    assert "No space left on device" in job.said
+    last = job.said.splitlines()[-1]  # which says what met the full disk first: a file, or the store
+    assert "No space left on device" in last or "database or disk is full" in last
     filler.unlink()
     check_complete(start(small_disk, job.printed_command(), TMPDIR=short_folder))
     outcome(
