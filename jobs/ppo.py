@@ -74,12 +74,15 @@ MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken en
 class FlightMetrics(RLlibCallback):
     """What flights look like, read off the environments' infos; rewards are the true ones.
 
-    An iteration ends two or three flights, so their figures are means over the last `EPISODES`.
+    An iteration ends two or three flights, so their figures are means over the last `EPISODES`. Flights
+    count in the order in which they began, those of one round of sampling together: of flights begun
+    at once the short ones end first, and these are crashes.
     """
 
     def __init__(self) -> None:
         """Begin without flights."""
         self._flights: deque[dict[str, float]] = deque(maxlen=EPISODES)
+        self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
         self._unfinished: dict[str, float] = {}
         self._rounds = 0
         self._encoder: tuple[EventVAE, dict[str, Any]] | None = None
@@ -98,13 +101,24 @@ class FlightMetrics(RLlibCallback):
         )
         metrics_logger.log_value("events_per_step", float(events.mean()), window=1)
         metrics_logger.log_value("dropped_events", float(dropped.sum()), window=1)
-        for chunk in samples:
-            self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
-            if chunk.is_done:
-                self._flights.append(outcome(chunk.get_infos(-1), self._unfinished.pop(chunk.id_)))
+        self._count(samples)
         for name in self._flights[0] if self._flights else ():
             mean = float(np.mean([flight[name] for flight in self._flights]))
             metrics_logger.log_value(name, mean, window=1)
+
+    def _count(self, samples: Any) -> None:
+        """Add the flights that ended to those that figures are taken from, as soon as it is their turn."""
+        self._begun.append({chunk.id_: None for chunk in samples if chunk.id_ not in self._unfinished})
+        for chunk in samples:
+            self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
+            if chunk.is_done:
+                ended = outcome(chunk.get_infos(-1), self._unfinished.pop(chunk.id_))
+                next(begun for begun in self._begun if chunk.id_ in begun)[chunk.id_] = ended
+        broken_off = self._unfinished.keys() - {chunk.id_ for chunk in samples}
+        for name in broken_off:
+            del self._unfinished[name], next(begun for begun in self._begun if name in begun)[name]
+        while self._begun and None not in self._begun[0].values():
+            self._flights.extend(flight for flight in self._begun.popleft().values() if flight)
 
     def _drift(self, module: Any) -> dict[str, float]:
         """The `jobs.drift.drift_figures` of the windows that the module met.

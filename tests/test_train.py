@@ -261,13 +261,35 @@ class Logger(dict):
         self[name] = value
 
 
-def test_flights_count_whole_and_stay_in_the_mean_over_iterations():
+@pytest.fixture
+def fly_round():
+    """Hands one round of sampling to the metrics; what they say then."""
     metrics, logger = FlightMetrics(), Logger()
-    metrics.on_sample_end(
-        metrics_logger=logger, samples=[Chunk("a", [1.0, 2.0], False), Chunk("b", [4.0], True)]
+
+    def fly(*samples):
+        metrics.on_sample_end(metrics_logger=logger, samples=list(samples))
+        return logger.get("flight_return"), logger.get("success_rate")
+
+    return fly
+
+
+def test_flights_count_whole_and_stay_in_the_mean_over_iterations(fly_round):
+    assert fly_round(Chunk("a", [1.0, 2.0], False), Chunk("b", [4.0], True)) == (None, None)
+    assert fly_round(Chunk("a", [5.0], True, success=True)) == (6.0, 0.5)  # 8 for a, 4 for b
+    assert fly_round(Chunk("c", [1.0], False)) == (6.0, 0.5)
+
+
+def test_a_short_flight_waits_for_those_that_began_with_it(fly_round):
+    assert (
+        fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], False), Chunk("c", [0.0], True)) == (None,) * 2
     )
-    assert (logger["flight_return"], logger["success_rate"]) == (4.0, 0.0)
-    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("a", [5.0], True, success=True)])
-    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)  # 8 for a, 4 for b
-    metrics.on_sample_end(metrics_logger=logger, samples=[Chunk("c", [1.0], False)])
-    assert (logger["flight_return"], logger["success_rate"]) == (6.0, 0.5)
+    assert fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], True, True), Chunk("d", [0.0], True)) == (
+        None,
+        None,
+    )
+    assert fly_round(Chunk("a", [0.0], True, success=True))[1] == 0.5  # a and b won, c and d crashed
+
+
+def test_a_flight_that_is_broken_off_holds_up_no_other(fly_round):
+    fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], True, success=True))
+    assert fly_round(Chunk("c", [0.0], False))[1] == 1.0
