@@ -67,7 +67,7 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine onl
 test: setup ## the quick tests (ARGS="-m slow" for the slow ones)
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
 
-test-faults: setup ## inject faults into running jobs, and print what was lost (20 minutes)
+test-faults: setup ## inject faults into running jobs, and print what was lost (15 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 2 --dist worksteal $(ARGS)
 
 test-cluster: setup ## the same sweep on a Ray cluster, and eight at once into PostgreSQL (20 minutes)
