@@ -182,10 +182,14 @@ def test_a_weight_sync_keeps_the_table_and_another_encoder_replaces_it(encoded_r
 
 
 def test_returns_are_reported_unscaled(encoded_runner):
-    done = [chunk for chunk in encoded_runner.sample(num_timesteps=16) if chunk.is_done]
+    first, second = (encoded_runner.sample(num_timesteps=16) for _ in range(2))
+    begun = {chunk.id_ for chunk in first}  # which all end in the second round
+    done = [chunk for chunk in (*first, *second) if chunk.is_done and chunk.id_ in begun]
+    returns = [chunk.get_return() for chunk in (*first, *second) if chunk.id_ in begun]
+    assert len(done) == len(begun)
     metrics = encoded_runner.get_metrics()
     metrics = {name: getattr(value, "peek", lambda value=value: value)() for name, value in metrics.items()}
-    assert metrics["flight_return"] == pytest.approx(np.mean([chunk.get_return() for chunk in done]))
+    assert metrics["flight_return"] == pytest.approx(np.sum(returns) / len(begun))
     distances = [chunk.get_infos(-1)["distance_m"] for chunk in done]
     assert metrics["distance_m"] == pytest.approx(np.mean(distances))
     assert metrics["flight_return"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
