@@ -153,7 +153,7 @@ def start(
     hook.mkdir(parents=True, exist_ok=True)
     (hook / "sitecustomize.py").write_text(HOOK.format(after=after or {}, first=first))
     path = os.pathsep.join([str(hook), str(ROOT)])
-    log = folder / f"log-{time.monotonic_ns()}"
+    log = Path(variables.get("TMPDIR", folder)) / f"log-{time.monotonic_ns()}"  # not on a disk that fills up
     with log.open("w") as file:
         process = subprocess.Popen(
             command,
