@@ -21,9 +21,12 @@ STYLES = {
     "event_image": ("#d55e00", "v"),
     "event_image_vae": ("#e69f00", "P"),
     "rgb": ("#cc79a7", "X"),
+    "bytestream_1500k": ("#7a5195", "<"),
+    "bytestream_paper": ("#5b6b1f", "h"),
+    "bytestream_robust": ("#b0003a", ">"),
 }
 BOUNDS = {"oracle": ("#6b7280", "."), "straight": ("#9ca3af", "."), "random": ("#c4c9d1", ".")}
-OTHERS = (("#7a5195", "<"), ("#8c564b", ">"), ("#a6761d", "h"))
+OTHERS = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
 SCALES = {
     "env.control_hz": ("Control rate [Hz]", "log"),
     "env.speed_mps": ("Speed [m/s]", "linear"),

@@ -3,11 +3,12 @@ import pytest
 import yaml
 
 from jobs.axes import axis_points
-from jobs.conditions import text
+from jobs.conditions import PRETRAINED, text
 from jobs.flights import EPISODE
 from jobs.groups import summarise_group
 from jobs.runs import REPOSITORY
 from jobs.sweep_figures import BOUNDS, STYLES, axis_figure, collision_figure, style_of
+from models.policy import MANIFEST
 from tests.test_groups import flights
 
 
@@ -99,3 +100,8 @@ def test_the_map_shows_contacts_alone():
     np.testing.assert_array_equal(usual, [[10.0, 1.0], [20.0, -2.0], [30.0, 3.0]])
     assert len(changed) == 1
     assert panel.get_title("left") == "bytestream: contacts unchanged 3 of 4, changed 1 of 1"
+
+
+def test_every_policy_that_is_shipped_has_a_look_of_its_own():
+    shipped = {path.parent.name.rpartition("-s")[0] for path in PRETRAINED.glob(f"*/{MANIFEST}")}
+    assert shipped <= STYLES.keys()
