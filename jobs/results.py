@@ -125,7 +125,7 @@ def write_results(sweep: Path, docs: Path) -> Path:
 def copy_small(picture: Path, target: Path) -> None:
     """A figure in `COLOURS` colours, a third of the size: enough for lines and print."""
     with Image.open(picture) as whole:
-        small = whole.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        small = whole.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     small.save(target, optimize=True)
 
 
