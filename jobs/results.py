@@ -153,7 +153,8 @@ def opening(about: Mapping[str, Any]) -> list[str]:
         "",
         f"Made on {about['date']} by `{about['command']}`, then `python -m platform.launch +exp=report`; "
         f"run `{about['run']}`, sweep `{about['identity']}`, flown at commit {commits(about)}. Films of "
-        "typical contacts, two of each group, are in the sweep's run in MLflow, under `sweep/crashes`.",
+        "typical contacts, at most two of each group, are in the sweep's run in MLflow, under "
+        "`sweep/crashes`.",
         "",
         f"Groups, with their number of trainings: {groups}. Each training flies the same {about['trials']} "
         f"held-out corridors of `{about['scene']}` under each condition; actions are {about['action']}. "
