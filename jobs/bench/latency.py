@@ -18,12 +18,12 @@ import onnxruntime
 import torch
 from rich.table import Table
 
-from envs.config import EnvConfig
+from envs.config import EnvConfig, sensor_settings
 from envs.events import EVENT
 from jobs.bench.throughput import composed
 from jobs.ppo import network_settings
+from jobs.pretrain import build_evae
 from jobs.progress import console
-from models.evae import EventVAE
 from models.export import export_onnx
 from models.features import FEATURES
 from models.frozen import encoder_of
@@ -59,7 +59,7 @@ def random_policy(name: str) -> Policy:
     networks = build_networks(network_settings(config))
     encoder = None
     if KINDS[name].encoder:
-        encoder = encoder_of(EventVAE(name, context=config.model.context or 1024).freeze())
+        encoder = encoder_of(build_evae(config.model, sensor_settings(config.env_config())).freeze())
     return Policy(networks.requires_grad_(False), network_settings(config), encoder)
 
 
