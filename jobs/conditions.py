@@ -1,7 +1,6 @@
 """What a sweep flies: policies and conditions, each pair as a cell with an identity of its own."""
 
 import dataclasses
-import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,11 +9,12 @@ from typing import Any
 
 import pydantic
 
-from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, settings_hash
+from envs.config import CameraConfig, EnvConfig, FidelityConfig, settings_hash
 from jobs.axes import axis_points, env_with
+from jobs.cells import Cell, Entry, make_cell
 from jobs.config import Config, ConfigError
 from jobs.evaluate import find_policy
-from jobs.flights import EPISODE, check_sensor
+from jobs.flights import check_sensor
 from jobs.pilots import BOUNDS
 from jobs.runs import REPOSITORY, Run, named_policy
 from models.policy import MANIFEST
@@ -23,54 +23,6 @@ PRETRAINED = REPOSITORY / "models" / "pretrained"
 CAMERA_SETTINGS = {field.name for field in dataclasses.fields(CameraConfig)}
 FIDELITY_SETTINGS = {field.name for field in dataclasses.fields(FidelityConfig)}
 NOMINAL = "nominal"  # the axis of the one condition that changes nothing
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A pilot that takes part in a sweep.
-
-    Attributes:
-        pilot: Path of a policy folder, or a bound's name.
-        group: What was trained; policies of one group differ in their training seed alone.
-        training: The training seed; None for a bound.
-        identity: Hash of its manifest, unique by its SHA-256 sums.
-        sensor: Sensor settings that it was trained with; none for a bound.
-    """
-
-    pilot: str
-    group: str
-    training: int | None
-    identity: str
-    sensor: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One pilot under one condition, through corridors that all share.
-
-    Attributes:
-        label: Axis and value; several axes share a cell where they hold the same value.
-        key: Hash of all that decides an episode but its seed: simulation, policy, choice of action.
-        entry: Who flies.
-        action: How a policy chooses.
-        env: The simulation.
-        seeds: One corridor each.
-        table: Settings of `EncoderTable.from_evae` that the policy's encoder is tabulated with; empty:
-            as the policy does.
-    """
-
-    label: tuple[str, str]
-    key: str
-    entry: Entry
-    action: str
-    env: EnvConfig
-    seeds: tuple[int, ...]
-    table: tuple[tuple[str, Any], ...] = ()
-
-    @functools.cached_property
-    def simulation(self) -> str:
-        """Hash of what decides how exact its events are: the simulation without its faults."""
-        return settings_hash(dataclasses.asdict(dataclasses.replace(self.env, faults=FaultsConfig())))
 
 
 @dataclass(frozen=True)
@@ -203,21 +155,6 @@ def _cell(
             f"sweep.axes.{label[0]}: {dict(point)} with the sensor of {entry.pilot!r}: {reason}"
         ) from None
     return make_cell(label, entry, config.evaluate.action, env, config.sweep.trials)
-
-
-def make_cell(
-    label: tuple[str, str],
-    entry: Entry,
-    action: str,
-    env: EnvConfig,
-    trials: int,
-    table: Mapping[str, Any] | None = None,
-) -> Cell:
-    """The cell of the first `trials` corridors, see `Cell`, with its key."""
-    facts = {"env": dataclasses.asdict(env), "pilot": entry.identity, "action": action}
-    facts |= {"table": dict(table)} if table else {}  # what was kept before there were tables stays valid
-    key = settings_hash({**facts, "kept": list(EPISODE.names or ())})  # other columns, other files
-    return Cell(label, key, entry, action, env, tuple(range(trials)), tuple((table or {}).items()))
 
 
 def _differences(entry: Entry, configured: EnvConfig) -> dict[str, tuple[Any, Any]]:

@@ -1,13 +1,12 @@
 """Fly the policy and its bounds through held-out corridors, and say how well each did.
 
 Run: python -m platform.launch +exp=evaluate
-Expect: about 2,000 control steps per second on one core. In the run folder under
+Expect: about 2,000 control steps per second on each core. In the run folder under
 `eval/`: every episode (`episodes.csv`), the table with its intervals, ways seen from above
-and a film of one flight.
+and a film of one flight. A stopped evaluation continues, and one that asks for more flies what is new.
 """
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,22 +14,22 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from envs.config import EnvConfig
+from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.accuracy import achieved
+from jobs.cells import Cell, Entry, episodes_folder, fly_cells, make_cell, read_kept
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
-from jobs.drift import DriftWatch
 from jobs.figures import Track, trajectory_figure
-from jobs.flights import Advance, Watch, Ways, check_sensor, fly, write_episodes
+from jobs.flights import Ways, check_sensor, fly, write_episodes
 from jobs.pictures import Decode, Film
-from jobs.pilots import BOUNDS, PolicyPilot, make_pilot
-from jobs.progress import console, progress
+from jobs.pilots import BOUNDS, make_pilot
+from jobs.progress import console
 from jobs.report import Summary, columns, markdown, metrics, show, summarise, table
 from jobs.runs import Run, finish, finished, latest_policies, locate_run, open_run, write_atomic
 from jobs.tracking import Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import pictures, reconstruct
-from models.policy import ENCODER, Policy, load_policy
+from models.policy import ENCODER, load_policy
 from models.weights import load_encoder
 
 LABELS = ("Pilot", "Scene", "Renderer")
@@ -77,19 +76,26 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     """Fly every task, write what came of it, and return the figures.
 
     What was asked before, of the same policy, is not flown again.
+
+    Raises:
+        RuntimeError: A task of the first renderer could not be flown.
     """
     path = find_policy(config, folder)
-    policy = load_policy(path)
-    check_sensor(policy.manifest, config.env_config())
-    asked = {"evaluate": as_dict(config)["evaluate"], "policy": policy.manifest["sha256"]}
+    manifest = load_policy(path).manifest
+    check_sensor(manifest, config.env_config())
+    asked = {"evaluate": as_dict(config)["evaluate"], "policy": manifest["sha256"]}
     done = finished(folder, "evaluate")
     if done is not None and done["asked"] == asked:
         console.print((folder.evaluation / "table.md").read_text(), markup=False)
         return done["figures"]
     announce(config, folder, path)
-    tracker.tags({"policy": policy.manifest["name"]})
+    tracker.tags({"policy": manifest["name"]})
     plan = tasks(config)
-    flown, tracks, drifts = fly_tasks(plan, config, path, policy)
+    cells = {task: cell_of(task, config, path, settings_hash(dict(manifest))) for task in plan}
+    flown = fly_tasks(cells, config, folder)
+    tracks = [track for task in plan if shown(task, plan) for track in tracks_of(task, cells[task])]
+    kept = episodes_folder(folder.evaluation)
+    drifts = {task: read_kept(kept, cells[task].key)["encoder"] for task in flown}
     rows = [summarise(task.label, episodes) for task, episodes in flown.items()]
     write_episodes(folder.evaluation / "episodes.csv", LABELS, {task.label: flown[task] for task in flown})
     publish(folder, tracker, rows, tracks)
@@ -104,30 +110,39 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     return finish(folder, "evaluate", {"asked": asked, "figures": figures})["figures"]
 
 
-def fly_tasks(
-    plan: Sequence[Task], config: Config, path: Path, policy: Policy
-) -> tuple[dict[Task, np.ndarray], list[Track], dict[Task, dict[str, float]]]:
-    """The episodes of each task that could be flown, ways to draw, and the drift of the policy's encoder."""
-    flown: dict[Task, np.ndarray] = {}
-    tracks: list[Track] = []
-    drifts: dict[Task, dict[str, float]] = {}
-    with progress("Evaluate", sum(task.episodes for task in plan), "episodes") as advance:
-        for task in plan:
-            ways = Ways(SHOWN_CORRIDORS if shown(task, plan) else ())
-            drift = DriftWatch(path if task.of_policy else task.pilot)
-            watch = functools.partial(_watch_each, (ways.add, drift.add))
-            tell = functools.partial(advance, note=" ".join(task.label))
-            episodes = fly_task(task, config, policy, watch, tell)
-            if episodes is not None:
-                flown[task] = episodes
-                tracks += ways.tracks(task.pilot.partition(" ")[0], episodes)
-                drifts[task] = drift.figures()
-    return flown, tracks, drifts
+def cell_of(task: Task, config: Config, path: Path, identity: str) -> Cell:
+    """A task as a cell of flights; `path` and `identity` are the policy's."""
+    env_config = config.env_config(scene=task.scene, split="eval", renderer=task.renderer)
+    if task.renderer == "pyrender":  # to see another picture, not to see it as exactly as the tolerance asks
+        fidelity = dataclasses.replace(env_config.fidelity, samples=2)
+        env_config = dataclasses.replace(env_config, fidelity=fidelity)
+    pilot, what = (str(path), identity) if task.of_policy else (task.pilot, task.pilot)
+    entry = Entry(pilot, task.pilot, None, what, {})
+    action = task.pilot.removeprefix("policy ")
+    return make_cell((task.scene, task.renderer), entry, action, env_config, task.episodes)
 
 
-def _watch_each(watches: Sequence[Watch], *step: Any) -> None:
-    for watch in watches:
-        watch(*step)
+def fly_tasks(cells: Mapping[Task, Cell], config: Config, folder: Run) -> dict[Task, np.ndarray]:
+    """The episodes of each task, but of those that a second renderer cannot draw.
+
+    Raises:
+        RuntimeError: A task of the first renderer could not be flown.
+    """
+    slowest_first = [*cells.values()][::-1]
+    flown, failed = fly_cells(config, folder.evaluation, slowest_first, "Evaluate", measuring=False)
+    for task, cell in cells.items():
+        if cell.key in failed and task.renderer == config.evaluate.renderers[0]:
+            reason = failed[cell.key]
+            raise RuntimeError(f"{' '.join(task.label)}: not flown: {reason}; the same command tries again")
+    return {task: flown[cell.key] for task, cell in cells.items() if cell.key in flown}
+
+
+def tracks_of(task: Task, cell: Cell) -> list[Track]:
+    """The ways of a task's flights through the corridors that are drawn; flown again, to the same end."""
+    seeds = [seed for seed in SHOWN_CORRIDORS if seed in cell.seeds]
+    ways = Ways(seeds)
+    episodes = fly(make_pilot(cell.entry.pilot, cell.action), cell.env, seeds, watch=ways.add)
+    return ways.tracks(task.pilot.partition(" ")[0], episodes)
 
 
 def tasks(config: Config) -> list[Task]:
@@ -154,23 +169,6 @@ def _episodes(config: Config, renderer: str) -> int:
 def shown(task: Task, plan: Sequence[Task]) -> bool:
     """Whether the ways of a task are drawn: policy and oracle, in the scene flown first."""
     return task.pilot in (plan[0].pilot, "oracle") and task.label[1:] == plan[0].label[1:]
-
-
-def fly_task(task: Task, config: Config, policy: Policy, watch: Watch, advance: Advance) -> np.ndarray | None:
-    """The episodes of a task, or None (and a line that says why) where a second renderer cannot run."""
-    stochastic = task.pilot.endswith("stochastic")
-    pilot = PolicyPilot(policy, stochastic) if task.of_policy else make_pilot(task.pilot)
-    env_config = config.env_config(scene=task.scene, split="eval", renderer=task.renderer)
-    if task.renderer == "pyrender":  # to see another picture, not to see it as exactly as the tolerance asks
-        fidelity = dataclasses.replace(env_config.fidelity, samples=2)
-        env_config = dataclasses.replace(env_config, fidelity=fidelity)
-    try:
-        return fly(pilot, env_config, range(task.episodes), watch=watch, advance=advance)
-    except RuntimeError as error:
-        if task.renderer == config.evaluate.renderers[0]:
-            raise
-        console.print(f"Not flown with {task.renderer}: {error}", markup=False)
-        return None
 
 
 def find_policy(config: Config, folder: Run) -> Path:

@@ -15,8 +15,9 @@ from rich.table import Table
 
 from envs.scene import make_scene
 from jobs.axes import axis_numbers
+from jobs.cells import Cell, accuracy_file
 from jobs.children import Child, write_children
-from jobs.conditions import NOMINAL, Cell, Sweep
+from jobs.conditions import NOMINAL, Sweep
 from jobs.config import Config
 from jobs.dashboard import COLOUR, NOTE, chart_view, table_view
 from jobs.drift import mean_figures
@@ -334,11 +335,6 @@ def save_views(tracker: Tracker, curves: Sequence[str]) -> None:
     )
     charts = sorted(curves, key=lambda curve: not curve.endswith("_success"))
     tracker.save_view(f"charts-{tracker.run_id}", f"{name}: charts", chart_view(f"{below}'group'", charts))
-
-
-def accuracy_file(place: Path, simulation: str) -> Path:
-    """Where a sweep's folder keeps how exact a simulation's events are, and how many renders that takes."""
-    return place / "accuracy" / f"{simulation}.json"
 
 
 def accuracy(place: Path, cell: Cell) -> dict[str, float]:

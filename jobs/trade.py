@@ -19,8 +19,9 @@ import torch
 from envs.accuracy import converged
 from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
+from jobs.cells import Cell, Entry, fly_cells, make_cell
 from jobs.children import Child, write_children
-from jobs.conditions import Cell, Entry, find_pilots, make_cell, read_entry, with_sensor
+from jobs.conditions import find_pilots, read_entry, with_sensor
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError
 from jobs.encoder_costs import CAPS, TIME_BINS
 from jobs.pilots import PolicyPilot, make_pilot
@@ -29,7 +30,6 @@ from jobs.replays import Measured, measure
 from jobs.report import draw_figure, publish_table, summarise
 from jobs.runs import Run, finish, locate_run, open_run, provenance, write_atomic, write_json
 from jobs.statistics import paired_rate_difference
-from jobs.sweep import fly_cells
 from jobs.sweep_report import command, today
 from jobs.tracking import Tracker, open_tracker
 from jobs.trade_encoder import EVENT_ENCODERS
@@ -73,7 +73,7 @@ def run(config: Config) -> dict[str, Any]:
     identity = settings_hash({"cells": [[cell.key, len(cell.seeds)] for cell in every]})
     with open_tracker(config, folder, key=f"trade {identity[:8]}") as tracker:
         tracker.tags({"kind": "trade", "policy": entry.group})
-        flown, failed = fly_cells(config, folder.path / "trade", every, measuring=False)
+        flown, failed = fly_cells(config, folder.path / "trade", every, "Trade", measuring=False)
         for cell in (every[0], every[-1]):
             if cell.key in failed:
                 raise RuntimeError(

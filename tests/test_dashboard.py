@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jobs import cells as flying
 from jobs import pipeline
-from jobs import sweep as sweeping
 from jobs.dashboard import (
     MOST_CHARACTERS,
     PAGE_WIDTH,
@@ -21,6 +21,7 @@ from jobs.dashboard import (
 )
 from jobs.flights import EPISODE
 from jobs.runs import Run, finish, open_run
+from jobs.sweep import run as run_sweep
 from jobs.tracking import open_store
 from tests.browser import CHROMIUM, Browser, served
 from tests.test_conditions import save_training, sweep_config
@@ -116,9 +117,9 @@ def store(tmp_path_factory):
     folder = evaluated_training(config)
     settings = dataclasses.replace(config.sweep, policies=[str(folder.policy), "straight"])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweeping, "_tuner", CrashingTuner)
-        patch.setattr(sweeping, "start_ray", lambda *given: None)
-        sweeping.run(dataclasses.replace(config, sweep=settings))
+        patch.setattr(flying, "_tuner", CrashingTuner)
+        patch.setattr(flying, "start_ray", lambda *given: None)
+        run_sweep(dataclasses.replace(config, sweep=settings))
     uri = f"sqlite:///{place / 'mlflow.db'}"
     client, experiment = open_store(uri, config.tracking.experiment)
     (training,) = client.search_runs([experiment], "tags.kind = 'run'")

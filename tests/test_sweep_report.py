@@ -1,12 +1,11 @@
 import numpy as np
 
+from jobs.cells import accuracy_file, flown
 from jobs.conditions import plan, read_entry
 from jobs.flights import EPISODE
 from jobs.runs import open_run, write_json
-from jobs.sweep import flown
 from jobs.sweep_report import (
     about,
-    accuracy_file,
     contacts,
     exactness,
     film_crashes,

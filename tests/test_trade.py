@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from envs.accuracy import NO_CULLING_M
-from jobs import sweep as sweeping
+from jobs import cells as flying
 from jobs import trade
 from jobs.conditions import read_entry
 from jobs.config import ConfigError
@@ -93,14 +93,14 @@ class StubTuner:
                 self.keep.on_trial_result(1, [], None, {**result, "failed": "RuntimeError: no OpenGL"})
                 continue
             self.flown.append(cell.key)
-            self.keep.on_trial_result(1, [], None, result | sweeping.flown(cell, False))
+            self.keep.on_trial_result(1, [], None, result | flying.flown(cell, False))
 
 
 @pytest.fixture
 def stub(monkeypatch):
     StubTuner.broken, StubTuner.flown = "", []
-    monkeypatch.setattr(sweeping, "_tuner", StubTuner)
-    monkeypatch.setattr(sweeping, "start_ray", lambda *given: None)
+    monkeypatch.setattr(flying, "_tuner", StubTuner)
+    monkeypatch.setattr(flying, "start_ray", lambda *given: None)
     monkeypatch.setattr(trade, "SPANS", {"tolerance": slice(5, None), "pyrender": slice(1)})
     return StubTuner
 

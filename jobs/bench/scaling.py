@@ -28,6 +28,7 @@ from rich.table import Table
 
 from envs.config import EnvConfig
 from jobs.bench.throughput import composed
+from jobs.cells import loaded
 from jobs.cluster import ONE_THREAD, QUIET
 from jobs.conditions import PRETRAINED
 from jobs.config import HELD_OUT_SCENE
@@ -35,7 +36,6 @@ from jobs.flights import fly
 from jobs.ppo import build_ppo
 from jobs.progress import console
 from jobs.runner import PlainEnvRunner
-from jobs.sweep import loaded
 
 STEPS = 2048  # of an iteration (appendix D.1.2)
 ROUNDS = 3
