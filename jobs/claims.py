@@ -1,25 +1,23 @@
 """What the paper says of its policies, and what a sweep found of it, by one stated rule."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from jobs.groups import Condition, Flights, table_of
-from jobs.statistics import Estimate, paired_difference
+from jobs.statistics import Estimate, mean_difference, paired_difference
 
 RULE = (
     "A claim is tested on the paper's own values, by the difference of two groups on the same corridors "
     "with its paired 95 % bootstrap interval. It *holds* if the interval of the mean over all conditions "
     "lies above 0 and no single condition's lies below; it *holds partly* if that interval or a single "
     "condition's lies above 0; it *does not hold* if the interval of the mean excludes a gain of 10 points "
-    "of success, or of 5 m; else it is *undecided*: more flights or trainings would tell."
+    "of success, or of 5 m; else it is *undecided*: more flights or trainings would tell. How fast a group "
+    "learns is its success averaged over the first 500,000 steps of training, and the interval Welch's over "
+    "trainings."
 )
 GAIN = {"success": 0.1, "distance_m": 5.0}  # the least that a claim has to mean
-UNTESTED = (
-    ("Training is faster than on event images", "abstract", "a sweep flies finished policies"),
-    ("An autoencoder over event images reaches no acceptable policy", "appendix D.1.2", "no bound is stated"),
-)
 Verdict = Literal["holds", "holds partly", "does not hold", "undecided", "not tested"]
 Measure = Literal["success", "distance_m"]
 Find = Callable[[Condition, str], Flights]  # flights of a group under a condition; empty if there are none
@@ -84,11 +82,18 @@ def _of_both(ours: str) -> list[Claim]:
     ]
 
 
+FASTER = "learns faster"
+VAE = "beats a policy on an autoencoder over event images, which could not reach acceptable performance"
 BEST = "without polarity is best among moving textures"
 CLAIMS = (
     *_of_both("bytestream"),
     *_of_both("bytestream_xy"),
     Claim(BEST, "F.1", "bytestream_xy", "bytestream", "distance_m", (("world", "dynamic"),)),
+    Claim(VAE, "D.1.2", "event_image", "event_image_vae", "success", (("world", "poles_eval"),)),
+)
+# Said by learning curves, and by no condition of a sweep.
+LEARNT = tuple(
+    Claim(FASTER, "abstract", ours, "event_image", "success", ()) for ours in ("bytestream", "bytestream_xy")
 )
 
 
@@ -109,6 +114,20 @@ def judge(claim: Claim, find: Find) -> Finding:
     return Finding(
         _verdict(overall, single, GAIN[claim.measure]), overall, dict(zip(both, single, strict=True))
     )
+
+
+def judge_learning(claim: Claim, trainings: Mapping[str, Sequence[float]]) -> Finding:
+    """Test a claim of `LEARNT` by `RULE`.
+
+    Args:
+        claim: What is said.
+        trainings: Group -> mean success rate, 0..1, of each training (`jobs.curves.mean_success`).
+    """
+    ours, theirs = (trainings.get(group, ()) for group in (claim.ours, claim.theirs))
+    if not ours or not theirs:
+        return Finding("not tested", None, {})
+    overall = mean_difference(ours, theirs)
+    return Finding(_verdict(overall, [overall], GAIN[claim.measure]), overall, {})
 
 
 def _over_conditions(tables: list[np.ndarray]) -> np.ndarray:

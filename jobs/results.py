@@ -7,21 +7,22 @@ docs/images/trade.png of the newest trade; with `resume` of what that run folder
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from jobs.claims import CLAIMS, RULE, UNTESTED, Claim, Finding, judge
-from jobs.conditions import NOMINAL
+from jobs.claims import CLAIMS, LEARNT, RULE, Claim, Finding, judge, judge_learning
+from jobs.conditions import NOMINAL, PRETRAINED
 from jobs.config import Config, ConfigError
+from jobs.curves import mean_success, read_curves
 from jobs.flights import EPISODE
 from jobs.groups import LABELS, Condition, Flights, details, estimate_text, matrix, summarise_group, table_of
 from jobs.progress import console
 from jobs.report import markdown_table
-from jobs.runs import REPOSITORY, write_atomic
+from jobs.runs import COMPARED_STEPS, REPOSITORY, write_atomic
 from jobs.statistics import two_stage_estimate
 
 Flown = dict[tuple[Condition, str], dict[int | None, np.ndarray]]
@@ -49,7 +50,8 @@ def run(config: Config) -> dict[str, Any]:
     Raises:
         ConfigError: If there is neither.
     """
-    writers = {"trade": write_trade, "sweep": write_results}  # in this order: one shows the other's figure
+    # In this order: one shows the other's figure.
+    writers: dict[str, Callable[[Path, Path], Path]] = {"trade": write_trade, "sweep": write_results}
     found = {name: find_study(config, name) for name in writers}
     if not any(found.values()):
         where = config.resume or config.runs_dir
@@ -91,12 +93,13 @@ def write_trade(trade: Path, docs: Path) -> Path:
     return docs / "trade.md"
 
 
-def write_results(sweep: Path, docs: Path) -> Path:
+def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Path:
     """Write results.md and copy the figures.
 
     Args:
         sweep: The folder that a sweep has left in its run folder.
         docs: Where results.md goes, its pictures into `images`.
+        pretrained: Where the learning curves of shipped policies are.
 
     Returns:
         The file.
@@ -111,7 +114,7 @@ def write_results(sweep: Path, docs: Path) -> Path:
     parts = [
         *opening(about),
         *breaks(about, flown),
-        *claims(flown),
+        *claims(flown, learnt(pretrained)),
         *figures(about, shown),
         *cost(docs),
         *tables(about, flown),
@@ -208,14 +211,23 @@ def cost(docs: Path) -> list[str]:
     return [f"## {title}", "", f"![{title}](images/trade.png)", "", made, ""]
 
 
-def claims(flown: Flown) -> list[str]:
+def learnt(pretrained: Path) -> dict[str, list[float]]:
+    """Group -> success averaged over the compared steps, of each shipped training that took so many."""
+    found: dict[str, list[float]] = {}
+    for curve in read_curves(pretrained).values():
+        if curve.env_steps[-1] >= COMPARED_STEPS:
+            found.setdefault(curve.exp, []).append(mean_success(curve, COMPARED_STEPS))
+    return found
+
+
+def claims(flown: Flown, trainings: Mapping[str, Sequence[float]]) -> list[str]:
     """The paper's claims with our findings."""
 
     def find(condition: Condition, group: str) -> Flights:
         return flown.get((condition, group), {})
 
     lines = [_claim_line(claim, judge(claim, find)) for claim in CLAIMS]
-    lines += [(text, source, "", "not tested", reason, "") for text, source, reason in UNTESTED]
+    lines += [_claim_line(claim, judge_learning(claim, trainings)) for claim in LEARNT]
     head = ("The paper says of", "Source", "Against", "Finding", "Difference, all conditions", "By condition")
     return ["## The paper's claims", "", RULE, "", markdown_table(head, lines, len(head))]
 
@@ -229,7 +241,7 @@ def _claim_line(claim: Claim, finding: Finding) -> tuple[str, ...]:
     overall = (
         f"{estimate_text(finding.overall, scale, form)}{unit}"
         if finding.overall
-        else "one of them did not fly"
+        else "one of them is missing"
     )
     return (
         f"`{claim.ours}`: {claim.text}",

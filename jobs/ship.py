@@ -9,11 +9,9 @@ compared at have its thousands of steps behind their name: bytestream_1500k. Eac
 version in MLflow's model registry.
 """
 
-import csv
-import io
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,15 +21,15 @@ import numpy as np
 from envs.config import settings_hash
 from jobs.conditions import PRETRAINED
 from jobs.config import Config, ConfigError
+from jobs.curves import as_csv, read_curves
 from jobs.figures import Curve, learning_figure
 from jobs.progress import console
 from jobs.registry import register_training
 from jobs.runs import REPOSITORY, group_name, open_run, write_atomic
 from jobs.tracking import open_tracker
-from models.policy import MANIFEST, load_policy, save_lean_policy
+from models.policy import load_policy, save_lean_policy
 
 FIGURE = REPOSITORY / "docs" / "images" / "learning.png"
-COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
 POINTS = 50  # of a curve
 
 
@@ -130,28 +128,3 @@ def curve(training: Training) -> Curve:
     ]
     env_steps, success, distance_m = np.array(values, float).reshape(-1, 3).T
     return Curve(training.group, training.seed, env_steps, success, distance_m)
-
-
-def read_curves(folder: Path) -> dict[tuple[str, int], Curve]:
-    """Experiment and seed -> curve, of `curves.csv` in `folder`, as far as their policies are there too."""
-    file = folder / "curves.csv"
-    rows = csv.DictReader(io.StringIO(file.read_text() if file.is_file() else ""))
-    found: dict[tuple[str, int], list[list[float]]] = defaultdict(list)
-    for row in rows:
-        found[row["exp"], int(row["seed"])].append([float(row[name]) for name in COLUMNS[2:]])
-    return {
-        key: Curve(*key, *np.array(points).T)
-        for key, points in found.items()
-        if (folder / f"{key[0]}-s{key[1]}" / MANIFEST).is_file()
-    }
-
-
-def as_csv(curves: Sequence[Curve]) -> str:
-    """The curves as one table, a row per point."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for one in curves:
-        for point in zip(one.env_steps, one.success_rate, one.distance_m, strict=True):
-            writer.writerow([one.exp, one.seed, int(point[0]), f"{point[1]:.3f}", f"{point[2]:.2f}"])
-    return text.getvalue()

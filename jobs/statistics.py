@@ -3,11 +3,11 @@
 All are 95 % intervals, and every draw comes from a generator that is given.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, trim_mean
+from scipy.stats import binomtest, trim_mean, ttest_ind
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -150,6 +150,19 @@ def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
         ends.append(float(np.sqrt(max(own * own - 2 * phi * own * other + other * other, 0.0))))
     difference = (first - second) / count
     return Estimate(difference, (difference - ends[0], difference + ends[1]))
+
+
+def mean_difference(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
+    """Mean of ours minus mean of theirs, of trainings that have nothing in common, with its 95 % interval.
+
+    The interval is Welch's (1947), which allows unequal variances; None where a side has less than
+    two values, or all are equal on both.
+    """
+    value = float(np.mean(ours) - np.mean(theirs))
+    if min(len(ours), len(theirs)) < 2 or np.ptp(ours) == np.ptp(theirs) == 0:
+        return Estimate(value, None)
+    found = ttest_ind(ours, theirs, equal_var=False).confidence_interval(CONFIDENCE)
+    return Estimate(value, (float(found.low), float(found.high)))
 
 
 def _checked(values: np.ndarray, name: str) -> np.ndarray:

@@ -1,6 +1,6 @@
 import pytest
 
-from jobs.claims import CLAIMS, Claim, judge
+from jobs.claims import CLAIMS, LEARNT, Claim, judge, judge_learning
 from tests.test_groups import flights
 
 AT = (("world", "a"), ("world", "b"))
@@ -54,3 +54,22 @@ def test_the_papers_claims_are_about_conditions_that_the_default_sweep_flies(tmp
     conditions = planned(sweep_config(tmp_path, axes=axes), "straight").conditions
     assert {at for claim in CLAIMS for at in claim.conditions} <= set(conditions)
     assert {claim.measure for claim in CLAIMS} == {"success", "distance_m"}
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "verdict"),
+    [
+        ((0.7, 0.72, 0.71), (0.4, 0.42, 0.38), "holds"),
+        ((0.4, 0.42, 0.38), (0.7, 0.72, 0.71), "does not hold"),
+        ((0.7, 0.72, 0.71), (0.69, 0.71, 0.7), "does not hold"),
+        ((0.9, 0.3, 0.6), (0.4, 0.5, 0.2), "undecided"),
+        ((0.9,), (0.4,), "undecided"),
+        ((), (0.4, 0.5), "not tested"),
+    ],
+)
+def test_who_learns_faster_is_judged_by_the_means_of_all_trainings(ours, theirs, verdict):
+    claim = LEARNT[0]
+    finding = judge_learning(claim, {claim.ours: ours, claim.theirs: theirs})
+    assert finding.verdict == verdict
+    if ours:
+        assert finding.overall.value == pytest.approx(sum(ours) / len(ours) - sum(theirs) / len(theirs))

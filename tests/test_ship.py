@@ -8,7 +8,8 @@ from mlflow import MlflowClient
 
 from jobs import ship as shipping
 from jobs.config import ConfigError, as_dict
-from jobs.ship import as_csv, curve, newest_trainings, read_curves, ship
+from jobs.curves import as_csv, read_curves
+from jobs.ship import curve, newest_trainings, ship
 from models.policy import load_policy
 from tests.test_evaluate import save_untrained
 from tests.test_runs import small_config

@@ -4,6 +4,7 @@ import pytest
 from jobs.statistics import (
     bootstrap_interval,
     interquartile_mean,
+    mean_difference,
     paired_difference,
     paired_rate_difference,
     two_stage_estimate,
@@ -207,3 +208,21 @@ def test_paired_rate_differences_hold_the_true_one_about_as_often_as_they_say():
 def test_pairs_that_are_none_are_refused(ours, theirs):
     with pytest.raises(ValueError, match="both must be flights of the same corridors"):
         paired_rate_difference(np.array(ours, bool), np.array(theirs, bool))
+
+
+def test_the_difference_of_trainings_that_share_nothing_holds_the_truth_as_often_as_it_says():
+    rng, held, repeats = np.random.default_rng(0), 0, 600
+    for _ in range(repeats):
+        ours, theirs = rng.normal(0.7, 0.05, 3), rng.normal(0.6, 0.02, 3)
+        low, high = mean_difference(ours, theirs).interval
+        held += low <= 0.1 <= high
+    assert 0.93 <= held / repeats <= 0.985
+
+
+def test_the_difference_of_trainings_changes_its_sign_with_the_sides_and_needs_two_of_each():
+    ours, theirs = [0.7, 0.8, 0.75], [0.5, 0.65]
+    there, back = mean_difference(ours, theirs), mean_difference(theirs, ours)
+    assert there.value == pytest.approx(-back.value)
+    assert there.interval == pytest.approx((-back.interval[1], -back.interval[0]))
+    assert mean_difference([0.7], theirs).interval is None
+    assert mean_difference([0.7, 0.7], [0.5, 0.5]) == (pytest.approx(0.2), None)
