@@ -54,9 +54,10 @@ train-all: setup ## every policy with three seeds into models/pretrained (hours;
 	for seed in $(SEEDS); do for exp in $(POLICIES); do \
 	    $(LAUNCH) +exp=$$exp job=train seed=$$seed train.env_steps=$(STEPS) $(ARGS) || exit 1; \
 	done; done
-	$(LAUNCH) +exp=ship
+	$(LAUNCH) +exp=ship $(ARGS)
 
-sweep-robustness: setup ## fly trained policies at other rates, thresholds, in other worlds, with faults
+# `train=true` trains them anew first, as train-all does.
+sweep-robustness: $(if $(filter true,$(train)),train-all,setup) ## fly trained policies at other rates, thresholds, in other worlds, with faults
 	$(LAUNCH) +exp=robustness $(ARGS)
 
 mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine only

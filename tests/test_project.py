@@ -122,6 +122,17 @@ def test_make_knows_how_to_reach_every_target(target):
     subprocess.run(["make", "--dry-run", target], cwd=ROOT, check=True, capture_output=True)
 
 
+def test_a_sweep_trains_and_ships_its_policies_first_only_if_told_to():
+    def planned(*words: str) -> str:
+        command = ["make", "--dry-run", "sweep-robustness", "POLICIES=rgb", "SEEDS=4", *words]
+        return subprocess.check_output(command, cwd=ROOT, text=True)
+
+    assert "job=train" not in planned()
+    told = planned("train=true", "ARGS=budget=smoke")
+    parts = ["job=train", "+exp=ship budget=smoke", "+exp=robustness budget=smoke"]
+    assert sorted(map(told.index, parts)) == list(map(told.index, parts))
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_the_continuous_integration_script_is_valid():
     subprocess.run(["bash", "-n", ".ci/run"], cwd=ROOT, check=True)
