@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
 from envs.scene import Scene
+from jobs.statistics import half_width
 
 OFF_COLOUR, NONE_COLOUR, ON_COLOUR = "#f97316", "#15181f", "#60a5fa"
 EVENT_COLOURS = LinearSegmentedColormap.from_list("events", [OFF_COLOUR, NONE_COLOUR, ON_COLOUR])
@@ -136,7 +137,7 @@ class Curve:
 def learning_figure(curves: Sequence[Curve]) -> Figure:
     """Success in training against steps: a line per training, their mean in bold, a panel per experiment.
 
-    The mean is drawn where every training has a point before and after.
+    The mean, with its 95 % interval over trainings, is drawn where every one has a point before and after.
     """
     names = list(dict.fromkeys(curve.exp for curve in curves))
     across = min(4, len(names))
@@ -153,6 +154,10 @@ def learning_figure(curves: Sequence[Curve]) -> Figure:
             )
             every = [np.interp(steps, curve.env_steps, curve.success_rate) for curve in own]
             mean = 100 * np.mean(every, axis=0)
+            if len(own) > 1:
+                half = 100 * half_width(np.array(every))
+                ends = np.clip([mean - half, mean + half], 0, 100)
+                panel.fill_between(steps / 1e3, *ends, color=POLICY, alpha=0.15, lw=0)
             panel.plot(steps / 1e3, mean, color=POLICY, lw=2.2)
             panel.annotate(
                 f"{mean[-1]:.0f} %", (steps[-1] / 1e3, mean[-1]), (-2, -14), textcoords="offset points",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, trim_mean, ttest_ind
+from scipy.stats import binomtest, t, trim_mean, ttest_ind
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -150,6 +150,21 @@ def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
         ends.append(float(np.sqrt(max(own * own - 2 * phi * own * other + other * other, 0.0))))
     difference = (first - second) / count
     return Estimate(difference, (difference - ends[0], difference + ends[1]))
+
+
+def half_width(values: np.ndarray) -> np.ndarray:
+    """Half of the 95 % interval of the mean over trainings, Student's, at each of k points: (k,).
+
+    Args:
+        values: Shape (trainings, k), two trainings at least.
+
+    Raises:
+        ValueError: There are fewer trainings.
+    """
+    count = len(values)
+    if count < 2:
+        raise ValueError(f"an interval over trainings needs two of them, got {count}")
+    return float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * values.std(axis=0, ddof=1) / count**0.5
 
 
 def mean_difference(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:

@@ -3,6 +3,7 @@ import pytest
 
 from jobs.statistics import (
     bootstrap_interval,
+    half_width,
     interquartile_mean,
     mean_difference,
     paired_difference,
@@ -226,3 +227,11 @@ def test_the_difference_of_trainings_changes_its_sign_with_the_sides_and_needs_t
     assert there.interval == pytest.approx((-back.interval[1], -back.interval[0]))
     assert mean_difference([0.7], theirs).interval is None
     assert mean_difference([0.7, 0.7], [0.5, 0.5]) == (pytest.approx(0.2), None)
+
+
+def test_the_interval_over_trainings_holds_the_true_mean_as_often_as_it_says_and_needs_two():
+    values = np.random.default_rng(0).normal(0.5, 0.1, (3, 4000))
+    held = np.abs(values.mean(axis=0) - 0.5) <= half_width(values)
+    assert 0.94 <= held.mean() <= 0.96
+    with pytest.raises(ValueError, match="needs two of them, got 1"):
+        half_width(values[:1])
