@@ -14,8 +14,8 @@ RULE = (
     "lies above 0 and no single condition's lies below; it *holds partly* if that interval or a single "
     "condition's lies above 0; it *does not hold* if the interval of the mean excludes a gain of 10 points "
     "of success, or of 5 m; else it is *undecided*: more flights or trainings would tell. How fast a group "
-    "learns is its success averaged over the first 500,000 steps of training, and the interval Welch's over "
-    "trainings."
+    "learns is its success averaged over the first 500,000 steps of training "
+    "(`models/pretrained/curves.csv`), and the interval Welch's over trainings."
 )
 GAIN = {"success": 0.1, "distance_m": 5.0}  # the least that a claim has to mean
 Verdict = Literal["holds", "holds partly", "does not hold", "undecided", "not tested"]

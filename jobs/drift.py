@@ -9,6 +9,7 @@ others as well as before.
 """
 
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,32 +23,38 @@ from models.weights import load_encoder
 
 FIGURES = ("policy_reconstruction", "policy_kl", "policy_explained", "policy_auc", "drift")
 MOST_WINDOWS = 512
-THINNED = 3  # not 2, which of eight flights in lock-step would keep the windows of some alone
 
 
 class DriftWatch:
     """Keeps windows while a policy with an event VAE is flown, and says how well that knows them.
 
-    All windows at first, and of many every third, ninth, ...: at most `MOST_WINDOWS`, spread
-    evenly over all steps. Of a pilot without an encoder it keeps nothing.
+    All windows at first, and of many those of every second, fourth, ... step of each flight: at most
+    `MOST_WINDOWS`, the same steps of all flights. Of a pilot without an encoder it keeps nothing.
     """
 
     def __init__(self, pilot: str | Path) -> None:
         """Watch the policy of a folder; a bound's name stands for a pilot without encoder."""
         self._file = Path(pilot) / ENCODER
         self._watching = self._file.is_file()
-        self._every, self._steps = 1, 0
-        self.windows: list[np.ndarray] = []
+        self._every, self._steps = 1, Counter[int]()
+        self._kept: list[tuple[int, np.ndarray]] = []
+
+    @property
+    def windows(self) -> list[np.ndarray]:
+        """The windows kept, packed, in the order in which they were met."""
+        return [window for _, window in self._kept]
 
     def add(self, env: Any, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
         """Keep the window of a step, if it is its turn (`jobs.flights.Watch`)."""
         if not self._watching:
             return
-        if self._steps % self._every == 0:
-            self.windows.append(cut_packed(observation))
-        self._steps += 1
-        if len(self.windows) > MOST_WINDOWS:
-            self.windows, self._every = self.windows[::THINNED], self._every * THINNED
+        step = self._steps[seed]
+        self._steps[seed] += 1
+        if step % self._every == 0:
+            self._kept.append((step, cut_packed(observation)))
+        while len(self._kept) > MOST_WINDOWS:
+            self._every *= 2
+            self._kept = [kept for kept in self._kept if kept[0] % self._every == 0]
 
     def figures(self) -> dict[str, float]:
         """The `drift_figures` of what was met; none if nothing was, or if a lean encoder draws nothing."""

@@ -17,10 +17,11 @@ import torch
 from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.accuracy import achieved
-from jobs.cells import Cell, Entry, episodes_folder, fly_cells, make_cell, read_kept
+from jobs.cells import Cell, Entry, episodes_folder, make_cell, read_kept
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
 from jobs.figures import Track, trajectory_figure
 from jobs.flights import Ways, check_sensor, fly, write_episodes
+from jobs.flying import fly_cells
 from jobs.pictures import Decode, Film
 from jobs.pilots import BOUNDS, make_pilot
 from jobs.progress import console
@@ -75,7 +76,7 @@ def run(config: Config) -> dict[str, Any]:
 def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     """Fly every task, write what came of it, and return the figures.
 
-    What was asked before, of the same policy, is not flown again.
+    What was asked before, of the same policy, is not flown again; what could not be drawn then is tried.
 
     Raises:
         RuntimeError: A task of the first renderer could not be flown.
@@ -85,7 +86,7 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     check_sensor(manifest, config.env_config())
     asked = {"evaluate": as_dict(config)["evaluate"], "policy": manifest["sha256"]}
     done = finished(folder, "evaluate")
-    if done is not None and done["asked"] == asked:
+    if done is not None and done["asked"] == asked and not done.get("missing"):
         console.print((folder.evaluation / "table.md").read_text(), markup=False)
         return done["figures"]
     announce(config, folder, path)
@@ -95,11 +96,11 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     flown = fly_tasks(cells, config, folder)
     tracks = [track for task in plan if shown(task, plan) for track in tracks_of(task, cells[task])]
     kept = episodes_folder(folder.evaluation)
-    drifts = {task: read_kept(kept, cells[task].key)["encoder"] for task in flown}
+    notes = {task: read_kept(kept, cells[task].key) for task in flown}
     rows = [summarise(task.label, episodes) for task, episodes in flown.items()]
     write_episodes(folder.evaluation / "episodes.csv", LABELS, {task.label: flown[task] for task in flown})
     publish(folder, tracker, rows, tracks)
-    figures = tracked_figures(rows) | drift_metrics(drifts)
+    figures = tracked_figures(rows) | drift_metrics({task: note["encoder"] for task, note in notes.items()})
     figures |= achieved(config.env_config(scene=HELD_OUT_SCENE))
     tracker.log(config.train.env_steps, figures)
     if config.evaluate.video:
@@ -107,7 +108,10 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
         env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
         file = folder.evaluation / "episode.mp4"
         tracker.artifact(film(str(path), config.evaluate.action, env_config, seed, file), "eval")
-    return finish(folder, "evaluate", {"asked": asked, "figures": figures})["figures"]
+    missing = [" ".join(task.label) for task in plan if task not in flown]
+    flown_at = sorted({commit for note in notes.values() for commit in note["commits"]})
+    marker = {"asked": asked, "figures": figures, "missing": missing, "flown_at": flown_at}
+    return finish(folder, "evaluate", marker)["figures"]
 
 
 def cell_of(task: Task, config: Config, path: Path, identity: str) -> Cell:

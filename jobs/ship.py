@@ -56,8 +56,10 @@ def run(config: Config) -> dict[str, Any]:
     """Ship the finished trainings; return how many of each experiment.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: There is none, or they were to learn nothing.
     """
+    if config.budget == "smoke":
+        raise ConfigError("budget: smoke learns nothing, and would replace what is shipped; ship another")
     trainings = newest_trainings(Path(config.runs_dir).resolve(), config.budget)
     if not trainings:
         where = str(Path(config.runs_dir).resolve())

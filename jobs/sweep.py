@@ -4,14 +4,15 @@ Run: python -m platform.launch +exp=robustness
 Expect: about half a second of one core for each flight (7 for each policy and condition); in the
 run folder under `sweep/` a figure per axis, tables with intervals and every episode. All fly the
 same corridors. A stopped sweep continues when the same command is given again: what was flown is
-read back, never flown twice; what failed is tried again (`jobs.cells`).
+read back, never flown twice; what failed is tried again (`jobs.flying`).
 """
 
 from typing import Any
 
-from jobs.cells import episodes_folder, fly_cells, read_kept
+from jobs.cells import episodes_folder, read_kept
 from jobs.conditions import Sweep, find_entries, plan
 from jobs.config import Config
+from jobs.flying import fly_cells
 from jobs.progress import console
 from jobs.runs import finish, locate_run, open_run
 from jobs.sweep_report import report

@@ -69,7 +69,7 @@ def report(
         tracker: The sweep's MLflow run.
         sweep: What was flown.
         episodes: EPISODE of each cell that could be flown, by its key.
-        kept: What else is kept of these: commit and encoder figures.
+        kept: What else is kept of these, see `jobs.cells.read_kept`.
         failed: Why the other cells could not be flown, by key.
     """
     rows = summarise_sweep(sweep, episodes, config.sweep.reference)
@@ -81,7 +81,7 @@ def report(
     flights = {(*cell.label, cell.entry.group, training_text(cell)): episodes[cell.key]
                for cell in sweep.cells if cell.key in episodes}  # fmt: skip
     write_episodes(place / "episodes.csv", LABELS, flights)
-    commits = sorted({values["commit"] for values in kept.values()})
+    commits = sorted({commit for values in kept.values() for commit in values["commits"]})
     write_json(place / "about.json", about(config, folder, sweep, commits))
     write_tables(place, tracker, config, sweep, rows, failed)
     track_rows(place, tracker, sweep, rows, kept, failed)

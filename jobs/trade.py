@@ -19,11 +19,12 @@ import torch
 from envs.accuracy import converged
 from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
-from jobs.cells import Cell, Entry, fly_cells, make_cell
+from jobs.cells import Cell, Entry, make_cell
 from jobs.children import Child, write_children
 from jobs.conditions import find_pilots, read_entry, with_sensor
 from jobs.config import HELD_OUT_SCENE, Config, ConfigError
 from jobs.encoder_costs import CAPS, TIME_BINS
+from jobs.flying import fly_cells
 from jobs.pilots import PolicyPilot, make_pilot
 from jobs.progress import console, progress
 from jobs.replays import Measured, measure

@@ -21,10 +21,10 @@ if not hasattr(platform, "__path__"):
 @pytest.fixture
 def stub(monkeypatch):
     """Cells are flown by `tests.stub_tuner.StubTuner`, whose lists say what was flown."""
-    from jobs import cells
+    from jobs import flying
     from tests.stub_tuner import StubTuner
 
     StubTuner.flown, StubTuner.measured, StubTuner.broken, StubTuner.dying = [], [], {}, set()
-    monkeypatch.setattr(cells, "_tuner", StubTuner)
-    monkeypatch.setattr(cells, "start_ray", lambda *given: None)
+    monkeypatch.setattr(flying, "_tuner", StubTuner)
+    monkeypatch.setattr(flying, "start_ray", lambda *given: None)
     return StubTuner

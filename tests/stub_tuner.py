@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from jobs.cells import MAX_FAILURES
 from jobs.flights import EPISODE
+from jobs.flying import MAX_FAILURES
 
 
 class StubTuner:

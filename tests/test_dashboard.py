@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs import cells as flying
-from jobs import pipeline
+from jobs import flying, pipeline
 from jobs.dashboard import (
     MOST_CHARACTERS,
     PAGE_WIDTH,

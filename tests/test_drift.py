@@ -49,18 +49,21 @@ def test_windows_without_events_have_figures_too(evae):
     assert (figures["policy_auc"], figures["policy_explained"]) == (0.5, 0.0)
 
 
-def test_the_windows_kept_are_few_and_from_all_over_the_flights(tmp_path):
+@pytest.mark.parametrize("flights", [1, 2, 3, 7, 8, 9, 10])
+def test_the_windows_kept_are_few_and_from_all_over_all_flights(tmp_path, flights):
     watch = DriftWatch(save_untrained(tmp_path / "policy"))
-    for step in range(10_000):
-        observation = np.zeros((3, 4), np.int32)
-        observation[0, 3] = step
-        watch.add(None, 0, observation, {})
-        assert len(watch.windows) <= MOST_WINDOWS
-    steps = np.array([int(kept[0, 3]) for kept in watch.windows])
-    assert len(steps) > MOST_WINDOWS / 3.1
-    assert len(set(np.diff(steps))) == 1
-    assert steps[-1] > 9_900
-    assert np.bincount(steps % 8, minlength=8).min() > 0.9 * len(steps) / 8  # of flights in lock-step, all
+    for step in range(2_000):
+        for seed in range(flights):
+            observation = np.zeros((3, 4), np.int32)
+            observation[0, 2:] = seed, step
+            watch.add(None, seed, observation, {})
+            assert len(watch.windows) <= MOST_WINDOWS
+    seeds, steps = np.array([kept[0, 2:] for kept in watch.windows]).T
+    assert len(steps) > MOST_WINDOWS / 2.5
+    assert set(np.bincount(seeds, minlength=flights)) == {len(steps) // flights}
+    for seed in range(flights):
+        assert len(set(np.diff(steps[seeds == seed]))) == 1
+        assert steps[seeds == seed][-1] > 1_900
 
 
 def test_a_flown_policy_is_measured_by_the_encoder_of_its_folder_on_what_it_saw(tmp_path):

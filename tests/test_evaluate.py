@@ -7,14 +7,26 @@ import pytest
 from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from envs.sensor import Sensor
+from jobs import evaluate as evaluating
+from jobs.cells import read_episodes
 from jobs.config import ConfigError
 from jobs.drift import FIGURES
-from jobs.evaluate import announce, evaluate, film_seed, find_policy, tasks, tracked_figures
+from jobs.evaluate import (
+    announce,
+    cell_of,
+    evaluate,
+    film_seed,
+    find_policy,
+    fly_tasks,
+    tasks,
+    tracked_figures,
+)
 from jobs.evaluate import run as run_evaluation
 from jobs.flights import EPISODE, Ways, check_sensor, fly
+from jobs.flying import KeepEpisodes
 from jobs.pilots import PolicyPilot, make_pilot
 from jobs.report import summarise
-from jobs.runs import open_run, write_json
+from jobs.runs import finished, open_run, write_json
 from jobs.tracking import open_tracker
 from models.evae import EventVAE
 from models.kinds import KINDS
@@ -249,3 +261,66 @@ def test_a_policy_flies_as_its_own_networks_say(policy):
         action = pilot(window[None], [info])
         np.testing.assert_array_equal(action, alone(window[None]))
         window, _, _, _, info = env.step(int(action[0]))
+
+
+def cells_for(config, path, identity="p"):
+    return {task: cell_of(task, config, path, identity) for task in tasks(config)}
+
+
+def test_more_episodes_fly_only_the_new_corridors_and_another_policy_flies_all_but_the_bounds(tmp_path, stub):
+    config = small_config(tmp_path)
+    settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"])
+    config = dataclasses.replace(config, evaluate=settings)
+    more = dataclasses.replace(config, evaluate=dataclasses.replace(settings, episodes=3))
+    run, path = open_run(config), save_untrained(tmp_path / "policy")
+    flown = fly_tasks(cells_for(config, path), config, run)
+    assert list(flown) == tasks(config)
+    assert len(stub.flown) == len(set(stub.flown)) == 10 * 2
+    stub.flown.clear()
+    fly_tasks(cells_for(more, path), more, run)
+    assert {seed for _, seed in stub.flown} == {2}
+    stub.flown.clear()
+    fly_tasks(cells_for(more, path, "another"), more, run)
+    assert len(stub.flown) == 4 * 3  # two choices of action in two scenes
+
+
+def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_stops_with_the_reason(
+    tmp_path, stub
+):
+    config = small_config(tmp_path)
+    run, path = open_run(config), save_untrained(tmp_path / "policy")
+    stub.broken = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
+    flown = fly_tasks(cells_for(config, path), config, run)
+    assert {task.renderer for task in tasks(config)} - {task.renderer for task in flown} == {"pyrender"}
+    stub.broken = {("poles", "raycast"): "ValueError: no"}
+    config = dataclasses.replace(config, runs_dir=str(tmp_path / "others"))
+    with pytest.raises(RuntimeError, match=r"poles raycast: not flown: ValueError: no; the same command"):
+        fly_tasks(cells_for(config, path), config, open_run(config))
+
+
+def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path, monkeypatch):
+    config = small_config(tmp_path)
+    settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)
+    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.05})
+    run, asked = open_run(config), []
+    save_untrained(run.policy, config.env_config(), "event_columns")
+
+    def flown_here(config, place, cells, *given, **named):
+        asked.append(len(cells))
+        able = [cell for cell in cells if len(asked) > 1 or cell.env.renderer == "raycast"]
+        keep = KeepEpisodes(place / "episodes")
+        for cell in able:
+            rows = fly(make_pilot("straight"), cell.env, cell.seeds).tolist()
+            result = {"key": cell.key, "label": [], "simulation": "s", "accuracy": None, "encoder": {}}
+            keep.on_trial_result(1, [], None, result | {"episodes": rows})
+        kept = {cell.key: read_episodes(cell, place / "episodes") for cell in able}
+        return kept, {cell.key: "no" for cell in cells if cell.key not in kept}
+
+    monkeypatch.setattr(evaluating, "fly_cells", flown_here)
+    with open_tracker(config, run) as tracker:
+        for _ in range(3):
+            evaluate(config, run, tracker)
+    assert asked == [11, 11]
+    marker = finished(run, "evaluate")
+    assert marker["missing"] == []
+    assert len(marker["flown_at"]) == 1

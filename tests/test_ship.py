@@ -104,7 +104,13 @@ def test_curves_are_read_back_as_written_if_their_policies_are_still_there(tmp_p
 
 
 def test_nothing_to_ship_is_said_with_where_it_was_sought(tmp_path):
-    with pytest.raises(ConfigError, match="runs_dir: no finished training with budget=smoke in"):
+    with pytest.raises(ConfigError, match="runs_dir: no finished training with budget=paper in"):
+        shipping.run(small_config(tmp_path, job="ship", exp="ship", budget="paper"))
+
+
+def test_trainings_that_learn_nothing_are_not_shipped(tmp_path):
+    finish_training(tmp_path, "run")
+    with pytest.raises(ConfigError, match="budget: smoke learns nothing"):
         shipping.run(small_config(tmp_path, job="ship", exp="ship"))
 
 
@@ -113,9 +119,12 @@ def test_the_job_writes_policies_curves_and_their_figure(tmp_path, monkeypatch):
     monkeypatch.setattr(shipping, "REPOSITORY", tmp_path)
     monkeypatch.setattr(shipping, "FIGURE", tmp_path / "learning.png")
     for seed in (0, 1):
-        finish_training(tmp_path, f"run{seed}", seed=seed)
-    finish_training(tmp_path, "rival", exp="event_set")
-    assert shipping.run(small_config(tmp_path, job="ship", exp="ship")) == {"bytestream": 2, "event_set": 1}
+        finish_training(tmp_path, f"run{seed}", seed=seed, budget="paper")
+    finish_training(tmp_path, "rival", exp="event_set", budget="paper")
+    assert shipping.run(small_config(tmp_path, job="ship", exp="ship", budget="paper")) == {
+        "bytestream": 2,
+        "event_set": 1,
+    }
     names = sorted(path.name for path in (tmp_path / "pretrained").iterdir())
     assert names == ["bytestream-s0", "bytestream-s1", "curves.csv", "event_set-s0"]
     assert (tmp_path / "learning.png").stat().st_size > 10_000

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.stats import ttest_ind
 
 from jobs.statistics import (
     bootstrap_interval,
@@ -225,6 +226,9 @@ def test_the_difference_of_trainings_changes_its_sign_with_the_sides_and_needs_t
     there, back = mean_difference(ours, theirs), mean_difference(theirs, ours)
     assert there.value == pytest.approx(-back.value)
     assert there.interval == pytest.approx((-back.interval[1], -back.interval[0]))
+    known = ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
+    assert there.interval == pytest.approx((known.low, known.high))
+    assert mean_difference([0.7, 0.7, 0.7], [0.5, 0.6, 0.7]).interval[0] > -0.2  # equal on one side
     assert mean_difference([0.7], theirs).interval is None
     assert mean_difference([0.7, 0.7], [0.5, 0.5]) == (pytest.approx(0.2), None)
 

@@ -1,8 +1,9 @@
 import numpy as np
 
-from jobs.cells import accuracy_file, flown
+from jobs.cells import accuracy_file
 from jobs.conditions import plan, read_entry
 from jobs.flights import EPISODE
+from jobs.flying import flown
 from jobs.runs import open_run, write_json
 from jobs.sweep_report import (
     about,

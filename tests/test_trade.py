@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from envs.accuracy import NO_CULLING_M
-from jobs import cells as flying
-from jobs import trade
+from jobs import flying, trade
 from jobs.conditions import read_entry
 from jobs.config import ConfigError
 from jobs.replays import Measured

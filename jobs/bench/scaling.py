@@ -28,11 +28,11 @@ from rich.table import Table
 
 from envs.config import EnvConfig
 from jobs.bench.throughput import composed
-from jobs.cells import loaded
 from jobs.cluster import ONE_THREAD, QUIET
 from jobs.conditions import PRETRAINED
 from jobs.config import HELD_OUT_SCENE
 from jobs.flights import fly
+from jobs.flying import loaded
 from jobs.ppo import build_ppo
 from jobs.progress import console
 from jobs.runner import PlainEnvRunner

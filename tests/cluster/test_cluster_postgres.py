@@ -77,11 +77,11 @@ def report(folder, uri, seed):
     """A sweep whose flights are made up, and everything else is not."""
     # Here, in a process of its own: Ray reads its token once, when it is imported, and another
     # test of this run names one later.
-    from jobs import sweep as sweeping
-    from tests.test_sweep import StubTuner
+    from jobs import flying, sweep
+    from tests.stub_tuner import StubTuner
 
-    sweeping._tuner, sweeping.start_ray = StubTuner, lambda *given: None
-    sweeping.run(in_store(folder, uri, seed))
+    flying._tuner, flying.start_ray = StubTuner, lambda *given: None
+    sweep.run(in_store(folder, uri, seed))
 
 
 def test_eight_sweeps_report_at_once_and_all_is_read_back(tmp_path, postgres):

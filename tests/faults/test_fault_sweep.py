@@ -28,7 +28,7 @@ def fly(pilot, config, seeds, *given, **named):
 
 
 def noting(tmp_path):
-    return {"jobs.cells": NOTED.format(file=str(tmp_path / "flights"))}
+    return {"jobs.flying": NOTED.format(file=str(tmp_path / "flights"))}
 
 
 def check_once(job, tmp_path, again_at_most):
@@ -89,7 +89,7 @@ def fly(pilot, config, seeds, *given, **named):
 def test_a_cell_that_raises_hangs_returns_nan_or_has_no_opengl_stops_no_other(tmp_path):
     renderers = "+sweep.axes.renderer={renderer:[raycast,pyrender]}"
     words = (*SWEEP, "~sweep.axes", SPARSITIES, renderers, "sweep.policies=[straight]")
-    job = launch(tmp_path, *words, after={"jobs.cells": BROKEN}, EGL_DEVICE_ID="999")
+    job = launch(tmp_path, *words, after={"jobs.flying": BROKEN}, EGL_DEVICE_ID="999")
     assert job.end() == 0, job.said
     table = (job.run / "sweep" / "table.md").read_text()
     reasons = {

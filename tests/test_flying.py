@@ -1,24 +1,16 @@
 import dataclasses
 import pickle
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jobs.cells import (
-    MOST_FLIGHTS,
-    FlightsError,
-    KeepEpisodes,
-    flown,
-    fly_cells,
-    read_episodes,
-    read_kept,
-    split,
-    unflown,
-    unmeasured,
-)
+from jobs.cells import MOST_FLIGHTS, read_episodes, read_kept, split, unflown
 from jobs.conditions import plan, read_entry
 from jobs.flights import EPISODE
-from jobs.runs import open_run
+from jobs.flying import FlightsError, KeepEpisodes, flown, fly_cells, packed, unmeasured, with_files
+from jobs.runs import open_run, write_json
 from tests.test_conditions import planned, save_training, sweep_config
 
 
@@ -125,9 +117,11 @@ def test_the_parts_of_a_cell_fly_each_seed_once_and_none_flies_too_many(tmp_path
     )
     parts = split(cell)
     assert [seed for part in parts for seed in part.seeds] == list(cell.seeds)
-    assert max(len(part.seeds) for part in parts) == MOST_FLIGHTS
+    assert [len(part.seeds) for part in parts] == [8, 8, 8]
+    assert MOST_FLIGHTS == 10
     assert {part.key for part in parts} == {cell.key}
-    assert len({part.part for part in parts}) == len(parts) == 3
+    assert len({part.part for part in parts}) == len(parts)
+    assert len(split(dataclasses.replace(cell, seeds=tuple(range(10))))) == 1
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
@@ -148,12 +142,47 @@ def test_parts_that_end_in_any_order_are_kept_as_one_cell_with_the_encoder_figur
 def test_a_cell_of_which_a_part_dies_keeps_the_others_and_flies_that_part_again(tmp_path, stub):
     config = sweep_config(tmp_path, trials=24)
     place, cells = open_run(config).path / "sweep", planned(config, "straight").cells[:1]
-    stub.dying = {(cells[0].key, 10)}
+    stub.dying = {(cells[0].key, 8)}
     with pytest.raises(FlightsError, match="its process ended 3 times"):
         fly_cells(config, place, cells)
-    assert {seed for _, seed in stub.flown} == {*range(10), *range(20, 24)}
+    assert {seed for _, seed in stub.flown} == {*range(8), *range(16, 24)}
     stub.dying = set()
     stub.flown.clear()
     (episodes,) = fly_cells(config, place, cells)[0].values()
-    assert sorted(seed for _, seed in stub.flown) == list(range(10, 20))
+    assert sorted(seed for _, seed in stub.flown) == list(range(8, 16))
     assert list(episodes["seed"]) == list(range(24))
+
+
+def test_a_cell_that_several_runs_fly_remembers_their_commits_and_restarts(tmp_path):
+    cell = dataclasses.replace(planned(sweep_config(tmp_path), "straight").cells[0], seeds=tuple(range(24)))
+    for run, part in enumerate(split(cell)):
+        keep = KeepEpisodes(tmp_path / "episodes")
+        keep.commit = f"c{run % 2}"
+        keep.restarts[part.part] = 2
+        rows = np.zeros(len(part.seeds), EPISODE)
+        rows["seed"] = part.seeds
+        result = {"key": cell.key, "label": [], "simulation": "s", "accuracy": None, "encoder": {}}
+        keep.on_trial_result(1, [], None, result | {"episodes": rows.tolist()})
+    kept = read_kept(tmp_path / "episodes", cell.key)
+    assert (kept["commits"], kept["restarts"]) == (["c0", "c1"], 6)
+
+
+def test_what_was_kept_with_one_commit_is_still_read(tmp_path):
+    write_json(tmp_path / "k.json", {"label": [], "commit": "c", "encoder": {}, "episodes": []})
+    assert read_kept(tmp_path, "k")["commits"] == ["c"]
+
+
+def test_a_worker_flies_the_policy_that_the_driver_has_though_it_cannot_see_its_folder(tmp_path):
+    config = sweep_config(tmp_path)
+    path = Path(save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    cell = plan(config, [read_entry(str(path))]).cells[0]
+    here = flown(cell, False)
+    files = packed([cell])
+    shutil.rmtree(path)
+    there = with_files(cell, files)
+    assert there.entry.pilot != cell.entry.pilot
+    assert there.key == cell.key
+    assert flown(there, False)["episodes"] == here["episodes"]
+    assert with_files(cell, files).entry.pilot == there.entry.pilot  # written once
+    bound = planned(config, "straight").cells[0]
+    assert with_files(bound, packed([bound])) == bound
