@@ -6,10 +6,10 @@ is part of the model: a table with one row per bin is therefore the model exactl
 
 A code is what is added to the features of an event before the maximum over events:
 
-    "additive"   sines and cosines of t (paper equation 1)
-    "eventnet"   minus the age 1 - t, the decay of EventNet; its rotation by the age of the event
-                 that wins follows after the maximum (`eventnet_phase`)
-    "none"       nothing
+- "additive": sines and cosines of t (paper equation 1).
+- "eventnet": minus the age 1 - t, the decay of EventNet; its rotation by the age of the event
+  that wins follows after the maximum (`eventnet_phase`).
+- "none": nothing.
 """
 
 import functools

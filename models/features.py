@@ -29,7 +29,7 @@ class Feature(NamedTuple):
     Attributes:
         dtype: Of its array.
         shape: Settings -> its shape.
-        from_observations: (observations (B, ...), settings, encoder) -> features (B, *shape).
+        from_observations: (observations (B, ...), settings, encoder) -> features (B, ...) of that shape.
         from_events: (step, settings, encoder) -> feature, of a step (events, start_us, window_us);
             None: events do not say it.
     """
