@@ -45,9 +45,12 @@ def page(uri: str) -> str:
 
 
 def dashboard_command(uri: str) -> str:
-    """The command that serves a store to browsers of this machine only."""
-    if uri == f"sqlite:///{REPOSITORY / 'mlflow.db'}":
-        return "make mlflow"
+    """What a person types to serve a store to browsers of this machine only."""
+    return "make mlflow" if uri == f"sqlite:///{REPOSITORY / 'mlflow.db'}" else server_command(uri)
+
+
+def server_command(uri: str) -> str:
+    """The server itself, whatever the store: variables and words."""
     lean = (
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true "
         "MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false"

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jobs.store import dashboard_command
+from jobs.store import server_command
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -31,11 +31,11 @@ NO_ASSISTANT = "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad
 
 @contextlib.contextmanager
 def served(uri: str, bin_folder: Path) -> Iterator[str]:
-    """Serve a store by the command that the jobs print, on a free port; yields the address."""
+    """Serve a store on a free port, by the command that the jobs print; yields the address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    words = shlex.split(dashboard_command(uri).replace("--port 5000", f"--port {port}"))
+    words = shlex.split(server_command(uri).replace("--port 5000", f"--port {port}"))
     settings = dict(
         word.split("=", 1) for word in words if word.isupper() or word.partition("=")[0].isupper()
     )
@@ -45,7 +45,9 @@ def served(uri: str, bin_folder: Path) -> Iterator[str]:
     )
     address = f"http://127.0.0.1:{port}"
     try:
-        wait_for(lambda: _healthy(address), f"{address}/health")
+        wait_for(lambda: _healthy(address) or server.poll() is not None, f"{address}/health")
+        if server.poll() is not None:
+            raise RuntimeError(f"the server ended with status {server.returncode}: {shlex.join(command)}")
         yield address
     finally:
         server.terminate()

@@ -19,7 +19,8 @@ from jobs.dashboard import (
     view_address,
 )
 from jobs.flights import EPISODE
-from jobs.runs import Run, finish, open_run
+from jobs.runs import REPOSITORY, Run, finish, open_run
+from jobs.store import dashboard_command, server_command
 from jobs.sweep import run as run_sweep
 from jobs.tracking import open_store
 from tests.browser import CHROMIUM, Browser, served
@@ -219,3 +220,20 @@ def test_films_play_on_the_artifacts_page(pages, name):
     browser, at = pages
     browser.open(at[name], ".mp4")
     assert browser.wait("document.querySelector('video')?.videoWidth > 0", "the film")
+
+
+def test_the_store_of_the_repository_is_served_by_make_and_any_by_the_server_itself():
+    own = f"sqlite:///{REPOSITORY / 'mlflow.db'}"
+    assert dashboard_command(own) == "make mlflow"
+    for uri in (own, "sqlite:////elsewhere/m.db"):
+        words = server_command(uri).split()
+        assert words[words.index("mlflow") : words.index("mlflow") + 2] == ["mlflow", "server"]
+        assert words[-1] == uri
+    assert dashboard_command("sqlite:////elsewhere/m.db") == server_command("sqlite:////elsewhere/m.db")
+
+
+def test_a_server_that_ends_is_said_at_once(tmp_path):
+    (tmp_path / "mlflow").write_text("#!/bin/sh\nexit 3\n")
+    (tmp_path / "mlflow").chmod(0o755)
+    with pytest.raises(RuntimeError, match="ended with status 3"), served("sqlite:///x.db", tmp_path):
+        pass
