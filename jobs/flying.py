@@ -244,10 +244,11 @@ def with_files(cell: Cell, files: Files) -> Cell:
         return cell
     place = _unpacked.get(cell.entry.identity)
     if place is None:
-        place = _unpacked[cell.entry.identity] = tempfile.mkdtemp(prefix="evade-policy-")
+        place = tempfile.mkdtemp(prefix="evade-policy-")
         atexit.register(shutil.rmtree, place, ignore_errors=True)
         for name, content in files[pilot].items():
             (Path(place) / name).write_bytes(content)
+        _unpacked[cell.entry.identity] = place  # only when it is whole
     return dataclasses.replace(cell, entry=dataclasses.replace(cell.entry, pilot=place))
 
 
