@@ -6,11 +6,13 @@ events of one interval. A fault that is off costs nothing and draws nothing.
 
 import dataclasses
 
+import numba
 import numpy as np
 
 from envs.config import FaultsConfig
-from envs.events import EVENT, MAX_EVENTS_PER_FRAME
+from envs.events import MAX_EVENTS_PER_FRAME
 
+Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
 SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
 
 
@@ -98,72 +100,107 @@ def apply_faults(
     if faults.event_dropout > 0.0:
         events = events[rng.random(events.size) >= faults.event_dropout]
     seconds = (t1_us - t0_us) * 1e-6
-    means = _expected(events.size, seconds, luminance, faults, pixels)
-    expected = sum(float(mean.sum()) for _, mean in means) + faults.leak_hz * pixels.live.size * seconds
+    kinds = _expected(events.size, seconds, luminance, faults, pixels)
+    expected = sum(float(upto[-1]) for _, upto in kinds) + faults.leak_hz * pixels.live.size * seconds
     if expected > MAX_EVENTS_PER_FRAME:
         raise ValueError(
             f"faults may add {MAX_EVENTS_PER_FRAME} events to an interval; these rates add about "
             f"{expected:.3g} from {t0_us} to {t1_us} us. Lower the rates or shorten the interval."
         )
-    width = pixels.dead.shape[1]
-    noise = [_at_any_time(_drawn(where, mean, rng), (t0_us, t1_us), width, rng) for where, mean in means]
+    noise = [_at_any_time(_drawn(where, upto, rng), (t0_us, t1_us), rng) for where, upto in kinds]
     if faults.leak_hz > 0.0:
-        noise.append(_leak(t0_us, t1_us, faults.leak_hz, pixels))
-    if sum(batch.size for batch in noise) == 0:
+        noise.append(_leak(t0_us, t1_us, faults.leak_hz, pixels.live, pixels.leak_phase))
+    if not noise:
         return events
-    both = np.concatenate((events, *noise))
-    return both[np.lexsort((both["x"], both["y"], both["t"]))]
+    times, places, polarities = (np.concatenate(parts) for parts in zip(*noise, strict=True))
+    if times.size == 0:
+        return events
+    order = np.lexsort((places, times))
+    return _merged(events, times[order], places[order], polarities[order], pixels.dead.shape[1])
 
 
 def _expected(
     num_events: int, seconds: float, luminance: np.ndarray, faults: FaultsConfig, pixels: PixelFaults
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each kind of noise that is on: flat pixels, and means of their false events, or one for all."""
-    means = []
+    """For each kind of noise that is on: flat pixels, and the mean number of false events up to each.
+
+    One number where all pixels are alike.
+    """
+    kinds = []
     background = faults.background_activity * num_events
     background += faults.background_activity_hz * seconds * pixels.live.size
-    if background > 0.0:
-        means.append((pixels.live, np.array([background])))
-    if faults.shot_noise_hz > 0.0:
-        light = np.minimum(luminance.ravel()[pixels.live], 1.0)
-        means.append((pixels.live, faults.shot_noise_hz * seconds * (1.0 - SHOT_NOISE_FALL * light)))
-    if faults.hot_pixel_hz > 0.0:
-        means.append((pixels.hot, np.array([faults.hot_pixel_hz * seconds * pixels.hot.size])))
-    return means
+    if background > 0.0 and pixels.live.size:
+        kinds.append((pixels.live, np.array([background])))
+    if faults.shot_noise_hz > 0.0 and pixels.live.size:
+        in_black = faults.shot_noise_hz * seconds
+        kinds.append((pixels.live, _shot_noise(luminance.ravel(), pixels.live, in_black)))
+    if faults.hot_pixel_hz > 0.0 and pixels.hot.size:
+        kinds.append((pixels.hot, np.array([faults.hot_pixel_hz * seconds * pixels.hot.size])))
+    return kinds
 
 
-def _drawn(where: np.ndarray, mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+@numba.njit(cache=True, error_model="numpy")
+def _shot_noise(luminance: np.ndarray, live: np.ndarray, in_black: float) -> np.ndarray:
+    """Mean number of shot noise events up to each live pixel, float64 (L,); `in_black` is a black pixel's."""
+    black, white, fall = np.float32(in_black), np.float32(1.0), np.float32(SHOT_NOISE_FALL)
+    upto, total = np.empty(live.size), 0.0
+    for k in range(live.size):
+        total += black * (white - fall * min(luminance[live[k]], white))
+        upto[k] = total
+    return upto
+
+
+def _drawn(where: np.ndarray, upto: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Flat pixels of false events: Poisson around each pixel's mean, or around one mean for all alike."""
-    if where.size == 0:
-        return where
-    upto = np.cumsum(mean, dtype=np.float64)
     number = int(rng.poisson(upto[-1]))
-    if mean.size == 1:
+    if upto.size == 1:
         return where[rng.integers(0, where.size, number)]
     place = np.searchsorted(upto, rng.random(number) * upto[-1], side="right")
     return where[np.minimum(place, where.size - 1)]
 
 
-def _at_any_time(
-    where: np.ndarray, span_us: tuple[int, int], width: int, rng: np.random.Generator
+def _at_any_time(where: np.ndarray, span_us: tuple[int, int], rng: np.random.Generator) -> Noise:
+    """Events at these flat pixels, times and polarities uniform."""
+    times = rng.integers(*span_us, where.size) + 1
+    return times, where, 2 * rng.integers(0, 2, where.size) - 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _leak(t0_us: int, t1_us: int, leak_hz: float, live: np.ndarray, phase: np.ndarray) -> Noise:
+    """Events of leakage; event k of a pixel comes (k + phase) / rate seconds after time 0."""
+    first, last = np.empty(live.size), np.empty(live.size)
+    total = 0
+    for k in range(live.size):
+        first[k] = np.floor(t0_us * 1e-6 * leak_hz - phase[k])
+        last[k] = np.floor(t1_us * 1e-6 * leak_hz - phase[k])
+        total += int(last[k] - first[k])
+    times, places, n = np.empty(total, np.int64), np.empty(total, np.int64), 0
+    for k in range(live.size):
+        for order in range(int(last[k] - first[k])):
+            seconds = (first[k] + 1.0 + order + phase[k]) / leak_hz
+            times[n] = int(min(max(np.ceil(seconds * 1e6), t0_us + 1), t1_us))
+            places[n] = live[k]
+            n += 1
+    return times, places, np.ones(total, np.int64)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _merged(
+    events: np.ndarray, times: np.ndarray, places: np.ndarray, polarities: np.ndarray, width: int
 ) -> np.ndarray:
-    """EVENT at these flat pixels, times and polarities uniform."""
-    noise = np.empty(where.size, EVENT)
-    noise["t"] = rng.integers(*span_us, where.size) + 1
-    noise["y"], noise["x"] = np.divmod(where, width)
-    noise["p"] = 2 * rng.integers(0, 2, where.size) - 1
-    return noise
-
-
-def _leak(t0_us: int, t1_us: int, leak_hz: float, pixels: PixelFaults) -> np.ndarray:
-    """EVENT of leakage; event k of a pixel comes (k + phase) / rate seconds after time 0."""
-    first = np.floor(t0_us * 1e-6 * leak_hz - pixels.leak_phase)
-    number = (np.floor(t1_us * 1e-6 * leak_hz - pixels.leak_phase) - first).astype(np.int64)
-    which = np.repeat(np.arange(pixels.live.size), number)
-    order = np.arange(which.size) - np.repeat(np.cumsum(number) - number, number)
-    seconds = (first[which] + 1.0 + order + pixels.leak_phase[which]) / leak_hz
-    noise = np.empty(which.size, EVENT)
-    noise["t"] = np.clip(np.ceil(seconds * 1e6), t0_us + 1, t1_us)
-    noise["y"], noise["x"] = np.divmod(pixels.live[which], pixels.dead.shape[1])
-    noise["p"] = 1
-    return noise
+    """EVENT sorted by (t, y, x) of events and noise that are; of equal ones the true events come first."""
+    both = np.empty(events.size + times.size, events.dtype)
+    true = false = 0
+    for k in range(both.size):
+        first = false == times.size
+        if not first and true < events.size:
+            t, place = events[true]["t"], events[true]["y"] * np.int64(width) + events[true]["x"]
+            first = t < times[false] or (t == times[false] and place <= places[false])
+        if first:
+            both[k] = events[true]
+            true += 1
+        else:
+            both[k]["t"], both[k]["p"] = times[false], polarities[false]
+            both[k]["y"], both[k]["x"] = places[false] // width, places[false] % width
+            false += 1
+    return both
