@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numba
 import numpy as np
 
-from envs.config import EnvConfig, FaultsConfig, FidelityConfig
+from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig, FidelityConfig
 from envs.events import EVENT
 from envs.fidelity import plan
 from envs.flight import DIAGONAL, Outcome, Point, clock_us
@@ -52,10 +52,11 @@ def measure(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0)
         seed: Of corridors and ways.
 
     Raises:
-        ValueError: The simulation has observation "none", which simulates no camera.
+        ValueError: The simulation has observation "luminance" or "none", which simulates no event camera.
     """
-    if config.observation == "none":
-        raise ValueError("observation must be one that has a camera for its error to be measured; got 'none'")
+    if config.observation in WITHOUT_EVENTS:
+        rule = "observation must be one that has a camera for its error to be measured"
+        raise ValueError(f"{rule}; got {config.observation!r}")
     pairs = [_flight(config, steps, np.random.default_rng([ENTROPY, seed, i])) for i in range(flights)]
     tolerance_us = TIME_SHARE * 1e6 / config.control_hz
     weights = [events.size + converged.size for events, converged, _ in pairs]

@@ -30,6 +30,8 @@ def _number_or_truth(value: Any) -> float | bool:
 
 Value = Annotated[float | bool, PlainValidator(_number_or_truth)]
 
+WITHOUT_EVENTS = ("luminance", "none")  # observations for which no event camera is simulated
+
 
 @dataclass(frozen=True, config=STRICT)
 class CameraConfig:
@@ -154,8 +156,8 @@ class EnvConfig:
         vehicle_radius_m: The vehicle is a disc of this radius [m].
         camera_height_m: Height of the camera above the ground [m].
         time_limit_s: Flight time after which the episode is truncated [s].
-        observation: "window", "event_image", "luminance", "events", or "none": nothing is
-            rendered, for a pilot that looks at nothing.
+        observation: "window", "event_image", "events"; "luminance": one picture a step, and no
+            event camera; or "none": nothing is rendered, for a pilot that looks at nothing.
         window_capacity: Most events that one window holds; the oldest beyond it are
             dropped and counted.
         split: Which corridors: those of one split never occur in another, whatever the seed.
@@ -176,6 +178,23 @@ class EnvConfig:
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     faults: FaultsConfig = dataclasses.field(default_factory=FaultsConfig)
     fidelity: FidelityConfig = dataclasses.field(default_factory=FidelityConfig)
+
+
+def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
+    """The settings that a flight with an observation depends on: the others have their default values.
+
+    Two simulations with equal ones give the same flights, step by step, to a pilot that sees "luminance"
+    (whatever the event camera is) or "none" (whatever any camera is); to others each setting may matter.
+    """
+    if observation not in WITHOUT_EVENTS:
+        return config
+    lens = {name: getattr(config.camera, name) for name in ("width", "height", "fov_deg")}
+    seen = dataclasses.replace(
+        config, window_capacity=EnvConfig.window_capacity, camera=CameraConfig(**lens), faults=FaultsConfig()
+    )
+    if observation == "none":
+        seen = dataclasses.replace(seen, camera=CameraConfig(), fidelity=FidelityConfig(), renderer="auto")
+    return seen
 
 
 def sensor_settings(config: EnvConfig) -> dict[str, Any]:

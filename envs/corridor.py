@@ -37,8 +37,8 @@ class CorridorEnv(gymnasium.Env):
     Attributes:
         config: The settings, `EnvConfig`.
         scene: The corridor of this episode.
-        events: EVENT array of the last step, faults included.
-        luminance: float32 (H, W), the last render.
+        events: EVENT array of the last step, faults included; empty with observation "luminance" or "none".
+        luminance: float32 (H, W), the last render; 0 with "none".
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012 - Gymnasium's name

@@ -16,10 +16,13 @@ TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
 
 
 class Sensor:
-    """Renderer, event camera and faults of one vehicle; with observation "none" a clock alone.
+    """Renderer, event camera and faults of one vehicle.
+
+    Only what is observed is simulated: with observation "luminance" one render a step and no event
+    camera, with "none" a clock alone.
 
     Attributes:
-        events: EVENT array of the last step, faults included.
+        events: EVENT array of the last step, faults included; empty where no camera is simulated.
         luminance: float32 (H, W), the last render.
         dropped: Events of the last step lost to the camera's cap.
         renders: Renders of the last step.
@@ -33,6 +36,7 @@ class Sensor:
         self._camera = EventCamera(config.camera)
         self._together = max(1, TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
+        self._pictures_alone = config.observation == "luminance"
         self.plan: Plan
 
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
@@ -46,7 +50,8 @@ class Sensor:
         self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
         self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
         self.luminance = self._renderer.render_way(self._poses(place, place, np.ones(1), np.array([t_us])))[0]
-        self._camera.reset(self.luminance, t_us)
+        if not self._pictures_alone:
+            self._camera.reset(self.luminance, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
         """Render the flown part of a control step in equal parts; set the events and the last render.
@@ -67,6 +72,10 @@ class Sensor:
             return
         start_us = self.t_us
         moving_us = round(outcome.flown * (end_us - start_us))
+        if self._pictures_alone:
+            self._look(start, outcome.end, start_us + moving_us)
+            self.t_us = end_us
+            return
         way_m = outcome.flown * self._config.speed_mps / self._config.control_hz
         self.renders = min(sub_renders(way_m, self.plan.max_step_m), moving_us) if moving_us else 0
         batches, self.dropped = [], 0
@@ -83,6 +92,15 @@ class Sensor:
             span_us = start_us, end_us
             events = apply_faults(events, *span_us, self.luminance, faults, self._pixels, self._rng)
         self.events = events
+
+    def _look(self, start: Point, end: Point, t_us: int) -> None:
+        """The picture at the end of the way; the last one stays if no time has passed."""
+        self.renders = int(t_us > self.t_us)
+        if self.renders:
+            picture = self._renderer.render_way(self._poses(start, end, np.ones(1), np.array([t_us])))[0]
+            if not (picture.min() >= 0.0 and picture.max() < np.inf):
+                raise ValueError("luminance must be finite and >= 0; the renderer gave something else.")
+            self.luminance = picture
 
     def close(self) -> None:
         """Free the renderer."""

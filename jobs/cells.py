@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.config import EnvConfig, FaultsConfig, settings_hash
+from envs.config import EnvConfig, FaultsConfig, seen_settings, settings_hash
 from jobs.flights import EPISODE
 from jobs.progress import console
 from jobs.runs import RunError, read_json
@@ -27,6 +27,7 @@ class Entry:
         training: The training seed; None for a bound.
         identity: Hash of its manifest, unique by its SHA-256 sums.
         sensor: Sensor settings that it was trained with; none for a bound.
+        observation: What it sees, as `envs.config.EnvConfig` names it.
     """
 
     pilot: str
@@ -34,6 +35,7 @@ class Entry:
     training: int | None
     identity: str
     sensor: dict[str, Any]
+    observation: str = "window"
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class Cell:
 
     Attributes:
         label: Axis and value; several axes share a cell where they hold the same value.
-        key: Hash of all that decides an episode but its seed: simulation, policy, choice of action.
+        key: Hash of all that decides an episode but its seed: what the pilot sees of the simulation,
+            the policy, the choice of action.
         entry: Who flies.
         action: How a policy chooses.
         env: The simulation.
@@ -79,7 +82,8 @@ def make_cell(
     table: Mapping[str, Any] | None = None,
 ) -> Cell:
     """The cell of the first `trials` corridors, see `Cell`, with its key."""
-    facts = {"env": dataclasses.asdict(env), "pilot": entry.identity, "action": action}
+    seen = seen_settings(env, entry.observation)
+    facts = {"env": dataclasses.asdict(seen), "pilot": entry.identity, "action": action}
     facts |= {"table": dict(table)} if table else {}  # what was kept before there were tables stays valid
     key = settings_hash({**facts, "kept": list(EPISODE.names or ())})  # other columns, other files
     return Cell(label, key, entry, action, env, tuple(range(trials)), tuple((table or {}).items()))

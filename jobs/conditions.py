@@ -17,6 +17,7 @@ from jobs.evaluate import find_policy
 from jobs.flights import check_sensor
 from jobs.pilots import BOUNDS
 from jobs.runs import REPOSITORY, Run, named_policy
+from models.kinds import kind_of
 from models.policy import MANIFEST
 
 PRETRAINED = REPOSITORY / "models" / "pretrained"
@@ -113,13 +114,14 @@ def read_entry(pilot: str) -> Entry:
         ConfigError: If the folder's manifest lacks what tells one training from another.
     """
     if pilot in BOUNDS:
-        return Entry(pilot, pilot, None, pilot, {})
+        return Entry(pilot, pilot, None, pilot, {}, "none")
     manifest: dict[str, Any] = json.loads((Path(pilot) / MANIFEST).read_text())
     missing = [name for name in ("name", "seed", "sensor") if name not in manifest]
     if missing:
         raise ConfigError(f"sweep.policies: the manifest of {pilot!r} lacks {missing}; train it anew")
     group = str(manifest.get("exp", manifest["name"]))
-    return Entry(pilot, group, int(manifest["seed"]), settings_hash(manifest), manifest["sensor"])
+    identity, observation = settings_hash(manifest), kind_of(manifest).observation
+    return Entry(pilot, group, int(manifest["seed"]), identity, manifest["sensor"], observation)
 
 
 def plan(config: Config, entries: Sequence[Entry]) -> Sweep:

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from envs.config import EnvConfig, settings_hash
+from envs.config import WITHOUT_EVENTS, EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.accuracy import achieved
 from jobs.cells import Cell, Entry, episodes_folder, make_cell, read_kept
@@ -250,14 +250,16 @@ def film_seed(episodes: np.ndarray) -> int:
 def film(source: str, action: str, env_config: EnvConfig, seed: int, path: Path) -> Path:
     """Film a flight of a policy's folder, or of a bound, through one corridor; return the file."""
     decode = decoder(Path(source)) if (Path(source) / ENCODER).is_file() else None
+    pilot = make_pilot(source, action)
     with Film(path, env_config.control_hz, decode) as reel:
 
         def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
             caption = f"{env_config.scene} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
             ending = "   goal" if info["success"] else "   collision" if info["collision"] else ""
-            reel.step(env.luminance, env.events, observation, f"{caption}{ending}")
+            events = None if pilot.observation in WITHOUT_EVENTS else env.events
+            reel.step(env.luminance, events, observation, f"{caption}{ending}")
 
-        fly(make_pilot(source, action), env_config, [seed], watch=watch)
+        fly(pilot, env_config, [seed], watch=watch)
     return path
 
 

@@ -35,7 +35,7 @@ class Film:
         self.path, self.decode = path, decode
         self.stride = max(1, round(control_hz / FRAMES_PER_FLOWN_S))
         self.slower = control_hz / self.stride / FILM_FPS
-        self._recent: list[np.ndarray] = []
+        self._recent: list[np.ndarray | None] = []
         self._part = path.with_name(f".{path.stem}.part.mp4")
 
     def __enter__(self) -> "Film":
@@ -56,14 +56,18 @@ class Film:
         else:
             self._part.unlink(missing_ok=True)
 
-    def step(self, luminance: np.ndarray, events: np.ndarray, window: np.ndarray, caption: str) -> None:
-        """Show a control step: its luminance (H, W), its EVENT array and its packed window."""
+    def step(
+        self, luminance: np.ndarray, events: np.ndarray | None, window: np.ndarray, caption: str
+    ) -> None:
+        """Show a control step: its luminance (H, W), its EVENT array or None if none are made, its window."""
         self._recent.append(events)
         if len(self._recent) < self.stride:
             return
-        shown = np.concatenate(self._recent)
+        shown = [batch for batch in self._recent if batch is not None]
         self._recent = []
-        panels = [("luminance", grey(luminance)), ("events", coloured(polarity(shown, luminance.shape)))]
+        panels = [("luminance", grey(luminance))]
+        if shown:
+            panels.append(("events", coloured(polarity(np.concatenate(shown), luminance.shape))))
         if self.decode is not None:
             panels.append(("decoded from the latents", coloured(self.decode(window))))
         note = f"{caption}   {self.slower:.0f}x slower than flown" if self.slower > 1 else caption

@@ -171,6 +171,7 @@ def test_a_job_says_what_it_achieves_and_whether_that_is_less_than_asked(monkeyp
     assert ("more than asked" in text) == says
 
 
-def test_a_simulation_without_a_camera_is_not_said_to_be_exact():
-    with pytest.raises(ValueError, match="observation must be one that has a camera"):
-        measure(EnvConfig(observation="none"))
+@pytest.mark.parametrize("observation", ["luminance", "none"])
+def test_a_simulation_without_a_camera_is_not_said_to_be_exact(observation):
+    with pytest.raises(ValueError, match=f"observation must be one that has a camera.*got '{observation}'"):
+        measure(EnvConfig(observation=observation))

@@ -48,7 +48,8 @@ def at(sweep, axis, value):
 
 
 def test_axes_change_their_settings_alone_and_share_the_unchanged_cell(tmp_path):
-    sweep = planned(sweep_config(tmp_path), "straight")
+    config = sweep_config(tmp_path)
+    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env_config()))
     assert sweep.conditions == [
         (NOMINAL, "poles_eval"), ("sparsity", "0"), ("sparsity", "0.5"), ("rate", "100"), ("rate", "200")
     ]  # fmt: skip
@@ -78,6 +79,29 @@ def test_another_policy_is_another_cell(tmp_path):
     manifest = json.loads((tmp_path / "one" / MANIFEST).read_text())
     (tmp_path / "one" / MANIFEST).write_text(json.dumps({**manifest, "sha256": {}}))
     assert len(keys | {planned(config, one).cells[0].key}) == 4
+
+
+def test_what_a_pilot_does_not_see_makes_no_cell_of_its_own(tmp_path):
+    axes = {
+        **AXES,
+        "threshold": {"camera.contrast_threshold": [0.2, 0.4]},
+        "exactness": {"fidelity.samples": [1, 8]},
+    }
+    config = sweep_config(tmp_path, axes=axes)
+    pilots = [save_training(tmp_path / name, name, 0, config.env_config(), name) for name in ("rgb", "eip")]
+    sweep = planned(config, "straight", *pilots)
+    keys = {
+        group: {cell.label: cell.key for cell in sweep.cells if cell.entry.group == group}
+        for group in sweep.groups
+    }
+    assert {group: len(set(found.values())) for group, found in keys.items()} == {
+        "straight": 2,  # the rate alone
+        "rgb": 4,  # and what a picture shows
+        "eip": 6,
+    }
+    assert keys["rgb"]["exactness", "8"] != keys["rgb"][NOMINAL, "poles_eval"]
+    errors = {cell.simulation for cell in sweep.cells if cell.label == ("threshold", "0.4")}
+    assert len(errors) == 1, "the condition is the same for all"
 
 
 def test_a_policy_flies_its_own_sensor_with_an_axis_changed_on_it(tmp_path):

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import gymnasium
@@ -7,7 +8,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, seen_settings
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.flight import clock_us, fly, planned_position
 from envs.scene import OBSTACLE, POLE, Scene
@@ -295,3 +296,50 @@ def test_the_picture_shows_luminance_beside_events():
     assert picture.shape == (32, 128, 3)
     assert picture[:, 64:].any()
     assert CorridorEnv(camera=SMALL).render() is None
+
+
+@pytest.mark.parametrize("scene", ["poles_dense", "dynamic"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_picture_is_that_of_the_event_camera_without_simulating_one(scene, seed):
+    usual, alone = (CorridorEnv(scene=scene, camera=SMALL, observation=o) for o in ("window", "luminance"))
+    (_, before), (picture, info) = usual.reset(seed=seed), alone.reset(seed=seed)
+    assert (picture == usual.luminance).all()
+    actions, ended = np.random.default_rng(seed), False
+    while not ended:
+        action = int(actions.integers(3))
+        _, *outcome, before = usual.step(action)
+        picture, *others, info = alone.step(action)
+        assert outcome == others
+        assert (picture == usual.luminance).all()
+        assert alone.events.size == info["num_events"] == 0
+        ended = outcome[1] or outcome[2]
+    assert {**before, "num_events": 0} == info
+
+
+def test_a_picture_that_is_no_luminance_is_refused(monkeypatch):
+    env = CorridorEnv(**EMPTY, observation="luminance")
+    env.reset(seed=0)
+    monkeypatch.setattr(env._sensor._renderer, "render_way", lambda poses: np.full((1, 16, 16), np.nan))
+    with pytest.raises(ValueError, match=r"step 1.*luminance must be finite"):
+        env.step(0)
+
+
+@pytest.mark.parametrize(
+    ("observation", "same", "other"),
+    [
+        (
+            "luminance",
+            {"camera": CameraConfig(16, 16, contrast_threshold=0.4, memory="frame"), "faults": FAULTY},
+            {"fidelity": FidelityConfig(samples=8)},
+        ),
+        ("none", {"camera": CameraConfig(20, 20), "fidelity": FidelityConfig(0.5)}, {"control_hz": 100.0}),
+        ("window", {"camera": SMALL}, {"camera": CameraConfig(16, 16, contrast_threshold=0.4)}),
+    ],
+)
+def test_flights_with_equal_seen_settings_are_equal(observation, same, other):
+    plain = EnvConfig(camera=SMALL, scene="shape_change", observation=observation, time_limit_s=0.5)
+    like, unlike = dataclasses.replace(plain, **same), dataclasses.replace(plain, **other)
+    seen = [seen_settings(config, observation) for config in (plain, like, unlike)]
+    assert seen[0] == seen[1] != seen[2]
+    flown = [flight_bytes(CorridorEnv(config), 1, [0, 1, 2] * 30) for config in (plain, like, unlike)]
+    assert flown[0] == flown[1] != flown[2]

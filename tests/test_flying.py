@@ -11,11 +11,13 @@ from jobs.conditions import plan, read_entry
 from jobs.flights import EPISODE
 from jobs.flying import FlightsError, KeepEpisodes, flown, fly_cells, packed, unmeasured, with_files
 from jobs.runs import open_run, write_json
-from tests.test_conditions import planned, save_training, sweep_config
+from tests.test_conditions import AXES, planned, save_training, sweep_config
+
+SEEN = {"speed": {"env.speed_mps": [20, 10]}, "rate": AXES["rate"]}  # changes that bounds notice
 
 
 def test_a_second_run_flies_nothing_twice(tmp_path, stub):
-    config = sweep_config(tmp_path)
+    config = sweep_config(tmp_path, axes=SEEN)
     place, cells = open_run(config).path / "sweep", planned(config, "straight", "oracle").cells
     first, failed = fly_cells(config, place, cells)
     assert len(stub.flown) == len(set(stub.flown)) == 12
@@ -57,14 +59,14 @@ def test_each_simulation_is_measured_once_whoever_flies_it(tmp_path, stub):
 
 
 def test_what_raises_or_dies_stops_no_other_and_is_flown_by_the_next_run(tmp_path, stub):
-    config = sweep_config(tmp_path)
+    config = sweep_config(tmp_path, axes=SEEN)
     place, cells = open_run(config).path / "sweep", planned(config, "straight").cells
     keys = {cell.label: cell.key for cell in cells}
-    raised, died = ("sparsity", "0.5"), ("rate", "100")
+    raised, died = ("speed", "10"), ("rate", "100")
     stub.broken = {raised: "ValueError: no", died: ""}
     episodes, failed = fly_cells(config, place, cells)
     assert failed == {keys[raised]: "ValueError: no", keys[died]: "its process ended 3 times"}
-    assert set(episodes) == {keys["sparsity", "0"]}
+    assert set(episodes) == {keys["speed", "20"]}
     stub.broken = {}
     stub.flown.clear()
     assert fly_cells(config, place, cells)[1] == {}

@@ -44,8 +44,9 @@ def test_a_group_of_which_nothing_was_flown_has_no_row(tmp_path):
 
 def test_contacts_of_the_sweeps_scene_are_told_by_what_was_changed_and_counted_once(tmp_path):
     axes = {"sparsity": {"faults.sparsity": [0.0, 0.5]}, "world": {"env.scene": ["poles_eval", "poles"]}}
-    sweep = planned(sweep_config(tmp_path, axes=axes), "straight")
-    usual, changed = contacts(sweep, "straight", {cell.key: flights(3) for cell in sweep.cells})
+    config = sweep_config(tmp_path, axes=axes)
+    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    usual, changed = contacts(sweep, "a", {cell.key: flights(3) for cell in sweep.cells})
     assert (len(usual), len(changed)) == (20, 20)
 
 
