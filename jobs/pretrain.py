@@ -83,7 +83,7 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
     """The weights that a run's event VAE still has to begin from; None for random ones.
 
     Raises:
-        ConfigError: `pretrain.encoder` names no encoder, or one of another model.
+        ConfigError: `pretrain.encoder` names no encoder, or one of another model or without a decoder.
     """
     named, config = folder.config.pretrain.encoder, folder.config
     if named is None or checkpoints(folder.encoder) or finished(folder, "pretrain") is not None:
@@ -104,6 +104,9 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
     ]
     if differ:
         raise ConfigError(f"pretrain.encoder: must have the settings of the model, got {', '.join(differ)}")
+    if evae.decoder is None:
+        rule = "must have a decoder to learn on; a shipped policy's has none, its run folder's has"
+        raise ConfigError(f"pretrain.encoder: {rule}, got {named!r}")
     return evae.state_dict()
 
 

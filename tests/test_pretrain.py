@@ -199,6 +199,10 @@ def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anyt
     for named, rule in rules.items():
         with pytest.raises(ConfigError, match=rf"pretrain\.encoder: .*{rule}"):
             run(refreshing(tmp_path, named, context=32))
+    lean = tmp_path / "lean" / "encoder.safetensors"
+    save_encoder(lean, EventVAE(context=64, latent=32, target="occupancy"), {}, lean=True)
+    with pytest.raises(ConfigError, match=r"pretrain\.encoder: must have a decoder .*got .*lean"):
+        run(refreshing(tmp_path, str(lean)))
     assert not (tmp_path / "runs").exists()
 
 
