@@ -85,6 +85,8 @@ def find_entries(config: Config, folder: Run, pretrained: Path = PRETRAINED) -> 
 def find_pilots(key: str, name: str, config: Config, folder: Run, pretrained: Path = PRETRAINED) -> list[str]:
     """Paths and bounds that a name stands for, which a configuration has under `key`.
 
+    A group of shipped policies, such as bytestream, stands for all its trainings: bytestream-s0, -s1, ..
+
     Raises:
         ConfigError: If there is no such policy.
     """
@@ -101,10 +103,12 @@ def find_pilots(key: str, name: str, config: Config, folder: Run, pretrained: Pa
     if name in BOUNDS:
         return [name]
     path = named_policy(name) or named_policy(str(pretrained / name))
-    if path is None:
-        places = "a name in models/pretrained, a policy folder or a run folder"
+    trainings = (found.parent for found in pretrained.glob(f"*/{MANIFEST}"))
+    found = [str(path)] if path else [str(one) for one in trainings if one.name.rpartition("-s")[0] == name]
+    if not found:
+        places = "a name or a group in models/pretrained, a policy folder or a run folder"
         raise ConfigError(f"{key}: must be 'pretrained', 'newest', one of {BOUNDS}, {places}, got {name!r}")
-    return [str(path)]
+    return sorted(found)
 
 
 def read_entry(pilot: str) -> Entry:

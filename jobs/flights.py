@@ -85,6 +85,7 @@ def _fly_batch(
     observations = np.stack([observation for observation, _ in started])
     infos = [info for _, info in started]
     pilot.reset(envs, seeds)
+    totals = [np.zeros(4) for _ in envs]
     episodes = np.zeros(len(envs), EPISODE)
     episodes["seed"] = seeds
     flying = list(range(len(envs)))
@@ -93,26 +94,23 @@ def _fly_batch(
         for row in tuple(flying):
             observation, reward, terminated, truncated, info = envs[row].step(int(actions[row]))
             observations[row], infos[row] = observation, info
-            _count(episodes, row, reward, truncated, info)
+            totals[row] += reward, 1, info["num_events"], info["dropped_events"]
             watch(envs[row], seeds[row], observation, info)
             if terminated or truncated:
+                _note(episodes[row], totals[row], truncated, info)
                 advance(1)
                 flying.remove(row)
                 observations[row] = 0  # an empty window costs the pilot nothing
-    episodes["events_per_step"] /= episodes["steps"]
     return episodes
 
 
-def _count(episodes: np.ndarray, row: int, reward: float, truncated: bool, info: Mapping[str, Any]) -> None:
-    """Add one step to an episode; `events_per_step` holds the sum until the end."""
-    episode = episodes[row]
+def _note(episode: np.void, totals: np.ndarray, truncated: bool, info: Mapping[str, Any]) -> None:
+    """Write down an episode that ended; `totals` are its return, steps, events and dropped events."""
     for name in ("success", "collision", "distance_m", "x_m"):
         episode[name] = info[name]
     episode["truncated"] = truncated
-    episode["return"] += reward
-    episode["steps"] += 1
-    episode["events_per_step"] += info["num_events"]
-    episode["dropped"] += info["dropped_events"]
+    episode["return"], episode["steps"], events, episode["dropped"] = totals
+    episode["events_per_step"] = events / episode["steps"]
 
 
 def check_sensor(

@@ -156,7 +156,8 @@ class SweepConfig:
 
     Attributes:
         scene: Where they fly unless an axis changes it.
-        policies: Each "pretrained" (all of models/pretrained), a name there, "newest", a bound, or a path.
+        policies: Each a group or a name in models/pretrained, "pretrained" (all there), "newest", a bound, or
+            a path.
         axes: Name -> setting -> values. The first setting names the points of the axis; others
             have as many values, or one that stays.
         reference: The group that paired differences are taken against.
