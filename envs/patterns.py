@@ -275,12 +275,6 @@ def around_pole(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> 
     one = math.atan2(entry - seen[i, b.FORWARD], entry * hit[b.LEFT_END] - seen[i, b.RIGHT])
     entry, _ = b.depths(seen, i, view, hit[b.RIGHT_END])
     other = math.atan2(entry - seen[i, b.FORWARD], entry * hit[b.RIGHT_END] - seen[i, b.RIGHT])
-    return metres(view, seen, i, one, other)
-
-
-@kernel
-def metres(view: np.ndarray, seen: np.ndarray, i: int, one: float, other: float) -> tuple[float, float]:
-    """Surface coordinates s of two azimuths in the camera's frame, by the shorter way between them."""
     turn = other - one
     turn -= 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
     start = seen[i, b.X] + seen[i, b.TURN] * (one + math.atan2(view[SIN], view[COS]))
@@ -314,26 +308,41 @@ def meet(shape: tuple, fall: float, span: tuple) -> tuple[float, float]:
     return depth, over - fall * depth
 
 
-@kernel
-def _place(view, seen, i: int, u: float, fall: float, hit: np.ndarray) -> tuple[float, float]:
-    """Azimuth in the camera's frame and height [m] of where a ray meets a cone or an ellipsoid."""
-    depth, _ = meet(quadric(seen, i, view, u), fall, (hit[b.ENTRY], hit[b.EXIT]))
-    right, forward = depth * u - seen[i, b.RIGHT], depth - seen[i, b.FORWARD]
-    return math.atan2(forward, right), view[EYE_Z] - fall * depth
+@inlined
+def _place(seen, i: int, u: float, fall: float, shape: tuple, span: tuple) -> tuple[float, float, float]:
+    """Right and forward of a curved body's axis, and above its middle or apex, where a ray meets it [m]."""
+    depth, up = meet(shape, fall, span)
+    return depth * u - seen[i, b.RIGHT], depth - seen[i, b.FORWARD], up
+
+
+@inlined
+def _between(one: tuple, other: tuple) -> float:
+    """Azimuth from one place around the axis to another, by the shorter way; to 1e-10."""
+    sine, cosine = one[0] * other[1] - one[1] * other[0], one[0] * other[0] + one[1] * other[1]
+    if abs(sine) > 0.1 * cosine:
+        return math.atan2(sine, cosine)
+    x = sine / max(cosine, 1e-300)
+    return x * (1.0 - x * x * (1.0 / 3.0 - x * x * (0.2 - x * x / 7.0)))
 
 
 @kernel
-def curved_pattern(view, seen, i, hit, low, high, stacks) -> float:
-    """Contrast times the pattern's mean over rows low .. high of a cone's side or an ellipsoid."""
+def curved_pattern(view, seen, i, hit, shapes: tuple, rows: tuple, stacks) -> float:
+    """Contrast times the pattern's mean over some rows of a cone's side or an ellipsoid.
+
+    `shapes` are `quadric` at the left end of the strip, at its right end and in its middle.
+    """
+    low, high = rows
     fall = (0.5 * (low + high) - view[HORIZON]) / view[FOCAL]
     tall = 0.5 * (high - low) / view[FOCAL]
-    u = 0.5 * (hit[b.LEFT_END] + hit[b.RIGHT_END])
-    one, left_z = _place(view, seen, i, hit[b.LEFT_END], fall, hit)
-    other, right_z = _place(view, seen, i, hit[b.RIGHT_END], fall, hit)
-    left_s, right_s = metres(view, seen, i, one, other)
-    one, upper_z = _place(view, seen, i, u, fall - tall, hit)
-    other, lower_z = _place(view, seen, i, u, fall + tall, hit)
-    upper_s, lower_s = metres(view, seen, i, one, other)
-    s, q = 0.5 * (left_s + right_s), seen[i, b.Y] + 0.5 * (upper_z + lower_z)
-    axes = (right_s - left_s, right_z - left_z, lower_s - upper_s, lower_z - upper_z)
+    u, span = 0.5 * (hit[b.LEFT_END] + hit[b.RIGHT_END]), (hit[b.ENTRY], hit[b.EXIT])
+    left = _place(seen, i, hit[b.LEFT_END], fall, shapes[0], span)
+    right = _place(seen, i, hit[b.RIGHT_END], fall, shapes[1], span)
+    upper = _place(seen, i, u, fall - tall, shapes[2], span)
+    lower = _place(seen, i, u, fall + tall, shapes[2], span)
+    across, down = _between(left, right), _between(upper, lower)
+    turn = seen[i, b.TURN]
+    azimuth = math.atan2(left[1], left[0]) + math.atan2(view[SIN], view[COS]) + 0.5 * across
+    s = seen[i, b.X] + turn * azimuth
+    q = seen[i, b.Y] + view[EYE_Z] - shapes[2][4] + 0.5 * (upper[2] + lower[2])
+    axes = (turn * across, right[2] - left[2], turn * down, lower[2] - upper[2])
     return pattern(view, stacks, BODY, s, q, axes, int(LOOKUPS * view[SAMPLES]))
