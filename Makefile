@@ -8,6 +8,9 @@ SEEDS ?= 0 1 2
 STEPS ?= 500000
 POLICIES ?= bytestream bytestream_xy event_columns event_image_vae event_set event_image rgb
 
+COMMA := ,
+TRAINED = 'sweep.policies=[$(subst $() ,$(COMMA),$(strip $(POLICIES)) straight oracle)]'
+
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
@@ -56,9 +59,9 @@ train-all: setup ## every policy with three seeds into models/pretrained (hours;
 	done; done
 	$(LAUNCH) +exp=ship $(ARGS)
 
-# `train=true` trains them anew first, as train-all does.
+# `train=true` trains $(POLICIES) anew first, as train-all does, and flies these.
 sweep-robustness: $(if $(filter true,$(train)),train-all,setup) ## fly trained policies at other rates, thresholds, in other worlds, with faults
-	$(LAUNCH) +exp=robustness $(ARGS)
+	$(LAUNCH) +exp=robustness $(if $(filter true,$(train)),$(TRAINED)) $(ARGS)
 
 mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine only
 	@echo "Open http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=results"

@@ -8,7 +8,7 @@ ValueError) that names the key, the value and the rule; an unknown key does too.
 import dataclasses
 import hashlib
 import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
@@ -30,6 +30,7 @@ def _number_or_truth(value: Any) -> float | bool:
 
 Value = Annotated[float | bool, PlainValidator(_number_or_truth)]
 
+Observation = Literal["window", "event_image", "luminance", "events", "none"]
 WITHOUT_EVENTS = ("luminance", "none")  # observations for which no event camera is simulated
 
 
@@ -171,7 +172,7 @@ class EnvConfig:
     vehicle_radius_m: Annotated[float, Field(ge=0, le=10)] = 0.3
     camera_height_m: Annotated[float, Field(ge=0, le=1000)] = 2.0
     time_limit_s: Positive = 10.0
-    observation: Literal["window", "event_image", "luminance", "events", "none"] = "window"
+    observation: Observation = "window"
     window_capacity: Annotated[int, Field(ge=1, le=10_000_000)] = 4096
     split: Literal["train", "validation", "eval"] = "train"
     renderer: Literal["auto", "raycast", "pyrender"] = "auto"
@@ -190,7 +191,12 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
         return config
     lens = {name: getattr(config.camera, name) for name in ("width", "height", "fov_deg")}
     seen = dataclasses.replace(
-        config, window_capacity=EnvConfig.window_capacity, camera=CameraConfig(**lens), faults=FaultsConfig()
+        config,
+        observation=cast(Observation, observation),
+        window_capacity=EnvConfig.window_capacity,
+        camera=CameraConfig(**lens),
+        faults=FaultsConfig(),
+        fidelity=dataclasses.replace(config.fidelity, max_step_m=None),
     )
     if observation == "none":
         seen = dataclasses.replace(seen, camera=CameraConfig(), fidelity=FidelityConfig(), renderer="auto")

@@ -47,17 +47,18 @@ class Sensor:
             self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
             return
         self._set_renderer(scene)
-        self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
         self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
-        self.luminance = self._renderer.render_way(self._poses(place, place, np.ones(1), np.array([t_us])))[0]
+        self.luminance = self._picture(place, t_us)
         if not self._pictures_alone:
+            self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
             self._camera.reset(self.luminance, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
         """Render the flown part of a control step in equal parts; set the events and the last render.
 
         Parts are never shorter than the clock's microsecond. A vehicle stopped by contact
-        or goal stands still for the rest of the step and sees nothing new.
+        or goal stands still for the rest of the step and sees nothing new. Where no event camera is
+        simulated, the last part alone is rendered.
 
         Args:
             start: Where the step began, x and y [m].
@@ -73,7 +74,9 @@ class Sensor:
         start_us = self.t_us
         moving_us = round(outcome.flown * (end_us - start_us))
         if self._pictures_alone:
-            self._look(start, outcome.end, start_us + moving_us)
+            self.renders = int(moving_us > 0)
+            if self.renders:
+                self.luminance = self._picture(outcome.end, start_us + moving_us)
             self.t_us = end_us
             return
         way_m = outcome.flown * self._config.speed_mps / self._config.control_hz
@@ -93,14 +96,13 @@ class Sensor:
             events = apply_faults(events, *span_us, self.luminance, faults, self._pixels, self._rng)
         self.events = events
 
-    def _look(self, start: Point, end: Point, t_us: int) -> None:
-        """The picture at the end of the way; the last one stays if no time has passed."""
-        self.renders = int(t_us > self.t_us)
-        if self.renders:
-            picture = self._renderer.render_way(self._poses(start, end, np.ones(1), np.array([t_us])))[0]
-            if not (picture.min() >= 0.0 and picture.max() < np.inf):
-                raise ValueError("luminance must be finite and >= 0; the renderer gave something else.")
-            self.luminance = picture
+    def _picture(self, place: Point, t_us: int) -> np.ndarray:
+        """What is seen from a place (x, y) [m] at a time."""
+        poses = self._poses(place, place, np.ones(1), np.array([t_us]))
+        picture = self._renderer.render_way(poses)[0]
+        if not (picture.min() >= 0.0 and picture.max() < np.inf):
+            raise ValueError("luminance must be finite and >= 0; the renderer gave something else")
+        return picture
 
     def close(self) -> None:
         """Free the renderer."""

@@ -291,8 +291,10 @@ def _shade_rows(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges
     ambient = hit[WEIGHT] * seen[i, b.ALBEDO] * view[v.AMBIENT]
     diffuse = hit[WEIGHT] * seen[i, b.ALBEDO] * view[v.DIFFUSE]
     textured = view[v.BODY + v.CONTRAST] > 0.0
-    ends = p.quadric(seen, i, view, hit[LEFT_END]), p.quadric(seen, i, view, hit[RIGHT_END])
-    shapes = (*ends, p.quadric(seen, i, view, hit[SLOPE]))
+    left = right = middle = shape
+    if textured:
+        left, right = p.quadric(seen, i, view, hit[LEFT_END]), p.quadric(seen, i, view, hit[RIGHT_END])
+        middle = p.quadric(seen, i, view, hit[SLOPE])
     high, low = min(top[0], top[1]), max(bottom[0], bottom[1])
     per_row, whole, rest = 1.0 / view[FOCAL], max(top[0], top[1]), min(bottom[0], bottom[1])
     for row in range(int(high), math.ceil(low)):
@@ -307,7 +309,8 @@ def _shade_rows(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges
             cosine = _cut_row(view, seen, i, hit, edges, (start, end))
         light = ambient + diffuse * cosine
         if textured:
-            light *= 1.0 + p.curved_pattern(view, seen, i, hit, shapes, (start, max(start, end)), stacks)
+            rows = start, max(start, end)
+            light *= 1.0 + p.curved_pattern(view, seen, i, hit, (left, right, middle), rows, stacks)
         sheet[v.PAINT, row] += share * light
 
 

@@ -35,7 +35,7 @@ class Entry:
     training: int | None
     identity: str
     sensor: dict[str, Any]
-    observation: str = "window"
+    observation: str
 
 
 @dataclass(frozen=True)

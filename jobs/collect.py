@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.config import EnvConfig, sensor_settings, settings_hash
+from envs.config import WITHOUT_EVENTS, EnvConfig, Observation, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
 from envs.flight import NUM_ACTIONS
@@ -22,7 +22,7 @@ from envs.recordings import Recording, write_recording
 from jobs.accuracy import achieved
 from jobs.config import Config, ConfigError
 from jobs.flights import check_sensor
-from jobs.pilots import Observation, Pilot, make_pilot
+from jobs.pilots import Pilot, make_pilot
 from jobs.progress import progress
 from jobs.recorded import Recorded, no_flights, read_recorded, with_recorded
 from jobs.runs import Run, finish, finished, locate_run, named_policy, open_run
@@ -143,7 +143,8 @@ def record(
         actions, draws = (np.random.SeedSequence([seed, len(parts), stream]) for stream in (1, 2))
         pilot = make_pilot(str(flown_by), "stochastic") if flown_by else HoldingPilot(actions)
         flight_seeds = np.random.default_rng(draws)
-        env = CorridorEnv(config, observation=pilot.observation)
+        blind = pilot.observation in WITHOUT_EVENTS  # its flights are recorded with events all the same
+        env = CorridorEnv(config, observation="events" if blind else pilot.observation)
         started = env.reset(seed=seed, options={"episode": POLICY_EPISODES if flown_by else 0})
         flown = 0
         while flown < num_steps:
@@ -237,7 +238,8 @@ def steps_of(
     """
     observation, info = started
     for _ in range(most_steps):
-        action = int(pilot(observation[None], [info])[0])
+        shown = env.luminance if pilot.observation == "luminance" else observation
+        action = int(pilot(shown[None], [info])[0])
         observation, _, terminated, truncated, info = env.step(action)
         yield int(info["t_us"])
         if terminated or truncated:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,12 +104,14 @@ def find_pilots(key: str, name: str, config: Config, folder: Run, pretrained: Pa
     if name in BOUNDS:
         return [name]
     path = named_policy(name) or named_policy(str(pretrained / name))
-    trainings = (found.parent for found in pretrained.glob(f"*/{MANIFEST}"))
-    found = [str(path)] if path else [str(one) for one in trainings if one.name.rpartition("-s")[0] == name]
-    if not found:
+    if path is not None:
+        return [str(path)]
+    shipped = (file.parent for file in pretrained.glob(f"*/{MANIFEST}"))
+    trainings = [str(place) for place in shipped if re.fullmatch(re.escape(name) + r"-s\d+", place.name)]
+    if not trainings:
         places = "a name or a group in models/pretrained, a policy folder or a run folder"
         raise ConfigError(f"{key}: must be 'pretrained', 'newest', one of {BOUNDS}, {places}, got {name!r}")
-    return sorted(found)
+    return sorted(trainings)
 
 
 def read_entry(pilot: str) -> Entry:

@@ -30,6 +30,7 @@ from jobs.runs import Run, finish, finished, latest_policies, locate_run, open_r
 from jobs.tracking import Tracker, open_tracker
 from models.batch import batch_packed
 from models.evae import pictures, reconstruct
+from models.kinds import kind_of
 from models.policy import ENCODER, load_policy
 from models.weights import load_encoder
 
@@ -92,7 +93,8 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     announce(config, folder, path)
     tracker.tags({"policy": manifest["name"]})
     plan = tasks(config)
-    cells = {task: cell_of(task, config, path, settings_hash(dict(manifest))) for task in plan}
+    of_policy = settings_hash(dict(manifest)), kind_of(manifest).observation
+    cells = {task: cell_of(task, config, path, of_policy) for task in plan}
     flown = fly_tasks(cells, config, folder)
     tracks = [track for task in plan if shown(task, plan) for track in tracks_of(task, cells[task])]
     kept = episodes_folder(folder.evaluation)
@@ -114,14 +116,14 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     return finish(folder, "evaluate", marker)["figures"]
 
 
-def cell_of(task: Task, config: Config, path: Path, identity: str) -> Cell:
-    """A task as a cell of flights; `path` and `identity` are the policy's."""
+def cell_of(task: Task, config: Config, path: Path, of_policy: tuple[str, str]) -> Cell:
+    """A task as a cell of flights; `path` is the policy's, `of_policy` its identity and observation."""
     env_config = config.env_config(scene=task.scene, split="eval", renderer=task.renderer)
     if task.renderer == "pyrender":  # to see another picture, not to see it as exactly as the tolerance asks
         fidelity = dataclasses.replace(env_config.fidelity, samples=2)
         env_config = dataclasses.replace(env_config, fidelity=fidelity)
-    pilot, what = (str(path), identity) if task.of_policy else (task.pilot, task.pilot)
-    entry = Entry(pilot, task.pilot, None, what, {})
+    pilot, what, sees = (str(path), *of_policy) if task.of_policy else (task.pilot, task.pilot, "none")
+    entry = Entry(pilot, task.pilot, None, what, {}, sees)
     action = task.pilot.removeprefix("policy ")
     return make_cell((task.scene, task.renderer), entry, action, env_config, task.episodes)
 

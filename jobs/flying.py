@@ -143,7 +143,7 @@ def fly_cells(
     Args:
         config: Says where Ray runs.
         place: The folder of a run folder that keeps them.
-        every: The cells; of those that share a key one is flown.
+        every: The cells; of those that share a key the first is flown.
         title: What the progress is called.
         measuring: Whether the accuracy of each simulation is measured too.
 
@@ -154,7 +154,9 @@ def fly_cells(
         FlightsError: If none could be flown.
     """
     kept = episodes_folder(place)
-    unique = {cell.key: cell for cell in every}
+    unique: dict[str, Cell] = {}
+    for cell in every:
+        unique.setdefault(cell.key, cell)
     missing = [cell for cell in (unflown(cell, kept) for cell in unique.values()) if cell.seeds]
     failed: dict[str, str] = {}
     if missing:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jobs.report import markdown_table
+from jobs.report import events_texts, markdown_table
 from jobs.statistics import (
     Estimate,
     Interval,
@@ -36,7 +36,7 @@ class Row:
         middle_m: Interquartile mean of the distance [m].
         success_difference: To the reference group on the same corridors; None: there is none.
         distance_difference_m: The same of the distance [m].
-        events_per_step: Mean events of a control step [-].
+        events_per_step: Mean events of a control step [-]; 0 for a pilot that sees none.
         dropped: Events that did not fit into a window or a pixel, all flights [-].
     """
 
@@ -146,8 +146,7 @@ def details(rows: Sequence[Row], reference: str) -> str:
             estimate_text(row.middle_m),
             estimate_text(row.success_difference, 100, "+.0f"),
             estimate_text(row.distance_difference_m, 1, "+.1f"),
-            f"{row.events_per_step:.0f}",
-            str(row.dropped),
+            *events_texts(row.events_per_step, row.dropped),
         )
         for row in rows
     ]
@@ -203,9 +202,9 @@ def metrics(row: Row) -> dict[str, float]:
         **_named("sweep/middle_half_m", row.middle_m),
         **_named("sweep/success_difference", row.success_difference),
         **_named("sweep/distance_difference_m", row.distance_difference_m),
-        "sim/events_per_step": row.events_per_step,
-        "sim/dropped_events": float(row.dropped),
     }
+    if row.events_per_step > 0.0:
+        figures |= {"sim/events_per_step": row.events_per_step, "sim/dropped_events": float(row.dropped)}
     try:
         return {**figures, "sweep/value": float(row.condition[1])}  # the x axis of a chart over runs
     except ValueError:  # the value is a word

@@ -18,7 +18,7 @@ Decode = Callable[[np.ndarray], np.ndarray]
 
 
 class Film:
-    """An MP4 file of one flight: luminance, events and, with a decoder, what the latents hold.
+    """An MP4 file of one flight: luminance, events if any are made, with a decoder what the latents hold.
 
     A context manager; `step` takes what one control step has shown. Frames are
     `FRAMES_PER_FLOWN_S` per second of flight, played `FILM_FPS` per second.
@@ -30,7 +30,7 @@ class Film:
         Args:
             path: Where it is written, whole or not at all.
             control_hz: Control steps per second of flight [Hz].
-            decode: Event window -> picture in [-1, 1], float (H, W); None: two panels.
+            decode: Event window -> picture in [-1, 1], float (H, W), of a third panel; None: there is none.
         """
         self.path, self.decode = path, decode
         self.stride = max(1, round(control_hz / FRAMES_PER_FLOWN_S))

@@ -7,10 +7,11 @@ something between them.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
+from envs.config import Observation
 from envs.corridor import CorridorEnv
 from envs.flight import DIAGONAL, NUM_ACTIONS
 from envs.scene import Scene
@@ -18,7 +19,6 @@ from envs.scene import Scene
 if TYPE_CHECKING:
     from models.policy import Policy
 
-Observation = Literal["window", "event_image", "luminance", "events", "none"]
 BOUNDS = ("straight", "random", "oracle")
 # Of one step in x and y, in step lengths: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])

@@ -30,7 +30,7 @@ class Summary:
         success: Fraction that reached the goal line, with its Wilson interval.
         distance_m: Mean forward distance without collision [m], with its bootstrap interval
             (None for a single episode).
-        events_per_step: Mean events of a control step [-]; 0 for a pilot that looks at nothing.
+        events_per_step: Mean events of a control step [-]; 0 for a pilot that sees none.
         dropped: Events that did not fit into a window or a pixel, all episodes [-].
     """
 
@@ -69,9 +69,12 @@ def cells(row: Summary) -> tuple[str, ...]:
     near, far = row.distance_interval or (None, None)
     distance = f"{row.distance_m:.1f}" + ("" if near is None else f" [{near:.1f}, {far:.1f}]")
     success = f"{100 * row.success:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
-    # No events at all were not counted: nothing was rendered for a pilot that looks at nothing.
-    events = (f"{row.events_per_step:.0f}", str(row.dropped)) if row.events_per_step > 0 else ("-", "-")
-    return (*row.label, str(row.episodes), success, distance, *events)
+    return (*row.label, str(row.episodes), success, distance, *events_texts(row.events_per_step, row.dropped))
+
+
+def events_texts(events_per_step: float, dropped: int) -> tuple[str, str]:
+    """Both as text; no events at all were not counted but not made, for a pilot that sees none."""
+    return (f"{events_per_step:.0f}", str(dropped)) if events_per_step > 0 else ("-", "-")
 
 
 def headings(names: Sequence[str]) -> tuple[str, ...]:

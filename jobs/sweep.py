@@ -1,7 +1,7 @@
 """Fly policies of several trainings through every condition, and say what each group bears (appendix D.3).
 
 Run: python -m platform.launch +exp=robustness
-Expect: about half a second of one core for each flight (7 for each policy and condition); in the
+Expect: about half a second of one core for each flight (7 for each training and condition); in the
 run folder under `sweep/` a figure per axis, tables with intervals and every episode. All fly the
 same corridors. A stopped sweep continues when the same command is given again: what was flown is
 read back, never flown twice; what failed is tried again (`jobs.flying`).

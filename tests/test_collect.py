@@ -121,6 +121,13 @@ def test_a_policy_draws_its_actions_and_the_same_seed_gives_the_same_bytes(polic
     assert one.events.tobytes() == again.events.tobytes() != other.events.tobytes()
 
 
+def test_flights_of_a_policy_that_sees_pictures_are_recorded_with_their_events(tmp_path):
+    rgb = save_untrained(tmp_path, name="rgb")
+    flown = record([(EnvConfig(), 40)], 0, lambda count: None, rgb, 1.0)
+    steps = np.unique(np.searchsorted(flown.index["step_t_us"], flown.t_us))
+    assert len(steps) > 30, "there are events in nearly every step"
+
+
 def collecting(tmp_path, policy):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.collect, policy=str(policy), num_steps=60, num_validation_steps=30)

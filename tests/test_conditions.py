@@ -182,7 +182,7 @@ def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
 
 def test_a_group_of_the_pretrained_folder_is_all_its_trainings_and_no_other_group(tmp_path):
     config = sweep_config(tmp_path, policies=["a", "straight"])
-    for place, group, seed in (("a-s1", "a", 1), ("a_b-s0", "a_b", 0), ("a-s0", "a", 0)):
+    for place, group, seed in (("a-s1", "a", 1), ("a-set-s0", "a-set", 0), ("a-s0", "a", 0)):
         save_training(tmp_path / "pretrained" / place, group, seed, config.env_config())
     entries = find_entries(config, open_run(config), tmp_path / "pretrained")
     assert [(entry.group, entry.training) for entry in entries] == [("a", 0), ("a", 1), ("straight", None)]

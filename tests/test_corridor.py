@@ -316,12 +316,17 @@ def test_a_picture_is_that_of_the_event_camera_without_simulating_one(scene, see
     assert {**before, "num_events": 0} == info
 
 
-def test_a_picture_that_is_no_luminance_is_refused(monkeypatch):
-    env = CorridorEnv(**EMPTY, observation="luminance")
+@pytest.mark.parametrize("observation", ["luminance", "window"])
+def test_a_picture_that_is_no_luminance_is_refused(monkeypatch, observation):
+    env = CorridorEnv(**EMPTY, observation=observation, fidelity=FidelityConfig(max_step_m=10.0))
     env.reset(seed=0)
-    monkeypatch.setattr(env._sensor._renderer, "render_way", lambda poses: np.full((1, 16, 16), np.nan))
+    monkeypatch.setattr(
+        env._sensor._renderer, "render_way", lambda poses: np.full((1, 16, 16), np.nan, np.float32)
+    )
     with pytest.raises(ValueError, match=r"step 1.*luminance must be finite"):
         env.step(0)
+    with pytest.raises(ValueError, match="luminance must be finite"):
+        env.reset()
 
 
 @pytest.mark.parametrize(

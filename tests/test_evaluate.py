@@ -264,7 +264,7 @@ def test_a_policy_flies_as_its_own_networks_say(policy):
 
 
 def cells_for(config, path, identity="p"):
-    return {task: cell_of(task, config, path, identity) for task in tasks(config)}
+    return {task: cell_of(task, config, path, (identity, "window")) for task in tasks(config)}
 
 
 def test_more_episodes_fly_only_the_new_corridors_and_another_policy_flies_all_but_the_bounds(tmp_path, stub):

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies
 
-from envs.config import CameraConfig, EnvConfig
+from envs.config import CameraConfig, EnvConfig, Observation
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
 from envs.windows import event_image, pack_window
-from jobs.pilots import Observation
 from models.features import FEATURES, feature_of, grey_picture, push_features
 from models.kinds import FINETUNED, KINDS
 from models.networks import NETWORKS, build_networks
