@@ -300,7 +300,7 @@ def track_rows(
     save_views(tracker, list(dict.fromkeys(name for curves in along.values() for name in curves)))
     errors = [found["sim/event_error"] for cell in sweep.cells if (found := accuracy(place, cell))]
     worst = {"sim/event_error": errors[0], "sim/event_error_max": max(errors)} if errors else {}
-    flights = sum(row.flights for row in rows)
+    flights = sum({cell.key: len(cell.seeds) for cell in sweep.cells if cell.key in kept}.values())
     figures = {
         "conditions": len(sweep.conditions),
         "groups": len(sweep.groups),

@@ -78,6 +78,7 @@ def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_reru
     assert child.data.metrics["sweep/success_difference"] == 0.0
     assert [point.value for point in client.get_metric_history(parent, "sweep/conditions")] == [5.0]
     assert client.get_run(parent).data.metrics["sim/event_error_max"] == 0.01
+    assert client.get_run(parent).data.metrics["sweep/flights"] == 8  # of each bound two rates
     (groups,) = tracked_sweeps(config, "group")[1].values()
     assert set(groups) == {"straight", "oracle"}
     curve = client.get_metric_history(groups["oracle"].info.run_id, "sweep/sparsity_percent_distance_m")
