@@ -90,8 +90,9 @@ def test_an_encoder_that_learns_on_goes_through_every_stage_and_the_sweep(tmp_pa
         if not name.startswith("decoder."):
             moved = not np.array_equal(learnt[f"trunk.{name}"], value)
             assert moved is not ("running" in name or "num_batches" in name), name
-    printed = launch(tmp_path, "+exp=robustness", "sweep.trials=1", "sweep.axes={faults.sparsity: [0.5]}")
-    assert "sparsity" in printed
+    axes = "~sweep.axes.renderer", "+sweep.axes.sparsity={faults.sparsity: [0.5]}"
+    flown = "sweep=renderer", "sweep.policies=[newest]", "sweep.trials=1", *axes
+    assert re.search(r"sparsity\s+│ 0\.5", launch(tmp_path, "+exp=robustness", *flown))
 
 
 def stored_run(folder: Path):

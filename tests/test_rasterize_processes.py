@@ -111,6 +111,7 @@ def test_workers_of_ray_draw_the_same_bytes_at_the_same_time(expected, tmp_path)
             renderers = [PyrenderRenderer(scene, 64, 64) for _ in range(2)]
             return [renderer.render(*POSE).tobytes() for _ in range(times) for renderer in renderers]
 
+    ray.shutdown()  # one that an earlier test has left may have too few cores, and be waited for forever
     start_ray(ClusterConfig(name="local", address=None, num_cpus=3, storage=None), tmp_path)
     try:
         workers = [ray.remote(num_cpus=1)(Worker).remote() for _ in range(3)]
