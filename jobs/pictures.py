@@ -95,7 +95,8 @@ def coloured(picture: np.ndarray) -> np.ndarray:
 def frame(panels: Sequence[tuple[str, np.ndarray]], caption: str) -> np.ndarray:
     """Panels uint8 (H, W, 3) side by side under their names, above a caption; uint8 with even sizes."""
     height, width = panels[0][1].shape[:2]
-    size = (len(panels) * (width * ZOOM + GAP) + GAP, height * ZOOM + 2 * BAR)
+    # The caption needs the room of two.
+    size = (max(2, len(panels)) * (width * ZOOM + GAP) + GAP, height * ZOOM + 2 * BAR)
     picture = Image.new("RGB", size, INK)
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(17)
