@@ -17,11 +17,12 @@ from PIL import Image
 
 from envs.config import CameraConfig
 from envs.events import EventCamera
-from envs.layouts import draw_obstacles
 from envs.observations import picture
 from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer
-from envs.scene import LAYOUTS, Scene, make_scene
+from envs.scene import Scene, make_scene
+from envs.scene.layouts import draw_obstacles
+from envs.scene.scene import LAYOUTS
 
 IMAGES = Path(__file__).resolve().parent / "images"
 SIZE, GAP, COLOURS = 256, 4, 64

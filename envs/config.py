@@ -47,7 +47,7 @@ class CameraConfig:
         memory: "reference": each pixel remembers the level of its last event, as a real
             sensor does. "frame": the paper's difference of two frames (equations 5-8),
             which forgets what stayed below the threshold. "legacy": the paper's published
-            code, see `envs.events`.
+            code, see `envs.events.camera`.
         luminance_floor: Added to luminance before the logarithm, so that black is defined;
             with response "lin_log" the luminance below which a pixel responds linearly.
         max_events_per_pixel: Most events of one pixel between two renders, the earliest.
@@ -132,7 +132,7 @@ class FidelityConfig:
 
     Attributes:
         tolerance: Accepted share of events that differ from the converged ones in pixel,
-            polarity or by more than 5 % of a control step in time, see `envs.accuracy`.
+            polarity or by more than 5 % of a control step in time, see `envs.event_error`.
         max_step_m: Longest way flown between two renders [m]; None: chosen.
         samples: Anti-aliasing of the renderer; None: chosen.
         cull_m: Obstacles farther than this are not drawn [m]; None: chosen.
@@ -149,7 +149,7 @@ class EnvConfig:
     """A corridor flight: the world, the vehicle, the sensor and the observation.
 
     Attributes:
-        scene: Name of a layout in `envs.layouts`, or the path of a mesh file.
+        scene: Name of a layout in `envs.scene.layouts`, or the path of a mesh file.
         layout: Numbers and truth values that replace the layout's own, such as
             {"num_obstacles": 60, "passable": False}; keys are the layout's fields.
         control_hz: Actions (and event windows) per second [Hz].
@@ -158,7 +158,7 @@ class EnvConfig:
         camera_height_m: Height of the camera above the ground [m].
         time_limit_s: Flight time after which the episode is truncated [s].
         observation: "window", "event_image", "events"; "luminance": one picture a step, and no
-            event camera; or "none": nothing is rendered, for a pilot that looks at nothing.
+            event camera; or "none": nothing is rendered, for an agent that looks at nothing.
         window_capacity: Most events that one window holds; the oldest beyond it are
             dropped and counted.
         split: Which corridors: those of one split never occur in another, whatever the seed.
@@ -184,7 +184,7 @@ class EnvConfig:
 def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
     """The settings that a flight with an observation depends on: the others have their default values.
 
-    Two simulations with equal ones give the same flights, step by step, to a pilot that sees "luminance"
+    Two simulations with equal ones give the same flights, step by step, to an agent that sees "luminance"
     (whatever the event camera is) or "none" (whatever any camera is); to others each setting may matter.
     """
     if observation not in WITHOUT_EVENTS:

@@ -20,7 +20,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envs import flight
+from envs import kinematics as flight
 from envs.config import EnvConfig
 from envs.observations import observation_space, observe, picture
 from envs.scene import make_scene
@@ -210,7 +210,7 @@ class CorridorVectorEnv(VectorEnv):
         """Reset all environments.
 
         Args:
-            seed: One per environment, or one number, see `envs.flight.spread_seeds`.
+            seed: One per environment, or one number, see `envs.kinematics.spread_seeds`.
             options: As for `CorridorEnv.reset`, for all.
 
         Raises:

@@ -1,6 +1,6 @@
 """What a scene requires: which renderer, how many renders, how much anti-aliasing, from one tolerance.
 
-The tolerance is the accepted event error of `envs.accuracy`. The rules below are fitted to
+The tolerance is the accepted event error of `envs.event_error`. The rules below are fitted to
 that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
 (`python -m jobs.bench.fidelity`), with the constants rounded to the safe side.
 """
@@ -12,7 +12,8 @@ from typing import Any
 
 from envs.config import EnvConfig
 from envs.raycast import RaycastRenderer
-from envs.scene import CONE, ELLIPSOID, Scene
+from envs.scene import Scene
+from envs.scene.scene import CONE, ELLIPSOID
 
 RENDERERS = ("auto", "raycast", "pyrender")
 
@@ -88,7 +89,7 @@ def make_renderer(chosen: Plan, scene: Scene, width: int, height: int, fov_deg: 
     """The renderer of a plan. Raises RuntimeError if it is pyrender and OpenGL cannot run."""
     make: Any = RaycastRenderer
     if chosen.renderer == "pyrender":  # imported only where it is needed: it loads OpenGL
-        make = importlib.import_module("envs.rasterize").PyrenderRenderer
+        make = importlib.import_module("envs.rasterize.renderer").PyrenderRenderer
     return make(scene, width, height, fov_deg, samples=chosen.samples, cull_m=chosen.cull_m)
 
 

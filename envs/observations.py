@@ -4,8 +4,8 @@ import numpy as np
 from gymnasium import spaces
 
 from envs.config import EnvConfig
-from envs.events import EVENT
-from envs.windows import OFF, ON, event_image, pack_window
+from envs.events import EVENT, event_image, pack_window
+from envs.events.windows import OFF, ON
 
 ZOOM = 4
 
@@ -14,7 +14,7 @@ def observation_space(config: EnvConfig) -> spaces.Space:
     """The space of what `config.observation` names.
 
     Returns:
-        "window": int32 (capacity + 1, 4), see `envs.windows.pack_window`; "event_image":
+        "window": int32 (capacity + 1, 4), see `envs.events.pack_window`; "event_image":
         uint8 (H, W); "luminance": float32 (H, W); "events": rows [t [us], x, y, p], int64;
         "none": uint8 (0,).
     """

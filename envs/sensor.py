@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 
 from envs.config import EnvConfig, FaultsConfig
-from envs.events import EVENT, EventCamera
-from envs.faults import apply_faults, draw_pixel_faults
+from envs.events import EVENT, EventCamera, apply_faults, draw_pixel_faults
 from envs.fidelity import Plan, make_renderer, plan, sub_renders
-from envs.flight import Outcome, Point
+from envs.kinematics import Outcome, Point
 from envs.scene import Scene
 
 FAULTLESS = FaultsConfig()

@@ -10,14 +10,14 @@ was when the same command is given again.
 
 from typing import Any
 
-from jobs.config import Config
-from jobs.evaluate import evaluate
-from jobs.pretrain import check_sources, prepare_encoder
-from jobs.progress import console
-from jobs.registry import register_training
-from jobs.runs import open_run
-from jobs.tracking import open_tracker
-from jobs.train import train
+from jobs.config.config import Config
+from jobs.evaluation.evaluate import evaluate
+from jobs.run.folder import open_run
+from jobs.run.progress import console
+from jobs.tracking.model_registry import register_training
+from jobs.tracking.tracker import open_tracker
+from jobs.training.pretrain import check_sources, prepare_encoder
+from jobs.training.train import train
 
 
 def run(config: Config) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 
     observation --feature, once per step--> stack of the last ones --network--> logits and value
 
-The words of a row name the entries of other tables: `envs.observations`, `models.features.FEATURES`
-and `models.networks.NETWORKS`. Imports no package, so that a configuration is checked in no time.
+The words of a row name the entries of other tables: `envs.observations`, `models.policy.features.FEATURES`
+and `models.policy.networks.NETWORKS`. Imports no package, so that a configuration is checked in no time.
 """
 
 from collections.abc import Mapping
@@ -27,21 +27,21 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "brp_full": Kind("window", "latent", "mlp", encoder=True),
-    "brp_xy": Kind("window", "latent", "mlp", encoder=True),
+    "bytestream": Kind("window", "latent", "mlp", encoder=True),
+    "bytestream_xy": Kind("window", "latent", "mlp", encoder=True),
     "event_columns": Kind("window", "columns", "mlp", encoder=False),
     "event_set": Kind("window", "events", "set", encoder=False),
-    "eip": Kind("event_image", "event_image", "cnn", encoder=False),
-    "eivae": Kind("window", "latent", "mlp", encoder=True),
+    "event_image": Kind("event_image", "event_image", "cnn", encoder=False),
+    "event_image_vae": Kind("window", "latent", "mlp", encoder=True),
     "rgb": Kind("luminance", "grey", "cnn", encoder=False),
 }
 # With `encoder: finetuned` the events are kept, and the encoder learns on as part of the network.
 FINETUNED = {
     name: KINDS[name]._replace(feature="event_rows", network="finetuned", encoder=False)
-    for name in ("brp_full", "brp_xy")
+    for name in ("bytestream", "bytestream_xy")
 }
-MOST_TIME_BINS = 1 << 15  # of an encoder that learns on: events are kept as rows of int16
-SMALLEST_IMAGE = 36  # pixels, of the picture that leaves the third convolution of "cnn" one pixel
+MAX_TIME_BINS = 1 << 15  # of an encoder that learns on: events are kept as rows of int16
+MIN_IMAGE = 36  # pixels, of the picture that leaves the third convolution of "cnn" one pixel
 
 
 def kind_of(settings: Mapping[str, Any]) -> Kind:

@@ -23,17 +23,17 @@ CONF = ROOT / "conf"
 
 JOBS = {
     "pipeline": "jobs.pipeline",
-    "collect": "jobs.collect",
-    "pretrain": "jobs.pretrain",
-    "train": "jobs.train",
-    "evaluate": "jobs.evaluate",
-    "sweep": "jobs.sweep",
-    "ship": "jobs.ship",
-    "report": "jobs.results",
-    "trade": "jobs.trade",
-    "trade_simulator": "jobs.trade_simulator",
-    "trade_encoder": "jobs.trade_encoder",
-    "probe": "jobs.probe",
+    "collect": "jobs.training.collect",
+    "pretrain": "jobs.training.pretrain",
+    "train": "jobs.training.train",
+    "evaluate": "jobs.evaluation.evaluate",
+    "sweep": "jobs.evaluation.sweep",
+    "ship": "jobs.reporting.publish",
+    "report": "jobs.reporting.report",
+    "trade": "jobs.studies.trade.trade",
+    "trade_simulator": "jobs.studies.simulator",
+    "trade_encoder": "jobs.studies.encoder.trade",
+    "probe": "jobs.studies.probe.probe",
 }
 
 # Two threads beside other busy processes ran ten times slower than one.
@@ -85,8 +85,8 @@ def compose(words: list[str]) -> dict[str, Any] | None:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from jobs.config import ConfigError
-    from jobs.refusals import redacted
+    from jobs.config.config import ConfigError
+    from jobs.config.errors import redacted
 
     reasons = refused_words(words)
     if reasons:
@@ -127,8 +127,8 @@ def refused_words(words: list[str]) -> list[str]:
 
 def explain(error: Exception, words: list[str]) -> str:
     """What Hydra says against a command line, in one line with the nearest key or the choices."""
-    from jobs.config import known_keys
-    from jobs.refusals import nearest
+    from jobs.config.config import known_keys
+    from jobs.config.errors import nearest
 
     text = str(error)
     unknown = re.match(r"Could not override '([^']+)'\.\nTo append to your config use \+(.*)", text)
@@ -154,8 +154,8 @@ def run(values: dict[str, Any]) -> None:
     Raises:
         ConfigError: If a value is refused; nothing has been started or written by then.
     """
-    from jobs.config import ConfigError, parse
-    from jobs.refusals import redacted
+    from jobs.config.config import ConfigError, parse
+    from jobs.config.errors import redacted
 
     reasons = dict.fromkeys(refused_values(values))
     if reasons:
@@ -188,7 +188,7 @@ def report(error: Exception) -> int:
     failure, and so is a full disk: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback
     of those too. No password of an address is shown.
     """
-    from jobs.refusals import redacted
+    from jobs.config.errors import redacted
 
     ours = raised_here(error)
     refused = isinstance(error, ValueError) and ours

@@ -20,9 +20,9 @@ if not hasattr(platform, "__path__"):
 
 @pytest.fixture
 def stub(monkeypatch):
-    """Cells are flown by `tests.stub_tuner.StubTuner`, whose lists say what was flown."""
-    from jobs import flying
-    from tests.stub_tuner import StubTuner
+    """Cells are flown by `tests.support.stub_tuner.StubTuner`, whose lists say what was flown."""
+    from jobs.rollout import scheduler as flying
+    from tests.support.stub_tuner import StubTuner
 
     StubTuner.flown, StubTuner.measured, StubTuner.broken, StubTuner.dying = [], [], {}, set()
     monkeypatch.setattr(flying, "_tuner", StubTuner)

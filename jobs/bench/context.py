@@ -15,8 +15,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from models.batch import EventBatch
-from models.evae import EventVAE, event_targets, train_step
+from models.encoder.evae import EventVAE, event_targets, train_step
+from models.encoder.event_batch import EventBatch
 
 
 def random_batch(evae: EventVAE, windows: int, events: int, rng: np.random.Generator) -> EventBatch:
@@ -31,7 +31,7 @@ def compare(variant: str, windows: int = 50, events: int = 2000, repeats: int = 
     """CPU seconds of one update, both forms, at the appendix's batch (B.2: 50 x 2000) and one thread.
 
     Args:
-        variant: "brp_full" or "brp_xy".
+        variant: "bytestream" or "bytestream_xy".
         windows: Windows per batch.
         events: Events per window.
         repeats: Timed updates of the plain form; the fused form gets five times as many.
@@ -74,5 +74,5 @@ def seconds(call: Callable[[], None]) -> float:
 
 if __name__ == "__main__":
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 3
-    figures = {variant: compare(variant, repeats=repeats) for variant in ("brp_full", "brp_xy")}
+    figures = {variant: compare(variant, repeats=repeats) for variant in ("bytestream", "bytestream_xy")}
     sys.stdout.write(json.dumps(figures, indent=2) + "\n")

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 
 from envs.events import EVENT
-from jobs.encoder_costs import encode_by_network
-from jobs.pretrain import Window
-from models.embedding import CODINGS
-from models.evae import EventVAE
-from models.table import EncoderTable
+from jobs.studies.encoder.costs import encode_by_network
+from jobs.training.pretrain import Window
+from models.encoder.embedding import CODINGS
+from models.encoder.evae import EventVAE
+from models.encoder.table import EncoderTable
 
 FEW, MANY, WINDOW_US = 300, 2000, 20_000
 CALLS = 20  # of what is short, in each round

@@ -12,7 +12,7 @@ luminance (4) and the quiet band (8), per event what it changes and leaves (37: 
 the pixel's level 16 and band 8). "published": how many times longer the paper's design takes
 than one call per frame, and than all in one; typed anew: a loop over all pixels with two
 logarithms each, and a structured sort by field name. It makes fewer events, see memory
-"legacy" in `envs.events`.
+"legacy" in `envs.events.camera`.
 """
 
 import time
@@ -23,7 +23,7 @@ import numpy as np
 from rich.table import Table
 
 from envs.events import EventCamera
-from jobs.progress import console
+from jobs.run.progress import console
 
 SIZES = ((64, 64), (346, 260), (640, 480), (1280, 720))
 SPEEDS = (("sparse", 0.1), ("dense", 1.0))  # pixels per frame

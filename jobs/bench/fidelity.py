@@ -12,9 +12,9 @@ import sys
 
 from rich.table import Table
 
-from envs.accuracy import REFERENCE_SAMPLES, measure
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
-from jobs.progress import console
+from envs.event_error import REFERENCE_SAMPLES, measure
+from jobs.run.progress import console
 
 RATES_HZ = (45.0, 100.0, 200.0, 400.0)
 THRESHOLDS = (0.05, 0.2, 0.5)

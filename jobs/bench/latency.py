@@ -21,15 +21,15 @@ from rich.table import Table
 from envs.config import EnvConfig, sensor_settings
 from envs.events import EVENT
 from jobs.bench.throughput import composed
-from jobs.ppo import network_settings
-from jobs.pretrain import build_evae
-from jobs.progress import console
-from models.export import export_onnx
-from models.features import FEATURES
-from models.frozen import encoder_of
+from jobs.run.progress import console
+from jobs.training.ppo import network_settings
+from jobs.training.pretrain import build_evae
+from models.encoder.frozen import encoder_of
 from models.kinds import KINDS
-from models.networks import build_networks
 from models.policy import Policy
+from models.policy.features import FEATURES
+from models.policy.networks import build_networks
+from models.policy.onnx import export_onnx
 
 SIZES = (0, 100, 300, 1000, 4000)  # events
 CALLS, WARM = 400, 20

@@ -2,7 +2,7 @@
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo
 Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
-`jobs.learner`, "stable-baselines3" its PPO with the same networks, encoder, corridors and
+`jobs.training.ppo_learner`, "stable-baselines3" its PPO with the same networks, encoder, corridors and
 settings. All take turns in one process; an iteration flies 2,048 steps in 16 corridors and
 learns 10 epochs. Seconds are wall time, medians over the rounds: `ppo_fast` flies in processes
 of its own, so the machine should be quiet. The second table is ours for every kind of policy.
@@ -27,16 +27,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.bench.throughput import composed
-from jobs.cluster import start_ray
-from jobs.config import Config
-from jobs.ppo import build_ppo
-from jobs.progress import console
-from jobs.settings import EVAE_SETTINGS
-from models.evae import EventVAE
-from models.features import push_features
+from jobs.config.config import Config
+from jobs.config.schema import EVAE_SETTINGS
+from jobs.run.progress import console
+from jobs.run.ray_cluster import start_ray
+from jobs.training.ppo import build_ppo
+from models.encoder.evae import EventVAE
+from models.encoder.table import EncoderTable
+from models.encoder.weights import save_encoder
 from models.kinds import KINDS
-from models.table import EncoderTable
-from models.weights import save_encoder
+from models.policy.features import push_features
 
 ROUNDS, FEW_ROUNDS = 5, 2
 MINIBATCHES = (32, 256)
@@ -109,7 +109,9 @@ def main() -> None:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         show("bytestream", seconds_of(against_others(Path(folder)), ROUNDS), "stable-baselines3, 32")
-        show("every policy, minibatches of 32", seconds_of(every_kind(Path(folder)), FEW_ROUNDS), "brp_full")
+        show(
+            "every policy, minibatches of 32", seconds_of(every_kind(Path(folder)), FEW_ROUNDS), "bytestream"
+        )
 
 
 def show(title: str, seconds: dict[str, float], unit: str) -> None:
@@ -158,7 +160,7 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
     """One iteration of our learner for each kind of policy."""
     work: dict[str, Callable[[], object]] = {}
     rows = {name: [f"model={name}"] for name in KINDS}
-    rows["brp_full, fine-tuned"] = ["model=brp_full", "model.encoder=finetuned"]
+    rows["bytestream, fine-tuned"] = ["model=bytestream", "model.encoder=finetuned"]
     for name, words in rows.items():
         config = composed(*words, CONSTANT)
         model = config.model

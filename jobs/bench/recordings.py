@@ -19,7 +19,7 @@ from rich.table import Table
 from envs.corridor import CorridorEnv
 from envs.recordings import WRITERS, downscale_events, read_events, write_events
 from jobs.bench.throughput import interleaved
-from jobs.progress import console
+from jobs.run.progress import console
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 SAMPLE = DATA / "expelliarmus_evt" / "evt3_sample.raw"

@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from envs.obstacles import BOX, CONE, ELLIPSOID, KINDS, OBSTACLE, POLE
 from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer, sample_luminance
-from envs.scene import Scene
-from envs.textures import Texture
-from jobs.progress import console
+from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture
+from envs.scene.obstacles import KINDS
+from jobs.run.progress import console
 
 ROUNDS = 9
 WAYS = np.linspace(0.0, 90.0, 30)

@@ -28,14 +28,14 @@ from rich.table import Table
 
 from envs.config import EnvConfig
 from jobs.bench.throughput import composed
-from jobs.cluster import ONE_THREAD, QUIET
-from jobs.conditions import PRETRAINED
-from jobs.config import HELD_OUT_SCENE
-from jobs.flights import fly
-from jobs.flying import loaded
-from jobs.ppo import build_ppo
-from jobs.progress import console
-from jobs.runner import PlainEnvRunner
+from jobs.config.config import HELD_OUT_SCENE
+from jobs.evaluation.sweep_plan import PRETRAINED
+from jobs.rollout.episodes import fly
+from jobs.rollout.scheduler import loaded
+from jobs.run.progress import console
+from jobs.run.ray_cluster import ONE_THREAD, QUIET
+from jobs.training.env_runner import PlainEnvRunner
+from jobs.training.ppo import build_ppo
 
 STEPS = 2048  # of an iteration (appendix D.1.2)
 ROUNDS = 3
@@ -217,9 +217,9 @@ def do_nothing(params: dict[str, Any]) -> None:
 def fly_condition(params: dict[str, Any]) -> None:
     """A trial that flies what a policy flies under the default condition."""
     first = CELL_FLIGHTS * params["trial"]
-    pilot = loaded(str(PRETRAINED / POLICY), "stochastic")
+    agent = loaded(str(PRETRAINED / POLICY), "stochastic")
     fly(
-        pilot, EnvConfig(scene=HELD_OUT_SCENE, split="eval"), range(first, first + CELL_FLIGHTS), CELL_FLIGHTS
+        agent, EnvConfig(scene=HELD_OUT_SCENE, split="eval"), range(first, first + CELL_FLIGHTS), CELL_FLIGHTS
     )
     tune.report({"key": params["trial"]})
 

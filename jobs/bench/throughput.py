@@ -24,12 +24,12 @@ from envs.events import EventCamera
 from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
-from jobs.config import Config, parse
-from jobs.progress import console
-from jobs.settings import EVAE_SETTINGS
-from models.evae import EventVAE
-from models.table import EncoderTable
-from models.weights import save_encoder
+from jobs.config.config import Config, parse
+from jobs.config.schema import EVAE_SETTINGS
+from jobs.run.progress import console
+from models.encoder.evae import EventVAE
+from models.encoder.table import EncoderTable
+from models.encoder.weights import save_encoder
 
 ROUNDS = 5
 NUM_ENVS = 16
@@ -126,9 +126,9 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
 
 def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
     """Seconds per environment step of sampling, and of whole PPO iterations."""
-    from jobs.cluster import start_ray
-    from jobs.ppo import build_ppo
-    from jobs.runner import PlainEnvRunner
+    from jobs.run.ray_cluster import start_ray
+    from jobs.training.env_runner import PlainEnvRunner
+    from jobs.training.ppo import build_ppo
 
     sensor = sensor_settings(CONFIG)
     path = folder / "encoder.safetensors"

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from jobs.tracking import open_store
-from tests.test_conditions import sweep_config
+from jobs.tracking.tracker import open_store
+from tests.jobs.evaluation.test_sweep_plan import sweep_config
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
 WRITERS = 8
@@ -77,8 +77,9 @@ def report(folder, uri, seed):
     """A sweep whose flights are made up, and everything else is not."""
     # Here, in a process of its own: Ray reads its token once, when it is imported, and another
     # test of this run names one later.
-    from jobs import flying, sweep
-    from tests.stub_tuner import StubTuner
+    from jobs.evaluation import sweep
+    from jobs.rollout import scheduler as flying
+    from tests.support.stub_tuner import StubTuner
 
     flying._tuner, flying.start_ray = StubTuner, lambda *given: None
     sweep.run(in_store(folder, uri, seed))

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tests.faults.harness import SWEEP, launch
 from tests.faults.test_fault_node import SMALL, cluster, on  # noqa: F401
+from tests.support.faults import SWEEP, launch
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
 AXIS = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}"

@@ -2,7 +2,7 @@ import subprocess
 
 import pytest
 
-from tests.faults.harness import TABLE
+from tests.support.faults import TABLE
 
 
 def pytest_collection_modifyitems(items):

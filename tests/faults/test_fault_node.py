@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from tests.faults.harness import SWEEP, TRAIN, launch, outcome
 from tests.faults.test_fault_training import FINE, check_complete
+from tests.support.faults import SWEEP, TRAIN, launch, outcome
 
 pytestmark = pytest.mark.faults
 TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
@@ -51,7 +51,7 @@ def test_a_sweep_that_loses_a_machine_flies_every_cell_once(tmp_path, cluster):
         "whole = flown\ndef flown(cell, measured):\n    time.sleep(2.0)\n    return whole(cell, measured)\n"
     )
     # Workers of a cluster are no children of the launcher: their machine hands them its environment.
-    job = launch(tmp_path, *words, *on(cluster), after={"jobs.flying": slow})
+    job = launch(tmp_path, *words, *on(cluster), after={"jobs.rollout.scheduler": slow})
     job.wait(lambda: len(job.kept()) >= 1)
     cluster.remove_node(nodes[0], allow_graceful=False)
     assert job.end() == 0, job.said

@@ -9,8 +9,8 @@ import urllib.request
 
 import pytest
 
-from jobs.tracking import open_store
-from tests.faults.harness import DEADLINE_S, TRAIN, launch, outcome, start
+from jobs.tracking.tracker import open_store
+from tests.support.faults import DEADLINE_S, TRAIN, launch, outcome, start
 
 pytestmark = pytest.mark.faults
 LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}

@@ -6,8 +6,8 @@ from collections import Counter
 
 import pytest
 
-from jobs.tracking import open_store
-from tests.faults.harness import SWEEP, launch, outcome, start
+from jobs.tracking.tracker import open_store
+from tests.support.faults import SWEEP, launch, outcome, start
 
 pytestmark = pytest.mark.faults
 SPARSITIES = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}"
@@ -17,18 +17,18 @@ CELLS = 4 * 2  # the nominal condition is that of sparsity 0
 NOTED = """
 import time
 whole_fly = fly
-def fly(pilot, config, seeds, *given, **named):
-    episodes = whole_fly(pilot, config, seeds, *given, **named)
+def fly(agent, config, seeds, *given, **named):
+    episodes = whole_fly(agent, config, seeds, *given, **named)
     with open({file!r}, "a") as notes:
         for seed in seeds:
-            notes.write(f"{{type(pilot).__name__}} {{config.faults.sparsity}} {{seed}}\\n")
+            notes.write(f"{{type(agent).__name__}} {{config.faults.sparsity}} {{seed}}\\n")
     time.sleep(1.0)
     return episodes
 """
 
 
 def noting(tmp_path):
-    return {"jobs.flying": NOTED.format(file=str(tmp_path / "flights"))}
+    return {"jobs.rollout.scheduler": NOTED.format(file=str(tmp_path / "flights"))}
 
 
 def check_once(job, tmp_path, again_at_most):
@@ -72,14 +72,14 @@ def test_ctrl_c_stops_a_sweep_that_the_same_command_continues(tmp_path):
 
 
 BROKEN = """
-LONGEST_START_S, LONGEST_STEP_S, MAX_FAILURES = 40.0, 0.0, 1
+MAX_START_S, MAX_STEP_S, MAX_FAILURES = 40.0, 0.0, 1
 whole_fly = fly
-def fly(pilot, config, seeds, *given, **named):
+def fly(agent, config, seeds, *given, **named):
     if config.faults.sparsity == 0.25:
         raise ZeroDivisionError("no")
     if config.faults.sparsity == 0.5:
         time.sleep(10**6)
-    episodes = whole_fly(pilot, config, seeds, *given, **named)
+    episodes = whole_fly(agent, config, seeds, *given, **named)
     if config.faults.sparsity == 0.75:
         episodes["distance_m"][1] = math.nan
     return episodes
@@ -89,7 +89,7 @@ def fly(pilot, config, seeds, *given, **named):
 def test_a_cell_that_raises_hangs_returns_nan_or_has_no_opengl_stops_no_other(tmp_path):
     renderers = "+sweep.axes.renderer={renderer:[raycast,pyrender]}"
     words = (*SWEEP, "~sweep.axes", SPARSITIES, renderers, "sweep.policies=[straight]")
-    job = launch(tmp_path, *words, after={"jobs.flying": BROKEN}, EGL_DEVICE_ID="999")
+    job = launch(tmp_path, *words, after={"jobs.rollout.scheduler": BROKEN}, EGL_DEVICE_ID="999")
     assert job.end() == 0, job.said
     table = (job.run / "sweep" / "table.md").read_text()
     reasons = {

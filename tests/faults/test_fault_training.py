@@ -10,7 +10,7 @@ import tempfile
 import pytest
 
 from models.policy import load_policy
-from tests.faults.harness import TRAIN, launch, outcome, start
+from tests.support.faults import TRAIN, launch, outcome, start
 
 pytestmark = pytest.mark.faults
 FINE = ("train.env_steps=960", "train.checkpoint_every=1")
@@ -160,12 +160,12 @@ def test_a_bug_that_ends_the_process_each_time_stops_after_a_few_restarts(tmp_pa
 
 
 def test_an_env_runner_that_hangs_is_ended_and_started_again(tmp_path):
-    limit = "LONGEST_SAMPLE_S = 60.0"
+    limit = "MAX_SAMPLE_S = 60.0"
     once = HANG.replace("count > 100", "count == 100 and not __import__('os').path.exists(MARK)").replace(
         "import time;", "open(MARK, 'w'); import time;"
     )
     code = f"MARK = {str(tmp_path / 'hung')!r}\n{once}"
-    job = launch(tmp_path, *TRAIN, *FINE, after={"jobs.runner": limit, "envs.corridor": code})
+    job = launch(tmp_path, *TRAIN, *FINE, after={"jobs.training.env_runner": limit, "envs.corridor": code})
     check_complete(job)
     assert (tmp_path / "hung").exists()
     assert job.rows()[-1]["perf/env_runner_restarts"] >= 1

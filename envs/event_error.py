@@ -1,0 +1,169 @@
+"""How far a simulation's events are from the converged ones: the error that fidelity is asked by."""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import numba
+import numpy as np
+
+from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig, FidelityConfig
+from envs.events import EVENT
+from envs.fidelity import plan
+from envs.kinematics import DIAGONAL, Outcome, Point, clock_us
+from envs.scene import Scene, make_scene
+from envs.sensor import Sensor
+
+# The converged simulation: so many times the renders of the tolerance 0.05, and this anti-aliasing.
+REFERENCE_RENDERS, REFERENCE_SAMPLES = 6, {"raycast": 12, "pyrender": 8}
+NO_CULLING_M = 1e6  # farther than any scene reaches
+TIME_SHARE = 0.05  # of a control step: how far apart in time two equal events may be
+MAX_KEPT = 64  # converged flights: several settings are measured against the same
+_CONVERGED: dict[str, np.ndarray] = {}
+ENTROPY = 20_210_608  # the corridors measured in are those of no split
+
+
+class Accuracy(NamedTuple):
+    """What a simulation achieves.
+
+    Attributes:
+        error: Event error against the converged simulation.
+        events: Events per control step, of the simulation and of the converged one.
+        renders: Renders per control step.
+    """
+
+    error: float
+    events: tuple[float, float]
+    renders: float
+
+
+def measure(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0) -> Accuracy:
+    """Event error of a simulation on short flights, against the converged simulation of the same flights.
+
+    Converged are: the renderer (the ray caster wherever it can draw the scene), its
+    anti-aliasing, the number of renders, no culling, a camera that remembers and gets linear
+    luminance. Thresholds and other properties of the camera are those of `config`, its
+    faults are left out. Each flight has a corridor of its own and goes straight or at 45
+    degrees, where nothing is in its way.
+
+    Args:
+        config: The simulation.
+        flights: How many.
+        steps: Control steps of each.
+        seed: Of corridors and ways.
+
+    Raises:
+        ValueError: The simulation has observation "luminance" or "none", which simulates no event camera.
+    """
+    if config.observation in WITHOUT_EVENTS:
+        rule = "observation must be one that has a camera for its error to be measured"
+        raise ValueError(f"{rule}; got {config.observation!r}")
+    pairs = [_flight(config, steps, np.random.default_rng([ENTROPY, seed, i])) for i in range(flights)]
+    tolerance_us = TIME_SHARE * 1e6 / config.control_hz
+    weights = [events.size + converged.size for events, converged, _ in pairs]
+    errors = [event_error(events, converged, tolerance_us) for events, converged, _ in pairs]
+    total = flights * steps
+    return Accuracy(
+        error=float(np.average(errors, weights=weights)) if sum(weights) else 0.0,
+        events=(sum(pair[0].size for pair in pairs) / total, sum(pair[1].size for pair in pairs) / total),
+        renders=sum(pair[2] for pair in pairs) / total,
+    )
+
+
+def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
+    """The simulation of the same flight without any error of rendering, see `measure`."""
+    renderer: Literal["raycast", "pyrender"] = "raycast" if scene.mesh is None else "pyrender"
+    asked = dataclasses.replace(config, faults=FaultsConfig(), renderer=renderer)
+    camera = dataclasses.replace(config.camera, memory="reference", encoding="linear32")
+    usual = dataclasses.replace(asked, camera=camera, fidelity=FidelityConfig())
+    fidelity = FidelityConfig(
+        max_step_m=plan(usual, scene).max_step_m / REFERENCE_RENDERS,
+        samples=REFERENCE_SAMPLES[renderer],
+        cull_m=NO_CULLING_M,
+    )
+    return dataclasses.replace(usual, fidelity=fidelity)
+
+
+def _flight(config: EnvConfig, steps: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int]:
+    """Events of one flight as `config` has it and converged, and the renders of the first."""
+    scene = make_scene(config.scene, rng, config.vehicle_radius_m, config.camera_height_m, **config.layout)
+    way = _free_way(config, scene, steps, rng)
+    config = dataclasses.replace(config, faults=FaultsConfig())
+    events, renders = _fly(Sensor(config), config, scene, way)
+    exact = converged(config, scene)
+    flight = f"{exact!r} {way}"
+    if flight not in _CONVERGED:
+        if len(_CONVERGED) == MAX_KEPT:
+            _CONVERGED.clear()
+        _CONVERGED[flight] = _fly(Sensor(exact), config, scene, way)[0]
+    return events, _CONVERGED[flight], renders
+
+
+def _free_way(config: EnvConfig, scene: Scene, steps: int, rng: np.random.Generator) -> list[Point]:
+    """Places at the ends of control steps on a straight way that touches nothing, if there is one."""
+    step_m = config.speed_mps / config.control_hz
+    for _ in range(100):
+        heading = rng.integers(3)
+        dx, dy = ((0.0, 1.0), (-DIAGONAL, DIAGONAL), (DIAGONAL, DIAGONAL))[heading]
+        x, y = rng.uniform(*scene.spawn_range_m), rng.uniform(0.0, scene.length_m)
+        way = [(x + dx * step_m * k, y + dy * step_m * k) for k in range(steps + 1)]
+        if not scene.collides(way[0], way[-1], config.vehicle_radius_m, config.camera_height_m):
+            break
+    return way
+
+
+def _fly(sensor: Sensor, config: EnvConfig, scene: Scene, way: list[Point]) -> tuple[np.ndarray, int]:
+    """All events of a flight along `way`, and the number of renders."""
+    sensor.reset(scene, way[0], np.random.default_rng(0))
+    batches, renders = [np.empty(0, EVENT)], 0
+    for k in range(1, len(way)):
+        sensor.step(way[k - 1], Outcome(way[k], 1.0, 0.0, False, False), clock_us(k, config.control_hz))
+        batches.append(sensor.events)
+        renders += sensor.renders
+    sensor.close()
+    return np.concatenate(batches), renders
+
+
+def event_error(events: np.ndarray, reference: np.ndarray, tolerance_us: float) -> float:
+    """Share of events without a partner: same pixel, same polarity, at most `tolerance_us` apart.
+
+    Partners are one to one, as many as possible. The share is taken of both streams together,
+    1 - 2 pairs / (events + reference): 0 if all pair up (or both are empty), 1 if none does,
+    the same whichever stream is called the reference.
+
+    Args:
+        events: EVENT array, in any order.
+        reference: EVENT array, in any order.
+        tolerance_us: Largest difference in time [us], >= 0.
+
+    Raises:
+        ValueError: `tolerance_us` is negative or not finite.
+    """
+    if not 0.0 <= tolerance_us < np.inf:
+        raise ValueError(f"tolerance_us must be finite and >= 0; got {tolerance_us}.")
+    total = events.size + reference.size
+    if total == 0:
+        return 0.0
+    return 1.0 - 2.0 * _pairs(*_by_pixel(events), *_by_pixel(reference), tolerance_us) / total
+
+
+def _by_pixel(events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keys of pixel and polarity, and times, sorted by key and then by time."""
+    keys = (events["y"].astype(np.int64) << 17) | (events["x"].astype(np.int64) << 1) | (events["p"] > 0)
+    order = np.lexsort((events["t"], keys))
+    return keys[order], events["t"][order]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pairs(keys, times, other_keys, other_times, tolerance):
+    """Pairs found by walking both streams at once; on a line, taking the earliest partner is optimal."""
+    i, j, pairs = 0, 0, 0
+    while i < keys.size and j < other_keys.size:
+        if keys[i] != other_keys[j]:
+            i, j = (i + 1, j) if keys[i] < other_keys[j] else (i, j + 1)
+        elif abs(times[i] - other_times[j]) <= tolerance:
+            i, j, pairs = i + 1, j + 1, pairs + 1
+        elif times[i] < other_times[j]:
+            i += 1
+        else:
+            j += 1
+    return pairs

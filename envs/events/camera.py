@@ -1,0 +1,213 @@
+"""The event camera: linear luminance frames in, time-ordered brightness-change events out.
+
+A pixel fires when its response to light (by default the logarithm) has moved by the contrast
+threshold from the level that it remembers (appendix E.1, read so that equations 5 to 8 are
+well founded). What it remembers is the setting `memory`:
+
+- "reference": the level moves only by whole thresholds, as in a real sensor, so events do not
+  depend on how often one looks; it is kept as a first level and counts, so it does not drift.
+- "frame": the level is the previous frame's, as the paper has it; what stays below the
+  threshold is forgotten.
+- "legacy": the published code of the paper (microsoft/event-vae-rl, event_sim.py). Of the
+  whole thresholds within the difference of two frames it loses the first, so a step of less
+  than two makes no event; the others are stamped from the start of the interval on, event k
+  of n at t_last + k (t - t_last) / n. To match it set `max_events_per_pixel=10` and
+  `luminance_floor=0.001 / 255`. Two things are not as published: the first event, which it
+  stamps t_last, is stamped t_last + 1 us, since that time belongs to the frame before; and
+  microseconds are not added to nanoseconds.
+
+Frames between those of the control steps make the events of "reference" better. "frame" and
+"legacy" compare one frame with the next and forget, so each more frame costs them events:
+give them one frame per control step.
+"""
+
+import dataclasses
+import operator
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from envs.config import CameraConfig
+from envs.events import crossings
+from envs.events.emission import EVENT
+from envs.events.photoreceptor import encode, encoding_tables, response_curve
+
+__all__ = ["EVENT", "EventCamera"]
+
+T_LIMIT_US = 2**52  # exact in float64, 142 years
+# Every pixel of the largest sensor can fire once; 0.6 GB at the most while they are sorted.
+MAX_EVENTS_PER_FRAME = 2**24
+MIN_SHARE = 0.1  # of the nominal threshold, under mismatch
+MIN_THRESHOLD = 1e-6
+
+
+def pixel_thresholds(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
+    """ON and OFF thresholds, float64 (H * W,) each, or (1,) without mismatch.
+
+    Under mismatch they are normal around the nominal threshold, ON and OFF independent, drawn
+    from `threshold_seed`, and never below a tenth of the nominal nor below 1e-6.
+    """
+    on = config.contrast_threshold
+    off = on if config.contrast_threshold_off is None else config.contrast_threshold_off
+    nominal = np.array([[on], [off]])
+    if config.threshold_mismatch == 0.0:
+        return nominal[0], nominal[1]
+    draws = np.random.default_rng(config.threshold_seed).standard_normal((2, config.height * config.width))
+    share = np.maximum(1.0 + config.threshold_mismatch * draws, MIN_SHARE)
+    thresholds = np.maximum(nominal * share, MIN_THRESHOLD)
+    return thresholds[0], thresholds[1]
+
+
+class EventCamera:
+    """One event camera with its per-pixel memory.
+
+    Same frames, same times and same settings give the same bytes, on any machine: what
+    decides an event is computed without a library's logarithm.
+
+    Attributes:
+        config: The settings, `CameraConfig`.
+        dropped: Events lost in the last step, to `max_events_per_pixel` or because a frame
+            gives at most `MAX_EVENTS_PER_FRAME`, the earliest ones. With excess "carry" they
+            are not lost but fire in later frames, and the number is 0.
+        t_us: Time of the last frame [us].
+    """
+
+    def __init__(self, width: int | CameraConfig = 64, height: int = 64, **fields: Any) -> None:
+        """Make a camera from sizes and fields, or from a `CameraConfig` and fields to replace.
+
+        Raises:
+            ValueError: A setting is unknown, of the wrong type or out of range.
+        """
+        if isinstance(width, CameraConfig):
+            config = dataclasses.replace(width, **fields)
+        else:
+            config = CameraConfig(width=width, height=height, **fields)
+        self.config = config
+        self.dropped = 0
+        self.t_us: int | None = None
+        legacy = config.memory == "legacy"
+        self._curve = response_curve(config.response, config.luminance_floor)
+        self._thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if legacy else 1)
+        forgets, carries = config.memory != "reference", config.excess == "carry"
+        self._rule = (config.refractory_us, config.max_events_per_pixel, carries, forgets, legacy)
+        self._tables = None if config.encoding == "linear32" else encoding_tables(config.encoding)
+        self._shape = (config.height, config.width)
+        pixels = config.width * config.height
+        self._state = (
+            np.zeros(pixels, np.float32),  # last frame
+            np.zeros((2, pixels), np.float32),  # quiet from row 0 to row 1, both included
+            np.zeros((3, pixels)),  # first level, ON count, OFF count
+            np.zeros(pixels if config.refractory_us > 0 else 0, np.int64),  # end of the last dead time
+        )
+        words = np.zeros((pixels + 7) // 8, np.uint64)  # one flag a pixel, padded
+        self._scratch = (words, np.zeros(8 * words.size, np.int64))  # and the pixels to decide
+
+    def reset(self, luminance: np.ndarray, t_us: int) -> None:
+        """Remember a first frame; it makes no events, and no pixel is in its dead time.
+
+        Args:
+            luminance: float32 (H, W), linear, finite, >= 0; 1 is white.
+            t_us: Its time [us].
+
+        Raises:
+            ValueError: Wrong shape, dtype, value or time; the camera is unchanged.
+        """
+        flat, t_us = self._checked(_stacked(luminance), 1), checked_time(t_us)
+        bad = int(crossings.first_invalid(flat[0]))
+        if bad >= 0:
+            raise self._refusal(flat, bad)
+        crossings.remember(self._encoded(flat)[0], self._curve, self._thresholds, self._state)
+        self.t_us, self.dropped = t_us, 0
+
+    def step(self, luminance: np.ndarray, t_us: int) -> np.ndarray:
+        """Events between the last frame and this one (appendix E.1).
+
+        Times are interpolated linearly in the response and rounded to whole microseconds.
+
+        Args:
+            luminance: float32 (H, W), linear, finite, >= 0; 1 is white. It is copied.
+            t_us: Its time [us], later than the last frame's.
+
+        Returns:
+            EVENT array with t in (t_last, t_us], sorted by (t, y, x, order in the pixel).
+
+        Raises:
+            ValueError: No reset yet, or wrong shape, dtype, value or time; the camera is
+                unchanged and takes the next good frame.
+        """
+        return self.steps(_stacked(luminance), (t_us,))
+
+    def steps(self, frames: np.ndarray, times_us: Sequence[int]) -> np.ndarray:
+        """Events of several frames, one after the other, in one call.
+
+        Args:
+            frames: float32 (K, H, W), K >= 1, each as `step` takes it.
+            times_us: Their times [us], each later than the one before.
+
+        Returns:
+            EVENT array with t in (t_last, times_us[-1]], sorted; the same bytes as K calls of
+            `step`. `dropped` counts the events lost in all K.
+
+        Raises:
+            ValueError: As `step`; if one frame or time is refused, none is taken.
+        """
+        if self.t_us is None:
+            raise ValueError("EventCamera.step needs a first frame; call reset(luminance, t_us) before it.")
+        times, flat = [self.t_us], self._checked(frames, len(times_us))
+        for t_us in times_us:
+            times.append(checked_time(t_us))
+            if times[-1] <= times[-2]:
+                raise ValueError(f"t_us must increase from frame to frame; got {t_us} after {times[-2]}.")
+        bad, dropped, events = crossings.steps(
+            self._encoded(flat),
+            np.array(times),
+            (self.config.width, MAX_EVENTS_PER_FRAME),
+            self._rule,
+            self._curve,
+            self._thresholds,
+            self._state,
+            self._scratch,
+        )
+        if bad >= 0:
+            raise self._refusal(flat, bad)
+        self.t_us, self.dropped = times[-1], dropped
+        return events
+
+    def _encoded(self, flat: np.ndarray) -> np.ndarray:
+        """The frames (K, N) as the sensor's front end hands them on."""
+        if self._tables is None:
+            return flat
+        encoded = np.empty_like(flat)
+        bad = int(encode(flat.ravel(), *self._tables, encoded.ravel()))
+        if bad >= 0:
+            raise self._refusal(flat, bad)
+        return encoded
+
+    def _checked(self, frames: np.ndarray, count: int) -> np.ndarray:
+        """The frames as a contiguous (K, N) array."""
+        if getattr(frames, "dtype", None) != np.float32 or frames.shape != (count, *self._shape) or not count:
+            dtype, shape = getattr(frames, "dtype", type(frames)), getattr(frames, "shape", ())[1:]
+            raise ValueError(f"luminance must be float32 {self._shape}; got {dtype} of shape {shape}.")
+        return frames.reshape(count, -1)
+
+    def _refusal(self, flat: np.ndarray, pixel: int) -> ValueError:
+        """The error for a value that is not a luminance."""
+        y, x = divmod(pixel % flat.shape[1], self.config.width)
+        return ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {flat.flat[pixel]!s}.")
+
+
+def _stacked(luminance: np.ndarray) -> np.ndarray:
+    """One frame as a stack of one; what is no array stays as it is, to be refused."""
+    return luminance[None] if isinstance(luminance, np.ndarray) else luminance
+
+
+def checked_time(t_us: int) -> int:
+    """A time as an int. Raises ValueError unless it is a whole number within +-2**52 [us]."""
+    try:
+        t_us = operator.index(t_us)
+    except TypeError:
+        raise ValueError(f"t_us must be an integer number of microseconds; got {t_us!r}.") from None
+    if not -T_LIMIT_US < t_us < T_LIMIT_US:
+        raise ValueError(f"t_us must lie within +-2**52; got {t_us}.")
+    return t_us

@@ -1,0 +1,137 @@
+"""What a pixel makes of light: an exact logarithm, the response curve, 8-bit encodings.
+
+The logarithm is built from +, -, *, / and bit shifts alone, which IEEE 754 rounds in one way,
+so that a level is crossed on every machine or on none; and a loop over it compiles to wide
+instructions, which no call of a library's `log` does.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+LARGEST = float(np.finfo(np.float32).max)
+ONE = 0x3FF0000000000000  # the bits of 1.0
+ROOT_HALF = 0x3FE6A09E667F3BCD  # the bits of sqrt(1/2)
+INVERSE_LN2 = 1.4426950408889634
+LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # sum: ln 2; k * HIGH is exact
+GAMMA = 2.2
+
+
+def response_curve(response: str, luminance_floor: float) -> tuple[float, float, float, float]:
+    """Numbers (shift, knee, gain, lowest) of a response curve, for `respond` and `light_of`.
+
+    With a = luminance_floor and L the luminance: "log" is log(L + a). "lin_log" is log(L)
+    from a upwards and log(a) + (L - a) / a below it; value and slope are continuous at a.
+
+    Args:
+        response: "log" or "lin_log".
+        luminance_floor: a > 0, relative to white = 1.
+    """
+    if response == "log":
+        return luminance_floor, 0.0, 0.0, -math.inf
+    return 0.0, luminance_floor, 1.0 / luminance_floor, math.log(luminance_floor)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def natural_logarithm(values, exponents):
+    """Replace each of `values` (float64, normal, > 0) by its logarithm; `exponents` is scratch of its size.
+
+    x = 2^k (1 + f) with 1 + f in [sqrt(1/2), sqrt(2)); log(1 + f) is the odd series in
+    s = f / (2 + f), as in Tang (1990) and fdlibm. Error below 1 ulp
+    (tests/envs/events/test_extremes.py).
+    """
+    bits = values.view(np.int64)
+    for i in range(values.size):
+        k = (bits[i] - ROOT_HALF) >> 52
+        exponents[i] = k
+        bits[i] -= k << 52
+    for i in range(values.size):
+        f = values[i] - 1.0
+        s = f / (2.0 + f)
+        z = s * s
+        r = 1.479819860511658591e-01 * z + 1.531383769920937332e-01
+        r = r * z + 1.818357216161805012e-01
+        r = r * z + 2.222219843214978396e-01
+        r = r * z + 2.857142874366239149e-01
+        r = r * z + 3.999999999940941908e-01
+        r = (r * z + 6.666666666666735130e-01) * z
+        half = 0.5 * f * f
+        k = exponents[i]
+        values[i] = k * LN2_HIGH - ((half - (s * (half + r) + k * LN2_LOW)) - f)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def respond(curve, luminance, levels, exponents):
+    """Write into the first `levels` (float64) the responses to `luminance` (float32, finite, >= 0)."""
+    shift, knee, gain, _ = curve
+    levels = levels[: luminance.size]
+    for i in range(luminance.size):
+        levels[i] = max(luminance[i] + shift, knee)
+    natural_logarithm(levels, exponents)
+    if gain > 0.0:
+        for i in range(luminance.size):
+            levels[i] += min(luminance[i] - knee, 0.0) * gain
+
+
+@numba.njit(cache=True, error_model="numpy")
+def exponential(values, exponents):
+    """Replace each of `values` (float64, between -700 and 700) by its exponential, relative error 1e-12."""
+    bits = values.view(np.int64)
+    for i in range(values.size):
+        k = np.rint(values[i] * INVERSE_LN2)
+        exponents[i] = np.int64(k)
+        values[i] = values[i] - k * LN2_HIGH - k * LN2_LOW
+    for i in range(values.size):
+        r = values[i]
+        e = r * (1.0 / 3628800.0) + 1.0 / 362880.0
+        e = e * r + 1.0 / 40320.0
+        e = e * r + 1.0 / 5040.0
+        e = e * r + 1.0 / 720.0
+        e = e * r + 1.0 / 120.0
+        e = e * r + 1.0 / 24.0
+        e = e * r + 1.0 / 6.0
+        e = e * r + 0.5
+        values[i] = (e * r + 1.0) * r + 1.0
+    for i in range(values.size):
+        bits[i] += exponents[i] << 52
+
+
+@numba.njit(cache=True, error_model="numpy")
+def light_of(curve, levels, exponents):
+    """Replace responses (float64) by their luminances; below 0 where no luminance responds so low."""
+    shift, knee, _, lowest = curve
+    if knee == 0.0:
+        exponential(levels, exponents)
+        for i in range(levels.size):
+            levels[i] -= shift
+        return
+    for i in range(levels.size):
+        levels[i] = np.exp(max(levels[i], lowest)) + min(levels[i] - lowest, 0.0) * knee
+
+
+def encoding_tables(encoding: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where an 8-bit encoding changes its code, float32 (255,), and what each code means, float32 (256,).
+
+    "linear8" rounds the luminance to the nearest multiple of 1/255; "gamma8" rounds its power
+    1/2.2 so, and decodes it again. Light above 1 has code 255.
+    """
+    gamma = {"linear8": 1.0, "gamma8": GAMMA}[encoding]
+    codes = np.arange(256) / 255.0
+    bounds = ((np.arange(255) + 0.5) / 255.0) ** gamma
+    return bounds.astype(np.float32), (codes**gamma).astype(np.float32)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def encode(luminance, bounds, meanings, out):
+    """Write the 8-bit version of `luminance` into `out`; index of the first invalid value, or -1."""
+    for i in range(luminance.size):
+        light = luminance[i]
+        if not 0.0 <= light <= LARGEST:
+            return i
+        code = 0
+        for half in (128, 64, 32, 16, 8, 4, 2, 1):
+            if light >= bounds[code + half - 1]:
+                code += half
+        out[i] = meanings[code]
+    return -1

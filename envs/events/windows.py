@@ -1,0 +1,113 @@
+"""Events of one control step as an array of fixed size, or as a picture (appendix D.1.2)."""
+
+import numba
+import numpy as np
+
+from envs.events.camera import EVENT
+
+ON, OFF = 255, 125  # picture values of polarities (appendix D.1.2)
+MAX_US = 2**31 - 1
+
+
+def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int) -> np.ndarray:
+    """Events of one window as an integer array of fixed size.
+
+    Row 0 is [count, dropped, window_us, 0]; rows 1 to count are [t - start_us, x, y, p], in
+    time order; the rest is 0. Beyond the capacity the newest are kept, the others counted.
+
+    Args:
+        events: EVENT with t in (start_us, start_us + window_us], sorted by t.
+        start_us: Start of the window [us].
+        window_us: Its length [us].
+        capacity: Most events that it holds.
+
+    Returns:
+        int32 (capacity + 1, 4).
+
+    Raises:
+        ValueError: Wrong dtype, window or capacity, or an event out of time or order.
+    """
+    if events.dtype != EVENT or events.ndim != 1:
+        raise ValueError(f"events must be a 1-D EVENT array; got {events.dtype}, {events.ndim}-D.")
+    if not 0 < window_us <= MAX_US or capacity < 1:
+        raise ValueError(
+            f"window_us must be in [1, {MAX_US}] and capacity >= 1; got {window_us} and {capacity}."
+        )
+    window = np.zeros((capacity + 1, 4), np.int32)
+    bad = _pack(events, start_us, window_us, window)
+    if bad >= 0:
+        raise ValueError(
+            f"events must be sorted by t within ({start_us}, {start_us + window_us}] us with p in {{-1, 1}}; "
+            f"event {bad} is {events[bad]}."
+        )
+    return window
+
+
+def unpack_window(window: np.ndarray) -> tuple[np.ndarray, int]:
+    """Events of a packed window, with t counted from its start, and the window's length [us].
+
+    Args:
+        window: int32 (capacity + 1, 4), as `pack_window` makes it.
+
+    Raises:
+        ValueError: Wrong dtype or shape, or a count that the rows cannot hold.
+    """
+    if window.dtype != np.int32 or window.ndim != 2 or window.shape[1] != 4 or window.shape[0] < 1:
+        raise ValueError(f"a window is int32 (capacity + 1, 4); got {window.dtype} {window.shape}.")
+    count = int(window[0, 0])
+    if not 0 <= count < window.shape[0]:
+        raise ValueError(f"a window of {window.shape[0] - 1} rows cannot hold {count} events.")
+    events = np.empty(count, EVENT)
+    for column, name in enumerate(("t", "x", "y", "p")):
+        events[name] = window[1 : count + 1, column]
+    return events, int(window[0, 2])
+
+
+def event_image(events: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Picture of events: 255 where the last one was ON, 125 where it was OFF, else 0 (appendix D.1.2).
+
+    Args:
+        events: EVENT in time order.
+        width: Pixels.
+        height: Pixels.
+
+    Returns:
+        uint8 (H, W).
+
+    Raises:
+        ValueError: An event lies outside the picture.
+    """
+    image = np.zeros((height, width), np.uint8)
+    bad = _draw(events, image)
+    if bad >= 0:
+        raise ValueError(f"events must lie within {width} x {height} pixels; event {bad} is {events[bad]}.")
+    return image
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pack(events, start_us, window_us, window):
+    """Fill the window; return the first event that breaks a rule, or -1."""
+    last = start_us + 1
+    for i in range(events.size):
+        event = events[i]
+        if not last <= event.t <= start_us + window_us or abs(event.p) != 1:
+            return i
+        last = event.t
+    dropped = max(events.size - (window.shape[0] - 1), 0)
+    window[0, 0], window[0, 1], window[0, 2] = events.size - dropped, dropped, window_us
+    for i in range(dropped, events.size):
+        event, row = events[i], i - dropped + 1
+        window[row, 0], window[row, 1] = event.t - start_us, event.x
+        window[row, 2], window[row, 3] = event.y, event.p
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _draw(events, image):
+    """Set the pixels of the events in order; return the first event outside, or -1."""
+    for i in range(events.size):
+        event = events[i]
+        if event.y >= image.shape[0] or event.x >= image.shape[1]:
+            return i
+        image[event.y, event.x] = ON if event.p > 0 else OFF
+    return -1

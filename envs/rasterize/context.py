@@ -1,0 +1,228 @@
+"""pyrender's OpenGL renderer as the simulator needs it: headless, linear, in float32, with its own shaders.
+
+Importing this loads OpenGL; only `envs.rasterize.renderer` does, when a renderer is made.
+"""
+
+import contextlib
+import ctypes
+import os
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from OpenGL import GL
+from OpenGL.error import Error
+from pyrender.camera import PerspectiveCamera
+from pyrender.platforms import egl
+from pyrender.renderer import Renderer
+from pyrender.shader_program import ShaderProgram
+
+from envs.rasterize.shaders import FRAGMENT, VERTEX, source
+from envs.scene.textures import noise_tile
+
+EGL = egl.egl  # imported before pyrender, OpenGL.EGL breaks the import of OpenGL.GL.shaders
+MULTISAMPLES = 4
+
+
+def start(width: int, height: int, antialias: bool) -> tuple["Platform", "LuminanceRenderer"]:
+    """A context of its own and a renderer in it, for images of `width` x `height` pixels."""
+    device = egl.get_device_by_index(int(os.environ.get("EGL_DEVICE_ID", "0")))
+    platform = Platform(width, height, device=device)
+    platform.init_context()
+    try:
+        with platform.current():
+            return platform, LuminanceRenderer(width, height, antialias)
+    except BaseException:
+        platform.delete_context()
+        raise
+
+
+class Platform(egl.EGLPlatform):
+    """pyrender's EGL platform, in which several contexts can live side by side."""
+
+    _egl_display: Any
+    _egl_context: Any
+
+    def make_uncurrent(self) -> None:
+        """Let another thread have the context."""
+        if self._egl_display is not None:
+            EGL.eglMakeCurrent(self._egl_display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
+
+    def delete_context(self) -> None:
+        """As pyrender's, without eglTerminate: the display is shared, every other renderer would die."""
+        if self._egl_context is not None:
+            self.make_uncurrent()
+            EGL.eglDestroyContext(self._egl_display, self._egl_context)
+            self._egl_context = self._egl_display = None
+
+    @contextlib.contextmanager
+    def current(self) -> Iterator[None]:
+        """Hold the context only while drawing, so that another thread may; RuntimeError if OpenGL fails.
+
+        OpenGL's own errors cannot be pickled, so that a worker could not report them.
+        """
+        try:
+            self.make_current()
+            try:
+                yield
+            finally:
+                self.make_uncurrent()
+        except Error as error:
+            raise RuntimeError(f"OpenGL failed: {' '.join(str(error).split())}") from None
+
+
+class Program(ShaderProgram):
+    """pyrender's shader program, from the text of its stages; it reads its uniforms from block 0."""
+
+    def __init__(self, surface: int, pattern: int) -> None:
+        """Compile and link in the current context."""
+        super().__init__(source(VERTEX, surface, pattern), source(FRAGMENT, surface, pattern))
+        self._add_to_context()
+        GL.glUniformBlockBinding(self._program_id, GL.glGetUniformBlockIndex(self._program_id, "Frame"), 0)
+
+    def _load(self, shader_filename: str) -> str:
+        return shader_filename
+
+
+class Camera(PerspectiveCamera):
+    """pyrender's pinhole camera without a far plane, half a step of the rasteriser's grid to the right.
+
+    A rasteriser rounds corners to a grid of 2^-bits pixels, and counts a sample that lies on an
+    edge to its right. So an edge less than half a step to the right of a sample would be drawn
+    on its left; with this, the rounding and the rule agree.
+    """
+
+    _matrix: np.ndarray | None = None
+
+    def get_projection_matrix(self, width: int | None = None, height: int | None = None) -> np.ndarray:
+        """(4, 4) from the camera's frame to the clip space, for an image of `width` pixels."""
+        if self._matrix is None:
+            self._matrix = super().get_projection_matrix(width, height)
+            self._matrix[0, 2] -= 2.0 ** -GL.glGetIntegerv(GL.GL_SUBPIXEL_BITS) / width
+        return self._matrix
+
+
+class Draw(NamedTuple):
+    """What one program draws.
+
+    Attributes:
+        program: Surface and pattern, as in `shaders.source`.
+        runs: (R, 2) first and last + 1 of the faces.
+        noise: Its seed; None if there is no noise.
+    """
+
+    program: tuple[int, int]
+    runs: np.ndarray
+    noise: int | None = None
+
+
+class LuminanceRenderer(Renderer):
+    """pyrender's renderer with one float channel, multisampled or not, and the shaders of this package.
+
+    The context is its own, so what never changes is set once.
+    """
+
+    def __init__(self, width: int, height: int, antialias: bool) -> None:
+        """Make the framebuffers, of `width` x `height` pixels, in the current context."""
+        super().__init__(width, height)
+        size = (width, height)
+        self._main_fb_ms, self._main_cb_ms, self._main_db_ms = _framebuffer(size, MULTISAMPLES * antialias)
+        self._main_fb, self._main_cb, self._main_db = _framebuffer(size, 0)
+        self._main_fb_dims = size
+        self._programs: dict[tuple[int, int], Program] = {}
+        self._tiles: dict[int, int] = {}  # by the seed of the noise
+        self._block = GL.glGenBuffers(1)
+        GL.glBindBufferBase(GL.GL_UNIFORM_BUFFER, 0, self._block)
+        # Nothing is too near to be seen.
+        for state in (GL.GL_DEPTH_TEST, GL.GL_CULL_FACE, GL.GL_DEPTH_CLAMP, GL.GL_MULTISAMPLE):
+            GL.glEnable(state)
+        GL.glViewport(0, 0, width, height)
+        # Of the next frame: what to draw, in this order, and the uniforms, one record.
+        self.draws: list[Draw] = []
+        self.frame = np.zeros(0)
+
+    def use(self, draws: list[Draw], sky: float) -> None:
+        """Prepare for a scene: compile what is missing, and load the noise."""
+        GL.glClearColor(sky, sky, sky, 1.0)
+        self._drop_tiles()
+        for draw in draws:
+            if draw.program not in self._programs:
+                self._programs[draw.program] = Program(*draw.program)
+            if draw.noise is not None and draw.noise not in self._tiles:
+                self._tiles[draw.noise] = _float_texture(noise_tile(draw.noise))
+        self.draws = draws
+
+    def delete(self) -> None:
+        """Free all objects of OpenGL."""
+        for program in self._programs.values():
+            program.delete()
+        self._programs.clear()
+        self._drop_tiles()
+        GL.glDeleteBuffers(1, [self._block])
+        super().delete()
+
+    def __del__(self) -> None:
+        """Nothing: pyrender would free its objects in whatever context is current then."""
+
+    def _drop_tiles(self) -> None:
+        for texture in self._tiles.values():
+            GL.glDeleteTextures([texture])
+        self._tiles.clear()
+
+    def _forward_pass(self, scene: Any, flags: int, seg_node_map: Any = None) -> np.ndarray:
+        """All of the frame, without pyrender's materials and lights."""
+        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._main_fb_ms)
+        GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
+        GL.glBufferData(GL.GL_UNIFORM_BUFFER, self.frame.nbytes, self.frame, GL.GL_STREAM_DRAW)
+        (mesh,) = scene.meshes
+        mesh.primitives[0]._bind()
+        for draw in self.draws:
+            self._programs[draw.program]._bind()
+            if draw.noise is not None:
+                GL.glBindTexture(GL.GL_TEXTURE_2D, self._tiles[draw.noise])
+            for first, end in draw.runs.tolist():
+                start = ctypes.c_void_p(12 * first)
+                GL.glDrawElements(GL.GL_TRIANGLES, 3 * (end - first), GL.GL_UNSIGNED_INT, start)
+        mesh.primitives[0]._unbind()
+        return self._read_main_framebuffer(scene, flags)
+
+    def _read_main_framebuffer(self, _scene: Any, _flags: int) -> np.ndarray:
+        """(H, W) float32, row 0 at the bottom; resolves the multisamples first."""
+        width, height = self._main_fb_dims
+        box = (0, 0, width, height)
+        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb_ms)
+        GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._main_fb)
+        GL.glBlitFramebuffer(*box, *box, GL.GL_COLOR_BUFFER_BIT, GL.GL_NEAREST)
+        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb)
+        image = np.empty((height, width), np.float32)
+        GL.glReadPixels(*box, GL.GL_RED, GL.GL_FLOAT, image)
+        return image
+
+
+def _framebuffer(size: tuple[int, int], multisamples: int) -> tuple[int, int, int]:
+    """Framebuffer, float colour buffer and depth buffer of `size` (width, height)."""
+    color, depth = GL.glGenRenderbuffers(2)
+    frame = GL.glGenFramebuffers(1)
+    GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, frame)
+    for buffer, kind, point in (
+        (color, GL.GL_R32F, GL.GL_COLOR_ATTACHMENT0),
+        (depth, GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT),
+    ):
+        GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
+        GL.glRenderbufferStorageMultisample(GL.GL_RENDERBUFFER, multisamples, kind, *size)
+        GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, point, GL.GL_RENDERBUFFER, buffer)
+    if GL.glCheckFramebufferStatus(GL.GL_FRAMEBUFFER) != GL.GL_FRAMEBUFFER_COMPLETE:
+        raise RuntimeError(f"no float framebuffer of {size} pixels with {multisamples} multisamples")
+    return frame, color, depth
+
+
+def _float_texture(texels: np.ndarray) -> int:
+    """A texture of one float channel that repeats, bilinear between its texels."""
+    texture = GL.glGenTextures(1)
+    GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
+    GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MIN_FILTER, GL.GL_LINEAR)
+    GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MAG_FILTER, GL.GL_LINEAR)
+    height, width = texels.shape
+    kinds = (GL.GL_RED, GL.GL_FLOAT)
+    GL.glTexImage2D(GL.GL_TEXTURE_2D, 0, GL.GL_R32F, width, height, 0, *kinds, np.ascontiguousarray(texels))
+    return int(texture)

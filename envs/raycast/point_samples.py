@@ -1,0 +1,265 @@
+"""Point samples of a scene by intersecting each ray with every surface: slow, plain, independent.
+
+One ray per pixel centre, direction (right, forward, up) = (u, 1, -v), so that the parameter
+along a ray is its depth [m]. Every body gives where the ray enters it, the nearest wins (a
+depth buffer), and textures are evaluated exactly at the point hit. Nothing here is shared
+with the column renderer, which is why it serves as its truth. Input is assumed valid.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from envs.scene import CONE, ELLIPSOID, POLE, Scene
+from envs.scene.textures import around, pattern_points
+
+SKY, GROUND, WALL, BODY = range(4)  # what a ray hits
+
+
+class Hits(NamedTuple):
+    """What rays hit, arrays of one shape.
+
+    Attributes:
+        surface: int8, one of SKY, GROUND, WALL, BODY.
+        thing: int64 index of the obstacle, 0 or 1 for the left or right wall.
+        depth: float64 distance along the optical axis [m], inf for the sky.
+        normal: (..., 3) float64 outward unit normal.
+        point: (..., 3) float64 [m].
+    """
+
+    surface: np.ndarray
+    thing: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+    point: np.ndarray
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enter_round(eye: np.ndarray, ray: np.ndarray, radius: float) -> tuple[float, float]:
+    """Where a ray enters and leaves an endless upright cylinder around the origin; (inf, -inf): never."""
+    square = ray[0] * ray[0] + ray[1] * ray[1]
+    middle = -(eye[0] * ray[0] + eye[1] * ray[1]) / square
+    beside = eye[0] * ray[1] - eye[1] * ray[0]
+    rest = (radius * radius - beside * beside / square) / square
+    if rest < 0.0:
+        return math.inf, -math.inf
+    return middle - math.sqrt(rest), middle + math.sqrt(rest)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enter_slab(eye: float, ray: float, half: float) -> tuple[float, float]:
+    """Where a ray enters and leaves -half < coordinate < half."""
+    if ray == 0.0:
+        return (-math.inf, math.inf) if abs(eye) < half else (math.inf, -math.inf)
+    one, other = (-half - eye) / ray, (half - eye) / ray
+    return min(one, other), max(one, other)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enter_pole(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
+    near, far = _enter_round(eye, ray, size[0])
+    low, high = _enter_slab(eye[2], ray[2], size[2])
+    depth = max(near, low)
+    if not 0.0 < depth <= min(far, high):
+        return math.inf
+    if low > near:
+        normal[:] = (0.0, 0.0, -1.0 if ray[2] > 0.0 else 1.0)
+    else:
+        x, y = eye[0] + depth * ray[0], eye[1] + depth * ray[1]
+        normal[:] = (x / size[0], y / size[0], 0.0)
+    return depth
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enter_box(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
+    depth, end, axis = -math.inf, math.inf, 0
+    for k in range(3):
+        near, far = _enter_slab(eye[k], ray[k], size[k])
+        if near > depth:
+            depth, axis = near, k
+        end = min(end, far)
+    if not 0.0 < depth <= end:
+        return math.inf
+    normal[:] = 0.0
+    normal[axis] = -1.0 if ray[axis] > 0.0 else 1.0
+    return depth
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enter_ellipsoid(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
+    """As a unit sphere, in coordinates divided by the half-axes."""
+    a = b = c = 0.0
+    for k in range(3):
+        e, d = eye[k] / size[k], ray[k] / size[k]
+        a, b, c = a + d * d, b + e * d, c + e * e
+    # |e x d|^2 instead of b b - a c, which cancels far away.
+    cross = 0.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        cross += ((eye[i] * ray[j] - eye[j] * ray[i]) / (size[i] * size[j])) ** 2
+    if a < cross or c <= 1.0:
+        return math.inf
+    depth = (-b - math.sqrt(a - cross)) / a
+    if depth <= 0.0:
+        return math.inf
+    length = 0.0
+    for k in range(3):
+        normal[k] = (eye[k] + depth * ray[k]) / (size[k] * size[k])
+        length += normal[k] * normal[k]
+    normal /= math.sqrt(length)
+    return depth
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enter_cone(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
+    """The side where x^2 + y^2 = k^2 (apex - z)^2 and the ray comes from outside; else the base."""
+    k = size[0] / (2.0 * size[2])
+    drop = size[2] - eye[2]  # from the apex down to the eye
+    a = ray[0] * ray[0] + ray[1] * ray[1] - k * k * ray[2] * ray[2]
+    b = eye[0] * ray[0] + eye[1] * ray[1] + k * k * drop * ray[2]
+    c = eye[0] * eye[0] + eye[1] * eye[1] - k * k * drop * drop
+    rest = b * b - a * c
+    best = math.inf
+    if rest >= 0.0:
+        root = -b - math.copysign(math.sqrt(rest), b)
+        for depth in (root / a, c / root):
+            z = eye[2] + depth * ray[2]
+            inwards = depth * a + b  # half the derivative of x^2 + y^2 - k^2 (apex - z)^2
+            if 0.0 < depth < best and -size[2] <= z <= size[2] and inwards < 0.0:
+                best = depth
+                x, y = eye[0] + depth * ray[0], eye[1] + depth * ray[1]
+                radial = math.hypot(x, y)
+                tall = math.sqrt(1.0 + k * k)
+                normal[:] = (x / radial / tall, y / radial / tall, k / tall)
+    base = (-size[2] - eye[2]) / ray[2]
+    x, y = eye[0] + base * ray[0], eye[1] + base * ray[1]
+    if ray[2] > 0.0 and 0.0 < base < best and x * x + y * y <= size[0] * size[0]:
+        best = base
+        normal[:] = (0.0, 0.0, -1.0)
+    return best
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enter(kind: int, eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
+    if kind == POLE:
+        return _enter_pole(eye, ray, size, normal)
+    if kind == CONE:
+        return _enter_cone(eye, ray, size, normal)
+    if kind == ELLIPSOID:
+        return _enter_ellipsoid(eye, ray, size, normal)
+    return _enter_box(eye, ray, size, normal)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _trace_flat(eye: np.ndarray, ray: np.ndarray, flats: np.ndarray, normal: np.ndarray) -> tuple:
+    """Depth, surface and thing of the ground, a wall or the sky along a ray."""
+    best, surface, thing = math.inf, SKY, 0
+    half, height, near, far = flats
+    if ray[2] < 0.0:
+        best, surface = max(-eye[2] / ray[2], 1e-300), GROUND
+        normal[:] = (0.0, 0.0, 1.0)
+    for side in (-1.0, 1.0):
+        depth = (side * half - eye[0]) / ray[0]
+        y, z = eye[1] + depth * ray[1], eye[2] + depth * ray[2]
+        if 0.0 < depth < best and near <= y <= far and 0.0 <= z <= height:
+            best, surface, thing = depth, WALL, (0 if side < 0.0 else 1)
+            normal[:] = (-1.0 if eye[0] < side * half else 1.0, 0.0, 0.0)
+    return best, surface, thing
+
+
+@numba.njit(cache=True, error_model="numpy")
+def trace(
+    kinds: np.ndarray, bodies: np.ndarray, flats: np.ndarray, pose: np.ndarray, image: tuple, out: tuple
+) -> None:
+    """Fill `out` with what each pixel centre's ray hits.
+
+    Args:
+        kinds: (N,) int64.
+        bodies: (N, 6) float64 centre and half-axes [m].
+        flats: (4,) float64 walls: half width, height, where they begin and end [m].
+        pose: (5,) float64 x, y, z [m], cosine and sine of the yaw.
+        image: width, height, focal length [pixels].
+        out: The arrays of `Hits`.
+    """
+    width, height, focal = image
+    surface, thing, depths, normals, points = out
+    ray, normal, eye = np.empty(3), np.empty(3), pose[:3]
+    eyes, reach = eye - bodies[:, :3], 1.001 * (bodies[:, 3] ** 2 + bodies[:, 4] ** 2)
+    for row in range(height):
+        ray[2] = (0.5 * height - row - 0.5) / focal
+        for column in range(width):
+            u = (column + 0.5 - 0.5 * width) / focal
+            ray[0], ray[1] = u * pose[3] - pose[4], u * pose[4] + pose[3]
+            best, surface[row, column], thing[row, column] = _trace_flat(
+                eye, ray, flats, normals[row, column]
+            )
+            square = ray[0] * ray[0] + ray[1] * ray[1]
+            for i in range(len(kinds)):
+                beside = eyes[i, 0] * ray[1] - eyes[i, 1] * ray[0]
+                if beside * beside > reach[i] * square:
+                    continue  # the ray passes beside a circle around the body: most do
+                depth = _enter(kinds[i], eyes[i], ray, bodies[i, 3:], normal)
+                if depth < best:
+                    best, surface[row, column], thing[row, column] = depth, BODY, i
+                    normals[row, column] = normal
+            depths[row, column] = best
+            for k in range(3):
+                points[row, column, k] = eye[k] + best * ray[k]
+
+
+def trace_scene(
+    scene: Scene, pose: tuple[float, float, float, float], width: int, height: int, focal: float
+) -> Hits:
+    """What the ray through each pixel centre hits; `pose` is (x, y, z [m], yaw [rad])."""
+    bodies = np.stack([scene.obstacles[key] for key in ("x", "y", "z", "rx", "ry", "rz")], axis=1)
+    flats = np.array([0.5 * scene.width_m, scene.wall_height_m, *scene.walls_y_m])
+    eye = np.array([*pose[:3], math.cos(pose[3]), math.sin(pose[3])])
+    shape = (height, width)
+    hits = Hits(
+        np.empty(shape, np.int8),
+        np.empty(shape, np.int64),
+        np.empty(shape),
+        np.zeros((*shape, 3)),
+        np.empty((*shape, 3)),
+    )
+    kinds = scene.obstacles["kind"].astype(np.int64)
+    trace(kinds, bodies.astype(np.float64), flats, eye, (width, height, float(focal)), tuple(hits))
+    return hits
+
+
+def shade_hits(scene: Scene, hits: Hits, t_s: float) -> np.ndarray:
+    """Linear luminance of what is hit, float64 of the shape of `hits.depth`."""
+    albedo = np.full(hits.depth.shape, scene.ground_albedo)
+    albedo[hits.surface == WALL] = scene.wall_albedo
+    on_body = hits.surface == BODY
+    albedo[on_body] = scene.obstacles["albedo"][hits.thing[on_body]]
+    for surface, texture in (
+        (GROUND, scene.ground_texture),
+        (WALL, scene.wall_texture),
+        (BODY, scene.obstacle_texture),
+    ):
+        where = hits.surface == surface
+        if not texture.plain and where.any():
+            s, q = _coordinates(scene, hits, where)
+            albedo[where] *= 1.0 + texture.contrast * pattern_points(texture, s, q, t_s)
+    luminance = scene.shade(albedo, hits.normal)
+    luminance[hits.surface == SKY] = scene.sky_luminance
+    return luminance
+
+
+def _coordinates(scene: Scene, hits: Hits, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Surface coordinates (s, q) [m] of the points hit in the mask `where`."""
+    (x, y, z), normal = hits.point[where].T, hits.normal[where]
+    level, across = np.abs(normal[:, 2]) == 1.0, np.abs(normal[:, 0]) == 1.0
+    s, q = np.where(level, x, np.where(across, y, x)), np.where(level, y, z)
+    bodies = scene.obstacles[hits.thing[where]] if len(scene.obstacles) else scene.obstacles
+    if len(bodies) and (hits.surface[where] == BODY).all():
+        # The apex of an ellipsoid is level but is no level face.
+        sides = np.isin(bodies["kind"], (POLE, CONE)) & ~level | (bodies["kind"] == ELLIPSOID)
+        turns = np.array([around(scene.obstacle_texture, radius) for radius in scene.obstacles["rx"]])
+        azimuth = np.arctan2(y - bodies["y"], x - bodies["x"])
+        s = np.where(sides, bodies["x"] + turns[hits.thing[where]] * azimuth, s)
+        q = np.where(sides, bodies["y"] + z, q)
+    return s, q

@@ -1,0 +1,234 @@
+"""Layouts of corridors as data: what stands in them, how much of it, how it looks.
+
+A new corridor is one more `Layout` in `LAYOUTS`. The sources are the appendix's B.1 (poles,
+cones and gates, of which the event data are made), D.1 (the lane of training), D.2 (what is
+flown in evaluation) and F.1 (moving textures); it gives words and few numbers, so the
+numbers are choices, made for a camera at 2 m above the ground and a vehicle of radius 0.3 m.
+"""
+
+import dataclasses
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from envs.scene.collision import keep_apart
+from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
+from envs.scene.textures import Texture
+
+SPAWN_RANGE_M = (-10.0, 10.0)  # appendix D.1
+SHAPES = {"pole": POLE, "cone": CONE, "ellipsoid": ELLIPSOID, "gate": BOX}
+GATE_BAR_M = 0.4  # thickness of a gate's posts, lintel and sill
+TRIES_PER_OBSTACLE = 200
+DENSEST = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
+PLAIN_SURFACE = Texture()
+
+
+def refuse_unless(rules: dict[str, bool], what: str, record: Any) -> None:
+    """Raise ValueError for the first rule that does not hold, with the values of the fields it names."""
+    for rule, holds in rules.items():
+        if not holds:
+            names = [field.name for field in dataclasses.fields(record)]
+            got = [f"{name}={getattr(record, name)!r}" for name in names if re.search(rf"\b{name}\b", rule)]
+            raise ValueError(f"{what}: {rule}, got {', '.join(got)}")
+
+
+def check_types(layout: Any) -> None:
+    """Refuse what is no number in [0, 100000], no truth value or no texture, as the field's default says.
+
+    Raises:
+        ValueError: Names the field and the value.
+    """
+    for field in dataclasses.fields(layout):
+        value = getattr(layout, field.name)
+        if isinstance(field.default, bool):
+            if not isinstance(value, bool):
+                raise ValueError(f"layout {field.name} must be true or false, got {value!r}")
+        elif isinstance(field.default, int | float):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= 1e5:
+                raise ValueError(f"layout {field.name} must be a number in [0, 100000], got {value!r}")
+        elif not isinstance(value, type(field.default)):
+            kind = type(field.default).__name__
+            raise ValueError(f"layout {field.name} must be a {kind}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Obstacles of one shape at random places of a lane between two walls.
+
+    Attributes:
+        shape: "pole", "cone", "ellipsoid" (all on the ground, round seen from above) or
+            "gate" (a frame across the lane, from the ground up).
+        num_obstacles: How many.
+        radius_min_m, radius_max_m: Radii are uniform between these [m]: of poles, of the
+            base of cones, the level half-axis of ellipsoids, half the inside width of gates.
+        height_m: Height of every obstacle [m].
+        min_gap_m: Smallest distance between two axes [m].
+        first_y_m, last_y_m: The axes stand at y uniform between these [m].
+        width_m, wall_height_m: The lane and its walls [m].
+        albedo_min, albedo_max: Albedos of obstacles are uniform between these.
+        ground_albedo, wall_albedo: Of the rest.
+        ground_texture, wall_texture, obstacle_texture: See `envs.scene.textures`.
+        passable: Whether a way to the goal line must lead from every start.
+    """
+
+    shape: str = "pole"
+    num_obstacles: int = 40
+    radius_min_m: float = 0.5
+    radius_max_m: float = 0.5
+    height_m: float = 8.0
+    min_gap_m: float = 2.0
+    first_y_m: float = 10.0
+    last_y_m: float = 100.0
+    width_m: float = 30.0
+    wall_height_m: float = 6.0
+    albedo_min: float = 0.25
+    albedo_max: float = 0.25
+    ground_albedo: float = 0.5
+    wall_albedo: float = 0.8
+    ground_texture: Texture = PLAIN_SURFACE
+    wall_texture: Texture = PLAIN_SURFACE
+    obstacle_texture: Texture = PLAIN_SURFACE
+    passable: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values; ValueError names the rule and what was given."""
+        check_types(self)
+        half_x = self.radius_max_m + (GATE_BAR_M if self.shape == "gate" else 0.0)
+        size = math.hypot(half_x, 0.5 * GATE_BAR_M) if self.shape == "gate" else half_x
+        rules = {
+            f"shape must be one of {sorted(SHAPES)}": self.shape in SHAPES,
+            "num_obstacles must be a whole number": float(self.num_obstacles).is_integer(),
+            "radius_min_m must be > 0 and <= radius_max_m": 0 < self.radius_min_m <= self.radius_max_m,
+            f"min_gap_m must be >= {2 * size:.6g}, or obstacles overlap": self.min_gap_m >= 2 * size,
+            f"width_m must be > 20 (the spawn range) and > {2 * half_x:.6g}": self.width_m
+            > max(SPAWN_RANGE_M[1] - SPAWN_RANGE_M[0], 2 * half_x),
+            "first_y_m must be <= last_y_m": self.first_y_m <= self.last_y_m,
+            "height_m and wall_height_m must be > 0": self.height_m > 0 and self.wall_height_m > 0,
+            f"height_m of a gate must be > {2 * GATE_BAR_M}": self.shape != "gate"
+            or self.height_m > 2 * GATE_BAR_M,
+            "albedo_min must be <= albedo_max <= 1": self.albedo_min <= self.albedo_max <= 1,
+        }
+        refuse_unless(rules, "layout", self)
+
+
+@dataclass(frozen=True)
+class MeshLayout:
+    """A lane whose obstacles are the surfaces of a mesh file; every field can be overridden.
+
+    Attributes:
+        scale: Metres per unit of the file.
+        width_m, wall_height_m: The lane and its walls [m].
+        passable: Whether a way to the goal line must lead from every start.
+    """
+
+    scale: float = 1.0
+    width_m: float = 30.0
+    wall_height_m: float = 6.0
+    passable: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values; ValueError names the rule and what was given."""
+        check_types(self)
+        rules = {
+            "scale and wall_height_m must be > 0": self.scale > 0 and self.wall_height_m > 0,
+            "width_m must be > 20 (the spawn range)": self.width_m > SPAWN_RANGE_M[1] - SPAWN_RANGE_M[0],
+        }
+        refuse_unless(rules, "layout", self)
+
+
+POLES_EVAL = Layout(num_obstacles=80, width_m=50.0)
+
+# Cones are as wide as poles where the camera flies, 2 m above the ground; so are ellipsoids,
+# whose middle is there. Hence the places that can be flown through are the same, and a
+# difference in success between these layouts and `poles_eval` is one of looks alone.
+LAYOUTS: dict[str, Layout] = {
+    "poles": Layout(),
+    "cones": Layout("cone", radius_min_m=0.75, radius_max_m=0.75, height_m=6.0),
+    "gates": Layout("gate", 20, radius_min_m=1.2, radius_max_m=1.6, height_m=4.0, min_gap_m=4.5),
+    "poles_dense": Layout(num_obstacles=80),
+    "poles_eval": POLES_EVAL,
+    "shape_change": dataclasses.replace(POLES_EVAL, shape="ellipsoid", height_m=4.0),
+    "texture_change": dataclasses.replace(
+        POLES_EVAL,
+        wall_albedo=0.6,
+        ground_texture=Texture("noise", period_m=1.0, contrast=0.5, seed=1),
+        wall_texture=Texture("checker", period_m=4.0, contrast=0.4),
+        obstacle_texture=Texture("rings", period_m=1.0, contrast=0.5),
+    ),
+    "dynamic": dataclasses.replace(
+        POLES_EVAL,
+        shape="cone",
+        radius_min_m=0.75,
+        radius_max_m=0.75,
+        height_m=6.0,
+        obstacle_texture=Texture("noise", period_m=1.0, contrast=0.8, velocity_mps=(3.0, 2.0), seed=2),
+    ),
+}
+
+
+def with_overrides(layout: Any, overrides: dict[str, Any]) -> Any:
+    """The layout with some of its fields replaced.
+
+    Raises:
+        ValueError: A key is no field of the layout, or its value is refused.
+    """
+    known = [field.name for field in dataclasses.fields(layout)]
+    for key in overrides:
+        if key not in known:
+            raise ValueError(f"layout has no {key!r}; it has {', '.join(known)}")
+    return dataclasses.replace(layout, **overrides)
+
+
+def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
+    """Obstacles inside the lane with axes `min_gap_m` apart, by rejection with a bounded number of tries.
+
+    Returns:
+        (N,) OBSTACLE; a gate is four of them.
+
+    Raises:
+        ValueError: If so many do not fit.
+    """
+    count = int(layout.num_obstacles)
+    bar = GATE_BAR_M if layout.shape == "gate" else 0.0
+    half = 0.5 * layout.width_m - layout.radius_max_m - bar
+    if _share_covered(layout, half) > DENSEST:  # asked first: the tries would take minutes
+        raise ValueError(
+            f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart; "
+            "lower num_obstacles or min_gap_m, or widen the lane"
+        )
+    tries = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (TRIES_PER_OBSTACLE * count, 2))
+    kept = keep_apart(tries, layout.min_gap_m, count)
+    if len(kept) < count:
+        raise ValueError(
+            f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart ({len(kept)} fit); "
+            "lower num_obstacles or min_gap_m, or widen the lane"
+        )
+    bodies = np.zeros(count, OBSTACLE)
+    bodies["kind"] = SHAPES[layout.shape]
+    bodies["x"], bodies["y"] = kept.T
+    bodies["rx"] = bodies["ry"] = rng.uniform(layout.radius_min_m, layout.radius_max_m, count)
+    bodies["z"] = bodies["rz"] = 0.5 * layout.height_m
+    bodies["albedo"] = rng.uniform(layout.albedo_min, layout.albedo_max, count)
+    return _gates(bodies) if layout.shape == "gate" else bodies
+
+
+def _share_covered(layout: Layout, half: float) -> float:
+    """Share of the area that discs of diameter `min_gap_m` around all axes would cover."""
+    gap = layout.min_gap_m
+    width, length = 2 * half + gap, layout.last_y_m - layout.first_y_m + gap
+    return layout.num_obstacles * 0.25 * math.pi * gap * gap / (width * length)
+
+
+def _gates(openings: np.ndarray) -> np.ndarray:
+    """Left posts, right posts, lintels and sills, (4 N,) OBSTACLE, around openings of half-width rx."""
+    bar = 0.5 * GATE_BAR_M
+    parts = np.tile(openings, (4, 1))
+    parts["ry"] = bar
+    parts["x"][:2] += np.array([[-1.0], [1.0]]) * (openings["rx"] + bar)
+    parts["rx"][:2] = bar
+    parts["z"][2] = 2.0 * openings["rz"] - bar
+    parts["z"][3] = parts["rz"][2:] = bar
+    return parts.T.ravel()

@@ -1,0 +1,73 @@
+"""What an agent needs to know: in which directions something stands, and how near it is.
+
+A ray is the way of a point, so where it ends is where that point first touches a section
+(`envs.scene.collision`): exact, for every kind of body and for meshes.
+"""
+
+import math
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+from envs.scene.collision import first_contact
+
+if TYPE_CHECKING:
+    from envs.scene.scene import Scene
+
+REACH_M = 100.0  # nothing is seen beyond it
+NEAR_M = 10.0  # proximity falls by e with each such distance: half a second of flight at 20 m/s
+
+
+def proximity(
+    scene: "Scene", pose: tuple[float, float, float, float], bearings_rad: np.ndarray
+) -> np.ndarray:
+    """How near the first obstacle in each bearing is: exp(-distance / NEAR_M), 0 for free sight.
+
+    The exponential keeps the measure in [0, 1] and lets what is too far to matter weigh
+    nothing: at 30 m it is 0.05, where 1 / (1 + distance / 5 m) is still 0.14.
+
+    Args:
+        scene: The corridor; its walls are no obstacles here.
+        pose: x, y, z [m] and yaw [rad], as of `CorridorEnv.camera_pose`; sight is level, at z.
+        bearings_rad: (K,) to the right of straight ahead [rad].
+
+    Returns:
+        float64 (K,) in [0, 1]; 1 from within an obstacle.
+
+    Raises:
+        ValueError: A number of the pose or a bearing is not finite.
+    """
+    bearings = np.asarray(bearings_rad, np.float64)
+    if not (np.isfinite(pose).all() and np.isfinite(bearings).all()):
+        raise ValueError(f"pose and bearings must be finite, got {pose} and {bearings_rad}")
+    x, y, z, yaw = pose
+    return _proximity((float(x), float(y)), bearings - yaw, scene.sections(z))
+
+
+def sector_bearings(fov_deg: float, sectors: int, rays: int = 1) -> np.ndarray:
+    """Bearings of rays spread evenly over sectors of the field of view, from left to right.
+
+    Args:
+        fov_deg: Horizontal field of view [degrees].
+        sectors: Equal parts of it.
+        rays: In each part, each in the middle of its share.
+
+    Returns:
+        float64 (sectors, rays) [rad].
+    """
+    count = sectors * rays
+    share = (np.arange(count) + 0.5) / count - 0.5
+    return np.radians(fov_deg * share).reshape(sectors, rays)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _proximity(eye: tuple, headings: np.ndarray, sections: np.ndarray) -> np.ndarray:
+    near = np.zeros(len(headings))
+    x, y = eye
+    for k in range(len(headings)):
+        end = x + REACH_M * math.sin(headings[k]), y + REACH_M * math.cos(headings[k])
+        contact = first_contact((x, y, end[0], end[1]), 0.0, math.inf, sections)
+        if contact <= 1.0:
+            near[k] = math.exp(-contact * REACH_M / NEAR_M)
+    return near

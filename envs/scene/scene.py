@@ -1,0 +1,333 @@
+"""The world: obstacles, walls and ground as plain arrays, its mesh, its collisions.
+
+x points right, y forward along the lane, z up; metres throughout. Luminance is linear, in
+[0, 1], and Lambertian: albedo * (ambient + diffuse * max(0, normal . sun)). The ground is
+an infinite plane at z = 0; the walls are two upright planes at x = +-width_m / 2, both
+sides of which can be seen.
+
+A vehicle is a level disc at its flight's height. It touches what the plane at that height
+cuts from the bodies and from the surfaces of a mesh, and the walls at any height.
+"""
+
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from envs.scene.collision import CELL_M, first_contact, ways_to_goal
+from envs.scene.layouts import (
+    LAYOUTS,
+    PLAIN_SURFACE,
+    SPAWN_RANGE_M,
+    Layout,
+    MeshLayout,
+    draw_obstacles,
+    refuse_unless,
+    with_overrides,
+)
+from envs.scene.mesh_file import is_mesh_path, read_mesh
+from envs.scene.obstacles import (
+    BOX,
+    CONE,
+    ELLIPSOID,
+    OBSTACLE,
+    POLE,
+    ROUNDING,
+    body_sections,
+    checked_mesh,
+    checked_obstacles,
+    mesh_sections,
+)
+from envs.scene.textures import Texture
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = [
+    "BOX",
+    "CONE",
+    "ELLIPSOID",
+    "LAYOUTS",
+    "OBSTACLE",
+    "POLE",
+    "Layout",
+    "MeshLayout",
+    "Scene",
+    "Texture",
+    "make_scene",
+]
+
+# The sun stands behind the start and to the right, so that the sides of a pole differ.
+SUN = (0.4, -0.5, math.sqrt(0.59))
+MAX_DRAWS = 20  # of a corridor, until one is passable
+HEIGHTS_KEPT = 8  # at which a scene remembers its sections
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One corridor, immutable: what stands where and how bright it is.
+
+    Attributes:
+        name: Layout it was made from.
+        obstacles: (N,) OBSTACLE, read-only.
+        length_m: The goal line is at y = length_m [m].
+        width_m: The walls are at x = +-width_m / 2 [m].
+        wall_height_m: Top of the walls [m].
+        walls_y_m: Where the walls begin and end in y [m]; collisions take them as endless.
+        spawn_range_m: Range of x at the start, y = 0 [m] (appendix D.1).
+        ground_albedo, wall_albedo: In [0, 1].
+        sky_luminance: Everything above the horizon that nothing hides.
+        ambient, diffuse: Lambert weights.
+        sun: Unit vector towards the sun.
+        ground_texture, wall_texture, obstacle_texture: See `envs.scene.textures`.
+        mesh: More surfaces, as vertices (V, 3) [m], faces (F, 3) counter-clockwise seen from
+            outside, and baked luminance (V,); only pyrender draws them. None: nothing more.
+    """
+
+    name: str
+    obstacles: np.ndarray
+    length_m: float = 100.0
+    width_m: float = 30.0
+    wall_height_m: float = 6.0
+    walls_y_m: tuple[float, float] = (-20.0, 150.0)
+    spawn_range_m: tuple[float, float] = SPAWN_RANGE_M
+    ground_albedo: float = 0.5
+    wall_albedo: float = 0.8
+    sky_luminance: float = 0.85
+    ambient: float = 0.35
+    diffuse: float = 0.65
+    sun: tuple[float, float, float] = SUN
+    ground_texture: Texture = PLAIN_SURFACE
+    wall_texture: Texture = PLAIN_SURFACE
+    obstacle_texture: Texture = PLAIN_SURFACE
+    mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def __post_init__(self) -> None:
+        """Keep read-only copies of the arrays; ValueError names the value that is refused."""
+        _check_numbers(self)
+        depth = _depth(self.obstacle_texture)
+        object.__setattr__(self, "obstacles", checked_obstacles(self.obstacles, depth))
+        if self.mesh is not None:
+            object.__setattr__(self, "mesh", checked_mesh(*self.mesh))
+
+    @cached_property
+    def kinds(self) -> frozenset[int]:
+        """Kinds of obstacles that are there: POLE, CONE, ELLIPSOID, BOX."""
+        return frozenset(np.unique(self.obstacles["kind"]).tolist())
+
+    @property
+    def is_still(self) -> bool:
+        """Whether nothing changes while the camera stands still."""
+        return not (self.ground_texture.moving or self.wall_texture.moving or self.obstacle_texture.moving)
+
+    @cached_property
+    def _sections(self) -> dict[float, np.ndarray]:
+        return {}
+
+    def sections(self, height_m: float = 2.0) -> np.ndarray:
+        """What a flight at `height_m` [m] can hit, walls aside.
+
+        Returns:
+            (M, 7) float64, read-only; see `envs.scene.obstacles`.
+        """
+        sections = self._sections.get(height_m)
+        if sections is None:
+            sections = body_sections(self.obstacles, height_m)
+            if self.mesh is not None:
+                sections = np.concatenate([sections, mesh_sections(self.mesh[0], self.mesh[1], height_m)])
+            sections.flags.writeable = False
+            if len(self._sections) == HEIGHTS_KEPT:
+                self._sections.clear()
+            self._sections[height_m] = sections
+        return sections
+
+    def shade(self, albedo: Any, normals: Any) -> np.ndarray:
+        """Lambertian luminance of surfaces of `albedo` (...,) with unit `normals` (..., 3); float64."""
+        towards_sun = np.maximum(0.0, np.asarray(normals, np.float64) @ np.asarray(self.sun))
+        return np.asarray(albedo, np.float64) * (self.ambient + self.diffuse * towards_sun)
+
+    def first_contact(self, a_m: Any, b_m: Any, radius_m: float, height_m: float = 2.0) -> float:
+        """Where a level disc of `radius_m` moving from `a_m` to `b_m` (x, y) [m] first touches something.
+
+        Touching counts as contact; a start in contact gives 0. Exact for any length. A body
+        is solid; a mesh is its surfaces, so inside one there is no contact until one is reached.
+
+        Args:
+            a_m: Where the way begins, x and y [m].
+            b_m: Where it ends.
+            radius_m: Of the disc [m].
+            height_m: At which it flies [m].
+
+        Returns:
+            Fraction in [0, 1] of the segment, or inf if there is no contact.
+
+        Raises:
+            ValueError: If a number is not finite, or the radius is negative.
+        """
+        ax, ay, bx, by = float(a_m[0]), float(a_m[1]), float(b_m[0]), float(b_m[1])
+        if not (math.isfinite(ax + ay + bx + by + height_m) and 0.0 <= radius_m < math.inf):
+            raise ValueError(
+                "first_contact: points, radius and height must be finite, radius >= 0, "
+                f"got {a_m}, {b_m}, {radius_m}, {height_m}"
+            )
+        return first_contact((ax, ay, bx, by), radius_m, 0.5 * self.width_m, self.sections(height_m))
+
+    def collides(self, a_m: Any, b_m: Any, radius_m: float, height_m: float = 2.0) -> bool:
+        """Whether a disc of `radius_m` touches anything on its way from `a_m` to `b_m` (x, y) [m]."""
+        return self.first_contact(a_m, b_m, radius_m, height_m) <= 1.0
+
+    def ways_to_goal(self, radius_m: float, height_m: float = 2.0) -> np.ndarray:
+        """From where the vehicle can reach the goal line, on a lattice of `envs.scene.collision.CELL_M`.
+
+        True is a proof for a vehicle whose steps are short against a cell; see
+        `envs.scene.collision.ways_to_goal`.
+
+        Returns:
+            bool (rows, 2 * n + 3), whose place [j, n + 1 + i] is x = i cells, y = j cells.
+        """
+        far = max(map(abs, self.spawn_range_m)) + self.length_m
+        columns = math.ceil(min(0.5 * self.width_m, far) / CELL_M) + 1
+        return ways_to_goal(self.sections(height_m), radius_m, 0.5 * self.width_m, self.length_m, columns)
+
+    def passable(self, radius_m: float, height_m: float = 2.0) -> bool:
+        """Whether a way to the goal line leads from every start, by steps ahead or 45 degrees to a side.
+
+        True only if there are such ways, and always if there are some that keep 1.5 cells
+        (0.15 m) more than `radius_m` from everything.
+        """
+        starts = self.ways_to_goal(radius_m, height_m)[0]
+        middle = (len(starts) - 1) // 2
+        first, last = (x_m / CELL_M for x_m in self.spawn_range_m)
+        inside = starts[max(middle + math.floor(first), 0) : middle + math.ceil(last) + 1]
+        return bool(inside.all())
+
+    def to_trimesh(self, sections: int = 32) -> "trimesh.Scene":
+        """The scene as one merged mesh; a level section of a round body has `sections` corners.
+
+        Vertices carry their baked luminance twice: as grey `vertex_colors` (8 bits) and
+        exactly, as float32, in `vertex_attributes["luminance"]`. Textures are not baked: a
+        surface has its mean luminance. The ground ends 100 km away.
+        """
+        # Imported here because the ray caster's workers never need it.
+        import trimesh
+
+        from envs.scene.triangles import scene_mesh
+
+        vertices, faces, luminance = scene_mesh(self, sections)
+        grey = np.clip(np.rint(luminance * 255.0), 0, 255).astype(np.uint8)
+        colors = np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=1)
+        mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
+        mesh.vertex_attributes["luminance"] = luminance.astype(np.float32)
+        return trimesh.Scene([mesh])
+
+
+def make_scene(
+    name: str,
+    rng: np.random.Generator,
+    vehicle_radius_m: float = 0.3,
+    height_m: float = 2.0,
+    /,
+    **overrides: Any,
+) -> Scene:
+    """Draw a scene; the same state of `rng` gives the same bytes.
+
+    The first of up to `MAX_DRAWS` drawn corridors that is passable is taken. A mesh file
+    leaves nothing to draw.
+
+    Args:
+        name: A key of LAYOUTS, or the path of a mesh file that `trimesh` can read, whose
+            surfaces stand in an otherwise empty lane.
+        rng: Source of all that is random.
+        vehicle_radius_m: Of the vehicle that has to get through [m].
+        height_m: At which it flies [m].
+        **overrides: Values that replace fields of the layout, such as num_obstacles=60;
+            those of a mesh file are the fields of `MeshLayout`.
+
+    Raises:
+        ValueError: If the name, an override or its value is not valid, if the obstacles
+            cannot be placed `min_gap_m` apart, or if no corridor was passable.
+    """
+    if not (math.isfinite(height_m) and 0.0 <= vehicle_radius_m < math.inf):
+        raise ValueError(
+            "make_scene: vehicle radius must be >= 0, it and the height finite, "
+            f"got {vehicle_radius_m}, {height_m}"
+        )
+    if name in LAYOUTS:
+        layout = with_overrides(LAYOUTS[name], overrides)
+        scenes = (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
+        remedy = "lower num_obstacles or the radii, raise min_gap_m, widen the lane"
+    elif is_mesh_path(name):
+        layout = with_overrides(MeshLayout(), overrides)
+        scenes = (_mesh_corridor(name, layout) for _ in range(1))
+        remedy = "lower scale, widen the lane, fly at another height"
+    else:
+        known = ", ".join(sorted(LAYOUTS))
+        raise ValueError(f"scene must be one of {known}, or the path of a mesh file, got {name!r}")
+    for scene in scenes:
+        if not layout.passable or scene.passable(vehicle_radius_m, height_m):
+            return scene
+    raise ValueError(
+        f"layout of scene {name!r} gave no corridor that a vehicle of radius {vehicle_radius_m} m can pass "
+        f"from every start at a height of {height_m} m; {remedy}, or set passable to false"
+    )
+
+
+def _corridor(name: str, layout: Layout, rng: np.random.Generator) -> Scene:
+    return Scene(
+        name=name,
+        obstacles=draw_obstacles(layout, rng),
+        width_m=float(layout.width_m),
+        wall_height_m=float(layout.wall_height_m),
+        ground_albedo=layout.ground_albedo,
+        wall_albedo=layout.wall_albedo,
+        ground_texture=layout.ground_texture,
+        wall_texture=layout.wall_texture,
+        obstacle_texture=layout.obstacle_texture,
+    )
+
+
+def _mesh_corridor(path: str, layout: MeshLayout) -> Scene:
+    file = Path(path)
+    stamp = (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else (0, 0)
+    return _read_mesh_corridor(path, stamp, layout)
+
+
+@functools.lru_cache(maxsize=2)
+def _read_mesh_corridor(path: str, stamp: tuple[int, int], layout: MeshLayout) -> Scene:
+    """The scene of a mesh file, read once: every episode flies the same; `stamp` tells a changed file."""
+    corners, normals, albedo = read_mesh(path)
+    bare = Scene(path, np.empty(0, OBSTACLE), width_m=layout.width_m, wall_height_m=layout.wall_height_m)
+    luminance = bare.shade(albedo, normals[:, None, :]).ravel()
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    return dataclasses.replace(bare, mesh=(layout.scale * corners.reshape(-1, 3), faces, luminance))
+
+
+def _depth(texture: Texture) -> float:
+    """By how much the pattern raises the albedo at most."""
+    return 0.0 if texture.plain else texture.contrast
+
+
+def _check_numbers(scene: Scene) -> None:
+    near, far = scene.walls_y_m
+    left, right = scene.spawn_range_m
+    sizes = (scene.length_m, scene.width_m, scene.wall_height_m)
+    surfaces = ((scene.ground_albedo, scene.ground_texture), (scene.wall_albedo, scene.wall_texture))
+    lights = (scene.ambient, scene.diffuse, scene.sky_luminance)
+    rules = {
+        "length_m, width_m and wall_height_m must be > 0 and finite": all(0.0 < s < math.inf for s in sizes),
+        "walls_y_m and spawn_range_m must be finite ranges": -math.inf < near < far < math.inf
+        and -math.inf < left <= right < math.inf,
+        "ambient, diffuse and sky_luminance must be >= 0, the first two together <= 1, the last too": all(
+            light >= 0.0 for light in lights
+        )
+        and max(scene.ambient + scene.diffuse, scene.sky_luminance) <= 1.0 + 1e-9,
+        "sun must be a unit vector": len(scene.sun) == 3 and abs(math.hypot(*scene.sun) - 1.0) <= 1e-6,
+        "ground_albedo and wall_albedo must be >= 0 and, times 1 + contrast of ground_texture and "
+        "wall_texture, <= 1": all(a >= 0.0 and a * (1.0 + _depth(t)) <= 1.0 + ROUNDING for a, t in surfaces),
+    }
+    refuse_unless(rules, f"scene {scene.name!r}", scene)

@@ -1,0 +1,251 @@
+"""The settings of each part of an experiment: names, units and ranges; the values are in conf/."""
+
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from envs.config import STRICT, Fraction, Positive
+from jobs.config.conditions import Axis, AxisName, Condition
+from models.kinds import FINETUNED, KINDS, MAX_TIME_BINS
+
+Count = Annotated[int, Field(ge=1)]
+NonNegative = Annotated[float, Field(ge=0)]
+Name = Annotated[str, Field(min_length=1)]
+Latent = Annotated[int, Field(ge=1, le=256)]
+Stack = Annotated[int, Field(ge=1, le=32)]
+Target = Literal["signed", "occupancy", "aged", "counts"]  # models.encoder.evae.TARGETS
+EVAE_SETTINGS = ("context", "latent", "norm", "target", "time_bins", "coding")
+
+
+@dataclass(frozen=True, config=STRICT)
+class ModelConfig:
+    """The policy's representation and network (appendix A.1, D.1.2).
+
+    The settings of the event VAE (`EVAE_SETTINGS`) and what PPO does with its encoder are None
+    for a policy without one, `hidden` for one whose network has fixed sizes.
+    """
+
+    name: str
+    context: Annotated[int, Field(ge=8, le=8192, multiple_of=2)] | None
+    latent: Latent | None
+    norm: Literal["batch", "none"] | None
+    target: Target | None
+    time_bins: Annotated[int, Field(ge=2, le=65536)] | None
+    coding: Literal["additive", "eventnet", "none"] | None
+    encoder: Literal["frozen", "finetuned"] | None
+    stack: Stack
+    hidden: list[Count] | None
+
+    @pydantic.model_validator(mode="after")
+    def _fits_its_kind(self) -> "ModelConfig":
+        if self.name not in KINDS:
+            raise ValueError(f"name must be one of {', '.join(KINDS)}, got {self.name!r}")
+        kind = KINDS[self.name]
+        wanted = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
+        for setting, wants in wanted.items():
+            value = getattr(self, setting)
+            if wants != (value is not None):
+                rule = f"be given for {self.name}" if wants else f"be null: {self.name} has no such part"
+                raise ValueError(f"{setting} must {rule}, got {value!r}")
+        if self.coding == "eventnet" and self.name != "bytestream":
+            rule = f"must be additive or none for {self.name}, which has no time"
+            raise ValueError(f"coding {rule}, got 'eventnet'")
+        if self.encoder == "finetuned":
+            self._can_be_finetuned()
+        return self
+
+    def _can_be_finetuned(self) -> None:
+        if self.name not in FINETUNED:
+            rule = f"must be frozen for {self.name}; {', '.join(FINETUNED)} can be fine-tuned"
+            raise ValueError(f"encoder {rule}, got 'finetuned'")
+        if self.time_bins is None or self.time_bins > MAX_TIME_BINS:
+            rule = f"must be at most {MAX_TIME_BINS} for encoder=finetuned"
+            raise ValueError(f"time_bins {rule}, got {self.time_bins}")
+
+
+@dataclass(frozen=True, config=STRICT)
+class AlgoConfig:
+    """PPO, each word as RLlib spells it (appendix D.1.2)."""
+
+    lr: Positive
+    lr_schedule: Literal["constant", "linear"]
+    gamma: Fraction
+    lambda_: Fraction
+    clip_param: Positive
+    num_epochs: Count
+    minibatch_size: Count
+    train_batch_size_per_learner: Count
+    vf_loss_coeff: NonNegative
+    entropy_coeff: NonNegative
+    grad_clip: Positive
+    reward_scale: Positive
+    num_envs_per_env_runner: Count
+    num_env_runners: Annotated[int, Field(ge=0, le=10_000)]
+
+    @pydantic.model_validator(mode="after")
+    def _minibatch_fits(self) -> "AlgoConfig":
+        if self.minibatch_size > self.train_batch_size_per_learner:
+            raise ValueError("minibatch_size must not exceed train_batch_size_per_learner")
+        return self
+
+
+@dataclass(frozen=True, config=STRICT)
+class CollectConfig:
+    """Which flights and recordings fill the data set of the event VAE; each gets an equal share of the steps.
+
+    Attributes:
+        scenes: Layouts flown.
+        recordings: Event files of real cameras; each gives what it has, if that is less.
+    """
+
+    scenes: list[Name]
+    recordings: list[Name]
+    num_steps: Count
+    num_validation_steps: Count
+    policy: str | None
+    policy_share: Fraction
+
+
+@dataclass(frozen=True, config=STRICT)
+class PretrainConfig:
+    """How the event VAE is trained (appendix B.2)."""
+
+    encoder: str | None
+    iterations: Count
+    batch_windows: Count
+    window_events: Count
+    windows: Literal["mixed", "count"]
+    lr: Positive
+    weight_decay: NonNegative
+    beta: NonNegative
+    beta_schedule: Literal["appendix", "constant"]
+    validate_every: Count
+    checkpoint_every: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class TrainConfig:
+    """How long the policy is trained, how often it is saved, and what it meets meanwhile.
+
+    Attributes:
+        conditions: Settings of the simulation that are replaced together, as a sweep replaces
+            them; the corridors flown at once take them in turn. [{}] changes nothing.
+    """
+
+    env_steps: Count
+    checkpoint_every: Count
+    conditions: Annotated[list[Condition], Field(min_length=1)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class EvaluateConfig:
+    """On how many held-out corridors, and drawn by which renderers."""
+
+    episodes: Count
+    renderers: Annotated[list[Literal["raycast", "pyrender"]], Field(min_length=1)]
+    pyrender_episodes: Count
+    action: Literal["deterministic", "stochastic"]
+    video: bool
+
+
+@dataclass(frozen=True, config=STRICT)
+class SweepConfig:
+    """Which policies fly through which changes, `trials` corridors for each training.
+
+    Attributes:
+        scene: Where they fly unless an axis changes it.
+        policies: Each a group or a name in models/pretrained, "pretrained" (all there), "newest", a bound, or
+            a path.
+        axes: Name -> setting -> values. The first setting names the points of the axis; others
+            have as many values, or one that stays.
+        reference: The group that paired differences are taken against.
+    """
+
+    scene: Name
+    policies: Annotated[list[Name], Field(min_length=1)]
+    axes: dict[AxisName, Axis]
+    trials: Count
+    reference: Name
+
+
+@dataclass(frozen=True, config=STRICT)
+class TradeConfig:
+    """Which policy flies under every setting of simulator and encoder, and how often.
+
+    Attributes:
+        policy: A name in models/pretrained, "newest", or a path.
+        trials: Corridors flown under each setting,
+        pyrender_trials: and under those that pyrender draws.
+        replays: Flights on which costs and errors are measured.
+    """
+
+    policy: Name
+    trials: Count
+    pyrender_trials: Count
+    replays: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class TradeSimulatorConfig:
+    """What the simulator's accuracy is measured on, and how often its cost."""
+
+    scenes: Annotated[list[Name], Field(min_length=1)]
+    control_hz: Annotated[list[Positive], Field(min_length=1)]
+    flights: Count
+    steps: Count
+    rounds: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class TradeEncoderConfig:
+    """How long the encoders that are compared are trained, and on what they are measured."""
+
+    iterations: Count
+    seeds: Count
+    windows: Annotated[int, Field(ge=4)]
+    rounds: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class ProbeConfig:
+    """On how many steps representations are probed, and which event VAEs are trained for that."""
+
+    num_steps: Count
+    num_validation_steps: Count
+    iterations: Count
+    seeds: Count
+    latents: Annotated[list[Latent], Field(min_length=1, max_length=8)]
+    targets: Annotated[list[Target], Field(min_length=1, max_length=4)]
+    stacks: Annotated[list[Stack], Field(min_length=1, max_length=8)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class ClusterConfig:
+    """Where Ray runs, and where its nodes leave what they write.
+
+    Attributes:
+        storage: A folder that every node sees (NFS), or an address such as s3://bucket/evade;
+            None for the run folder, where there is but one machine.
+    """
+
+    name: Literal["local", "ray"]
+    address: str | None
+    num_cpus: Count | None
+    storage: str | None
+
+    @pydantic.field_validator("storage")
+    @classmethod
+    def _seen_from_everywhere(cls, storage: str | None) -> str | None:
+        if storage is not None and not storage.startswith("/") and "://" not in storage:
+            raise ValueError("must be an absolute folder, an address such as s3://bucket/evade, or null")
+        return storage
+
+
+@dataclass(frozen=True, config=STRICT)
+class TrackingConfig:
+    """Where results are recorded."""
+
+    uri: Name
+    experiment: Name

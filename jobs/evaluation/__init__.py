@@ -1,0 +1,1 @@
+"""Testing policies: held-out corridors, and sweeps over conditions."""

@@ -1,0 +1,211 @@
+"""Figures of a sweep: every axis as lines or bars, and where along the corridor flights ended in contact."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jobs.analysis.plots import GRID, INK, MUTED
+from jobs.analysis.statistics import Interval
+from jobs.config.conditions import axis_numbers, moving_settings
+from jobs.evaluation.group_stats import Row
+
+# Okabe and Ito's colours, told apart by the colour-blind too, and a marker each; the yellow is left out.
+STYLES = {
+    "bytestream": ("#0072b2", "o"),
+    "bytestream_xy": ("#56b4e9", "s"),
+    "event_columns": ("#009e73", "^"),
+    "event_set": ("#000000", "D"),
+    "event_image": ("#d55e00", "v"),
+    "event_image_vae": ("#e69f00", "P"),
+    "rgb": ("#cc79a7", "X"),
+    "bytestream_1500k": ("#7a5195", "<"),
+    "bytestream_paper": ("#5b6b1f", "h"),
+    "bytestream_robust": ("#b0003a", ">"),
+}
+BOUNDS = {"oracle": ("#6b7280", "."), "straight": ("#9ca3af", "."), "random": ("#c4c9d1", ".")}
+OTHERS = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
+SCALES = {
+    "env.control_hz": ("Control rate [Hz]", "log"),
+    "env.speed_mps": ("Speed [m/s]", "linear"),
+    "env.scene": ("Scene", "linear"),
+    "camera.contrast_threshold": ("Contrast threshold [log intensity]", "log"),
+    "camera.memory": ("Memory of the pixels", "linear"),
+    "faults.sparsity": ("Dead pixels [fraction]", "linear"),
+    "faults.background_activity": ("Background activity [fraction of true events]", "linear"),
+    "faults.background_activity_hz": ("Background activity [Hz per pixel]", "linear"),
+    "faults.shot_noise_hz": ("Shot noise in black [Hz per pixel]", "linear"),
+    "renderer": ("Renderer", "linear"),
+}
+MAX_BANDS = 4  # of groups in one panel; more would cover each other, and become bars on points set apart
+DODGE = 0.012  # between such points, as a share of the axis
+MAX_ACROSS = 2  # panels of the collision map side by side
+Measure = Callable[[Row], tuple[float, Interval]]
+
+
+def style_of(group: str) -> tuple[str, str]:
+    """Colour and marker of a group, the same in every figure."""
+    return {**STYLES, **BOUNDS}.get(group) or OTHERS[sum(group.encode()) % len(OTHERS)]
+
+
+def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Sequence[Row]) -> Figure:
+    """Success and distance of all groups along one axis: lines over numbers, bars over words.
+
+    Bars also where several settings change together: no single number says what a point is.
+
+    Args:
+        axis: Its name.
+        points: Value as text -> settings that it changes; the first one names it.
+        rows: Of this axis.
+    """
+    first = next(iter(next(iter(points.values()))))
+    label, scale = SCALES.get(first, (first, "linear"))
+    moving, words = moving_settings(points), axis_numbers(points) is None
+    groups = list(dict.fromkeys(row.group for row in rows))
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2)
+    ticks = [_tick(point, moving) for point in points.values()] if words else list(points)
+    for panel, measure in zip(panels, (_success_percent, _distance_m), strict=True):
+        if words:
+            _draw_bars(panel, list(points), groups, rows, measure)
+            panel.set_xticks(range(len(points)), ticks, fontsize=8 if len(moving) < 2 else 7)
+        else:
+            _draw_lines(panel, groups, rows, measure, scale)
+        panel.set_xlabel(label if len(moving) < 2 else f"{label}, and what changes with it")
+        panel.grid(axis="y", color=GRID)
+        panel.set_axisbelow(True)
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set(ylim=(0, 103), ylabel="Flights that reached the goal [%]")
+    panels[1].set(ylim=(0, 103), ylabel="Mean distance without collision [m]")
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 5), frameon=False)
+    figure.supxlabel(_note(axis, points, moving, rows), x=0.995, ha="right", fontsize=7, color=MUTED)
+    return figure
+
+
+def _draw_lines(
+    panel: Axes, groups: Sequence[str], rows: Sequence[Row], measure: Measure, scale: str
+) -> None:
+    """A line for each group with its intervals: a band, or bars where there are many groups."""
+    seen = [group for group in groups if group not in BOUNDS]
+    crowded = len(seen) > MAX_BANDS
+    panel.set_xscale(scale)
+    ticks = sorted({float(row.condition[1]) for row in rows})
+    for group in groups:
+        own = sorted((row for row in rows if row.group == group), key=lambda row: float(row.condition[1]))
+        colour, marker = style_of(group)
+        x = np.array([float(row.condition[1]) for row in own])
+        if crowded and group in seen:
+            x = _set_apart(x, ticks, scale, seen.index(group) - (len(seen) - 1) / 2)
+        y, low, high = np.array([(value, *interval) for value, interval in map(measure, own)]).T
+        dashes = "--" if group in BOUNDS else "-"
+        panel.plot(
+            x, y, color=colour, marker=marker, ms=6, lw=1.8, ls=dashes, mec="white", mew=0.6, label=group
+        )
+        if not crowded:
+            panel.fill_between(x, low, high, color=colour, alpha=0.10, lw=0)
+        elif group in seen:
+            panel.vlines(x, low, high, color=colour, alpha=0.5, lw=1.2, zorder=1)
+    panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    panel.set_xticks([], minor=True)
+    panel.margins(x=0.05)
+
+
+def _set_apart(x: np.ndarray, ticks: Sequence[float], scale: str, places: float) -> np.ndarray:
+    """Points of an axis moved to the side by so many places of `DODGE`."""
+    if scale == "log":
+        return x * (ticks[-1] / ticks[0]) ** (DODGE * places)
+    return x + (ticks[-1] - ticks[0]) * DODGE * places
+
+
+def _draw_bars(
+    panel: Axes, values: Sequence[str], groups: Sequence[str], rows: Sequence[Row], measure: Measure
+) -> None:
+    """Bars of all groups side by side at each value, with their intervals."""
+    width = 0.84 / len(groups)
+    for place, group in enumerate(groups):
+        own = [row for row in rows if row.group == group]
+        x = [values.index(row.condition[1]) + (place - (len(groups) - 1) / 2) * width for row in own]
+        y, low, high = np.array([(value, *interval) for value, interval in map(measure, own)]).T
+        spread = np.abs(np.array([y - low, high - y]))
+        look: dict[str, Any] = {"ecolor": INK, "error_kw": {"lw": 0.9, "capsize": min(2.5, 14 * width)}}
+        panel.bar(x, y, 0.94 * width, color=style_of(group)[0], yerr=spread, label=group, **look)
+
+
+def _tick(point: Mapping[str, object], moving: Sequence[str]) -> str:
+    """What a point is; where several settings change, each on a line of its own, numbers with their names."""
+    if len(moving) < 2:
+        return str(next(iter(point.values()))).replace("_", "\n")
+    return "\n".join(_named(key.rpartition(".")[2], point[key]) for key in moving)
+
+
+def _named(name: str, value: Any) -> str:
+    """A number behind its name; a word, which says itself what it is, alone and in short lines."""
+    return f"{name} {value:g}" if isinstance(value, int | float) else str(value).replace("_", "\n")
+
+
+def _note(
+    axis: str, points: Mapping[str, Mapping[str, object]], moving: Sequence[str], rows: Sequence[Row]
+) -> str:
+    """What stays along the axis, and how much was flown."""
+    point = next(iter(points.values()))
+    held = [f"{key.rpartition('.')[2]} {value}" for key, value in point.items() if key not in moving]
+    flights, trainings = {row.flights for row in rows}, {len(row.trainings) for row in rows}
+    counts = f"{_range(flights)} flights of {_range(trainings)} trainings for each group"
+    return "; ".join([axis, *held, counts, "95 % intervals"])
+
+
+def _range(counts: set[int]) -> str:
+    return " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
+
+
+def _success_percent(row: Row) -> tuple[float, Interval]:
+    low, high = row.success_interval
+    return 100 * row.success.value, (100 * low, 100 * high)
+
+
+def _distance_m(row: Row) -> tuple[float, Interval]:
+    return row.distance_m.value, row.distance_m.interval or (row.distance_m.value,) * 2
+
+
+def collision_figure(
+    ends: Mapping[str, tuple[np.ndarray, np.ndarray]], length_m: float, half_width_m: float
+) -> Figure:
+    """Where flights of each group ended in contact, seen from above.
+
+    Args:
+        ends: Group -> EPISODE without any change, and EPISODE under all changes in the same scene.
+        length_m: Where the goal line is [m].
+        half_width_m: Where the walls are [m].
+    """
+    across = min(MAX_ACROSS, len(ends))
+    down = -(-len(ends) // across)
+    figure = Figure(figsize=(6.6 * across, 0.7 + 2.3 * down), layout="constrained")
+    grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    for panel, (group, parts) in zip(grid.flat, ends.items(), strict=False):
+        said = []
+        colour = style_of(group)[0]
+        looks: tuple[dict[str, Any], ...] = (
+            {"s": 26, "alpha": 0.95, "edgecolors": "white", "lw": 0.5},
+            {"s": 7, "alpha": 0.25, "lw": 0},
+        )
+        for episodes, look, name in zip(parts, looks, ("unchanged", "changed"), strict=True):
+            hit = episodes[episodes["collision"]]
+            order = 3 if name == "unchanged" else 2
+            panel.scatter(hit["distance_m"], hit["x_m"], color=colour, zorder=order, **look)
+            said.append(f"{name} {len(hit)} of {len(episodes)}")
+        panel.hlines([-half_width_m, half_width_m], 0, length_m, color=INK, lw=1.5)
+        panel.vlines(length_m, -half_width_m, half_width_m, color=MUTED, lw=1.2, ls=":")
+        panel.set(xlim=(-2, length_m + 2), ylim=(half_width_m + 1.5, -half_width_m - 1.5))
+        panel.set_title(f"{group}: contacts {', '.join(said)}", loc="left", fontsize=9, color=INK)
+        panel.spines[:].set_visible(False)
+        panel.tick_params(labelsize=8)
+    for panel in grid.flat[len(ends) :]:
+        panel.set_visible(False)
+    figure.supxlabel(
+        "y, along the corridor [m]; large dots: nothing changed, small dots: all changes", fontsize=8
+    )
+    figure.supylabel("x, to the right [m]", fontsize=8)
+    return figure

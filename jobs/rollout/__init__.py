@@ -1,0 +1,1 @@
+"""Rolling out agents: episodes, evaluation tasks, and their scheduling on all cores."""

@@ -1,0 +1,207 @@
+"""Who flies: the trained policy, and the bounds that say how hard the corridors are.
+
+`straight` and `random` see nothing; `oracle` knows where everything stands. A result means
+something between them.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+import numpy as np
+
+from envs.config import Observation
+from envs.corridor import CorridorEnv
+from envs.kinematics import DIAGONAL, NUM_ACTIONS
+from envs.scene import Scene
+
+if TYPE_CHECKING:
+    from models.policy import Policy
+
+BOUNDS = ("straight", "random", "oracle")
+# Of one step in x and y, in step lengths: forward, left, right.
+MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])
+LATTICE_M = 0.25
+CLEARANCE_SCALE_M = 0.4  # the price of a place falls by e with each such distance from contact
+BLOCKED = 1e3
+SIDE_PRICE = 0.01  # of a lattice step to the side: of two free ways, the straighter
+
+
+class Agent(Protocol):
+    """Chooses an action for each flight of a batch.
+
+    Attributes:
+        observation: What its environments must show, as `envs.config.EnvConfig` names it.
+    """
+
+    @property
+    def observation(self) -> Observation:
+        """What it sees."""
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Begin one flight per environment, which has just been reset with its seed."""
+
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Actions (B,) for observations (B, ...) and the flights' infos."""
+
+
+def make_agent(name: str, action: str = "deterministic", table: Mapping[str, Any] | None = None) -> Agent:
+    """A bound by its name, or the policy of a folder.
+
+    Args:
+        name: "straight", "random", "oracle", or the path of a policy folder.
+        action: "deterministic" or "stochastic": how a policy chooses.
+        table: Settings of `EncoderTable.from_evae` for a policy whose frozen encoder reads single
+            events; None: those of the policy.
+    """
+    bounds: dict[str, Callable[[], Agent]] = {
+        "straight": StraightAgent,
+        "random": RandomAgent,
+        "oracle": OracleAgent,
+    }
+    if name in bounds:
+        return bounds[name]()
+    # Here, because the bounds need no network.
+    from models.encoder.table import EncoderTable
+    from models.encoder.weights import load_encoder
+    from models.policy import load_policy
+    from models.policy.policy import ENCODER
+
+    policy = load_policy(Path(name))
+    if table:
+        policy.encoder = EncoderTable.from_evae(load_encoder(Path(name) / ENCODER)[0], **table)
+    return PolicyAgent(policy, action == "stochastic")
+
+
+class StraightAgent:
+    """Always ahead."""
+
+    observation: Observation = "none"
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Nothing to remember."""
+
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Zeros (B,)."""
+        return np.zeros(len(infos), np.int64)
+
+
+class RandomAgent:
+    """Any action with the same probability at each step, drawn from the flight's own stream."""
+
+    observation: Observation = "none"
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """One stream per flight, so that no flight depends on its neighbours."""
+        self._streams = flight_streams(seeds)
+
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Actions (B,)."""
+        return np.array([stream.integers(NUM_ACTIONS) for stream in self._streams])
+
+
+class PolicyAgent:
+    """A trained policy; it sees its observation alone."""
+
+    def __init__(self, policy: "Policy", stochastic: bool = False) -> None:
+        """Fly a loaded policy, choosing its likeliest action or drawing one as in training."""
+        self.policy, self.stochastic = policy, stochastic
+        self.observation = cast(Observation, policy.observation)
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Forget the flights before."""
+        self.policy.reset(len(envs))
+        self._streams = flight_streams(seeds)
+
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Actions (B,); draws come from each flight's own stream."""
+        logits = self.policy.logits(observations).astype(np.float64)
+        if not self.stochastic:
+            return logits.argmax(axis=1)
+        gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])
+        return (logits + gumbel).argmax(axis=1)
+
+
+class OracleAgent:
+    """Plans on a lattice with the true geometry, then follows the plan."""
+
+    observation: Observation = "none"
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Plan one way per flight."""
+        self._plans = []
+        for env in envs:
+            step_m = env.config.speed_mps / env.config.control_hz
+            vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
+            plan = plan_way(env.scene, env.camera_pose()[0], *vehicle)
+            self._plans.append((plan, MOVES * step_m))
+
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """For each flight the action that ends closest to its plan."""
+        flights = zip(self._plans, infos, strict=True)
+        return np.array([follow(*plan, info["x_m"], info["y_m"]) for plan, info in flights])
+
+
+def flight_streams(seeds: Sequence[int]) -> list[np.random.Generator]:
+    """One random stream per flight; it depends on the flight's seed alone."""
+    return [np.random.default_rng(np.random.SeedSequence([int(seed), 0x9110])) for seed in seeds]
+
+
+def follow(way_x_m: np.ndarray, moves_m: np.ndarray, x_m: float, y_m: float) -> int:
+    """The move (of shape (3, 2), x and y [m]) after which x is closest to the way's."""
+    places = np.interp(y_m + moves_m[:, 1], np.arange(len(way_x_m)) * LATTICE_M, way_x_m)
+    return int(np.abs(x_m + moves_m[:, 0] - places).argmin())
+
+
+def plan_way(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 2.0) -> np.ndarray:
+    """The cheapest way to the goal line on a lattice of the three directions (dynamic programming).
+
+    Args:
+        scene: The true geometry.
+        start_x_m: Where the flight starts, y = 0 [m].
+        radius_m: Of the vehicle [m].
+        height_m: At which it flies [m].
+
+    Returns:
+        x [m] at y = 0, LATTICE_M, 2 LATTICE_M, ... up to the goal line, float64.
+    """
+    price, start = lattice_prices(scene, start_x_m, radius_m, height_m)
+    rows, columns = price.shape
+    moves = np.zeros((rows, columns), np.int64)
+    rest = price[-1]
+    for row in range(rows - 2, -1, -1):
+        padded = np.pad(rest, 1, constant_values=np.inf)
+        ways = np.stack([padded[1:-1], padded[:-2] + SIDE_PRICE, padded[2:] + SIDE_PRICE])
+        choice = ways.argmin(axis=0)
+        moves[row] = np.array([0, -1, 1])[choice]
+        rest = price[row] + ways.min(axis=0)
+    way = [start]
+    for row in range(rows - 1):
+        way.append(way[-1] + moves[row, way[-1]])
+    return start_x_m + (np.array(way) - start) * LATTICE_M
+
+
+def lattice_prices(
+    scene: Scene, start_x_m: float, radius_m: float, height_m: float
+) -> tuple[np.ndarray, int]:
+    """What it costs to be at each place of the lattice, (rows in y, columns in x), and the start's column.
+
+    A place in contact costs `BLOCKED`; others less, the farther they are from contact.
+    """
+    half = 0.5 * scene.width_m - radius_m
+    left, right = math.floor((start_x_m + half) / LATTICE_M), math.floor((half - start_x_m) / LATTICE_M)
+    x_m = start_x_m + np.arange(-left, right + 1) * LATTICE_M
+    y_m = np.arange(math.ceil(scene.length_m / LATTICE_M) + 1) * LATTICE_M
+    clearance = np.broadcast_to(half - np.abs(x_m), (len(y_m), len(x_m))).copy()
+    reach = 6 * CLEARANCE_SCALE_M  # beyond it an obstacle adds nothing to the price
+    for x, y, ux, uy, hx, hy, r in scene.sections(height_m):
+        size = r + radius_m
+        deep = abs(uy) * hx + abs(ux) * hy + size + reach
+        rows = slice(*np.searchsorted(y_m, [y - deep, y + deep]))
+        dx, dy = x_m[None, :] - x, y_m[rows, None] - y
+        along, across = np.abs(dx * ux + dy * uy) - hx, np.abs(dy * ux - dx * uy) - hy
+        gap = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)) - size
+        clearance[rows] = np.minimum(clearance[rows], gap)
+    price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
+    return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price), left

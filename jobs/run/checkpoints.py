@@ -1,0 +1,80 @@
+"""Checkpoints of a training that are known to be whole: sealed when written, checked before use.
+
+A disk that lost power or was full, and a copy that was cut off, leave files that look right. A
+checkpoint that is not what was written is replaced by the newest one that is.
+"""
+
+import hashlib
+import shutil
+from pathlib import Path
+
+from jobs.run.files import RunError, read_json, write_json
+
+SEAL = "sha256.json"
+UNSEALED = "not sealed"
+
+
+def seal(checkpoint: Path) -> None:
+    """Write the SHA-256 of each file of a checkpoint beside them."""
+    write_json(checkpoint / SEAL, _digests(checkpoint))
+
+
+def damage(checkpoint: Path) -> str | None:
+    """What is wrong with a checkpoint, in a few words; None if it is what was written.
+
+    One without a seal was cut off by a kill before it got one: it may be whole, but nothing says so.
+    """
+    if not checkpoint.is_dir():
+        return "missing"
+    if not (checkpoint / SEAL).is_file():
+        return UNSEALED if any(checkpoint.iterdir()) else "empty"
+    try:
+        sealed = read_json(checkpoint / SEAL)
+    except RunError:
+        return f"{SEAL} changed"
+    found = _digests(checkpoint)
+    differ = sorted(name for name in sealed.keys() | found.keys() if sealed.get(name) != found.get(name))
+    return None if not differ else f"{', '.join(differ)} changed"
+
+
+def mend(checkpoint: Path) -> str | None:
+    """Put the newest whole checkpoint beside a damaged one into its place; what was done, None if nothing.
+
+    One without a seal, which may be whole, is taken only where none has one.
+
+    Args:
+        checkpoint: The one that a training would continue from, `checkpoint_<number>`.
+
+    Raises:
+        RunError: There is no whole one.
+    """
+    reason = damage(checkpoint)
+    if reason is None:
+        return None
+    others = sorted(
+        (path for path in checkpoint.parent.glob("checkpoint_*") if path != checkpoint), reverse=True
+    )
+    wrong = {path: damage(path) for path in others}
+    good = next((path for wanted in (None, UNSEALED) for path in others if wrong[path] == wanted), None)
+    if reason == UNSEALED and (good is None or wrong[good] == UNSEALED):
+        return None
+    if good is None:
+        experiment = checkpoint.parent.parent
+        remedy = f"delete {experiment}, and the same command trains anew"
+        raise RunError(f"{checkpoint}: damaged ({reason}), and no other is whole; {remedy}")
+    shutil.rmtree(checkpoint, ignore_errors=True)
+    part = checkpoint.with_name(f".{checkpoint.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    shutil.copytree(good, part)
+    part.rename(checkpoint)
+    return f"Checkpoint damaged ({reason}), {good.name} takes its place: {checkpoint}"
+
+
+def _digests(checkpoint: Path) -> dict[str, str]:
+    """File -> SHA-256 of all but the seal."""
+    files = (path for path in sorted(checkpoint.rglob("*")) if path.is_file())
+    return {
+        str(path.relative_to(checkpoint)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+        if path != checkpoint / SEAL
+    }

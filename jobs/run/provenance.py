@@ -1,0 +1,54 @@
+"""What made a number: the commit, the machine, the command and the date."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+ELSEWHERE = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say where, not what
+
+
+def provenance() -> dict[str, Any]:
+    """Commit and machine: what to name beside a figure so that it can be trusted."""
+    python = ".".join(map(str, sys.version_info[:3]))
+    return {"commit": git_commit(), "host": os.uname().nodename, "cpus": os.cpu_count(), "python": python}
+
+
+def git_commit() -> str:
+    """The repository's commit, with "-dirty" behind it if files differ from it; or "unknown"."""
+    commit = _git("rev-parse", "HEAD")
+    if commit is None:
+        return "unknown"
+    return f"{commit}-dirty" if _git("status", "--porcelain", "--untracked-files=no") else commit
+
+
+def _git(*arguments: str) -> str | None:
+    """What git prints, or None when there is no git or no repository."""
+    try:
+        command = ["git", "-C", str(REPOSITORY), *arguments]
+        result = subprocess.run(  # noqa: S603  own words, no shell
+            command, capture_output=True, text=True, timeout=20, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip()
+
+
+def command() -> str:
+    """The command that is running, without where it runs and writes: no path of a machine."""
+    words = [
+        re.sub(r"/[^\s,\]]*/", "", word)
+        for word in sys.argv[1:]
+        if not word.lstrip("+").startswith(ELSEWHERE)
+    ]
+    return f"python -m platform.launch {shlex.join(words)}"
+
+
+def today() -> str:
+    """The date, UTC."""
+    return datetime.now(UTC).strftime("%Y-%m-%d")

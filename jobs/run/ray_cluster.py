@@ -1,0 +1,220 @@
+"""Start or join Ray: quietly, authenticated, one thread per worker."""
+
+import contextlib
+import fcntl
+import logging
+import os
+import secrets
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from jobs.config.config import ConfigError
+from jobs.config.schema import ClusterConfig
+
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "LP_NUM_THREADS": "0",
+    # A learner of a large network takes more threads (`training.ppo_learner`); those that wait must sleep:
+    # spinning beside one busy program made a gradient three times slower.
+    "OMP_WAIT_POLICY": "PASSIVE",
+}
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_DEDUP_LOGS": "1",
+    # Ray's own 15 leaves a worker a thirtieth of a core that any other program wants.
+    "RAY_worker_niceness": "0",
+    # A busy machine starts a worker in minutes; after a minute, Ray would start another beside it.
+    "RAY_worker_register_timeout_seconds": "600",
+    "RAY_AIR_NEW_OUTPUT": "0",
+    # Write down at once which checkpoint is the newest: a kill must not leave the name of one
+    # that newer ones have replaced.
+    "TUNE_GLOBAL_CHECKPOINT_S": "0",
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    # Tune would take Ctrl+C for the end of a training.
+    "TUNE_DISABLE_SIGINT_HANDLER": "1",
+    "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
+}
+STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a machine that is busy
+
+
+class ClusterError(RuntimeError):
+    """Ray could not be started; the message says why in one line, and what to do."""
+
+
+def start_ray(cluster: ClusterConfig, folder: Path) -> None:
+    """Start Ray on this machine, or join the cluster named; do nothing if that is done.
+
+    A local Ray asks every client for a token, which lies in a file that its owner alone can
+    read; the home folder is not touched. Workers run one thread each: two threads beside
+    other busy processes are slower than one.
+
+    Args:
+        cluster: Where Ray runs.
+        folder: Where the token of a local Ray is kept.
+
+    Raises:
+        ConfigError: If the cluster cannot be joined, others can read the token, or nothing is
+            said of the token of a cluster that is joined.
+        ClusterError: If this machine is too busy to start one.
+    """
+    os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
+    check_mode(cluster)
+    if cluster.name == "local":
+        use_token(folder / ".ray" / "token")
+    elif os.environ.get("RAY_AUTH_TOKEN_PATH") and not os.environ.get("RAY_AUTH_TOKEN"):
+        check_private(Path(os.environ["RAY_AUTH_TOKEN_PATH"]))
+    import ray
+
+    if ray.is_initialized():
+        return
+    for name in ("ray", "ray.rllib", "ray.tune"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    settings = {
+        "runtime_env": {"env_vars": ONE_THREAD},
+        "log_to_driver": False,
+        "logging_level": logging.ERROR,
+        "configure_logging": True,
+    }
+    if cluster.name == "local":
+        with one_at_a_time():
+            _start_local({"num_cpus": cluster.num_cpus, **settings})
+        return
+    try:
+        ray.init(address=cluster.address or "auto", **settings)
+    except (ConnectionError, ray.exceptions.RayError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
+
+
+def _start_local(settings: dict[str, Any]) -> None:
+    import ray
+
+    for _ in range(STARTS):
+        try:
+            ray.init(address="local", include_dashboard=False, **settings)
+            return
+        except Exception as error:  # Ray's own has no type of its own
+            if "timed out during startup" not in str(error):
+                raise
+            ray.shutdown()
+    raise ClusterError(f"Ray did not start in {STARTS} times 30 s: the machine is too busy; try again later")
+
+
+def fit(tuner: Any) -> Any:
+    """Run a Tuner; what its callbacks raise comes out as it is, and not as the text of a traceback."""
+    from ray.tune import TuneError
+
+    try:
+        return tuner.fit()
+    except TuneError as error:
+        raise (error.__context__ or error) from None
+
+
+def storage(cluster: ClusterConfig, folder: Path) -> str:
+    """Where the nodes of a cluster leave what belongs into a folder of a run: a path or an address.
+
+    Args:
+        cluster: Names the storage, if it is not the run folder itself.
+        folder: A folder of the run, `<runs_dir>/<run>/<name>`.
+    """
+    if cluster.storage is None:
+        return str(folder)
+    return f"{cluster.storage.rstrip('/')}/{folder.parent.name}/{folder.name}"
+
+
+def holds(place: str, start: str) -> bool:
+    """Whether a path or an address holds a file whose name begins so."""
+    import pyarrow.fs
+
+    system, root = pyarrow.fs.FileSystem.from_uri(place)
+    inside = system.get_file_info(pyarrow.fs.FileSelector(root, allow_not_found=True))
+    return any(info.base_name.startswith(start) for info in inside)
+
+
+@contextlib.contextmanager
+def one_at_a_time() -> Iterator[None]:
+    """Let one process of this user after the other start a local Ray.
+
+    Two that started within seconds of each other have been seen to wait for each other forever.
+    """
+    lock = Path(tempfile.gettempdir()) / f"evade-start-ray-{os.getuid()}.lock"
+    with lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # let go of when the file is closed, or the process ends
+        yield
+
+
+def check_mode(cluster: ClusterConfig) -> None:
+    """Refuse a Ray that would ask nobody for a token, unless a cluster is said to be one.
+
+    Raises:
+        ConfigError: RAY_AUTH_MODE turns a local Ray's token off, or is not given for another.
+    """
+    mode = os.environ.get("RAY_AUTH_MODE")
+    if cluster.name == "local" and mode not in (None, "token"):
+        rule = "must be token, or not set, for cluster=local: without it, anyone who reaches Ray runs code"
+        raise ConfigError(f"RAY_AUTH_MODE: {rule}, got {mode!r}; unset it")
+    if cluster.name == "ray" and mode not in ("token", "disabled"):
+        remedy = (
+            "set it to token, and RAY_AUTH_TOKEN_PATH to the file with the cluster's token "
+            "(disabled joins a cluster that asks nobody for one)"
+        )
+        raise ConfigError(f"RAY_AUTH_MODE: must be token or disabled for cluster=ray, got {mode!r}; {remedy}")
+
+
+def use_token(file: Path) -> None:
+    """Let this process's Ray authenticate by the token in a private file, made if missing.
+
+    A token that the environment already names is kept. RAY_AUTH_MODE stays as it is: a Ray
+    that starts without it turns authentication on, whereas a Ray that is already imported
+    would not notice it.
+
+    Raises:
+        ConfigError: If the file is another user's, or others can read it.
+    """
+    if os.environ.get("RAY_AUTH_TOKEN"):
+        return
+    if not os.environ.get("RAY_AUTH_TOKEN_PATH"):
+        make_token(file)
+        os.environ["RAY_AUTH_TOKEN_PATH"] = str(file)
+    check_private(Path(os.environ["RAY_AUTH_TOKEN_PATH"]))
+
+
+def make_token(file: Path) -> None:
+    """Write a new token to a file that nobody else can read; one that is there stays."""
+    if file.exists():
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.parent.chmod(0o700)
+    handle, part = tempfile.mkstemp(dir=file.parent)  # for its owner alone
+    with os.fdopen(handle, "w") as stream:
+        stream.write(secrets.token_hex(32))
+    with contextlib.suppress(FileExistsError):
+        os.link(part, file)  # whole or not at all, and never over one that another process made
+    Path(part).unlink()
+
+
+def check_private(file: Path) -> None:
+    """Refuse a token that anyone but this user could read.
+
+    Raises:
+        ConfigError: If there is no such file, it is another user's, or its mode lets others in.
+    """
+    try:
+        info = file.stat()
+    except OSError as error:
+        raise ConfigError(f"RAY_AUTH_TOKEN_PATH: {str(file)!r} cannot be read: {error.strerror}") from None
+    mode = stat.S_IMODE(info.st_mode)
+    if not stat.S_ISREG(info.st_mode) or info.st_uid != os.getuid() or mode & 0o077:
+        rule = "must be a file that its owner alone can read, and yours"
+        found = f"mode {mode:04o} of user {info.st_uid}"
+        raise ConfigError(
+            f"RAY_AUTH_TOKEN_PATH: {rule}, got {found} ({str(file)!r}); if nobody else has read it, "
+            f"run `chmod 600 {file}`, else delete it for a new one"
+        )

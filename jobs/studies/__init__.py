@@ -1,0 +1,1 @@
+"""Studies of the simulator, the encoder, and what a representation tells."""

@@ -1,0 +1,1 @@
+"""Encoders compared: what each costs, and what it keeps."""

@@ -1,0 +1,187 @@
+"""What an encoding of events costs, and how far its latent is from float64 with exact time."""
+
+import copy
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from jobs.training.pretrain import Window
+from models.encoder.embedding import time_code
+from models.encoder.evae import EventVAE, event_targets, reconstruct
+from models.encoder.event_batch import EventBatch, batch_windows, index_events
+from models.encoder.table import EncoderTable
+
+TIME_BINS = (16, 64, 256, 1024, 4096, 65536)
+CAPS = (250, 500, 1000, 2000, 4096)
+CHUNKS = (1, 2, 5, 20)
+TIMED_WINDOWS = 8
+Encode = Callable[[Window], np.ndarray]
+
+
+class Form(NamedTuple):
+    """One way to encode a window: what was changed, to what, and the function to mu (latent,)."""
+
+    knob: str
+    setting: str
+    encode: Encode
+    evae: EventVAE
+
+
+class Row(NamedTuple):
+    """What a form comes to.
+
+    Attributes:
+        knob, setting: As in `Form`.
+        step_us, dense_us: Process time per window of one control step, and of 2,000 events [us].
+        error_max, error_mean: Distance of mu from float64 with exact time, as share of the
+            standard deviation of the posterior, over latents and windows.
+        explained: Of the held-out pictures, decoded from this mu; see `explained`.
+    """
+
+    knob: str
+    setting: str
+    step_us: float
+    dense_us: float
+    error_max: float
+    error_mean: float
+    explained: float
+
+
+def default_forms(evae: EventVAE) -> list[Form]:
+    """The lookup table as it is used, the network itself, and the table with one setting changed."""
+    table = EncoderTable.from_evae(evae)
+    forms = [("default", "", encode_whole(table)), ("torch", "plain network", encode_by_network(evae))]
+    for precision in ("int16", "int8"):
+        forms.append(("precision", precision, encode_whole(EncoderTable.from_evae(evae, precision))))
+    if evae.ecn.coding != "none":
+        for bins in TIME_BINS:
+            forms.append(("time bins", str(bins), encode_whole(EncoderTable.from_evae(evae, time_bins=bins))))
+    forms += [("newest events", str(most), encode_newest(table, most)) for most in CAPS]
+    forms += [("chunks", str(count), encode_in_chunks(table, count)) for count in CHUNKS]
+    forms.append(("chunks", "per event", encode_in_chunks(table, None)))
+    return [Form(*form, evae) for form in forms]
+
+
+def size_form(evae: EventVAE) -> Form:
+    """The table of a model of another context size."""
+    return Form("context", str(evae.settings["context"]), encode_whole(EncoderTable.from_evae(evae)), evae)
+
+
+def encode_whole(table: EncoderTable) -> Encode:
+    """All events at once."""
+    return lambda window: table.encode(*window)
+
+
+def encode_newest(table: EncoderTable, most: int) -> Encode:
+    """The newest `most` events alone."""
+    return lambda window: table.encode(window[0][-most:], *window[1:])
+
+
+def encode_in_chunks(table: EncoderTable, count: int | None) -> Encode:
+    """`count` chunks, one after the other as a stream brings them; None: each event by itself."""
+
+    def encode(window: Window) -> np.ndarray:
+        events, start_us, window_us = window
+        context = table.empty()
+        for part in np.array_split(events, count or max(1, len(events))):
+            context = table.update(context, part, start_us, window_us)
+        return table.latent(context)
+
+    return encode
+
+
+def encode_by_network(evae: EventVAE) -> Encode:
+    """Every event through the network, as published."""
+
+    @torch.no_grad()
+    def encode(window: Window) -> np.ndarray:
+        context = evae.ecn.plain(batch_windows([window], evae.grid))
+        return evae.encoder(context)[0, : evae.settings["latent"]].numpy()
+
+    return encode
+
+
+@torch.no_grad()
+def exact_latents(evae: EventVAE, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (B, latent) of the posterior, float64, times not rounded to bins.
+
+    Raises:
+        ValueError: The model's contexts are complex.
+    """
+    if evae.ecn.coding == "eventnet":
+        raise ValueError("coding must be additive or none, got 'eventnet'")
+    model = copy.deepcopy(evae).double()
+    features = model.ecn.cell_features().numpy()
+    contexts = np.zeros((len(windows), features.shape[1]))
+    for context, (events, start_us, window_us) in zip(contexts, windows, strict=True):
+        if len(events):
+            fields = tuple(events[name] for name in "txyp")
+            cells = index_events(fields, start_us, window_us, evae.grid)[0] % len(features)
+            times = np.clip((events["t"] - start_us) / window_us, 0.0, 1.0)
+            codes = time_code(times, features.shape[1], evae.ecn.coding)
+            context[:] = np.maximum((features[cells] + codes).max(axis=0), 0.0)
+    mu, logvar = model.encoder(torch.from_numpy(contexts)).chunk(2, dim=-1)
+    return mu.numpy(), torch.exp(0.5 * logvar).numpy()
+
+
+@torch.no_grad()
+def explained(evae: EventVAE, batch: EventBatch, mu: torch.Tensor | None = None) -> float:
+    """Share of the variance of the windows' pictures that the decoded ones explain (R2).
+
+    1 - squared error / squared error of the mean picture: 0 for what knows nothing of the single
+    window, 1 for perfection.
+
+    Args:
+        evae: Frozen model.
+        batch: Windows.
+        mu: Latents to decode (B, latent); None: the model's own.
+    """
+    targets = event_targets(batch, evae.target)
+    logits = evae(batch)[0] if mu is None else evae.decoder(mu)
+    error = (reconstruct(logits, evae.target) - targets).square().sum()
+    return 1.0 - float(error / (targets.mean(0) - targets).square().sum().clamp_min(1e-12))
+
+
+def measure(
+    forms: Sequence[Form], windows: list[Window], timed: tuple[list[Window], list[Window]], rounds: int,
+    advance: Callable[[int], None],
+) -> list[Row]:  # fmt: skip
+    """Cost and accuracy of each form.
+
+    Args:
+        forms: What to measure.
+        windows: Held-out windows for the accuracy.
+        timed: Windows of one control step, and dense ones, for the cost.
+        rounds: Of timing.
+        advance: Told 1 after each form.
+    """
+    costs = costs_us(forms, timed, rounds)
+    rows: list[Row] = []
+    reference: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for form, (step_us, dense_us) in zip(forms, costs.tolist(), strict=True):
+        if id(form.evae) not in reference:
+            reference[id(form.evae)] = exact_latents(form.evae, windows)
+        mu, deviation = reference[id(form.evae)]
+        own = np.stack([form.encode(window) for window in windows])
+        error = np.abs(own - mu) / deviation
+        share = explained(form.evae, batch_windows(windows, form.evae.grid), torch.from_numpy(own))
+        rows.append(Row(*form[:2], step_us, dense_us, float(error.max()), float(error.mean()), float(share)))
+        advance(1)
+    return rows
+
+
+def costs_us(forms: Sequence[Form], timed: tuple[list[Window], ...], rounds: int) -> np.ndarray:
+    """Process time per window [us] (forms, kinds of windows): medians of interleaved rounds."""
+    seconds = np.empty((rounds + 1, len(forms), len(timed)))  # the first round compiles
+    for turn in range(rounds + 1):
+        for place, form in enumerate(forms):
+            for kind, windows in enumerate(timed):
+                form.encode(windows[0])  # its table comes back into the cache, as it is in a flight
+                start = time.process_time()
+                for window in windows[:TIMED_WINDOWS]:
+                    form.encode(window)
+                seconds[turn, place, kind] = (time.process_time() - start) / len(windows[:TIMED_WINDOWS])
+    return 1e6 * np.median(seconds[1:], axis=0)

@@ -1,0 +1,117 @@
+"""Random flights with what an agent would have to know at each step, and what their events say of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from envs.config import EnvConfig
+from envs.corridor import CorridorEnv
+from envs.kinematics import SEED_STRIDE
+from envs.scene.range_scan import NEAR_M, proximity, sector_bearings
+from jobs.training.collect import HoldingAgent, steps_of
+from jobs.training.pretrain import Window
+from models.encoder.evae import EventVAE
+from models.encoder.event_batch import Grid, batch_windows
+from models.encoder.event_images import cell_counts
+from models.encoder.frozen import encoder_of
+from models.policy.features import FEATURES
+
+SECTORS = 24  # of the field of view
+RAYS = 8  # in each: at 90 degrees no pole of 0.2 m stands unseen at 20 m
+ALARM_M = 15.0  # what stands nearer is what an agent has to turn away from
+CELLS = (8, 16)  # each way; the finer ones say nearly all that a picture says
+
+
+@dataclass(frozen=True)
+class ProbeData:
+    """Control steps of whole flights, in their order.
+
+    Attributes:
+        windows: Events of each step.
+        flight: int64 (N,), number of each step's flight, ascending.
+        proximity: float64 (N, SECTORS), of the nearest obstacle in each sector at the end of the step,
+            from left to right; see `envs.scene.range_scan.proximity`.
+        bearing_deg: float64 (SECTORS,), middle of each sector, to the right [degrees].
+    """
+
+    windows: list[Window]
+    flight: np.ndarray
+    proximity: np.ndarray
+    bearing_deg: np.ndarray
+
+    @property
+    def alarm(self) -> np.ndarray:
+        """Bool (N,): whether an obstacle stands within ALARM_M."""
+        return self.proximity.max(axis=1) >= np.exp(-ALARM_M / NEAR_M)
+
+
+def fly_and_look(config: EnvConfig, num_steps: int, seed: int, advance: Callable[[int], None]) -> ProbeData:
+    """Fly at random, as `jobs.training.collect` does but elsewhere, and keep the truth beside the events.
+
+    Args:
+        config: Environment.
+        num_steps: Control steps [-].
+        seed: Of corridors and actions.
+        advance: Told the number of steps after each flight.
+    """
+    env = CorridorEnv(config)
+    agent = HoldingAgent(np.random.SeedSequence([seed, 4]))
+    bearings = sector_bearings(config.camera.fov_deg, SECTORS, RAYS)
+    windows: list[Window] = []
+    flight: list[int] = []
+    near: list[np.ndarray] = []
+    started = env.reset(seed=seed + SEED_STRIDE)  # not the corridors that the encoder was trained in
+    while len(windows) < num_steps:
+        start_us, number, done = 0, (flight[-1] + 1 if flight else 0), len(windows)
+        agent.reset([env], [number])
+        for end_us in steps_of(env, agent, started, num_steps - len(windows)):
+            windows.append((env.events.copy(), start_us, end_us - start_us))
+            flight.append(number)
+            rays = proximity(env.scene, env.camera_pose(), bearings.ravel())
+            near.append(rays.reshape(bearings.shape).max(axis=1))
+            start_us = end_us
+        advance(len(windows) - done)
+        started = env.reset()
+    env.close()
+    return ProbeData(windows, np.array(flight), np.stack(near), np.degrees(bearings.mean(axis=1)))
+
+
+def nothing(probe_data: ProbeData) -> np.ndarray:
+    """Zeros (N, 1): what is known without looking."""
+    return np.zeros((len(probe_data.flight), 1), np.float32)
+
+
+def columns(probe_data: ProbeData, grid: Grid) -> np.ndarray:
+    """What the policy event_columns sees of each step, float32 (N, 2 width)."""
+    settings = {"width": grid.width, "height": grid.height}
+    make = FEATURES["columns"].from_events
+    assert make is not None  # noqa: S101  for the type checker
+    return np.stack([make(window, settings, None) for window in probe_data.windows])
+
+
+def cells(probe_data: ProbeData, grid: Grid, across: int) -> np.ndarray:
+    """log(1 + count) of OFF and ON events in `across` x `across` cells, float32 (N, 2 across^2)."""
+    return np.log1p(cell_counts(batch_windows(probe_data.windows, grid), across))
+
+
+def latents(probe_data: ProbeData, evae: EventVAE) -> np.ndarray:
+    """Latent of each step's window, float32 (N, latent)."""
+    encoder = encoder_of(evae)
+    return np.stack([encoder.encode(*window) for window in probe_data.windows])
+
+
+def stacked(features: np.ndarray, flight: np.ndarray, stack: int) -> np.ndarray:
+    """The last `stack` rows at each step, oldest first, as `models.policy.features.push_features` keeps them.
+
+    Args:
+        features: (N, D).
+        flight: int64 (N,), ascending; the first row of a flight fills all places before it.
+        stack: Rows.
+
+    Returns:
+        (N, stack D).
+    """
+    first = np.searchsorted(flight, flight)
+    places = np.arange(len(flight))[:, None] - np.arange(stack)[::-1]
+    return features[np.maximum(places, first[:, None])].reshape(len(features), -1)

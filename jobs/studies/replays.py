@@ -1,0 +1,190 @@
+"""What a setting changes on flights that were recorded: events, latents, actions, and the cost of a step.
+
+A recorded flight is its corridor and its actions. Flown again with these actions under another setting,
+it comes to the same places: whatever differs is the setting's doing.
+"""
+
+import time
+from collections.abc import Callable, Generator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.config import EnvConfig
+from envs.corridor import CorridorEnv
+from envs.event_error import TIME_SHARE, event_error
+from envs.events import EVENT, unpack_window
+from jobs.rollout.agents import PolicyAgent
+from jobs.studies.encoder.costs import exact_latents
+from models.encoder.evae import EventVAE
+from models.encoder.event_batch import cut_packed
+from models.encoder.table import EncoderTable
+
+TURN = 50  # steps: a few hundredths of a second, in which a table is soon back in the cache
+Setting = tuple[EnvConfig, PolicyAgent]
+
+
+class Replay(NamedTuple):
+    """One flight of T steps.
+
+    Attributes:
+        actions: What the agent chose at each step, int64 (T,).
+        windows: What it saw before that: packed windows int32 (rows, 4), T of them.
+        events: EVENT, all of the flight.
+        step_us: Mean process time of a step: the choice and the simulation [us].
+    """
+
+    actions: np.ndarray
+    windows: list[np.ndarray]
+    events: np.ndarray
+    step_us: float
+
+
+Flight = Generator[None, None, Replay]
+
+
+class Measured(NamedTuple):
+    """What a setting comes to over all recorded flights.
+
+    Attributes:
+        step_us: Process time of a step, median over flights [us].
+        event_error: Against the reference's events, see `envs.event_error`.
+        latent_error: Against the exact latents of the reference's events, see `latent_error`.
+        other_action: Share of steps at which the policy chooses another action than the reference.
+    """
+
+    step_us: float
+    event_error: float
+    latent_error: float
+    other_action: float
+
+
+class _Note(NamedTuple):
+    """One flight under one setting, beside the reference."""
+
+    step_us: float
+    event_error: float
+    events: int  # of both
+    latents: np.ndarray
+    others: np.ndarray
+
+
+def measure(
+    settings: Sequence[Setting], evae: EventVAE, seeds: Sequence[int], advance: Callable[[int], None]
+) -> list[Measured]:
+    """Record one flight per seed under the first setting, and fly it again under each.
+
+    The settings take turns every `TURN` steps, so that a busy machine hits all alike. A policy that
+    draws its actions draws with the same numbers under each.
+
+    Args:
+        settings: Simulation and policy of each; the last one is the reference.
+        evae: The policy's encoder, for latents in float64 with exact time.
+        seeds: Of the corridors.
+        advance: Told 1 for each setting and flight.
+    """
+    exact: list[np.ndarray] = []
+    notes: list[list[_Note]] = [[] for _ in settings]
+    for seed in seeds:
+        actions = replay(*settings[0], seed).actions
+        flown = take_turns([steps(*setting, seed, actions) for setting in settings], advance)
+        reference = flown[-1]
+        windows = [unpack_window(window) for window in reference.windows]
+        exact.append(exact_latents(evae, [(events, 0, window_us) for events, window_us in windows])[0])
+        for notes_of, own, setting in zip(notes, flown, settings, strict=True):
+            notes_of.append(_note(own, reference, *setting))
+    return [_measured(own, np.concatenate(exact)) for own in notes]
+
+
+def _note(own: Replay, reference: Replay, env: EnvConfig, agent: PolicyAgent) -> _Note:
+    error = event_error(own.events, reference.events, TIME_SHARE * 1e6 / env.control_hz)
+    others = own.actions != reference.actions
+    events = own.events.size + reference.events.size
+    return _Note(own.step_us, error, events, latents_of(agent, own.windows), others)
+
+
+def _measured(notes: Sequence[_Note], exact: np.ndarray) -> Measured:
+    weights = [note.events for note in notes]
+    errors = [note.event_error for note in notes]
+    return Measured(
+        step_us=float(np.median([note.step_us for note in notes])),
+        event_error=float(np.average(errors, weights=weights)) if sum(weights) else 0.0,
+        latent_error=latent_error(np.concatenate([note.latents for note in notes]), exact),
+        other_action=float(np.concatenate([note.others for note in notes]).mean()),
+    )
+
+
+def take_turns(flights: Sequence[Flight], advance: Callable[[int], None]) -> list[Replay]:
+    """Fly all to their ends, one turn of each after the other; `advance` is told 1 at each end."""
+    done: dict[int, Replay] = {}
+    while len(done) < len(flights):
+        for place, flight in enumerate(flights):
+            if place in done:
+                continue
+            try:
+                next(flight)
+            except StopIteration as end:
+                done[place] = end.value
+                advance(1)
+    return [done[place] for place in range(len(flights))]
+
+
+def replay(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray | None = None) -> Replay:
+    """Fly a flight of `steps` in one go."""
+    return take_turns([steps(config, agent, seed, actions)], lambda count: None)[0]
+
+
+def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray | None = None) -> Flight:
+    """Fly the corridor of a seed, in turns of `TURN` steps.
+
+    Args:
+        config: The simulation.
+        agent: Chooses at every step; it remembers one flight at a time.
+        seed: Of the corridor.
+        actions: Flown in place of those that the agent chooses, int64 (T,); None: its own, until the
+            flight ends.
+    """
+    env = CorridorEnv(config, observation=agent.observation)
+    try:
+        observation, info = env.reset(seed=seed)
+        agent.reset([env], [seed])
+        chosen: list[int] = []
+        windows, events = [], [np.empty(0, EVENT)]
+        seconds, over = 0.0, False
+        while not over:
+            windows.append(cut_packed(observation))
+            start = time.process_time()
+            chosen.append(int(agent(observation[None], [info])[0]))
+            action = chosen[-1] if actions is None else int(actions[len(chosen) - 1])
+            observation, _, terminated, truncated, info = env.step(action)
+            seconds += time.process_time() - start
+            events.append(env.events)
+            over = terminated or truncated
+            if len(chosen) % TURN == 0:
+                yield
+    finally:
+        env.close()
+    return Replay(np.array(chosen), windows, np.concatenate(events), 1e6 * seconds / len(chosen))
+
+
+def latents_of(agent: PolicyAgent, windows: Sequence[np.ndarray]) -> np.ndarray:
+    """Latents (T, latent) that a policy's encoder makes of packed windows.
+
+    Raises:
+        TypeError: The policy has no lookup table of single events.
+    """
+    table = agent.policy.encoder
+    if not isinstance(table, EncoderTable):
+        raise TypeError(f"the policy's encoder must be an EncoderTable, got {type(table).__name__}")
+    return np.concatenate([table.encode_windows(window[None]) for window in windows])
+
+
+def latent_error(latents: np.ndarray, exact: np.ndarray) -> float:
+    """Root of the mean squared error of latents (T, latent), in standard deviations of the exact ones.
+
+    Both are taken over all units together, so that a unit that says nothing weighs nothing: 0 for
+    the exact latents, 1 for their mean, which knows nothing of the single step.
+    """
+    deviation = float(np.sqrt(exact.var(axis=0).sum()))
+    error = float(np.sqrt(np.square(latents - exact).sum(axis=1).mean()))
+    return error / deviation if deviation > 0.0 else float("nan")

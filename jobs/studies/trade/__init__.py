@@ -1,0 +1,1 @@
+"""Speed against accuracy, from one end to the other."""

@@ -1,0 +1,58 @@
+"""Finished runs below another in MLflow: a sweep's conditions and groups, a trade's settings."""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from envs.config import settings_hash
+from jobs.tracking.store import check_metrics, flatten
+from jobs.tracking.tracker import Tracker
+
+MAX_CHILDREN = 10_000  # of one run
+
+
+class Child(NamedTuple):
+    """A finished run below another, with all that it holds."""
+
+    name: str
+    params: Mapping[str, Any]
+    tags: Mapping[str, str]
+    metrics: Mapping[str, float]
+    curves: Mapping[str, Mapping[int, float]] = {}  # metric -> its value at each step
+
+
+def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> None:
+    """Write finished runs below `parent`: three calls each, and none for one that is there unchanged.
+
+    One whose content has changed takes the place of the run of the same name.
+    """
+    from mlflow.entities import Metric, Param, RunTag
+
+    client = parent.client
+    search = f"tags.`mlflow.parentRunId` = '{parent.run_id}' and tags.kind = '{kind}'"
+    found = client.search_runs([parent.experiment_id], search, max_results=MAX_CHILDREN)
+    known = {run.info.run_name: run for run in found}
+    for child in children:
+        content = settings_hash(child._asdict() | {"params": flatten(child.params)})
+        old = known.get(child.name)
+        if old is not None and old.data.tags.get("content") == content:
+            continue
+        if old is not None:
+            client.delete_run(old.info.run_id)
+        facts = {"kind": kind, "mlflow.parentRunId": parent.run_id}
+        run_id = client.create_run(parent.experiment_id, tags=facts, run_name=child.name).info.run_id
+        now_ms = int(time.time() * 1000)
+        client.log_batch(
+            run_id,
+            metrics=[Metric(name, value, now_ms, step) for name, step, value in _points(child)],
+            params=[Param(key, value) for key, value in flatten(child.params).items()],
+            tags=[RunTag(key, value) for key, value in {**child.tags, "content": content}.items()],
+        )
+        client.set_terminated(run_id)
+
+
+def _points(child: Child) -> list[tuple[str, int, float]]:
+    """Name, step and value of everything that a child measured; what is no curve is at step 0."""
+    curves = {name: {0: value} for name, value in child.metrics.items()} | dict(child.curves)
+    check_metrics({name: sum(points.values()) for name, points in curves.items()})
+    return [(name, step, value) for name, points in curves.items() for step, value in points.items()]

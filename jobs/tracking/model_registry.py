@@ -1,0 +1,156 @@
+"""Trained policies in MLflow's model registry: one name for each group, one version for each training.
+
+A version is sufficient alone: the policy folder (safetensors and JSON), the script `tracking.served_policy`
+and the package `models`. Nothing is pickled, and nothing is installed to find out what it needs.
+"""
+
+import importlib.metadata
+import json
+import shutil
+import tempfile
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from envs.config import settings_hash
+from jobs.run.folder import group_name
+from jobs.run.provenance import REPOSITORY
+from jobs.tracking.tracker import Tracker
+from models.kinds import kind_of
+from models.policy.policy import MANIFEST
+
+if TYPE_CHECKING:
+    from mlflow.models import ModelSignature
+
+PREFIX = "evade-"
+NEEDED = (
+    "mlflow",
+    "numba",
+    "numpy",
+    "pandas",
+    "safetensors",
+    "torch",
+)  # by `jobs.tracking.served_policy` and `models`
+ABOUT = """\
+Policies of the group `{group}`, a version for each training; its tags name seed, commit and figures.
+
+    model = mlflow.pyfunc.load_model("models:/{name}/1")
+    actions = model.predict(what_a_flight_has_seen)["action"]
+
+Loading runs the code that lies beside the weights, as of any MLflow model; the weights alone are in
+the artifacts of the model, `artifacts/policy`, for `models.policy.load_policy`.
+"""
+
+
+INTERFACE = (
+    "What one flight has seen, from its start: events t [us], x, y, p (-1 or +1), or pictures of luminance. "
+    "Out come, for its start and after each control step, the likeliest action (0 forward, 1 left, 2 right) "
+    "and the logits of all."
+)
+SHOWN = ("eval/success_rate", "eval/success_rate_low", "eval/success_rate_high", "eval/distance_m",
+         "train/success_rate", "sim/event_error")  # fmt: skip
+
+
+def register_training(tracker: Tracker, path: Path) -> str:
+    """Register the policy of a run folder whose training is finished, with what its stages found.
+
+    Returns:
+        As `register`.
+    """
+    config = json.loads((path / "config.json").read_text())
+    train, evaluated = (path / "stages" / f"{stage}.json" for stage in ("train", "evaluate"))
+    about = json.loads(train.read_text())
+    figures = about["figures"]
+    if evaluated.is_file():
+        figures |= json.loads(evaluated.read_text())["figures"]["figures"]
+    tags = {name: config[name] for name in ("seed", "budget")} | {"run": path.name, "commit": about["commit"]}
+    tags |= {name: figures[name] for name in SHOWN if name in figures}
+    return register(tracker, path / "policy", group_name(config["exp"], config["train"]["env_steps"]), tags)
+
+
+def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, Any]) -> str:
+    """Register the policy of a training, once; a version that is there gets the new tags.
+
+    Args:
+        tracker: The run that trained it.
+        policy: Its folder.
+        group: What it is one training of.
+        tags: What a reader of the version wants to know; floats are shortened.
+
+    Returns:
+        The version's name, "evade-bytestream/2".
+    """
+    client, name = tracker.client, PREFIX + group
+    manifest = json.loads((policy / MANIFEST).read_text())
+    identity = settings_hash(manifest)
+    if not client.search_registered_models(f"name = '{name}'"):
+        client.create_registered_model(name, description=ABOUT.format(group=group, name=name))
+    found = [
+        version
+        for version in client.search_model_versions(f"name = '{name}'")
+        if version.tags.get("policy") == identity
+    ]
+    version = found[0] if found else _add_version(tracker, policy, name, manifest)
+    for key, value in {**tags, "policy": identity}.items():
+        client.set_model_version_tag(
+            name, version.version, key, f"{value:.4g}" if isinstance(value, float) else value
+        )
+    return f"{name}/{version.version}"
+
+
+def _add_version(tracker: Tracker, policy: Path, name: str, manifest: Mapping[str, Any]) -> Any:
+    """Write the model's files into the store, and a version that points at them."""
+    from mlflow import pyfunc
+    from mlflow.entities import LoggedModelOutput
+
+    client = tracker.client
+    with tempfile.TemporaryDirectory() as place:
+        code, files = Path(place) / "models", Path(place) / "model"
+        shutil.copytree(
+            REPOSITORY / "models", code, ignore=shutil.ignore_patterns("pretrained", "__pycache__")
+        )
+        with warnings.catch_warnings():  # it asks for an example, to check the signature by
+            warnings.simplefilter("ignore", UserWarning)
+            pyfunc.save_model(
+                files,
+                python_model=str(REPOSITORY / "jobs" / "tracking" / "served_policy.py"),
+                artifacts={"policy": str(policy)},
+                code_paths=[str(code)],
+                signature=signature(manifest),
+                pip_requirements=[f"{package}=={importlib.metadata.version(package)}" for package in NEEDED],
+            )
+        model = client.create_logged_model(tracker.experiment_id, name, tracker.run_id)
+        client.log_model_artifacts(model.model_id, str(files))
+    client.finalize_logged_model(model.model_id, "READY")
+    client.log_outputs(tracker.run_id, [LoggedModelOutput(model.model_id, step=0)])
+    return client.create_model_version(
+        name,
+        model.artifact_location,
+        tracker.run_id,
+        model_id=model.model_id,
+        description=INTERFACE,
+        await_creation_for=None,
+    )
+
+
+def signature(manifest: Mapping[str, Any]) -> "ModelSignature":
+    """What `ServedPolicy.predict` takes and gives, for the policy of a manifest."""
+    import numpy as np
+    from mlflow.models import ModelSignature
+    from mlflow.types import ColSpec, ParamSchema, ParamSpec, Schema, TensorSpec
+
+    from jobs.tracking.served_policy import ACTIONS
+
+    given = Schema(
+        [ColSpec("long", "step"), ColSpec("long", "action"), *(ColSpec("float", name) for name in ACTIONS)]
+    )
+    if kind_of(manifest).observation == "luminance":
+        shape = (-1, manifest["height"], manifest["width"])
+        return ModelSignature(Schema([TensorSpec(np.dtype(np.float32), shape)]), given)
+    window_us = round(1e6 / manifest["sensor"]["control_hz"])
+    return ModelSignature(
+        Schema([ColSpec("long", name) for name in "txyp"]),
+        given,
+        ParamSchema([ParamSpec("window_us", "long", window_us)]),
+    )

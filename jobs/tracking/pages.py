@@ -1,0 +1,247 @@
+"""What a reader of MLflow's pages is told of the experiment and of each run, and the views that show them.
+
+Text and plain values; `jobs.tracking.tracker` writes them. Pages of MLflow hold pictures of their own size
+alone and fold a long text, so a run's page shows small pictures (`page/` among its artifacts) and
+begins with one line that says it all.
+"""
+
+import base64
+import io
+import json
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from PIL import Image
+
+WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
+# MLflow's own names: of the text on a page, of a run's colour in charts, of stored views.
+NOTE, COLOUR, VIEW_TAG = "mlflow.note.content", "mlflow.runColor", "mlflow.sharedViewState"
+MAX_CHARACTERS = 8000  # of a run's page; MLflow cuts what is longer, and does not say so
+PAGE_WIDTH = 860  # pixels of a picture beside MLflow's side panels on a screen of 1600
+PREVIEWS = "page"
+
+KINDS = {
+    "pipeline": "From nothing to an evaluated policy",
+    "collect": "Recordings of flights, to pretrain on",
+    "pretrain": "An event VAE, whose frozen encoder a policy sees by",
+    "train": "A policy trained by PPO",
+    "evaluate": "A policy and its bounds in corridors never trained on",
+    "sweep": "Policies at other rates and thresholds, in other worlds, with sensor faults",
+    "ship": "The trained policies of models/pretrained, and how they learnt",
+    "trade": "What exactness costs from end to end",
+    "trade_simulator": "What exact events cost",
+    "trade_encoder": "What an exact encoder costs",
+    "probe": "What a representation of events tells an agent",
+}
+FIGURES = {  # metric: what it is, how it is written
+    "eval/success_rate": ("success in held-out corridors", "{:.0%}"),
+    "eval/distance_m": ("distance without collision", "{:.1f} m"),
+    "train/success_rate": ("success in training", "{:.0%}"),
+    "evae/explained_step": ("reconstruction explained by the latent", "{:.0%}"),
+    "sweep/conditions": ("", "{:.0f} conditions"),
+    "sweep/groups": ("", "{:.0f} groups of policies"),
+    "sweep/flights": ("", "{:.0f} flights"),
+}
+FIRST = ("eval/", "sweep/control_hz.", "sweep/contrast_threshold.", "sweep/sparsity.",
+         "sweep/background_activity.", "sweep/", "train/")  # fmt: skip
+COLUMNS = {  # view: name, filter, columns; the first column orders the runs
+    "results": ("Results", "tags.kind = 'run'", (
+        "metrics.`eval/success_rate`", "metrics.`eval/distance_m`", "metrics.`train/success_rate`",
+        "metrics.`sim/event_error`", "params.`exp`", "params.`seed`", "params.`train.env_steps`",
+    )),
+    "sweeps": ("Sweeps", "tags.kind = 'sweep'", (
+        "metrics.`sweep/conditions`", "metrics.`sweep/groups`", "metrics.`sweep/flights`", "tags.`groups`",
+    )),
+}  # fmt: skip
+CURVES = ("train/success_rate", "train/distance_m")  # of trainings, over environment steps
+READING = """
+| job | what its runs hold |
+|---|---|
+{kinds}
+
+A row of **Results** is a run folder: its page begins with its figures and holds the resolved settings
+(Parameters), commit and host (Tags), and tables and films (Artifacts). Of a **sweep**, the page shows the
+figures with 95 % intervals; below it lie a run for each condition and group, named `axis=value group`, and a
+run for each group, whose metrics `sweep/AXIS_success` are curves with the axis as their step. **Model
+registry**, on the left, has the trained policies: a model for each group, a version for each training.
+
+Success is the fraction of flights that reach the goal at 100 m, distance what is flown without a
+collision. `sim/event_error` is how far the simulated events are from exact ones, `fidelity.tolerance`
+what was asked.
+"""
+
+
+def run_address(experiment_id: str, run_id: str, file: str = "") -> str:
+    """Address of a run's page, or of one of its artifacts, from the dashboard's own."""
+    path = f"/artifacts/{file}" if file else ""
+    return f"#/experiments/{experiment_id}/runs/{run_id}{path}?{WORKFLOW}"
+
+
+def view_address(experiment_id: str, key: str) -> str:
+    """Address of a stored view of the experiment's runs; one of charts opens as such."""
+    mode = "&compareRunsMode=CHART" if key.startswith("charts") else ""
+    return f"#/experiments/{experiment_id}/runs?{WORKFLOW}&viewStateShareKey={key}{mode}"
+
+
+def table_view(search: str, columns: Sequence[str]) -> dict[str, Any]:
+    """The state of a table of runs.
+
+    Args:
+        search: Filter, such as "tags.kind = 'condition'".
+        columns: Such as "metrics.`eval/success_rate`"; the first orders the rows.
+    """
+    order = {"orderByKey": columns[0], "orderByAsc": False}
+    return {"searchFilter": search, **order, "selectedColumns": list(columns)}
+
+
+def chart_view(search: str, metrics: Sequence[str]) -> dict[str, Any]:
+    """The state of a page of line charts, one for each metric; x is the metric's step."""
+    section = {"uuid": "charts", "name": "Charts", "display": True, "isReordered": True}
+    cards = [
+        {
+            "uuid": metric, "type": "LINE", "metricKey": metric, "metricSectionId": "charts",
+            "runsCountToCompare": 30, "deleted": False, "isGenerated": False, "xAxisKey": "step",
+            "displayPoints": True, "range": {}, "lineSmoothness": 0, "scaleType": "linear",
+            "xAxisScaleType": "linear",
+        }
+        for metric in metrics
+    ]  # fmt: skip
+    # In the order of time, MLflow would show the runs' parents, with the runs folded below.
+    order = {"orderByKey": f"metrics.`{metrics[0]}`" if metrics else "", "orderByAsc": False}
+    return {
+        "searchFilter": search, **order, "compareRunCharts": cards, "compareRunSections": [section],
+        "isAccordionReordered": True, "runsHiddenMode": "SHOW_ALL", "hideEmptyCharts": True,
+    }  # fmt: skip
+
+
+def usual_views() -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Key, name and state of the views that every store has."""
+    for key, (name, search, columns) in COLUMNS.items():
+        yield key, name, table_view(search, columns)
+    yield "charts-learning", "Learning curves", chart_view("tags.kind = 'run'", CURVES)
+
+
+def packed_view(name: str, state: Mapping[str, Any], now_ms: int) -> str:
+    """A view as MLflow stores it in a tag of the experiment."""
+    packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
+    return json.dumps({"name": name, "createdAt": now_ms, "updatedAt": now_ms, "state": packed})
+
+
+def stored_views(tags: Mapping[str, str]) -> dict[str, str]:
+    """Key -> name of the views in an experiment's tags, the newest first."""
+    views = {
+        tag.removeprefix(f"{VIEW_TAG}."): json.loads(value)
+        for tag, value in tags.items()
+        if tag.startswith(VIEW_TAG)
+    }
+    newest = sorted(views.items(), key=lambda item: -item[1]["createdAt"])
+    return {key: view["name"] for key, view in newest}
+
+
+def experiment_note(experiment_id: str, tags: Mapping[str, str]) -> str:
+    """The text above the table of runs; its first line, all that MLflow shows folded, leads to the views."""
+    views = stored_views(tags)
+    usual = [key for key, *_ in usual_views() if key in views]
+    newest = [key for key in views if key not in usual][:2]  # of the newest sweep
+    links = " · ".join(f"[{views[key]}]({view_address(experiment_id, key)})" for key in (*usual, *newest))
+    kinds = "\n".join(f"| `{job}` | {text} |" for job, text in KINDS.items())
+    title = "**Evade**: policies that fly by the events of an event camera."
+    return f"{title} Open {links}\n{READING.format(kinds=kinds)}"
+
+
+@dataclass(frozen=True)
+class Page:
+    """What the page of a run is made of.
+
+    Attributes:
+        experiment_id: Of MLflow.
+        run_id: Of MLflow.
+        params: The resolved settings.
+        tags: Job, commit, host and more.
+        metrics: Newest values.
+        files: Paths of all artifacts.
+        tables: Path -> text of those that are Markdown.
+        views: Key -> name of the stored views of this run.
+    """
+
+    experiment_id: str
+    run_id: str
+    params: Mapping[str, str]
+    tags: Mapping[str, str]
+    metrics: Mapping[str, float]
+    files: Sequence[str]
+    tables: Mapping[str, str]
+    views: Mapping[str, str]
+
+
+def run_note(page: Page) -> str:
+    """The text at the top of a run's page: what it is, its figures, pictures and tables."""
+    parts = [headline(page), links(page), *pictures(page), made(page)]
+    used = sum(len(part) + 2 for part in parts)
+    for path, text in page.tables.items():
+        address = run_address(page.experiment_id, page.run_id, path)
+        whole = f"[{path}]({address})\n\n{text}"
+        part = whole if used + len(whole) < MAX_CHARACTERS else f"Table: [{path}]({address})"
+        used += len(part) + 2
+        parts.append(part)
+    return "\n\n".join(part for part in parts if part)
+
+
+def headline(page: Page) -> str:
+    """What the run is, and its main figures."""
+    what = KINDS.get(page.tags.get("job", ""), "A run")
+    named = ", ".join(page.params[name] for name in ("exp", "budget") if name in page.params)
+    figures = [_figure(page, name) for name in FIGURES if name in page.metrics]
+    seed = page.params.get("seed", "-")
+    return f"**{what}** ({named}, seed {seed}): {', '.join(figures) or 'no figures yet'}."
+
+
+def _figure(page: Page, name: str) -> str:
+    """A figure as text, with its interval if there is one."""
+    text, form = FIGURES[name]
+    bounds = [page.metrics.get(f"{name}_{end}") for end in ("low", "high")]
+    known = [form.format(bound) for bound in bounds if bound is not None]
+    value = f"{text} {form.format(page.metrics[name])}".strip()
+    return value + (f" [{', '.join(known)}]" if len(known) == 2 else "")
+
+
+def links(page: Page) -> str:
+    """Where to go from here: the views of this run, and its films."""
+    found = [f"[{name}]({view_address(page.experiment_id, key)})" for key, name in page.views.items()]
+    films = [path for path in page.files if path.endswith(".mp4")]
+    found += [f"[Film: {path}]({run_address(page.experiment_id, page.run_id, path)})" for path in films]
+    return " · ".join(found)
+
+
+def pictures(page: Page) -> list[str]:
+    """The small pictures, those first that say most, each with the way to the large one."""
+    names = [path.removeprefix(f"{PREVIEWS}/") for path in page.files if path.startswith(f"{PREVIEWS}/")]
+    return [
+        f"![{name}](get-artifact?path={PREVIEWS}/{name}&run_uuid={page.run_id})\n"
+        f"[{name}]({run_address(page.experiment_id, page.run_id, name)})"
+        for name in sorted(names, key=_place)
+    ]
+
+
+def _place(name: str) -> tuple[int, str]:
+    ranks = [rank for rank, start in enumerate(FIRST) if name.startswith(start)]
+    return (min(ranks, default=len(FIRST)), name)
+
+
+def made(page: Page) -> str:
+    """Commit, machine, and the fidelity asked and achieved."""
+    tags = {name: page.tags.get(name, "-") for name in ("commit", "host", "cpus", "python")}
+    asked = page.params.get("fidelity.tolerance", "-")
+    text = "Commit `{commit}`, host `{host}` ({cpus} CPUs), Python {python}. ".format(**tags)
+    achieved = {"": "sim/event_error", " at worst": "sim/event_error_max"}
+    found = [f"{page.metrics[name]:.3f}{when}" for when, name in achieved.items() if name in page.metrics]
+    return f"{text}Event error asked: at most {asked}; achieved: {', '.join(found) or 'not measured'}."
+
+
+def preview(picture: bytes) -> Image.Image:
+    """A picture no wider than a run's page."""
+    image = Image.open(io.BytesIO(picture)).convert("RGB")
+    image.thumbnail((PAGE_WIDTH, 10 * PAGE_WIDTH))
+    return image

@@ -1,0 +1,87 @@
+"""Where the tracking store is, and what may be written to it; plain values, no tracker needed."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jobs.config.config import Config, ConfigError
+from jobs.config.errors import HIDDEN, redacted
+from jobs.run.provenance import REPOSITORY
+
+SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep")
+MAX_METRICS = 40  # of one call; a page with hundreds of charts cannot be read, nor drawn
+MAX_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
+LOCAL_PAGE = "http://127.0.0.1:5000"
+
+
+def store_uri(config: Config) -> str:
+    """The store's address; a relative SQLite file lies in the folder that holds `runs_dir`.
+
+    Raises:
+        ConfigError: If the address is of a kind that MLflow does not keep runs in, or one that
+            was written down here, without its password.
+    """
+    uri = config.tracking.uri
+    if HIDDEN in uri:
+        remedy = (
+            "give it again, or leave it out and set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD "
+            "(of a server) or PGPASSFILE (of PostgreSQL)"
+        )
+        raise ConfigError(f"tracking.uri: must hold the password itself, got {uri!r}; {remedy}")
+    if uri.startswith("sqlite:///"):
+        return f"sqlite:///{Path(config.runs_dir).resolve().parent / uri.removeprefix('sqlite:///')}"
+    if uri.startswith(("http://", "https://", "postgresql", "mysql")):
+        return uri
+    raise ConfigError(
+        f"tracking.uri: must begin with sqlite:/// or http:// or https://, got {redacted(uri)!r}"
+    )
+
+
+def page(uri: str) -> str:
+    """Where a browser finds a tracking store; it will ask for the password."""
+    return redacted(uri).replace(f"{HIDDEN}@", "").rstrip("/") if uri.startswith("http") else LOCAL_PAGE
+
+
+def dashboard_command(uri: str) -> str:
+    """What a person types to serve a store to browsers of this machine only."""
+    return "make mlflow" if uri == f"sqlite:///{REPOSITORY / 'mlflow.db'}" else server_command(uri)
+
+
+def server_command(uri: str) -> str:
+    """The server itself, whatever the store: variables and words."""
+    lean = (
+        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true "
+        "MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false"
+    )
+    server = "mlflow server --workers 1 --host 127.0.0.1 --port 5000"
+    return f"{lean} {server} --backend-store-uri {redacted(uri)}"
+
+
+def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
+    """The metrics as floats; `jobs.tracking.tracker.Tracker.log` says what is refused."""
+    values = {name: float(value) for name, value in metrics.items()}
+    infinite = [f"{name} = {value}" for name, value in values.items() if math.isinf(value)]
+    if infinite:
+        raise ValueError(f"metrics must be finite, got {', '.join(infinite)}; leave out the unmeasured")
+    stray = [name for name in values if name.partition("/")[0] not in SECTIONS or "/" not in name]
+    if stray:
+        raise ValueError(f"metric names must be section/name with a section of {SECTIONS}, got {stray}")
+    if len(values) > MAX_METRICS:
+        raise ValueError(f"metrics must be at most {MAX_METRICS} a call, got {len(values)}; choose some")
+    return values
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested settings as `outer.inner` -> text; a text that MLflow would cut is refused."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            flat.update(flatten(value, f"{name}."))
+            continue
+        text = str(value)
+        if len(text) > MAX_PARAM_CHARACTERS:
+            raise ValueError(f"{name} must be at most {MAX_PARAM_CHARACTERS} characters, got {len(text)}")
+        flat[name] = text
+    return flat

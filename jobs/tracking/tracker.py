@@ -1,0 +1,346 @@
+"""What happened, written to MLflow; the only file that talks to it.
+
+One process creates the store (two at once break it), the driver alone writes, and it writes in
+batches: hundreds of single writes cost seconds, a batch a few hundredths of one.
+
+A store that does not answer holds up no training: curves wait in the run folder and are delivered
+when it is back. All else (tables, figures, the runs themselves) waits for it two minutes, then
+stops with what is computed in the run folder, from where the same command records it.
+"""
+
+import contextlib
+import dataclasses
+import fcntl
+import json
+import logging
+import math
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from envs.config import settings_hash
+from jobs.config.config import Config, as_dict
+from jobs.config.errors import redacted
+from jobs.run.files import read_json, write_json
+from jobs.run.folder import Run, holding
+from jobs.run.progress import console
+from jobs.run.provenance import provenance
+from jobs.tracking.pages import (
+    NOTE,
+    PREVIEWS,
+    VIEW_TAG,
+    Page,
+    experiment_note,
+    packed_view,
+    preview,
+    run_address,
+    run_note,
+    stored_views,
+    usual_views,
+    view_address,
+)
+from jobs.tracking.retry_queue import PATIENT, QUICK, RetryQueue, StoreAway, calls
+from jobs.tracking.store import check_metrics, dashboard_command, flatten, page, store_uri
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from mlflow import MlflowClient
+
+BATCH = 100  # MLflow's limit on parameters and on tags of one call
+KNOWN_RUNS = "tracking.json"  # in a run folder
+AWAY = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # codes of MLflow's that another attempt may not meet
+
+
+class TrackingError(RuntimeError):
+    """The tracking store does not answer; the message says where the results are."""
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """One MLflow run that is being written; `uri` is where, without a password."""
+
+    client: "MlflowClient"
+    uri: str
+    experiment_id: str
+    run_id: str
+    retry_queue: RetryQueue
+
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Write metrics of one step in one batch, now or when the store answers again.
+
+        Args:
+            step: Position on the run's own axis, such as environment steps [-].
+            metrics: `section/name` -> value. NaN means "not measured": it is left out, and
+                the tag `not_measured` names it.
+
+        Raises:
+            ValueError: If a value is infinite (MLflow would store 1.8e308 without a word),
+                a name is in no known section, or there are more than `jobs.tracking.store.MAX_METRICS`.
+        """
+        values = check_metrics(metrics)
+        missing = sorted(name for name, value in values.items() if math.isnan(value))
+        measured = {name: value for name, value in values.items() if name not in missing}
+        row = {"step": step, "time_ms": int(time.time() * 1000), "metrics": measured, "missing": missing}
+        with calls(QUICK):
+            reason = self.retry_queue.deliver([row], self._send)
+        if reason is not None:
+            console.print(
+                f"{self.uri} does not answer, results wait in {self.retry_queue.file}: {reason}", markup=False
+            )
+
+    def _send(self, row: Mapping[str, Any]) -> None:
+        """Write what `log` was told; the same row twice is the same points once, as their times are equal.
+
+        Raises:
+            StoreAway: The store does not answer.
+        """
+        from mlflow.entities import Metric, RunTag
+        from mlflow.exceptions import MlflowException
+
+        step, missing = row["step"], row["missing"]
+        metrics = [Metric(name, value, row["time_ms"], step) for name, value in row["metrics"].items()]
+        tags = [RunTag("not_measured", f"step {step}: {', '.join(missing)}")] if missing else []
+        try:
+            self.client.log_batch(self.run_id, metrics=metrics, tags=tags)
+        except MlflowException as error:
+            if error.error_code not in AWAY:
+                raise
+            raise StoreAway(_reason(error)) from error
+
+    def log_once(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Write only what the run does not hold yet: MLflow would draw a repeated point twice."""
+        held = {
+            (name, point.step, point.value)
+            for name in self.client.get_run(self.run_id).data.metrics.keys() & metrics.keys()
+            for point in self.client.get_metric_history(self.run_id, name)
+        }
+        self.log(step, {name: value for name, value in metrics.items() if (name, step, value) not in held})
+
+    def params(self, values: Mapping[str, Any]) -> None:
+        """Write settings that the run does not have yet, nested mappings as `outer.inner`."""
+        from mlflow.entities import Param
+
+        known = self.client.get_run(self.run_id).data.params
+        new = [Param(key, text) for key, text in flatten(values).items() if key not in known]
+        for first in range(0, len(new), BATCH):
+            self.client.log_batch(self.run_id, params=new[first : first + BATCH])
+
+    def tags(self, values: Mapping[str, Any]) -> None:
+        """Write tags; a tag that exists takes the new value."""
+        from mlflow.entities import RunTag
+
+        self.client.log_batch(self.run_id, tags=[RunTag(key, str(value)) for key, value in values.items()])
+
+    def figure(self, name: str, figure: "Figure") -> None:
+        """Write a figure as a picture file called `name`."""
+        self.client.log_figure(self.run_id, figure, name, save_kwargs={"dpi": 120})
+
+    def text(self, name: str, text: str) -> None:
+        """Write a text file called `name`."""
+        self.client.log_text(self.run_id, text, name)
+
+    def table(self, name: str, columns: Mapping[str, Sequence[Any]]) -> None:
+        """Write a table as `name`.json; the values of its first column must be unique."""
+        self.client.log_table(self.run_id, dict(columns), f"{name}.json")
+
+    def artifact(self, path: Path, folder: str | None = None) -> None:
+        """Write a file, as it is, into a folder of the run's artifacts."""
+        self.client.log_artifact(self.run_id, str(path), folder)
+
+    def of(self, path: Path) -> "Tracker":
+        """The MLflow run of another run folder in the same store; this one, if that has none."""
+        run_id = _known_runs(path).get(_slot(self, "run"), self.run_id)
+        return dataclasses.replace(self, run_id=run_id)
+
+    def save_view(self, key: str, name: str, state: Mapping[str, Any]) -> None:
+        """Store a view of the experiment's runs under "Views", unless it is there unchanged.
+
+        Args:
+            key: Identity of the view; the same key replaces it.
+            name: What the menu calls it.
+            state: As `jobs.tracking.pages.table_view` or `chart_view` makes it.
+        """
+        tag, view = f"{VIEW_TAG}.{key}", packed_view(name, state, int(time.time() * 1000))
+        old = json.loads(self.client.get_experiment(self.experiment_id).tags.get(tag, "{}"))
+        if old.get("state") != json.loads(view)["state"]:
+            self.client.set_experiment_tag(self.experiment_id, tag, view)
+
+    def describe_experiment(self) -> None:
+        """Store the usual views, and write the text above the table of runs, unless it is there."""
+        for key, name, state in usual_views():
+            self.save_view(key, name, state)
+        tags = self.client.get_experiment(self.experiment_id).tags
+        note = experiment_note(self.experiment_id, tags)
+        if tags.get(NOTE) != note:
+            self.client.set_experiment_tag(self.experiment_id, NOTE, note)
+
+    def write_page(self) -> None:
+        """Write the text at the top of the run's page anew, with small copies of all its pictures."""
+        files = [path for path in self.files() if not path.startswith(f"{PREVIEWS}/")]
+        with tempfile.TemporaryDirectory() as place:
+            pictures = [path for path in files if path.endswith(".png")]
+            for path in pictures:
+                small = preview(Path(self.client.download_artifacts(self.run_id, path, place)).read_bytes())
+                self.client.log_image(self.run_id, small, artifact_file=f"{PREVIEWS}/{path}")
+            tables = {
+                path: Path(self.client.download_artifacts(self.run_id, path, place)).read_text()
+                for path in files
+                if path.endswith(".md")
+            }
+        run, views = self.client.get_run(self.run_id), self.client.get_experiment(self.experiment_id).tags
+        own = {key: name for key, name in stored_views(views).items() if key.endswith(self.run_id)}
+        small_ones = [f"{PREVIEWS}/{path}" for path in pictures]
+        facts = run.data.params, run.data.tags, run.data.metrics
+        shown = Page(self.experiment_id, self.run_id, *facts, [*files, *small_ones], tables, own)
+        self.tags({NOTE: run_note(shown)})
+
+    def files(self, folder: str | None = None) -> list[str]:
+        """Paths of all artifacts of the run."""
+        found = self.client.list_artifacts(self.run_id, folder)
+        return [path for file in found for path in (self.files(file.path) if file.is_dir else [file.path])]
+
+    def dashboard(self) -> str:
+        """The command that opens the dashboard, and the addresses to open in it."""
+        lines = [] if self.uri.startswith("http") else [f"Dashboard: {dashboard_command(self.uri)}"]
+        own = run_address(self.experiment_id, self.run_id), view_address(self.experiment_id, "results")
+        this, every = (f"{page(self.uri)}/{address}" for address in own)
+        return "\n".join([*lines, f"This run:  {this}", f"All runs:  {every}"])
+
+
+@contextlib.contextmanager
+def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Tracker]:
+    """Write to the MLflow run of a run folder: the one it had before, or a new one.
+
+    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C. Whoever writes
+    to it works in the run folder: no other process may.
+
+    Args:
+        config: Names the store and the experiment; its settings become parameters.
+        folder: The run folder; it remembers the MLflow run's id.
+        key: Which of the folder's MLflow runs.
+
+    Raises:
+        RunError: Another process works in the run folder.
+        TrackingError: The store does not answer.
+    """
+    uri = store_uri(config)
+    name = folder.path.name if key == "run" else f"{folder.path.name} {key}"
+    facts = {"run_folder": folder.path, "job": config.job, **provenance()}
+    with holding(folder), _answering(uri, folder):
+        client, experiment_id = open_store(uri, config.tracking.experiment, config.cluster.storage)
+        waiting = folder.path / f"undelivered-{quote(key, safe='')}.jsonl"
+        store = Tracker(client, redacted(uri), experiment_id, "", RetryQueue(waiting))
+        tracker = _continue_or_create(store, folder, key, name, {"kind": key})
+        with _ended(tracker):
+            tracker.params(as_dict(folder.config))
+            tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
+            tracker.artifact(folder.path / "config.yaml")
+            tracker.describe_experiment()
+            tracker.write_page()
+            yield tracker
+            tracker.describe_experiment()
+            tracker.write_page()
+
+
+@contextlib.contextmanager
+def _answering(uri: str, folder: Run) -> Iterator[None]:
+    """Stop with one clear error where the store does not answer."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        with calls(PATIENT):
+            yield
+    except (MlflowException, StoreAway) as error:
+        if isinstance(error, MlflowException) and error.error_code not in AWAY:
+            raise
+        rest = f"what was computed is in {folder.path}, the same command records it"
+        raise TrackingError(
+            f"tracking.uri: {redacted(uri)} does not answer ({_reason(error)}); {rest}"
+        ) from error
+
+
+def _reason(error: Exception) -> str:
+    """The cause, as the last words of what MLflow says."""
+    return str(error).strip().splitlines()[0].rpartition("Caused by ")[2][:200]
+
+
+@contextlib.contextmanager
+def _ended(tracker: Tracker) -> Iterator[None]:
+    """End the run as what its block turned out to be; deliver what waits before it is finished."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        yield
+        for row in tracker.retry_queue.rows():
+            tracker._send(row)
+        tracker.retry_queue.file.unlink(missing_ok=True)
+        tracker.client.set_terminated(tracker.run_id, "FINISHED")
+    except BaseException as error:
+        status = "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
+        # A store that does not answer must not hide why the block ended.
+        with contextlib.suppress(MlflowException), calls(QUICK):
+            tracker.client.set_terminated(tracker.run_id, status)
+        raise
+
+
+def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
+    """The MLflow run that the folder remembers under `key`, or a new one that it will remember."""
+    from mlflow.exceptions import MlflowException
+
+    known, slot = _known_runs(folder.path), _slot(near, key)
+    run_id = known.get(slot)
+    if run_id is not None:
+        try:
+            near.client.update_run(run_id, status="RUNNING")
+            near.client.log_batch(run_id, tags=[])
+            return replace(near, run_id=run_id)
+        except MlflowException as error:  # the run was deleted: begin a new one
+            if error.error_code in AWAY:
+                raise
+    run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
+    write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})
+    return dataclasses.replace(near, run_id=run.info.run_id)
+
+
+def _known_runs(path: Path) -> dict[str, str]:
+    """The MLflow runs that a run folder remembers: id by slot."""
+    file = path / KNOWN_RUNS
+    return read_json(file) if file.is_file() else {}
+
+
+def _slot(near: Tracker, key: str) -> str:
+    """The name of one MLflow run of a folder: it has others in other stores."""
+    return f"{near.uri} {near.experiment_id} {key}"
+
+
+def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["MlflowClient", str]:
+    """A client of the store and the id of the experiment; both are created if they are not there.
+
+    `storage` keeps a new experiment's artifacts; None: beside an SQLite file, or the server's own.
+    """
+    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+    os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
+    os.environ["MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT"] = "true"  # with the password that is in it
+    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+    from mlflow import MlflowClient
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    location, name = None, f"evade-store-{os.getuid()}-{settings_hash({'uri': uri})[:8]}.lock"
+    lock = Path(tempfile.gettempdir(), name)
+    if uri.startswith("sqlite:///"):
+        file = Path(uri.removeprefix("sqlite:///"))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lock, beside = file.with_suffix(".lock"), file.parent / "mlartifacts"
+        location = (beside / quote(experiment, safe="")).as_uri()
+    if storage is not None:
+        location = f"{storage.rstrip('/')}/mlartifacts/{quote(experiment, safe='')}"
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        client = MlflowClient(tracking_uri=uri)
+        known = client.get_experiment_by_name(experiment)
+        return client, known.experiment_id if known else client.create_experiment(experiment, location)

@@ -1,0 +1,1 @@
+"""Making a policy: recordings, the event VAE, and PPO."""

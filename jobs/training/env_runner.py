@@ -1,0 +1,267 @@
+"""RLlib's environment runner with all flights of a process in one loop over arrays.
+
+RLlib appends each number of each step to the object of its episode and sends every step through
+two pipelines of connectors, which takes longer than to simulate it. Here the steps of all
+corridors are kept as arrays, and the episodes are cut out of them at the end: the same flights
+as RLlib's own runner with connectors that stack features (`test_env_runner.py` compares the
+bytes).
+
+What a policy keeps of a step (`models.policy.features`) is made exactly once, when it is shown, and the
+stack of the last ones takes the observation's place: PPO's epochs and its bootstrap values see
+stacks, and a raw window never leaves the process that flew.
+"""
+
+import uuid
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from ray.rllib.core.columns import Columns
+from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
+
+from jobs.run.watchdog import ending_after
+from models.policy.features import push_features
+
+MAX_SAMPLE_S = 900.0  # a process that flies compiles for a minute first, on a busy machine for several
+
+
+class Step(NamedTuple):
+    """One step of all N flights, each an array (N, ...).
+
+    Attributes:
+        stacks: What the policy saw before it.
+        actions: What it drew, int64.
+        logits: What it drew them from, float32 (N, actions).
+        logp: Logarithm of the probability of each action, float32.
+        rewards: True ones, float64.
+        terminated: Whether the flight ended by contact or goal.
+        truncated: Whether the flight ended by its time limit.
+        infos: The environments', each value an array.
+        over: Where the environment was reset instead of flown.
+    """
+
+    stacks: np.ndarray
+    actions: np.ndarray
+    logits: np.ndarray
+    logp: np.ndarray
+    rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    infos: dict[str, np.ndarray]
+    over: np.ndarray
+
+
+class FlightError(RuntimeError):
+    """What the simulation or the policy raised in a process that flies."""
+
+
+def one_line(error: Exception) -> str:
+    """Type and text of an error."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+class Raised:
+    """A sample that could not be flown, on its way to the process that learns, where it raises."""
+
+    def __init__(self, reason: str) -> None:
+        """Remember why."""
+        self.reason = reason
+
+    def __getitem__(self, index: int) -> Any:
+        """Raise it."""
+        raise FlightError(self.reason)
+
+
+class PlainEnvRunner(SingleAgentEnvRunner):
+    """Flies the corridors of one process, whose module makes the features, without connectors.
+
+    RLlib starts a process anew that has ended or hangs, and that is right. It would also do so
+    where the code raised, hide the reason in a log, and meet the same again: that is told instead.
+    """
+
+    _needs_initial_reset: bool
+    _ongoing_episodes_for_metrics: dict[str, list[SingleAgentEpisode]]
+
+    def __init__(self, **settings: Any) -> None:
+        """Build the environments and the policy.
+
+        In a process of its own what that raises is kept for whoever asks for anything: RLlib would go on
+        without the process, and fail for lack of it.
+        """
+        self._refused = ""
+        try:
+            super().__init__(**settings)
+        except Exception as error:
+            if not settings.get("worker_index"):
+                raise
+            self._refused = one_line(error)
+
+    def assert_healthy(self) -> None:
+        """As RLlib's; a process that could not be built answers too."""
+        if not self._refused:
+            super().assert_healthy()
+
+    def get_spaces(self) -> Any:
+        """As RLlib's, which asks this first.
+
+        Raises:
+            FlightError: The process could not be built.
+        """
+        if self._refused:
+            raise FlightError(self._refused)
+        return super().get_spaces()
+
+    def sample(self, **asked: Any) -> list[SingleAgentEpisode]:
+        """Fly as asked, in less than `MAX_SAMPLE_S`.
+
+        Raises:
+            FlightError: With the type and text of whatever was raised.
+        """
+        if self._refused:
+            raise FlightError(self._refused)
+        try:
+            with ending_after(MAX_SAMPLE_S):
+                return super().sample(**asked)
+        except Exception as error:
+            raise FlightError(one_line(error)) from error
+
+    def apply(self, func: Callable[..., Any], *values: Any, **named: Any) -> Any:
+        """As RLlib's, which ends the process where `func` raises; but a flight's error is handed on."""
+
+        def handed_on(runner: Any, *values: Any, **named: Any) -> Any:
+            try:
+                return func(runner, *values, **named)
+            except FlightError as error:
+                return Raised(str(error))
+
+        return super().apply(handed_on, *values, **named)
+
+    def _sample(
+        self,
+        *,
+        num_timesteps: int | None = None,
+        num_episodes: int | None = None,
+        explore: bool = True,
+        random_actions: bool = False,
+        force_reset: bool = False,
+    ) -> list[SingleAgentEpisode]:
+        """Fly at least `num_timesteps` steps, all corridors in lock-step.
+
+        Returns:
+            The flights that ended, in the order in which they did, then the pieces of those
+            that go on; observations are stacks of features.
+
+        Raises:
+            ValueError: Something else was asked than steps of the policy's drawn actions.
+        """
+        if num_timesteps is None or random_actions or not explore:
+            raise ValueError("PlainEnvRunner flies num_timesteps of drawn actions and nothing else")
+        if force_reset or self._needs_initial_reset:
+            self._take_off()
+        steps: list[Step] = []
+        flown = 0
+        while flown < num_timesteps:
+            steps.append(self._step())
+            flown += int((~steps[-1].over).sum())
+        done, going_on = self._cut(steps)
+        self._done_episodes_for_metrics.extend(done)
+        for piece in going_on:
+            self._ongoing_episodes_for_metrics[piece.id_].append(piece)
+        self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=flown)
+        self._increase_sampled_metrics(flown, len(done))
+        return done + going_on
+
+    def _take_off(self) -> None:
+        """Start every flight anew; those that were in the air are forgotten."""
+        seed = self._seed if self._needs_initial_reset else None
+        observations, infos = self.env.unwrapped.reset(seed=seed)
+        features = self.module.features(observations)
+        shape = len(features), self.module.observation_space.shape[0], *features.shape[1:]
+        first = np.ones(len(features), bool)
+        self._stacks = push_features(np.empty(shape, features.dtype), features, first)
+        self._infos, self._over = infos, ~first
+        self._flights = [(uuid.uuid4().hex, 0) for _ in features]  # name, steps so far
+        self._ongoing_episodes_for_metrics = defaultdict(list)
+        self._needs_initial_reset = False
+
+    @torch.no_grad()
+    def _step(self) -> Step:
+        """Decide and fly one step everywhere; flights that are over start anew instead."""
+        stacks, over = self._stacks, self._over
+        logits = self.module._forward({Columns.OBS: torch.from_numpy(stacks)})[Columns.ACTION_DIST_INPUTS]
+        chances = torch.softmax(logits, dim=-1)
+        actions = torch.multinomial(chances, 1, replacement=True)
+        logp = torch.log_softmax(logits, dim=-1).gather(1, actions)
+        actions, logits, logp = actions[:, 0].numpy(), logits.numpy(), logp[:, 0].numpy()
+        observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
+        self._stacks = push_features(stacks, self.module.features(observations), over)
+        self._over = terminated | truncated
+        return Step(stacks, actions, logits, logp, rewards, terminated, truncated, infos, over)
+
+    def _cut(self, steps: list[Step]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
+        """The flights that ended in these steps, and the pieces of those that go on."""
+        over = np.stack([step.over for step in steps])
+        ended = np.stack([step.terminated | step.truncated for step in steps])
+        stacks = np.stack([*(step.stacks for step in steps), self._stacks])
+        infos = [self._infos, *(step.infos for step in steps)]
+        self._infos = infos[-1]
+        columns = {
+            name: np.stack([getattr(step, name) for step in steps])
+            for name in ("actions", "logits", "logp", "rewards")
+        }
+        done: list[tuple[int, SingleAgentEpisode]] = []
+        going_on = []
+        for row in range(over.shape[1]):
+            first = 0
+            for last in [*np.flatnonzero(ended[:, row]), len(steps)]:
+                if over[first : first + 1, row].any():  # reset here: the flight begins after it
+                    self._flights[row] = uuid.uuid4().hex, 0
+                    first += 1
+                end = min(last + 1, len(steps))
+                if end > first:
+                    piece = slice(first, end)
+                    episode = self._episode(
+                        row,
+                        stacks[first : end + 1, row],
+                        {name: values[piece, row] for name, values in columns.items()},
+                        [_of_row(info, row) for info in infos[first : end + 1]],
+                    )
+                    if last < len(steps):
+                        episode.is_terminated = bool(steps[last].terminated[row])
+                        episode.is_truncated = bool(steps[last].truncated[row])
+                        done.append((int(last), episode))
+                    else:
+                        going_on.append(episode)
+                first = end
+        return [episode for _, episode in sorted(done, key=lambda pair: pair[0])], going_on
+
+    def _episode(
+        self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: list[dict[str, Any]]
+    ) -> SingleAgentEpisode:
+        """A piece of the flight in a row, which is that much longer then."""
+        name, begun = self._flights[row]
+        self._flights[row] = name, begun + len(columns["actions"])
+        return SingleAgentEpisode(
+            name,
+            observations=InfiniteLookbackBuffer(stacks),
+            observation_space=self.module.observation_space,
+            infos=infos,
+            actions=InfiniteLookbackBuffer(columns["actions"]),
+            action_space=self.module.action_space,
+            rewards=InfiniteLookbackBuffer(columns["rewards"]),
+            extra_model_outputs={
+                Columns.ACTION_DIST_INPUTS: InfiniteLookbackBuffer(columns["logits"]),
+                Columns.ACTION_LOGP: InfiniteLookbackBuffer(columns["logp"]),
+            },
+            t_started=begun,
+            len_lookback_buffer=0,
+        )
+
+
+def _of_row(infos: dict[str, np.ndarray], row: int) -> dict[str, Any]:
+    """The info of one environment; names with an underscore are Gymnasium's masks."""
+    return {name: values[row] for name, values in infos.items() if not name.startswith("_")}

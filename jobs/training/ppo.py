@@ -1,0 +1,298 @@
+"""PPO as appendix D.1.2 states it, in RLlib's words; what the learner is told and what it counts."""
+
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from ray.rllib.algorithms.ppo import PPO as RLlibPPO
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.callbacks.callbacks import RLlibCallback
+from ray.tune.registry import register_env
+
+from envs.config import sensor_differences, sensor_settings, settings_hash
+from envs.corridor import CorridorVectorEnv
+from jobs.config.conditions import env_with
+from jobs.config.config import Config, ConfigError
+from jobs.config.schema import EVAE_SETTINGS
+from jobs.rollout.drift import drift_figures
+from jobs.training.env_runner import MAX_SAMPLE_S, PlainEnvRunner
+from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
+from models.encoder.evae import EventVAE
+from models.encoder.finetuned import evae_settings
+from models.encoder.weights import EncoderFileError, load_encoder
+from models.kinds import KINDS
+from models.policy.rllib_module import module_spec
+
+
+class PPO(RLlibPPO):
+    """RLlib's PPO; what its construction raises is raised by the first iteration instead.
+
+    Ray ends a process whose construction failed once all that it owns is released, which processes
+    that fly never do: the launcher would wait forever. Its name is RLlib's, because Tune
+    continues a training only under the name that it began with.
+    """
+
+    _refused: Exception | None = None
+
+    def setup(self, config: Any) -> None:
+        """Build it."""
+        try:
+            super().setup(config)
+        except Exception as error:
+            self._refused = error
+
+    def load_checkpoint(self, checkpoint: Any) -> None:
+        """Go on from a checkpoint; one that could not be built says so in its first iteration."""
+        if self._refused is None:
+            super().load_checkpoint(checkpoint)
+
+    def step(self) -> Any:
+        """One iteration."""
+        if self._refused is not None:
+            raise self._refused
+        return super().step()
+
+    def cleanup(self) -> None:
+        """Let go of what was built."""
+        if self._refused is None:
+            super().cleanup()
+
+
+ENV = "evade-corridors"
+NUM_ACTIONS = 3
+EPISODES = 100  # that a rate is averaged over
+DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
+LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
+MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
+
+
+class FlightMetrics(RLlibCallback):
+    """What flights look like, read off the environments' infos; rewards are the true ones.
+
+    An iteration ends two or three flights, so their figures are means over the last `EPISODES`. Flights
+    count in the order in which they began, those of one round of sampling together: of flights begun
+    at once the short ones end first, and these are crashes.
+    """
+
+    def __init__(self) -> None:
+        """Begin without flights."""
+        self._flights: deque[dict[str, float]] = deque(maxlen=EPISODES)
+        self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
+        self._unfinished: dict[str, float] = {}
+        self._rounds = 0
+        self._encoder: tuple[EventVAE, dict[str, Any]] | None = None
+
+    def on_sample_end(
+        self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
+    ) -> None:
+        """Count the events of each step and the outcome of each flight that ended; measure drift at times."""
+        if env_runner is not None and self._rounds % DRIFT_EVERY == 0:
+            for name, value in self._drift(env_runner.module).items():
+                metrics_logger.log_value(name, value, window=1)
+        self._rounds += 1
+        infos = [info for chunk in samples for info in chunk.get_infos()[1:]]
+        events, dropped = (
+            np.array([info[key] for info in infos]) for key in ("num_events", "dropped_events")
+        )
+        metrics_logger.log_value("events_per_step", float(events.mean()), window=1)
+        metrics_logger.log_value("dropped_events", float(dropped.sum()), window=1)
+        self._count(samples)
+        for name in self._flights[0] if self._flights else ():
+            mean = float(np.mean([flight[name] for flight in self._flights]))
+            metrics_logger.log_value(name, mean, window=1)
+
+    def _count(self, samples: Any) -> None:
+        """Add the flights that ended to those that figures are taken from, as soon as it is their turn."""
+        self._begun.append({chunk.id_: None for chunk in samples if chunk.id_ not in self._unfinished})
+        for chunk in samples:
+            self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
+            if chunk.is_done:
+                ended = outcome(chunk.get_infos(-1), self._unfinished.pop(chunk.id_))
+                next(begun for begun in self._begun if chunk.id_ in begun)[chunk.id_] = ended
+        broken_off = self._unfinished.keys() - {chunk.id_ for chunk in samples}
+        for name in broken_off:
+            del self._unfinished[name], next(begun for begun in self._begun if name in begun)[name]
+        while self._begun and None not in self._begun[0].values():
+            self._flights.extend(flight for flight in self._begun.popleft().values() if flight)
+
+    def _drift(self, module: Any) -> dict[str, float]:
+        """The `jobs.rollout.drift.drift_figures` of the windows that the module met.
+
+        None without an encoder, or where its file is no longer there: the frozen part that
+        flies has no decoder.
+        """
+        about = module.model_config["encoder_file"]
+        if about is None or not module.met:
+            return {}
+        if self._encoder is None:
+            try:
+                with torch.random.fork_rng(devices=[]):  # a model is made with random weights first
+                    self._encoder = load_encoder(about["path"])
+            except EncoderFileError:
+                return {}
+        evae, manifest = self._encoder
+        if manifest["sha256"] != about["digest"]:
+            return {}
+        return drift_figures(evae, module.met, manifest.get("figures", {}))
+
+
+def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:
+    """The figures of a flight that has ended, from its last info."""
+    return {
+        "flight_return": episode_return,
+        "success_rate": float(info["success"]),
+        "collision_rate": float(info["collision"]),
+        "distance_m": float(info["distance_m"]),
+    }
+
+
+def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConfig:
+    """The algorithm of an experiment; every default of RLlib that differs from the paper's is set.
+
+    `vf_clip_param` is infinite because RLlib clips the squared error, which with rewards of
+    +-100 would leave the value network without a gradient.
+
+    Args:
+        config: The experiment.
+        encoder_path: The pretrained encoder's file, for a policy that has one.
+
+    Raises:
+        ConfigError: If the encoder was made for another sensor, or for another model than the
+            one to fine-tune.
+    """
+    algo, settings = config.algo, network_settings(config)
+    # It learns while the processes that fly, if any, wait: together they need a core for each of these.
+    runners = algo.num_env_runners
+    own_cpus = LITTLE if runners else 1
+    register_env(ENV, make_corridors)
+    spec = module_spec(settings, config.seed, pretrained_encoder(config, encoder_path))
+    return (
+        PPOConfig()
+        .environment(ENV, env_config=corridor_settings(config), disable_env_checking=True)
+        .framework("torch")
+        .env_runners(
+            num_env_runners=runners,
+            num_cpus_per_env_runner=1.0 - LITTLE / max(1, runners),
+            num_envs_per_env_runner=algo.num_envs_per_env_runner,
+            sample_timeout_s=MAX_SAMPLE_S + 60.0,  # a process that hangs ends itself before
+            gym_env_vectorize_mode="vector_entry_point",
+            env_runner_cls=PlainEnvRunner,
+        )
+        .resources(num_cpus_for_main_process=own_cpus)
+        .learners(
+            num_learners=0,
+            num_cpus_per_learner=own_cpus,
+            learner_class=PlainPPOLearner,
+        )
+        .training(
+            learner_config_dict={REWARD_SCALE: algo.reward_scale},
+            lr=learning_rate(config),
+            gamma=algo.gamma,
+            lambda_=algo.lambda_,
+            clip_param=algo.clip_param,
+            num_epochs=algo.num_epochs,
+            minibatch_size=algo.minibatch_size,
+            train_batch_size_per_learner=algo.train_batch_size_per_learner,
+            vf_loss_coeff=algo.vf_loss_coeff,
+            vf_clip_param=math.inf,
+            use_kl_loss=False,
+            kl_coeff=0.0,
+            entropy_coeff=algo.entropy_coeff,
+            grad_clip=algo.grad_clip,
+            grad_clip_by="global_norm",
+        )
+        .rl_module(rl_module_spec=spec)
+        .callbacks(FlightMetrics)
+        .reporting(metrics_num_episodes_for_smoothing=EPISODES)
+        .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
+        .debugging(seed=config.seed, log_level="ERROR")
+    )
+
+
+def learning_rate(config: Config) -> float | list[list[float]]:
+    """Adam's step size: one number, or (environment step, value) pairs between which RLlib interpolates."""
+    if config.algo.lr_schedule == "constant":
+        return config.algo.lr
+    return [[0, config.algo.lr], [config.train.env_steps, 0.0]]
+
+
+def corridor_settings(config: Config) -> dict[str, Any]:
+    """What `make_corridors` makes the flights of a training from.
+
+    Tune continues a stopped training only under the keys and kinds of values that it began with,
+    so a setting of later versions appears only where it is used.
+    """
+    settings: dict[str, Any] = {
+        "config": config.env_config(split="train", observation=KINDS[config.model.name].observation)
+    }
+    if config.train.conditions != [{}]:
+        settings["conditions"] = config.train.conditions
+    return settings
+
+
+def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
+    """The environments of one env runner, which take the conditions of the training in turn."""
+    worlds = [env_with(context["config"], condition) for condition in context.get("conditions", [{}])]
+    return CorridorVectorEnv(context["num_envs"], worlds)
+
+
+def network_settings(config: Config) -> dict[str, Any]:
+    """What the policy's networks are built from."""
+    model, camera = config.model, config.camera
+    return {
+        "name": model.name,
+        "width": camera.width,
+        "height": camera.height,
+        "encoder": model.encoder,
+        **{name: getattr(model, name) for name in EVAE_SETTINGS},
+        "stack": model.stack,
+        "hidden": model.hidden,
+        "num_actions": NUM_ACTIONS,
+    }
+
+
+def policy_settings(config: Config) -> dict[str, Any]:
+    """What a policy must be flown with, for its manifest."""
+    sensor = sensor_settings(config.env_config())
+    return {
+        "exp": config.exp,
+        "observation": KINDS[config.model.name].observation,
+        "window_capacity": config.env_config().window_capacity,
+        "sensor": sensor,
+        "sensor_hash": settings_hash(sensor),
+        "seed": config.seed,
+        **network_settings(config),
+        "ppo": dataclasses.asdict(config.algo),
+    }
+
+
+def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, dict[str, Any]] | None:
+    """The encoder file with its manifest; None for a policy without one.
+
+    Raises:
+        ConfigError: It was made for another sensor, or for another model than the one to fine-tune.
+        ValueError: A policy that needs one got none, or the other way round.
+    """
+    name, needed = config.model.name, KINDS[config.model.name].encoder
+    if needed != (path is not None):
+        raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")
+    if path is None:
+        return None
+    _, about = load_encoder(path)
+    differ = sensor_differences(about["sensor"], config.env_config())
+    if differ:
+        values = ", ".join(
+            f"{name}: {there!r} there, {here!r} here" for name, (there, here) in differ.items()
+        )
+        remedy = "use its settings, or pretrain an encoder for these"
+        raise ConfigError(f"encoder: was made for another sensor: {values}; {remedy}")
+    if config.model.encoder == "finetuned":
+        wanted = evae_settings(network_settings(config))
+        if wanted != about["model"]:
+            raise ConfigError(f"encoder: must be one of {wanted} to be fine-tuned, got {about['model']}")
+    return path, about

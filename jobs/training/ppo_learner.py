@@ -1,0 +1,196 @@
+"""RLlib's PPO learner with all minibatches of an iteration in one loop.
+
+The value targets, the loss, its gradient and the optimiser are RLlib's (`test_ppo_learner.py`
+compares them, and the weights after an update). Around each minibatch of 32 steps RLlib slices,
+dispatches, times and logs, which takes longer than the gradient of two small networks; here that
+is done once per iteration, and no pipeline of connectors makes the batch. RLlib appends a row to
+each flight to bootstrap its value: it masks that row in the loss, but counts it in minibatches
+and in the mean and deviation of the advantages. Here it is in neither.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from ray.rllib.algorithms.ppo.ppo import LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY
+from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.learner.learner import ENTROPY_KEY, POLICY_LOSS_KEY, VF_LOSS_KEY
+from ray.rllib.core.learner.training_data import TrainingData
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.evaluation.postprocessing import Postprocessing
+from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
+from scipy.signal import lfilter
+from torch import Tensor, nn
+
+READ = (
+    Columns.OBS,
+    Columns.ACTIONS,
+    Columns.ACTION_LOGP,
+    Postprocessing.ADVANTAGES,
+    Postprocessing.VALUE_TARGETS,
+)
+GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
+EXPLAINED_ROWS = 1024  # values are compared with their targets so many at a time
+MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
+REWARD_SCALE = (
+    "reward_scale"  # of the learner's own settings: multiplies rewards; episodes keep the true ones
+)
+
+
+def advantages(
+    values: np.ndarray, rewards: np.ndarray, terminated: bool, gamma: float, lambda_: float
+) -> np.ndarray:
+    """Generalised advantage estimates of a piece of a flight (Schulman et al. 2016), float64 (T,).
+
+    Args:
+        values: Of its T + 1 observations, (T + 1,).
+        rewards: Of its T steps, (T,).
+        terminated: Whether it ended for good, so that its last observation has no value.
+        gamma: Discount per step.
+        lambda_: Weight of longer estimates.
+    """
+    values = values.astype(np.float64)
+    values[-1] *= not terminated
+    errors = rewards + gamma * values[1:] - values[:-1]
+    return lfilter([1.0], [1.0, -gamma * lambda_], errors[::-1])[::-1]
+
+
+class PlainPPOLearner(PPOTorchLearner):
+    """PPO for one module with discrete actions, without the divergence penalty, on one device."""
+
+    def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
+        """Adam with all its steps in one call."""
+        parameters = [value for value in self._module[module_id].parameters() if value.requires_grad]
+        self.register_optimizer(
+            module_id=module_id,
+            optimizer=torch.optim.Adam(parameters, fused=True),
+            params=parameters,
+            lr_or_lr_schedule=config.lr,
+        )
+
+    def update(
+        self,
+        *,
+        training_data: TrainingData | None = None,
+        episodes: list[Any] | None = None,
+        timesteps: Mapping[str, Any] | None = None,
+        num_epochs: int = 1,
+        minibatch_size: int | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        """All epochs over the steps of one iteration, shuffled in each.
+
+        Args:
+            training_data: Flights, as RLlib hands them over; or else
+            episodes: the flights themselves.
+            timesteps: Counters that schedules follow.
+            num_epochs: Passes over the steps.
+            minibatch_size: Steps per gradient; None: all.
+            kwargs: RLlib's other wishes, which concern other kinds of data.
+
+        Returns:
+            Metrics, as RLlib's learner returns them; losses are means over the last epoch.
+
+        Raises:
+            RuntimeError: A gradient is not finite; the weights are those before it.
+        """
+        torch.set_num_threads(self._threads())
+        counters = dict(timesteps or {})
+        self.before_gradient_based_update(timesteps=counters)
+        training_data = training_data or TrainingData(episodes=episodes)
+        training_data.validate()
+        training_data.solve_refs()
+        self._weights_seq_no += 1
+        rows = self._rows(training_data.episodes)
+        count = len(rows[Columns.ACTIONS])
+        for _ in range(num_epochs):
+            figures = self._epoch(rows, minibatch_size or count)
+        figures[LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY] = self._explained_variance(rows)
+        self.metrics.log_dict(figures, key=DEFAULT_MODULE_ID, window=1)
+        steps = SampleBatch({Columns.ACTIONS: rows[Columns.ACTIONS]})
+        self._log_steps_trained_metrics(MultiAgentBatch({DEFAULT_MODULE_ID: steps}, env_steps=count))
+        self.after_gradient_based_update(timesteps=counters)
+        return self.metrics.reduce()
+
+    def _threads(self) -> int:
+        """Those of the processes that fly, which wait meanwhile; one for networks too small to share."""
+        large = any(True for _ in self.module[DEFAULT_MODULE_ID].unwrapped().trunk.parameters())
+        return max(1, min(self.config.num_env_runners, os.cpu_count() or 1)) if large else 1
+
+    def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
+        """The steps of all flights, one after the other, with what the loss compares them to."""
+        config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
+        scale = config.learner_config_dict.get(REWARD_SCALE, 1.0)
+        shown = [np.asarray(episode.get_observations()) for episode in episodes]
+        ends = np.cumsum([len(observations) for observations in shown])
+        stacks = np.concatenate(shown)
+        values = module.compute_values({Columns.OBS: torch.from_numpy(stacks)}).numpy()
+        estimates = [
+            advantages(
+                of_flight, scale * episode.get_rewards(), episode.is_terminated, config.gamma, config.lambda_
+            )
+            for of_flight, episode in zip(np.split(values, ends[:-1]), episodes, strict=True)
+        ]
+        flown = np.ones(len(stacks), bool)
+        flown[ends - 1] = False
+        estimate = np.concatenate(estimates)
+        standard = (estimate - estimate.mean()) / max(MIN_DEVIATION, estimate.std())
+        columns = {
+            Columns.OBS: stacks[flown],
+            Columns.ACTIONS: np.concatenate([episode.get_actions() for episode in episodes]),
+            Columns.ACTION_LOGP: np.concatenate(
+                [episode.get_extra_model_outputs(Columns.ACTION_LOGP) for episode in episodes]
+            ),
+            Postprocessing.ADVANTAGES: standard.astype(np.float32),
+            Postprocessing.VALUE_TARGETS: (estimate + values[flown]).astype(np.float32),
+        }
+        return {name: torch.from_numpy(column) for name, column in columns.items()}
+
+    def _epoch(self, rows: dict[str, Tensor], minibatch_size: int) -> dict[str, Tensor]:
+        """One pass over the rows in random order; the mean of each figure."""
+        order = torch.randperm(len(rows[Columns.ACTIONS]))
+        parts = [rows[key][order].split(minibatch_size) for key in READ]
+        figures = [self._step(dict(zip(READ, part, strict=True))) for part in zip(*parts, strict=True)]
+        return {name: torch.stack([one[name] for one in figures]).mean() for name in figures[0]}
+
+    def _step(self, rows: dict[str, Tensor]) -> dict[str, Tensor]:
+        """One gradient step; its losses, entropy and the gradient's norm before the clip."""
+        optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
+        parameters = optimizer.param_groups[0]["params"]
+        total, figures = self._loss(rows)
+        optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        limit = float("inf") if self.config.grad_clip is None else self.config.grad_clip
+        norm = nn.utils.clip_grad_norm_(parameters, limit, error_if_nonfinite=True)
+        optimizer.step()
+        return {**figures, self.TOTAL_LOSS_KEY: total.detach(), GRADIENT_NORM_KEY: norm}
+
+    def _loss(self, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """The clipped surrogate, the value's squared error and the entropy, joined as RLlib joins them."""
+        config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
+        out = module._forward_train(rows)
+        logps = torch.log_softmax(out[Columns.ACTION_DIST_INPUTS], dim=-1)
+        logp = logps.gather(1, rows[Columns.ACTIONS].long()[:, None]).squeeze(1)
+        ratio, advantages = torch.exp(logp - rows[Columns.ACTION_LOGP]), rows[Postprocessing.ADVANTAGES]
+        clipped = ratio.clamp(1.0 - config.clip_param, 1.0 + config.clip_param)
+        policy_loss = -torch.minimum(advantages * ratio, advantages * clipped).mean()
+        values = module.compute_values(rows, embeddings=out.get(Columns.EMBEDDINGS))
+        errors = (values - rows[Postprocessing.VALUE_TARGETS]).square().clamp(max=config.vf_clip_param)
+        value_loss, entropy = errors.mean(), -(logps.exp() * logps).sum(-1).mean()
+        bonus = self.entropy_coeff_schedulers_per_module[DEFAULT_MODULE_ID].get_current_value()
+        total = policy_loss + config.vf_loss_coeff * value_loss - bonus * entropy
+        figures = {POLICY_LOSS_KEY: policy_loss, VF_LOSS_KEY: value_loss, ENTROPY_KEY: entropy}
+        return total, {name: value.detach() for name, value in figures.items()}
+
+    @torch.no_grad()
+    def _explained_variance(self, rows: dict[str, Tensor]) -> Tensor:
+        """Share of the targets' variance that the values explain after the update; at least -1, as RLlib."""
+        module, targets = self.module[DEFAULT_MODULE_ID].unwrapped(), rows[Postprocessing.VALUE_TARGETS]
+        parts = rows[Columns.OBS].split(EXPLAINED_ROWS)
+        values = torch.cat([module.compute_values({Columns.OBS: part}) for part in parts])
+        unexplained = (targets - values).var() / targets.var().clamp_min(1e-12)
+        return (1.0 - unexplained).clamp_min(-1.0)

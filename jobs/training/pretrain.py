@@ -1,0 +1,328 @@
+"""Train the event VAE on collected flights and freeze its encoder (appendix B).
+
+Run: python -m platform.launch +exp=pretrain
+Expect: about 0.1 s per iteration of 50 windows on one core; `encoder/encoder.safetensors`
+with its manifest, and `encoder/reconstructions.png`, in the run folder. A killed run
+continues from its last checkpoint.
+"""
+
+import hashlib
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from envs.config import sensor_settings
+from envs.recordings import Recording, read_recording
+from jobs.analysis.plots import reconstruction_figure
+from jobs.config.config import Config, ConfigError
+from jobs.config.schema import EVAE_SETTINGS, ModelConfig, PretrainConfig
+from jobs.run.files import write_atomic
+from jobs.run.folder import Run, finish, finished, locate_run, open_run
+from jobs.run.progress import console, progress
+from jobs.tracking.tracker import Tracker, open_tracker
+from jobs.training.collect import check_collect, collect, data_file
+from models.encoder.evae import (
+    EventVAE,
+    appendix_beta,
+    collapsed,
+    event_targets,
+    pictures,
+    reconstruct,
+    train_step,
+    validate,
+)
+from models.encoder.event_batch import EventBatch, Grid, batch_windows
+from models.encoder.weights import EncoderFileError, load_encoder, save_encoder
+from models.kinds import KINDS
+
+Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
+
+ENCODER, CHECKPOINTS = "encoder.safetensors", "checkpoint-*.pt"
+CHECKPOINTS_KEPT = 2  # should the newest be damaged
+MIN_STEPS, MAX_STEPS = 0.5, 8.0
+VALIDATION_WINDOWS = 200
+PICTURE_WINDOWS = 8
+COLLAPSED = (
+    "the latent says nothing of its window (posterior collapse), a policy would see nothing; "
+    "if more iterations do not help, take a smaller pretrain.beta or pretrain.beta_schedule=constant"
+)
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Collect if there is no data yet, then train the event VAE; return its figures.
+
+    Raises:
+        ConfigError: The policy has no event VAE, or as `check_sources`.
+    """
+    name = locate_run(config).config.model.name
+    if not KINDS[name].encoder:
+        raise ConfigError(f"model: {name} has no event VAE to pretrain; go on with job=train")
+    check_sources(config)
+    folder = open_run(config)
+    config = folder.config
+    with open_tracker(config, folder) as tracker:
+        prepare_encoder(config, folder, tracker)
+    return finished(folder, "pretrain") or {}
+
+
+def check_sources(config: Config) -> None:
+    """Check the files that collecting and pretraining begin from, before anything is made.
+
+    Raises:
+        ConfigError: `collect.policy`, `collect.recordings` or `pretrain.encoder` names one that does not fit.
+    """
+    folder = locate_run(config)
+    if KINDS[folder.config.model.name].encoder:
+        check_collect(folder)
+        initial_state(folder)
+
+
+def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
+    """The weights that a run's event VAE still has to begin from; None for random ones.
+
+    Raises:
+        ConfigError: `pretrain.encoder` names no encoder, or one of another model or without a decoder.
+    """
+    named, config = folder.config.pretrain.encoder, folder.config
+    if named is None or checkpoints(folder.encoder) or finished(folder, "pretrain") is not None:
+        return None
+    path = Path(named)
+    file = path if path.suffix == ".safetensors" else path / "encoder" / ENCODER
+    try:
+        evae, _ = load_encoder(file)
+    except EncoderFileError as error:
+        rule = f"must be a run folder with an encoder, or an encoder file, got {named!r}"
+        raise ConfigError(f"pretrain.encoder: {rule}: {error}") from error
+    with torch.device("meta"):  # its settings alone, without memory for weights
+        wanted = build_evae(config.model, sensor_settings(config.env_config())).settings
+    differ = [
+        f"{name}: {evae.settings[name]!r} there, {value!r} here"
+        for name, value in wanted.items()
+        if evae.settings[name] != value
+    ]
+    if differ:
+        raise ConfigError(f"pretrain.encoder: must have the settings of the model, got {', '.join(differ)}")
+    if evae.decoder is None:
+        rule = "must have a decoder to learn on; a shipped policy's has none, its run folder's has"
+        raise ConfigError(f"pretrain.encoder: {rule}, got {named!r}")
+    return evae.state_dict()
+
+
+def prepare_encoder(config: Config, folder: Run, tracker: Tracker) -> Path | None:
+    """Collect and pretrain what is not there yet; the encoder file, or None if the policy has no encoder."""
+    if not KINDS[config.model.name].encoder:
+        return None
+    collect(config, folder, tracker)
+    pretrain(config, folder, tracker)
+    return encoder_file(folder)
+
+
+def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
+    """Train an event VAE on the run's recordings and write its encoder file."""
+    done = finished(folder, "pretrain")
+    if done is not None:
+        return done
+    settings = config.pretrain
+    train = read_recording(data_file(folder, "train"))
+    validation = read_recording(data_file(folder, "validation"))
+    torch.manual_seed(config.seed)
+    evae = build_evae(config.model, train.about["sensor"])
+    begin = initial_state(folder)
+    if begin is not None:
+        evae.load_state_dict(begin)
+    optimizer = torch.optim.Adam(
+        evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
+    )
+    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 2]))
+    held_out = held_out_windows(validation, settings, evae.grid)
+    first = restore(folder.encoder, evae, optimizer, rng)
+    latest: dict[str, float] = {}
+    with progress("Pretrain the event VAE", settings.iterations, "iterations", done=first) as advance:
+        for iteration in range(first, settings.iterations):
+            evae.train()
+            batch = batch_windows(sample_windows(train, settings, settings.batch_windows, rng), evae.grid)
+            targets = event_targets(batch, evae.target)
+            losses = train_step(evae, optimizer, batch, targets, beta(settings, iteration), rng)
+            last = iteration + 1 == settings.iterations
+            if last or (iteration + 1) % settings.validate_every == 0:
+                before, latest = latest, held_out_figures(evae, held_out)
+                if latest["collapsed"] > before.get("collapsed", 0.0):
+                    console.print(f"Iteration {iteration + 1}: {COLLAPSED}", markup=False)
+                tracker.log(
+                    iteration + 1, {f"evae/{name}": value for name, value in {**losses, **latest}.items()}
+                )
+            if last or (iteration + 1) % settings.checkpoint_every == 0:
+                save_checkpoint(folder.encoder, evae, optimizer, rng, iteration + 1)
+            measured = f", held out {latest['explained_step']:.0%} explained" if latest else ""
+            advance(1, note=f"loss {losses['loss']:.4f}{measured}")
+    return freeze(config, folder, tracker, evae, train.about, held_out)
+
+
+def build_evae(model: ModelConfig, sensor: dict[str, Any]) -> EventVAE:
+    """The untrained event VAE that a model configuration and a sensor ask for."""
+    settings = {name: getattr(model, name) for name in EVAE_SETTINGS}
+    return EventVAE(variant=model.name, width=sensor["width"], height=sensor["height"], **settings)
+
+
+def beta(settings: PretrainConfig, iteration: int) -> float:
+    """Weight of the KL divergence at an iteration (appendix B.2, or a constant)."""
+    if settings.beta_schedule == "appendix":
+        return appendix_beta(iteration)
+    return settings.beta
+
+
+def sample_windows(
+    recording: Recording, settings: PretrainConfig, count: int, rng: np.random.Generator
+) -> list[Window]:
+    """Draw event windows that never cross from one flight into the next.
+
+    "count" windows hold `window_events` events from a random index on (appendix B.2). "mixed"
+    windows last between half a control step and eight, so that the encoder knows the short,
+    sparse and empty windows of control at any rate as well as long ones.
+
+    Returns:
+        (events, start_us, window_us) each; every event has start_us < t <= start_us + window_us.
+    """
+    draw = _window_by_count if settings.windows == "count" else _window_by_time
+    return [draw(recording, settings.window_events, rng) for _ in range(count)]
+
+
+def _window_by_time(recording: Recording, most_events: int, rng: np.random.Generator) -> Window:
+    start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    step = int(rng.integers(len(start)))
+    period_us = int(end[step] - start[step])
+    ratio = np.exp(rng.uniform(np.log(MIN_STEPS), np.log(MAX_STEPS)))
+    window_us = max(1, round(period_us * ratio))
+    last = int(np.searchsorted(flight, flight[step], side="right")) - 1
+    start_us = int(start[step]) + int(rng.integers(period_us))
+    start_us = min(start_us, int(end[last]) - window_us)
+    first = int(np.searchsorted(flight, flight[step]))
+    start_us = max(start_us, int(start[first]))
+    return cut_window(recording, start_us, window_us, most_events)
+
+
+def _window_by_count(recording: Recording, num_events: int, rng: np.random.Generator) -> Window:
+    t_us, start, flight = recording.t_us, recording.index["step_t_us"], recording.index["step_flight"]
+    first = int(rng.integers(len(t_us)))
+    step = int(np.searchsorted(start, t_us[first], side="left")) - 1
+    last_step = int(np.searchsorted(flight, flight[step], side="right")) - 1
+    flight_end = int(np.searchsorted(t_us, recording.index["step_end_us"][last_step], side="right"))
+    stop = min(first + num_events, flight_end)
+    start_us = int(t_us[first]) - 1
+    return recording.events[first:stop], start_us, int(t_us[stop - 1]) - start_us
+
+
+def cut_window(recording: Recording, start_us: int, window_us: int, most_events: int) -> Window:
+    """The newest `most_events` of the events with start_us < t <= start_us + window_us."""
+    first, stop = np.searchsorted(recording.t_us, [start_us, start_us + window_us], side="right")
+    return recording.events[max(first, stop - most_events) : stop], start_us, window_us
+
+
+def held_out_windows(recording: Recording, settings: PretrainConfig, grid: Grid) -> dict[str, EventBatch]:
+    """Fixed windows of unseen flights: one control step long, and four."""
+    rng = np.random.default_rng(0)
+    start, end = recording.index["step_t_us"], recording.index["step_end_us"]
+    windows: dict[str, EventBatch] = {}
+    for name, steps in (("step", 1), ("four_steps", 4)):
+        chosen = rng.choice(len(start), VALIDATION_WINDOWS)
+        spans = [(int(start[step]), steps * int(end[step] - start[step])) for step in chosen]
+        cut = [cut_window(recording, begin, span, settings.window_events) for begin, span in spans]
+        windows[name] = batch_windows(cut, grid)
+    return windows
+
+
+def held_out_figures(evae: EventVAE, held_out: dict[str, EventBatch]) -> dict[str, float]:
+    """Figures of `evae.validate` for each window length; `collapsed` is 1 if it is so at all."""
+    evae.eval()
+    found = {
+        name: validate(evae, batch, event_targets(batch, evae.target)) for name, batch in held_out.items()
+    }
+    figures = {
+        f"{key}_{name}": value
+        for name, values in found.items()
+        for key, value in values.items()
+        if key != "mean_picture"
+    }
+    return figures | {"collapsed": float(all(map(collapsed, found.values())))}
+
+
+def freeze(
+    config: Config,
+    folder: Run,
+    tracker: Tracker,
+    evae: EventVAE,
+    about: dict[str, Any],
+    held_out: dict[str, EventBatch],
+) -> dict[str, Any]:
+    """Write the encoder file and a picture of its reconstructions; return its held-out figures."""
+    figures = held_out_figures(evae, held_out)
+    manifest = {
+        "sensor": about["sensor"],
+        "sensor_hash": about["sensor_hash"],
+        "scenes": about["scenes"],
+        "iterations": config.pretrain.iterations,
+        "figures": figures,
+    }
+    save_encoder(encoder_file(folder), evae, manifest)
+    tracker.artifact(encoder_file(folder).with_suffix(".json"), "encoder")
+    figure = reconstruction_figure(*example_pictures(evae, held_out))
+    tracker.figure("evae/reconstructions.png", figure)
+    return finish(folder, "pretrain", figures)
+
+
+@torch.no_grad()
+def example_pictures(evae: EventVAE, held_out: dict[str, EventBatch]) -> tuple[np.ndarray, np.ndarray]:
+    """Target pictures and their reconstructions, the first few of each length: (K, H, W) each."""
+    targets = [event_targets(batch, evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
+    drawn = [reconstruct(evae(batch)[0], evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
+    shown = [pictures(torch.cat(values), evae.target, evae.grid).numpy() for values in (targets, drawn)]
+    return shown[0], shown[1]
+
+
+def encoder_file(folder: Run) -> Path:
+    """Where the frozen encoder lives in a run folder."""
+    return folder.encoder / ENCODER
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of a pretraining, the newest first."""
+    return sorted(folder.glob(CHECKPOINTS), reverse=True)
+
+
+def save_checkpoint(
+    folder: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator, iteration: int
+) -> None:
+    """Write everything that a killed training needs to go on; its name holds its SHA-256."""
+    state = {
+        "evae": evae.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "rng": rng.bit_generator.state,
+        "torch_rng": torch.get_rng_state(),
+        "iteration": iteration,
+    }
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    content = buffer.getvalue()
+    write_atomic(folder / f"checkpoint-{iteration:09d}-{hashlib.sha256(content).hexdigest()}.pt", content)
+    for old in checkpoints(folder)[CHECKPOINTS_KEPT:]:
+        old.unlink()
+
+
+def restore(folder: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator) -> int:
+    """Load the newest checkpoint that is whole; return the number of iterations already done."""
+    for path in checkpoints(folder):
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != path.stem.rpartition("-")[2]:
+            console.print(f"Checkpoint damaged, the one before it is taken: {path}", markup=False)
+            path.unlink()
+            continue
+        state = torch.load(io.BytesIO(content), weights_only=True)
+        evae.load_state_dict(state["evae"])
+        optimizer.load_state_dict(state["optimizer"])
+        rng.bit_generator.state = state["rng"]
+        torch.set_rng_state(state["torch_rng"])
+        return int(state["iteration"])
+    return 0

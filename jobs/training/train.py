@@ -1,0 +1,342 @@
+"""Train the policy by PPO (appendix D.1), on the encoder if it has one.
+
+Run: python -m platform.launch +exp=train
+Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
+`train/results.jsonl`. A stopped run continues from its last whole checkpoint when the same
+command is given again; an environment step that was reported once is not reported twice. What
+a lost process or machine ends is tried again at once, what the code raises is not: it would
+raise the same again.
+"""
+
+import contextlib
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow.fs
+import ray
+import torch
+from ray import tune
+from ray.rllib.core.rl_module.rl_module import RLModule
+
+from jobs.config.config import Config, ConfigError
+from jobs.rollout.drift import FIGURES
+from jobs.run.checkpoints import mend, seal
+from jobs.run.folder import Run, finish, finished, open_run
+from jobs.run.progress import console, progress
+from jobs.run.ray_cluster import fit, holds, start_ray, storage
+from jobs.tracking.tracker import open_tracker
+from jobs.training.env_runner import FlightError
+from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_settings
+from jobs.training.pretrain import check_sources, prepare_encoder
+from models.encoder.weights import load_encoder
+from models.kinds import kind_of
+from models.policy import save_policy
+
+OnResult = Callable[[int, Mapping[str, float]], None]
+
+# Name in the tracker -> where RLlib's result has it.
+METRICS = {
+    "train/episode_return": ("env_runners", "flight_return"),
+    "train/episodes": ("env_runners", "num_episodes_lifetime"),
+    "train/success_rate": ("env_runners", "success_rate"),
+    "train/collision_rate": ("env_runners", "collision_rate"),
+    "train/distance_m": ("env_runners", "distance_m"),
+    "train/policy_loss": ("learners", "default_policy", "policy_loss"),
+    "train/value_loss": ("learners", "default_policy", "vf_loss"),
+    "train/explained_variance": ("learners", "default_policy", "vf_explained_var"),
+    "train/entropy": ("learners", "default_policy", "entropy"),
+    "train/gradient_norm": ("learners", "default_policy", "gradients_default_optimizer_global_norm"),
+    "sim/events_per_step": ("env_runners", "events_per_step"),
+    "sim/dropped_events": ("env_runners", "dropped_events"),
+    **{f"evae/{name}": ("env_runners", name) for name in FIGURES},
+    "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
+    "perf/trial_restarts": ("trial_restarts",),
+}
+ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
+ENV_STEPS = "num_env_steps_sampled_lifetime"
+FLOWN = ("env_runners", "num_env_steps_sampled")
+MAX_PAUSE_S = 600.0  # while every process that flies starts again: a busy machine takes minutes
+MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
+MAX_FAILURES = 2
+CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
+LISTENER = "train"
+FAILURE = re.compile(r"^Failure # \d+ .*$", re.MULTILINE)  # begins each error that Tune writes about a trial
+RAISED = re.compile(r"^(?:\w+\.)*\w+(?:Error|Exception|Exit|Interrupt)\b.*$", re.MULTILINE)
+
+_LISTENERS: dict[str, Callable[[Mapping[str, Any]], None]] = {}
+
+
+class TrainingError(RuntimeError):
+    """Training stopped; the message says why in one line and how to go on."""
+
+
+class Relay(tune.Callback):
+    """Hands results to the listener that this process has registered under a name.
+
+    Tune pickles its callbacks into the experiment's state, and neither a tracker nor a
+    progress bar can be pickled: the callback carries the name alone.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Remember the name."""
+        self.name = name
+
+    def on_trial_result(
+        self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
+    ) -> None:
+        """Pass one result on, with the number of restarts before it."""
+        _LISTENERS[self.name]({**result, "trial_restarts": trial.num_failures})
+
+    def on_checkpoint(
+        self, iteration: int, trials: list[Any], trial: Any, checkpoint: tune.Checkpoint, **info: Any
+    ) -> None:
+        """Seal one."""
+        if on_disk(checkpoint):
+            seal(Path(checkpoint.path))
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Say that the training goes on, or stop it if its code raised."""
+        error = newest_error(trial.error_file)
+        raised = RAISED.findall(error)
+        if raised and not raised[-1].startswith("ray.exceptions."):
+            raise TrainingError(stopped(error))
+        reason = last_line(error) if error else "its process could not be started"
+        console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
+
+
+def newest_error(file: str | None) -> str:
+    """The newest of the errors that Tune has written about a trial, as text; empty if there is none.
+
+    Tune keeps the error itself too, pickled, but where another user of the machine may write.
+    """
+    if file is None or not Path(file).is_file():
+        return ""
+    return FAILURE.split(Path(file).read_text())[-1].strip()
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Collect and pretrain where the policy needs that and it is not done; train; return the figures."""
+    check_sources(config)
+    folder = open_run(config)
+    config = folder.config
+    with open_tracker(config, folder) as tracker:
+        train(config, folder, prepare_encoder(config, folder, tracker), tracker.log)
+    return finished(folder, "train") or {}
+
+
+def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
+    """Train until `train.env_steps`, from the newest checkpoint if there is one; export the policy.
+
+    Args:
+        config: The experiment.
+        folder: The run folder.
+        encoder_path: The pretrained encoder's file; None for a policy without one.
+        on_result: Called with (environment steps, metrics) after each PPO iteration, in this
+            process; a metric that was not measured is NaN.
+
+    Returns:
+        The policy folder, sufficient alone.
+
+    Raises:
+        TrainingError: If training failed or a loss is not finite.
+    """
+    if finished(folder, "train") is not None:
+        return folder.policy
+    start_ray(config.cluster, folder.path)
+    check_cpus(config)
+    algorithm = build_ppo(config, encoder_path)
+    with _listening(config, folder, on_result) as last:
+        results = fit(_tuner(config, folder, algorithm))
+    if results.errors:
+        raise TrainingError(stopped(results.errors[0]))
+    figures = {name: value for name, value in last.items() if math.isfinite(value)}
+    with results[0].checkpoint.as_directory() as checkpoint:
+        export_policy(config, Path(checkpoint), encoder_path, folder.policy, figures)
+    finish(folder, "train", figures)
+    return folder.policy
+
+
+def stopped(error: Exception | str) -> str:
+    """What to say of a training that an error ended."""
+    return f"training stopped: {last_line(error)}; the same command continues from its last checkpoint"
+
+
+def last_line(error: Exception | str) -> str:
+    """The line of a worker's error that names its cause."""
+    lines = str(error).strip().splitlines()
+    raised = f"{FlightError.__module__}.{FlightError.__qualname__}: "  # as Ray writes it before the message
+    return lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
+
+
+def check_cpus(config: Config) -> None:
+    """Refuse more env runners than a local Ray has CPUs for: Tune would wait for them forever."""
+    needed, cpus = config.algo.num_env_runners, int(ray.cluster_resources().get("CPU", 0))
+    if config.cluster.name == "local" and needed > cpus:
+        rule = f"needs as many CPUs, and Ray has {cpus} (algo=ppo needs one)"
+        raise ConfigError(f"algo.num_env_runners: {rule}, got {config.algo.num_env_runners}")
+
+
+def export_policy(
+    config: Config, checkpoint: Path, encoder_path: Path | None, target: Path, figures: dict[str, float]
+) -> None:
+    """Write the policy folder of a checkpoint of this run.
+
+    Raises:
+        TrainingError: If the checkpoint's encoder is not the one in the file.
+    """
+    module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
+    settings = policy_settings(config)
+    evae, about = None, dict[str, Any]()
+    if encoder_path is not None and kind_of(settings).encoder:
+        evae, about = load_encoder(encoder_path)
+    frozen = {} if evae is None else evae.state_dict()
+    flown = {} if module.encoder is None else module.encoder.state_dict()
+    if not all(torch.equal(value, frozen[name]) for name, value in flown.items()):
+        raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
+    manifest = {**settings, "figures": figures}
+    save_policy(target, module.networks(), manifest, evae, about.get("figures"))
+
+
+def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
+    """The experiment in the run folder: continued if it is there, else new."""
+    path = storage(config.cluster, folder.train)
+    # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
+    if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
+        stopped_at = restored(path, algorithm).get_results()[0].checkpoint
+        said = mend(Path(stopped_at.path)) if stopped_at and on_disk(stopped_at) else None
+        if said:
+            console.print(said, markup=False)
+        return restored(path, algorithm)
+    return tune.Tuner(
+        PPO,
+        param_space=algorithm,
+        run_config=tune.RunConfig(
+            name=folder.train.name,
+            storage_path=path.rpartition("/")[0],
+            stop={ENV_STEPS: config.train.env_steps},
+            verbose=0,
+            callbacks=[Relay(LISTENER)],
+            failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
+            checkpoint_config=tune.CheckpointConfig(
+                checkpoint_frequency=config.train.checkpoint_every,
+                num_to_keep=CHECKPOINTS_KEPT,
+                checkpoint_at_end=True,
+            ),
+        ),
+    )
+
+
+def on_disk(checkpoint: tune.Checkpoint) -> bool:
+    """Whether a checkpoint lies in a folder; an object store checks what it keeps itself."""
+    return isinstance(checkpoint.filesystem, pyarrow.fs.LocalFileSystem)
+
+
+def restored(path: str, algorithm: Any) -> tune.Tuner:
+    """The experiment of a folder, to go on."""
+    return tune.Tuner.restore(path, PPO, resume_errored=True, param_space=algorithm)
+
+
+@contextlib.contextmanager
+def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
+    """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
+    file = folder.train / "results.jsonl"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(whole_lines(file))
+    reported, last = reported_so_far(file)
+    total, since_s = config.train.env_steps, time.monotonic()
+    paused_s: float | None = None
+    with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
+
+        def listen(result: Mapping[str, Any]) -> None:
+            nonlocal reported, since_s, paused_s
+            now_s = time.monotonic()
+            if not _lookup(result, FLOWN) > 0:
+                paused_s = now_s if paused_s is None else paused_s
+                check_pause(now_s - paused_s, result, config.algo.num_env_runners)
+                return
+            paused_s, env_steps = None, int(result[ENV_STEPS])
+            last.update(read_metrics(result, now_s - since_s))
+            since_s = now_s
+            if env_steps <= reported:
+                return
+            row = {name: value if math.isfinite(value) else None for name, value in last.items()}
+            lines.write(json.dumps({"env_steps": env_steps, **row}) + "\n")
+            lines.flush()
+            on_result(env_steps, dict(last))
+            advance(env_steps - reported, note=_note(last))
+            reported = env_steps
+
+        _LISTENERS[LISTENER] = listen
+        try:
+            yield last
+        finally:
+            del _LISTENERS[LISTENER]
+
+
+def check_pause(seconds: float, result: Mapping[str, Any], env_runners: int) -> None:
+    """Let a training wait for processes that fly and have ended, unless they do not come back.
+
+    Raises:
+        TrainingError: All have been started as often as they may be, or after `MAX_PAUSE_S`.
+    """
+    known = result.get("fault_tolerance", {})
+    restarts, alive = known.get("num_remote_worker_restarts", 0), known.get("num_healthy_workers", 1)
+    if seconds > MAX_PAUSE_S or (alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)):
+        ended = f"every process that flies has ended, some {MAX_RESTARTS + 1} times"
+        raise TrainingError(
+            f"no step was flown for {seconds:.0f} s: {ended}; see /tmp/ray/session_latest/logs"
+        )
+
+
+def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
+    """Environment steps and metrics of the last whole line of a results file; 0 and none without one."""
+    lines = whole_lines(file).splitlines()
+    if not lines:
+        return 0, {}
+    row = json.loads(lines[-1])
+    return int(row.pop("env_steps")), {name: math.nan if x is None else x for name, x in row.items()}
+
+
+def whole_lines(file: Path) -> bytes:
+    """A file's content up to its last line end: a kill can leave half a line behind it."""
+    text = file.read_bytes() if file.exists() else b""
+    return text[: text.rfind(b"\n") + 1]
+
+
+def read_metrics(result: Mapping[str, Any], seconds: float) -> dict[str, float]:
+    """The metrics worth keeping of an RLlib result; NaN where nothing was measured.
+
+    `seconds` have passed since the one before it, on a clock that does not jump as RLlib's may.
+
+    Raises:
+        TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
+    """
+    metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
+    steps = _lookup(result, FLOWN)
+    metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
+    bad = [f"{name} = {metrics[name]}" for name in ALWAYS_FINITE if not math.isfinite(metrics[name])]
+    if bad:
+        where = f"at environment step {result[ENV_STEPS]}"
+        raise TrainingError(f"losses must be finite, got {', '.join(bad)} {where}")
+    return metrics
+
+
+def _lookup(result: Mapping[str, Any], path: tuple[str, ...]) -> float:
+    value: Any = result
+    for key in path:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return math.nan if value is None else float(value)
+
+
+def _note(metrics: Mapping[str, float]) -> str:
+    """The figures that a person watches."""
+    parts = [f"{metrics['perf/env_steps_per_second']:,.0f} steps/s"]
+    if not math.isnan(metrics["train/episode_return"]):
+        parts.append(f"return {metrics['train/episode_return']:.1f}")
+        parts.append(f"success {metrics['train/success_rate']:.0%}")
+    return ", ".join(parts)

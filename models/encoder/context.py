@@ -1,0 +1,299 @@
+"""The event context network (appendix A.1): a set of events in, one context vector out.
+
+    context = max over events of ReLU( ECN(x, y, p) + embedding(t) ),   0 for no event
+
+ECN is three per-event layers (64, 128, context), each with batch normalisation and ReLU.
+ReLU floors the context at 0, which is therefore the identity of the maximum.
+
+With EventNet's coding (appendix A.2, equation 4) an event has a complex number per feature,
+
+    a = [ tanh(ECN(x, y, p)) - age ]_+ exp(-i 2 pi age),   age = 1 - t
+
+and the context is the one of largest magnitude: its real parts, then its imaginary parts. The
+magnitude is the additive form with tanh features and the code -age; the phase is that of the
+event that wins (the newest of equals) and has no gradient.
+
+`EventContextNetwork.plain` is this formula, event by event. `EventContextNetwork.forward` is
+the same function with the same parameters, gradients and running statistics, tens of times
+faster on a CPU (`jobs/bench/context.py`): x, y, p have only 2 H W values, so the layers run once
+per distinct value, with batch statistics weighted by how often each occurs. Only the order of the
+sums differs; `tests/models/encoder/test_context.py` states the bounds for float64 and float32.
+"""
+
+import itertools
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from models.encoder.embedding import embedding_table, eventnet_phase
+from models.encoder.event_batch import EventBatch, Grid, distinct
+
+DTYPES = (torch.float32, torch.float64)
+
+
+class EventContextNetwork(nn.Module):
+    """Per-event network and maximum over events.
+
+    Args:
+        grid: Sensor size and time bins.
+        variant: "bytestream": x, y, p and the time embedding; "bytestream_xy": x, y alone.
+        context: Features D, even.
+        norm: "batch" or "none". With "batch" the layers have no bias: the normalisation
+            subtracts it again, and its gradient would be rounding noise that Adam amplifies.
+        coding: Of time, one of `models.encoder.embedding.CODINGS`; "bytestream_xy" has none.
+
+    A frozen network (parameters that need no gradient) never moves its running statistics,
+    not even in train mode.
+    """
+
+    def __init__(self, grid: Grid, variant: str, context: int, norm: str, coding: str = "additive") -> None:
+        super().__init__()
+        self.grid = grid
+        self.uses_polarity = variant == "bytestream"
+        self.coding = coding if variant == "bytestream" else "none"
+        sizes = [3 if self.uses_polarity else 2, 64, 128, context]
+        bias = norm == "none"
+        self.layers = nn.ModuleList(nn.Linear(a, b, bias=bias) for a, b in itertools.pairwise(sizes))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(size) for size in sizes[1:] if norm == "batch")
+
+    def forward(self, batch: EventBatch) -> Tensor:
+        """Context (B, D) of a batch of windows, or (B, 2 D) by EventNet's coding.
+
+        The fused form on a CPU, the plain one elsewhere.
+
+        Raises:
+            ValueError: The batch was made for another grid, or has fewer than two events
+                to take batch statistics from, or the weights are not float32 or float64.
+        """
+        if self.layers[0].weight.device.type != "cpu":
+            return self.plain(batch)
+        cell, bins, embedding = self._address(batch)
+        present, multiplicity, rank = distinct(cell)
+        share = self._share(multiplicity, len(cell))
+        h, weight, bias = self._last_layer(self._inputs(present), share, len(cell))
+        events, squash = (rank, bins, batch.offsets, embedding), self.coding == "eventnet"
+        ordered = newest_first(events) if squash else events
+        context, winning_bin = MaxContext.apply(h, weight, bias, ordered, squash)
+        return self._rotated(context, winning_bin) if squash else context
+
+    def plain(self, batch: EventBatch) -> Tensor:
+        """The same context, event by event: what the fused form is tested against.
+
+        Raises:
+            ValueError: As `forward`.
+        """
+        cell, bins, embedding = self._address(batch)
+        h = self._inputs(cell)
+        self._share(np.ones(1), len(cell))
+        for layer, norm in self._pairs():
+            h = layer(h)
+            if norm is not None:
+                running, affine = (norm.running_mean, norm.running_var), (norm.weight, norm.bias)
+                h = functional.batch_norm(h, *running, *affine, self.learns, norm.momentum, norm.eps)
+                norm.num_batches_tracked += int(self.learns)
+            h = torch.relu(h)
+        h = torch.tanh(h) if self.coding == "eventnet" else h
+        value = torch.relu(h + torch.from_numpy(embedding[bins]).to(h.device))  # (N, D)
+        sizes = np.diff(batch.offsets).tolist()
+        best = torch.stack([v.max(0).values if len(v) else v.sum(0) for v in value.split(sizes)])
+        if self.coding != "eventnet":
+            return best
+        times = torch.from_numpy(bins).to(h.device)[:, None].expand_as(value)
+        winning_bin = torch.stack([
+            torch.where(v == b, t, 0).max(0).values if len(v) else t.sum(0)
+            for v, t, b in zip(value.split(sizes), times.split(sizes), best, strict=True)
+        ])  # fmt: skip
+        return self._rotated(best, winning_bin)
+
+    def cell_features(self) -> Tensor:
+        """Features (cells, D) >= 0 of every distinct event, by the running statistics."""
+        cells = np.arange((2 if self.uses_polarity else 1) * self.grid.width * self.grid.height)
+        h, weight, bias = self._last_layer(self._inputs(cells), None, 0)
+        features = torch.relu(torch.addmm(bias, h, weight.T))
+        return torch.tanh(features) if self.coding == "eventnet" else features
+
+    @property
+    def learns(self) -> bool:
+        """Whether batch statistics are taken and running ones moved."""
+        return self.training and self.layers[0].weight.requires_grad
+
+    def _pairs(self) -> list[tuple[Any, Any]]:
+        return list(zip(self.layers, self.norms if len(self.norms) else [None] * 3, strict=True))
+
+    def _address(self, batch: EventBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cell and row of code of every event, and the codes (one row of zeros without time)."""
+        if batch.grid != self.grid:
+            raise ValueError(
+                f"the batch has {batch.grid}, the model {self.grid}: make it with the model's grid"
+            )
+        if self.layers[0].weight.dtype not in DTYPES:
+            raise ValueError(f"weights must be float32 or float64, got {self.layers[0].weight.dtype}")
+        dtype = str(self.layers[0].weight.dtype).removeprefix("torch.")
+        codes = embedding_table(self.grid.time_bins, self.layers[-1].out_features, dtype, self.coding)
+        pixels = self.grid.width * self.grid.height
+        cell = batch.code if self.uses_polarity else batch.code % pixels
+        return cell, np.zeros_like(batch.bin) if self.coding == "none" else batch.bin, codes
+
+    def _rotated(self, magnitude: Tensor, winning_bin: Tensor) -> Tensor:
+        """Real and imaginary parts (B, 2 D) of magnitudes (B, D) with the phase of bins (B, D)."""
+        dtype = str(magnitude.dtype).removeprefix("torch.")
+        phase = torch.from_numpy(np.array(eventnet_phase(self.grid.time_bins, dtype))).to(magnitude.device)
+        return torch.cat([magnitude * part[winning_bin.long()] for part in phase], dim=1)
+
+    def _inputs(self, cell: np.ndarray) -> Tensor:
+        """Inputs (N, 3 or 2) of cells: x, y scaled to [-1, 1], then p."""
+        width, height = self.grid.width, self.grid.height
+        columns = [
+            2.0 * (cell % width) / max(width - 1, 1) - (width > 1),
+            2.0 * (cell // width % height) / max(height - 1, 1) - (height > 1),
+            2.0 * (cell // (width * height)) - 1.0,
+        ][: 3 if self.uses_polarity else 2]
+        return torch.from_numpy(np.stack(columns, axis=1)).to(self.layers[0].weight)
+
+    def _share(self, multiplicity: np.ndarray, events: int) -> Tensor | None:
+        """Fraction of the batch's events in each present cell; None without batch statistics."""
+        if not (self.learns and len(self.norms)):
+            return None
+        if events < 2:
+            raise ValueError(f"batch statistics need at least two events in a training batch, got {events}")
+        return torch.from_numpy(multiplicity / events).to(self.layers[0].weight)
+
+    def _last_layer(self, h: Tensor, share: Tensor | None, events: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Run the first two layers; the last as (h, weight, bias), to be finished where it is needed."""
+        *inner, last = self._pairs()
+        for layer, norm in inner:
+            h, weight, bias = folded(layer, norm, h, share, events)
+            h = torch.relu(torch.addmm(bias, h, weight.T))
+        return folded(*last, h, share, events)
+
+
+def folded(
+    layer: nn.Linear, norm: nn.BatchNorm1d | None, h: Tensor, share: Tensor | None, events: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One affine map (h, weight, bias) equal to `norm(layer(h))` over the batch of events.
+
+    The batch mean and variance of W h follow from those of h: W mean(h) and diag(W cov(h) W^T).
+    So the normalisation costs a small covariance instead of passes over all features, and
+    leaves the gradient of the output sparse.
+
+    Args:
+        layer: Without bias if `norm` is given.
+        norm: Batch normalisation, or None.
+        h: Inputs (U, K) of the distinct events.
+        share: Their fraction of the batch (U,); None: running statistics.
+        events: Events of the batch, for the unbiased running variance.
+
+    Returns:
+        h (U, K), centred if batch statistics are used; weight (F, K); bias (F,).
+    """
+    if norm is None:
+        return h, layer.weight, layer.bias
+    if share is None:
+        scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+        return h, layer.weight * scale[:, None], norm.bias - norm.running_mean * scale
+    centre = share @ h
+    h = h - centre
+    covariance = (h * share[:, None]).T @ h
+    variance = ((layer.weight @ covariance) * layer.weight).sum(1).clamp_min(0)
+    with torch.no_grad():
+        norm.num_batches_tracked += 1
+        norm.running_mean.lerp_(layer.weight @ centre, norm.momentum)
+        norm.running_var.lerp_(variance * (events / (events - 1)), norm.momentum)
+    return h, layer.weight * (norm.weight / torch.sqrt(variance + norm.eps))[:, None], norm.bias
+
+
+def newest_first(events: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Events (cell, bin, offsets, codes), each window's by falling bin: of equals the newest wins."""
+    cell, bins, offsets, codes = events
+    window = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    order = np.lexsort((-bins, window))
+    return cell[order], bins[order], offsets, codes
+
+
+class MaxContext(torch.autograd.Function):
+    """context = max over events of ReLU(f(h W^T + b)[cell] + code[bin]), sparse backward.
+
+    f is ReLU, or tanh(ReLU) if `squash`.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: tuple[np.ndarray, ...], squash: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Context (B, D) and the bin (B, D) of the event it is from, 0 without one.
+
+        `events` is (cell, bin, offsets, codes).
+        """
+        cell, bins, offsets, codes = events
+        activation = torch.addmm(bias, h, weight.T).relu_()
+        features = (activation.tanh_() if squash else activation).numpy()
+        context = np.zeros((len(offsets) - 1, len(bias)), features.dtype)
+        winner = np.full(context.shape, -1, np.int32)
+        winning_bin = np.zeros(context.shape, np.int32)
+        _maximum((features, codes), (cell, bins, offsets), context, winner, winning_bin)
+        ctx.slope = _tanh_slope(features, winner) if squash else None
+        ctx.save_for_backward(h, weight, torch.from_numpy(winner))
+        found = torch.from_numpy(context), torch.from_numpy(winning_bin)
+        ctx.mark_non_differentiable(found[1])
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of h, weight and bias: only winning events with an active feature have one."""
+        h, weight, winner = ctx.saved_tensors
+        if ctx.slope is not None:
+            gradient = gradient * torch.from_numpy(ctx.slope)
+        outputs = torch.zeros_like(h), torch.zeros_like(weight), weight.new_zeros(len(weight))
+        arrays = [tensor.detach().contiguous().numpy() for tensor in (gradient, winner, h, weight)]
+        _scatter(*arrays, *(tensor.numpy() for tensor in outputs))
+        return *outputs, None, None
+
+
+def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
+    """Derivative of tanh (B, D) where it took the winners' features (cells, D); anything without a winner."""
+    if len(features) == 0:
+        return np.ones(winner.shape, features.dtype)
+    return 1.0 - features[np.maximum(winner, 0), np.arange(winner.shape[1])] ** 2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _maximum(tables, events, context, winner, winning_bin) -> None:  # type: ignore[no-untyped-def]
+    """Raise `context` (B, D) to the events' maximum, the first of equals.
+
+    `winner` becomes its cell, -1 where it has no gradient; `winning_bin` its bin.
+    """
+    features, codes = tables
+    cell, bins, offsets = events
+    for b in range(context.shape[0]):
+        best, who = context[b], winner[b]
+        for n in range(offsets[b], offsets[b + 1]):
+            feature, code = features[cell[n]], codes[bins[n]]
+            event = np.int32(n)
+            for j in range(len(best)):
+                value = feature[j] + code[j]
+                better = value > best[j]
+                best[j] = value if better else best[j]
+                who[j] = event if better else who[j]
+        for j in range(len(best)):
+            if who[j] >= 0:
+                winning_bin[b, j] = bins[who[j]]
+                u = cell[who[j]]
+                who[j] = u if features[u, j] > 0 else -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _scatter(gradient, winner, h, weight, grad_h, grad_weight, grad_bias) -> None:  # type: ignore[no-untyped-def]
+    """Add each winner's gradient to its row of h, its row of the weight, and the bias."""
+    for b in range(gradient.shape[0]):
+        for j in range(gradient.shape[1]):
+            u = winner[b, j]
+            if u >= 0:
+                g = gradient[b, j]
+                grad_bias[j] += g
+                for k in range(h.shape[1]):
+                    grad_weight[j, k] += g * h[u, k]
+                    grad_h[u, k] += g * weight[j, k]

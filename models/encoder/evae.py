@@ -1,0 +1,319 @@
+"""The event variational autoencoder (appendix A.1, B.2): events -> context -> latent -> event picture.
+
+Loss of one batch, both terms on a stated scale:
+
+    loss = mean over windows and outputs of the reconstruction error
+         + beta * mean over windows of KL( q(z | events) || N(0, 1) ), summed over the latent
+
+The mean over pixels is 1 / (H W) of the sum in an evidence lower bound, so `beta` here weighs
+H W times more than the same number in front of a summed error: the appendix's schedule
+(`appendix_beta`) on this scale drives the latent of the full variant to the prior within 1,500
+iterations. A weight near 1e-5 keeps it alive.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from models.encoder.context import EventContextNetwork
+from models.encoder.embedding import CODINGS
+from models.encoder.event_batch import EventBatch, Grid
+from models.encoder.event_images import PictureContextNetwork, cell_counts, last_polarity, newest_time
+
+VARIANTS = ("bytestream", "bytestream_xy", "event_image_vae")
+NORMS = ("batch", "none")
+TARGETS = ("signed", "occupancy", "aged", "counts")
+CELLS = 8  # each way, of the target "counts"
+COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events
+LIMITS = {"width": 4096, "height": 4096, "context": 8192, "latent": 256, "time_bins": 65536}
+LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
+ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)
+# A latent that the KL term had emptied held 0.03 nats and explained 0.000; living ones hold 10 and more.
+EMPTY_KL = 0.1  # nats
+EMPTY_EXPLAINED = 0.01
+
+
+class EventVAE(nn.Module):
+    """Event context network, encoder 1024-256-(mu, logvar) and decoder latent-256-1024-H W.
+
+    Args:
+        variant: "bytestream" sees t, x, y, p; "bytestream_xy" sees x, y alone; "event_image_vae" sees event
+            images through convolutions, which leave norm, time_bins and coding without use.
+        width, height: Pixels of the sensor.
+        context: Features of the context vector, even.
+        latent: Size of z.
+        norm: "batch" or "none": normalisation of the context network.
+        target: What is reconstructed: "signed" (Tanh, smooth L1), "occupancy" or "aged" (Sigmoid,
+            binary cross entropy), or "counts" (linear, mean squared error); see `event_targets`.
+        time_bins: Resolution of time within a window, part of the model.
+        coding: How the time of an event enters the context: "additive" (sines and cosines),
+            "eventnet" (decay and rotation, twice the numbers) or "none"; "bytestream_xy" has no time
+            and takes "additive" as "none".
+
+    Raises:
+        ValueError: A setting outside its range; the message names it.
+    """
+
+    def __init__(  # noqa: PLR0913 - the settings of an encoder file
+        self,
+        variant: str = "bytestream",
+        width: int = 64,
+        height: int = 64,
+        context: int = 1024,
+        latent: int = 8,
+        norm: str = "batch",
+        target: str = "signed",
+        time_bins: int = 1024,
+        coding: str = "additive",
+    ) -> None:
+        super().__init__()
+        self.settings: dict[str, Any] = {
+            "variant": variant, "width": width, "height": height, "context": context,
+            "latent": latent, "norm": norm, "target": target, "time_bins": time_bins, "coding": coding,
+        }  # fmt: skip
+        check_settings(self.settings)
+        self.grid = Grid(width, height, time_bins)
+        self.target = target
+        self.ecn: nn.Module = (
+            PictureContextNetwork(self.grid, context)
+            if variant == "event_image_vae"
+            else EventContextNetwork(self.grid, variant, context, norm, coding)
+        )
+        parts = 2 if coding == "eventnet" else 1  # real and imaginary
+        self.encoder = nn.Sequential(nn.Linear(parts * context, 256), nn.ReLU(), nn.Linear(256, 2 * latent))
+        self.decoder = nn.Sequential(
+            nn.Linear(latent, 256),
+            nn.ReLU(),
+            nn.Linear(256, 1024),
+            nn.ReLU(),
+            nn.Linear(1024, math.prod(target_shape(target, self.grid))),
+        )
+
+    def forward(self, batch: EventBatch, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Reconstruct a batch of windows.
+
+        Args:
+            batch: Windows, made with this model's `grid`.
+            noise: Standard normal (B, latent) for z = mu + noise exp(logvar / 2); None: z = mu.
+
+        Returns:
+            Logits (B, outputs) of `reconstruct`, mu (B, latent), logvar (B, latent); there are
+            as many outputs as `target_shape` holds.
+        """
+        mu, logvar = self.encoder(self.ecn(batch)).chunk(2, dim=-1)
+        z = mu if noise is None else mu + noise * torch.exp(0.5 * logvar.clamp(-30.0, LOGVAR_LIMIT))
+        return self.decoder(z), mu, logvar
+
+    def freeze(self) -> "EventVAE":
+        """Eval mode, and no parameter or running statistic moves any more; returns self."""
+        return self.eval().requires_grad_(False)
+
+
+def check_settings(settings: dict[str, Any]) -> None:
+    """Check the arguments of `EventVAE`.
+
+    Raises:
+        ValueError: Names the setting, the value and the rule.
+    """
+    choices = (("variant", VARIANTS), ("norm", NORMS), ("target", TARGETS), ("coding", CODINGS))
+    for name, allowed in choices:
+        if settings[name] not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {settings[name]!r}")
+    for name, limit in LIMITS.items():
+        value = settings[name]
+        if type(value) is not int or not 1 <= value <= limit:
+            raise ValueError(f"{name} must be an integer in 1..{limit}, got {value!r}")
+    if settings["context"] % 2:
+        raise ValueError(f"context must be even (sines and cosines), got {settings['context']}")
+    if settings["variant"] != "bytestream" and settings["coding"] == "eventnet":
+        rule = f"must be additive or none for {settings['variant']}, which has no time"
+        raise ValueError(f"coding {rule}, got 'eventnet'")
+
+
+def target_shape(target: str, grid: Grid) -> tuple[int, ...]:
+    """Shape of one window's target: a picture (H, W), or for "counts" (2, CELLS, CELLS), OFF and ON."""
+    return (2, CELLS, CELLS) if target == "counts" else (grid.height, grid.width)
+
+
+def event_targets(batch: EventBatch, target: str) -> Tensor:
+    """Pictures that the decoder learns, float32 (B, outputs), row-major (`target_shape`).
+
+    "signed": polarity of each pixel's last event, -1, 0 or +1. "occupancy": 1 where the pixel
+    had any event, else 0. "aged": where it had any, the time of its newest one in (0, 1), newest
+    near 1, else 0. These follow from the set of events alone, as the context does: an
+    event that occurs twice counts once. Events of a window are taken in their given (time) order.
+    "counts": log2(1 + count) / COUNTED_BITS of the OFF, then the ON events of each cell.
+    """
+    if target == "counts":
+        return torch.from_numpy(np.log2(1.0 + cell_counts(batch, CELLS)) / np.float32(COUNTED_BITS))
+    if target == "aged":
+        return torch.from_numpy(newest_time(batch))
+    last = last_polarity(batch)
+    return torch.from_numpy(last if target == "signed" else np.abs(last))
+
+
+def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
+    """Mean over windows and outputs of the target's error, see `EventVAE`.
+
+    The cross entropy takes logits because sigmoid followed by log is infinite from 17 on.
+    """
+    if target == "signed":
+        return functional.smooth_l1_loss(torch.tanh(logits), targets)
+    if target == "counts":
+        return functional.mse_loss(logits, targets)
+    return functional.binary_cross_entropy_with_logits(logits, targets)
+
+
+def reconstruct(logits: Tensor, target: str) -> Tensor:
+    """Target's values from logits: Tanh in [-1, 1], Sigmoid in [0, 1] (appendix A.1), or as they are."""
+    if target == "counts":
+        return logits
+    return torch.tanh(logits) if target == "signed" else torch.sigmoid(logits)
+
+
+def pictures(values: Tensor, target: str, grid: Grid) -> Tensor:
+    """Values of a target (B, outputs) as pictures to look at, (B, H, W) in about [-1, 1].
+
+    Of "counts" each pixel shows its cell: the larger of ON and, below 0, OFF.
+    """
+    shaped = values.reshape(-1, *target_shape(target, grid))
+    if target != "counts":
+        return shaped
+    off, on = shaped.unbind(1)
+    rows, columns = (torch.arange(side) * CELLS // side for side in (grid.height, grid.width))
+    return torch.where(on >= off, on, -off)[:, rows[:, None], columns]
+
+
+def kl_divergence(mu: Tensor, logvar: Tensor) -> Tensor:
+    """KL( N(mu, exp(logvar)) || N(0, 1) ) of each window, summed over the latent: (B,).
+
+    0.5 (mu^2 + expm1(logvar) - logvar), which keeps small values that 1 + logvar - exp(logvar)
+    cancels. Above logvar 10 exp continues along its tangent, so that value and gradient stay
+    finite and point back.
+    """
+    bounded = logvar.clamp_max(LOGVAR_LIMIT)
+    exp_minus_1 = torch.expm1(bounded) + torch.exp(bounded.detach()) * (logvar - bounded)
+    return 0.5 * (mu.square() + exp_minus_1 - logvar).sum(dim=-1)
+
+
+def appendix_beta(iteration: int) -> float:
+    """The appendix's KL weight (B.2): 0 up to iteration 1000, then 1e-3 * iteration / 10000.
+
+    The appendix leaves iteration 1000 open; it is 0 here.
+    """
+    return 0.0 if iteration <= 1000 else 1e-3 * iteration / 10_000
+
+
+def train_step(
+    evae: EventVAE, optimizer: torch.optim.Optimizer, batch: EventBatch, targets: Tensor, beta: float,
+    rng: np.random.Generator, max_norm: float = 1.0,
+) -> dict[str, float]:  # fmt: skip
+    """One update of the model on one batch.
+
+    Args:
+        evae: Model in train mode.
+        optimizer: Over its parameters.
+        batch: Windows, at least two events together.
+        targets: From `event_targets`, on the model's device.
+        beta: KL weight on the scale of this module's loss.
+        rng: Draws the noise of the latent.
+        max_norm: The gradient's norm is clipped to this.
+
+    Returns:
+        loss, reconstruction, kl (mean over windows), active_units, gradient_norm (before the clip).
+
+    Raises:
+        RuntimeError: The gradient is not finite; no parameter has been changed.
+    """
+    parameter = evae.decoder[0].weight
+    noise = torch.from_numpy(rng.standard_normal((len(batch), evae.settings["latent"]))).to(parameter)
+    logits, mu, logvar = evae(batch, noise)
+    reconstruction, kl = reconstruction_loss(logits, targets, evae.target), kl_divergence(mu, logvar).mean()
+    loss = reconstruction + beta * kl
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    norm = nn.utils.clip_grad_norm_(evae.parameters(), max_norm, error_if_nonfinite=True)
+    optimizer.step()
+    figures = {"loss": loss, "reconstruction": reconstruction, "kl": kl, "gradient_norm": norm}
+    return {name: value.item() for name, value in figures.items()} | {"active_units": active_units(mu)}
+
+
+@torch.no_grad()
+def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, float]:
+    """Figures of the model on held-out windows, z = mu; the model must be in eval mode.
+
+    Returns:
+        reconstruction (mean error of a pixel), mean_picture (the same error for the targets' own
+        mean picture), explained (1 - reconstruction / mean_picture: 0 for a model that has learnt
+        nothing of the single window, 1 for a perfect one, and 0 where all targets are the same;
+        of "aged" none reaches 1: the cross entropy keeps the entropy of times between 0 and 1),
+        auc (`ranking_area` of "the target is not 0" by the picture's magnitude), kl (mean over
+        windows [nats]), active_units.
+    """
+    logits, mu, logvar = evae(batch)
+    mean = targets.mean(0).expand_as(targets)
+    if evae.target == "signed":
+        baseline = functional.smooth_l1_loss(mean, targets)
+    elif evae.target == "counts":
+        baseline = functional.mse_loss(mean, targets)
+    else:
+        baseline = functional.binary_cross_entropy(mean, targets)
+    reconstruction, mean_picture = (
+        error.item() for error in (reconstruction_loss(logits, targets, evae.target), baseline)
+    )
+    return {
+        "reconstruction": reconstruction,
+        "mean_picture": mean_picture,
+        "explained": 1.0 - reconstruction / mean_picture if mean_picture > 0 else 0.0,
+        "auc": ranking_area(reconstruct(logits, evae.target).abs().numpy(), targets.numpy() != 0),
+        "kl": kl_divergence(mu, logvar).mean().item(),
+        "active_units": active_units(mu),
+    }
+
+
+def ranking_area(scores: np.ndarray, positive: np.ndarray) -> float:
+    """Area under the ROC curve: how often a positive has the higher score of a random pair.
+
+    Exact: the share of the pairs (positive, negative), a tie counts half (Mann and Whitney 1947).
+
+    Args:
+        scores: Any shape, without NaN.
+        positive: bool, the same shape.
+
+    Returns:
+        0..1; 0.5, as of scores that say nothing, if all or none are positive.
+
+    Raises:
+        ValueError: A score is NaN, which has no rank.
+    """
+    if np.isnan(scores).any():
+        raise ValueError("scores must be numbers, got NaN, which has no rank; check the model's weights")
+    own, others = np.sort(scores[positive]), np.sort(scores[~positive])
+    if not len(own) or not len(others):
+        return 0.5
+    twice = sum(int(np.searchsorted(others, own, side).sum()) for side in ("left", "right"))
+    return twice / (2 * len(own) * len(others))
+
+
+def collapsed(figures: Mapping[str, float]) -> bool:
+    """Whether the posterior has fallen onto the prior, so that the latent says nothing of its window.
+
+    Nothing of the single window is decoded (`EMPTY_EXPLAINED`), and the latent is either the same
+    for every window (no active unit) or next to the prior (`EMPTY_KL`). Both are asked, because a
+    latent without a KL term may live on a small scale, and a young model decodes nothing yet.
+
+    Args:
+        figures: Of `validate`.
+    """
+    silent = figures["active_units"] == 0 or figures["kl"] < EMPTY_KL
+    return silent and figures["explained"] < EMPTY_EXPLAINED
+
+
+def active_units(mu: Tensor) -> float:
+    """Number of latent units whose mean varies by more than 0.01 over the windows of `mu` (B, latent)."""
+    return float((mu.detach().var(0, correction=0) > ACTIVE_VARIANCE).sum())

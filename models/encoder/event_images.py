@@ -1,0 +1,129 @@
+"""Event images through convolutions: the other half of an encoder that sees pictures, not events.
+
+The policy EIVAE of appendix D.1.2: a variational autoencoder over event images whose encoder
+is the convolutions of the policy EIP. Here each step's image has a latent of its own and the
+policy sees a stack of them, as of those of the bytestream; the paper encodes the stack of
+images. So the two differ in what the encoder sees, and in nothing else.
+"""
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows
+from models.kinds import MIN_IMAGE
+
+OFF_SHARE = 125.0 / 255.0  # of the picture value of ON (appendix D.1.2)
+
+
+class PictureContextNetwork(nn.Module):
+    """Event image to context: three convolutions and a dense layer (Mnih et al., Nature 2015).
+
+    Args:
+        grid: Sensor size; time is not seen.
+        context: Features D.
+
+    Raises:
+        ValueError: The sensor has fewer than 36 pixels each way.
+    """
+
+    def __init__(self, grid: Grid, context: int) -> None:
+        super().__init__()
+        if min(grid.width, grid.height) < MIN_IMAGE:
+            raise ValueError(
+                f"event images need {MIN_IMAGE} pixels each way, got {grid.width} x {grid.height}"
+            )
+        self.grid = grid
+        height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in (grid.height, grid.width))
+        self.layers = nn.Sequential(
+            *(nn.Conv2d(1, 32, 8, 4), nn.ReLU()),
+            *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),
+            *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),
+            nn.Flatten(),
+            *(nn.Linear(64 * height * width, context), nn.ReLU()),
+        )
+        for layer in self.layers:
+            if isinstance(layer, nn.Conv2d | nn.Linear):  # torch's own weights let sparse pictures fade
+                nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
+                nn.init.zeros_(layer.bias)
+
+    def forward(self, batch: EventBatch) -> Tensor:
+        """Context (B, D) of a batch of windows."""
+        return self.layers(event_pictures(batch).to(self.layers[0].weight))
+
+
+def last_polarity(batch: EventBatch) -> np.ndarray:
+    """Polarity of each pixel's last event, -1, 0 or +1: float32 (B, H W), row-major."""
+    picture = np.zeros((len(batch), batch.grid.width * batch.grid.height), np.float32)
+    _draw(batch.code, batch.offsets, picture)
+    return picture
+
+
+def newest_time(batch: EventBatch) -> np.ndarray:
+    """Time of each pixel's newest event within its window, 0 where there is none: float32 (B, H W).
+
+    Times are the centres of their bins, in (0, 1), newest near 1.
+    """
+    pixels = batch.grid.width * batch.grid.height
+    picture = np.zeros((len(batch), pixels), np.float32)
+    time = ((batch.bin + 0.5) / batch.grid.time_bins).astype(np.float32)
+    np.maximum.at(picture, (_window(batch), batch.code % pixels), time)
+    return picture
+
+
+def cell_counts(batch: EventBatch, cells: int) -> np.ndarray:
+    """OFF, then ON events in each of cells x cells equal parts of the sensor: float32 (B, 2 cells cells).
+
+    A pixel (x, y) belongs to column x cells // width and row y cells // height; row-major.
+    """
+    row, x = np.divmod(batch.code, batch.grid.width)
+    sign, y = np.divmod(row, batch.grid.height)
+    cell = (sign * cells + y * cells // batch.grid.height) * cells + x * cells // batch.grid.width
+    size = 2 * cells * cells
+    counts = np.bincount(_window(batch) * size + cell, minlength=len(batch) * size)
+    return counts.reshape(len(batch), size).astype(np.float32)
+
+
+def _window(batch: EventBatch) -> np.ndarray:
+    """The window of each event, int64 (N,)."""
+    return np.repeat(np.arange(len(batch)), np.diff(batch.offsets))
+
+
+def event_pictures(batch: EventBatch) -> Tensor:
+    """Event images float32 (B, 1, H, W) on a scale where ON is 1."""
+    last = torch.from_numpy(last_polarity(batch))
+    pictures = torch.where(last < 0, OFF_SHARE, last)
+    return pictures.reshape(-1, 1, batch.grid.height, batch.grid.width)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _draw(code, offsets, picture) -> None:  # type: ignore[no-untyped-def]
+    pixels = picture.shape[1]
+    for b in range(picture.shape[0]):
+        for n in range(offsets[b], offsets[b + 1]):
+            picture[b, code[n] % pixels] = 1.0 if code[n] >= pixels else -1.0
+
+
+class PictureEncoder:
+    """The frozen half of such an autoencoder: windows to latents, as `models.table.EncoderTable`."""
+
+    def __init__(self, evae: Any) -> None:
+        """Take the parts of an `EventVAE` of variant "event_image_vae"."""
+        self.grid, self.latent_size = evae.grid, evae.settings["latent"]
+        self.layers = nn.Sequential(evae.ecn.layers, evae.encoder).eval()
+
+    def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
+        """Latent mu (latent,) of one window. Raises ValueError as `event_batch.index_events`."""
+        return self._mu(batch_windows([(events, start_us, window_us)], self.grid))[0]
+
+    def encode_windows(self, windows: np.ndarray) -> np.ndarray:
+        """Latents (B, latent) of packed windows. Raises ValueError as `event_batch.index_packed`."""
+        return self._mu(batch_packed(windows, self.grid))
+
+    def _mu(self, batch: EventBatch) -> np.ndarray:
+        with torch.inference_mode():
+            return self.layers(event_pictures(batch))[:, : self.latent_size].numpy()

@@ -1,0 +1,250 @@
+"""The frozen encoder as an exact lookup table (appendix C), also for streams (appendix A.3).
+
+x, y, p and the time bin are bounded: the context network is 2 H W rows of features and one row
+of embedding per time bin. A context is the maximum of their sums, floored at 0, so that
+
+    context(any chunks of a window, in any order) == context(the window),   bit for bit:
+
+a sum is rounded the same in every chunk, and a maximum does not round. The rows are computed
+in float64 and rounded once, to the model's precision or a smaller one; `tests/models/encoder/test_table.py`
+states the distance to the module.
+
+With EventNet's coding a context also holds the time bin of the event that each magnitude is from,
+of equal ones the newest; the phase of that bin follows when the latent is asked for.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from models.encoder.embedding import bin_centres, eventnet_phase, time_code
+from models.encoder.evae import EventVAE
+from models.encoder.event_batch import Grid, index_events, index_packed, thin
+
+PRECISIONS = ("model", "int16", "int8")
+INT16_TOP, INT8_TOP = 32_767, 127
+
+
+@dataclass(frozen=True)
+class EncoderTable:
+    """An event encoder without a network: read-only arrays.
+
+    Attributes:
+        grid: Sensor size and time bins.
+        features: (cells, D) rows for each (p, y, x), or (y, x) without polarity; >= 0.
+        embedding: Code of each time bin (time_bins, D), or one row of zeros for an encoder without time.
+        hidden: Weight (256, D or 2 D) and bias (256,) of the encoder's first layer; the weight
+            takes a context in the units of the rows.
+        head: Weight (latent, 256) and bias (latent,) of mu.
+        phase: Of each time bin, real and imaginary part (2, time_bins), for EventNet's coding.
+        most_events: A whole window is thinned to so many before it is encoded
+            (`models.encoder.event_batch.thin`), None: never. `update` takes every event of a stream.
+    """
+
+    grid: Grid
+    features: np.ndarray
+    embedding: np.ndarray
+    hidden: tuple[np.ndarray, np.ndarray]
+    head: tuple[np.ndarray, np.ndarray]
+    phase: np.ndarray | None = None
+    most_events: int | None = None
+
+    @classmethod
+    def from_evae(
+        cls, evae: EventVAE, precision: str = "model", time_bins: int | None = None
+    ) -> "EncoderTable":
+        """Tabulate a model by its running statistics.
+
+        Args:
+            evae: The model.
+            precision: Of the rows. "model": the model's dtype (float32), exact. "int16": fixed
+                point with one scale for all, a power of two, of 2^-11 for features below 15;
+                it halves what an event reads, and is more exact than float16, which CPUs
+                would have to convert. "int8": one scale for each feature.
+            time_bins: Another resolution of time than the model's; None: the model's, exact.
+
+        Raises:
+            ValueError: Unknown precision, time_bins out of the model's range, or weights that
+                are neither float32 nor float64.
+        """
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
+        dtype = str(evae.encoder[0].weight.dtype).removeprefix("torch.")
+        if dtype not in ("float32", "float64"):
+            raise ValueError(f"weights must be float32 or float64, got {dtype}: call evae.float()")
+        exact = _exact(evae, time_bins)
+        with torch.no_grad():
+            features = exact.ecn.cell_features().numpy()
+        coding = exact.ecn.coding
+        grid = exact.grid._replace(time_bins=1) if coding == "none" else exact.grid
+        embedding = time_code(bin_centres(grid.time_bins), features.shape[1], coding)
+        features, embedding, scale = _rounded(features, embedding, precision, dtype)
+        first, _, last = exact.encoder
+        hidden = _array(first.weight) * np.resize(scale, first.in_features), _array(first.bias)
+        head = [_array(part)[: evae.settings["latent"]] for part in (last.weight, last.bias)]
+        return cls(
+            grid=grid,
+            features=_read_only(features),
+            embedding=_read_only(embedding),
+            hidden=(_read_only(hidden[0], dtype), _read_only(hidden[1], dtype)),
+            head=(_read_only(head[0], dtype), _read_only(head[1], dtype)),
+            phase=eventnet_phase(grid.time_bins, dtype) if coding == "eventnet" else None,
+        )
+
+    def empty(self) -> np.ndarray:
+        """Context of no event: zeros (D,), int16 for rows of int8, whose sums it holds.
+
+        With EventNet's coding (2, D), magnitudes and time bins; int32 for rows of integers.
+        """
+        dtype = self.features.dtype
+        if self.phase is not None:
+            return np.zeros((2, self.features.shape[1]), np.int32 if dtype.kind == "i" else dtype)
+        return np.zeros(self.features.shape[1], np.int16 if dtype == np.int8 else dtype)
+
+    def update(self, context: np.ndarray, events: Any, start_us: int, window_us: int) -> np.ndarray:
+        """Context after more events of the same window; `context`, as of `empty`, is left as it was.
+
+        Raises:
+            ValueError: As `models.encoder.event_batch.index_events`, or `context` is not one of this table's.
+        """
+        own = self.empty()
+        if context.shape != own.shape or context.dtype != own.dtype:
+            expected = f"{own.dtype} {own.shape}"
+            raise ValueError(
+                f"context must be {expected} (start from empty()), got {context.dtype} {context.shape}"
+            )
+        address = index_events(tuple(events[name] for name in "txyp"), start_us, window_us, self.grid)
+        result = context.copy()
+        self._raise(address, result)
+        return result
+
+    def _raise(self, address: np.ndarray, context: np.ndarray) -> None:
+        """Raise `context` to the maximum over it and the addressed events (2, N)."""
+        kernel = _raise_to if self.phase is None else _raise_to_newest
+        kernel(self.features, self.embedding, address, context)
+
+    def latent(self, context: np.ndarray) -> np.ndarray:
+        """Latent mu (latent,) of a context."""
+        values = context.astype(self.head[1].dtype)
+        if self.phase is not None:
+            values = (values[0] * self.phase[:, context[1].astype(np.int64)]).ravel()
+        return _mlp(values, *self.hidden, *self.head)
+
+    def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
+        """Latent mu (latent,) of one window; without events, that of the zero context.
+
+        Args:
+            events: Structured array with integer fields t [us], x, y [pixels], p (-1 or +1).
+            start_us: Start of the window on the clock of t.
+            window_us: Length of the window [us].
+
+        Raises:
+            ValueError: As `models.encoder.event_batch.index_events`.
+        """
+        address = index_events(tuple(events[name] for name in "txyp"), start_us, window_us, self.grid)
+        return self._encode(address)
+
+    def encode_windows(self, windows: np.ndarray) -> np.ndarray:
+        """Latents (B, latent) of packed windows, int32 (B, capacity + 1, 4); each as `encode`'s, bit for bit.
+
+        Raises:
+            ValueError: As `models.encoder.event_batch.index_packed`.
+        """
+        latents = np.empty((len(windows), len(self.head[1])), self.head[1].dtype)
+        for row, window in enumerate(windows):
+            latents[row] = self._encode(index_packed(window, self.grid))
+        return latents
+
+    def _encode(self, address: np.ndarray) -> np.ndarray:
+        """Latent mu (latent,) of the addressed events (2, N) of one window."""
+        context = self.empty()
+        self._raise(address if self.most_events is None else thin(address, self.most_events), context)
+        return self.latent(context)
+
+
+def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
+    """The model in float64, with another resolution of time unless that is None."""
+    settings = evae.settings if time_bins is None else {**evae.settings, "time_bins": time_bins}
+    exact = EventVAE(**settings).double()
+    exact.load_state_dict({**exact.state_dict(), **evae.state_dict()})  # a lean file's has no decoder
+    return exact
+
+
+def _rounded(
+    features: np.ndarray, embedding: np.ndarray, precision: str, dtype: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+    """Rows of features and embedding in their precision, and what one unit of theirs is worth."""
+    if precision == "model":
+        return features.astype(dtype), embedding.astype(dtype), 1.0
+    highest = features.max(axis=0) + 1.0  # the embedding lies in [-1, 1]
+    if precision == "int16":
+        scale = 2.0 ** np.ceil(np.log2(highest.max() / INT16_TOP))
+        return np.rint(features / scale).astype("i2"), np.rint(embedding / scale).astype("i2"), scale
+    scale = highest / INT8_TOP
+    return np.rint(features / scale).astype("i1"), np.rint(embedding / scale).astype("i1"), scale
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().numpy()
+
+
+def _read_only(array: np.ndarray, dtype: Any = None) -> np.ndarray:
+    array = np.array(array, dtype, order="C")
+    array.setflags(write=False)
+    return array
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _raise_to(features, embedding, address, context) -> None:  # type: ignore[no-untyped-def]
+    """Raise `context` (D,) to the maximum over the addressed events (2, N).
+
+    Four events at a time, so that the context is read and written a quarter as often; the
+    last four may hold an event several times, which changes no maximum.
+    """
+    cells, last = len(features), address.shape[1] - 1
+    for n in range(0, last + 1, 4):
+        second, third, fourth = min(n + 1, last), min(n + 2, last), min(n + 3, last)
+        feature_1, code_1 = features[address[0, n] % cells], embedding[address[1, n]]
+        feature_2, code_2 = features[address[0, second] % cells], embedding[address[1, second]]
+        feature_3, code_3 = features[address[0, third] % cells], embedding[address[1, third]]
+        feature_4, code_4 = features[address[0, fourth] % cells], embedding[address[1, fourth]]
+        for j in range(len(context)):
+            early = max(feature_1[j] + code_1[j], feature_2[j] + code_2[j])
+            late = max(feature_3[j] + code_3[j], feature_4[j] + code_4[j])
+            context[j] = max(max(early, late), context[j])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _raise_to_newest(features, embedding, address, context) -> None:  # type: ignore[no-untyped-def]
+    """Raise magnitudes and their time bins `context` (2, D); of equal magnitudes the newest stays."""
+    best, newest, cells = context[0], context[1], len(features)
+    for n in range(address.shape[1]):
+        feature, code = features[address[0, n] % cells], embedding[address[1, n]]
+        time = context.dtype.type(address[1, n])
+        for j in range(len(best)):
+            value = context.dtype.type(feature[j] + code[j])
+            better = (value > best[j]) | ((value == best[j]) & (time > newest[j]))
+            best[j] = value if better else best[j]
+            newest[j] = time if better else newest[j]
+
+
+# Reordering the sums lets them use vector registers (20 times faster); it decides no event.
+@numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _mlp(context, hidden_weight, hidden_bias, weight, bias):  # type: ignore[no-untyped-def]
+    """Second half of the encoder: ReLU layer, then mu."""
+    hidden = hidden_bias.copy()
+    for i in range(len(hidden)):
+        total = hidden[i]
+        for j in range(len(context)):
+            total += hidden_weight[i, j] * context[j]
+        hidden[i] = max(total, np.float32(0.0))
+    latent = bias.copy()
+    for i in range(len(latent)):
+        total = latent[i]
+        for j in range(len(hidden)):
+            total += weight[i, j] * hidden[j]
+        latent[i] = total
+    return latent

@@ -1,0 +1,211 @@
+"""Encoder files: tensors as safetensors, and beside them a JSON manifest that says what they are.
+
+`NAME.safetensors` holds the state of an `EventVAE`; `NAME.json` holds its settings ("model"),
+the SHA-256 of the tensors' file and whatever the writer adds, such as sensor settings, their
+hash and figures. Everything is checked before use: size, digest, names, shapes, dtypes, finite
+values. No pickle is read or written.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from models.encoder.evae import EventVAE, check_settings
+
+FORMAT = 1
+MAX_MANIFEST_BYTES = 1 << 20
+MAX_HEADER_BYTES = 1 << 20
+DECODER = "decoder."  # of the names of its tensors
+LEAN = {torch.float32: torch.float16}  # what a tensor may be rounded to
+RESERVED = ("format", "model", "sha256")
+ADDED_SETTINGS = {"coding": "additive"}  # what a file means that was written before there was a choice
+
+
+class EncoderFileError(ValueError):
+    """An encoder file that was refused; the message begins with its name."""
+
+
+def save_encoder(path: str | Path, evae: EventVAE, manifest: dict[str, Any], lean: bool = False) -> None:
+    """Write an encoder and its manifest; each file appears complete or not at all.
+
+    Args:
+        path: The tensors' file, ending in .safetensors; the manifest takes the same name and .json.
+        evae: float32 model.
+        manifest: What else to record, as JSON values: sensor settings, hash, figures.
+        lean: Leave the decoder out and round the weights to float16: it flies, but draws no
+            pictures, in a fraction of the space.
+
+    Raises:
+        EncoderFileError: A tensor is not finite or not float32, or the manifest holds a
+            reserved key, a value that JSON cannot hold, or is too large.
+    """
+    target = tensor_path(path)
+    taken = [key for key in RESERVED if key in manifest]
+    if taken:
+        raise EncoderFileError(f"{target}: the manifest's keys {taken} are written here; rename yours")
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in evae.state_dict().items()}
+    check_tensors(target, tensors, evae.settings)
+    data = safetensors.torch.save(lean_tensors(tensors) if lean else tensors)
+    digest = hashlib.sha256(data).hexdigest()
+    record = {**manifest, "format": FORMAT, "model": evae.settings, "sha256": digest}
+    try:
+        text = json.dumps(record, indent=2, sort_keys=True, allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        raise EncoderFileError(f"{target}: the manifest must hold finite JSON values: {error}") from None
+    if len(text) > MAX_MANIFEST_BYTES:
+        raise EncoderFileError(
+            f"{target}: manifest of {len(text)} bytes, at most {MAX_MANIFEST_BYTES} are read"
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(target, data)
+    write_atomic(target.with_suffix(".json"), text)
+
+
+def load_encoder(path: str | Path) -> tuple[EventVAE, dict[str, Any]]:
+    """Read an encoder: the frozen model (eval mode, no gradients) and its manifest.
+
+    Of a lean file the model's `decoder` is None.
+
+    Raises:
+        EncoderFileError: A file is missing, too large, damaged or does not fit its manifest.
+    """
+    target = tensor_path(path)
+    manifest = read_manifest(target.with_suffix(".json"))
+    settings = manifest["model"]
+    expected = expected_tensors(settings)
+    limit = sum(tensor.nbytes for tensor in expected.values()) + MAX_HEADER_BYTES
+    data = read_limited(target, limit)
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != manifest["sha256"]:
+        raise EncoderFileError(f"{target}: damaged: SHA-256 {digest}, the manifest says {manifest['sha256']}")
+    try:
+        tensors = safetensors.torch.load(data)
+    except Exception as error:
+        raise EncoderFileError(f"{target}: not a safetensors file: {error}") from None
+    check_tensors(target, tensors, settings)
+    evae = EventVAE(**settings)
+    if is_lean(tensors):
+        evae.decoder = None
+    evae.load_state_dict(tensors)
+    return evae.freeze(), manifest
+
+
+def lean_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of what flies, weights and biases in float16; running statistics stay as they are."""
+    flying = {name: tensor for name, tensor in tensors.items() if not name.startswith(DECODER)}
+    rounded = (".weight", ".bias")
+    return {name: tensor.half() if name.endswith(rounded) else tensor for name, tensor in flying.items()}
+
+
+def is_lean(tensors: dict[str, Tensor]) -> bool:
+    """Whether the decoder was left out."""
+    return not any(name.startswith(DECODER) for name in tensors)
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Read and check a manifest.
+
+    Raises:
+        EncoderFileError: Not a JSON object with the keys and model settings of this format.
+    """
+    try:
+        manifest = json.loads(read_limited(path, MAX_MANIFEST_BYTES))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise EncoderFileError(f"{path}: not a JSON file: {error}") from None
+    missing = [key for key in RESERVED if not isinstance(manifest, dict) or key not in manifest]
+    if missing:
+        raise EncoderFileError(f"{path}: the manifest lacks {missing}")
+    if manifest["format"] != FORMAT:
+        raise EncoderFileError(f"{path}: format {manifest['format']!r}, this version reads {FORMAT}")
+    try:
+        settings = manifest["model"] = {**ADDED_SETTINGS, **manifest["model"]}
+        check_settings(settings)
+        if set(settings) != set(EventVAE.__init__.__annotations__) - {"return"}:
+            raise ValueError(f"unknown settings among {sorted(settings)}")
+    except (KeyError, TypeError, ValueError) as error:
+        raise EncoderFileError(f"{path}: the model's settings are refused: {error}") from None
+    return manifest
+
+
+def expected_tensors(settings: dict[str, Any]) -> dict[str, Tensor]:
+    """State of a model with these settings: shapes and dtypes, without memory for values."""
+    with torch.device("meta"):
+        return EventVAE(**settings).state_dict()
+
+
+def check_tensors(path: Path, tensors: dict[str, Tensor], settings: dict[str, Any]) -> None:
+    """Compare tensors with the model they belong to.
+
+    Raises:
+        EncoderFileError: Another set of names, another shape or dtype, or a value that is not finite.
+    """
+    expected = expected_tensors(settings)
+    if is_lean(tensors):
+        expected = {name: model for name, model in expected.items() if not name.startswith(DECODER)}
+    if set(tensors) != set(expected):
+        names = sorted(set(tensors) ^ set(expected))
+        raise EncoderFileError(f"{path}: unexpected or missing tensors: {names}")
+    for name, model in expected.items():
+        tensor = tensors[name]
+        form, rule = (tensor.dtype, tuple(tensor.shape)), (model.dtype, tuple(model.shape))
+        if form not in (rule, (LEAN.get(model.dtype), rule[1])):
+            raise EncoderFileError(f"{path}: tensor {name} is {form}, the model needs {rule}")
+        if not torch.isfinite(tensor).all():
+            raise EncoderFileError(f"{path}: tensor {name} has values that are not finite")
+        if name.endswith("running_var") and (tensor < 0).any():
+            raise EncoderFileError(f"{path}: tensor {name} has negative variances")
+
+
+def tensor_path(path: str | Path) -> Path:
+    """The tensors' file as a Path.
+
+    Raises:
+        EncoderFileError: It does not end in .safetensors.
+    """
+    target = Path(path)
+    if target.suffix != ".safetensors":
+        raise EncoderFileError(f"{target}: an encoder file ends in .safetensors")
+    return target
+
+
+def read_limited(path: Path, limit: int) -> bytes:
+    """The bytes of a file of at most `limit` bytes.
+
+    Raises:
+        EncoderFileError: It cannot be read, is a link, a pipe or a device, or is larger; that is
+            known before a byte is read.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # a pipe would block
+        with os.fdopen(handle, "rb") as file:
+            info = os.fstat(handle)
+            if not stat.S_ISREG(info.st_mode):
+                raise EncoderFileError(f"{path}: cannot be read: no regular file")
+            if info.st_size > limit:
+                raise EncoderFileError(f"{path}: {info.st_size} bytes, at most {limit} are read")
+            return file.read(limit)
+    except OSError as error:
+        is_link = error.errno == errno.ELOOP
+        reason = "a link, which could name any file; copy the file itself" if is_link else error.strerror
+        raise EncoderFileError(f"{path}: cannot be read: {reason}") from None
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write beside `path`, flush to disk, then rename: a reader sees the old file or the new one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,163 @@
+"""A small network over a set of events, trained end to end: the rival of a frozen encoder.
+
+In the spirit of FLEET (Gottwald et al.): Fourier features of a pixel's place, time as a gate on
+what an event says, and pooling over the set. A window is thinned to at most `EVENTS` events,
+evenly over their order in time; of fewer, the rest of the rows is empty (`event_batch.event_rows`).
+
+    window = [ max | mean | number ] over events of  place(x, y, p) * gate(t)
+
+`EventSet.plain` is this formula, row by row. `EventSet.forward` is the same function with the
+same parameters and gradients, several times faster on a CPU: both factors run once per distinct
+value in the batch, and the products are pooled as they are made. Only the order of sums differs.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from models.encoder.event_batch import EMPTY, OFF, ON, EventBatch, Grid, batch_rows, distinct
+
+EVENTS = 256  # of a window that the network sees
+TIMES = 1024  # steps into which a window's time is rounded
+OCTAVES = 5  # of the Fourier features: waves of 2 images down to 1/8 of one
+WIDTH = 64  # features of an event
+OUTPUTS = 128  # of the trunk
+
+
+class EventSet(nn.Module):
+    """Features of sets of events: float32 (B, OUTPUTS) of stacks int16 (B, stack, EVENTS, 4)."""
+
+    def __init__(self, stack: int, size: Sequence[int]) -> None:
+        """Make it for stacks of `stack` windows of a sensor of `size` (width, height) pixels."""
+        super().__init__()
+        self.grid = Grid(size[0], size[1], TIMES)
+        self.place = nn.Sequential(
+            nn.Linear(4 * OCTAVES + 3, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU()
+        )
+        self.gate = nn.Sequential(nn.Linear(1, WIDTH), nn.Sigmoid())
+        self.join = nn.Sequential(nn.Linear(stack * (2 * WIDTH + 1), OUTPUTS), nn.ReLU())
+
+    def forward(self, stacks: Tensor) -> Tensor:
+        """Each event's features times its gate; maximum, mean and number over each window.
+
+        The fused form on a CPU, the plain one elsewhere.
+
+        Raises:
+            ValueError: A row is no event of the sensor.
+        """
+        if stacks.device.type != "cpu":
+            return self.plain(stacks)
+        batch = batch_rows(stacks.flatten(0, 1).numpy(), self.grid)
+        largest, total = self._pooled(batch)
+        number = torch.from_numpy(np.diff(batch.offsets)).to(total)[:, None]
+        return self._joined((largest, total, number), stacks.shape[:2])
+
+    def plain(self, stacks: Tensor) -> Tensor:
+        """The same features, row by row: what the fused form is tested against, and what is exported."""
+        kind, time, x, y = stacks.to(self.gate[0].weight)[..., None].unbind(-2)
+        on, there = (kind == ON).to(kind) - (kind == OFF).to(kind), (kind != EMPTY).to(kind)
+        inputs = torch.cat(_inputs(along(x, self.grid.width), along(y, self.grid.height), on), dim=-1)
+        features = self.place(inputs) * self.gate(time / TIMES) * there
+        pooled = features.amax(-2), features.sum(-2), there.sum(-2)
+        return self._joined(pooled, stacks.shape[:2])
+
+    def _pooled(self, batch: EventBatch) -> tuple[Tensor, Tensor]:
+        """Maximum and sum (windows, WIDTH) of the events of each window."""
+        weight, (width, height, _) = self.gate[0].weight, self.grid
+        cells, _, cell = distinct(batch.code)
+        times, _, time = distinct(batch.bin)
+        sides = [along(torch.arange(side).to(weight)[:, None], side) for side in (width, height)]
+        on = torch.from_numpy(2.0 * (cells >= width * height) - 1.0).to(weight)[:, None]
+        places = self.place(
+            torch.cat(_inputs(sides[0][cells % width], sides[1][cells // width % height], on), dim=-1)
+        )
+        gates = self.gate(torch.from_numpy(times).to(weight)[:, None] / TIMES)
+        return GatedPool.apply(places, gates, (cell, time, batch.offsets))
+
+    def _joined(self, pooled: tuple[Tensor, Tensor, Tensor], shape: Sequence[int]) -> Tensor:
+        """The trunk's outputs (B, OUTPUTS) of maxima, sums and numbers of all windows."""
+        largest, total, number = (part.reshape(*shape, -1) for part in pooled)
+        mean = total / number.clamp_min(1.0)
+        return self.join(torch.cat([largest, mean, number / EVENTS], dim=-1).flatten(1))
+
+
+def along(place: Tensor, side: int) -> Tensor:
+    """Fourier features (..., 1 + 2 OCTAVES) of places (..., 1) along a side of so many pixels."""
+    scaled = place * (2.0 / max(side - 1, 1)) - 1.0
+    waves = place.new_tensor([math.pi * 2.0 ** (octave - 1) for octave in range(OCTAVES)])
+    return torch.cat([scaled, (scaled * waves).sin(), (scaled * waves).cos()], dim=-1)
+
+
+def _inputs(x: Tensor, y: Tensor, on: Tensor) -> list[Tensor]:
+    """What `EventSet.place` sees of an event, from the features of its column and row."""
+    parts = [1, OCTAVES, OCTAVES]
+    (place_x, sin_x, cos_x), (place_y, sin_y, cos_y) = x.split(parts, -1), y.split(parts, -1)
+    return [place_x, place_y, on, sin_x, sin_y, cos_x, cos_y]
+
+
+class GatedPool(torch.autograd.Function):
+    """Maximum and sum over each window's events of places[cell] * gates[time], both at least 0."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, places: Tensor, gates: Tensor, events: tuple[np.ndarray, ...]
+    ) -> tuple[Tensor, Tensor]:
+        """Two tensors (B, F); `events` is (cell, time, offsets)."""
+        shape = len(events[-1]) - 1, places.shape[1]
+        largest, total = (np.zeros(shape, places.detach().numpy().dtype) for _ in range(2))
+        winner = np.full(shape, -1, np.int32)
+        _pool((places.detach().numpy(), gates.detach().numpy()), events, largest, total, winner)
+        ctx.save_for_backward(places, gates)
+        ctx.events, ctx.winner = events, winner
+        return torch.from_numpy(largest), torch.from_numpy(total)
+
+    @staticmethod
+    def backward(ctx: Any, of_largest: Tensor, of_total: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of places and gates: every event has that of the sum, a winner that of the maximum."""
+        factors = tuple(value.detach().numpy() for value in ctx.saved_tensors)
+        found = tuple(np.zeros_like(factor) for factor in factors)
+        gradients = of_largest.contiguous().numpy(), of_total.contiguous().numpy()
+        _spread(gradients, factors, ctx.events, ctx.winner, found)
+        return *(torch.from_numpy(value) for value in found), None
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pool(factors, events, largest, total, winner) -> None:  # type: ignore[no-untyped-def]
+    places, gates = factors
+    cell, time, offsets = events
+    for b in range(len(offsets) - 1):
+        best, sums, who = largest[b], total[b], winner[b]
+        for n in range(offsets[b], offsets[b + 1]):
+            place, gate, event = places[cell[n]], gates[time[n]], np.int32(n)
+            for j in range(len(best)):
+                value = place[j] * gate[j]
+                better = value > best[j]
+                best[j] = value if better else best[j]
+                who[j] = event if better else who[j]
+                sums[j] += value
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _spread(gradients, factors, events, winner, found) -> None:  # type: ignore[no-untyped-def]
+    of_largest, of_total = gradients
+    places, gates = factors
+    cell, time, offsets = events
+    of_places, of_gates = found
+    for b in range(len(offsets) - 1):
+        gradient = of_total[b]
+        for n in range(offsets[b], offsets[b + 1]):
+            place, gate = places[cell[n]], gates[time[n]]
+            to_place, to_gate = of_places[cell[n]], of_gates[time[n]]
+            for j in range(len(gradient)):
+                to_place[j] += gradient[j] * gate[j]
+                to_gate[j] += gradient[j] * place[j]
+        for j in range(len(gradient)):
+            n = winner[b, j]
+            if n >= 0:
+                of_places[cell[n], j] += of_largest[b, j] * gates[time[n], j]
+                of_gates[time[n], j] += of_largest[b, j] * places[cell[n], j]

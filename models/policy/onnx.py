@@ -1,0 +1,202 @@
+"""A policy as one ONNX file: events or a picture in, logits and the next stack of features out.
+
+For robots without Python. The graph holds the whole of it, with the preprocessing of training. It takes::
+
+    events       int64 (N, 4), t since the window's start [us], x, y [pixels], p (-1 or +1), in time order
+    window_us    int64 (), length of the window [us]        (policies that see events)
+    luminance    float32 (H, W), linear                     (policies that see luminance)
+    last_stack   (stack, ...), what the step before gave as next_stack; for a flight's first step anything
+    first        bool (), whether this is a flight's first step
+
+and gives::
+
+    logits       float32 (actions,), unnormalised log-probabilities
+    next_stack   as last_stack: float32, uint8 for pictures, int32 for sets of events
+
+`tests/models/policy/test_onnx.py` compares it with `models.policy.Policy` in onnxruntime. Needs the extra
+`onnx` of this package.
+"""
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from models.encoder.event_batch import OFF as OFF_ROW
+from models.encoder.event_batch import ON as ON_ROW
+from models.encoder.event_images import OFF_SHARE, PictureEncoder
+from models.kinds import KINDS
+from models.policy.event_set import EVENTS, TIMES, EventSet
+from models.policy.features import GAMMA, OFF, ON
+from models.policy.policy import Policy
+
+NEEDED = ("onnx", "onnxscript")
+MAX_EVENTS = 1 << 24
+
+
+def export_onnx(policy: Policy, path: str | Path) -> Path:
+    """Write a policy as an ONNX file; its weights are in it.
+
+    Args:
+        policy: As `models.policy.load_policy` returns it.
+        path: The file; its folder must exist.
+
+    Returns:
+        The file.
+
+    Raises:
+        ModuleNotFoundError: The extra `onnx` is not installed.
+    """
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ModuleNotFoundError(f"ONNX export needs {', '.join(missing)}: pip install 'evade[onnx]'")
+    flying = FlyingPolicy(policy).eval()
+    seen, examples, dynamic = flying.examples()
+    stack = torch.zeros(flying.shape, dtype=flying.dtype)
+    names = {"input_names": [*seen, "last_stack", "first"], "output_names": ["logits", "next_stack"]}
+    program: Any = torch.onnx.export(
+        flying,
+        (*examples, stack, torch.tensor(True)),
+        dynamo=True,
+        dynamic_shapes=((*dynamic, None, None),),  # of the one argument *inputs
+        verbose=False,
+        **names,
+    )
+    program.save(str(path))
+    return Path(path)
+
+
+class FlyingPolicy(nn.Module):
+    """One step of one flight of a policy, as a function of tensors."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        manifest = policy.manifest
+        feature = policy._feature
+        self.shape = (manifest["stack"], *feature.shape(manifest))
+        kept = torch.from_numpy(policy._stacks).dtype
+        self.dtype = torch.int32 if kept == torch.int16 else kept  # of which onnxruntime knows more
+        self.size = manifest["height"], manifest["width"]
+        self.sees_events = feature.from_events is not None
+        self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
+        self.read = self.trunk.plain if isinstance(self.trunk, EventSet) else self.trunk
+        self.kind = KINDS[manifest["name"]].feature
+        if isinstance(policy.encoder, PictureEncoder):
+            self.kind, self.layers, self.latent = "picture_latent", policy.encoder.layers, manifest["latent"]
+        elif policy.encoder is not None:
+            table = policy.encoder
+            self.time_bins, self.turns = table.grid.time_bins, table.phase is not None
+            self.most_events = table.most_events
+            arrays = {"features": table.features, "embedding": table.embedding}
+            for name, (weight, bias) in {"hidden": table.hidden, "head": table.head}.items():
+                arrays |= {f"{name}_weight": weight, f"{name}_bias": bias}
+            if table.phase is not None:
+                arrays["phase"] = table.phase
+            for name, array in arrays.items():
+                self.register_buffer(name, torch.from_numpy(array.copy()))
+
+    def examples(self) -> tuple[list[str], tuple[Tensor, ...], tuple[Any, ...]]:
+        """Names, examples and free sizes of what the policy sees."""
+        if self.sees_events:
+            events = torch.tensor([[0, 0, 0, 1], [1, 0, 0, -1], [2, 0, 0, 1]])
+            count = torch.export.Dim("count", min=0, max=MAX_EVENTS)
+            return ["events", "window_us"], (events, torch.tensor(5000)), ({0: count}, None)
+        return ["luminance"], (torch.zeros(self.size),), (None,)
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits and the next stack; inputs as the module's docstring lists them."""
+        *seen, stack, first = inputs
+        feature = MAKERS[self.kind](self, *seen).to(self.dtype)
+        pushed = torch.cat([stack[1:], feature[None]])
+        stack = torch.where(first, feature[None].expand(self.shape), pushed)
+        return self.pi(self.read(stack[None]))[0], stack
+
+
+def _latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+    """Maximum over the events of table rows, then the encoder's dense layers (appendix C)."""
+    there = torch.ones_like(events[:, :1], dtype=torch.bool)
+    if policy.most_events is not None:
+        events, there = _thinned(events, policy.most_events)
+    bins = _bins(events[:, 0], window_us, policy.time_bins)
+    rows = policy.features[_code(policy, events) % len(policy.features)] + policy.embedding[bins]
+    rows = torch.cat([torch.where(there, rows, 0.0), torch.zeros(1, rows.shape[1])])
+    context = rows.amax(0)  # 0 without events
+    if policy.turns:  # EventNet's coding: the phase of the newest event of this magnitude
+        times = torch.cat([bins, torch.zeros(1, dtype=bins.dtype)])
+        newest = torch.where(rows == context, times[:, None], 0).amax(0)
+        context = (context * policy.phase[:, newest]).flatten()
+    hidden = torch.relu(policy.hidden_weight @ context + policy.hidden_bias)
+    return policy.head_weight @ hidden + policy.head_bias
+
+
+def _picture_latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+    """Mean of the latent of the event image, with OFF as a share of ON."""
+    picture = _event_image(policy, events, window_us)
+    shares = torch.where(picture == ON, 1.0, torch.where(picture == OFF, OFF_SHARE, 0.0))
+    return policy.layers(shares[None, None])[0, : policy.latent]
+
+
+def _events(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+    """Rows of events, as `models.encoder.event_batch.event_rows`."""
+    events, there = _thinned(events, EVENTS)
+    t, x, y, p = events.unbind(1)
+    rows = torch.stack([torch.where(p > 0, ON_ROW, OFF_ROW), _bins(t, window_us, TIMES), x, y], dim=1)
+    return torch.where(there, rows, 0)
+
+
+def _thinned(events: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """At most so many events, evenly over their order (`event_batch.thin`), and which are any."""
+    count = torch.ones_like(events[:, 0]).sum()
+    kept = count.clamp(max=most)
+    k = torch.arange(most)
+    places = torch.div((2 * k + 1) * count, 2 * kept.clamp(min=1), rounding_mode="floor")
+    padded = torch.cat([events, torch.zeros(1, 4, dtype=torch.int64)])
+    return padded[torch.minimum(places, count)], (k < kept)[:, None]
+
+
+def _bins(t: Tensor, window_us: Tensor, time_bins: int) -> Tensor:
+    """Time bin of each event (`models.encoder.embedding.time_bin`)."""
+    offset = torch.minimum(t.clamp(min=0), window_us)
+    return torch.div(offset * time_bins, window_us, rounding_mode="floor").clamp(max=time_bins - 1)
+
+
+def _columns(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+    """log(1 + count) of ON, then of OFF events in each column."""
+    _, x, _, p = events.unbind(1)
+    width = policy.size[1]
+    place = x + width * (p < 0)
+    counts = torch.zeros(2 * width).scatter_add(0, place, torch.ones_like(place, dtype=torch.float32))
+    return torch.log1p(counts)
+
+
+def _event_image(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+    """255 or 125 by each pixel's last event: the one with the highest number."""
+    _, x, y, p = events.unbind(1)
+    numbered = 2 * torch.ones_like(p).cumsum(0) + (p > 0)
+    none = torch.zeros(policy.size[0] * policy.size[1], dtype=torch.int64)
+    last = none.scatter_reduce(0, y * policy.size[1] + x, numbered, "amax")
+    return torch.where(last == 0, 0, torch.where(last % 2 == 1, ON, OFF)).reshape(policy.size)
+
+
+def _grey(policy: FlyingPolicy, luminance: Tensor) -> Tensor:
+    """Gamma-encoded 8-bit picture."""
+    return torch.round(255.0 * luminance.clamp(0.0, 1.0) ** (1.0 / GAMMA))
+
+
+def _code(policy: FlyingPolicy, events: Tensor) -> Tensor:
+    """Row of each event in a table: ((p > 0) * height + y) * width + x."""
+    _, x, y, p = events.unbind(1)
+    return ((p > 0) * policy.size[0] + y) * policy.size[1] + x
+
+
+MAKERS: dict[str, Callable[..., Tensor]] = {
+    "latent": _latent,
+    "picture_latent": _picture_latent,
+    "events": _events,
+    "columns": _columns,
+    "event_image": _event_image,
+    "grey": _grey,
+}

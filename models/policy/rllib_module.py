@@ -1,0 +1,148 @@
+"""A policy inside RLlib: a module that owns the networks and the encoder.
+
+`features` makes what a policy keeps of a step (`models.policy.features`); the networks see stacks of the
+last ones (`jobs.training.env_runner` keeps them). `models.policy.policy` is the same policy without Ray.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, ValueFunctionAPI
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.core.rl_module.torch import TorchRLModule
+from torch import Tensor, nn
+
+from models.encoder.event_batch import cut_packed
+from models.encoder.event_images import PictureEncoder
+from models.encoder.frozen import read_encoder_part, tabulate
+from models.encoder.table import EncoderTable
+from models.kinds import kind_of
+from models.policy.features import feature_of
+from models.policy.networks import PARTS, build_networks
+
+MET_WINDOWS = 128  # that a module remembers
+VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
+
+
+def stack_space(settings: Mapping[str, Any]) -> gym.spaces.Box:
+    """What the networks see: (stack, *feature), oldest feature first."""
+    feature = feature_of(settings)
+    whole = np.issubdtype(feature.dtype, np.integer)
+    low, high = (np.iinfo(feature.dtype).min, np.iinfo(feature.dtype).max) if whole else (-np.inf, np.inf)
+    return gym.spaces.Box(low, high, (settings["stack"], *feature.shape(settings)), feature.dtype)
+
+
+class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
+    """Frozen encoder, where the policy has one, and the networks.
+
+    The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
+    checkpoint is sufficient alone. An encoder that learns on is the networks' trunk instead.
+    `model_config` holds what `module_spec` puts there.
+
+    Attributes:
+        met: With a frozen encoder, the newest windows that it was shown, one of each vector step
+            and of each flight in turn, as `models.encoder.event_batch.cut_packed` cuts them.
+    """
+
+    def setup(self) -> None:
+        """Build the parts; called once by RLlib."""
+        settings: Any = self.model_config
+        about = settings["encoder_file"]
+        part = None if about is None else read_encoder_part(**about)
+        networks = build_networks(settings, settings["seed"])
+        if part is not None and not kind_of(settings).encoder:
+            networks["trunk"].load_state_dict(part.state_dict())
+            part = None
+        self.encoder = part
+        self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
+        self._table: EncoderTable | PictureEncoder | None = None
+        self.met: deque[np.ndarray] = deque(maxlen=MET_WINDOWS)
+        self._steps = 0
+
+    def get_non_inference_attributes(self) -> list[str]:
+        """What an env runner does without."""
+        return ["vf"]
+
+    def train(self, mode: bool = True) -> "PolicyModule":
+        """Keep every part as it is: an encoder stays in eval mode, the other networks have no modes.
+
+        RLlib toggles the mode around every forward pass; a walk through all parts each
+        time would take longer than the pass, and would let running statistics move.
+        """
+        self.training = mode
+        return self
+
+    def networks(self) -> nn.ModuleDict:
+        """The networks, as `models.policy.networks.assemble` names them."""
+        return nn.ModuleDict({name: getattr(self, name) for name in PARTS})
+
+    def features(self, observations: np.ndarray) -> np.ndarray:
+        """Features (B, ...) of observations (B, ...)."""
+        settings: Any = self.model_config
+        if self.encoder is not None:
+            self._table = self._table or tabulate(self.encoder, settings["encoder_file"]["settings"])
+            self.met.append(cut_packed(observations[self._steps % len(observations)]))
+            self._steps += 1
+        return feature_of(settings).from_observations(observations, settings, self._table)
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Load weights; the table is built anew only if they change the encoder."""
+        if self.encoder is None:
+            super().set_state(state)
+            return
+        before = [value.clone() for value in self.encoder.state_dict().values()]
+        super().set_state(state)
+        if not all(map(torch.equal, before, self.encoder.state_dict().values())):
+            self._table = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the table, which is built from the encoder where it is needed, and the windows."""
+        return {**self.__dict__, "_table": None, "met": deque(maxlen=MET_WINDOWS)}
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        return {Columns.ACTION_DIST_INPUTS: self.pi(self.trunk(batch[Columns.OBS]))}
+
+    def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        """The same, and what the trunk gives, so that the value's loss need not run it again."""
+        embeddings = self.trunk(batch[Columns.OBS])
+        return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), Columns.EMBEDDINGS: embeddings}
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Tensor:
+        """Values float32 (B,) of the batch's observations.
+
+        Without the trunk's embeddings no gradient is kept: RLlib asks so for the targets, of
+        the whole batch, whose graph would be a gigabyte of activations.
+        """
+        if embeddings is not None:
+            return self.vf(embeddings).squeeze(-1)
+        with torch.no_grad():
+            parts = [self.vf(self.trunk(part)) for part in batch[Columns.OBS].split(VALUE_ROWS)]
+        return torch.cat(parts).squeeze(-1)
+
+
+def module_spec(
+    settings: Mapping[str, Any], seed: int, encoder: tuple[str | Path, Mapping[str, Any]] | None = None
+) -> RLModuleSpec:
+    """Specification of the module.
+
+    Args:
+        settings: What `models.policy.networks.build_networks` reads.
+        seed: Of the networks' initial weights.
+        encoder: The pretrained encoder's file and its manifest; None for a policy without one.
+    """
+    about = None
+    if encoder is not None:
+        path, manifest = encoder
+        about = {"path": str(path), "digest": manifest["sha256"], "settings": manifest["model"]}
+    return RLModuleSpec(
+        module_class=PolicyModule,
+        observation_space=stack_space(settings),
+        action_space=gym.spaces.Discrete(settings["num_actions"]),
+        model_config={**settings, "encoder_file": about, "seed": seed},
+    )

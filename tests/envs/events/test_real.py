@@ -1,0 +1,87 @@
+import itertools
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from envs.events import EventCamera
+
+ROOT = Path(__file__).resolve().parents[3]
+FOLDER = Path(os.environ.get("EVADE_DATA", ROOT.parent / "shared" / "data")) / "rpg_slider_depth"
+SHAPE = (180, 240)
+THRESHOLDS = (0.3, 0.4, 0.5, 0.6)
+GREY = 1 / 255  # one level of the recorded frames
+
+pytestmark = pytest.mark.skipif(
+    not FOLDER.is_dir(), reason=f"no recording in {FOLDER}; set EVADE_DATA to the folder that holds it"
+)
+
+
+def net(x, y, p):
+    """Signed event image: sum of polarities of each pixel."""
+    image = np.zeros(SHAPE)
+    np.add.at(image, (y, x), p)
+    return image
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Frames 1 to 4 of a DAVIS240C on a slider, their times, and the real net events between them."""
+    rows = [line.split() for line in (FOLDER / "images.txt").read_text().splitlines()[1:5]]
+    times = [round(float(row[0]) * 1e6) for row in rows]
+    frames = [np.float32(Image.open(FOLDER / row[1]).convert("L")) / np.float32(255) for row in rows]
+    t, x, y, p = np.loadtxt(FOLDER / "events_chunk.txt").T
+    t, x, y, p = np.rint(t * 1e6), x.astype(int), y.astype(int), 2 * p - 1
+    assert ((t > times[0]) & (t <= times[3])).sum() == 37_142
+    inside = [(t > a) & (t <= b) for a, b in itertools.pairwise(times)]
+    return frames, times, [net(x[i], y[i], p[i]) for i in inside]
+
+
+def simulated(recording, **fields):
+    frames, times, _ = recording
+    camera = EventCamera(SHAPE[1], SHAPE[0], **fields)
+    camera.reset(frames[0], times[0])
+    return [camera.step(frame, t) for frame, t in zip(frames[1:], times[1:], strict=True)]
+
+
+def likeness(recording, events):
+    """Means over the intervals: correlation, the same blurred, equal signs, active pixels shared."""
+    figures = []
+    for real, batch in zip(recording[2], events, strict=True):
+        ours = net(batch["x"], batch["y"], batch["p"])
+        both, any_ = (real != 0) & (ours != 0), (real != 0) | (ours != 0)
+        pair = (gaussian_filter(real, 1).ravel(), gaussian_filter(ours, 1).ravel())
+        signs = (np.sign(real) == np.sign(ours))[both].mean()
+        plain = np.corrcoef(real.ravel(), ours.ravel())[0, 1]
+        figures.append((plain, np.corrcoef(*pair)[0, 1], signs, both.sum() / any_.sum()))
+    return np.mean(figures, axis=0)
+
+
+@pytest.mark.parametrize("floor", [1, 5])
+def test_simulated_events_are_like_those_of_a_real_sensor(recording, floor):
+    figures = [
+        likeness(recording, simulated(recording, contrast_threshold=c, luminance_floor=floor * GREY))
+        for c in THRESHOLDS
+    ]
+    _, blurred, signs, shared = max(figures, key=lambda row: row[3])
+    assert blurred >= 0.80
+    assert signs >= 0.95
+    assert shared >= 0.44
+
+
+@pytest.mark.parametrize(
+    ("threshold", "count", "figures"),
+    [
+        (0.2, 115_027, (0.669, 0.804, 0.950, 0.450)),
+        (0.5, 32_458, (0.638, 0.758, 0.971, 0.351)),
+        (0.75, 14_925, (0.592, 0.709, 0.974, 0.253)),
+    ],
+)
+def test_memory_legacy_makes_the_events_of_the_published_code(recording, threshold, count, figures):
+    fields = {"luminance_floor": GREY, "max_events_per_pixel": 10, "memory": "legacy"}
+    events = simulated(recording, contrast_threshold=threshold, **fields)
+    assert sum(map(len, events)) == count
+    assert likeness(recording, events) == pytest.approx(figures, abs=6e-4)

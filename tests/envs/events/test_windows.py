@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.events import EVENT, event_image, pack_window, unpack_window
+
+PIXELS = st.integers(0, 65535)
+ROWS = st.lists(st.tuples(st.integers(1, 5000), PIXELS, PIXELS, st.sampled_from([-1, 1])), max_size=12)
+
+
+def as_events(rows, start_us=0):
+    events = np.array(sorted(rows), EVENT) if rows else np.empty(0, EVENT)
+    events["t"] += start_us
+    return events
+
+
+@settings(deadline=None)
+@given(ROWS, st.integers(-(2**40), 2**40))
+def test_packing_and_unpacking_gives_the_events_back(rows, start_us):
+    window = pack_window(as_events(rows, start_us), start_us, 5000, 12)
+    assert window.dtype == np.int32
+    assert window.shape == (13, 4)
+    assert window[0].tolist() == [len(rows), 0, 5000, 0]
+    assert not window[len(rows) + 1 :].any()
+    events, window_us = unpack_window(window)
+    assert window_us == 5000
+    assert np.array_equal(events, as_events(rows))
+
+
+def test_over_capacity_the_newest_are_kept_and_the_others_counted():
+    events = as_events([(t, t, 2 * t, 1) for t in range(1, 11)])
+    window = pack_window(events, 0, 10, 4)
+    assert window[0].tolist() == [4, 6, 10, 0]
+    assert window[1:, 0].tolist() == [7, 8, 9, 10]
+
+
+@pytest.mark.parametrize(
+    "rows", [[(0, 1, 1, 1)], [(11, 1, 1, 1)], [(5, 1, 1, 0)], [(5, 1, 1, 1), (4, 1, 1, 1)], [(-3, 1, 1, 1)]]
+)
+def test_events_out_of_time_order_or_polarity_are_refused(rows):
+    with pytest.raises(ValueError, match=f"event {len(rows) - 1}"):
+        pack_window(np.array(rows, EVENT), 0, 10, 4)
+
+
+@pytest.mark.parametrize(("window_us", "capacity"), [(0, 4), (2**31, 4), (10, 0)])
+def test_a_window_without_length_or_room_is_refused(window_us, capacity):
+    with pytest.raises(ValueError, match="window_us"):
+        pack_window(np.empty(0, EVENT), 0, window_us, capacity)
+
+
+def test_other_arrays_are_refused():
+    with pytest.raises(ValueError, match="EVENT"):
+        pack_window(np.zeros((3, 4)), 0, 10, 4)
+    with pytest.raises(ValueError, match="int32"):
+        unpack_window(np.zeros((3, 4)))
+    window = np.zeros((3, 4), np.int32)
+    window[0, 0] = 3
+    with pytest.raises(ValueError, match="cannot hold 3"):
+        unpack_window(window)
+
+
+def test_the_picture_shows_the_last_polarity_of_each_pixel():
+    events = as_events([(1, 2, 0, 1), (2, 2, 0, -1), (3, 0, 1, -1), (4, 0, 1, 1)])
+    assert event_image(events, 3, 2).tolist() == [[0, 0, 125], [255, 0, 0]]
+    assert event_image(events, 3, 2).dtype == np.uint8
+
+
+@pytest.mark.parametrize(("x", "y"), [(3, 0), (0, 2)])
+def test_an_event_outside_the_picture_is_refused(x, y):
+    with pytest.raises(ValueError, match="event 0"):
+        event_image(as_events([(1, x, y, 1)]), 3, 2)

@@ -1,0 +1,277 @@
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from envs.raycast import RaycastRenderer, sample_luminance
+from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture
+
+KINDS = (POLE, CONE, ELLIPSOID, BOX)
+AHEAD = ((0.3, 0.0, 2.0, 0.0), (-4.0, 30.0, 2.0, 0.2), (6.0, 55.0, 1.0, -0.5), (0.0, 60.0, 2.0, 3.0))
+ABOVE = ((0.0, 20.0, 9.0, 0.3), (3.0, 40.0, 5.0, -0.7), (2.0, 30.0, 40.0, 1.0))
+
+
+def body(kind: int, x: float, y: float, z: float, rx: float, rz: float, **more: float) -> np.ndarray:
+    """One obstacle around (x, y, z), as a record."""
+    made = np.zeros(1, OBSTACLE)
+    values = {"kind": kind, "x": x, "y": y, "z": z, "rx": rx, "ry": rx, "rz": rz, "albedo": 0.4, **more}
+    for key, value in values.items():
+        made[key] = value
+    return made
+
+
+def forest(kinds: tuple[int, ...], rng: np.random.Generator, count: int = 40, **scene: object) -> Scene:
+    """Bodies of the kinds in turn, apart from each other: a third floats, a sixth is sunk."""
+    made = []
+    for k in range(count):
+        x, y = rng.uniform(-1.0, 1.0) + 3.5 * (k % 8 - 3.5), 10.0 + 3.0 * (k // 8) * 40 / count * 2
+        rx, rz = rng.uniform(0.4, 1.0), rng.uniform(0.5, 3.0)
+        lift = rng.choice([0.0, 0.0, 0.0, 0.5, 1.5, -0.5 * rz])
+        shape = {"ry": rng.uniform(0.4, 1.0)} if kinds[k % len(kinds)] == BOX else {}
+        made.append(
+            body(kinds[k % len(kinds)], x, y, rz + lift, rx, rz, albedo=rng.uniform(0.1, 0.6), **shape)
+        )
+    return Scene("forest", np.concatenate(made), **scene)
+
+
+def gate(x: float, y: float) -> np.ndarray:
+    """Two posts, a lintel and a sill between them."""
+    posts = [body(BOX, x + side * 1.75, y, 3.0, 0.25, 3.0) for side in (-1, 1)]
+    lintel = body(BOX, x, y, 4.75, 1.5, 1.25, ry=0.25, albedo=0.2)
+    return np.concatenate([*posts, lintel, body(BOX, x, y, 0.5, 1.5, 0.5, ry=0.25, albedo=0.6)])
+
+
+def errors(scene: Scene, pose: tuple, samples: int = 1, points: int = 24) -> np.ndarray:
+    exact = RaycastRenderer(scene, 24, 20, samples=samples).render(*pose)
+    return np.abs(exact - sample_luminance(scene, pose, 24, 20, samples=points))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_looks_as_many_point_samples_of_it(kind):
+    scenes = [forest((kind,), np.random.default_rng(seed)) for seed in range(2)]
+    found = np.stack([errors(scene, pose) for scene in scenes for pose in AHEAD + ABOVE])
+    assert found.mean() < 2e-3
+    assert np.quantile(found, 0.99) < 0.05
+    finer = np.stack([errors(scene, pose, 6) for scene in scenes for pose in AHEAD + ABOVE])
+    # What is left at 24 x 24 points is their own error at upright edges, 1 / 48 pixel.
+    assert finer.mean() < 6e-4
+    assert finer.max() < 0.03
+
+
+def test_all_kinds_together_and_gates_hide_each_other_rightly():
+    rng = np.random.default_rng(5)
+    gates = Scene(
+        "gates", np.concatenate([gate(x, 8.0 + 9.0 * k) for k, x in enumerate(rng.uniform(-9, 9, 8))])
+    )
+    for scene in (forest(KINDS, rng, 60), gates):
+        found = np.stack([errors(scene, pose, 4) for pose in AHEAD + ABOVE])
+        assert found.mean() < 7e-4
+        assert found.max() < 0.05
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_bodies_above_each_other_the_one_nearer_in_height_hides_the_other(kind):
+    tower = [body(kind, 0.3, 8.0, 0.5, 2.5, 0.5), body(kind, 0.0, 8.2, 3.5, 1.5, 0.5, albedo=0.6)]
+    for order in (tower, tower[::-1]):
+        scene = Scene("tower", np.concatenate(order))
+        for y in (0.0, 3.0, 6.0):
+            for z in (0.0, 2.0, 3.5, 5.0, 9.0):
+                assert errors(scene, (0.0, y, z, 0.1), 8).mean() < 1.5e-3, (y, z)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_body_is_seen_from_close_above_and_below_and_beside_its_slope(kind):
+    scene = Scene("one", body(kind, 0.2, 5.0, 4.0, 1.5, 1.0))
+    for z in (0.0, 2.9, 5.1, 7.0):
+        for y in (4.2, 5.0, 5.5, 3.0):
+            assert errors(scene, (0.0, y, z, 0.4), 8).mean() < 2e-3, (z, y)
+    if kind == CONE:  # within the circle of its base, and above its side
+        assert errors(scene, (0.0, 4.0, 4.6, 0.1), 8).mean() < 2e-3
+
+
+def test_a_cone_ends_at_its_outline_or_at_the_far_edge_of_its_base():
+    scene = Scene("one", body(CONE, 0.0, 5.0, 2.0, 2.0, 2.0))
+    for pose in ((0.0, 2.0, 8.0, 0.0), (0.0, 2.5, 6.0, 0.1), (0.5, 2.8, 5.0, 0.0), (0.0, -3.0, 3.0, 0.0)):
+        image = RaycastRenderer(scene, 24, 24, 160.0, samples=6).render(*pose)
+        assert np.abs(image - sample_luminance(scene, pose, 24, 24, 160.0, samples=32)).max() < 0.01
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_body_is_invisible_from_its_inside(kind):
+    scene = Scene("one", body(kind, 0.2, 5.0, 4.0, 1.5, 1.0))
+    empty = dataclasses.replace(scene, obstacles=scene.obstacles[:0])
+    for render in (
+        lambda s, p: RaycastRenderer(s, 16, 16).render(*p),
+        lambda s, p: sample_luminance(s, p, 16, 16),
+    ):
+        assert np.array_equal(render(scene, (0.2, 5.1, 3.9, 0.3)), render(empty, (0.2, 5.1, 3.9, 0.3)))
+        assert not np.array_equal(render(scene, (0.2, 0.0, 3.9, 0.0)), render(empty, (0.2, 0.0, 3.9, 0.0)))
+
+
+def test_a_sphere_covers_the_solid_angle_that_geometry_says():
+    scene = Scene("one", body(ELLIPSOID, 0.0, 10.0, 50.0, 3.0, 3.0, albedo=0.0), wall_height_m=1e-9)
+    image = RaycastRenderer(scene, 64, 64, samples=8).render(0.0, 0.0, 50.0)
+    # Its outline on the optical axis is a circle of radius f * tan(asin(r / d)).
+    radius = 32.0 * 3.0 / math.sqrt(100.0 - 9.0)
+    sky, ground = image[0, 0], image[63, 0]
+    covered = (1.0 - image[:32] / sky).sum() + (1.0 - image[32:] / ground).sum()
+    assert covered == pytest.approx(math.pi * radius * radius, rel=2e-4)
+
+
+def covered(scene: Scene, samples: int, yaw: float) -> float:
+    """Area of the image [pixels] that black bodies cover before a plain sky and ground."""
+    image = RaycastRenderer(scene, 64, 64, samples=samples).render(0.0, 0.0, 50.0, yaw).astype(np.float64)
+    empty = dataclasses.replace(scene, obstacles=scene.obstacles[:0])
+    behind = RaycastRenderer(empty, 64, 64).render(0.0, 0.0, 50.0, yaw)
+    return float((1.0 - image / behind).sum())
+
+
+@pytest.mark.parametrize(("x", "radius"), [(0.0, 3.0), (4.1, 1.0), (-6.3, 0.4), (2.2, 5.0)])
+def test_slanting_outlines_cover_the_area_that_geometry_says(x, radius):
+    yaw, away = 0.1, math.hypot(x, 12.0)
+    theta, alpha = abs(math.atan2(x, 12.0) + yaw), math.asin(radius / away)
+    # A sphere shows as the ellipse that its tangents cut from the image's plane.
+    ellipse = math.sin(alpha) ** 2 * math.cos(alpha) / (math.cos(theta) ** 2 - math.sin(alpha) ** 2) ** 1.5
+    # Level with its base, a cone is a triangle.
+    left, right = math.tan(theta - alpha), math.tan(theta + alpha)
+    triangle = 0.5 * (right - left) * 4.0 / (away * math.cos(theta))
+    sphere = Scene("one", body(ELLIPSOID, x, 12.0, 50.0, radius, radius, albedo=0.0), wall_height_m=1e-9)
+    cone = Scene("one", body(CONE, x, 12.0, 52.0, radius, 2.0, albedo=0.0), wall_height_m=1e-9)
+    for samples in (1, 4):
+        assert covered(cone, samples, yaw) == pytest.approx(1024.0 * triangle, rel=2e-5)
+    assert covered(sphere, 1, yaw) == pytest.approx(1024.0 * math.pi * ellipse, rel=2e-5)
+    assert covered(sphere, 4, yaw) == pytest.approx(1024.0 * math.pi * ellipse, rel=2e-5)
+
+
+def test_straight_outlines_are_exact_also_where_they_cross_and_arcs_converge():
+    flat = {"ambient": 1.0, "diffuse": 0.0}
+    for kinds, most in (((CONE, BOX), (2e-5, 1e-5)), ((ELLIPSOID,), (4e-4, 1e-4))):
+        for seed in range(2):
+            scene = forest(kinds, np.random.default_rng(seed), **flat)
+            for pose in AHEAD[:3]:
+                best = RaycastRenderer(scene, 64, 64, samples=16).render(*pose)
+                for samples, bound in zip((1, 3), most, strict=True):
+                    image = RaycastRenderer(scene, 64, 64, samples=samples).render(*pose)
+                    assert np.abs(image - best).mean() < bound, (kinds, pose, samples)
+
+
+def test_a_world_of_twice_the_size_looks_the_same():
+    scene = forest(KINDS, np.random.default_rng(1), ground_texture=Texture("checker", 2.0, 0.3))
+    twice = scene.obstacles.copy()
+    for key in ("x", "y", "z", "rx", "ry", "rz"):
+        twice[key] *= 2.0
+    lengths = {"width_m": 60.0, "wall_height_m": 12.0, "walls_y_m": (-40.0, 300.0), "obstacles": twice}
+    large = dataclasses.replace(scene, **lengths, ground_texture=Texture("checker", 4.0, 0.3))
+    for x, y, z, yaw in AHEAD + ABOVE:
+        image = RaycastRenderer(scene, 32, 32).render(x, y, z, yaw)
+        np.testing.assert_allclose(
+            RaycastRenderer(large, 32, 32).render(2 * x, 2 * y, 2 * z, yaw), image, atol=1e-6
+        )
+
+
+def test_a_mirrored_world_is_the_mirrored_picture_and_a_moved_one_the_same():
+    scene = forest(KINDS, np.random.default_rng(2))
+    turned, moved = scene.obstacles.copy(), scene.obstacles.copy()
+    turned["x"] *= -1
+    moved["y"] += 7.25
+    mirrored = dataclasses.replace(scene, obstacles=turned, sun=(-scene.sun[0], *scene.sun[1:]))
+    along = dataclasses.replace(scene, obstacles=moved, walls_y_m=(-12.75, 157.25))
+    for x, y, z, yaw in AHEAD + ABOVE:
+        image = RaycastRenderer(scene, 32, 32).render(x, y, z, yaw)
+        other = RaycastRenderer(mirrored, 32, 32).render(-x, y, z, -yaw)
+        np.testing.assert_allclose(other, image[:, ::-1], atol=2e-5)
+        np.testing.assert_allclose(
+            RaycastRenderer(along, 32, 32).render(x, y + 7.25, z, yaw), image, atol=1e-6
+        )
+
+
+def test_the_error_falls_faster_than_the_width_of_the_strips():
+    scene, pose = forest((CONE, ELLIPSOID), np.random.default_rng(3)), AHEAD[1]
+    best = RaycastRenderer(scene, 32, 32, samples=48).render(*pose)
+    found = [
+        np.abs(RaycastRenderer(scene, 32, 32, samples=n).render(*pose) - best).mean() for n in (1, 2, 4, 8)
+    ]
+    assert found[0] < 2e-3
+    assert all(fine < 0.5 * coarse for coarse, fine in itertools.pairwise(found)), found
+
+
+def test_bodies_beyond_the_culling_distance_are_left_out_and_no_others():
+    scene = forest(KINDS, np.random.default_rng(4))
+    o = scene.obstacles
+    away = np.hypot(o["x"] - 1.0, o["y"] - 5.0)
+    nearest = np.sort(away)
+    limit = 0.5 * (nearest[12] + nearest[13])
+    # Shrunk to poles of a millimetre, a body's nearest point is where it stands.
+    thin = o.copy()
+    thin["kind"], thin["rx"], thin["ry"], thin["z"], thin["rz"] = POLE, 1e-3, 1e-3, 3.0, 3.0
+    kept = dataclasses.replace(scene, obstacles=thin[away < limit])
+    image = RaycastRenderer(dataclasses.replace(scene, obstacles=thin), 64, 64, cull_m=limit).render(1, 5, 2)
+    assert np.array_equal(image, RaycastRenderer(kept, 64, 64).render(1, 5, 2))
+    plain = RaycastRenderer(scene, 64, 64).render(1, 5, 2)
+    assert np.array_equal(RaycastRenderer(scene, 64, 64, cull_m=1e5).render(1, 5, 2), plain)
+    # Height counts: 6 m ahead and 7 m below is 9.2 m away.
+    below = Scene("one", body(POLE, 0.0, 12.0, 1.0, 1.0, 1.0))
+    none = RaycastRenderer(Scene("none", below.obstacles[:0]), 16, 16, 150.0).render(0.0, 5.0, 9.0)
+    for limit, drawn in ((9.1, False), (9.3, True)):
+        seen = RaycastRenderer(below, 16, 16, 150.0, cull_m=limit).render(0.0, 5.0, 9.0)
+        assert np.array_equal(seen, none) != drawn
+
+
+def everything(rng: np.random.Generator) -> Scene:
+    """All kinds, all surfaces textured and moving."""
+    return forest(
+        KINDS,
+        rng,
+        ground_texture=Texture("noise", 2.0, 0.5, (1.0, -2.0), 3),
+        wall_texture=Texture("checker", 1.0, 0.2, (0.5, 0.0)),
+        obstacle_texture=Texture("checker", 0.7, 0.5, (0.3, 1.0)),
+    )
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_every_pose_gives_finite_luminance_between_the_scenes_least_and_most(textured):
+    rng = np.random.default_rng(6)
+    scene = everything(rng) if textured else forest(KINDS, rng)
+    least, most = 0.1 * 0.35 * (0.5 if textured else 1.0), 0.85
+    most = max(most, 0.8 * 1.2 if textured else 0.8)
+    renderer = RaycastRenderer(scene, 17, 13)
+    o = scene.obstacles
+    for _ in range(400):
+        near = o[rng.integers(len(o))]
+        angle, reach = rng.uniform(-np.pi, np.pi), near["rx"] * rng.choice([0, 0.5, 1, 1 + 1e-9, 1 + 1e-6, 3])
+        x, y = near["x"] + reach * np.cos(angle), near["y"] + reach * np.sin(angle)
+        x = rng.choice([x, x, near["x"] + near["rx"], 15.0, -15.0, 15.0 + 1e-6, 1e6])
+        y = rng.choice([y, y, near["y"] - near["ry"], -1e6])
+        z = rng.choice([0.0, 1e-9, 2.0, 6.0, near["z"], near["z"] + near["rz"], near["z"] - near["rz"], 1e6])
+        yaw = rng.choice([0.0, np.pi / 2, -np.pi / 2, np.pi, 0.3, -2.0, 1e5, rng.uniform(-3, 3)])
+        pose = (float(x), float(y), max(0.0, float(z)), float(yaw), float(rng.choice([0.0, 3.7, 1e6])))
+        image = renderer.render(*pose)
+        assert np.isfinite(image).all(), pose
+        # What edges leave of a row adds up to one: only rounding is left.
+        assert least - 1e-6 <= image.min() <= image.max() <= most + 1e-6, pose
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 90.0), (1280, 720, 90.0), (64, 3, 1.0), (31, 64, 170.0)])
+def test_images_of_any_shape_and_field_of_view_show_the_same_world(shape):
+    width, height, fov = shape
+    scene, pose = forest(KINDS, np.random.default_rng(7)), (0.3, 12.0, 2.0, 0.1)
+    image = RaycastRenderer(scene, width, height, fov).render(*pose)
+    points = sample_luminance(scene, pose, width, height, fov, samples=1 if width > 100 else 32)
+    assert image.shape == (height, width)
+    assert np.abs(image - points).mean() < (1e-2 if width == 1 else 5e-3)
+
+
+def test_ten_thousand_bodies_or_none_are_a_picture():
+    rng = np.random.default_rng(8)
+    crowd = np.concatenate([body(k % 4, 0.0, 0.0, 1.0, 0.1, 1.0) for k in range(10_000)])
+    crowd["x"], crowd["y"] = 0.3 * (np.arange(10_000) % 100 - 49.5), 5.0 + 0.3 * (np.arange(10_000) // 100)
+    crowd["albedo"] = rng.uniform(0.1, 0.6, 10_000)
+    for obstacles in (crowd, crowd[:0]):
+        scene = Scene("crowd", obstacles)
+        found = np.abs(
+            RaycastRenderer(scene, 12, 12, samples=8).render(0, 0, 3)
+            - sample_luminance(scene, (0, 0, 3, 0), 12, 12, samples=16)
+        )
+        assert found.mean() < 3e-3

@@ -1,0 +1,250 @@
+import base64
+import os
+import resource
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pytest
+
+from envs.events import EVENT
+from envs.recordings import read_events
+
+DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
+CHECKERBOARDS = DATA / "dvs128_checkerboard"
+needs_samples = pytest.mark.skipif(not CHECKERBOARDS.is_dir(), reason=f"no {CHECKERBOARDS}; set EVADE_DATA")
+
+# Twelve events written by dv-processing 2.0.4 (zlib, base 85): event i has the time
+# 1,700,000,000,000,000 us + 100 i^2, x = 37 i mod 346, y = 29 i mod 260, ON when 3 divides i.
+LZ4_FILE = (
+    "c-oCq&x_MQ6n@!;RZ4dW(nAlr#IcHpwMo~q2W?7ge_+J!f-Sr5DlDOyt%KW4m`n=mNyI-u!9T&Hco#1oy!kJPXOD___a$a)%"
+    "|`6NB;O?8_r3RK=3Tnj>fXE7X$@-?b0xo?11JH2y?wh2@yO#^g#w&K1fby5qPGgO@pB2F?oRb76#?U(MK&rXY2<Yrb&tDL_n"
+    "Zl}2oI(09de@kj(lVhBUu{>HBC295zTpOOn0Od`eS-*krAKxf(B81qRV3+4FV~cHztj{`?b0eG5;y%f{mHy9QC;y9?>lfpZ4"
+    "f;kGJu=aCQZgR4iz?9ZElxS%!2<JsJGRCX#e$FcQp{8HKgOK=O(1I?{>%=sXTrS-{nHF+4kDRHRM2JHtVy!Q9cXtYb6{mO9O"
+    "h*a3S&@1KNZo+ORywau(>8M?i{bQ_!IB03(5(W%Yvw07(P20o}}R%%40&Rxp6^$D&U?zE9l?*Dt7D(RP+%@1!7{ve-|CW-bE"
+    "U>RFS#V3+*79vG+tyIo0$Kt4=Tn(z1;X)C}i<S=6J8(k-^1O{-IqaH1nmvTCK<Yp~+6dplOC)Gp2*1EvB$NjTbIK<qz#hV@%"
+    "2y=3K0w%46eMV4ge6!*LWgVc)PkF{_DxcMfbjd3he_(aVe3{p^(fV1ELnwhEJVfCc__nb5uW|tg<ft2&K1tUx20K)9sZ}*Ur"
+    "81UoB"
+)
+ZSTD_FILE = (
+    "c-m7|baV~Ub#V+a(KF!X(qU#`kYHe7@bvd^WdH*%AfJVShk*mgVqgGDGYA0j9cBhN_{PM*V3Sg&P?lO$oSC0zt7N2Spk&9T0"
+    "0cI9`6;Oid5O8Hwo3V>C7yX{`AP}}i6t4fO8QW~K2#~Xasv#72FOam$`eaUiWIU_D{YmM^K%P|Qj0<MD=Cyz761(>E-A{)OI"
+    "Nas3J!6x(FZBTsXM<YGd(jeF~>JQr8Fni4`@HSA-?%}`OZM`qQvl`%#ze1A`SE}Eh#81!De7;S!!NMF#%&hT3k|#lZ!G7O0f"
+    "9MxwN<>KUX0ou_O^JqmU1_PLBvvJyU?zXQpMQ7NHyJ8Ws|a)c~Zp$;1|q2Kt$3(TT<G;>@bl2$+?bc_m7A#wKRitiz%&5=Eb"
+    "pnE^5S@=J@7F#_MkG0Za<XmPwDR-fvFyo!`6k@zsSjebg*9Tz11PXl6&t@?iz9^|qxG_i>*P4F%LUX^9`_C>#y?!{|o?SDv|"
+    "7CUfs8(+z;n*lsU^KYLJ`7f|hcb(WXOZJTwUh4uhizc_#PEzU@e!`JjCMEfF*#!wZq1nwXr|&YJ*|kZ0PSsSdh_#+-J^TBa#"
+    "269`b};j>l{XxGz-J(Fhmoz>`anVfy9CcWhUVqFn0e+^9uF|iX)`qLJw3}G?5YG`CWfFRyb=qxMl%2B4^xo;_uKe&f$hno(t"
+    "??Xc5e}RzvU=LL;0;FPA`#VZv#yOQ&!pC`7`Tibs$Tlv^)zNg93xsg3}w<u3<>iWbg+7`sPSO"
+)
+
+
+def aedat2(path: Path, entries: list[tuple[int, int]], chip: str = "") -> Path:
+    lines = b"#!AER-DAT2.0\r\n" + (f"# AEChip: {chip}\r\n".encode() if chip else b"")
+    path.write_bytes(lines + b"".join(struct.pack(">II", *entry) for entry in entries))
+    return path
+
+
+def xml(streams: int = 1, width: int = 8) -> bytes:
+    nodes = "".join(
+        f'<node name="{number}"><attr key="typeIdentifier">EVTS</attr><node name="info">'
+        f'<attr key="sizeX">{width}</attr><attr key="sizeY">6</attr></node></node>'
+        for number in range(streams)
+    )
+    return f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
+
+
+def aedat4(path: Path, packets: list[tuple[int, bytes]], codec: int = 0, text: bytes | None = None) -> Path:
+    """A file by the published schema, its flatbuffers laid out by hand."""
+    text = xml() if text is None else text
+    table = struct.pack("<HHHHH2x", 10, 16, 4, 0, 8)  # vtable: its size, the table's, three fields
+    header = struct.pack("<I", 16) + table + struct.pack("<iiiI", 12, codec, 4, len(text)) + text
+    body = b"".join(struct.pack("<ii", stream, len(packet)) + packet for stream, packet in packets)
+    path.write_bytes(b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header + body)
+    return path
+
+
+def packet(events: list[tuple[int, int, int, int]], count: int | None = None) -> bytes:
+    """One size-prefixed flatbuffer of events, not compressed."""
+    table = struct.pack("<I4sHHH2x", 16, b"EVTS", 6, 8, 4)
+    start = struct.pack("<iII", 8, 4, len(events) if count is None else count)
+    body = table + start + b"".join(struct.pack("<qhhB3x", *event) for event in events)
+    return struct.pack("<I", len(body)) + body
+
+
+@needs_samples
+@pytest.mark.parametrize(
+    ("name", "count", "span_us"), [("checkerboard_3", 49_724, 111_580), ("calibration_23", 76_732, 568_582)]
+)
+def test_the_checkerboards_decode_as_by_their_description(name, count, span_us):
+    path = CHECKERBOARDS / f"{name}.aedat"
+    file = read_events(path)
+    assert (file.format, file.width, file.height, file.late) == ("aedat2", 128, 128, 0)
+    assert len(file.events) == count
+    assert file.events["t"][-1] - file.events["t"][0] == span_us
+    with path.open("rb") as raw:
+        while (line := raw.readline()).startswith(b"#"):
+            pass
+        body = line + raw.read()
+    expected = [
+        (t_us, 127 - (address >> 1 & 127), 127 - (address >> 8 & 127), 1 - 2 * (address & 1))
+        for address, t_us in struct.iter_unpack(">II", body)
+    ]
+    assert file.events.tolist() == expected
+
+
+def test_a_davis_is_read_with_the_addresses_that_simulators_write_for_it(tmp_path):
+    """The mapping of v2e's AEDAT 2.0 output: mirrored columns, rows from below."""
+    pixels = [(0, 0, 1), (345, 259, -1), (17, 200, 1)]
+    entries = [(345 - x << 12 | 259 - y << 22 | (p > 0) << 11, 100 + x) for x, y, p in pixels]
+    frames = [(1 << 31 | 5, 100), (1 << 10, 200)]  # a sample of a frame, an external event
+    path = aedat2(tmp_path / "a.aedat", [*frames, *entries], "eu.seebetter.ini.chips.davis.Davis346blue")
+    file = read_events(path)
+    assert (file.width, file.height, file.skipped) == (346, 260, 2)
+    assert sorted(file.events.tolist()) == sorted((100 + x, x, y, p) for x, y, p in pixels)
+    unnamed = aedat2(tmp_path / "b.aedat", entries)
+    assert read_events(unnamed, width=346, height=260).events.tobytes() == file.events.tobytes()
+    with pytest.raises(ValueError, match="an unknown camera"):
+        read_events(unnamed)
+
+
+def test_special_events_of_a_dvs128_are_passed_over_and_its_clock_unwrapped(tmp_path):
+    path = aedat2(tmp_path / "a.aedat", [(0, 2**32 - 1), (0x8000, 0), (1, 3)])
+    file = read_events(path)
+    assert file.events.tolist() == [(2**32 - 1, 127, 127, 1), (2**32 + 3, 127, 127, -1)]
+    assert file.skipped == 1
+
+
+def test_jaers_end_of_header_lets_the_first_address_begin_like_a_comment(tmp_path):
+    head = b"#!AER-DAT2.0\r\n# AEChip: x.DAVIS640\r\n#End Of ASCII Header\r\n"
+    (tmp_path / "a.aedat").write_bytes(head + struct.pack(">II", 0x23000000, 7))
+    assert read_events(tmp_path / "a.aedat").events["t"].tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("entries", "chip", "rule"),
+    [
+        ([(0, 1)], "ch.unizh.ini.DVS640", "DVS640, no DVS128 or DAVIS"),
+        ([(1 << 16, 1)], "", "an unknown camera"),
+        ([(300 << 12, 1)], "x.DAVIS240C", "outside a sensor of 240x180"),
+        ([(0, 1), (0, 5_000_000), (0, 2)], "", "reset clock"),
+    ],
+)
+def test_an_aedat2_file_that_breaks_a_rule_is_refused(entries, chip, rule, tmp_path):
+    with pytest.raises(ValueError, match=rule):
+        read_events(aedat2(tmp_path / "a.aedat", entries, chip))
+
+
+@pytest.mark.parametrize(
+    ("content", "rule"),
+    [
+        (b"#!AER-DAT2.0\r\n1234567", "is truncated"),
+        (b"#!AER-DAT2.0", "header without end"),
+        (b"#!AER-DAT3.1\r\n", "another AEDAT version"),
+    ],
+)
+def test_an_aedat2_file_that_is_cut_or_of_another_version_is_refused(content, rule, tmp_path):
+    (tmp_path / "a.aedat").write_bytes(content)
+    with pytest.raises(ValueError, match=rule):
+        read_events(tmp_path / "a.aedat")
+
+
+@pytest.mark.parametrize("text", [LZ4_FILE, ZSTD_FILE], ids=["lz4", "zstd"])
+def test_a_file_by_the_makers_library_is_read(text, tmp_path):
+    (tmp_path / "a.aedat4").write_bytes(zlib.decompress(base64.b85decode(text)))
+    file = read_events(tmp_path / "a.aedat4")
+    assert (file.format, file.width, file.height) == ("aedat4", 346, 260)
+    assert file.events.tolist() == [
+        (1_700_000_000_000_000 + 100 * i * i, 37 * i % 346, 29 * i % 260, 1 if i % 3 == 0 else -1)
+        for i in range(12)
+    ]
+
+
+def test_packets_of_other_streams_are_passed_over_whatever_they_hold(tmp_path):
+    events = [(5, 1, 2, 1), (7, 3, 4, 0)]
+    path = aedat4(tmp_path / "a.aedat4", [(0, packet(events[:1])), (9, b"junk"), (0, packet(events[1:]))])
+    assert read_events(path).events.tolist() == [(5, 1, 2, 1), (7, 3, 4, -1)]
+    assert read_events(aedat4(tmp_path / "b.aedat4", [])).events.tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("packets", "codec", "text", "rule"),
+    [
+        ([(0, packet([(5, 1, 2, 1)], count=2))], 0, None, "declares 2 events and has no room"),
+        ([(0, packet([(5, 1, 2, 1)])[:20])], 0, None, "damaged"),
+        ([(0, packet([(5, 8, 2, 1)]))], 0, None, "x=8 outside the sensor"),
+        ([(0, packet([(5, -1, 2, 1)]))], 0, None, "x must lie in"),
+        ([(0, packet([(-5, 1, 2, 1)]))], 0, None, "t must lie in"),
+        ([(0, b"no lz4 frame")], 1, None, "damaged"),
+        ([], 0, xml(2), "2 event streams"),
+        ([], 0, xml(0), "0 event streams"),
+        ([], 0, b"<!DOCTYPE x [<!ENTITY a 'b'>]><dv>&a;</dv>", "XML entities"),
+        ([], 0, b"<dv>", "damaged"),
+        ([], 0, xml().replace(b">8<", b">wide<"), "damaged"),
+    ],
+)
+def test_an_aedat4_file_that_breaks_a_rule_is_refused(packets, codec, text, rule, tmp_path):
+    with pytest.raises(ValueError, match=rule) as caught:
+        read_events(aedat4(tmp_path / "a.aedat4", packets, codec, text))
+    assert "a.aedat4" in str(caught.value)
+
+
+def test_a_packet_or_header_longer_than_the_file_is_refused(tmp_path):
+    path = aedat4(tmp_path / "a.aedat4", [(0, packet([(5, 1, 2, 1)]))])
+    raw = path.read_bytes()
+    path.write_bytes(raw[:-1])
+    with pytest.raises(ValueError, match="declares 48 bytes and 47 follow"):
+        read_events(path)
+    path.write_bytes(raw[:14] + struct.pack("<I", 1 << 31) + raw[18:])
+    with pytest.raises(ValueError, match="its header declares 2147483648 bytes"):
+        read_events(path)
+
+
+@pytest.mark.parametrize(("codec", "name"), [(1, "lz4"), (3, "zstd")])
+def test_a_packet_that_unpacks_to_gigabytes_takes_no_memory(codec, name, tmp_path):
+    def packed(size: int) -> bytes:
+        sink = pyarrow.BufferOutputStream()
+        with pyarrow.CompressedOutputStream(sink, name) as out:
+            out.write(struct.pack("<I", size))
+            for _ in range(256):
+                out.write(bytes(1 << 20))
+        return sink.getvalue().to_pybytes()
+
+    small = aedat4(tmp_path / "a.aedat4", [(0, packed(100))], codec)
+    large = aedat4(tmp_path / "b.aedat4", [(0, packed(1 << 30))], codec)
+    assert large.stat().st_size < 4 << 20
+    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert read_events(small).events.tolist() == []  # all zero: a table without fields
+    with pytest.raises(ValueError, match="at most 268435456 are unpacked"):
+        read_events(large)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 64 << 10
+
+
+def test_packets_that_hold_one_event_and_megabytes_of_nothing_are_let_go(tmp_path):
+    size, number = 16 << 20, 12
+    one = packet([(5, 1, 2, 1)])
+    sink = pyarrow.BufferOutputStream()
+    with pyarrow.CompressedOutputStream(sink, "zstd") as out:
+        out.write(struct.pack("<I", size) + one[4:] + bytes(size - len(one) + 4))
+    path = aedat4(tmp_path / "a.aedat4", [(0, sink.getvalue().to_pybytes())] * number, 3)
+    assert path.stat().st_size < 1 << 20
+    tracemalloc.start()
+    try:
+        assert read_events(path).events.tolist() == [(5, 1, 2, 1)] * number
+        assert tracemalloc.get_traced_memory()[1] < 3 * size
+    finally:
+        tracemalloc.stop()
+
+
+def test_another_reader_gives_the_same_events(tmp_path):
+    aedat = pytest.importorskip("aedat", reason="the package aedat reads AEDAT 4.0 independently")
+    path = tmp_path / "a.aedat4"
+    path.write_bytes(zlib.decompress(base64.b85decode(LZ4_FILE)))
+    theirs = np.concatenate([part["events"] for part in aedat.Decoder(path) if "events" in part])
+    ours = read_events(path).events
+    assert ours.dtype == EVENT
+    for name in "txy":
+        assert np.array_equal(ours[name], theirs[name])
+    assert np.array_equal(ours["p"] > 0, theirs["on"])

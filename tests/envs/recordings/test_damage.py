@@ -1,0 +1,208 @@
+"""Damaged and hostile files of every format: one ValueError, in bounded memory and time."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from envs.events import EVENT
+from envs.recordings import FORMATS, read_events, write_events
+
+ROOT = Path(__file__).resolve().parents[3]
+MEMORY_BYTES = 3 << 30  # of address space, most of it taken by the libraries
+
+# Runs in a process of its own: a crash or a hang of a library must fail the test, not end it.
+CHILD = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+import pyarrow
+from envs.recordings import read_events
+memory, *paths = sys.argv[1:]
+resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
+resource.setrlimit(resource.RLIMIT_CPU, (100, 100))
+for path in map(Path, paths):
+    good, rng = path.read_bytes() if ROUNDS > 1 else b"", np.random.default_rng(0)
+    for number in range(ROUNDS):
+        if ROUNDS > 1:
+            bad = np.frombuffer(good, np.uint8).copy()
+            place, size = int(rng.integers(len(bad))), int(rng.integers(1, 20))
+            if number % 5 == 0:
+                bad[rng.integers(0, len(bad), size)] ^= np.uint8(1 << rng.integers(8))
+            elif number % 5 == 1:
+                bad[rng.integers(0, min(600, len(bad)), 3)] = rng.integers(0, 256, 3)
+            elif number % 5 == 2:
+                bad = bad[:place]
+            elif number % 5 == 3:
+                bad[place:] = rng.integers(0, 256, len(bad) - place)
+            else:
+                bad[place : place + 4] = rng.choice([0, 127, 255])
+            path.write_bytes(bad.tobytes())
+        try:
+            file = read_events(path)
+            assert np.all(np.diff(file.events["t"]) >= 0)
+            print(path.name, "read")
+        except ValueError as error:
+            assert str(path) in str(error), error
+            assert str(error).count(str(path)) == 1, error
+            print(path.name, "refused")
+"""
+
+
+def run_child(paths: list[Path], rounds: int = 1) -> list[str]:
+    """What became of each read, in a process with little memory."""
+    child = subprocess.run(
+        [sys.executable, "-c", CHILD.replace("ROUNDS", str(rounds)), str(MEMORY_BYTES), *map(str, paths)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert child.returncode == 0, (child.returncode, child.stdout[-500:], child.stderr[-3000:])
+    return child.stdout.splitlines()
+
+
+def some_events() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    events = np.empty(300, EVENT)
+    events["t"] = np.sort(rng.integers(0, 100_000, 300))
+    events["x"], events["y"] = rng.integers(0, 34, (2, 300))
+    events["p"] = rng.choice([-1, 1], 300)
+    return events
+
+
+def one_of_each(folder: Path) -> list[Path]:
+    """A good file of every format."""
+    from tests.envs.recordings.test_aedat import LZ4_FILE, ZSTD_FILE, aedat2, base64, zlib
+
+    events, paths = some_events(), []
+    for format in ("npz", "hdf5", "txt", "csv", "dat", "evt2", "evt3"):
+        suffix = {"txt": ".txt", "csv": ".csv", "hdf5": ".h5"}.get(format, "")
+        paths.append(folder / f"{format}{suffix}")
+        write_events(paths[-1], events, 34, 34, format)
+    for name, text in (("aedat4_lz4", LZ4_FILE), ("aedat4_zstd", ZSTD_FILE)):
+        paths.append(folder / name)
+        paths[-1].write_bytes(zlib.decompress(base64.b85decode(text)))
+    columns = [events[name].tolist() for name in "xyt"]
+    paths.append(aedat2(folder / "aedat2", [(x << 1 | y << 8, t) for x, y, t in zip(*columns, strict=True)]))
+    paths.append(folder / "nmnist.bin")
+    entries = [(x << 32 | y << 24 | t).to_bytes(5, "big") for x, y, t in zip(*columns, strict=True)]
+    paths[-1].write_bytes(b"".join(entries))
+    halves = np.zeros((4, 2), "<u4")
+    halves[:, 1] = [8 << 28, 1 << 28, 1 << 28 | 5, 0]
+    halves[:, 0] = 7
+    paths.append(folder / "evt21")
+    paths[-1].write_bytes(b"% format EVT21;height=34;width=64\n% end\n" + halves.tobytes())
+    return paths
+
+
+def test_there_is_a_good_file_of_every_format(tmp_path):
+    paths = one_of_each(tmp_path)
+    assert {read_events(path).format for path in paths} == set(FORMATS)
+
+
+def test_flipped_cut_and_scrambled_files_are_read_or_refused_by_name(tmp_path):
+    paths = one_of_each(tmp_path)
+    results = run_child(paths, rounds=60)
+    assert len(results) == 60 * len(paths)
+    for path in paths:
+        assert results.count(f"{path.name} refused") > 15, path.name
+
+
+def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
+    bomb = tmp_path / "bomb.npz"
+    header = {"descr": "<i8", "fortran_order": False, "shape": (2,)}
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in "txyp":
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array_header_1_0(file, header)
+                for _ in range(256 if name == "t" else 0):
+                    file.write(bytes(1 << 20))
+    shape = tmp_path / "shape.npz"
+    with zipfile.ZipFile(shape, "w") as archive:
+        for name in "txyp":
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array_header_1_0(file, {**header, "shape": (1 << 50,)})
+    declared = tmp_path / "declared.h5"
+    with h5py.File(declared, "w") as file:
+        for name in "txyp":
+            file.create_dataset(f"events/{name}", (25 * 10**9,), "i8", chunks=(1024,), fillvalue=1)
+    sparse = tmp_path / "sparse.raw"
+    sparse.write_bytes(b"% evt 3.0\n")
+    os.truncate(sparse, 1 << 40)
+    line = tmp_path / "line.txt"
+    line.touch()
+    os.truncate(line, 7 << 30)
+    vectors = tmp_path / "vectors.raw"  # 1.2e9 events in 200 MB
+    with vectors.open("wb") as out:
+        out.write(b"% evt 3.0\n" + np.array([0x8000, 0x0001, 0x3000], "<u2").tobytes())
+        for _ in range(100):
+            out.write(np.full(1 << 20, 0x4FFF, "<u2").tobytes())
+    names = [bomb, shape, declared, sparse, line, vectors]
+    assert all(path.stat().st_blocks * 512 < 1 << 28 for path in names)
+    assert run_child(names) == [f"{path.name} refused" for path in names]
+    for path in names:
+        path.unlink()
+
+
+@pytest.mark.parametrize("format", [None, *FORMATS])
+def test_what_is_no_regular_file_is_refused_without_being_opened(format, tmp_path):
+    os.mkfifo(tmp_path / "fifo.npz")
+    (tmp_path / "empty.raw").touch()
+    (tmp_path / "loop.raw").symlink_to("loop.raw")
+    (tmp_path / "link.raw").symlink_to("fifo.npz")
+    for path, rule in (
+        (tmp_path, "is no regular file"),
+        (tmp_path / "fifo.npz", "is no regular file"),
+        (Path("/dev/zero"), "is no regular file"),
+        (tmp_path / "empty.raw", "is empty"),
+        (tmp_path / "missing.raw", "cannot be opened"),
+        (tmp_path / "loop.raw", "cannot be opened"),
+        (tmp_path / "link.raw", "is no regular file"),
+        (tmp_path / "nul\0.raw", "cannot be opened"),
+    ):
+        with pytest.raises(ValueError, match=rule):
+            read_events(path, format)
+
+
+@pytest.mark.parametrize("format", [None, *FORMATS])
+def test_random_bytes_are_refused_in_every_format_that_can_tell(format, tmp_path):
+    path = tmp_path / "random.xyz"
+    path.write_bytes(np.random.default_rng(0).bytes(5 * 8 * 1000 + 3))
+    with pytest.raises(ValueError, match=r"random\.xyz"):
+        read_events(path, format)
+
+
+def test_a_file_larger_than_allowed_is_not_opened(tmp_path):
+    write_events(tmp_path / "a.npz", some_events(), 34, 34)
+    with pytest.raises(ValueError, match="at most max_bytes=100 are read"):
+        read_events(tmp_path / "a.npz", max_bytes=100)
+
+
+def test_a_flipped_bit_in_stored_events_is_noticed_where_the_format_has_checksums(tmp_path):
+    for name in ("a.npz", "a.h5"):
+        write_events(tmp_path / name, some_events(), 34, 34)
+        good = (tmp_path / name).read_bytes()
+        first, size = packed_x(tmp_path / name)
+        for place in range(first, first + size, 7):
+            bad = bytearray(good)
+            bad[place] ^= 4
+            (tmp_path / name).write_bytes(bad)
+            with pytest.raises(ValueError, match=name):
+                read_events(tmp_path / name)
+
+
+def packed_x(path: Path) -> tuple[int, int]:
+    """Where the packed x of a file lies, and how many bytes it has."""
+    if path.suffix == ".npz":
+        with zipfile.ZipFile(path) as archive:
+            info = archive.getinfo("x.npy")
+        return path.read_bytes().index(b"x.npy") + 25, info.compress_size - 25
+    with h5py.File(path) as file:
+        chunk = file["events/x"].id.get_chunk_info(0)
+    return int(chunk.byte_offset), int(chunk.size)

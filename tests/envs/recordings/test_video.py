@@ -1,0 +1,222 @@
+import os
+import subprocess
+import threading
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from envs.config import CameraConfig
+from envs.events import EventCamera
+from envs.recordings import video_to_events
+from envs.recordings.video import area_average, video_steps
+
+DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
+VIDEOS = DATA / "videos"
+needs_videos = pytest.mark.skipif(not VIDEOS.is_dir(), reason=f"no {VIDEOS}; set EVADE_DATA")
+FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
+
+
+def encode(path: Path, frames: np.ndarray, *options: str, fps: str = "25") -> Path:
+    """A video without loss, from uint8 (N, H, W, 3)."""
+    rows, columns = frames.shape[1:3]
+    command = [FFMPEG, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-r", fps]
+    command += ["-s", f"{columns}x{rows}", "-i", "-", "-c:v", "ffv1", "-pix_fmt", "bgr0", *options, str(path)]
+    subprocess.run(command, input=frames.tobytes(), check=True)
+    return path
+
+
+def some_frames(count: int = 8, rows: int = 12, columns: int = 16) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return rng.integers(0, 256, (count, rows, columns, 3), dtype=np.uint8)
+
+
+def retimed(milliseconds: str) -> list[str]:
+    """Options that give frame N its own time."""
+    clock = ["-enc_time_base", "1/1000", "-fps_mode", "passthrough"]
+    return ["-vf", f"settb=1/1000,setpts={milliseconds}", *clock]
+
+
+def light(frames: np.ndarray) -> np.ndarray:
+    """Luminance by IEC 61966-2-1, in float64, written out anew."""
+    value = frames / 255.0
+    linear = np.where(value > 0.04045, ((value + 0.055) / 1.055) ** 2.4, value / 12.92)
+    return 0.2126 * linear[..., 0] + 0.7152 * linear[..., 1] + 0.0722 * linear[..., 2]
+
+
+def test_the_events_are_those_of_a_camera_that_sees_the_frames_in_linear_light(tmp_path):
+    frames = some_frames()
+    camera = CameraConfig(width=16, height=12, contrast_threshold=0.3)
+    steps = list(video_steps(encode(tmp_path / "a.mkv", frames), camera))
+    expected = EventCamera(camera)
+    expected.reset(light(frames[0]).astype(np.float32), 0)
+    assert len(steps) == 7
+    for number, step in enumerate(steps, start=1):
+        events = expected.step(light(frames[number]).astype(np.float32), 40_000 * number)
+        assert step.t_us == 40_000 * number
+        assert abs(len(step.events) - len(events)) <= 2  # a rounding of float32 may move one event
+        assert step.events["t"].min() > step.t_us - 40_000
+        assert step.events["t"].max() <= step.t_us
+
+
+def test_grey_is_read_exactly_and_linear_light_can_be_asked_for(tmp_path):
+    frames = np.repeat(some_frames()[..., :1], 3, axis=3)
+    frames[:] = np.maximum(frames, 30)
+    path = encode(tmp_path / "a.mkv", frames)
+    camera = CameraConfig(width=16, height=12)
+    found = video_to_events(path, camera, transfer="linear")
+    expected = EventCamera(camera)
+    grey = (frames[..., 0] / 255.0).astype(np.float32)
+    expected.reset(grey[0], 0)
+    count = sum(len(expected.step(picture, 40_000 * (n + 1))) for n, picture in enumerate(grey[1:]))
+    assert abs(len(found.events) - count) <= 2
+    assert len(video_to_events(path, camera).events) > 1.5 * count  # sRGB has more contrast
+    with pytest.raises(ValueError, match="transfer must be"):
+        video_to_events(path, camera, transfer="rec2020")
+
+
+def test_times_are_those_of_the_video_also_when_frames_are_not_evenly_spaced(tmp_path):
+    frames = some_frames(6)
+    path = encode(tmp_path / "a.mkv", frames, *retimed("N*N*10"))
+    steps = list(video_steps(path))
+    expected = EventCamera(16, 12)
+    expected.reset(light(frames[0]).astype(np.float32), 0)
+    assert [step.t_us for step in steps] == [10_000 * n * n for n in range(1, 6)]
+    for step, frame in zip(steps, frames[1:], strict=True):
+        count = len(expected.step(light(frame).astype(np.float32), step.t_us))
+        assert abs(len(step.events) - count) <= 2
+    path = encode(tmp_path / "b.avi", some_frames(31), fps="30000/1001")
+    assert [step.t_us for step in video_steps(path)] == [round(n * 1_001_000 / 30) for n in range(1, 31)]
+
+
+def test_without_a_camera_the_sensor_has_the_size_of_the_video(tmp_path):
+    file = video_to_events(encode(tmp_path / "a.mkv", some_frames()))
+    assert (file.width, file.height, file.format, file.dropped) == (16, 12, "video", 0)
+    assert np.all(np.diff(file.events["t"]) >= 0)
+    assert file.events["x"].max() == 15
+    assert file.events["y"].max() == 11
+
+
+def test_a_larger_video_is_averaged_in_linear_light(tmp_path):
+    """Black and white in turn, in every larger pixel alike: nothing moves in the mean."""
+    board = (np.indices((12, 16)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    frames = np.stack([board, 255 - board, board])[..., None].repeat(3, axis=3)
+    path = encode(tmp_path / "a.mkv", frames)
+    assert len(video_to_events(path).events) > 12 * 16
+    assert len(video_to_events(path, CameraConfig(width=4, height=3)).events) == 0
+
+
+def test_events_that_the_camera_drops_are_counted(tmp_path):
+    path = encode(tmp_path / "a.mkv", some_frames())
+    camera = CameraConfig(width=16, height=12, max_events_per_pixel=1)
+    every, kept = video_to_events(path), video_to_events(path, camera)
+    assert len(kept.events) + kept.dropped == len(every.events)
+    assert kept.dropped > 0
+
+
+def test_more_events_than_asked_for_are_refused(tmp_path):
+    path = encode(tmp_path / "a.mkv", some_frames())
+    running = set(threading.enumerate())
+    with pytest.raises(ValueError, match="at most max_events=10 are read"):
+        video_to_events(path, max_events=10)
+    assert set(threading.enumerate()) <= running
+
+
+def test_a_stream_that_is_left_early_leaves_nothing_running(tmp_path):
+    running = set(threading.enumerate())
+    steps = video_steps(encode(tmp_path / "a.mkv", some_frames(200, 120, 160)))
+    assert next(steps).t_us == 40_000
+    assert len(set(threading.enumerate()) - running) == 1
+    steps.close()
+    assert set(threading.enumerate()) <= running
+
+
+@needs_videos
+@pytest.mark.parametrize(
+    ("name", "frames", "last_us"), [("bikes", 250, 9_960_000), ("carphone_pristine", 120, 3_970_633)]
+)
+def test_real_videos_have_their_published_frames_and_rates(name, frames, last_us):
+    camera = CameraConfig(width=32, height=24)
+    steps = list(video_steps(VIDEOS / f"{name}.mp4", camera))
+    assert len(steps) == frames - 1
+    assert steps[-1].t_us == last_us
+    assert sum(len(step.events) for step in steps) > 5000
+
+
+@needs_videos
+def test_a_video_cut_short_is_refused(tmp_path):
+    whole = (VIDEOS / "bikes.mp4").read_bytes()
+    (tmp_path / "a.mp4").write_bytes(whole[: len(whole) * 2 // 3])
+    with pytest.raises(ValueError, match=r"a\.mp4: is (damaged|no video)"):
+        video_to_events(tmp_path / "a.mp4", CameraConfig(width=16, height=16))
+
+
+@pytest.mark.parametrize("damage", ["cut", "scrambled"])
+def test_a_video_that_breaks_off_or_is_damaged_inside_is_refused(damage, tmp_path):
+    path = encode(tmp_path / "a.mkv", some_frames(20))
+    raw = bytearray(path.read_bytes())
+    half = len(raw) // 2
+    raw[half : half + 50] = bytes(50)
+    path.write_bytes(raw[:half] if damage == "cut" else raw)
+    with pytest.raises(ValueError, match="is damaged or truncated"):
+        video_to_events(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "rule"),
+    [
+        (b"not a video", "is no video"),
+        (b"", "is empty"),
+        (b"#EXTM3U\n#EXTINF:1,\ngood.mkv\n#EXT-X-ENDLIST\n", "is no video"),
+        (b"ffconcat version 1.0\nfile good.mkv\n", "is no video"),
+    ],
+)
+def test_what_is_no_video_or_points_to_another_file_is_refused(content, rule, tmp_path):
+    encode(tmp_path / "good.mkv", some_frames())
+    (tmp_path / "a.mp4").write_bytes(content)
+    with pytest.raises(ValueError, match=rule) as caught:
+        video_to_events(tmp_path / "a.mp4")
+    assert "a.mp4" in str(caught.value)
+
+
+def test_a_single_picture_a_folder_and_a_missing_file_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="at least two"):
+        video_to_events(encode(tmp_path / "a.mkv", some_frames(1)))
+    with pytest.raises(ValueError, match="is no regular file"):
+        video_to_events(tmp_path)
+    with pytest.raises(ValueError, match="cannot be opened"):
+        video_to_events(tmp_path / "b.mp4")
+
+
+def test_times_that_do_not_increase_are_refused(tmp_path):
+    path = encode(tmp_path / "a.mkv", some_frames(4), *retimed("if(gte(N\\,2)\\,N-1\\,N)"))
+    with pytest.raises(ValueError, match="times must increase"):
+        video_to_events(path)
+
+
+def test_frames_too_large_for_memory_are_refused(tmp_path, monkeypatch):
+    path = encode(tmp_path / "a.mkv", some_frames())
+    monkeypatch.setattr("envs.recordings.video.MAX_PIXELS", 100)
+    with pytest.raises(ValueError, match="is no video that can be read"):
+        video_to_events(path)
+
+
+@pytest.mark.parametrize("old", [(12, 16), (7, 5), (3, 3)])
+@pytest.mark.parametrize("new", [(3, 4), (5, 3), (1, 1), (9, 11)])
+def test_averaging_keeps_the_mean_and_a_flat_picture_flat(old, new):
+    picture = np.random.default_rng(0).random(old).astype(np.float32)
+    average = area_average(old, new)
+    assert average(picture).shape == new
+    assert average(picture).dtype == np.float32
+    assert average(picture).mean() == pytest.approx(picture.mean(), rel=1e-5)
+    assert average(np.full(old, 0.25, np.float32)) == pytest.approx(0.25, rel=1e-6)
+    assert average(picture).min() >= picture.min() - 1e-6
+    assert average(picture).max() <= picture.max() + 1e-6
+
+
+def test_averaging_by_whole_numbers_is_the_mean_of_blocks():
+    picture = np.random.default_rng(0).random((12, 16)).astype(np.float32)
+    blocks = picture.reshape(3, 4, 4, 4).mean(axis=(1, 3))
+    assert area_average((12, 16), (3, 4))(picture) == pytest.approx(blocks, rel=1e-5)
+    assert area_average((12, 16), (12, 16))(picture) is picture

@@ -1,0 +1,127 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from envs.scene import Texture
+from envs.scene.textures import (
+    LEVELS,
+    TILE,
+    TILE_PERIODS,
+    around,
+    noise_stack,
+    noise_tile,
+    noise_waves,
+    pattern_points,
+)
+
+
+def places(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    s, q = np.random.default_rng(seed).uniform(-50.0, 50.0, (2, 500))
+    return s, q
+
+
+@pytest.mark.parametrize("name", ["plain", "checker", "stripes", "rings", "noise"])
+def test_a_pattern_stays_within_one_repeats_and_has_no_mean(name):
+    texture = Texture(name, 2.0, 0.5, seed=4)
+    s, q = places()
+    found = pattern_points(texture, s, q)
+    assert np.abs(found).max() <= 1.0
+    repeat = 2.0 * TILE_PERIODS
+    np.testing.assert_allclose(pattern_points(texture, s + repeat, q - 3 * repeat), found, atol=1e-9)
+    grid = (np.arange(512) + 0.5) / 512 * repeat
+    assert abs(pattern_points(texture, *np.meshgrid(grid, grid)).mean()) < 1e-6
+
+
+def test_signs_are_those_of_the_sine_waves_and_zero_counts_as_plus():
+    s, q = places(1)
+    wave_s, wave_q = np.sign(np.sin(math.pi * s)), np.sign(np.sin(math.pi * q))
+    signs = {"checker": wave_s * wave_q, "stripes": wave_s, "rings": wave_q}
+    for name, expected in signs.items():
+        assert np.array_equal(pattern_points(Texture(name, 2.0, 1.0), s, q), expected)
+        assert pattern_points(Texture(name, 2.0, 1.0), np.zeros(1), np.zeros(1)) == 1.0
+
+
+@pytest.mark.parametrize("name", ["checker", "stripes", "rings", "noise"])
+def test_a_moving_pattern_is_the_still_one_shifted(name):
+    s, q = places(2)
+    moving = Texture(name, 1.5, 0.5, (2.0, -0.75), seed=1)
+    still = dataclasses.replace(moving, velocity_mps=(0.0, 0.0))
+    shifted = pattern_points(still, s - 2.0 * 3.0, q + 0.75 * 3.0)
+    assert np.array_equal(pattern_points(moving, s, q, 3.0), shifted)
+    assert moving.moving
+    assert not still.moving
+
+
+def test_the_noise_has_only_waves_of_one_to_two_periods_all_equally_strong():
+    tile = noise_tile(7)
+    assert tile.shape == (TILE, TILE)
+    assert tile.dtype == np.float32
+    assert np.abs(tile).max() == 1.0
+    power = np.abs(np.fft.fft2(tile.astype(np.float64)))
+    b, a = np.meshgrid(*[np.fft.fftfreq(TILE, 1 / TILE)] * 2, indexing="ij")
+    inside = (np.hypot(a, b) >= TILE_PERIODS / 2) & (np.hypot(a, b) <= TILE_PERIODS)
+    assert power[~inside].max() < 1e-4 * power.max()
+    assert power[inside].min() > 0.999 * power.max()
+
+
+def test_the_noise_depends_on_its_seed_alone_and_cannot_be_written_to():
+    assert np.array_equal(noise_tile(3), noise_tile.__wrapped__(3))
+    assert not np.array_equal(noise_tile(3), noise_tile(4))
+    with pytest.raises(ValueError, match="read-only"):
+        noise_tile(3)[0, 0] = 0.0
+
+
+def test_points_of_the_noise_are_the_sum_of_its_waves_to_a_thousandth():
+    s, q = places(3)
+    cycles, amplitudes = noise_waves(5)
+    turns = np.exp(
+        2j * math.pi / (2.0 * TILE_PERIODS) * (np.outer(s, cycles[:, 0]) + np.outer(q, cycles[:, 1]))
+    )
+    np.testing.assert_allclose(
+        pattern_points(Texture("noise", 2.0, 1.0, seed=5), s, q), (turns @ amplitudes).real, atol=1.5e-3
+    )
+
+
+def test_a_level_of_the_stack_is_the_tile_averaged_over_squares():
+    stack, tile = noise_stack(2), noise_tile(2).astype(np.float64)
+    step = TILE // stack.shape[1]
+    np.testing.assert_allclose(stack[0], tile[::step, ::step], atol=1e-6)
+    for level in (1, 4, LEVELS - 1):
+        wide = level * TILE // 16
+        kernel = np.zeros(TILE)
+        kernel[: wide + 1] = 1.0
+        kernel[[0, wide]] = 0.5  # trapezoidal rule, around its middle
+        window = np.fft.fft(np.roll(kernel / wide, -(wide // 2)))
+        mean = np.fft.ifft2(np.fft.fft2(tile) * np.outer(window, window)).real
+        np.testing.assert_allclose(stack[level], mean[::step, ::step], atol=3e-3)
+
+
+@pytest.mark.parametrize("name", ["checker", "noise"])
+def test_a_whole_number_of_periods_goes_around(name):
+    for radius in (1e-3, 0.3, 0.5, 2.0):
+        texture = Texture(name, 0.5, 0.5)
+        repeat = 0.5 * (TILE_PERIODS if name == "noise" else 1)
+        turns = 2.0 * math.pi * around(texture, radius) / repeat
+        assert turns == pytest.approx(round(turns))
+        assert abs(turns - max(1.0, 2.0 * math.pi * radius / repeat)) <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("pattern", "dots"),
+        ("period_m", 0.0),
+        ("period_m", math.nan),
+        ("contrast", 1.1),
+        ("contrast", math.nan),
+        ("velocity_mps", (0.0, math.inf)),
+        ("velocity_mps", (1.0,)),
+        ("seed", -1),
+        ("seed", 0.5),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused_by_name(field, value):
+    with pytest.raises(ValueError, match=field):
+        Texture(**{"pattern": "noise", field: value})

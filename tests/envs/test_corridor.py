@@ -1,0 +1,351 @@
+import dataclasses
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, seen_settings
+from envs.corridor import CorridorEnv, CorridorVectorEnv
+from envs.events import unpack_window
+from envs.kinematics import clock_us, fly, planned_position
+from envs.scene import Scene
+from envs.scene.scene import OBSTACLE, POLE
+
+SMALL = CameraConfig(width=16, height=16)
+EMPTY = {"layout": {"num_obstacles": 0}, "camera": SMALL}
+FAULTY = FaultsConfig(sparsity=0.3, background_activity=0.2, background_activity_hz=50.0)
+
+
+def corridor(poles=(), width_m=30.0):
+    obstacles = np.array([(POLE, x, y, 3.0, r, r, 3.0, 0.5) for x, y, r in poles], OBSTACLE)
+    return Scene("test", obstacles, width_m=width_m)
+
+
+def straight(env, seed=0, **options):
+    """Fly forward to the end; all results of step."""
+    env.reset(seed=seed, **options)
+    results = [env.step(0)]
+    while not (results[-1][2] or results[-1][3]):
+        results.append(env.step(0))
+    return results
+
+
+def flight_bytes(env, seed, actions):
+    """All that a flight gives, as bytes; it starts again when it is over."""
+    observation, info = env.reset(seed=seed)
+    seen = [observation.tobytes(), repr(info)]
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        seen += [observation.tobytes(), repr((reward, terminated, truncated, info)), env.events.tobytes()]
+        if terminated or truncated:
+            env.reset()
+    return seen
+
+
+@pytest.mark.parametrize("observation", ["window", "event_image", "luminance", "events", "none"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_environment_passes_the_checkers(observation):
+    env = CorridorEnv(camera=SMALL, observation=observation, render_mode="rgb_array")
+    check_env(env)
+    check_env_sb3(env)
+
+
+def test_it_can_be_made_by_name_single_and_vectorised():
+    env = gymnasium.make("envs.corridor:evade/Corridor-v0", camera=SMALL)
+    assert isinstance(env.unwrapped, CorridorEnv)
+    many = gymnasium.make_vec(
+        "envs.corridor:evade/Corridor-v0", 2, vectorization_mode="vector_entry_point", camera=SMALL
+    )
+    assert isinstance(many, CorridorVectorEnv)
+    assert many.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
+
+
+@pytest.mark.parametrize("control_hz", [45.0, 100.0, 200.0, 400.0, 37.3])
+def test_a_straight_success_returns_200_at_any_rate(control_hz):
+    results = straight(CorridorEnv(**EMPTY, control_hz=control_hz, fidelity=FidelityConfig(max_step_m=10.0)))
+    assert abs(sum(r[1] for r in results) - 200.0) < 1e-9
+    assert [r[2] for r in results[-2:]] == [False, True]
+    info = results[-1][4]
+    assert info["success"]
+    assert not info["collision"]
+    assert info["distance_m"] == info["y_m"] == 100.0
+    assert len(results) == math.ceil(5.0 * control_hz)
+
+
+def test_a_thousand_steps_of_a_tenth_of_a_metre_are_a_hundred_metres():
+    config = EnvConfig()
+    assert planned_position(0.0, [1000, 0, 0], config) == (0.0, 100.0)
+    assert planned_position(3.0, [0, 500, 500], config)[0] == 3.0
+    x, y = planned_position(0.0, [0, 1, 0], config)
+    assert x == -y == pytest.approx(-0.1 / math.sqrt(2), abs=1e-15)
+
+
+def test_a_collision_returns_the_metres_to_the_contact_less_100():
+    env = CorridorEnv(**EMPTY | {"layout": {"num_obstacles": 60}})
+    for seed in range(20):
+        results = straight(env, seed)
+        info = results[-1][4]
+        expected = info["y_m"] + (100.0 if info["success"] else -100.0)
+        assert abs(sum(r[1] for r in results) - expected) < 1e-9
+        assert info["success"] is not info["collision"]
+        if info["collision"]:
+            here = info["x_m"], info["y_m"]
+            gaps = [math.dist((pole["x"], pole["y"]), here) - pole["rx"] for pole in env.scene.obstacles]
+            assert min(gaps) == pytest.approx(0.3, abs=1e-6)
+            return
+    pytest.fail("no flight met a pole")
+
+
+@pytest.mark.parametrize("action", [1, 2])
+def test_a_flight_to_the_side_ends_at_the_wall(action):
+    env = CorridorEnv(**EMPTY, time_limit_s=100.0)
+    _, info = env.reset(seed=0)
+    steps = 0
+    while not info["collision"]:
+        info = env.step(action)[4]
+        steps += 1
+    assert abs(info["x_m"]) == pytest.approx(15.0 - 0.3, abs=1e-9)
+    assert info["y_m"] == pytest.approx(abs(info["x_m"] - env._spawn_x), abs=1e-9)
+    assert steps == math.ceil(info["y_m"] * math.sqrt(2) / 0.1 - 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("pole_y", "success", "reward", "end_y"),
+    [
+        (50.0, False, 50.0 - 2.0 - 100.0, 48.0),  # pole before the goal line
+        (102.0, False, 0.0, 100.0),  # touched exactly on the line: a collision
+        (102.5, True, 200.0, 100.0),  # behind the line: never reached
+    ],
+)
+def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
+    outcome = fly(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5, 2.0)
+    assert (outcome.success, outcome.collision) == (success, not success)
+    assert outcome.reward == pytest.approx(reward, abs=1e-9)
+    assert outcome.end == (0.0, pytest.approx(end_y, abs=1e-9))
+
+
+def test_a_success_ends_exactly_on_the_goal_line():
+    for start_y, end_y in np.random.default_rng(0).uniform((0.0, 100.0), (100.0, 1e5), (200, 2)):
+        outcome = fly(corridor(), (0.0, start_y), (0.3, end_y), 0.3, 2.0)
+        assert outcome.success
+        assert outcome.end[1] == 100.0
+        assert outcome.reward == 100.0 - start_y + 100.0
+
+
+def test_a_start_in_contact_is_a_collision_without_progress():
+    outcome = fly(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3, 2.0)
+    assert outcome == ((0.0, 0.0), 0.0, -100.0, False, True)
+
+
+@pytest.mark.parametrize("speed_mps", [20.0, 1e3, 1e6])
+def test_no_speed_jumps_over_a_pole(speed_mps):
+    config = EnvConfig(speed_mps=speed_mps, layout={"num_obstacles": 0}, camera=SMALL)
+    env = CorridorEnv(config, fidelity=FidelityConfig(max_step_m=1.0))
+    env.reset(seed=0)
+    env.scene = corridor([(env.camera_pose()[0], 40.0, 1.0)])
+    info: dict = {"collision": False}
+    while not info["collision"]:
+        _, _, terminated, _, info = env.step(0)
+    assert terminated
+    assert info["y_m"] == pytest.approx(38.7, abs=1e-9)
+
+
+@pytest.mark.parametrize("hz", [45.0, 200.0, 999_999.5, 1e6, 0.1])
+def test_the_clock_counts_steps_and_never_stands(hz):
+    times = [clock_us(k, hz) for k in range(2000)]
+    assert all(abs(t - k * 1e6 / hz) <= 0.5 for k, t in enumerate(times))
+    assert (np.diff(times) > 0).all()
+
+
+def test_past_the_time_limit_the_flight_is_truncated_and_not_terminated():
+    results = straight(CorridorEnv(**EMPTY, time_limit_s=0.1))
+    assert len(results) == 20
+    assert [r[2:4] for r in results[-2:]] == [(False, False), (False, True)]
+    assert not results[-1][4]["success"]
+    at_the_goal = straight(CorridorEnv(**EMPTY, time_limit_s=5.0, fidelity=FidelityConfig(max_step_m=9.0)))
+    assert at_the_goal[-1][2:4] == (True, False)
+
+
+def test_the_window_holds_the_events_of_its_step():
+    env = CorridorEnv()
+    env.reset(seed=1)
+    for k in range(30):
+        window, _, _, _, info = env.step(k % 3)
+        events, window_us = unpack_window(window)
+        assert window_us == 5000
+        assert len(events) == info["num_events"] > 0
+        assert info["t_us"] == 5000 * (k + 1)
+        events["t"] += info["t_us"] - 5000
+        assert np.array_equal(events, env.events)
+
+
+def test_events_that_a_window_cannot_hold_are_counted():
+    env = CorridorEnv(window_capacity=5)
+    env.reset(seed=1)
+    for _ in range(10):
+        window, _, _, _, info = env.step(0)
+    assert info["dropped_events"] == info["num_events"] - 5 > 0
+    assert np.array_equal(window[1:, 1], env.events["x"][-5:])
+
+
+@pytest.mark.parametrize("faults", [FaultsConfig(), FAULTY])
+def test_the_same_seed_gives_the_same_bytes(faults):
+    actions = np.random.default_rng(0).integers(0, 3, 60)
+    first = flight_bytes(CorridorEnv(camera=SMALL, faults=faults, time_limit_s=0.1), 7, actions)
+    assert first == flight_bytes(CorridorEnv(camera=SMALL, faults=faults, time_limit_s=0.1), 7, actions)
+    assert first != flight_bytes(CorridorEnv(camera=SMALL, faults=faults, time_limit_s=0.1), 8, actions)
+
+
+def test_splits_never_share_a_corridor_and_options_pick_an_episode():
+    def poles(split, seed, episode):
+        env = CorridorEnv(camera=SMALL, split=split)
+        env.reset(seed=seed, options={"episode": episode})
+        return env.scene.obstacles.tobytes(), env.camera_pose()
+
+    cases = [(s, seed, e) for s in ("train", "validation", "eval") for seed in (0, 1, 2) for e in (0, 1, 2)]
+    assert len({poles(*case) for case in cases}) == len(cases)
+    env = CorridorEnv(camera=SMALL)
+    env.reset(seed=1)
+    env.reset()
+    assert (env.scene.obstacles.tobytes(), env.camera_pose()) == poles("train", 1, 1)
+
+
+def test_faults_leave_the_corridor_and_the_spawn_alone():
+    camera = CameraConfig(width=16, height=16, contrast_threshold=0.01)
+    clean, faulty = CorridorEnv(camera=camera), CorridorEnv(camera=camera, faults=FAULTY)
+    clean.reset(seed=4)
+    faulty.reset(seed=4)
+    assert clean.camera_pose() == faulty.camera_pose()
+    assert clean.scene.obstacles.tobytes() == faulty.scene.obstacles.tobytes()
+    dead = faulty._sensor._pixels.dead
+    assert dead.sum() == round(0.3 * 256)
+    silenced = 0
+    for _ in range(20):
+        clean.step(0)
+        faulty.step(0)
+        silenced += dead[clean.events["y"], clean.events["x"]].sum()
+        assert not dead[faulty.events["y"], faulty.events["x"]].any()
+        assert (np.diff(faulty.events["t"]) >= 0).all()
+    assert silenced > 20
+
+
+@pytest.mark.parametrize("action", [3, -1, 0.0, np.nan, None, "0", [0]])
+def test_an_action_outside_the_space_is_refused_and_the_flight_goes_on(action):
+    env = CorridorEnv(**EMPTY)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+    assert env.step(np.int64(0))[4]["t_us"] == 5000
+
+
+def test_a_step_before_reset_or_after_the_end_is_refused():
+    env = CorridorEnv(**EMPTY, time_limit_s=0.005)
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+    env.reset(seed=0)
+    assert env.step(0)[3]
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+
+
+def test_a_bad_number_stops_the_flight_naming_episode_step_and_seed(monkeypatch):
+    env = CorridorEnv(**EMPTY)
+    env.reset(seed=11)
+    env.step(0)
+    bad = np.full((64, 16, 16), np.nan, np.float32)
+    monkeypatch.setattr(env._sensor._renderer, "render_way", lambda poses: bad[: len(poses)])
+    with pytest.raises(ValueError, match=r"episode 0, step 2, seed 11: .*pixel x=0, y=0 is nan"):
+        env.step(0)
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+
+
+def test_a_reward_that_is_not_finite_is_refused():
+    endless = corridor()
+    object.__setattr__(endless, "length_m", math.nan)  # which a scene itself refuses
+    with pytest.raises(ValueError, match="finite"):
+        fly(endless, (0.0, math.nan), (0.0, 1.0), 0.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("control_hz", 0.0), ("control_hz", math.nan), ("scene", "moon"), ("render_mode", "human"), ("typo", 1)],
+)
+def test_settings_that_make_no_sense_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name}|{value}"):
+        CorridorEnv(**{name: value}).reset(seed=0)
+
+
+@pytest.mark.parametrize("options", [{"episode": -1}, {"episode": 1.5}, {"seed": 1}])
+def test_unknown_options_are_refused(options):
+    with pytest.raises(ValueError, match="options"):
+        CorridorEnv(camera=SMALL).reset(seed=0, options=options)
+
+
+def test_the_picture_shows_luminance_beside_events():
+    camera = CameraConfig(width=16, height=8, contrast_threshold=0.02)
+    env = CorridorEnv(camera=camera, render_mode="rgb_array")
+    env.reset(seed=0)
+    assert not env.render()[:, 64:].any()
+    env.step(0)
+    picture = env.render()
+    assert picture[::4, :64:4, 0].tolist() == np.uint8(255 * np.sqrt(env.luminance)).tolist()
+    assert picture.shape == (32, 128, 3)
+    assert picture[:, 64:].any()
+    assert CorridorEnv(camera=SMALL).render() is None
+
+
+@pytest.mark.parametrize("scene", ["poles_dense", "dynamic"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_picture_is_that_of_the_event_camera_without_simulating_one(scene, seed):
+    usual, alone = (CorridorEnv(scene=scene, camera=SMALL, observation=o) for o in ("window", "luminance"))
+    (_, before), (picture, info) = usual.reset(seed=seed), alone.reset(seed=seed)
+    assert (picture == usual.luminance).all()
+    actions, ended = np.random.default_rng(seed), False
+    while not ended:
+        action = int(actions.integers(3))
+        _, *outcome, before = usual.step(action)
+        picture, *others, info = alone.step(action)
+        assert outcome == others
+        assert (picture == usual.luminance).all()
+        assert alone.events.size == info["num_events"] == 0
+        ended = outcome[1] or outcome[2]
+    assert {**before, "num_events": 0} == info
+
+
+@pytest.mark.parametrize("observation", ["luminance", "window"])
+def test_a_picture_that_is_no_luminance_is_refused(monkeypatch, observation):
+    env = CorridorEnv(**EMPTY, observation=observation, fidelity=FidelityConfig(max_step_m=10.0))
+    env.reset(seed=0)
+    monkeypatch.setattr(
+        env._sensor._renderer, "render_way", lambda poses: np.full((1, 16, 16), np.nan, np.float32)
+    )
+    with pytest.raises(ValueError, match=r"step 1.*luminance must be finite"):
+        env.step(0)
+    with pytest.raises(ValueError, match="luminance must be finite"):
+        env.reset()
+
+
+@pytest.mark.parametrize(
+    ("observation", "same", "other"),
+    [
+        (
+            "luminance",
+            {"camera": CameraConfig(16, 16, contrast_threshold=0.4, memory="frame"), "faults": FAULTY},
+            {"fidelity": FidelityConfig(samples=8)},
+        ),
+        ("none", {"camera": CameraConfig(20, 20), "fidelity": FidelityConfig(0.5)}, {"control_hz": 100.0}),
+        ("window", {"camera": SMALL}, {"camera": CameraConfig(16, 16, contrast_threshold=0.4)}),
+    ],
+)
+def test_flights_with_equal_seen_settings_are_equal(observation, same, other):
+    plain = EnvConfig(camera=SMALL, scene="shape_change", observation=observation, time_limit_s=0.5)
+    like, unlike = dataclasses.replace(plain, **same), dataclasses.replace(plain, **other)
+    seen = [seen_settings(config, observation) for config in (plain, like, unlike)]
+    assert seen[0] == seen[1] != seen[2]
+    flown = [flight_bytes(CorridorEnv(config), 1, [0, 1, 2] * 30) for config in (plain, like, unlike)]
+    assert flown[0] == flown[1] != flown[2]

@@ -1,0 +1,281 @@
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from envs.config import EnvConfig
+from jobs.config.config import ENV_PARTS, SECTIONS, Config, ConfigError, as_dict, known_keys, parse
+from jobs.config.errors import JOBS_CHOOSE
+from jobs.config.schema import EVAE_SETTINGS
+from jobs.run.folder import run_name
+from models.kinds import KINDS
+
+CONF = Path(__file__).resolve().parents[3] / "conf"
+
+POLICIES = {
+    "bytestream": "bytestream",
+    "bytestream_finetuned": "bytestream",
+    "bytestream_paper": "bytestream",
+    "bytestream_robust": "bytestream",
+    "bytestream_xy": "bytestream_xy",
+    "event_columns": "event_columns",
+    "event_set": "event_set",
+    "event_image": "event_image",
+    "event_image_vae": "event_image_vae",
+    "rgb": "rgb",
+}
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
+CHOICES = [f"{group}={option}" for group in GROUPS if group != "exp" for option in options(group)]
+
+
+@pytest.fixture(scope="module")
+def composed():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield lambda *words: OmegaConf.to_container(compose("config", list(words)))
+
+
+@pytest.fixture(scope="module")
+def values(composed):
+    return composed("+exp=bytestream")
+
+
+def changed(values: dict, key: str, value: object) -> dict:
+    section, _, name = key.rpartition(".")
+    return {**values, section: {**values[section], name: value}} if section else {**values, name: value}
+
+
+@pytest.mark.parametrize("budget", options("budget"))
+@pytest.mark.parametrize("exp", options("exp"))
+def test_every_experiment_is_accepted_with_every_budget(composed, exp, budget):
+    config = parse(composed(f"+exp={exp}", f"budget={budget}"))
+    assert config.budget == budget
+    assert config.job == ("sweep" if exp == "robustness" else "pipeline" if exp in POLICIES else exp)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_file_of_every_group_is_accepted(composed, choice):
+    parse(composed("+exp=bytestream", choice))
+
+
+def test_the_yaml_of_the_world_says_what_its_dataclasses_say(values):
+    defaults = dataclasses.asdict(EnvConfig())
+    defaults = {name: value for name, value in defaults.items() if name not in JOBS_CHOOSE}
+    assert {**values["env"], **{part: values[part] for part in ENV_PARTS}} == defaults
+
+
+@pytest.mark.parametrize("section", [*SECTIONS, ""])
+def test_no_key_is_given_without_being_checked_nor_checked_without_being_given(values, section):
+    fields = {field.name for field in dataclasses.fields(SECTIONS.get(section, Config))}
+    assert set(values[section] if section else values) == fields
+
+
+@pytest.mark.parametrize(
+    "file", sorted(path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help"))
+)
+def test_every_value_says_its_unit_or_source_in_a_comment(file):
+    lines = file.read_text().splitlines()
+    assert lines[0].startswith("#")
+    if file.parent != CONF and file.parent.name != "budget":
+        assert [line for line in lines[1:] if ": " in line and "#" not in line and "name:" not in line] == []
+
+
+def test_ppo_is_the_papers(composed):
+    algo = parse(composed("+exp=bytestream", "budget=paper", "algo=ppo")).algo
+    assert dataclasses.asdict(algo) == {
+        "lr": 3e-4,
+        "lr_schedule": "constant",
+        "gamma": 0.99,
+        "lambda_": 0.95,
+        "clip_param": 0.2,
+        "num_epochs": 10,
+        "minibatch_size": 32,
+        "train_batch_size_per_learner": 2048,
+        "vf_loss_coeff": 0.5,
+        "entropy_coeff": 0.0,
+        "grad_clip": 0.5,
+        "reward_scale": 1.0,
+        "num_env_runners": 0,
+        "num_envs_per_env_runner": 16,
+    }
+
+
+def test_the_stages_of_an_experiment_share_its_run_folder(composed):
+    stages = ("bytestream", "collect", "pretrain", "train", "evaluate")
+    assert len({run_name(parse(composed(f"+exp={stage}"))) for stage in stages}) == 1
+
+
+@pytest.mark.parametrize(
+    ("exp", "name"),
+    POLICIES.items(),
+)
+def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_its_name(composed, exp, name):
+    jobs = ("pipeline", "train", "evaluate", "sweep")
+    configs = [parse(composed(f"+exp={exp}", f"job={job}", "budget=short")) for job in jobs]
+    assert [(config.job, config.model.name) for config in configs] == [(job, name) for job in jobs]
+    (folder,) = {run_name(config) for config in configs}
+    assert folder.startswith(f"{exp}-short-s0-")
+
+
+@pytest.mark.parametrize("name", sorted(KINDS))
+def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
+    values = composed("+exp=bytestream", f"model={name}")
+    kind = KINDS[name]
+    needed = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
+    usual = composed("+exp=bytestream")["model"]
+    for key, wanted in needed.items():
+        other, rule = (None, f"be given for {name}") if wanted else (usual[key], f"be null: {name} has no")
+        with pytest.raises(ConfigError, match=f"^model: {key} must {rule}.*got"):
+            parse(changed(values, f"model.{key}", other))
+
+
+@pytest.mark.parametrize("name", ["bytestream_xy", "event_image_vae"])
+def test_a_code_that_forgets_is_refused_where_there_is_no_time(composed, name):
+    with pytest.raises(ConfigError, match=f"coding must be additive or none for {name}.*got 'eventnet'"):
+        parse(composed("+exp=bytestream", f"model={name}", "model.coding=eventnet"))
+    assert parse(composed("+exp=bytestream", "model.coding=eventnet")).model.coding == "eventnet"
+
+
+def test_an_encoder_learns_on_only_where_its_events_can_be_kept(composed):
+    assert parse(composed("+exp=bytestream_finetuned")).model.encoder == "finetuned"
+    with pytest.raises(
+        ConfigError, match="encoder must be frozen for event_image_vae; bytestream, bytestream_xy can be"
+    ):
+        parse(composed("+exp=event_image_vae", "model.encoder=finetuned"))
+    with pytest.raises(ConfigError, match="time_bins must be at most 32768 for encoder=finetuned, got 40000"):
+        parse(composed("+exp=bytestream_finetuned", "model.time_bins=40000"))
+
+
+def test_a_whole_number_names_the_same_run_as_its_float(composed):
+    words = ("env.control_hz=100", "env.control_hz=100.0")
+    assert len({run_name(parse(composed("+exp=bytestream", word))) for word in words}) == 1
+
+
+def test_a_configuration_survives_being_written_and_read(values):
+    config = parse(values)
+    assert parse(yaml.safe_load(yaml.safe_dump(as_dict(config), sort_keys=False))) == config
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), "fast", True, None, [1.0], {}])
+@pytest.mark.parametrize("key", ["algo.lr", "env.control_hz", "camera.contrast_threshold", "faults.sparsity"])
+def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
+    with pytest.raises(ConfigError, match=f"^{key}: "):
+        parse(changed(values, key, value))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "rule"),
+    [
+        ("env.control_hz", -1, "greater than or equal to 0.1, got -1"),
+        ("env.speed_mps", 0, "greater than 0, got 0"),
+        ("camera.width", 4097, "less than or equal to 4096, got 4097"),
+        ("camera.memory", "none", "'reference', 'frame' or 'legacy', got 'none'"),
+        ("faults.sparsity", 1.2, "less than or equal to 1, got 1.2"),
+        ("algo.minibatch_size", 4096, "must not exceed train_batch_size_per_learner"),
+        ("algo.minibatch_size", 0, "greater than or equal to 1, got 0"),
+        ("seed", -1, "greater than or equal to 0, got -1"),
+        ("seed", 1.5, "valid integer, got 1.5"),
+        ("seed", 2**31, "less than 2147483648, got 2147483648"),
+        ("job", "os.system", "got 'os.system'"),
+        ("exp", "../up", "got '../up'"),
+        ("evaluate.renderers", [], "at least 1 item"),
+        (
+            "sweep.axes",
+            {"rate": {"env.control_hz": [100.0, 0.0]}},
+            "rate: env.control_hz=0.0: Input should be",
+        ),
+        ("sweep.axes", {"rate": {}}, "sweep.axes.rate: Dictionary should have at least 1 item"),
+        ("sweep.axes", {"rate": {"env.control_hz": []}}, "rate.env.control_hz: List should have at least 1"),
+        (
+            "sweep.axes",
+            {"rate": {"env.control_hz": [float("nan")]}},
+            "must be a finite number, a word or null",
+        ),
+        ("sweep.axes", {"a/b": {"env.control_hz": [1]}}, "String should match pattern"),
+        (
+            "sweep.axes",
+            {"where": {"env.scene": ["moon"]}},
+            "sweep.axes: must be one of cones, dynamic, gates",
+        ),
+        ("sweep.policies", [], "at least 1 item"),
+        ("env.camera", {"width": 64}, "env.camera: "),
+        ("camera", 64, "must be a group of settings, got 64"),
+        ("env", None, "must be a group of settings, got None"),
+        ("env.contrast_treshold", 0.2, "no such key, got 0.2; did you mean camera.contrast_threshold?"),
+        ("sed", 1, "no such key, got 1; did you mean seed?"),
+        ("env.split", "eval", "env.split: no such key, got 'eval'; every job chooses it itself"),
+        ("env.observation", "luminance", "no such key, got 'luminance'; every job chooses it itself"),
+        ("env.scene", "moon", "env.scene: must be one of cones, dynamic, gates, "),
+        ("sweep.scene", "moon", "sweep.scene: must be one of cones, dynamic, gates, "),
+        (
+            "collect.scenes",
+            ["poles", "moon"],
+            "collect.scenes: must be one of cones, dynamic, gates, poles, ",
+        ),
+        ("collect.scenes", [], "must name a scene where collect.recordings is empty, got []"),
+        ("env.layout", {"num_obstacles": 100_000}, "num_obstacles=100000 cannot be placed 2.0 m apart"),
+        ("env.layout", {"num_obstacles": 2.5}, "num_obstacles must be a whole number"),
+        ("env.layout", {"num_pole": 3}, "has no 'num_pole'"),
+        ("env.layout", {"name": 3}, "has no 'name'"),
+        ("model.name", "snn", f"name must be one of {', '.join(KINDS)}, got 'snn'"),
+        ("model.latent", None, "latent must be given for bytestream, got None"),
+        ("model.hidden", None, "hidden must be given for bytestream, got None"),
+        (
+            "train.conditions",
+            [{"env.scene": "moon"}],
+            "train.conditions: must be one of cones, ",
+        ),
+        ("train.conditions", [{}] * 17, "must be at most the 16 of algo.num_envs_per_env_runner, got 17"),
+        ("train.conditions", [], "at least 1 item"),
+        ("model.coding", "phase", "'additive', 'eventnet' or 'none', got 'phase'"),
+    ],
+)
+def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule):
+    with pytest.raises(ConfigError) as refusal:
+        parse(changed(values, key, value))
+    assert str(refusal.value).startswith(key.partition(".")[0])
+    assert rule in str(refusal.value)
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("exp", ["event_image", "event_image_vae", "rgb"])
+def test_a_picture_too_small_for_the_network_is_refused(composed, exp):
+    rule = f"camera.width: must be at least 36 for the network of {POLICIES[exp]}, got 35"
+    with pytest.raises(ConfigError, match=f"^{re.escape(rule)}$"):
+        parse(composed(f"+exp={exp}", "camera.width=35"))
+    parse(composed(f"+exp={exp}", "camera.width=36"))
+    parse(composed("+exp=event_columns", "camera.width=35"))
+
+
+def test_all_refusals_come_at_once(values):
+    with pytest.raises(ConfigError) as refusal:
+        parse(changed(changed(changed(values, "seed", -1), "algo.lr", -1.0), "env.control_hz", -1.0))
+    assert [line.partition(":")[0] for line in str(refusal.value).splitlines()] == [
+        "algo.lr",
+        "env.control_hz",
+        "seed",
+    ]
+
+
+def test_what_jobs_choose_is_no_key_and_reaches_no_run(values):
+    assert {f"env.{name}" for name in JOBS_CHOOSE}.isdisjoint(known_keys())
+    config = parse(values)
+    assert set(config.env).isdisjoint(JOBS_CHOOSE)
+    assert (config.env_config().split, config.env_config().observation) == ("train", "window")
+
+
+def test_every_known_key_can_be_replaced(values):
+    keys = known_keys()
+    assert {"seed", "env.control_hz", "camera.memory", "algo.lambda_"} <= set(keys)
+    for key in keys:
+        section, _, name = key.rpartition(".")
+        assert name in (values[section] if section else values)

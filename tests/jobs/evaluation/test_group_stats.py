@@ -1,0 +1,116 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jobs.analysis.tables import markdown_table
+from jobs.evaluation.group_stats import axis_curves, columns, details, matrix, metrics, summarise_group
+from jobs.rollout.episodes import EPISODE
+from jobs.tracking.store import check_metrics
+
+AT = ("sparsity", "0.2")
+
+
+def flights(success, trials=20, offset_m=0.0):
+    """EPISODE of one training that succeeds in its first corridors."""
+    flown = np.zeros(trials, EPISODE)
+    flown["seed"] = np.arange(trials)
+    flown["success"][:success] = True
+    flown["distance_m"] = np.where(flown["success"], 100.0, 40.0 + flown["seed"]) + offset_m
+    flown["events_per_step"] = 300.0
+    return flown
+
+
+def test_a_group_pools_its_trainings():
+    row = summarise_group(AT, "a", {0: flights(10), 1: flights(14)})
+    assert (row.trainings, row.flights, row.success.value) == ((0, 1), 40, 0.6)
+    assert row.wilson == pytest.approx((0.446, 0.737), abs=1e-3)
+    assert row.distance_m.value == pytest.approx(
+        np.mean([flights(10)["distance_m"], flights(14)["distance_m"]])
+    )
+
+
+def test_the_interval_of_success_holds_both_of_its_kinds():
+    same = summarise_group(AT, "a", {seed: flights(20) for seed in range(3)})
+    assert same.success.interval == (1.0, 1.0)
+    assert same.success_interval == same.wilson
+    apart = summarise_group(AT, "a", {0: flights(0), 1: flights(20), 2: flights(20)})
+    assert apart.success_interval[0] == apart.success.interval[0] < apart.wilson[0]
+
+
+def test_a_difference_is_taken_corridor_by_corridor():
+    row = summarise_group(AT, "a", {0: flights(10, offset_m=3.0)}, {5: flights(10), 6: flights(10)})
+    assert row.success_difference == (0.0, (0.0, 0.0))
+    assert row.distance_difference_m.value == pytest.approx(3.0)
+    assert row.distance_difference_m.interval == pytest.approx((3.0, 3.0))
+    worse = summarise_group(AT, "a", {0: flights(4)}, {0: flights(16)})
+    assert worse.success_difference.value == pytest.approx(-0.6)
+    assert worse.success_difference.interval[1] < 0
+
+
+def test_trainings_that_flew_other_corridors_are_refused():
+    other = flights(3)
+    other["seed"] += 1
+    with pytest.raises(ValueError, match=r"trainings \[0, 1\] must have flown the same corridors"):
+        summarise_group(AT, "a", {0: flights(3), 1: other})
+
+
+def test_the_table_has_a_column_for_each_group_and_says_what_failed():
+    rows = [summarise_group(AT, "a", {0: flights(10)})]
+    head, lines = matrix(rows, [AT, ("sparsity", "0.5")], ["a", "b"], {(*AT, "b"): "failed"})
+    assert markdown_table(head, lines, 2).splitlines() == [
+        "| Axis | Value | a | b |",
+        "| --- | --- | ---: | ---: |",
+        "| sparsity | 0.2 | 50 [30, 70] | failed |",
+        "| sparsity | 0.5 | - | - |",
+    ]
+
+
+def test_every_estimate_stands_beside_its_interval():
+    row = summarise_group(AT, "a", {0: flights(10)}, {0: flights(10, offset_m=1.0)})
+    text = details([row], "b")
+    low, high = row.distance_m.interval
+    assert f"| {row.distance_m.value:.1f} [{low:.1f}, {high:.1f}] |" in text
+    assert "| +0 [+0, +0] | -1.0 [-1.0, -1.0] | 300 | 0 |" in text
+
+
+def test_a_tracked_row_says_its_place_on_the_axis_where_that_is_a_number():
+    row = summarise_group(AT, "a", {0: flights(10)}, {0: flights(8)})
+    figures = check_metrics(metrics(row))
+    assert figures["sweep/value"] == 0.2
+    assert figures["eval/success_rate_low"] == row.success_interval[0]
+    assert figures["sweep/success_difference"] == pytest.approx(0.1)
+    word = dataclasses.replace(row, condition=("world", "poles"), success_difference=None)
+    assert not {"sweep/value", "sweep/success_difference"} & set(metrics(word))
+    single = summarise_group(AT, "a", {0: flights(1, trials=1)})
+    assert {"eval/distance_m_low", "sweep/middle_half_m_low"}.isdisjoint(metrics(single))
+
+
+def test_the_first_column_of_a_tracked_table_is_unique():
+    rows = [summarise_group(AT, group, {0: flights(10)}) for group in ("a", "b")]
+    first, *others = columns(rows).values()
+    assert len(set(first)) == 2
+    assert {len(values) for values in others} == {2}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "steps", "unit"),
+    [
+        ([25.0, 800.0], [25, 800], ""),
+        ([0.05, 0.4], [5, 40], "_percent"),
+        ([0.0, 0.125], [0, 125], "_permille"),
+    ],
+)
+def test_a_curve_has_the_axis_as_whole_steps_and_says_their_unit(numbers, steps, unit):
+    values = {str(number): number for number in numbers}
+    rows = [
+        summarise_group(("a", value), "g", {0: flights(won)})
+        for won, value in zip((5, 20), values, strict=True)
+    ]
+    curves = axis_curves("a", values, rows)
+    assert set(curves) == {f"sweep/a{unit}_success", f"sweep/a{unit}_distance_m"}
+    assert curves[f"sweep/a{unit}_success"] == dict(zip(steps, [0.25, 1.0], strict=True))
+
+
+def test_an_axis_too_fine_for_whole_steps_has_no_curve():
+    assert axis_curves("a", {"1e-05": 1e-5}, []) == {}

@@ -1,0 +1,219 @@
+import dataclasses
+import json
+
+import pytest
+
+from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
+from jobs.config.config import ConfigError
+from jobs.evaluation.sweep_plan import NOMINAL, find_entries, plan, read_entry, text, with_sensor
+from jobs.run.folder import open_run
+from models.policy.policy import MANIFEST
+from tests.jobs.evaluation.test_evaluate import save_untrained
+from tests.jobs.run.test_folder import small_config
+
+AXES = {
+    "sparsity": {"faults.sparsity": [0.0, 0.5]},
+    "rate": {"env.control_hz": [100, 200], "env.scene": ["poles_eval"]},
+}
+OTHER_CAMERA = {
+    "threshold_mismatch": 0.03,
+    "threshold_seed": 1,
+    "response": "lin_log",
+    "encoding": "linear8",
+}
+
+
+def sweep_config(tmp_path, trials=2, policies=("straight",), axes=AXES, **changes):
+    """A sweep of short flights."""
+    config = small_config(tmp_path, job="sweep", exp="robustness")
+    settings = dataclasses.replace(config.sweep, axes=axes, trials=trials, policies=list(policies), **changes)
+    return dataclasses.replace(config, sweep=settings, env={**config.env, "time_limit_s": 0.2})
+
+
+def save_training(path, group, seed, env_config, name="event_columns"):
+    """An untrained policy that says it is a training of `group`; returns the folder."""
+    save_untrained(path, env_config, name)
+    manifest = json.loads((path / MANIFEST).read_text())
+    (path / MANIFEST).write_text(json.dumps({**manifest, "exp": group, "seed": seed}))
+    return str(path)
+
+
+def planned(config, *agents):
+    return plan(config, [read_entry(agent) for agent in agents])
+
+
+def at(sweep, axis, value):
+    (cell,) = [cell for cell in sweep.cells if cell.label == (axis, value)]
+    return cell
+
+
+def test_axes_change_their_settings_alone_and_share_the_unchanged_cell(tmp_path):
+    config = sweep_config(tmp_path)
+    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    assert sweep.conditions == [
+        (NOMINAL, "poles_eval"), ("sparsity", "0"), ("sparsity", "0.5"), ("rate", "100"), ("rate", "200")
+    ]  # fmt: skip
+    usual = at(sweep, NOMINAL, "poles_eval")
+    assert usual.key == at(sweep, "sparsity", "0").key == at(sweep, "rate", "200").key
+    sparse = dataclasses.replace(usual.env.faults, sparsity=0.5)
+    assert at(sweep, "sparsity", "0.5").env == dataclasses.replace(usual.env, faults=sparse)
+    assert at(sweep, "rate", "100").env == dataclasses.replace(usual.env, control_hz=100.0)
+    assert len({cell.key for cell in sweep.cells}) == 3
+    assert all(cell.env.split == "eval" and cell.seeds == (0, 1) for cell in sweep.cells)
+
+
+def test_faults_change_no_accuracy_and_anything_else_does(tmp_path):
+    sweep = planned(sweep_config(tmp_path), "straight", "oracle")
+    usual, sparse, slow = (
+        {cell.simulation for cell in sweep.cells if cell.label == label}
+        for label in ((NOMINAL, "poles_eval"), ("sparsity", "0.5"), ("rate", "100"))
+    )
+    assert usual == sparse != slow
+    assert len(usual) == 1
+
+
+def test_another_policy_is_another_cell(tmp_path):
+    config = sweep_config(tmp_path)
+    one = save_training(tmp_path / "one", "a", 0, config.env_config())
+    keys = {planned(config, name).cells[0].key for name in ("straight", "oracle", one)}
+    manifest = json.loads((tmp_path / "one" / MANIFEST).read_text())
+    (tmp_path / "one" / MANIFEST).write_text(json.dumps({**manifest, "sha256": {}}))
+    assert len(keys | {planned(config, one).cells[0].key}) == 4
+
+
+def test_what_a_agent_does_not_see_makes_no_cell_of_its_own(tmp_path):
+    axes = {
+        **AXES,
+        "threshold": {"camera.contrast_threshold": [0.2, 0.4]},
+        "exactness": {"fidelity.samples": [1, 8]},
+    }
+    config = sweep_config(tmp_path, axes=axes)
+    agents = [
+        save_training(tmp_path / name, name, 0, config.env_config(), name) for name in ("rgb", "event_image")
+    ]
+    sweep = planned(config, "straight", *agents)
+    keys = {
+        group: {cell.label: cell.key for cell in sweep.cells if cell.entry.group == group}
+        for group in sweep.groups
+    }
+    assert {group: len(set(found.values())) for group, found in keys.items()} == {
+        "straight": 2,  # the rate alone
+        "rgb": 4,  # and what a picture shows
+        "event_image": 6,
+    }
+    assert keys["rgb"]["exactness", "8"] != keys["rgb"][NOMINAL, "poles_eval"]
+    errors = {cell.simulation for cell in sweep.cells if cell.label == ("threshold", "0.4")}
+    assert len(errors) == 1, "the condition is the same for all"
+
+
+def test_a_policy_flies_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
+    config = sweep_config(tmp_path)
+    trained = config.env_config(control_hz=100.0, camera=CameraConfig(memory="frame"))
+    agent = save_training(tmp_path / "policy", "a", 0, trained)
+    sweep = planned(config, agent, "straight")
+    assert sweep.differ == {agent: {"control_hz": (100.0, 200.0), "memory": ("frame", "reference")}}
+    own = sensor_settings(trained)
+    flown = {cell.label: sensor_settings(cell.env) for cell in sweep.cells if cell.entry.agent == agent}
+    assert flown[NOMINAL, "poles_eval"] == flown["sparsity", "0.5"] == flown["rate", "100"] == own
+    assert flown["rate", "200"] == {**own, "control_hz": 200.0}
+    ours = [cell.env for cell in sweep.cells if cell.entry.agent == "straight"]
+    assert {env.camera.memory for env in ours} == {"reference"}
+
+
+def test_an_own_sensor_that_an_axis_excludes_is_refused_with_both_named(tmp_path):
+    config = sweep_config(tmp_path, axes={"dead_time": {"camera.refractory_us": [0, 10]}})
+    agent = save_training(tmp_path / "policy", "a", 0, config.env_config(camera=CameraConfig(memory="frame")))
+    with pytest.raises(ConfigError, match=r"^sweep\.axes\.dead_time: .*refractory_us.* 10.*got 10$"):
+        planned(config, agent)
+
+
+def test_every_sensor_setting_of_a_manifest_reaches_the_simulation():
+    changed = {"luminance_floor": 1e-2, "max_events_per_pixel": 7, "contrast_threshold_off": 0.4}
+    fidelity = FidelityConfig(0.1, max_step_m=0.05, samples=3, cull_m=40.0)
+    usual, differ = sensor_settings(EnvConfig()), set()
+    held = EnvConfig(camera=CameraConfig(refractory_us=10))
+    for exclusive in ({"memory": "frame"}, {"refractory_us": 100}, {"excess": "carry"}):
+        camera = CameraConfig(32, 48, 60.0, 0.3, **OTHER_CAMERA, **changed, **exclusive)
+        other = EnvConfig(camera=camera, control_hz=50.0, speed_mps=5.0, fidelity=fidelity)
+        sensor = json.loads(json.dumps(sensor_settings(other)))
+        differ |= {name for name in usual if sensor[name] != usual[name]}
+        assert sensor_settings(with_sensor(EnvConfig(), sensor)) == sensor
+        assert sensor_settings(with_sensor(held, sensor)) == sensor
+    assert differ == set(usual)
+
+
+def test_policies_of_one_group_stand_together_by_their_training_seed(tmp_path):
+    config = sweep_config(tmp_path)
+    folder, env = open_run(config), config.env_config()
+    for place, group, seed in (("x", "b", 1), ("y", "a", 0), ("z", "b", 0)):
+        save_training(tmp_path / "pretrained" / place, group, seed, env)
+    named = sweep_config(tmp_path, policies=["pretrained", "oracle", "pretrained"])
+    entries = find_entries(named, folder, tmp_path / "pretrained")
+    assert [(entry.group, entry.training) for entry in entries] == [
+        ("b", 0),
+        ("b", 1),
+        ("a", 0),
+        ("oracle", None),
+    ]
+    assert plan(named, entries).groups == {"b": [0, 1], "a": [0], "oracle": [None]}
+
+
+def test_a_policy_without_an_experiment_is_of_the_group_of_its_kind(tmp_path):
+    agent = save_training(tmp_path / "policy", "x", 5, EnvConfig())
+    manifest = json.loads((tmp_path / "policy" / MANIFEST).read_text())
+    del manifest["exp"]
+    (tmp_path / "policy" / MANIFEST).write_text(json.dumps(manifest))
+    assert read_entry(agent).group == "event_columns"
+
+
+def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_path):
+    config = sweep_config(tmp_path)
+    folder = open_run(config)
+    path = save_training(tmp_path / "runs" / "trained" / "policy", "a", 0, config.env_config(), "bytestream")
+    for name in ("newest", path, path.removesuffix("/policy")):
+        (entry,) = find_entries(sweep_config(tmp_path, policies=[name]), folder)
+        assert entry.agent == path
+
+
+def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
+    config = sweep_config(tmp_path, policies=["one"])
+    path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env_config())
+    (entry,) = find_entries(config, open_run(config), tmp_path / "pretrained")
+    assert entry.agent == path
+
+
+def test_a_group_of_the_pretrained_folder_is_all_its_trainings_and_no_other_group(tmp_path):
+    config = sweep_config(tmp_path, policies=["a", "straight"])
+    for place, group, seed in (("a-s1", "a", 1), ("a-set-s0", "a-set", 0), ("a-s0", "a", 0)):
+        save_training(tmp_path / "pretrained" / place, group, seed, config.env_config())
+    entries = find_entries(config, open_run(config), tmp_path / "pretrained")
+    assert [(entry.group, entry.training) for entry in entries] == [("a", 0), ("a", 1), ("straight", None)]
+
+
+def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
+    folder = open_run(sweep_config(tmp_path))
+
+    def refusal(*names):
+        with pytest.raises(ConfigError) as refused:
+            find_entries(sweep_config(tmp_path, policies=names), folder, tmp_path / "none")
+        return str(refused.value)
+
+    assert refusal("pretrained").startswith("sweep.policies: 'pretrained' means the policies in ")
+    assert "train one (python -m platform.launch +exp=bytestream)" in refusal("pretrained")
+    assert refusal("pretrained").endswith("sweep.policies=[newest]")
+    assert refusal(str(tmp_path)).startswith("sweep.policies: must be 'pretrained', 'newest', ")
+    assert refusal(str(tmp_path)).endswith(f"got {str(tmp_path)!r}")
+    one, two = (save_training(tmp_path / name, "a", 0, EnvConfig(), kind) for name, kind in (
+        ("one", "event_columns"), ("two", "event_image")
+    ))  # fmt: skip
+    assert refusal(one, two).startswith("sweep.policies: two policies are a with training seed 0, got ")
+    (tmp_path / "one" / MANIFEST).write_text("{}")
+    assert "lacks ['name', 'seed', 'sensor']; train it anew" in refusal(one)
+
+
+@pytest.mark.parametrize(
+    ("value", "label"),
+    [(45, "45"), (0.05, "0.05"), (0.12345678, "0.12345678"), ("frame", "frame"), (None, "null")],
+)
+def test_a_value_is_told_from_every_other_by_its_label(value, label):
+    assert text(value) == label

@@ -1,0 +1,97 @@
+import json
+import shutil
+
+import pytest
+
+from jobs.run.checkpoints import SEAL, UNSEALED, damage, mend, seal
+from jobs.run.files import RunError
+
+
+def checkpoint(folder, number, content=b"weights"):
+    path = folder / "trial" / f"checkpoint_{number:06d}"
+    (path / "learner").mkdir(parents=True)
+    (path / "learner" / "state.pkl").write_bytes(content)
+    (path / "about.json").write_text(json.dumps({"number": number}))
+    seal(path)
+    return path
+
+
+def cut(path):
+    file = path / "learner" / "state.pkl"
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+def flip(path):
+    file = path / "learner" / "state.pkl"
+    content = bytearray(file.read_bytes())
+    content[3] ^= 1
+    file.write_bytes(content)
+
+
+HARM = {
+    "cut": (cut, "learner/state.pkl changed"),
+    "flip": (flip, "learner/state.pkl changed"),
+    "lost": (lambda path: (path / "about.json").unlink(), "about.json changed"),
+    "more": (lambda path: (path / "new").touch(), "new changed"),
+    "seal": (lambda path: (path / SEAL).write_text('{"about'), f"{SEAL} changed"),
+}
+
+
+@pytest.mark.parametrize("name", HARM)
+def test_a_checkpoint_is_whole_until_anything_in_it_changes(tmp_path, name):
+    harm, reason = HARM[name]
+    path = checkpoint(tmp_path, 1)
+    assert damage(path) is None
+    harm(path)
+    assert damage(path) == reason
+
+
+def test_a_checkpoint_without_a_seal_is_taken_only_where_none_has_one(tmp_path):
+    first, second, third = (checkpoint(tmp_path, number) for number in (1, 2, 3))
+    for path in (first, third):
+        (path / SEAL).unlink()
+    assert damage(third) == UNSEALED
+    cut(third)
+    assert "(not sealed), checkpoint_000002 takes its place" in mend(third)
+    assert damage(third) is None
+    for path in (second, third):
+        (path / SEAL).unlink()
+    assert mend(third) is None
+    shutil.rmtree(third)
+    assert "(missing), checkpoint_000002 takes its place" in mend(third)
+
+
+def test_a_checkpoint_of_which_nothing_is_there_is_damaged(tmp_path):
+    assert damage(tmp_path / "none") == "missing"
+    (tmp_path / "none").mkdir()
+    assert damage(tmp_path / "none") == "empty"
+
+
+def test_a_damaged_checkpoint_is_replaced_by_the_newest_whole_one(tmp_path):
+    paths = [checkpoint(tmp_path, number) for number in (1, 2, 3)]
+    assert mend(paths[2]) is None
+    cut(paths[2])
+    flip(paths[1])
+    assert mend(paths[2]).startswith(
+        "Checkpoint damaged (learner/state.pkl changed), checkpoint_000001 takes"
+    )
+    assert damage(paths[2]) is None
+    assert json.loads((paths[2] / "about.json").read_text()) == {"number": 1}
+    assert damage(paths[0]) is None
+
+
+def test_a_missing_checkpoint_is_replaced_by_one_that_is_newer(tmp_path):
+    newer = checkpoint(tmp_path, 5)
+    named = newer.with_name("checkpoint_000002")
+    assert "(missing), checkpoint_000005 takes its place" in mend(named)
+    assert json.loads((named / "about.json").read_text()) == {"number": 5}
+
+
+def test_without_a_whole_checkpoint_the_remedy_is_said(tmp_path):
+    paths = [checkpoint(tmp_path, number) for number in (1, 2)]
+    for path in paths:
+        cut(path)
+    with pytest.raises(
+        RunError, match=rf"no other is whole; delete {tmp_path}, and the same command trains anew"
+    ):
+        mend(paths[1])

@@ -1,0 +1,183 @@
+import dataclasses
+import errno
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from envs.config import settings_hash
+from jobs.config.config import Config, ConfigError
+from jobs.run import folder as runs
+from jobs.run.files import RunError, write_json
+from jobs.run.folder import UNNAMED, finish, finished, holding, latest_policies, open_run, run_name
+from jobs.run.provenance import REPOSITORY, git_commit
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    return small_config(tmp_path)
+
+
+def small_config(tmp_path: Path, **changes: object) -> Config:
+    """A checked configuration whose runs lie in a folder of the test's own."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+
+    from jobs.config.config import parse
+
+    conf = Path(__file__).resolve().parents[3] / "conf"
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        composed = compose("config", ["+exp=bytestream", "budget=smoke"])
+    values = OmegaConf.to_container(composed, resolve=True)
+    return parse({**values, "runs_dir": str(tmp_path / "runs"), **changes})
+
+
+def test_the_same_settings_find_the_same_folder_whatever_job_tracker_or_cluster(config):
+    elsewhere = dataclasses.replace(
+        config,
+        job="evaluate",
+        tracking=dataclasses.replace(config.tracking, uri="http://localhost:1"),
+        cluster=dataclasses.replace(config.cluster, num_cpus=7),
+    )
+    assert open_run(config).path == open_run(elsewhere).path
+    assert open_run(config).path.name.startswith("bytestream-smoke-s0-")
+
+
+def test_every_setting_that_changes_results_changes_the_folder(config):
+    names = {
+        run_name(config),
+        run_name(dataclasses.replace(config, seed=1)),
+        run_name(dataclasses.replace(config, algo=dataclasses.replace(config.algo, lr=1e-5))),
+        run_name(dataclasses.replace(config, faults=dataclasses.replace(config.faults, sparsity=0.1))),
+    }
+    assert len(names) == 4
+
+
+def test_resume_flies_the_stored_settings_under_the_job_that_is_asked_for(config):
+    stored = open_run(config)
+    other = dataclasses.replace(config, seed=5, job="evaluate", resume=str(stored.path))
+    run = open_run(other)
+    assert run.path == stored.path
+    assert (run.config.seed, run.config.job) == (config.seed, "evaluate")
+    assert run.config.algo == config.algo
+
+
+def test_resume_of_a_folder_without_a_run_says_what_a_run_folder_is(config, tmp_path):
+    with pytest.raises(ConfigError, match=r"resume: must be a run folder \(one that holds config.json\)"):
+        open_run(dataclasses.replace(config, resume=str(tmp_path)))
+
+
+def test_a_stage_is_finished_once_its_figures_are_written(config):
+    run = open_run(config)
+    assert finished(run, "train") is None
+    finish(run, "train", {"eval/success_rate": 0.5})
+    assert finished(run, "train") == {"eval/success_rate": 0.5}
+    assert finished(run, "collect") is None
+
+
+def test_a_marker_with_nan_is_refused_and_leaves_no_file(config):
+    run = open_run(config)
+    with pytest.raises(ValueError, match="JSON compliant"):
+        finish(run, "train", {"loss": float("nan")})
+    assert finished(run, "train") is None
+    assert not list(run.path.glob("stages/*"))
+
+
+def test_the_latest_policy_of_a_kind_is_the_one_finished_last(tmp_path):
+    assert latest_policies(tmp_path) == {}
+    for name, kind in (("a", "bytestream"), ("c", "bytestream"), ("b", "bytestream"), ("e", "rgb")):
+        write_json(tmp_path / name / "policy" / "policy.json", {"name": kind})
+        time.sleep(0.01)
+    (tmp_path / "d" / "policy").mkdir(parents=True)
+    newest = {"bytestream": tmp_path / "b" / "policy", "rgb": tmp_path / "e" / "policy"}
+    assert latest_policies(tmp_path) == newest
+
+
+def test_the_stored_configuration_is_readable_as_yaml_and_json(config):
+    import yaml
+
+    run = open_run(config)
+    assert yaml.safe_load((run.path / "config.yaml").read_text()) == json.loads(
+        (run.path / "config.json").read_text()
+    )
+
+
+def test_a_damaged_marker_is_named_with_its_remedy(config):
+    run = open_run(config)
+    finish(run, "train", {})
+    (run.path / "stages" / "train.json").write_text('{"fig')
+    with pytest.raises(
+        RunError, match=r"train\.json: must be JSON, got a damaged file .*; delete it, and the same"
+    ):
+        finished(run, "train")
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_part(config, monkeypatch):
+    run = open_run(config)
+    finish(run, "train", {"loss": 1.0})
+
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(runs.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        finish(run, "train", {"loss": 2.0})
+    assert finished(run, "train") == {"loss": 1.0}
+    assert [path.name for path in (run.path / "stages").iterdir()] == ["train.json"]
+
+
+def test_one_process_works_in_a_run_folder_and_lets_go_when_it_is_killed(config):
+    run = open_run(config)
+    code = f"""
+import sys
+from pathlib import Path
+from jobs.run.folder import Run, holding
+with holding(Run(Path({str(run.path)!r}), None)):
+    print("in", flush=True)
+    sys.stdin.read()
+"""
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=REPOSITORY) as other:
+        other.stdout.readline()
+        with (
+            pytest.raises(RunError, match=rf"process {other.pid} of .* works there; wait until"),
+            holding(run),
+        ):
+            pass
+        other.kill()
+    with holding(run):
+        pass
+
+
+def test_without_git_the_commit_is_unknown(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert git_commit() == "unknown"
+
+
+def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(config):
+    run = open_run(config)
+    stored = json.loads((run.path / "config.json").read_text())
+    del stored["collect"]["recordings"], stored["train"]["conditions"]
+    (run.path / "config.json").write_text(json.dumps(stored))
+    assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
+    settings = {name: value for name, value in stored.items() if name not in UNNAMED}
+    assert run.path.name.endswith(settings_hash(settings)[:8])
+    noisy = dataclasses.replace(config.train, conditions=[{"faults.sparsity": 0.5}])
+    assert run_name(dataclasses.replace(config, train=noisy)) != run.path.name
+
+
+def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):
+    run = open_run(config)
+    stored = json.loads((run.path / "config.json").read_text())
+    del stored["probe"]
+    stored["sweep"] = {"axes": "of another version"}
+    (run.path / "config.json").write_text(json.dumps(stored))
+    again = open_run(dataclasses.replace(config, resume=str(run.path), seed=7))
+    assert again.config == dataclasses.replace(config, resume=str(run.path))
+    del stored["algo"]
+    (run.path / "config.json").write_text(json.dumps(stored))
+    with pytest.raises(ConfigError, match="algo: must be a group of settings"):
+        open_run(dataclasses.replace(config, resume=str(run.path)))

@@ -1,0 +1,263 @@
+import multiprocessing
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+
+import pydantic
+import pytest
+import ray
+from ray.tune import TuneError
+
+from jobs.config.config import ConfigError
+from jobs.config.schema import ClusterConfig
+from jobs.run import ray_cluster as joining
+from jobs.run.ray_cluster import (
+    ClusterError,
+    check_mode,
+    check_private,
+    holds,
+    make_token,
+    one_at_a_time,
+    storage,
+    use_token,
+)
+
+ROOT = Path(__file__).resolve().parents[3]
+LOCAL = ClusterConfig(name="local", address=None, num_cpus=1, storage=None)
+JOINED = ClusterConfig(name="ray", address="127.0.0.1:1", num_cpus=None, storage=None)
+
+
+def cluster(place):
+    return ClusterConfig(name="ray", address="auto", num_cpus=None, storage=place)
+
+
+def test_what_nodes_write_lies_in_the_run_folder_or_under_its_name_in_the_storage(tmp_path):
+    folder = tmp_path / "runs" / "a-smoke-s0-1" / "train"
+    assert storage(cluster(None), folder) == str(folder)
+    assert storage(cluster("/nfs/evade/"), folder) == "/nfs/evade/a-smoke-s0-1/train"
+    assert storage(cluster("s3://bucket/evade"), folder) == "s3://bucket/evade/a-smoke-s0-1/train"
+
+
+def test_a_storage_that_other_machines_would_look_for_elsewhere_is_refused():
+    with pytest.raises(pydantic.ValidationError, match="must be an absolute folder"):
+        cluster("checkpoints")
+
+
+def test_a_folder_is_searched_by_its_path_and_by_its_address(tmp_path):
+    (tmp_path / "experiment_state-1.json").touch()
+    for place in (str(tmp_path), tmp_path.as_uri()):
+        assert holds(place, "experiment_state-")
+        assert not holds(place, "tuner")
+        assert not holds(f"{place}/none", "experiment_state-")
+
+
+def start(results, name):
+    with one_at_a_time():
+        results.put((name, "in"))
+        time.sleep(0.3)
+        results.put((name, "out"))
+
+
+def test_two_processes_start_ray_one_after_the_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    context = multiprocessing.get_context("fork")
+    results = context.Queue()
+    processes = [context.Process(target=start, args=(results, name)) for name in "ab"]
+    for process in processes:
+        process.start()
+    order = [results.get(timeout=20) for _ in range(4)]
+    for process in processes:
+        process.join()
+    assert [place for _, place in order] == ["in", "out", "in", "out"]
+    assert order[0][0] == order[1][0] != order[2][0] == order[3][0]
+
+
+def test_a_process_that_dies_lets_go(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    context = multiprocessing.get_context("fork")
+    process = context.Process(target=start, args=(context.Queue(), "a"))
+    process.start()
+    time.sleep(0.1)
+    process.kill()
+    process.join()
+    with one_at_a_time():
+        pass
+
+
+@pytest.fixture
+def no_token(monkeypatch):
+    """An environment that names no token; what a test adds to it is undone."""
+    for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_AUTH_MODE"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+
+
+def test_the_token_of_a_local_ray_can_be_read_by_its_owner_alone(tmp_path, monkeypatch, no_token):
+    monkeypatch.setenv("HOME", "/nowhere")
+    file = tmp_path / ".ray" / "token"
+    use_token(file)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
+    assert list(file.parent.iterdir()) == [file]
+    assert os.environ["RAY_AUTH_TOKEN_PATH"] == str(file)
+    token = file.read_text()
+    use_token(tmp_path / "other")
+    assert file.read_text() == token
+    assert len(token) == 64
+    assert not (tmp_path / "other").exists()
+
+
+def test_who_makes_a_token_at_the_same_time_finds_the_same_one(tmp_path):
+    gate = Barrier(8)
+
+    def make(file: Path) -> str:
+        gate.wait()
+        make_token(file)
+        return file.read_text()
+
+    for number in range(20):
+        file = tmp_path / str(number) / "token"
+        with ThreadPoolExecutor(8) as pool:
+            tokens = set(pool.map(make, [file] * 8))
+        assert len(tokens) == 1
+        assert len(tokens.pop()) == 64
+        assert list(file.parent.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620])
+@pytest.mark.parametrize("is_given", [True, False])
+def test_a_token_that_others_can_read_is_refused_with_the_remedy(
+    tmp_path, monkeypatch, no_token, mode, is_given
+):
+    file = tmp_path / "token"
+    file.write_text("x" * 64)
+    file.chmod(mode)
+    if is_given:
+        monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(file))
+    with pytest.raises(ConfigError, match=rf"got mode {mode:04o} .* run `chmod 600 {file}`"):
+        use_token(tmp_path / "other" if is_given else file)
+    file.chmod(0o600)
+    use_token(file)
+
+
+def test_a_token_that_is_missing_or_of_another_user_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match=r"RAY_AUTH_TOKEN_PATH: .* cannot be read: No such file"):
+        check_private(tmp_path / "token")
+    make_token(tmp_path / "token")
+    owner = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    with pytest.raises(ConfigError, match=f"mode 0600 of user {owner}"):
+        check_private(tmp_path / "token")
+
+
+@pytest.mark.parametrize("mode", ["disabled", "", "Token"])
+def test_the_token_of_a_local_ray_cannot_be_turned_off(monkeypatch, mode):
+    monkeypatch.setenv("RAY_AUTH_MODE", mode)
+    with pytest.raises(ConfigError, match=rf"RAY_AUTH_MODE: must be token, .* got '{mode}'; unset it"):
+        check_mode(LOCAL)
+
+
+def test_a_cluster_is_joined_without_a_token_only_when_that_is_said(monkeypatch, no_token):
+    check_mode(LOCAL)
+    with pytest.raises(ConfigError, match=r"RAY_AUTH_MODE: must be token or disabled .* got None; set it to"):
+        check_mode(JOINED)
+    for mode in ("token", "disabled"):
+        monkeypatch.setenv("RAY_AUTH_MODE", mode)
+        check_mode(JOINED)
+
+
+# Serves until its standard input ends; the first line it prints is the address.
+HEAD = """
+import sys
+from pathlib import Path
+from jobs.run.ray_cluster import start_ray
+from jobs.config.schema import ClusterConfig
+start_ray(ClusterConfig(name="local", address=None, num_cpus=1, storage=None), Path(sys.argv[1]))
+import ray
+@ray.remote
+def whoami():
+    import os
+    return os.environ["RAY_AUTH_MODE"]
+assert ray.get(whoami.remote()) == "token"
+print(ray.get_runtime_context().gcs_address, flush=True)
+sys.stdin.read()
+"""
+CLIENT = """
+import sys
+import ray
+ray.init(address=sys.argv[1], log_to_driver=False, logging_level="ERROR")
+print("joined")
+"""
+
+
+def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_token):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # of joining; Ray's own 20 take as many seconds
+
+    def join(**more: str) -> str:
+        command = [sys.executable, "-c", CLIENT, address]
+        client = subprocess.run(
+            command, env=environment | more, capture_output=True, text=True, timeout=100, check=False
+        )
+        return client.stdout.strip() or client.stderr
+
+    command = [sys.executable, "-c", HEAD, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as head:
+        address = head.stdout.readline().strip()
+        token = (tmp_path / ".ray" / "token").read_text()
+        assert "joined" not in (without := join(RAY_AUTH_MODE="disabled"))
+        assert "joined" not in (wrong := join(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64))
+        assert join(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=token) == "joined"
+        head.stdin.close()
+        assert head.wait(60) == 0
+    assert "uthenticat" in without
+    assert "uthenticat" in wrong
+
+
+@pytest.mark.parametrize("failures", [0, 1, joining.STARTS])
+def test_a_busy_machine_gets_more_than_one_chance_to_start_ray(monkeypatch, failures):
+    calls = []
+
+    def init(**settings):
+        calls.append(settings)
+        if calls.count(settings) <= failures:
+            raise Exception("The current node timed out during startup. ...")
+
+    monkeypatch.setattr(ray, "init", init)
+    monkeypatch.setattr(ray, "shutdown", lambda: calls.append("shutdown"))
+    if failures < joining.STARTS:
+        joining._start_local({"num_cpus": 1})
+        assert calls == [{"address": "local", "include_dashboard": False, "num_cpus": 1}] + (
+            ["shutdown", calls[0]] * failures
+        )
+    else:
+        with pytest.raises(ClusterError, match="the machine is too busy"):
+            joining._start_local({"num_cpus": 1})
+
+
+def test_another_error_of_ray_is_raised_as_it_is(monkeypatch):
+    def init(**settings):
+        raise ValueError("no such setting")
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ValueError, match="no such setting"):
+        joining._start_local({})
+
+
+def test_what_a_callback_raises_comes_out_of_tune_as_it_is():
+    class Tuner:
+        def fit(self):
+            try:
+                raise ClusterError("the reason")
+            except ClusterError:
+                raise TuneError("Traceback ...")  # noqa: B904
+
+    with pytest.raises(ClusterError, match="the reason"):
+        joining.fit(Tuner())

@@ -1,0 +1,36 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+HANG = """
+import time
+from jobs.run.watchdog import ending_after
+with ending_after(30.0):
+    pass
+with ending_after({limit}):
+    {block}
+print("done")
+"""
+
+
+def run(limit, block):
+    code = HANG.format(limit=limit, block=block)
+    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    "block", ["time.sleep(50)", "max(iter(int, 1))"]
+)  # the second never lets go of the interpreter
+def test_a_process_that_hangs_is_ended_and_says_where(block):
+    done = run(0.5, block)
+    assert done.returncode == 1
+    assert "Timeout" in done.stderr
+    assert 'File "<string>", line 7' in done.stderr
+    assert "done" not in done.stdout
+
+
+def test_what_is_in_time_goes_on():
+    assert run(30.0, "pass").stdout == "done\n"

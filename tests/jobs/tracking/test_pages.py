@@ -1,0 +1,241 @@
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jobs import pipeline
+from jobs.evaluation.sweep import run as run_sweep
+from jobs.rollout import scheduler as flying
+from jobs.rollout.episodes import EPISODE
+from jobs.run.folder import Run, finish, open_run
+from jobs.run.provenance import REPOSITORY
+from jobs.tracking.pages import (
+    MAX_CHARACTERS,
+    PAGE_WIDTH,
+    Page,
+    chart_view,
+    experiment_note,
+    packed_view,
+    preview,
+    run_address,
+    run_note,
+    view_address,
+)
+from jobs.tracking.store import dashboard_command, server_command
+from jobs.tracking.tracker import open_store
+from tests.jobs.evaluation.test_sweep_plan import save_training, sweep_config
+from tests.support.browser import CHROMIUM, Browser, served
+
+PAGE = Page(
+    experiment_id="1",
+    run_id="abc",
+    params={"exp": "robustness", "budget": "short", "seed": "0", "fidelity.tolerance": "0.05"},
+    tags={"job": "sweep", "commit": "c0ffee", "host": "box", "cpus": "2", "python": "3.11"},
+    metrics={"eval/success_rate": 0.9, "eval/success_rate_low": 0.8, "eval/success_rate_high": 0.95},
+    files=["sweep/crashes/a.mp4", "page/sweep/world.png", "page/sweep/control_hz.png"],
+    tables={"sweep/table.md": "| a |"},
+    views={"charts-abc": "Sweep abc: charts"},
+)
+
+
+def test_a_runs_page_begins_with_what_it_is_and_shows_figures_before_tables():
+    note = run_note(PAGE)
+    order = (
+        "**Policies at other rates", "90% [80%, 95%]", "charts-abc", "sweep/crashes/a.mp4",
+        "page/sweep/control_hz.png&run_uuid=abc", "page/sweep/world.png", "`c0ffee`", "0.05", "| a |",
+    )  # fmt: skip
+    assert sorted(map(note.index, order)) == list(map(note.index, order))
+
+
+def test_a_table_that_would_be_cut_is_linked_instead():
+    note = run_note(dataclasses.replace(PAGE, tables={"big.md": "x" * MAX_CHARACTERS, "small.md": "| b |"}))
+    assert len(note) < MAX_CHARACTERS
+    assert "Table: [big.md]" in note
+    assert note.endswith("| b |")
+
+
+def test_the_experiments_first_line_leads_to_the_newest_sweep():
+    views = {
+        "results": "Results",
+        "charts-1": "Sweep 1: charts",
+        "charts-2": "Sweep 2: charts",
+        "table-2": "T",
+    }
+    tags = {
+        f"mlflow.sharedViewState.{key}": packed_view(name, chart_view("", []), now_ms)
+        for now_ms, (key, name) in enumerate(views.items())
+    }
+    first = experiment_note("1", tags).splitlines()[0]
+    assert view_address("1", "results") in first
+    assert view_address("1", "charts-2") in first
+    assert "charts-1" not in first
+
+
+@pytest.mark.parametrize(("given", "kept"), [((2000, 500), (PAGE_WIDTH, 215)), ((400, 300), (400, 300))])
+def test_pictures_of_a_page_are_narrowed_and_never_enlarged(tmp_path, given, kept):
+    from PIL import Image
+
+    Image.new("RGBA", given).save(tmp_path / "large.png")
+    assert preview((tmp_path / "large.png").read_bytes()).size == kept
+
+
+class CrashingTuner:
+    """Tune without flights: the policy hits something everywhere, a bound nowhere."""
+
+    def __init__(self, folder, missing, measured, keep):
+        self.missing, self.keep = missing, keep
+
+    def fit(self):
+        for cell in self.missing:
+            rows = np.zeros(len(cell.seeds), EPISODE)
+            rows["seed"], rows["distance_m"] = cell.seeds, 50.0
+            rows["collision"] = cell.entry.training is not None
+            rows["success"] = ~rows["collision"]
+            result = {"key": cell.key, "label": list(cell.label), "simulation": cell.simulation}
+            result |= {"accuracy": {"event_error": 0.01, "renders_per_step": 3.0}, "encoder": {}}
+            self.keep.on_trial_result(1, [], None, {**result, "episodes": rows.tolist()})
+
+
+def evaluated_training(config) -> Run:
+    """A pipeline whose training is done, evaluated and registered by its job."""
+    evaluation = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"])
+    config = dataclasses.replace(config, job="pipeline", exp="bytestream", evaluate=evaluation)
+    folder = open_run(config)
+    save_training(folder.policy, "bytestream", 0, config.env_config(), "bytestream")
+    for stage in ("collect", "pretrain", "train"):
+        finish(folder, stage, {"train/success_rate": 0.5} if stage == "train" else {})
+    pipeline.run(config)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """A store with an evaluated training and a sweep; the addresses of their pages by name."""
+    place = tmp_path_factory.mktemp("dashboard")
+    axes = {"control_hz": {"env.control_hz": [100, 200]}, "sparsity": {"faults.sparsity": [0.0, 0.5]}}
+    config = sweep_config(place, policies=["straight"], reference="straight", axes=axes)
+    folder = evaluated_training(config)
+    settings = dataclasses.replace(config.sweep, policies=[str(folder.policy), "straight"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flying, "_tuner", CrashingTuner)
+        patch.setattr(flying, "start_ray", lambda *given: None)
+        run_sweep(dataclasses.replace(config, sweep=settings))
+    uri = f"sqlite:///{place / 'mlflow.db'}"
+    client, experiment = open_store(uri, config.tracking.experiment)
+    (training,) = client.search_runs([experiment], "tags.kind = 'run'")
+    (sweep,) = client.search_runs([experiment], "tags.kind = 'sweep'")
+    films = [file.path for file in client.list_artifacts(sweep.info.run_id, "sweep/crashes")]
+    return uri, {
+        "runs": view_address(experiment, "results"),
+        "training": run_address(experiment, training.info.run_id),
+        "flight": run_address(experiment, training.info.run_id, "eval/episode.mp4"),
+        "sweep": run_address(experiment, sweep.info.run_id),
+        "charts": view_address(experiment, f"charts-{sweep.info.run_id}"),
+        "crash": run_address(experiment, sweep.info.run_id, films[0]),
+        "model": "#/models/evade-bytestream_4k/versions/1?workflowType=machine_learning",
+    }
+
+
+@pytest.fixture(scope="module")
+def pages(store, tmp_path_factory):
+    """Opens a page by its name, in one browser."""
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium: apt-get install --no-install-recommends chromium")
+    uri, addresses = store
+    with served(uri, Path(sys.executable).parent) as address:
+        browser = Browser(tmp_path_factory.mktemp("profile"))
+        try:
+            yield browser, {name: f"{address}/{place}" for name, place in addresses.items()}
+        finally:
+            browser.close()
+
+
+browsed = pytest.mark.slow, pytest.mark.timeout(900)
+pictures_shown = (
+    "[...document.images].filter(i => i.src.includes('get-artifact') && i.naturalWidth > 0).length"
+)
+
+
+def in_browser(test):
+    """Marks of a test that opens pages: it takes a minute or more."""
+    for mark in browsed:
+        test = mark(test)
+    return test
+
+
+@in_browser
+def test_the_experiment_says_what_it_is_and_shows_results_by_run(pages):
+    browser, at = pages
+    browser.open(
+        at["runs"], "Evade: policies that fly by the events", "Results", "Learning curves", "Sweeps",
+        "bytestream-smoke-s0-", "eval/success_rate", "eval/distance_m", "sim/event_error",
+    )  # fmt: skip
+
+
+@in_browser
+def test_a_trainings_page_shows_its_figures_settings_and_origin(pages):
+    browser, at = pages
+    browser.open(
+        at["training"], "From nothing to an evaluated policy", "success in held-out corridors", "Commit",
+        "Event error asked: at most 0.05; achieved:", "policy stochastic", "camera.contrast_threshold",
+        "host", "evade-bytestream_4k",
+    )  # fmt: skip
+    assert browser.wait(f"{pictures_shown} >= 1", "the ways flown")
+
+
+@in_browser
+def test_a_sweeps_page_shows_its_report_figures_first_and_its_children_by_condition(pages):
+    browser, at = pages
+    text = browser.open(
+        at["sweep"], "Policies at other rates and thresholds", "charts", "sweep/control_hz.png",
+        "sweep/sparsity.png", "Success [%] with 95 % intervals", "control_hz=100", "Child runs",
+    )  # fmt: skip
+    assert text.index("sweep/control_hz.png") < text.index("Success [%] with 95 % intervals")
+    assert browser.wait(f"{pictures_shown} >= 3", "a picture for each axis, and the contacts")
+
+
+@in_browser
+def test_charts_show_each_group_over_each_axis(pages):
+    browser, at = pages
+    browser.open(
+        at["charts"], "sweep/control_hz_success", "sweep/sparsity_percent_success", "2 matching runs"
+    )
+    browser.shows("straight")
+
+
+@in_browser
+def test_the_registered_model_shows_its_signature(pages):
+    browser, at = pages
+    browser.open(
+        at["model"], "evade-bytestream_4k", "Version 1", "events t [us], x, y, p", "eval/success_rate"
+    )
+    browser.click("Inputs (4)")
+    browser.click("Outputs (5)")
+    browser.shows("t (required)", "p (required)", "long", "action", "forward", "left", "right", "float")
+
+
+@in_browser
+@pytest.mark.parametrize("name", ["flight", "crash"])
+def test_films_play_on_the_artifacts_page(pages, name):
+    browser, at = pages
+    browser.open(at[name], ".mp4")
+    assert browser.wait("document.querySelector('video')?.videoWidth > 0", "the film")
+
+
+def test_the_store_of_the_repository_is_served_by_make_and_any_by_the_server_itself():
+    own = f"sqlite:///{REPOSITORY / 'mlflow.db'}"
+    assert dashboard_command(own) == "make mlflow"
+    for uri in (own, "sqlite:////elsewhere/m.db"):
+        words = server_command(uri).split()
+        assert words[words.index("mlflow") : words.index("mlflow") + 2] == ["mlflow", "server"]
+        assert words[-1] == uri
+    assert dashboard_command("sqlite:////elsewhere/m.db") == server_command("sqlite:////elsewhere/m.db")
+
+
+def test_a_server_that_ends_is_said_at_once(tmp_path):
+    (tmp_path / "mlflow").write_text("#!/bin/sh\nexit 3\n")
+    (tmp_path / "mlflow").chmod(0o755)
+    with pytest.raises(RuntimeError, match="ended with status 3"), served("sqlite:///x.db", tmp_path):
+        pass

@@ -1,0 +1,155 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from envs.config import EnvConfig, FaultsConfig
+from envs.corridor import CorridorEnv
+from envs.recordings import read_recording
+from jobs.config.config import ConfigError
+from jobs.rollout.agents import PolicyAgent
+from jobs.run.folder import finish, locate_run, open_run
+from jobs.training import collect
+from jobs.training.collect import FLIGHT_GAP_US, check_policy, record
+from tests.jobs.evaluation.test_evaluate import save_untrained
+from tests.jobs.run.test_folder import small_config
+
+
+def flights(**fields):
+    return [(EnvConfig(observation="events", **fields), 900)]
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return record(flights(), 0, lambda count: None)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(recording):
+    assert record(flights(), 0, lambda count: None).events.tobytes() == recording.events.tobytes()
+    assert record(flights(), 1, lambda count: None).events.tobytes() != recording.events.tobytes()
+
+
+def test_another_seed_flies_other_corridors(monkeypatch):
+    seen = []
+
+    def look(env, agent, started, most_steps):
+        seen.append(env.scene.obstacles.tobytes())
+        return [env.events], [5000]
+
+    monkeypatch.setattr(collect, "fly_once", look)
+    for seed in (0, 1):
+        record([(EnvConfig(observation="events"), 3)], seed, lambda count: None)
+    assert len(set(seen)) == len(seen) == 6
+
+
+def test_every_event_lies_in_a_step_and_no_step_spans_two_flights(recording):
+    start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    assert len(start) == 900
+    assert np.all(end > start)
+    same = flight[1:] == flight[:-1]
+    assert np.all(start[1:][same] == end[:-1][same])
+    assert np.all(start[1:][~same] == end[:-1][~same] + FLIGHT_GAP_US)
+    step = np.searchsorted(start, recording.t_us, side="left") - 1
+    assert np.all(recording.t_us <= end[step])
+
+
+def test_events_are_in_time_order_and_on_the_sensor(recording):
+    assert np.all(np.diff(recording.t_us) >= 0)
+    assert recording.events["x"].max() < 64
+    assert len(recording.events) > 900 * 50
+
+
+def test_splits_share_no_flight(recording):
+    other = record(flights(split="validation"), 0, lambda count: None)
+    assert other.events.tobytes() != recording.events.tobytes()
+
+
+def test_the_facts_name_sensor_scenes_and_faults():
+    about = record(flights(faults=FaultsConfig(sparsity=0.5)), 4, lambda count: None).about
+    assert about["sensor"]["contrast_threshold"] == 0.2
+    assert about["scenes"] == ["poles"]
+    assert about["faults"][0]["sparsity"] == 0.5
+    assert about["seed"] == 4
+
+
+def test_a_resumed_job_works_with_the_stored_settings(tmp_path):
+    stored = open_run(small_config(tmp_path))
+    collect.run(dataclasses.replace(small_config(tmp_path), seed=99, resume=str(stored.path)))
+    assert read_recording(stored.data / "train.h5").about["seed"] == stored.config.seed
+
+
+@pytest.fixture(scope="module", params=["bytestream", "event_image", "rgb"])
+def policy(request, tmp_path_factory):
+    return save_untrained(tmp_path_factory.mktemp("flown") / "policy", name=request.param)
+
+
+def test_a_policy_flies_its_share_of_the_steps_in_corridors_of_its_own(policy, monkeypatch):
+    flown, corridors, step = {True: 0, False: 0}, {True: set(), False: set()}, CorridorEnv.step
+    of_policy = None
+
+    def fly(env, agent, started, most_steps):
+        nonlocal of_policy
+        of_policy = isinstance(agent, PolicyAgent)
+        return fly_once(env, agent, started, most_steps)
+
+    def count(env, action):
+        flown[of_policy] += 1
+        corridors[of_policy].add(env.scene.obstacles.tobytes())
+        return step(env, action)
+
+    fly_once = collect.fly_once
+    monkeypatch.setattr(collect, "fly_once", fly)
+    monkeypatch.setattr(CorridorEnv, "step", count)
+    mixed = record(flights(), 0, lambda count: None, policy, 1 / 3)
+    assert flown == {True: 300, False: 600}
+    assert not corridors[True] & corridors[False]
+    assert mixed.about["policy"] == str(policy)
+    assert mixed.about["policy_share"] == 1 / 3
+    assert len(mixed.index["step_t_us"]) == 900
+    assert np.all(np.diff(mixed.t_us) >= 0)
+
+
+def test_the_random_flights_are_those_of_a_recording_without_a_policy(recording, policy):
+    mixed = record(flights(), 0, lambda count: None, policy, 0.5)
+    first = record([(EnvConfig(observation="events"), 450)], 0, lambda count: None).events
+    np.testing.assert_array_equal(mixed.events[: len(first)], first)
+    assert (recording.about["policy"], recording.about["policy_share"]) == (None, 0.0)
+
+
+def test_a_policy_draws_its_actions_and_the_same_seed_gives_the_same_bytes(policy):
+    one, again, other = (record(flights(), seed, lambda count: None, policy, 1.0) for seed in (0, 0, 1))
+    assert one.events.tobytes() == again.events.tobytes() != other.events.tobytes()
+
+
+def test_flights_of_a_policy_that_sees_pictures_are_recorded_with_their_events(tmp_path):
+    rgb = save_untrained(tmp_path, name="rgb")
+    flown = record([(EnvConfig(), 40)], 0, lambda count: None, rgb, 1.0)
+    steps = np.unique(np.searchsorted(flown.index["step_t_us"], flown.t_us))
+    assert len(steps) > 30, "there are events in nearly every step"
+
+
+def collecting(tmp_path, policy):
+    config = small_config(tmp_path)
+    settings = dataclasses.replace(config.collect, policy=str(policy), num_steps=60, num_validation_steps=30)
+    return dataclasses.replace(config, collect=settings)
+
+
+def test_a_path_without_a_policy_or_one_of_another_sensor_is_refused_before_anything_is_made(tmp_path):
+    other = save_untrained(tmp_path / "other", EnvConfig(control_hz=100.0))
+    for path, words in ((tmp_path, "a run folder or a policy folder"), (other, "control_hz = 200.0 instead")):
+        with pytest.raises(ConfigError, match=f"collect.policy: .*{words}"):
+            collect.run(collecting(tmp_path, path))
+    assert not (tmp_path / "runs").exists()
+
+
+def test_both_recordings_of_a_run_hold_flights_of_the_policy_and_it_is_not_asked_for_again(tmp_path):
+    policy = save_untrained(tmp_path / "trained" / "policy")
+    config = collecting(tmp_path, policy.parent)  # by its run folder
+    collect.run(config)
+    folder = open_run(config)
+    for split in ("train", "validation"):
+        about = read_recording(folder.data / f"{split}.h5").about
+        assert (about["policy"], about["policy_share"]) == (str(policy), 0.5)
+    (policy / "policy.json").unlink()
+    assert check_policy(locate_run(config)) is None
+    assert finish(folder, "collect", {}) == collect.run(config)

@@ -1,0 +1,252 @@
+import itertools
+import math
+import pickle
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from ray.rllib.connectors.connector_v2 import ConnectorV2
+from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+
+from jobs.rollout.drift import FIGURES, drift_figures
+from jobs.training.env_runner import FlightError, PlainEnvRunner
+from jobs.training.ppo import build_ppo
+from models.encoder.weights import load_encoder
+from models.kinds import KINDS
+from models.policy.features import push_features
+from tests.jobs.training.test_train import SHORT, make_config, write_encoder
+
+
+class StackFeatures(ConnectorV2):
+    """RLlib's own way: a connector that replaces each newest observation by a stack of features."""
+
+    def __init__(self, space):
+        self.space = space
+        super().__init__()
+
+    def recompute_output_observation_space(self, input_observation_space, input_action_space):
+        return self.space
+
+    def __call__(self, *, rl_module, batch, episodes, **kwargs):
+        features = rl_module.features(np.stack([episode.get_observations(-1) for episode in episodes]))
+        first = np.array([episode.t == 0 for episode in episodes])
+        stacks = np.zeros((len(episodes), *self.space.shape), self.space.dtype)
+        for row, episode in enumerate(episodes):
+            if not first[row]:
+                stacks[row] = episode.get_observations(-2)
+        for episode, stacked in zip(episodes, push_features(stacks, features, first), strict=True):
+            episode.observation_space = self.space
+            episode.set_observations(at_indices=-1, new_data=stacked)
+        return batch
+
+
+def make_runners(name, folder, *overrides):
+    """Ours, and RLlib's with the connector; both with larger logits, so that actions differ."""
+    config = make_config(*SHORT, f"model={name}", "algo.num_envs_per_env_runner=3", *overrides)
+    ppo = build_ppo(config, write_encoder(folder, config) if KINDS[name].encoder else None)
+    space = ppo.rl_module_spec.observation_space
+    theirs = ppo.copy(copy_frozen=False).env_runners(
+        env_runner_cls=SingleAgentEnvRunner,
+        env_to_module_connector=lambda env, spaces, device: StackFeatures(space),
+    )
+    runners = PlainEnvRunner(config=ppo, worker_index=0), SingleAgentEnvRunner(config=theirs, worker_index=0)
+    for runner in runners:
+        for value in runner.module.pi.parameters():
+            value.data.mul_(20.0)
+    return runners
+
+
+def samples_of(runner, sizes):
+    torch.manual_seed(0)
+    return [runner.sample(num_timesteps=size) for size in sizes]
+
+
+@pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_set", "event_image", "rgb"])
+def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
+    ours, theirs = make_runners(name, tmp_path)
+    for mine, other in zip(*(samples_of(runner, (40, 1, 17, 64)) for runner in (ours, theirs)), strict=True):
+        assert [len(chunk) for chunk in mine] == [len(chunk) for chunk in other]
+        for one, two in zip(mine, other, strict=True):
+            for get in ("get_observations", "get_actions", "get_rewards"):
+                found, expected = np.asarray(getattr(one, get)()), np.asarray(getattr(two, get)())
+                np.testing.assert_array_equal(found, expected, err_msg=get)
+            for key in ("action_logp", "action_dist_inputs"):
+                found, expected = (chunk.get_extra_model_outputs(key) for chunk in (one, two))
+                np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+            assert one.get_infos() == two.get_infos()
+            assert (one.is_terminated, one.is_truncated) == (two.is_terminated, two.is_truncated)
+            assert (one.t_started, one.t) == (two.t_started, two.t)
+            one.validate()
+    actions = np.concatenate([chunk.get_actions() for chunk in mine])
+    assert len(set(actions)) == 3
+    for runner in (ours, theirs):
+        runner.stop()
+
+
+def test_pieces_of_a_flight_share_its_name_and_follow_each_other(tmp_path):
+    ours, theirs = make_runners("event_columns", tmp_path)
+    theirs.stop()
+    flights = {}
+    for chunk in (chunk for sample in samples_of(ours, (10, 10, 30)) for chunk in sample):
+        flights.setdefault(chunk.id_, []).append(chunk)
+    assert max(map(len, flights.values())) >= 2
+    for pieces in flights.values():
+        assert [piece.t_started for piece in pieces] == [0, *(piece.t for piece in pieces[:-1])]
+        assert not any(piece.is_done for piece in pieces[:-1])
+        for before, after in itertools.pairwise(pieces):
+            np.testing.assert_array_equal(before.get_observations(-1), after.get_observations(0))
+    metrics = ours.get_metrics()
+    done = [pieces for pieces in flights.values() if pieces[-1].is_done]
+    expected = np.mean([sum(len(piece) for piece in pieces) for pieces in done])
+    assert metrics["episode_len_mean"].peek() == pytest.approx(expected)
+    assert metrics["num_env_steps_sampled"].peek() == sum(
+        len(piece) for pieces in flights.values() for piece in pieces
+    )
+    ours.stop()
+
+
+def test_a_reset_forgets_the_flights_in_the_air(tmp_path):
+    ours, theirs = make_runners("event_columns", tmp_path)
+    theirs.stop()
+    (first,) = samples_of(ours, (10,))
+    again = ours.sample(num_timesteps=10, force_reset=True)
+    assert {chunk.id_ for chunk in first}.isdisjoint(chunk.id_ for chunk in again)
+    assert all(chunk.t_started == 0 for chunk in again)
+    ours.stop()
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"num_episodes": 1},
+        {"num_timesteps": 4, "random_actions": True},
+        {"num_timesteps": 4, "explore": False},
+    ],
+)
+def test_what_it_cannot_fly_is_refused(asked, tmp_path):
+    ours, theirs = make_runners("event_columns", tmp_path)
+    with pytest.raises(FlightError, match=r"ValueError: .*drawn actions and nothing else"):
+        ours.sample(**asked)
+    for runner in (ours, theirs):
+        runner.stop()
+
+
+class Broken(PlainEnvRunner):
+    """One whose flights raise; made without a process of its own."""
+
+    def __init__(self):
+        self.error = ValueError("episode 3, step 7, seed 0: the reward must be finite; got nan")
+
+    def sample(self, **asked):
+        raise FlightError(f"ValueError: {self.error}")
+
+
+def test_what_a_flight_raises_is_raised_again_where_its_sample_is_used():
+    sent = Broken().apply(lambda runner: (runner.sample(), runner.get_metrics()))
+    received = pickle.loads(pickle.dumps(sent))
+    with pytest.raises(FlightError, match="step 7, seed 0: the reward must be finite; got nan"):
+        received[0]
+
+
+def test_any_other_error_ends_the_process_as_rllib_has_it():
+    runner = Broken()
+    runner.config = SimpleNamespace(restart_failed_env_runners=False)
+    with pytest.raises(SystemExit):
+        runner.apply(lambda runner: runner.no_such_method())
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory):
+    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
+
+
+@pytest.fixture
+def encoded_runner(encoder):
+    runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), encoder), worker_index=0)
+    yield runner
+    runner.stop()
+
+
+def test_a_weight_sync_keeps_the_table_and_another_encoder_replaces_it(encoded_runner):
+    module, windows = encoded_runner.module, np.zeros((1, 4097, 4), np.int32)
+    windows[0, :2] = [1, 0, 5000, 0], [4000, 20, 30, 1]
+    latent = module.features(windows)
+    table, state = module._table, module.get_state()
+    module.set_state(state)
+    assert module._table is table
+    state["encoder.encoder.2.bias"] = state["encoder.encoder.2.bias"] + 1
+    module.set_state(state)
+    np.testing.assert_allclose(module.features(windows), latent + 1, atol=1e-5)
+
+
+def test_returns_are_reported_unscaled(encoded_runner):
+    first, second = (encoded_runner.sample(num_timesteps=16) for _ in range(2))
+    begun = {chunk.id_ for chunk in first}  # which all end in the second round
+    done = [chunk for chunk in (*first, *second) if chunk.is_done and chunk.id_ in begun]
+    returns = [chunk.get_return() for chunk in (*first, *second) if chunk.id_ in begun]
+    assert len(done) == len(begun)
+    metrics = encoded_runner.get_metrics()
+    metrics = {name: getattr(value, "peek", lambda value=value: value)() for name, value in metrics.items()}
+    assert metrics["flight_return"] == pytest.approx(np.sum(returns) / len(begun))
+    distances = [chunk.get_infos(-1)["distance_m"] for chunk in done]
+    assert metrics["distance_m"] == pytest.approx(np.mean(distances))
+    assert metrics["flight_return"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
+    assert metrics["success_rate"] == metrics["collision_rate"] == 0.0
+    assert metrics["dropped_events"] == 0.0
+    assert metrics["events_per_step"] > 0.0
+
+
+def test_a_module_remembers_the_newest_windows_of_all_flights_in_turn(encoded_runner):
+    module = encoded_runner.module
+    windows = np.zeros((2, 5, 4), np.int32)
+    for step in range(300):
+        windows[:, 0] = [[2, 0, 5000, step], [4, 0, 5000, 1000 + step]]
+        windows[:, 1:, 3] = 1
+        module.features(windows)
+    assert len(module.met) == 128
+    assert [int(kept[0, 3]) for kept in module.met] == [step + 1000 * (step % 2) for step in range(172, 300)]
+    assert {len(kept) for kept in module.met} == {3, 5}
+    windows[:] = 0
+    assert module.met[-1][0, 0] == 4  # a copy
+    assert len(pickle.loads(pickle.dumps(module.__getstate__()["met"]))) == 0
+
+
+def drift_of(runner, rounds=1):
+    """What a runner tells of its encoder in the last of some rounds; the samples of all."""
+    samples, told = [], {}
+    for _ in range(rounds):
+        samples += runner.sample(num_timesteps=30)
+        metrics = {
+            name: getattr(value, "peek", lambda: math.nan)() for name, value in runner.get_metrics().items()
+        }
+        told = {name: metrics[name] for name in FIGURES if not math.isnan(metrics.get(name, math.nan))}
+    return told, samples
+
+
+def test_drift_is_measured_every_tenth_round_on_what_the_policy_met(encoded_runner, encoder):
+    first, _ = drift_of(encoded_runner)
+    evae, about = load_encoder(encoder)
+    expected = drift_figures(evae, encoded_runner.module.met, {"reconstruction_step": 0.5})
+    assert first == pytest.approx(expected | {"drift": expected["policy_reconstruction"] / 0.5})
+    assert about["figures"] == {"reconstruction_step": 0.5}
+    assert drift_of(encoded_runner)[0] == drift_of(encoded_runner, 8)[0] == {}
+    assert set(drift_of(encoded_runner)[0]) == set(FIGURES)
+
+
+def test_without_its_file_an_encoder_is_flown_but_not_measured_and_nothing_else_changes(
+    encoder, tmp_path, monkeypatch
+):
+    flights = []
+    for there in (True, False):
+        path = shutil.copytree(encoder.parent, tmp_path / str(there)) / encoder.name
+        runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), path), worker_index=0)
+        if not there:
+            path.unlink()
+        told, _ = drift_of(runner)
+        _, samples = drift_of(runner)  # what follows a measurement
+        runner.stop()
+        assert bool(told) is there
+        flights.append(np.concatenate([chunk.get_actions() for chunk in samples]))
+    np.testing.assert_array_equal(*flights)

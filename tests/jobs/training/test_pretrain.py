@@ -1,0 +1,219 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from envs.config import EnvConfig
+from jobs.config.config import ConfigError
+from jobs.config.schema import EVAE_SETTINGS, ModelConfig, PretrainConfig
+from jobs.run.folder import open_run
+from jobs.training.collect import record
+from jobs.training.pretrain import (
+    beta,
+    check_sources,
+    checkpoints,
+    cut_window,
+    held_out_figures,
+    held_out_windows,
+    prepare_encoder,
+    restore,
+    run,
+    sample_windows,
+    save_checkpoint,
+)
+from models.encoder.evae import EventVAE, event_targets, train_step
+from models.encoder.event_batch import batch_windows
+from models.encoder.weights import load_encoder, save_encoder
+from tests.jobs.run.test_folder import small_config
+
+SETTINGS = PretrainConfig(
+    encoder=None,
+    iterations=100,
+    batch_windows=8,
+    window_events=500,
+    windows="mixed",
+    lr=1e-3,
+    weight_decay=0.0,
+    beta=1e-5,
+    beta_schedule="constant",
+    validate_every=10,
+    checkpoint_every=10,
+)
+COUNT = dataclasses.replace(SETTINGS, windows="count")
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return record([(EnvConfig(observation="events"), 900)], 0, lambda count: None)
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, COUNT], ids=["mixed", "count"])
+def test_windows_hold_what_they_say_and_stay_in_one_flight(recording, settings):
+    start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    for events, start_us, window_us in sample_windows(recording, settings, 3000, np.random.default_rng(1)):
+        assert len(events) <= 500
+        assert np.all((events["t"] > start_us) & (events["t"] <= start_us + window_us))
+        first = int(np.searchsorted(start, start_us, side="right")) - 1
+        last = int(np.searchsorted(end, start_us + window_us, side="left"))
+        assert flight[max(first, 0)] == flight[last]
+
+
+def test_mixed_windows_last_from_half_a_step_to_eight_steps(recording):
+    windows = sample_windows(recording, SETTINGS, 500, np.random.default_rng(2))
+    lengths = np.array([window_us for _, _, window_us in windows]) / 5000
+    assert lengths.min() < 0.7
+    assert lengths.max() > 6
+    assert np.all((lengths >= 0.499) & (lengths <= 8.001))
+
+
+def test_count_windows_hold_the_asked_number_of_events(recording):
+    sizes = [len(events) for events, _, _ in sample_windows(recording, COUNT, 100, np.random.default_rng(3))]
+    assert np.median(sizes) == 500  # fewer only where a flight ends
+
+
+def test_an_overfull_window_keeps_the_newest_events(recording):
+    start_us, end_us = int(recording.index["step_t_us"][0]), int(recording.index["step_end_us"][200])
+    everything = cut_window(recording, start_us, end_us - start_us, 10**9)[0]
+    kept = cut_window(recording, start_us, end_us - start_us, 100)[0]
+    assert len(everything) > 100
+    assert np.array_equal(kept, everything[-100:])
+
+
+def test_beta_follows_its_schedule():
+    assert [beta(SETTINGS, iteration) for iteration in (0, 99)] == [1e-5, 1e-5]
+    appendix = dataclasses.replace(SETTINGS, beta_schedule="appendix")
+    assert beta(appendix, 1000) == 0.0
+    assert beta(appendix, 20_000) == pytest.approx(2e-3)
+
+
+def training(recording, iterations, checkpoint=None):
+    """An event VAE after some iterations, interrupted and continued at `checkpoint` if given."""
+    torch.manual_seed(0)
+    evae = EventVAE(context=64, latent=32, target="occupancy")
+    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3)
+    rng = np.random.default_rng(0)
+    first = 0 if checkpoint is None else restore(checkpoint, evae, optimizer, rng)
+    for _ in range(first, iterations):
+        batch = batch_windows(sample_windows(recording, SETTINGS, 8, rng), evae.grid)
+        train_step(evae, optimizer, batch, event_targets(batch, evae.target), 1e-5, rng)
+    return evae, optimizer, rng
+
+
+def test_an_interrupted_training_ends_with_the_same_weights(recording, tmp_path):
+    whole = training(recording, 20)[0]
+    evae, optimizer, rng = training(recording, 12)
+    save_checkpoint(tmp_path, evae, optimizer, rng, 12)
+    continued = training(recording, 20, tmp_path)[0]
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, continued.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(
+    "harm", [lambda content: content[:-9], lambda content: content[:900] + b"!" + content[901:]]
+)
+def test_a_damaged_checkpoint_is_left_for_the_one_before_it(recording, tmp_path, capsys, harm):
+    evae, optimizer, rng = training(recording, 1)
+    for iteration in (10, 20, 30):
+        save_checkpoint(tmp_path, evae, optimizer, rng, iteration)
+    newest, before = checkpoints(tmp_path)
+    newest.write_bytes(harm(newest.read_bytes()))
+    assert restore(tmp_path, evae, optimizer, rng) == 20
+    assert capsys.readouterr().out == f"Checkpoint damaged, the one before it is taken: {newest}\n"
+    assert checkpoints(tmp_path) == [before]
+
+
+def test_training_explains_windows_of_flights_that_it_never_saw(recording):
+    unseen = record([(EnvConfig(observation="events", split="validation"), 300)], 0, lambda count: None)
+    torch.manual_seed(0)
+    untrained = EventVAE(context=64, latent=32, target="occupancy")
+    held_out = held_out_windows(unseen, SETTINGS, untrained.grid)
+    before = held_out_figures(untrained, held_out)
+    after = held_out_figures(training(recording, 150)[0], held_out)
+    assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]
+    assert after["explained_four_steps"] > before["explained_four_steps"]
+
+
+class Listener:
+    """Takes what a tracker would."""
+
+    def __init__(self):
+        self.logged = {}
+
+    def log(self, step, figures):
+        self.logged[step] = figures
+
+    def artifact(self, *given):
+        pass
+
+    figure = artifact
+
+
+@pytest.mark.parametrize(("weight", "dead"), [(100.0, 1.0), (1e-5, 0.0)])
+def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_path, capsys, weight, dead):
+    config = small_config(tmp_path)
+    config = dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, context=64),
+        collect=dataclasses.replace(config.collect, num_steps=200, num_validation_steps=100),
+        pretrain=dataclasses.replace(config.pretrain, iterations=100, validate_every=50, beta=weight),
+    )
+    folder, listener = open_run(config), Listener()
+    file = prepare_encoder(config, folder, listener)
+    figures = [figures for step, figures in listener.logged.items() if step > 0]
+    assert sorted(listener.logged) == [0, 50, 100]
+    assert figures[-1]["evae/collapsed"] == dead
+    assert load_encoder(file)[1]["figures"]["collapsed"] == dead
+    assert capsys.readouterr().out.count("posterior collapse") == dead  # once
+
+
+def refreshing(tmp_path, encoder, **changes):
+    config = small_config(tmp_path)
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, **{"context": 64, **changes}),
+        collect=dataclasses.replace(config.collect, num_steps=100, num_validation_steps=50),
+        pretrain=dataclasses.replace(config.pretrain, iterations=1, lr=1e-9, encoder=encoder),
+    )
+
+
+def test_a_refresh_begins_with_the_weights_of_the_encoder_that_is_named(tmp_path):
+    torch.manual_seed(7)
+    evae, run_folder = EventVAE(context=64, latent=32, target="occupancy"), tmp_path / "before"
+    save_encoder(run_folder / "encoder" / "encoder.safetensors", evae, {})
+    for named in (run_folder, run_folder / "encoder" / "encoder.safetensors"):
+        config = refreshing(tmp_path, str(named))
+        file = prepare_encoder(config, open_run(config), Listener())
+        for name, value in load_encoder(file)[0].named_parameters():
+            torch.testing.assert_close(value, evae.state_dict()[name], atol=1e-6, rtol=0)
+    (run_folder / "encoder" / "encoder.json").unlink()
+    check_sources(config)  # pretrained already: the encoder is no longer needed
+
+
+def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anything_is_made(tmp_path):
+    save_encoder(tmp_path / "encoder.safetensors", EventVAE(context=64, latent=32, target="signed"), {})
+    rules = {
+        str(tmp_path): r"must be a run folder with an encoder, or an encoder file, got .*cannot be read",
+        str(tmp_path / "encoder.safetensors"): r"got context: 64 there, 32 here, target: 'signed' there",
+    }
+    for named, rule in rules.items():
+        with pytest.raises(ConfigError, match=rf"pretrain\.encoder: .*{rule}"):
+            run(refreshing(tmp_path, named, context=32))
+    lean = tmp_path / "lean" / "encoder.safetensors"
+    save_encoder(lean, EventVAE(context=64, latent=32, target="occupancy"), {}, lean=True)
+    with pytest.raises(ConfigError, match=r"pretrain\.encoder: must have a decoder .*got .*lean"):
+        run(refreshing(tmp_path, str(lean)))
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
+    model = ModelConfig(
+        name="event_image", stack=3, hidden=None, encoder=None, **dict.fromkeys(EVAE_SETTINGS)
+    )
+    config = dataclasses.replace(small_config(tmp_path), model=model)
+    with pytest.raises(
+        ConfigError, match="model: event_image has no event VAE to pretrain; go on with job=train"
+    ):
+        run(config)
+    assert not (tmp_path / "runs").exists()  # refused before anything was made
+    assert prepare_encoder(config, open_run(config), None) is None

@@ -1,0 +1,295 @@
+import dataclasses
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import nullcontext
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from ray.exceptions import ActorDiedError, RayTaskError
+
+from envs.config import sensor_settings, settings_hash
+from jobs.config.config import parse
+from jobs.run.folder import open_run
+from jobs.training import train as training
+from jobs.training.ppo import FlightMetrics
+from jobs.training.pretrain import build_evae
+from jobs.training.train import TrainingError, read_metrics, reported_so_far
+from models.encoder.weights import save_encoder
+from models.policy import load_policy
+
+ROOT = Path(__file__).resolve().parents[3]
+# Seven steps to a flight: every flight is truncated, and no chunk of samples ends with one.
+SHORT = ("env.time_limit_s=0.035", "algo.num_envs_per_env_runner=2", "algo.reward_scale=0.5")
+
+
+def make_config(*overrides):
+    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        chosen = [] if any(word.startswith("algo=") for word in overrides) else ["algo=ppo"]
+        composed = hydra.compose("config", ["+exp=train", *chosen, *overrides])
+    values = OmegaConf.to_container(composed, resolve=True)
+    values.pop("hydra", None)
+    return parse(values)
+
+
+def write_encoder(folder, config):
+    torch.manual_seed(0)
+    sensor = sensor_settings(config.env_config())
+    evae = build_evae(config.model, sensor)
+    for parameter in evae.ecn.parameters():  # random weights see little; make latents differ
+        parameter.data.mul_(1.5)
+    path = folder / "encoder.safetensors"
+    about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {"reconstruction_step": 0.5}}
+    save_encoder(path, evae.freeze(), about)
+    return path
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory):
+    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
+
+
+def result(**learner):
+    losses = {
+        "policy_loss": 0.1,
+        "vf_loss": 2.0,
+        "vf_explained_var": 0.5,
+        "entropy": 1.0,
+        "gradients_default_optimizer_global_norm": 0.7,
+    }
+    return {
+        "num_env_steps_sampled_lifetime": 4096,
+        "env_runners": {
+            "num_env_steps_sampled": 2048,
+            "flight_return": 12.5,
+            "num_episodes_lifetime": 3,
+        },
+        "learners": {"default_policy": losses | learner},
+        "fault_tolerance": {"num_remote_worker_restarts": 0},
+        "trial_restarts": 0,
+    }
+
+
+def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
+    metrics = read_metrics(result(), 2.0)
+    assert metrics["train/episode_return"] == 12.5
+    assert metrics["train/value_loss"] == 2.0
+    assert metrics["perf/env_steps_per_second"] == 1024.0
+    assert math.isnan(metrics["train/success_rate"])
+    assert 12 <= len(metrics) <= 20
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_loss_that_is_not_finite_stops_the_training(bad):
+    with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
+        read_metrics(result(vf_loss=bad), 2.0)
+
+
+@pytest.mark.parametrize(
+    ("runners", "alive", "restarts", "stops"),
+    [(1, 0, 3, True), (2, 0, 6, True), (1, 0, 2, False), (2, 0, 5, False), (2, 1, 6, False)],
+)
+def test_a_training_stops_at_once_when_nothing_that_flies_is_started_again(runners, alive, restarts, stops):
+    known = {"fault_tolerance": {"num_healthy_workers": alive, "num_remote_worker_restarts": restarts}}
+    with pytest.raises(TrainingError, match="every process that flies") if stops else nullcontext():
+        training.check_pause(1.0, known, runners)
+
+
+def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
+    folder, seen = open_run(make_config(f"runs_dir={tmp_path}")), []
+    empty = {**result(), "env_runners": {}, "learners": {}}
+    with training._listening(folder.config, folder, lambda step, metrics: seen.append(step)):
+        listen = training._LISTENERS[training.LISTENER]
+        for seconds in (100.0, 400.0, 400.0, 300.0, 300.0):
+            now[0] += seconds
+            listen(result() if seconds == 400.0 and not seen else empty)
+        now[0] += 1.0
+        with pytest.raises(
+            TrainingError, match="no step was flown for 601 s: every process that flies has ended"
+        ):
+            listen(empty)
+    assert seen == [4096]
+
+
+class Trial:
+    """A trial whose errors Tune has written down, the newest last."""
+
+    num_failures = 1
+
+    def __init__(self, folder, *errors):
+        self.error_file = str(folder / "error.txt") if errors else None
+        texts = [
+            f"Failure # {k} (occurred at 2026-01-01_00-00-00)\n{text}\n" for k, text in enumerate(errors)
+        ]
+        (folder / "error.txt").write_text("".join(texts))
+
+
+def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_path, capsys):
+    relay = training.Relay("name")
+    raised = str(RayTaskError("train", "ray::PPO.train()\n  File 'a'\nValueError: no", ValueError("no")))
+    lost = str(ActorDiedError())
+    within = str(
+        RayTaskError("train", "ray::PPO.train()\nray.exceptions.ActorDiedError: gone", ActorDiedError())
+    )
+    for errors in (
+        (raised,),
+        (lost, raised),
+        (raised.replace("ValueError", "jobs.training.env_runner.FlightError: KeyError"),),
+    ):
+        with pytest.raises(
+            TrainingError, match=r"^training stopped: \w+Error: no; the same command continues"
+        ):
+            relay.on_trial_recover(1, [], Trial(tmp_path, *errors))
+    for errors in ((), (lost,), (within,), (raised, lost)):
+        relay.on_trial_recover(1, [], Trial(tmp_path, *errors))
+    assert capsys.readouterr().out.count("goes on from its last checkpoint") == 4
+
+
+def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):
+    file = tmp_path / "results.jsonl"
+    assert reported_so_far(file)[0] == 0
+    file.write_text('{"env_steps": 64}\n{"env_steps": 128}\n{"env_st')
+    assert reported_so_far(file)[0] == 128
+
+
+def test_half_a_line_left_by_a_kill_is_not_written_on_to(tmp_path):
+    config = make_config(f"runs_dir={tmp_path}")
+    folder = open_run(config)
+    file = folder.train / "results.jsonl"
+    file.parent.mkdir(parents=True)
+    file.write_text('{"env_steps": 64, "train/entropy": 0.5}\n{"env_st')
+    with training._listening(config, folder, lambda step, metrics: None) as last:
+        assert last == {"train/entropy": 0.5}
+        training._LISTENERS[training.LISTENER]({**result(), "num_env_steps_sampled_lifetime": 128})
+    assert [json.loads(line)["env_steps"] for line in file.read_text().splitlines()] == [64, 128]
+
+
+def test_a_step_is_reported_once_even_after_a_restart(tmp_path):
+    config = make_config(f"runs_dir={tmp_path}")
+    folder, seen = open_run(config), []
+    for steps in ((64, 128), (128, 192)):
+        with training._listening(config, folder, lambda step, metrics: seen.append(step)) as last:
+            for step in steps:
+                training._LISTENERS[training.LISTENER]({**result(), "num_env_steps_sampled_lifetime": step})
+    assert seen == [64, 128, 192]
+    assert last["train/episode_return"] == 12.5
+    lines = (folder.train / "results.jsonl").read_text().splitlines()
+    assert [json.loads(line)["env_steps"] for line in lines] == seen
+    assert json.loads(lines[0])["train/success_rate"] is None
+    assert training._LISTENERS == {}
+
+
+TINY = (
+    *SHORT,
+    "algo.train_batch_size_per_learner=64",
+    "algo.num_epochs=1",
+    "train.env_steps=4000",
+    "train.checkpoint_every=1",
+)
+SCRIPT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, "tests")
+from jobs.training.train import train
+from tests.jobs.training.test_train import TINY, make_config, open_run
+config = make_config(*TINY, f"runs_dir={sys.argv[1]}")
+train(config, open_run(config), Path(sys.argv[2]), lambda step, metrics: None)
+"""
+
+
+def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path), str(encoder)]
+    config = make_config(*TINY, f"runs_dir={tmp_path}")
+    folder = open_run(config)
+    results = folder.train / "results.jsonl"
+    killed = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"HOME": "/nowhere"})
+    deadline = time.monotonic() + 120
+    while reported_so_far(results)[0] < 400 and killed.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    before = reported_so_far(results)[0]
+    assert 400 <= before < 4000
+    subprocess.run(command, cwd=ROOT, check=True, timeout=200)
+    steps = [json.loads(line)["env_steps"] for line in results.read_text().splitlines()]
+    assert steps == sorted(set(steps))
+    assert steps[-1] >= 4000
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    assert {row["evae/drift"] is None for row in rows} == {True, False}  # not measured in each iteration
+    assert json.loads((folder.policy / "encoder.json").read_text())["figures"] == {"reconstruction_step": 0.5}
+    episodes = [json.loads(line)["train/episodes"] for line in results.read_text().splitlines()]
+    assert episodes == sorted(episodes)  # counted on, not anew
+    policy = load_policy(folder.policy)
+    window = np.zeros((1, 4097, 4), np.int32)
+    window[0, 0, 2] = 5000
+    assert np.isfinite(policy.logits(window)).all()
+    assert policy.manifest["ppo"] == dataclasses.asdict(config.algo)
+
+
+class Chunk:
+    """A piece of an episode, as RLlib hands it to callbacks."""
+
+    def __init__(self, name, rewards, done, success=False):
+        self.id_, self.rewards, self.is_done = name, rewards, done
+        self.info = {
+            "num_events": 3,
+            "dropped_events": 0,
+            "success": success,
+            "collision": not success,
+            "distance_m": 7.0,
+        }
+
+    def get_return(self):
+        return sum(self.rewards)
+
+    def get_infos(self, index=None):
+        return self.info if index == -1 else [self.info] * (1 + len(self.rewards))
+
+
+class Logger(dict):
+    def log_value(self, name, value, window):
+        self[name] = value
+
+
+@pytest.fixture
+def fly_round():
+    """Hands one round of sampling to the metrics; what they say then."""
+    metrics, logger = FlightMetrics(), Logger()
+
+    def fly(*samples):
+        metrics.on_sample_end(metrics_logger=logger, samples=list(samples))
+        return logger.get("flight_return"), logger.get("success_rate")
+
+    return fly
+
+
+def test_flights_count_whole_and_stay_in_the_mean_over_iterations(fly_round):
+    assert fly_round(Chunk("a", [1.0, 2.0], False), Chunk("b", [4.0], True)) == (None, None)
+    assert fly_round(Chunk("a", [5.0], True, success=True)) == (6.0, 0.5)  # 8 for a, 4 for b
+    assert fly_round(Chunk("c", [1.0], False)) == (6.0, 0.5)
+
+
+def test_a_short_flight_waits_for_those_that_began_with_it(fly_round):
+    assert (
+        fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], False), Chunk("c", [0.0], True)) == (None,) * 2
+    )
+    assert fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], True, True), Chunk("d", [0.0], True)) == (
+        None,
+        None,
+    )
+    assert fly_round(Chunk("a", [0.0], True, success=True))[1] == 0.5  # a and b won, c and d crashed
+
+
+def test_a_flight_that_is_broken_off_holds_up_no_other(fly_round):
+    fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], True, success=True))
+    assert fly_round(Chunk("c", [0.0], False))[1] == 1.0

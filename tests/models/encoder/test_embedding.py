@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+
+from models.encoder.embedding import embedding_table, eventnet_phase, temporal_embedding, time_bin, time_code
+
+
+def test_the_embedding_is_sines_then_cosines_of_the_published_frequencies():
+    t, context = 0.37, 1024
+    embedded = temporal_embedding(t, context)
+    for i in (0, 1, 200, 511):
+        w = 100.0 / 1000.0 ** (i / context)
+        assert embedded[i] == pytest.approx(np.sin(w * t), abs=1e-13)
+        assert embedded[512 + i] == pytest.approx(np.cos(w * t), abs=1e-13)
+
+
+def test_time_zero_is_all_zero_sines_and_unit_cosines():
+    assert np.array_equal(temporal_embedding(0.0, 8), [0, 0, 0, 0, 1, 1, 1, 1])
+
+
+def test_the_embedding_keeps_the_shape_of_the_times_in_front():
+    assert temporal_embedding(np.zeros((2, 3)), 16).shape == (2, 3, 16)
+
+
+@pytest.mark.parametrize("context", [0, 1, 7])
+def test_a_context_without_pairs_is_refused(context):
+    with pytest.raises(ValueError, match="context must be even"):
+        temporal_embedding(0.5, context)
+
+
+@pytest.mark.parametrize("t", [-1e-9, 1.001, np.nan, np.inf])
+def test_a_time_outside_of_the_window_is_refused(t):
+    with pytest.raises(ValueError, match="must lie in"):
+        temporal_embedding([0.5, t], 8)
+
+
+def test_the_table_holds_the_bin_centres_and_cannot_be_written():
+    table = embedding_table(16, 8, "float64")
+    assert np.array_equal(table[3], temporal_embedding(3.5 / 16, 8))
+    with pytest.raises(ValueError, match="read-only"):
+        table[0, 0] = 1
+
+
+def test_the_table_is_the_float64_embedding_rounded_once():
+    assert np.array_equal(embedding_table(64, 16), embedding_table(64, 16, "float64").astype(np.float32))
+
+
+def test_eventnet_takes_the_age_off_every_feature_and_none_adds_nothing():
+    times = np.array([0.0, 0.3, 1.0])
+    assert np.allclose(time_code(times, 4, "eventnet"), np.repeat([[-1.0], [-0.7], [0.0]], 4, axis=1))
+    assert np.array_equal(time_code(times, 4, "none"), np.zeros((3, 4)))
+    assert np.array_equal(time_code(times, 4), temporal_embedding(times, 4))
+    assert embedding_table(8, 4, "float64", "eventnet")[:, 0].tolist() == [-0.9375 + i / 8 for i in range(8)]
+    assert np.array_equal(embedding_table(8, 4, "float32", "none"), np.zeros((1, 4), np.float32))
+
+
+def test_eventnet_turns_once_backwards_over_the_window():
+    phase = eventnet_phase(8, "float64")
+    age = 1 - (np.arange(8) + 0.5) / 8
+    assert np.allclose(phase[0] + 1j * phase[1], np.exp(-2j * np.pi * age), atol=1e-15)
+    with pytest.raises(ValueError, match="read-only"):
+        phase[0, 0] = 1
+
+
+def test_an_unknown_coding_is_refused():
+    with pytest.raises(ValueError, match="coding must be one of additive, eventnet, none, got 'sum'"):
+        time_code(0.5, 8, "sum")
+
+
+def test_bins_are_the_floor_of_time_times_bins_with_the_window_end_in_the_last():
+    bins = [time_bin(t, 1000, 8, 4) for t in range(1000, 1009)]
+    assert bins == [0, 0, 1, 1, 2, 2, 3, 3, 3]
+
+
+@pytest.mark.parametrize("t", [-(2**63), -1, 0])
+def test_an_event_before_its_window_takes_the_first_bin(t):
+    assert time_bin(t, 0, 5000, 1024) == 0
+
+
+@pytest.mark.parametrize("t", [5000, 5001, 2**63 - 1])
+def test_an_event_after_its_window_takes_the_last_bin(t):
+    assert time_bin(t, 0, 5000, 1024) == 1023
+
+
+def test_bins_are_exact_microseconds_on_a_clock_of_years():
+    start, window = 10**15, 1 << 46
+    for bins in (1024, 65536):
+        edge = start + 5 * (window // bins)
+        assert (time_bin(edge - 1, start, window, bins), time_bin(edge, start, window, bins)) == (4, 5)

@@ -1,0 +1,81 @@
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from models.kinds import MIN_IMAGE
+from models.policy.networks import PARTS, assemble, build_networks
+
+MLP = {"name": "bytestream", "latent": 8, "stack": 3, "hidden": [64, 64], "num_actions": 3}
+CNN = {"name": "event_image", "width": 64, "height": 64, "stack": 3, "hidden": None, "num_actions": 3}
+
+
+def layers(network):
+    return [part for part in network.modules() if isinstance(part, nn.Linear | nn.Conv2d)]
+
+
+@pytest.mark.parametrize("settings", [MLP, CNN], ids=["mlp", "cnn"])
+def test_layers_are_orthogonal_with_the_gain_of_their_place(settings):
+    networks = build_networks(settings, seed=7)
+    for name, last_gain in (("trunk", math.sqrt(2.0)), ("pi", 0.01), ("vf", 1.0)):
+        for layer in layers(networks[name]):
+            weight = layer.weight.detach().double().flatten(1)
+            gram = weight @ weight.T if weight.shape[0] <= weight.shape[1] else weight.T @ weight
+            gain = last_gain if layer is layers(networks[name])[-1] else math.sqrt(2.0)
+            torch.testing.assert_close(gram, gain**2 * torch.eye(len(gram)).double(), atol=1e-4, rtol=0)
+            assert not layer.bias.any()
+
+
+@pytest.mark.parametrize("settings", [MLP, CNN], ids=["mlp", "cnn"])
+def test_the_weights_follow_from_the_seed(settings):
+    first, again, other = (build_networks(settings, seed).state_dict() for seed in (7, 7, 8))
+    for name, value in first.items():
+        assert torch.equal(value, again[name])
+        assert torch.equal(value, other[name]) is name.endswith("bias")
+
+
+def test_two_mlps_share_nothing():
+    networks = build_networks(MLP, seed=7)
+    assert list(networks["trunk"].parameters()) == []
+    for name, outputs in (("pi", 3), ("vf", 1)):
+        shapes = [tuple(layer.weight.shape) for layer in layers(networks[name])]
+        assert shapes == [(64, 24), (64, 64), (outputs, 64)]
+        assert [type(part) for part in networks[name][1::2]] == [nn.Tanh, nn.Tanh]
+    assert not torch.equal(networks["pi"][0].weight, networks["vf"][0].weight)
+
+
+def test_the_cnn_is_that_of_stable_baselines():
+    from stable_baselines3.common.policies import ActorCriticCnnPolicy
+
+    spaces = gymnasium.spaces.Box(0, 255, (3, 64, 64), np.uint8), gymnasium.spaces.Discrete(3)
+    torch.manual_seed(0)
+    theirs = ActorCriticCnnPolicy(*spaces, lambda progress: 3e-4)
+    theirs.action_net.weight.data.mul_(100.0)  # so that logits differ
+    ours = assemble(CNN)
+    copied = zip(
+        (layer for name in PARTS for layer in layers(ours[name])),
+        (*layers(theirs.features_extractor), theirs.action_net, theirs.value_net),
+        strict=True,
+    )
+    for layer, source in copied:
+        layer.load_state_dict(source.state_dict())
+    pictures = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
+    with torch.no_grad():
+        embeddings = ours["trunk"](pictures)
+        expected = theirs.get_distribution(pictures).distribution.logits
+        logits = torch.log_softmax(ours["pi"](embeddings), dim=1)
+        torch.testing.assert_close(logits, expected, atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(
+            ours["vf"](embeddings), theirs.predict_values(pictures), atol=1e-6, rtol=1e-5
+        )
+
+
+def test_the_smallest_picture_is_the_smallest():
+    smallest = {**CNN, "width": MIN_IMAGE, "height": MIN_IMAGE}
+    pictures = torch.zeros(1, 3, MIN_IMAGE, MIN_IMAGE, dtype=torch.uint8)
+    assert build_networks(smallest)["trunk"](pictures).shape == (1, 512)
+    with pytest.raises(RuntimeError):
+        assemble(smallest)["trunk"](pictures[..., 1:])

@@ -1,0 +1,93 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from models.encoder.evae import EventVAE
+from models.policy import load_policy, save_policy
+from models.policy import onnx as export
+from models.policy.onnx import export_onnx
+from tests.models.policy.test_policy import EVENT, FLOWN, SIDE, make_networks, make_settings, save
+
+onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+EDGES = [(1, 0, 0, 1), (5000, SIDE - 1, SIDE - 1, -1), (4999, SIDE - 1, 0, 1), (5000, 0, SIDE - 1, -1)]
+
+
+def make_events(count, rng):
+    events = np.zeros(count, EVENT)
+    events["t"] = np.sort(rng.integers(1, 5001, count))
+    events["x"], events["y"] = rng.integers(0, SIDE, (2, count))
+    events["p"] = rng.choice([-1, 1], count)
+    return events
+
+
+def steps():
+    """Events of the steps of a flight: none, one, a few, many, twice in a pixel, at the edges."""
+    rng = np.random.default_rng(0)
+    yield from (make_events(count, rng) for count in (0, 1, 40, 700, 1500, 0, 3))
+    many = make_events(500, rng)
+    many["x"], many["y"] = many["x"] % 3, many["y"] % 2
+    yield many
+    yield np.sort(np.array(EDGES, EVENT), order="t")
+
+
+def fly_exported(file, shown, shape, dtype):
+    """Logits of each step of one flight, by onnxruntime alone."""
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    stack, first, logits = np.full(shape, 7, dtype), np.array(True), []
+    for inputs in shown:
+        out, stack = session.run(None, {**inputs, "last_stack": stack, "first": first})
+        first = np.array(False)
+        logits.append(out)
+    return np.array(logits)
+
+
+@pytest.fixture(scope="module", params=[*FLOWN, "bytestream_xy", "eventnet"])
+def folder(request, tmp_path_factory):
+    path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
+    if name not in ("bytestream_xy", "eventnet"):
+        return save(path, name)
+    torch.manual_seed(0)
+    changes = {"variant": "bytestream_xy"} if name == "bytestream_xy" else {"coding": "eventnet"}
+    evae = EventVAE(width=SIDE, height=SIDE, context=64, time_bins=32, **changes).freeze()
+    for parameter in evae.ecn.layers.parameters():  # so that magnitudes outlive many ages
+        parameter.data.mul_(3.0)
+    name = evae.settings["variant"]
+    return save_policy(path, make_networks(name), make_settings(name), evae)
+
+
+def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_a_flight(folder, tmp_path):
+    policy = load_policy(folder)
+    file = export_onnx(policy, tmp_path / "policy.onnx")
+    feature = policy._feature
+    if feature.from_events is None:
+        rng = np.random.default_rng(0)
+        pictures = rng.uniform(-0.2, 1.4, (6, SIDE, SIDE)).astype(np.float32)
+        expected = np.array([policy.logits(picture[None])[0] for picture in pictures])
+        shown = [{"luminance": picture} for picture in pictures]
+    else:
+        expected, shown = [], []
+        for events in steps():
+            made = feature.from_events((events, 0, 5000), policy.manifest, policy.encoder)
+            expected.append(policy._logits(made[None], None)[0])
+            rows = np.stack([events[name].astype(np.int64) for name in "txyp"], axis=1)
+            shown.append({"events": rows, "window_us": np.array(5000)})
+    dtype = policy._stacks.dtype if policy._stacks.dtype != np.int16 else np.int32
+    found = fly_exported(file, shown, policy._stacks.shape[1:], dtype)
+    scale = np.abs(expected).max()
+    assert np.abs(found - np.array(expected)).max() < 1e-5 * scale
+    assert np.ptp(np.array(expected), axis=0).max() > 0.01 * scale
+
+
+def test_the_rest_of_the_package_does_without_onnx():
+    code = "import models.policy.policy, models.policy.onnx, sys; sys.exit('onnx' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+
+
+def test_what_is_not_installed_is_named(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(export.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"onnx, onnxscript: pip install 'evade\[onnx\]'"):
+        export_onnx(load_policy(folder), tmp_path / "policy.onnx")
+    assert not any(tmp_path.iterdir())

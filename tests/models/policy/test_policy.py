@@ -1,0 +1,216 @@
+import hashlib
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from models.encoder.evae import EventVAE
+from models.encoder.frozen import encoder_of
+from models.kinds import KINDS, kind_of
+from models.policy import Policy, load_policy, save_policy
+from models.policy.features import feature_of
+from models.policy.networks import build_networks
+from models.policy.policy import ENCODER, MANIFEST
+
+EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+SIDE = 40
+SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789ab"}
+FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
+
+
+def make_evae(seed=0, variant="bytestream"):
+    torch.manual_seed(seed)
+    return EventVAE(variant, width=SIDE, height=SIDE, context=64, time_bins=32).freeze()
+
+
+def make_settings(name):
+    """Of a kind of policy, or of "finetuned": bytestream with an encoder that learnt on."""
+    if name == "finetuned":
+        evae = make_evae().settings
+        own = {key: evae[key] for key in ("context", "norm", "target", "time_bins", "coding")}
+        return {**make_settings("bytestream"), **own, "encoder": "finetuned"}
+    kind = KINDS[name]
+    sizes = {"width": SIDE, "height": SIDE, "stack": 3, "num_actions": 3}
+    parts = {
+        "latent": 8 if kind.encoder else None,
+        "hidden": [64, 64] if kind.network == "mlp" else None,
+    }
+    return {"name": name, **sizes, **parts, **SENSOR, "figures": {"return": 1.5}}
+
+
+def make_networks(name):
+    networks = build_networks(make_settings(name), seed=3)
+    *_, last = networks["pi"].modules()
+    last.weight.data.mul_(100.0)  # so that actions differ
+    return networks
+
+
+def save(path, name):
+    evae = make_evae(variant=name) if kind_of(make_settings(name)).encoder else None
+    return save_policy(path, make_networks(name), make_settings(name), evae)
+
+
+@pytest.fixture(scope="module", params=FLOWN)
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def folder(tmp_path, name):
+    return save(tmp_path / "policy", name)
+
+
+@pytest.fixture
+def encoded(tmp_path):
+    return save(tmp_path / "policy", "bytestream")
+
+
+def make_windows(rng, count, capacity=40, side=16):
+    windows = np.zeros((count, capacity + 1, 4), np.int32)
+    for window in windows:
+        events = int(rng.integers(0, capacity + 1))
+        window[0] = events, 0, 5000, 0
+        window[1 : events + 1, 0] = np.sort(rng.integers(1, 5001, events))
+        window[1 : events + 1, 1:3] = rng.integers(0, side, (events, 2))
+        window[1 : events + 1, 3] = rng.choice([-1, 1], events)
+    return windows
+
+
+def make_observations(name, rng, count):
+    """What an environment might show, (count, ...)."""
+    if kind_of(make_settings(name)).observation == "window":
+        return make_windows(rng, count, side=SIDE)
+    pictures = rng.choice([0, 0, 0, 125, 255], (count, SIDE, SIDE)).astype(np.uint8)
+    return pictures if name == "event_image" else (pictures / 255).astype(np.float32)
+
+
+def step_events(window, start_us):
+    rows = window[1 : window[0, 0] + 1]
+    events = np.empty(len(rows), EVENT)
+    for column, field in enumerate("txyp"):
+        events[field] = rows[:, column]
+    events["t"] += start_us
+    return events
+
+
+def expected_logits(name, flights):
+    """Logits after the last of each flight's observations (B, T, ...), by a plain loop."""
+    settings, networks = make_settings(name), make_networks(name)
+    table = encoder_of(make_evae(variant=name)) if kind_of(settings).encoder else None
+    stacks = []
+    for observations in flights:
+        features = list(feature_of(settings).from_observations(observations, settings, table))
+        stacks.append(np.stack((features[:1] * 2 + features)[-3:]))
+    with torch.no_grad():
+        return networks["pi"](networks["trunk"](torch.from_numpy(np.stack(stacks)))).numpy()
+
+
+def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(name, folder):
+    policy = load_policy(folder)
+    flights = make_observations(name, np.random.default_rng(0), 20)
+    flights = flights.reshape(5, 4, *flights.shape[1:])
+    policy.reset(5)
+    for t in range(1, 5):
+        logits = policy.logits(flights[:, t - 1])
+        np.testing.assert_allclose(logits, expected_logits(name, flights[:, :t]), rtol=1e-5, atol=1e-5)
+    assert np.ptp(logits, axis=0).max() > 1e-2
+    assert policy.manifest["figures"] == {"return": 1.5}
+    assert policy.observation == kind_of(make_settings(name)).observation
+
+
+def test_the_same_policy_is_saved_as_the_same_bytes_and_each_file_has_its_sum(name, folder, tmp_path):
+    again = save(tmp_path / "again", name)
+    files = sorted(path.name for path in folder.iterdir())
+    assert files == sorted(path.name for path in again.iterdir())
+    assert (ENCODER in files) is kind_of(make_settings(name)).encoder
+    for file in files:
+        assert (folder / file).read_bytes() == (again / file).read_bytes()
+    sums = json.loads((folder / MANIFEST).read_text())["sha256"]
+    assert sums == {
+        file: hashlib.sha256((folder / file).read_bytes()).hexdigest() for file in files if file != MANIFEST
+    }
+
+
+def test_a_restarted_flight_forgets_and_its_neighbours_remember(name, folder):
+    steps = make_observations(name, np.random.default_rng(1), 12)
+    steps = steps.reshape(4, 3, *steps.shape[1:])
+    kept, restarted, alone = load_policy(folder), load_policy(folder), load_policy(folder)
+    kept.reset(3)
+    restarted.reset(3)
+    for step in steps[:3]:
+        kept.logits(step)
+        restarted.logits(step)
+    whole = kept.logits(steps[3])
+    part = restarted.logits(steps[3], np.array([False, True, False]))
+    np.testing.assert_array_equal(part[[0, 2]], whole[[0, 2]])
+    assert not np.array_equal(part[1], whole[1])
+    np.testing.assert_allclose(part[1], alone.logits(steps[3][1:2])[0], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_image", "finetuned"])
+def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path, name):
+    folder = save(tmp_path, name)
+    windows = make_windows(np.random.default_rng(2), 30, side=SIDE)
+    settings = make_settings("event_image")
+    batch, single = load_policy(folder), load_policy(folder)
+    chosen, acted = [], []
+    for step, window in enumerate(windows):
+        events = step_events(window, 5000 * step)
+        shown = window
+        if name == "event_image":
+            shown = feature_of(settings).from_events((events, 5000 * step, 5000), settings, None)
+        chosen.append(int(batch(shown[None])[0]))
+        acted.append(single.act(events, 5000 * step, 5000))
+    assert acted == chosen
+    assert len(set(chosen)) > 1
+
+
+def test_a_policy_that_sees_no_events_says_so(tmp_path):
+    with pytest.raises(ValueError, match="a policy that sees luminance: call it with observations"):
+        load_policy(save(tmp_path, "rgb")).act(np.empty(0, EVENT), 0, 5000)
+
+
+def test_actions_are_int64_and_the_likeliest_ones(name, folder):
+    policy = load_policy(folder)
+    observations = make_observations(name, np.random.default_rng(3), 6)
+    policy.reset(6)
+    actions = policy(observations)
+    policy.reset(6)
+    assert actions.dtype == np.int64
+    np.testing.assert_array_equal(actions, policy.logits(observations).argmax(axis=1))
+
+
+def test_a_stochastic_policy_draws_actions_with_their_probabilities():
+    class Fixed(nn.Module):
+        def forward(self, stacks):
+            return torch.log(torch.tensor([0.2, 0.5, 0.3])).repeat(len(stacks), 1) + 40.0
+
+    count, settings = 4000, make_settings("event_columns")
+    networks = nn.ModuleDict({"trunk": nn.Identity(), "pi": Fixed()})
+    policy = Policy(networks, settings, deterministic=False, rng=np.random.default_rng(4))
+    policy.reset(count)
+    actions = policy(np.repeat(make_windows(np.random.default_rng(5), 1), count, axis=0))
+    shares = np.bincount(actions, minlength=3) / count
+    np.testing.assert_allclose(shares, [0.2, 0.5, 0.3], atol=0.03)  # 4 standard errors
+    with pytest.raises(ValueError, match="rng must be given"):
+        Policy(networks, settings, deterministic=False)
+
+
+def test_a_number_of_observations_other_than_that_of_the_flights_is_refused(name, folder):
+    with pytest.raises(ValueError, match=r"one for each of 1 flights, got 2: call reset\(num_envs\)"):
+        load_policy(folder)(make_observations(name, np.random.default_rng(6), 2))
+
+
+def test_an_encoder_is_saved_if_and_only_if_the_policy_has_one(tmp_path):
+    for name, evae, rule in (("bytestream", None, "given"), ("event_image", make_evae(), "None")):
+        with pytest.raises(ValueError, match=f"evae must be {rule} for {name}"):
+            save_policy(tmp_path, make_networks(name), make_settings(name), evae)
+
+
+def test_flying_needs_no_ray():
+    code = "import sys, models.policy.policy; sys.exit('ray' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,271 @@
+import importlib.util
+import os
+import resource
+import shlex
+import signal
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from jobs.config.config import Config
+
+ROOT = Path(__file__).resolve().parents[2]
+EVADE = Path(sys.executable).parent / "evade"
+HEAVY = ("torch", "ray", "mlflow", "numba", "matplotlib", "gymnasium", "trimesh", "pyrender", "h5py", "scipy")
+
+
+@pytest.fixture(scope="module")
+def launcher():
+    spec = importlib.util.spec_from_file_location("launch_under_test", ROOT / "platform" / "launch.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def launch(launcher, monkeypatch, capsys, tmp_path):
+    """Run the launcher in this process, in an empty folder; returns status, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["evade", *words])
+        try:
+            status = launcher.main()
+        except SystemExit as leaving:
+            status = leaving.code or 0
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def job(launcher, monkeypatch):
+    """Replace the job `train` by a function, and return the configurations that it was given."""
+
+    def replace(function) -> None:
+        module = types.ModuleType("jobs_under_test")
+        module.run = function
+        monkeypatch.setitem(sys.modules, "jobs_under_test", module)
+        monkeypatch.setitem(launcher.JOBS, "train", "jobs_under_test")
+
+    return replace
+
+
+def processor_time_s() -> float:
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+
+
+def shell(*command: str | Path, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--cfg", "job", "+exp=train"], ["+exp=train", "seed=-1"]])
+def test_answers_come_without_importing_anything_heavy(words):
+    began = processor_time_s()
+    result = shell(sys.executable, "-X", "importtime", "-m", "platform.launch", *words)
+    assert processor_time_s() - began < 3.0
+    imported = {line.rpartition("|")[2].strip() for line in result.stderr.splitlines() if "|" in line}
+    assert "hydra" in imported
+    assert imported.isdisjoint(HEAVY)
+
+
+def test_help_names_every_job_experiment_and_budget(launch, launcher):
+    status, out, err = launch("--help")
+    assert (status, err) == (0, "")
+    for group in ("exp", "budget"):
+        for file in (ROOT / "conf" / group).glob("*.yaml"):
+            assert f"\n  {file.stem} " in out
+    assert out.count("\n  evade +exp=") == 7
+    assert "$" not in out
+
+
+def test_cfg_job_prints_the_composed_configuration(launch):
+    status, out, err = launch("--cfg", "job", "+exp=bytestream", "budget=smoke", "seed=3")
+    assert (status, err) == (0, "")
+    assert "\nseed: 3\n" in out
+    assert "\nbudget: smoke\n" in out
+
+
+def test_the_module_refuses_with_one_message_and_no_traceback(tmp_path):
+    result = shell(sys.executable, "-m", "platform.launch", "+exp=bytestream", "algo.lr=nan")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == "evade: refused: algo.lr: Input should be a finite number, got nan\n"
+
+
+@pytest.mark.skipif(not EVADE.exists(), reason="the command is not installed; run `pip install -e .`")
+def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
+    words = ("+exp=bytestream", "seed=five")
+    here, there = shell(sys.executable, "-m", "platform.launch", *words), shell(EVADE, *words, cwd=tmp_path)
+    assert (here.returncode, here.stderr) == (there.returncode, there.stderr)
+    assert here.returncode == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["foo=1"], "foo: no such key, got foo=1; --cfg job shows every key"),
+        (["+foo=1"], "foo: no such key, got 1; --cfg job shows every key"),
+        (["sed=1"], "sed: no such key, got sed=1; did you mean seed?"),
+        (["contrast_threshold=0.1"], "did you mean camera.contrast_threshold?"),
+        (["env.control-hz=45"], "did you mean env.control_hz?"),
+        (["env.control_hz=fast"], "env.control_hz: Input should be a valid number, got 'fast'"),
+        (["env.control_hz=nan"], "env.control_hz: Input should be a finite number, got nan"),
+        (["env.control_hz=inf"], "env.control_hz: Input should be a finite number, got inf"),
+        (["env.speed_mps=-1"], "env.speed_mps: Input should be greater than 0, got -1"),
+        (["faults.sparsity=1.5"], "faults.sparsity: Input should be less than or equal to 1, got 1.5"),
+        (["env.scene=moon"], "env.scene: must be one of cones, dynamic, gates, poles, "),
+        (["collect.scenes=[moon]"], "collect.scenes: must be one of cones, dynamic, gates, poles, "),
+        (["sweep.scene=moon"], "sweep.scene: must be one of cones, dynamic, gates, poles, "),
+        (
+            ["+env.layout.num_obstacles=100000"],
+            "env.layout: layout num_obstacles=100000 cannot be placed 2.0 m apart",
+        ),
+        (["env.split=eval"], "env.split: no such key, got env.split=eval; every job chooses it itself"),
+        (["+env.split=eval"], "env.split: no such key, got 'eval'; every job chooses it itself"),
+        (["seed=null"], "seed: Input should be a valid integer, got None"),
+        (["seed="], "seed: Input should be a valid integer, got ''"),
+        (["job=os.system"], "job: Input should be 'pipeline'"),
+        (["budget=huge"], "budget: must be one of paper, short, smoke, got 'huge'"),
+        (["env=3"], "env=3: "),
+        (["seed=[1"], "seed=[1: "),
+        (["seed"], "Error parsing override 'seed'"),
+        (["seed=1,2"], "'seed=1,2': write [a,b] for a list; several runs are the sweep job's work"),
+        (["--multirun", "seed=1,2"], "--multirun: several runs are the sweep job's work"),
+        (["-m"], "-m: several runs are the sweep job's work: +exp=robustness"),
+        (["hydra.mode=MULTIRUN"], "hydra.mode=MULTIRUN: several runs are the sweep job's work"),
+        (["hydra.run.dir=elsewhere"], "hydra.run.dir=elsewhere: Hydra's own settings are fixed"),
+        (["+hydra.callbacks.x._target_=os.system"], "Hydra's own settings are fixed"),
+        (["+env.layout._target_=os.system"], "env.layout._target_: such keys make Hydra call code"),
+        (["++algo={_target_:torch.load,f:x}"], "algo._target_: such keys make Hydra call code"),
+        (["+sweep.axes.x=[{_target_:os.remove}]"], "sweep.axes.x.0._target_: such keys make Hydra call code"),
+        (["tracking.uri=${oc.env:HOME}"], "tracking.uri: must be the value itself, not a reference"),
+        (["--experimental-rerun=config.pickle"], "Hydra's own settings are fixed"),
+    ],
+)
+def test_a_refused_command_line_ends_with_status_2_and_one_message(launch, job, tmp_path, words, message):
+    job(lambda config: pytest.fail("the job must not start"))
+    status, out, err = launch("+exp=train", *words)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert err.startswith("evade: refused: ")
+    assert len(err.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", [[], ["budget=smoke"], ["seed=1"]])
+def test_without_an_experiment_the_message_lists_them(launch, words):
+    status, _, err = launch(*words)
+    assert status == 2
+    assert (
+        "name an experiment with +exp=NAME, one of bytestream, bytestream_finetuned, bytestream_paper, "
+        in err
+    )
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("word", "message"), [("exp=train", "use +exp=train"), ("+exp=trian", "got 'trian'")]
+)
+def test_a_misspelt_experiment_is_refused(launch, word, message):
+    status, _, err = launch(word)
+    assert status == 2
+    assert message in err
+
+
+def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folder(
+    launch, job, tmp_path, monkeypatch
+):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    given = []
+    job(given.append)
+    words = [
+        "env.scene=poles_eval",
+        "+env.layout.num_obstacles=60",
+        "seed=3",
+        "renderer=raycast",
+        "resume=runs/x",
+    ]
+    status, out, err = launch("+exp=train", *words)
+    assert (status, err) == (0, "")
+    (line,) = out.splitlines()
+    said, _, command = line.partition(": ")
+    assert said == "If this is stopped, it continues with"
+    assert shlex.split(command) == [sys.executable, "-m", "platform.launch", "+exp=train", *words]
+    (config,) = given
+    assert isinstance(config, Config)
+    assert (config.job, config.seed, config.renderer, config.resume) == ("train", 3, "raycast", "runs/x")
+    assert config.env_config().layout == {"num_obstacles": 60.0}
+    assert list(tmp_path.iterdir()) == []
+    assert "HYDRA_FULL_ERROR" not in os.environ
+
+
+def test_a_process_gets_one_thread_unless_the_user_says_otherwise(launch, launcher, job, monkeypatch):
+    for name in launcher.ONE_THREAD:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    seen = []
+    job(lambda config: seen.append({name: os.environ[name] for name in launcher.ONE_THREAD}))
+    assert launch("+exp=train")[0] == 0
+    assert seen == [{**launcher.ONE_THREAD, "OMP_NUM_THREADS": "4"}]
+
+
+def unknown_scene(config):
+    from envs.scene import make_scene
+
+    make_scene("moon", None)
+
+
+def lost_renderer(config):
+    raise KeyError("renderer")
+
+
+def test_a_value_that_the_job_refuses_ends_with_status_2_and_one_message(launch, job):
+    job(unknown_scene)
+    status, _, err = launch("+exp=train")
+    assert status == 2
+    assert "moon" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_an_unexpected_failure_shows_its_traceback_and_ends_with_status_1(launch, job):
+    job(lost_renderer)
+    status, _, err = launch("+exp=train")
+    assert status == 1
+    assert "Traceback" in err
+    assert err.endswith("evade: failed: KeyError: 'renderer'\n")
+
+
+def test_the_traceback_of_a_refusal_is_shown_on_demand(launch, job, monkeypatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    job(unknown_scene)
+    status, _, err = launch("+exp=train")
+    assert status == 2
+    assert "Traceback" in err
+
+
+def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):
+    # A background shell starts its children deaf to Ctrl+C; Python then makes no exception of it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    job(lambda config: signal.raise_signal(signal.SIGINT))
+    try:
+        status, _, err = launch("+exp=train")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert status == 130
+    assert len(err.splitlines()) == 1
+
+
+def test_every_job_has_a_module(launcher):
+    assert [path for path in launcher.JOBS.values() if importlib.util.find_spec(path) is None] == []
+    assert set(launcher.JOBS) == set(Config.__annotations__["job"].__args__)
+
+
+def test_the_launcher_says_so_when_conf_is_not_there(launch, launcher, monkeypatch, tmp_path):
+    monkeypatch.setattr(launcher, "CONF", tmp_path / "conf")
+    status, _, err = launch("+exp=train")
+    assert status == 2
+    assert "pip install -e ." in err

@@ -1,0 +1,177 @@
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from mlflow import MlflowClient
+
+from envs.config import EnvConfig
+from envs.corridor import CorridorEnv
+from models.policy import load_policy
+
+ROOT = Path(__file__).resolve().parents[2]
+SECTIONS = ("evae/", "train/", "eval/", "sim/", "perf/")
+
+
+def launch(folder: Path, *words: str) -> str:
+    """What the launcher prints; it must end well."""
+    command = [sys.executable, "-m", "platform.launch", *words, "budget=smoke", f"runs_dir={folder / 'runs'}"]
+    environment = {**os.environ, "PYTHONPATH": ""}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """One smoke run through every stage, shared by the tests of this file."""
+    folder = tmp_path_factory.mktemp("flown")
+    printed = launch(folder, "+exp=bytestream")
+    (run,) = (folder / "runs").iterdir()
+    return folder, run, printed
+
+
+FEW_STEPS = (
+    "algo.train_batch_size_per_learner=256",
+    "train.env_steps=512",
+    "evaluate.episodes=2",
+    "evaluate.renderers=[raycast]",
+    "evaluate.video=false",
+    "env.scene=poles_eval",  # one scene instead of two
+    "env.time_limit_s=1.0",
+)
+
+
+@pytest.mark.parametrize(
+    ("exp", "words"),
+    [
+        ("event_columns", FEW_STEPS),
+        pytest.param("event_image", (), marks=pytest.mark.slow),
+        pytest.param("rgb", (), marks=pytest.mark.slow),
+    ],
+)
+def test_a_policy_without_an_event_vae_trains_and_evaluates_at_once(tmp_path, exp, words):
+    printed = launch(tmp_path, f"+exp={exp}", *words)
+    assert re.search(r"policy stochastic\s+│ poles_eval\s+│ raycast\s+│\s+\d+ │\s+\d+ \[\d+, \d+\]", printed)
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run.name.startswith(f"{exp}-smoke-s0-")
+    assert not {"data", "encoder"} & {path.name for path in run.iterdir()}
+    assert {path.stem for path in (run / "stages").iterdir()} == {"train", "evaluate"}
+    assert {path.name for path in (run / "policy").iterdir()} == {"policy.json", "networks.safetensors"}
+    assert (run / "eval" / "episode.mp4").is_file() is (not words)
+    policy = load_policy(run / "policy")
+    env = CorridorEnv(EnvConfig(split="eval", observation=policy.observation))
+    observation, _ = env.reset(seed=0)
+    for _ in range(5):
+        observation, *_ = env.step(int(policy(observation[None])[0]))
+    _, stored = stored_run(tmp_path)
+    assert (stored.info.status, stored.data.tags["policy"]) == ("FINISHED", policy.manifest["name"])
+    assert stored.info.run_name == run.name
+    assert all(any(name.startswith(section) for name in stored.data.metrics) for section in SECTIONS[1:])
+
+
+@pytest.mark.slow
+def test_an_encoder_that_learns_on_goes_through_every_stage_and_the_sweep(tmp_path):
+    launch(tmp_path, "+exp=bytestream_finetuned", *FEW_STEPS)
+    (run,) = (tmp_path / "runs").iterdir()
+    assert {path.stem for path in (run / "stages").iterdir()} == {"collect", "pretrain", "train", "evaluate"}
+    assert {path.name for path in (run / "policy").iterdir()} == {"policy.json", "networks.safetensors"}
+    pretrained = safetensors.numpy.load_file(run / "encoder" / "encoder.safetensors")
+    learnt = safetensors.numpy.load_file(run / "policy" / "networks.safetensors")
+    for name, value in pretrained.items():
+        if not name.startswith("decoder."):
+            moved = not np.array_equal(learnt[f"trunk.{name}"], value)
+            assert moved is not ("running" in name or "num_batches" in name), name
+    axes = "~sweep.axes.renderer", "+sweep.axes.sparsity={faults.sparsity: [0.5]}"
+    flown = "sweep=renderer", "sweep.policies=[newest]", "sweep.trials=1", *axes
+    assert re.search(r"sparsity\s+│ 0\.5", launch(tmp_path, "+exp=robustness", *flown))
+
+
+def stored_run(folder: Path):
+    client = MlflowClient(f"sqlite:///{folder / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("evade")
+    runs = client.search_runs([experiment.experiment_id], "tags.kind = 'run'")
+    assert len(runs) == 1
+    return client, runs[0]
+
+
+def test_the_table_shows_the_policy_between_its_bounds(flown):
+    for name in ("policy stochastic", "policy deterministic", "straight", "random", "oracle"):
+        assert re.search(rf"{name}\s+│ poles_eval\s+│ raycast\s+│\s+10 │\s+\d+ \[\d+, \d+\]", flown[2]), name
+    assert "/#/experiments/" in flown[2]
+
+
+def test_pretraining_reduced_the_loss_on_unseen_flights(flown):
+    client, run = stored_run(flown[0])
+    history = client.get_metric_history(run.info.run_id, "evae/reconstruction_step")
+    assert len(history) == 2
+    assert history[-1].value < history[0].value
+
+
+def test_the_store_holds_settings_figures_and_pictures(flown):
+    client, run = stored_run(flown[0])
+    assert run.info.status == "FINISHED"
+    assert run.data.params["camera.contrast_threshold"] == "0.2"
+    assert run.data.params["algo.minibatch_size"] == "256"
+    assert all(any(name.startswith(section) for name in run.data.metrics) for section in SECTIONS)
+    assert np.isfinite(list(run.data.metrics.values())).all()
+    steps = [point.step for point in client.get_metric_history(run.info.run_id, "train/entropy")]
+    assert steps == sorted(set(steps))
+    assert steps[-1] >= 4096
+    files = {
+        file.path for folder in ("evae", "eval") for file in client.list_artifacts(run.info.run_id, folder)
+    }
+    assert "config.yaml" in {file.path for file in client.list_artifacts(run.info.run_id)}
+    wanted = {"evae/reconstructions.png", "eval/trajectories.png", "eval/episode.mp4", "eval/table.md"}
+    assert wanted <= files
+
+
+def test_the_policy_carries_the_very_encoder_that_was_pretrained(flown):
+    run = flown[1]
+    encoder = json.loads((run / "encoder" / "encoder.json").read_text())
+    carried = json.loads((run / "policy" / "encoder.json").read_text())
+    assert carried["sha256"] == encoder["sha256"]
+
+
+def test_the_policy_folder_alone_flies(flown, tmp_path):
+    folder = tmp_path / "elsewhere"
+    (flown[1] / "policy").rename(folder)
+    try:
+        policy = load_policy(folder)
+        env = CorridorEnv(EnvConfig(split="eval"))
+        window, _ = env.reset(seed=0)
+        for _ in range(10):
+            window, *_ = env.step(int(policy(window[None])[0]))
+    finally:
+        folder.rename(flown[1] / "policy")
+
+
+def test_the_same_command_again_repeats_nothing(flown):
+    start = time.monotonic()
+    printed = launch(flown[0], "+exp=bytestream")
+    assert time.monotonic() - start < 60
+    assert "Train the policy" not in printed
+    assert "policy stochastic" in printed
+    stored_run(flown[0])
+
+
+def test_a_sweep_flies_the_policy_just_trained_and_a_rerun_flies_nothing(flown):
+    printed = launch(flown[0], "+exp=robustness", "sweep.policies=[newest]", "sweep.trials=1")
+    for axis in ("control_hz", "contrast_threshold", "sparsity", "background_activity"):
+        assert axis in printed
+    again = launch(flown[0], "+exp=robustness", "sweep.policies=[newest]", "sweep.trials=1")
+    assert "Sweep:" not in again
+    client = MlflowClient(f"sqlite:///{flown[0] / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("evade").experiment_id
+    (parent,) = client.search_runs([experiment], "tags.kind = 'sweep'")
+    children = client.search_runs([experiment], f"tags.`mlflow.parentRunId` = '{parent.info.run_id}'")
+    assert len({child.info.run_name for child in children}) == len(children) >= 12
+    assert {child.info.status for child in children} == {"FINISHED"}

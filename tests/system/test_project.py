@@ -1,0 +1,156 @@
+import importlib
+import importlib.metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+import jobs
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+LOCK = [line for line in (ROOT / "requirements.lock").read_text().splitlines() if line and line[0] != "#"]
+SOURCES = ("*.*", "Makefile", ".ci/*", "conf/**/*.yaml", "docker/*", "docs/*.md", "[a-z]*/**/*.py")
+
+
+def locked() -> dict[str, str]:
+    return dict(line.split("==") for line in LOCK)
+
+
+def normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_line_of_the_lock_pins_one_package():
+    assert [line for line in LOCK if not re.fullmatch(r"[a-z0-9.-]+==[0-9][a-z0-9.]*", line)] == []
+    assert len(locked()) == len(LOCK)
+
+
+def test_the_lock_holds_everything_that_the_project_needs_in_a_fitting_version():
+    extras = PROJECT["optional-dependencies"]
+    for text in [*PROJECT["dependencies"], *extras["dev"], *extras["docs"]]:
+        needed = Requirement(text)
+        assert needed.specifier.contains(locked()[normal(needed.name)]), text
+
+
+def test_the_lock_leaves_the_build_of_torch_open():
+    assert locked()["torch"] == "2.13.0"
+    assert [name for name in locked() if name.startswith(("nvidia", "triton", "cuda"))] == []
+
+
+def test_the_installed_versions_are_those_of_the_lock():
+    assert [
+        (name, version, importlib.metadata.version(name))
+        for name, version in locked().items()
+        if importlib.metadata.version(name).partition("+")[0] != version
+    ] == []
+
+
+def test_the_changelog_begins_with_the_version_of_the_project():
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest[1] == PROJECT["version"]
+    assert importlib.metadata.version("evade") == PROJECT["version"]
+
+
+@pytest.mark.parametrize("entry", PROJECT["scripts"].values())
+def test_every_entry_point_leads_to_a_function(entry):
+    module, _, name = entry.partition(":")
+    assert callable(getattr(importlib.import_module(module), name))
+
+
+def test_the_command_says_so_when_the_launcher_is_not_there(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(jobs, "__file__", str(tmp_path / "jobs" / "__init__.py"))
+    assert jobs.main() == 2
+    assert "pip install -e ." in capsys.readouterr().err
+
+
+def test_importing_the_rooms_is_light():
+    code = "import sys, envs, jobs, models; print({'torch', 'ray', 'mlflow', 'hydra'} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True) == "set()\n"
+
+
+def test_make_help_lists_every_target():
+    environment = {
+        key: value for key, value in os.environ.items() if not key.startswith("MAKE")
+    }  # as if typed
+
+    def make(*words: str) -> str:
+        return subprocess.check_output(["make", *words], cwd=ROOT, env=environment, text=True)
+
+    listed = make("help")
+    targets = {
+        "setup",
+        "bytestream",
+        "train-all",
+        "sweep-robustness",
+        "mlflow",
+        "test",
+        "test-faults",
+        "test-cluster",
+        "lint",
+        "check",
+        "bench",
+        "docs",
+    }
+    assert {line.split()[0] for line in listed.splitlines()[1:]} == targets | {"lock", "clean", "help"}
+    assert make() == listed
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "setup",
+        "bytestream",
+        "train-all",
+        "sweep-robustness",
+        "mlflow",
+        "lint",
+        "check",
+        "bench",
+        "docs",
+        "lock",
+        "clean",
+    ],
+)
+def test_make_knows_how_to_reach_every_target(target):
+    subprocess.run(["make", "--dry-run", target], cwd=ROOT, check=True, capture_output=True)
+
+
+def test_a_sweep_trains_and_ships_its_policies_first_only_if_told_to():
+    def planned(*words: str) -> str:
+        command = ["make", "--dry-run", "sweep-robustness", "POLICIES=rgb", "SEEDS=4", *words]
+        return subprocess.check_output(command, cwd=ROOT, text=True)
+
+    assert "job=train" not in planned()
+    told = planned("train=true", "ARGS=budget=smoke")
+    flown = "+exp=robustness 'sweep.policies=[rgb,straight,oracle]' budget=smoke"
+    parts = ["job=train", "+exp=ship budget=smoke", flown]
+    assert sorted(map(told.index, parts)) == list(map(told.index, parts))
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_the_continuous_integration_script_is_valid():
+    subprocess.run(["bash", "-n", ".ci/run"], cwd=ROOT, check=True)
+    assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
+
+
+def test_no_file_names_a_package_index_or_a_folder_of_one_machine():
+    index = r"\s--(?:extra-)?index-url|\s--find-links|\s--trusted-host"
+    private = re.compile(index + r"|/home/(?!evade/)[a-z]|/root/")  # evade is the image's own user
+    files = [path for pattern in SOURCES for path in ROOT.glob(pattern) if path.is_file()]
+    files = [path for path in files if path.suffix not in (".db", ".png", ".gif", ".svg", ".mp4")]
+    found = {
+        str(path.relative_to(ROOT)): private.findall(path.read_text())
+        for path in files
+        if path != Path(__file__)
+    }
+    assert {name: words for name, words in found.items() if words} == {}
+    assert {"Makefile", "requirements.lock", "platform/launch.py", "conf/config.yaml", ".ci/run"} <= set(
+        found
+    )
