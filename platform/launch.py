@@ -18,7 +18,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from jobs.run.provenance import REPOSITORY as ROOT
+from jobs.run.threads import ONE_THREAD
+
 CONF = ROOT / "conf"
 
 JOBS = {
@@ -34,15 +36,6 @@ JOBS = {
     "trade_simulator": "jobs.studies.simulator",
     "trade_encoder": "jobs.studies.encoder.trade",
     "probe": "jobs.studies.probe.probe",
-}
-
-# Two threads beside other busy processes ran ten times slower than one.
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-    "LP_NUM_THREADS": "0",
 }
 
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"

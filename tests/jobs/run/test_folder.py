@@ -10,9 +10,9 @@ import pytest
 
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError
-from jobs.run import folder as runs
 from jobs.run.files import RunError, write_json
-from jobs.run.folder import UNNAMED, finish, finished, holding, latest_policies, open_run, run_name
+from jobs.run.folder import UNNAMED, finish, finished, latest_policies, open_run, run_name
+from jobs.run.locks import held_alone
 from jobs.run.provenance import REPOSITORY, git_commit
 
 
@@ -122,7 +122,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_part(config, monkeypatch):
     def full(handle):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(runs.os, "fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
         finish(run, "train", {"loss": 2.0})
     assert finished(run, "train") == {"loss": 1.0}
@@ -134,8 +134,8 @@ def test_one_process_works_in_a_run_folder_and_lets_go_when_it_is_killed(config)
     code = f"""
 import sys
 from pathlib import Path
-from jobs.run.folder import Run, holding
-with holding(Run(Path({str(run.path)!r}), None)):
+from jobs.run.locks import held_alone
+with held_alone(Path({str(run.path)!r})):
     print("in", flush=True)
     sys.stdin.read()
 """
@@ -144,11 +144,11 @@ with holding(Run(Path({str(run.path)!r}), None)):
         other.stdout.readline()
         with (
             pytest.raises(RunError, match=rf"process {other.pid} of .* works there; wait until"),
-            holding(run),
+            held_alone(run.path),
         ):
             pass
         other.kill()
-    with holding(run):
+    with held_alone(run.path):
         pass
 
 

@@ -11,7 +11,8 @@ from PIL import Image
 
 from jobs.config.config import ConfigError
 from jobs.run.files import RunError
-from jobs.run.folder import Run, holding, open_run
+from jobs.run.folder import Run, open_run
+from jobs.run.locks import held_alone
 from jobs.tracking import retry_queue as retry_queue
 from jobs.tracking import tracker as tracking
 from jobs.tracking.child_runs import Child, write_children
@@ -212,7 +213,7 @@ def test_a_store_that_does_not_answer_stops_with_one_error_that_says_where_the_r
 
 def test_a_second_process_is_kept_out_of_the_run_folder(folder):
     with (
-        holding(folder),
+        held_alone(folder.path),
         pytest.raises(RunError, match=r"works there; wait until it has ended"),
         open_tracker(folder.config, folder),
     ):
