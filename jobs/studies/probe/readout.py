@@ -112,6 +112,9 @@ def inner_flights(flight: np.ndarray) -> np.ndarray:
 def ridge(x: np.ndarray, y: np.ndarray, inner: np.ndarray, x_held_out: np.ndarray) -> np.ndarray:
     """Predictions (M, K) by ridge regression in closed form; the penalty is the best for `inner` steps.
 
+    All penalties share the normal equations. scikit-learn's Ridge forms them anew for each, which took
+    five to eight times as long on 20,000 rows, and holds all rows in float64.
+
     Args:
         x: float32 (N, D), of mean 0 and deviation 1.
         y: (N, K).
