@@ -64,6 +64,7 @@ def start(results, name):
         results.put((name, "out"))
 
 
+@pytest.mark.system
 def test_two_processes_start_ray_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     context = multiprocessing.get_context("fork")
@@ -196,6 +197,7 @@ print("joined")
 """
 
 
+@pytest.mark.system
 def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_token):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
     environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # of joining; Ray's own 20 take as many seconds
