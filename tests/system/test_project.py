@@ -85,10 +85,10 @@ def test_importing_the_rooms_is_light():
     assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True) == "set()\n"
 
 
-TARGETS = """
-    setup bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster
-    lint check bench docs lock clean
-""".split()
+TARGETS = (
+    *("setup", "bytestream", "train-all", "sweep-robustness", "mlflow", "lint", "check", "bench", "docs"),
+    *("test", "test-system", "test-slow", "test-faults", "test-cluster", "lock", "clean"),
+)
 
 
 def test_make_help_lists_every_target():
