@@ -203,7 +203,8 @@ def test_the_tracked_figures_name_agent_scene_and_renderer(tmp_path):
     assert len(figures) <= 40
 
 
-@pytest.mark.parametrize("name", ["bytestream", "rgb"])
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["bytestream", pytest.param("rgb", marks=pytest.mark.slow)])
 def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)

@@ -127,6 +127,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_part(config, monkeypatch):
     assert [path.name for path in (run.path / "stages").iterdir()] == ["train.json"]
 
 
+@pytest.mark.system
 def test_one_process_works_in_a_run_folder_and_lets_go_when_it_is_killed(config):
     run = open_run(config)
     code = f"""

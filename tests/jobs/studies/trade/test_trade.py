@@ -106,6 +106,7 @@ def stub(monkeypatch):
     return StubTuner
 
 
+@pytest.mark.system
 @pytest.mark.timeout(900)  # where no kernel is compiled yet
 def test_the_job_leaves_table_figure_and_page_and_a_second_run_flies_only_what_failed(tmp_path, policy, stub):
     config = trade_config(tmp_path, policy)
