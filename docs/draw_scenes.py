@@ -1,4 +1,4 @@
-"""Draw every scene for docs/scenes.md and print the figures of its table.
+"""Draw every scene for docs/scenes.md and print the numbers of its table.
 
 Run from the repository root: python docs/draw_scenes.py [NAME ...]
 Writes docs/images/scene_NAME.png, three panels each: the corridor from above the start, what
@@ -41,7 +41,7 @@ def main() -> None:
                 scene = make_scene(example_mesh(folder), np.random.default_rng(SEED))
         else:
             scene = make_scene(name, np.random.default_rng(SEED))
-            sys.stdout.write(figures(name) + "\n")
+            sys.stdout.write(measurements(name) + "\n")
         draw(scene).save(IMAGES / f"scene_{name}.png", optimize=True)
 
 
@@ -102,7 +102,7 @@ def example_mesh(folder: str) -> str:
     return path
 
 
-def figures(name: str) -> str:
+def measurements(name: str) -> str:
     """How many corridors are passable and what they cost, over `CORRIDORS` seeds."""
     starts = np.random.default_rng(0)
     passable = hits = 0

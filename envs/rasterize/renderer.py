@@ -69,9 +69,7 @@ class PyrenderRenderer:
             ValueError: If a size is not at least 1, fov_deg not in [1, 170], or cull_m not > 0.
             RuntimeError: If EGL or a system library it needs is missing; names the packages.
         """
-        check_image(width, height, fov_deg, samples)
-        if not cull_m > 0.0:
-            raise ValueError(f"cull_m must be > 0 (inf: draw everything), got {cull_m!r}")
+        check_image(width, height, fov_deg, samples, cull_m)
         self.width, self.height, self.samples, self.cull_m = width, height, samples, cull_m
         self._platform, self._renderer = _start(width * samples, height * samples, samples > 1)
         self._slope = math.tan(0.5 * math.radians(fov_deg))

@@ -12,7 +12,7 @@ import numpy as np
 from envs.raycast.bodies import box_slab, depths
 from envs.raycast.coverage import Layer, share_below
 from envs.raycast.records import Canvas, Ends, Record, inlined, kernel
-from envs.scene import CONE
+from envs.scene import BOX, CONE
 from envs.scene.textures import LEVELS, NOISE, RINGS, STACK_TEXELS, STRIPES
 
 TEXELS = STACK_TEXELS * STACK_TEXELS
@@ -30,6 +30,13 @@ class Footprint(NamedTuple):
     one_q: float
     other_s: float
     other_q: float
+
+
+class Rows(NamedTuple):
+    """From where to where a pattern is averaged, in rows of the image."""
+
+    first: float
+    last: float
 
 
 class Quadric(NamedTuple):
@@ -108,8 +115,14 @@ def _noise(stacks: np.ndarray, stack: int, s: float, q: float, sides: Footprint,
     return total / count
 
 
+@inlined
+def _scaled(sides: Footprint, scale: float) -> Footprint:
+    """A footprint in another unit."""
+    return Footprint(sides.one_s * scale, sides.one_q * scale, sides.other_s * scale, sides.other_q * scale)
+
+
 @kernel
-def pattern(
+def _pattern(
     frame: Record, stacks: np.ndarray, look: Record, s: float, q: float, sides: Footprint, max_lookups: int
 ) -> float:
     """Contrast times the mean of a texture over the parallelogram around (s, q) [m].
@@ -120,26 +133,20 @@ def pattern(
     scale = look.frequency
     s = (s - look.speed_s * frame.time) * scale
     q = (q - look.speed_q * frame.time) * scale
-    one_s, one_q, other_s, other_q = (
-        sides.one_s * scale,
-        sides.one_q * scale,
-        sides.other_s * scale,
-        sides.other_q * scale,
-    )
+    sides = _scaled(sides, scale)
     mean = look.contrast
     if look.pattern == NOISE:
-        tiles = Footprint(0.25 * one_s, 0.25 * one_q, 0.25 * other_s, 0.25 * other_q)
-        return mean * _noise(stacks, look.stack, 0.25 * s, 0.25 * q, tiles, max_lookups)
+        return mean * _noise(stacks, look.stack, 0.25 * s, 0.25 * q, _scaled(sides, 0.25), max_lookups)
     if look.pattern != RINGS:
-        mean *= _wave(s, math.sqrt(one_s * one_s + other_s * other_s))
+        mean *= _wave(s, math.sqrt(sides.one_s * sides.one_s + sides.other_s * sides.other_s))
     if look.pattern != STRIPES:
-        mean *= _wave(q, math.sqrt(one_q * one_q + other_q * other_q))
+        mean *= _wave(q, math.sqrt(sides.one_q * sides.one_q + sides.other_q * sides.other_q))
     return mean
 
 
 @kernel
 def _level_row(
-    frame: Record, stacks: np.ndarray, look: Record, rows: Ends, height: float, u: float, wide: float
+    frame: Record, stacks: np.ndarray, look: Record, rows: Rows, height: float, u: float, wide: float
 ) -> float:
     """Contrast times the mean of a texture of a level face at `height` [m] over some rows.
 
@@ -148,7 +155,7 @@ def _level_row(
     """
     drop = frame.focal * (frame.eye_z - height)
     along_s, along_q = u * frame.cos - frame.sin, u * frame.sin + frame.cos
-    low, high = rows.left - frame.horizon, rows.right - frame.horizon
+    low, high = rows.first - frame.horizon, rows.last - frame.horizon
     if abs(low) < MIN_ROW:
         low = math.copysign(MIN_ROW, drop)
     if abs(high) < MIN_ROW:
@@ -167,16 +174,16 @@ def _level_row(
         across = depth * wide
         sides = Footprint(across * frame.cos, across * frame.sin, long * along_s, long * along_q)
         s, q = frame.eye_x + depth * along_s, frame.eye_y + depth * along_q
-        total += pattern(frame, stacks, look, s, q, sides, max_lookups)
+        total += _pattern(frame, stacks, look, s, q, sides, max_lookups)
         first = last
     return total / parts
 
 
 @inlined
-def _rows_between(row: int, top: Ends, bottom: Ends) -> Ends:
+def _rows_between(row: int, top: Ends, bottom: Ends) -> Rows:
     """First and last row of the part of a pixel that lies between the middles of two edges."""
     high, low = 0.5 * (top.left + top.right), 0.5 * (bottom.left + bottom.right)
-    return Ends(min(max(high, row), low), max(min(low, row + 1.0), high))
+    return Rows(min(max(high, row), low), max(min(low, row + 1.0), high))
 
 
 @kernel
@@ -189,32 +196,30 @@ def texture_level(canvas: Canvas, top: Ends, bottom: Ends, height: float) -> Non
         share = share_below(row, top) - share_below(row, bottom)
         if share > 0.0:
             start, end = _rows_between(row, top, bottom)
-            rows = Ends(start, max(start, end))
+            rows = Rows(start, max(start, end))
             mean = _level_row(frame, canvas.stacks, frame.body_texture, rows, height, strip.slope, wide)
             canvas.accumulators[Layer.PAINT, row] += weight * share * mean
 
 
 @kernel
-def texture_side(canvas: Canvas, top: Ends, bottom: Ends, across: Ends, foot: float) -> None:
-    """Add the pattern of a body's upright face between two edges.
-
-    Args:
-        canvas: With the strip's light and the depth at which it enters the body.
-        top: Upper edge.
-        bottom: Lower edge.
-        across: Coordinate s at both ends of the gap [m].
-        foot: Coordinate q at height 0 [m].
-    """
+def texture_side(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
+    """Add the pattern of the side of a box or a pole between two edges."""
     frame, strip = canvas.frame, canvas.strip
+    if body.kind == BOX:
+        left, right = _along_face(frame, body, strip)
+        foot = 0.0
+    else:
+        left, right = _around_pole(frame, body, strip)
+        foot = body.y
     tall, weight = strip.entry / frame.focal, strip.weight * strip.light
-    middle, max_lookups = 0.5 * (across.left + across.right), int(MAX_LOOKUPS * frame.samples)
+    middle, max_lookups = 0.5 * (left + right), int(MAX_LOOKUPS * frame.samples)
     for row in range(int(min(top.left, top.right)), int(max(bottom.left, bottom.right)) + 1):
         share = share_below(row, top) - share_below(row, bottom)
         if share > 0.0:
             start, end = _rows_between(row, top, bottom)
             q = foot + frame.eye_z - (0.5 * (start + end) - frame.horizon) * tall
-            sides = Footprint(across.right - across.left, 0.0, 0.0, max(0.0, end - start) * tall)
-            mean = pattern(frame, canvas.stacks, frame.body_texture, middle, q, sides, max_lookups)
+            sides = Footprint(right - left, 0.0, 0.0, max(0.0, end - start) * tall)
+            mean = _pattern(frame, canvas.stacks, frame.body_texture, middle, q, sides, max_lookups)
             canvas.accumulators[Layer.PAINT, row] += weight * share * mean
 
 
@@ -253,7 +258,7 @@ def _texture_layer(canvas: Canvas, layer: Layer, u: float) -> None:
             middle = (
                 u if part > 1.0 - MIN_SHOWN else min(max(across / shown, u - 0.5 * whole), u + 0.5 * whole)
             )
-            rows = Ends(low, low + tall)
+            rows = Rows(low, low + tall)
             if ground:
                 mean = _level_row(frame, stacks, frame.ground_texture, rows, 0.0, middle, part * whole)
             else:
@@ -263,7 +268,7 @@ def _texture_layer(canvas: Canvas, layer: Layer, u: float) -> None:
 
 
 @kernel
-def _wall_row(frame: Record, stacks: np.ndarray, rows: Ends, side: float, u: float, wide: float) -> float:
+def _wall_row(frame: Record, stacks: np.ndarray, rows: Rows, side: float, u: float, wide: float) -> float:
     """Contrast times the mean of the wall at x = side * half width over some rows."""
     away = side * frame.wall_half - frame.eye_x
     left, right = u - 0.5 * wide, u + 0.5 * wide
@@ -273,14 +278,14 @@ def _wall_row(frame: Record, stacks: np.ndarray, rows: Ends, side: float, u: flo
     one, other = min(abs(one), 1e9), min(abs(other), 1e9)
     one, other = one * (left * frame.sin + frame.cos), other * (right * frame.sin + frame.cos)
     tall = away / (u * frame.cos - frame.sin) / frame.focal
-    q = frame.eye_z - (0.5 * (rows.left + rows.right) - frame.horizon) * tall
-    sides = Footprint(other - one, 0.0, 0.0, (rows.right - rows.left) * tall)
+    q = frame.eye_z - (0.5 * (rows.first + rows.last) - frame.horizon) * tall
+    sides = Footprint(other - one, 0.0, 0.0, (rows.last - rows.first) * tall)
     s = frame.eye_y + 0.5 * (one + other)
-    return pattern(frame, stacks, frame.wall_texture, s, q, sides, int(MAX_LOOKUPS * frame.samples))
+    return _pattern(frame, stacks, frame.wall_texture, s, q, sides, int(MAX_LOOKUPS * frame.samples))
 
 
 @kernel
-def along_face(frame: Record, body: Record, strip: Record) -> Ends:
+def _along_face(frame: Record, body: Record, strip: Record) -> Ends:
     """World y (x) where both ends of the gap meet the face of a box that looks along x (y) [m]."""
     cos, sin, left, right = frame.cos, frame.sin, strip.gap_slopes.left, strip.gap_slopes.right
     along_x, along_y = strip.slope * cos - sin, strip.slope * sin + cos
@@ -297,7 +302,7 @@ def along_face(frame: Record, body: Record, strip: Record) -> Ends:
 
 
 @kernel
-def around_pole(frame: Record, body: Record, strip: Record) -> Ends:
+def _around_pole(frame: Record, body: Record, strip: Record) -> Ends:
     """Surface coordinate s [m] where both ends of the gap meet a pole."""
     one, other = _azimuth(frame, body, strip.gap_slopes.left), _azimuth(frame, body, strip.gap_slopes.right)
     turn = other - one
@@ -356,15 +361,15 @@ def _turn_between(one: Place, other: Place) -> float:
 
 @kernel
 def curved_pattern(
-    canvas: Canvas, body: Record, shapes: tuple[Quadric, Quadric, Quadric], low: float, high: float
+    canvas: Canvas, body: Record, shapes: tuple[Quadric, Quadric, Quadric], rows: Rows
 ) -> float:
     """Contrast times the pattern's mean over some rows of a cone's side or an ellipsoid.
 
     `shapes` are `quadric` at the left end of the gap, at its right end and in its middle.
     """
     frame, strip, slopes = canvas.frame, canvas.strip, canvas.strip.gap_slopes
-    fall = (0.5 * (low + high) - frame.horizon) / frame.focal
-    tall = 0.5 * (high - low) / frame.focal
+    fall = (0.5 * (rows.first + rows.last) - frame.horizon) / frame.focal
+    tall = 0.5 * (rows.last - rows.first) / frame.focal
     left = _place(body, strip, slopes.left, fall, shapes[0])
     right = _place(body, strip, slopes.right, fall, shapes[1])
     upper = _place(body, strip, strip.slope, fall - tall, shapes[2])
@@ -374,4 +379,4 @@ def curved_pattern(
     s = body.x + body.turn * azimuth
     q = body.y + frame.eye_z - shapes[2].over + 0.5 * (upper.up + lower.up)
     sides = Footprint(body.turn * across, right.up - left.up, body.turn * down, lower.up - upper.up)
-    return pattern(frame, canvas.stacks, frame.body_texture, s, q, sides, int(MAX_LOOKUPS * frame.samples))
+    return _pattern(frame, canvas.stacks, frame.body_texture, s, q, sides, int(MAX_LOOKUPS * frame.samples))

@@ -71,9 +71,8 @@ def _make_frame(scene: Scene, focal: float, samples: int) -> tuple[np.ndarray, n
 
 def _texture_record(texture: Texture, stack: int) -> tuple[float, ...]:
     """A TEXTURE record, of which `stack` tells where its filtered tiles are, if it is noise."""
-    contrast = 0.0 if texture.plain else texture.contrast
     kind = PATTERNS.index(texture.pattern)
-    return (kind, 1.0 / texture.period_m, contrast, *texture.velocity_mps, stack)
+    return (kind, 1.0 / texture.period_m, texture.depth, *texture.velocity_mps, stack)
 
 
 def focal_length(width: int, fov_deg: float) -> float:
@@ -108,9 +107,7 @@ class RaycastRenderer:
             ValueError: If a size is not at least 1, fov_deg not in [1, 170], cull_m not
                 positive, or the scene holds what this renderer cannot draw.
         """
-        check_image(width, height, fov_deg, samples)
-        if not cull_m > 0.0:
-            raise ValueError(f"cull_m must be > 0 m (inf: draw all); got {cull_m!r}.")
+        check_image(width, height, fov_deg, samples, cull_m)
         self.width, self.height, self.fov_deg, self.samples = width, height, fov_deg, samples
         self.cull_m = float(cull_m)
         self.set_scene(scene)

@@ -8,30 +8,10 @@ import math
 
 import numpy as np
 
+from envs.raycast import coverage, patterns
 from envs.raycast.bodies import MIN_DEPTH, box_slab, cosine, depths, mean_root, root
-from envs.raycast.coverage import (
-    Layer,
-    beyond,
-    cover,
-    cover_ground,
-    cut_gap,
-    ends,
-    fill,
-    is_open,
-    left_of_row,
-    put,
-    share_below,
-)
-from envs.raycast.patterns import (
-    Quadric,
-    along_face,
-    around_pole,
-    curved_pattern,
-    meet,
-    quadric,
-    texture_level,
-    texture_side,
-)
+from envs.raycast.coverage import Layer, beyond, ends, is_open, put
+from envs.raycast.patterns import Quadric, Rows
 from envs.raycast.records import Canvas, Ends, Record, inlined, kernel
 from envs.scene import BOX, ELLIPSOID, POLE
 
@@ -92,7 +72,7 @@ def _cut_at(gaps: np.ndarray, k: int, edge: Record, limit: Record, count: int) -
     left, right = _in_gap(gaps[k], edge)
     one, other = left - limit.left, right - limit.right
     if one * other < 0.0 and min(abs(one), abs(other)) > MIN_CROSSING and 2 * count < len(gaps):
-        cut_gap(gaps, k, count, one / (one - other))
+        coverage.cut_gap(gaps, k, count, one / (one - other))
         return count + 1
     return count
 
@@ -116,7 +96,7 @@ def _carve(canvas: Canvas, count: int, k: int, standing: bool) -> int:
     below = is_open(last, bottom) and count < len(gaps)
     if below and standing:
         if frame.ground_texture.contrast > 0.0:
-            cover_ground(frame, canvas.accumulators, last, bottom, strip.weight, strip.slope)
+            coverage.cover_ground(frame, canvas.accumulators, last, bottom, strip.weight, strip.slope)
         below = False
     if is_open(top, first):
         if below:
@@ -159,10 +139,10 @@ def show_walls(canvas: Canvas, count: int, limit: float) -> int:
             top, bottom = _clip(gaps[k], strip.cap), _clip(gaps[k], strip.end)
             if is_open(top, bottom):
                 enter_gap(frame, strip, gaps[k])
-                fill(frame, accumulators, top, bottom, frame.wall_albedo * facing, strip.weight)
+                coverage.fill(frame, accumulators, top, bottom, frame.wall_albedo * facing, strip.weight)
                 if frame.wall_texture.contrast > 0.0:
                     layer = Layer.RIGHT_WALL if side > 0.0 else Layer.LEFT_WALL
-                    cover(accumulators[layer : layer + 3], top, bottom, strip.weight, strip.slope)
+                    coverage.cover(accumulators[layer : layer + 3], top, bottom, strip.weight, strip.slope)
                 count = _carve(canvas, count, k, True)
         strip.wall_side, strip.wall_depth, strip.wall_after = -side, strip.wall_after, math.inf
     return count
@@ -216,7 +196,7 @@ def _cut_for_body(canvas: Canvas, body: Record, count: int) -> int:
     textured = canvas.frame.body_texture.contrast > 0.0
     if textured and body.kind != BOX and broad and 2 * count < len(gaps):
         for k in range(count):
-            cut_gap(gaps, k, count + k, 0.5)
+            coverage.cut_gap(gaps, k, count + k, 0.5)
         count *= 2
     return count
 
@@ -226,13 +206,13 @@ def _paint_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: End
     """Paint what lies between four edges: a body's level top, its side, its underside."""
     frame, strip, accumulators = canvas.frame, canvas.strip, canvas.accumulators
     if is_open(first, last):
-        fill(frame, accumulators, first, last, strip.light, strip.weight)
+        coverage.fill(frame, accumulators, first, last, strip.light, strip.weight)
         if _is_curved(body):
             _shade_rows(canvas, body, first, last)
     if is_open(top, first):
-        fill(frame, accumulators, top, first, strip.level_light, strip.weight)
+        coverage.fill(frame, accumulators, top, first, strip.level_light, strip.weight)
     if is_open(last, bottom):
-        fill(frame, accumulators, last, bottom, strip.level_light, strip.weight)
+        coverage.fill(frame, accumulators, last, bottom, strip.level_light, strip.weight)
     if frame.body_texture.contrast > 0.0:
         _texture_faces(canvas, body, top, first, last, bottom)
 
@@ -260,14 +240,11 @@ def show_body(canvas: Canvas, body: Record, count: int) -> int:
 def _texture_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: Ends, bottom: Ends) -> None:
     """Add the pattern to a body's flat faces: between four edges, the level top, the side, the underside."""
     if is_open(top, first):
-        texture_level(canvas, top, first, body.top)
+        patterns.texture_level(canvas, top, first, body.top)
     if is_open(last, bottom):
-        texture_level(canvas, last, bottom, body.bottom)
-    if is_open(first, last):
-        if body.kind == BOX:
-            texture_side(canvas, first, last, along_face(canvas.frame, body, canvas.strip), 0.0)
-        if body.kind == POLE:
-            texture_side(canvas, first, last, around_pole(canvas.frame, body, canvas.strip), body.y)
+        patterns.texture_level(canvas, last, bottom, body.bottom)
+    if is_open(first, last) and not _is_curved(body):
+        patterns.texture_side(canvas, body, first, last)
 
 
 @inlined
@@ -275,7 +252,7 @@ def _cosine(
     frame: Record, body: Record, shape: Quadric, u: float, fall: float, nearest: float, farthest: float
 ) -> float:
     """Cosine between the sun and a quadric, at least 0, where the ray of `fall` per depth meets it."""
-    depth, up = meet(shape, fall, nearest, farthest)
+    depth, up = patterns.meet(shape, fall, nearest, farthest)
     length = math.sqrt(max(1e-300, shape.size + shape.ratio * (shape.ratio - 1.0) * up * up))
     right, forward = depth * u - body.right, depth - body.forward
     towards = right * frame.sun_right + forward * frame.sun_forward + shape.ratio * up * frame.sun_z
@@ -289,14 +266,14 @@ def _shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
     wide = slopes.right - slopes.left
     broad = wide > MAX_SHARE * (body.high - body.low)
     u, second = strip.slope - broad * GAUSS * wide, strip.slope + GAUSS * wide
-    shape, other = quadric(body, frame, u), quadric(body, frame, second)
+    shape, other = patterns.quadric(body, frame, u), patterns.quadric(body, frame, second)
     ambient = strip.weight * body.albedo * frame.ambient
     diffuse = strip.weight * body.albedo * frame.diffuse
     textured = frame.body_texture.contrast > 0.0
     left = right = middle = shape
     if textured:
-        left, right = quadric(body, frame, slopes.left), quadric(body, frame, slopes.right)
-        middle = quadric(body, frame, strip.slope)
+        left, right = patterns.quadric(body, frame, slopes.left), patterns.quadric(body, frame, slopes.right)
+        middle = patterns.quadric(body, frame, strip.slope)
     high, low = min(top.left, top.right), max(bottom.left, bottom.right)
     per_row, whole, rest = 1.0 / frame.focal, max(top.left, top.right), min(bottom.left, bottom.right)
     for row in range(int(high), math.ceil(low)):
@@ -307,11 +284,12 @@ def _shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
             if broad:
                 towards = 0.5 * (_cosine(frame, body, other, second, fall, 0.0, math.inf) + towards)
         else:
-            share = share_below(row, top) - share_below(row, bottom)
+            share = coverage.share_below(row, top) - coverage.share_below(row, bottom)
             towards = _cut_row(frame, body, strip, top, bottom, start, end)
         light = ambient + diffuse * towards
         if textured:
-            light *= 1.0 + curved_pattern(canvas, body, (left, right, middle), start, max(start, end))
+            rows = Rows(start, max(start, end))
+            light *= 1.0 + patterns.curved_pattern(canvas, body, (left, right, middle), rows)
         canvas.accumulators[Layer.PAINT, row] += share * light
 
 
@@ -324,14 +302,14 @@ def _cut_row(
     Luminance changes fastest next to the outline: four points of what is left, at each of
     two slopes the quarters of the rows between the edges.
     """
-    left, right = left_of_row(top, bottom, start, end)
+    left, right = coverage.left_of_row(top, bottom, start, end)
     total = tall = 0.0
     for k in range(2):
         x = left + (0.5 + (2 * k - 1) * GAUSS) * (right - left)
         u = strip.gap_slopes.left + x * (strip.gap_slopes.right - strip.gap_slopes.left)
         upper = max(start, top.left + x * (top.right - top.left))
         lower = max(upper, min(end, bottom.left + x * (bottom.right - bottom.left)))
-        shape = quadric(body, frame, u)
+        shape = patterns.quadric(body, frame, u)
         entry, leave = depths(body, frame, u)
         entry, leave = max(MIN_DEPTH, entry), max(MIN_DEPTH, leave)
         for j in range(2):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from envs.raycast.point_samples import BODY, trace_scene
-from envs.scene import Scene, make_scene
+from envs.scene import LAYOUTS, OBSTACLE, POLE, Scene, make_scene
 from envs.scene.range_scan import NEAR_M, REACH_M, proximity, sector_bearings
-from envs.scene.scene import LAYOUTS, OBSTACLE, POLE
 
 
 def pole(x, y, radius=0.5):
