@@ -26,7 +26,7 @@ NO_STACKS = np.zeros(1, np.float32)
 
 
 def _check_scene(scene: Scene) -> None:
-    """ValueError if the scene holds a mesh, which only pyrender draws."""
+    """ValueError if the scene has a mesh, which only pyrender draws."""
     if scene.mesh is not None:
         raise ValueError("raycast draws no meshes, and the scene has one; use pyrender")
 
@@ -81,7 +81,7 @@ def focal_length(width: int, fov_deg: float) -> float:
 
 
 class RaycastRenderer:
-    """Renders one scene after the other; holds no state but the scene and the image's geometry."""
+    """Renders one scene after the other; its only state is the scene and the shape of the image."""
 
     def __init__(
         self,

@@ -52,7 +52,7 @@ sections = st.builds(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     rows=st.lists(sections, max_size=4),
     a=st.tuples(metres, metres),
@@ -266,7 +266,7 @@ def search(scene: Scene, radius: float, step: float, starts: np.ndarray) -> np.n
 
 def test_the_lattice_agrees_with_an_exact_search():
     starts, promises = np.array([-1.03, 0.0, 0.77]), []
-    for seed in range(16):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         kinds, radii = rng.choice([POLE, BOX, CONE, ELLIPSOID], 20), rng.uniform(0.2, 0.7, 20)
         places = rng.uniform((-3, 1), (3, 9), (20, 2))
