@@ -275,7 +275,7 @@ def test_the_lattice_agrees_with_an_exact_search():
         leads = scene.ways_to_goal(0.2)
         cells = np.rint(starts / CELL_M)
         promised = leads[0, cells.astype(int) + (leads.shape[1] - 1) // 2]
-        # What is promised can be flown, and what can be flown with 1.5 cells to spare is promised.
+        # Each promised way exists, and each way with 1.5 cells to spare is promised.
         assert (search(scene, 0.2, 0.05, starts) >= promised).all()
         assert (promised >= search(scene, 0.2 + 1.5 * CELL_M, CELL_M, cells * CELL_M)).all()
         promises.append(promised.mean())
