@@ -9,8 +9,9 @@ the numbers are our choices, made for a camera at 2 m above the ground and a veh
 import dataclasses
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -139,6 +140,7 @@ class MeshLayout:
         refuse_unless(rules, "layout", self)
 
 
+AnyLayout = TypeVar("AnyLayout", Layout, MeshLayout)
 POLES_EVAL = Layout(num_obstacles=80, width_m=50.0)
 
 # Cones are as wide as poles where the camera flies, 2 m above the ground; so are ellipsoids,
@@ -169,7 +171,7 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
-def with_overrides(layout: Any, overrides: dict[str, Any]) -> Any:
+def with_overrides(layout: AnyLayout, overrides: Mapping[str, object]) -> AnyLayout:
     """The layout with some of its fields replaced.
 
     Raises:
@@ -179,7 +181,7 @@ def with_overrides(layout: Any, overrides: dict[str, Any]) -> Any:
     for key in overrides:
         if key not in known:
             raise ValueError(f"layout has no {key!r}; it has {', '.join(known)}")
-    return dataclasses.replace(layout, **overrides)
+    return dataclasses.replace(layout, **overrides)  # type: ignore[arg-type]  # __post_init__ checks them
 
 
 def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:

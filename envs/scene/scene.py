@@ -230,17 +230,17 @@ def make_scene(
         )
     if name in LAYOUTS:
         layout = with_overrides(LAYOUTS[name], overrides)
-        scenes = (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
+        passable, scenes = layout.passable, (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
         remedy = "lower num_obstacles or the radii, raise min_gap_m, widen the lane"
     elif is_mesh_path(name):
-        layout = with_overrides(MeshLayout(), overrides)
-        scenes = (_mesh_corridor(name, layout) for _ in range(1))
+        lane = with_overrides(MeshLayout(), overrides)
+        passable, scenes = lane.passable, (_mesh_corridor(name, lane) for _ in range(1))
         remedy = "lower scale, widen the lane, fly at another height"
     else:
         known = ", ".join(sorted(LAYOUTS))
         raise ValueError(f"scene must be one of {known}, or the path of a mesh file, got {name!r}")
     for scene in scenes:
-        if not layout.passable or scene.passable(vehicle_radius_m, height_m):
+        if not passable or scene.passable(vehicle_radius_m, height_m):
             return scene
     raise ValueError(
         f"layout of scene {name!r} gave no corridor that a vehicle of radius {vehicle_radius_m} m can pass "

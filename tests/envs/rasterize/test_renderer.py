@@ -124,7 +124,7 @@ def test_the_uniforms_lie_in_memory_as_the_shaders_expect(make):
     platform, _ = start(8, 8, False)
     with platform.current():
         for surface in range(len(SURFACES)):
-            size, program = np.zeros(1, np.int32), Program(surface, PATTERNS.index("checker"))
+            size, program = np.zeros(1, np.int32), Program(surface, PATTERNS.index("plain"))
             GL.glGetActiveUniformBlockiv(program._program_id, 0, GL.GL_UNIFORM_BLOCK_DATA_SIZE, size)
             assert size[0] == FRAME.itemsize
     platform.delete_context()
