@@ -7,6 +7,7 @@ started or written by then.
 
 import dataclasses
 import itertools
+import re
 import typing
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
@@ -23,7 +24,6 @@ from jobs.config.schema import (
     ClusterConfig,
     CollectConfig,
     EvaluateConfig,
-    ModelConfig,
     Name,
     PretrainConfig,
     ProbeConfig,
@@ -34,7 +34,7 @@ from jobs.config.schema import (
     TradeSimulatorConfig,
     TrainConfig,
 )
-from models.kinds import KINDS, MIN_IMAGE
+from models.kinds import KINDS, Model, model_keys, read_model
 
 
 class ConfigError(ValueError):
@@ -59,7 +59,7 @@ class Config:
     faults: FaultsConfig
     renderer: Literal["auto", "raycast", "pyrender"]
     fidelity: FidelityConfig
-    model: ModelConfig
+    model: Model
     algo: AlgoConfig
     collect: CollectConfig
     pretrain: PretrainConfig
@@ -102,6 +102,7 @@ def parse(values: Mapping[str, Any]) -> Config:
     """
     refused: list[str] = []
     parts = {name: _build(section, values.get(name), name, refused) for name, section in SECTIONS.items()}
+    parts["model"] = _build(read_model, values.get("model"), "model", refused)
     parts["env"] = world = _build(EnvConfig, values.get("env"), "env", refused)
     if world is not None:  # 100 and 100.0 become the same setting, so that they name the same run
         parts["env"] = {name: getattr(world, name) for name in ENV_KEYS}
@@ -136,6 +137,7 @@ def known_keys() -> list[str]:
     keys = [field.name for field in dataclasses.fields(Config)]
     for name, section in SECTIONS.items():
         keys += [f"{name}.{field.name}" for field in dataclasses.fields(typing.cast(Any, section))]
+    keys += [f"model.{name}" for name in model_keys()]
     return keys + [f"env.{name}" for name in ENV_KEYS]
 
 
@@ -160,14 +162,15 @@ def _build(section: Any, values: Any, name: str, refused: list[str], skip: Colle
     try:
         return section(**{str(key): value for key, value in values.items()})
     except pydantic.ValidationError as error:
-        refused += [line for line in explain(error, name, known_keys()) if line.partition(":")[0] not in skip]
+        refused += [
+            line for line in explain(error, name, known_keys()) if re.split("[:.]", line)[0] not in skip
+        ]
         return None
 
 
 def _refused_picture(config: Config) -> list[str]:
     """Sides of the sensor's picture that the policy's network cannot take."""
-    if KINDS[config.model.name].network != "cnn" and config.model.name != "event_image_vae":
-        return []
+    smallest = KINDS[config.model.name].min_side
     sides = {name: getattr(config.camera, name) for name in ("width", "height")}
-    rule = f"must be at least {MIN_IMAGE} for the network of {config.model.name}"
-    return [f"camera.{name}: {rule}, got {side}" for name, side in sides.items() if side < MIN_IMAGE]
+    rule = f"must be at least {smallest} for the network of {config.model.name}"
+    return [f"camera.{name}: {rule}, got {side}" for name, side in sides.items() if side < smallest]

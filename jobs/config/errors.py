@@ -33,7 +33,8 @@ def explain(error: pydantic.ValidationError, section: str, keys: Sequence[str]) 
     for problem in error.errors():
         key = ".".join([section] * bool(section) + [str(part) for part in problem["loc"]])
         if problem["type"] == "unexpected_keyword_argument":
-            lines.append(f"{key}: no such key, got {problem['input']!r}{nearest(key, keys)}")
+            hint = "; this kind of model has none" if key in keys else nearest(key, keys)
+            lines.append(f"{key}: no such key, got {problem['input']!r}{hint}")
         elif problem["type"] in ("missing", "missing_argument", "value_error"):
             lines.append(f"{key}: {problem['msg'].removeprefix('Value error, ')}")
         else:

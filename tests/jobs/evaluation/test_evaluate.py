@@ -31,7 +31,7 @@ from jobs.run.files import write_json
 from jobs.run.folder import finished, open_run
 from jobs.tracking.tracker import open_tracker
 from models.encoder.evae import EventVAE
-from models.kinds import KINDS
+from models.kinds import KINDS, PolicySpec, model_keys, read_model
 from models.policy import load_policy, save_policy
 from models.policy.networks import build_networks
 from tests.jobs.run.test_folder import small_config
@@ -41,16 +41,17 @@ HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
 
 def save_untrained(path, env_config=HELD_OUT, name="bytestream"):
     """A policy folder with random weights; large ones, so that its actions differ."""
-    kind, sensor = KINDS[name], sensor_settings(env_config)
-    sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
-    parts = {"latent": 8 if kind.encoder else None, "hidden": [16] if kind.network == "mlp" else None}
+    sensor = sensor_settings(env_config)
+    own = {"name": name, "stack": 3, "hidden": [16], "context": 64, "latent": 8, "norm": "batch"}
+    own |= {"target": "signed", "time_bins": 1024, "coding": "additive", "encoder": "frozen"}
+    model = read_model(**{key: own[key] for key in model_keys(name)})
+    spec = PolicySpec(model, 64, 64, 3)
     about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {}}
-    networks = build_networks({"name": name, **sizes, **parts}, seed=3)
+    networks = build_networks(spec, seed=3)
     for value in networks["pi"].parameters():
         value.data *= 1000.0
-    evae = EventVAE(context=64).freeze() if kind.encoder else None
-    manifest = {"name": name, **sizes, **parts, **about}
-    return save_policy(path, networks, manifest, evae, {"reconstruction_step": 0.5})
+    evae = EventVAE(context=64).freeze() if spec.frozen else None
+    return save_policy(path, networks, spec, about, evae, {"reconstruction_step": 0.5})
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,9 @@ from jobs.config.config import parse
 from jobs.run.folder import open_run
 from jobs.training import train as training
 from jobs.training.ppo import FlightMetrics
-from jobs.training.pretrain import build_evae
+from jobs.training.pretrain import evae_settings
 from jobs.training.train import TrainingError, read_metrics, reported_so_far
+from models.encoder.evae import EventVAE
 from models.encoder.weights import save_encoder
 from models.policy import load_policy
 
@@ -43,7 +44,7 @@ def make_config(*overrides):
 def write_encoder(folder, config):
     torch.manual_seed(0)
     sensor = sensor_settings(config.env_config())
-    evae = build_evae(config.model, sensor)
+    evae = EventVAE.of(evae_settings(config))
     for parameter in evae.ecn.parameters():  # random weights see little; make latents differ
         parameter.data.mul_(1.5)
     path = folder / "encoder.safetensors"
