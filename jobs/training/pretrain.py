@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from envs.recordings import Recording, read_recording
-from jobs.analysis.plots import reconstruction_figure
+from jobs.analysis.plots import plot_reconstructions
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import PretrainConfig
 from jobs.run.files import write_atomic
@@ -193,7 +193,7 @@ class EvaeTraining:
 
 def evae_settings(config: Config) -> EvaeSettings:
     """The settings of an experiment's event VAE."""
-    camera = config.env_config().camera
+    camera = config.env.camera
     return PolicySpec(config.model, camera.width, camera.height).evae
 
 
@@ -298,7 +298,7 @@ def freeze(
     }
     save_encoder(encoder_file(folder), evae, manifest)
     tracker.artifact(encoder_file(folder).with_suffix(".json"), "encoder")
-    figure = reconstruction_figure(*example_pictures(evae, held_out))
+    figure = plot_reconstructions(*example_pictures(evae, held_out))
     tracker.figure("evae/reconstructions.png", figure)
     return finish(folder, "pretrain", figures)
 

@@ -26,7 +26,7 @@ from jobs.training.pretrain import (
 from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder, save_encoder
 from models.kinds import FixedModel
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 SETTINGS = PretrainConfig(
     encoder=None,

@@ -5,7 +5,7 @@ import torch
 from models.encoder.evae import event_targets, pictures, reconstruct, target_shape
 from models.encoder.event_batch import EventBatch, batch_windows
 from models.kinds import TARGETS
-from tests.models.encoder.test_evae import bars, events, small
+from tests.support.encoders import bars, events, small
 
 
 def test_the_signed_target_is_the_polarity_of_the_pixels_last_event():
