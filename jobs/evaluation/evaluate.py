@@ -97,7 +97,7 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     """
     path = find_policy(config, folder)
     manifest = load_policy(path).manifest
-    check_sensor(manifest, config.env_config())
+    check_sensor(manifest, config.env)
     asked = {"evaluate": as_dict(config)["evaluate"], "policy": manifest["sha256"]}
     done = finished(folder, "evaluate")
     if done is not None and done["asked"] == asked and not done.get("missing"):
@@ -116,22 +116,23 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     write_episodes(folder.evaluation / "episodes.csv", LABELS, {task.label: flown[task] for task in flown})
     publish(folder, tracker, rows, tracks)
     figures = tracked_figures(rows) | drift_metrics({task: note["encoder"] for task, note in notes.items()})
-    figures |= achieved(config.env_config(scene=HELD_OUT_SCENE))
+    figures |= achieved(dataclasses.replace(config.env, scene=HELD_OUT_SCENE))
     tracker.log(config.train.env_steps, figures)
     if config.evaluate.video:
         seed = film_seed(flown[plan[0]])
-        env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
+        env_config = dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval")
         file = folder.evaluation / "episode.mp4"
         tracker.artifact(film(str(path), config.evaluate.action, env_config, seed, file), "eval")
     missing = [" ".join(task.label) for task in plan if task not in flown]
     flown_at = sorted({commit for note in notes.values() for commit in note["commits"]})
     marker = {"asked": asked, "figures": figures, "missing": missing, "flown_at": flown_at}
-    return finish(folder, "evaluate", marker)["figures"]
+    finish(folder, "evaluate", marker)
+    return figures
 
 
 def cell_of(task: Task, config: Config, path: Path, of_policy: tuple[str, str]) -> Cell:
     """A task as a cell of flights; `path` is the policy's, `of_policy` its identity and observation."""
-    env_config = config.env_config(scene=task.scene, split="eval", renderer=task.renderer)
+    env_config = dataclasses.replace(config.env, scene=task.scene, split="eval", renderer=task.renderer)
     if task.renderer == "pyrender":  # to see another picture, not to see it as exactly as the tolerance asks
         fidelity = dataclasses.replace(env_config.fidelity, samples=2)
         env_config = dataclasses.replace(env_config, fidelity=fidelity)
@@ -171,7 +172,7 @@ def tasks(config: Config) -> list[Task]:
     the configured one comes first and is the one that figures without a suffix belong to.
     """
     first, *others = config.evaluate.renderers
-    scenes = dict.fromkeys((HELD_OUT_SCENE, config.env_config().scene))
+    scenes = dict.fromkeys((HELD_OUT_SCENE, config.env.scene))
     actions = sorted(ACTIONS, key=lambda action: action != config.evaluate.action)
     policies = [f"policy {action}" for action in actions]
     pairs = [(agent, scene) for scene in scenes for agent in (*policies, *BOUNDS)]

@@ -6,6 +6,7 @@ quarter of an hour; the trainings are kept in the run folder, so that a killed j
 and one plot, in the run folder under `probe/` and in MLflow.
 """
 
+import dataclasses
 import functools
 import re
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from envs.config import Split
 from jobs.analysis.plots import COLOURS, GREYS, INK, MUTED, tidy
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.config import Config, ConfigError
@@ -107,12 +109,14 @@ def run(config: Config) -> dict[str, float]:
 
 def record_both(config: Config) -> tuple[ProbeData, ProbeData]:
     """Record episodes to fit the probes to, and others in validation corridors to judge them by."""
-    sizes = {"train": config.probe.num_steps, "validation": config.probe.num_validation_steps}
+    env = dataclasses.replace(config.env, observation="events")
+    sizes: dict[Split, int] = {
+        "train": config.probe.num_steps,
+        "validation": config.probe.num_validation_steps,
+    }
     with progress("Record probe data", sum(sizes.values()), "steps") as advance:
         train, held_out = (
-            record_probe_data(
-                config.env_config(split=split, observation="events"), steps, config.seed, advance
-            )
+            record_probe_data(dataclasses.replace(env, split=split), steps, config.seed, advance)
             for split, steps in sizes.items()
         )
     return train, held_out

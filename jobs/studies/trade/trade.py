@@ -8,6 +8,7 @@ continues when the same command is given again: no episode is evaluated twice; c
 measured anew.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
@@ -127,7 +128,7 @@ def plan(config: Config, entry: Entry, evae: EventVAE) -> list[Cell]:
     Raises:
         ConfigError: If the policy's own sensor and a setting exclude each other.
     """
-    own = with_sensor(config.env_config(scene=HELD_OUT_SCENE, split="eval"), entry.sensor)
+    own = with_sensor(dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval"), entry.sensor)
     timed = evae.ecn.coding != "none"
     found: dict[str, Cell] = {}
     for knob, text, simulation, table in changes(timed):

@@ -203,13 +203,15 @@ def test_the_tracked_figures_name_agent_scene_and_renderer(tmp_path):
     assert len(figures) <= 40
 
 
-@pytest.mark.parametrize("name", ["bytestream", "rgb"])
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["bytestream", pytest.param("rgb", marks=pytest.mark.slow)])
 def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.6})
+    env = dataclasses.replace(config.env, time_limit_s=0.6)
+    config = dataclasses.replace(config, evaluate=settings, env=env)
     run = open_run(config)
-    save_untrained(run.policy, config.env_config(), name)
+    save_untrained(run.policy, config.env, name)
     with open_tracker(config, run) as tracker:
         figures = evaluate(config, run, tracker)
         assert evaluate(config, run, tracker) == figures
@@ -286,9 +288,10 @@ def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_sto
 def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path, monkeypatch):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.05})
+    env = dataclasses.replace(config.env, time_limit_s=0.05)
+    config = dataclasses.replace(config, evaluate=settings, env=env)
     run, asked = open_run(config), []
-    save_untrained(run.policy, config.env_config(), "event_columns")
+    save_untrained(run.policy, config.env, "event_columns")
 
     def flown_here(config, place, cells, *given, **named):
         asked.append(len(cells))

@@ -159,6 +159,7 @@ print("joined")
 """
 
 
+@pytest.mark.system
 def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_token):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
     environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # of joining; Ray's own 20 take as many seconds

@@ -150,6 +150,7 @@ def test_a_row_becomes_text_and_columns():
     }
 
 
+@pytest.mark.system
 def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_path, monkeypatch):
     monkeypatch.setattr(trade_encoder, "CONTEXTS", (16, 32))
     monkeypatch.setattr(trade_encoder, "CODING_CONTEXT", 16)

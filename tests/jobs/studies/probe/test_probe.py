@@ -26,7 +26,7 @@ def small_probe(tmp_path, **changes):
     settings = {"num_steps": 120, "num_validation_steps": 60, "iterations": 1, "seeds": 2}
     return dataclasses.replace(
         config,
-        env={**config.env, "time_limit_s": 0.1},
+        env=dataclasses.replace(config.env, time_limit_s=0.1),
         model=dataclasses.replace(config.model, context=32),
         collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
         pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
@@ -39,6 +39,7 @@ def make_row(name="signed, latent 8", place=(8, "signed"), share=0.5):
     return ProbeResult(Representation(name, [], place), 8, {1: told, 3: told})
 
 
+@pytest.mark.system
 def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, monkeypatch):
     config = small_probe(tmp_path, latents=[4], targets=["occupancy", "signed", "aged", "counts"])
     metrics = probe.run(config)
