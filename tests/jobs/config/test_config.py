@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 import re
 from pathlib import Path
 
@@ -89,6 +90,22 @@ def test_every_value_says_its_unit_or_source_in_a_comment(file):
     assert lines[0].startswith("#")
     if file.parent != CONF and file.parent.name != "budget":
         assert [line for line in lines[1:] if ": " in line and "#" not in line and "name:" not in line] == []
+
+
+@pytest.mark.parametrize(
+    "file", sorted(path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help", "budget"))
+)
+def test_every_group_names_the_class_that_its_keys_are_fields_of(file):
+    text = file.read_text()
+    values = yaml.safe_load(text)
+    groups = {file.parent.name: values}
+    if file.parent == CONF:
+        groups = {key: group for key, group in values.items() if isinstance(group, dict) and key != "hydra"}
+    classes = re.findall(r"Fields: ([\w.]+)\.(\w+)", text)
+    assert len(classes) == len(groups)
+    for (module, name), group in zip(classes, groups.values(), strict=True):
+        fields = {field.name for field in dataclasses.fields(getattr(importlib.import_module(module), name))}
+        assert group.keys() - {"defaults"} <= fields
 
 
 def test_ppo_is_the_papers(composed):
