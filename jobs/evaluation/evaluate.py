@@ -16,9 +16,20 @@ import torch
 
 from envs.config import WITHOUT_EVENTS, EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
-from jobs.analysis.plots import trajectory_figure
-from jobs.analysis.tables import Summary, columns, markdown, metrics, show, summarise, table
-from jobs.analysis.video import Decode, Film
+from jobs.analysis.plots import plot_trajectories
+from jobs.analysis.tables import (
+    CAPTION,
+    SUMMARY_HEADINGS,
+    Summary,
+    markdown_table,
+    publish_plot,
+    show_table,
+    summarise,
+    summary_cells,
+    summary_columns,
+    summary_metrics,
+)
+from jobs.analysis.video import Decode, open_film
 from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
 from jobs.rollout.accuracy import achieved
 from jobs.rollout.agents import BOUNDS, make_agent
@@ -206,14 +217,13 @@ def announce(config: Config, folder: Run, path: Path) -> None:
 
 def publish(folder: Run, tracker: Tracker, rows: Sequence[Summary], tracks: Sequence[Trajectory]) -> None:
     """Show, store and track the table and the ways."""
-    text = markdown(LABELS, rows)
-    show(table("Held-out corridors", LABELS, rows))
+    head, lines = (*LABELS, *SUMMARY_HEADINGS), [summary_cells(row) for row in rows]
+    text = markdown_table(head, lines, len(LABELS))
+    show_table("Held-out corridors", head, lines, len(LABELS), CAPTION)
     write_atomic(folder.evaluation / "table.md", text)
     tracker.text("eval/table.md", text)
-    tracker.table("eval/results", columns(LABELS, rows))
-    figure = trajectory_figure(tracks)
-    figure.savefig(folder.evaluation / "trajectories.png", dpi=120)
-    tracker.figure("eval/trajectories.png", figure)
+    tracker.table("eval/results", summary_columns(LABELS, rows))
+    publish_plot(folder, tracker, "eval/trajectories", plot_trajectories(tracks))
 
 
 def tracked_figures(rows: Sequence[Summary]) -> dict[str, float]:
@@ -223,9 +233,9 @@ def tracked_figures(rows: Sequence[Summary]) -> dict[str, float]:
     for row in rows:
         ending = suffix(row.label, first)
         if not ending:
-            figures |= metrics(row)
+            figures |= summary_metrics(row)
         elif row.label[0] == first[0] or row.label[1] == first[1]:
-            figures |= {f"{name}{ending}": metrics(row)[name] for name in VIEW_COLUMNS[::3]}
+            figures |= {f"{name}{ending}": summary_metrics(row)[name] for name in VIEW_COLUMNS[::3]}
     return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
@@ -256,7 +266,7 @@ def film(source: str, action: str, env_config: EnvConfig, seed: int, path: Path)
     """Film a flight of a policy's folder, or of a bound, through one corridor; return the file."""
     decode = decoder(Path(source)) if (Path(source) / ENCODER).is_file() else None
     agent = make_agent(source, action)
-    with Film(path, env_config.control_hz, decode) as reel:
+    with open_film(path, env_config.control_hz, decode) as reel:
 
         def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
             caption = f"{env_config.scene} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
