@@ -51,7 +51,12 @@ OF_BOTH: tuple[tuple[str, str, Measure, dict[str, tuple[str, ...]]], ...] = (
     ),
     ("tolerates another camera threshold", "D.3", "distance_m", {"contrast_threshold": ("0.05",)}),
     ("tolerates dead pixels", "D.3", "distance_m", {"sparsity": ("0.2", "0.5")}),
-    ("tolerates background activity", "abstract, D.3", "distance_m", {"background_activity": ("0.05", "0.1")}),
+    (
+        "tolerates background activity",
+        "abstract, D.3",
+        "distance_m",
+        {"background_activity": ("0.05", "0.1")},
+    ),
     ("generalises to other textures", "D.3", "success", {"world": ("texture_change",)}),
     ("generalises to other shapes", "D.3", "success", {"world": ("shape_change",)}),
     ("gains much over event images with moving textures", "F.1", "distance_m", {"world": ("dynamic",)}),
