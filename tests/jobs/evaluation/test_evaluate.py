@@ -210,9 +210,10 @@ def test_the_tracked_figures_name_agent_scene_and_renderer(tmp_path):
 def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.6})
+    env = dataclasses.replace(config.env, time_limit_s=0.6)
+    config = dataclasses.replace(config, evaluate=settings, env=env)
     run = open_run(config)
-    save_untrained(run.policy, config.env_config(), name)
+    save_untrained(run.policy, config.env, name)
     with open_tracker(config, run) as tracker:
         figures = evaluate(config, run, tracker)
         assert evaluate(config, run, tracker) == figures
@@ -289,9 +290,10 @@ def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_sto
 def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path, monkeypatch):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.05})
+    env = dataclasses.replace(config.env, time_limit_s=0.05)
+    config = dataclasses.replace(config, evaluate=settings, env=env)
     run, asked = open_run(config), []
-    save_untrained(run.policy, config.env_config(), "event_columns")
+    save_untrained(run.policy, config.env, "event_columns")
 
     def flown_here(config, place, cells, *given, **named):
         asked.append(len(cells))
@@ -316,7 +318,7 @@ def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done
 
 def test_a_caption_has_room_under_a_single_panel():
     panel = ("luminance", np.zeros((64, 64, 3), np.uint8))
-    caption = "shape_change 99   9.99 s    99.9 m   collision   4x slower than flown"
+    caption = "shape_change 99   9.99 s    99.9 m   collision   4x slower"
     one, three = (frame([panel] * count, caption)[-40:] for count in (1, 3))
     np.testing.assert_array_equal(one, three[:, : one.shape[1]])
     assert (three[:, one.shape[1] :] == three[0, -1]).all(), "all of the caption is in the narrow one"
