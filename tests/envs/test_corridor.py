@@ -305,7 +305,9 @@ def test_a_picture_is_that_of_the_event_camera_without_simulating_one(scene, see
     (_, before), (picture, info) = usual.reset(seed=seed), alone.reset(seed=seed)
     assert (picture == usual.luminance).all()
     actions, ended = np.random.default_rng(seed), False
-    while not ended:
+    for _ in range(200):
+        if ended:
+            break
         action = int(actions.integers(3))
         _, *outcome, before = usual.step(action)
         picture, *others, info = alone.step(action)

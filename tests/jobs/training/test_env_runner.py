@@ -159,11 +159,6 @@ def test_any_other_error_ends_the_process_as_rllib_has_it():
         runner.apply(lambda runner: runner.no_such_method())
 
 
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory):
-    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
-
-
 @pytest.fixture
 def encoded_runner(encoder):
     runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), encoder), worker_index=0)

@@ -135,6 +135,7 @@ def test_the_job_leaves_table_figure_and_page_and_a_second_run_flies_only_what_f
     assert children["most exact"].data.tags["verdict"] in ("as good", "undecided", "worse")
 
 
+@pytest.mark.system
 def test_without_the_default_there_is_nothing_to_compare(tmp_path, policy, stub):
     stub.broken = "default"
     with pytest.raises(
