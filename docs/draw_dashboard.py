@@ -13,9 +13,9 @@ from pathlib import Path
 
 from PIL import Image
 
+from docs.browser import Browser, served
 from jobs.tracking.pages import run_address, view_address
 from jobs.tracking.tracker import open_store
-from tests.support.browser import Browser, served
 
 IMAGES = Path(__file__).resolve().parent / "images"
 COLOURS = 160

@@ -5,7 +5,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import pytest
@@ -15,43 +14,6 @@ from jobs.config.config import Config
 ROOT = Path(__file__).resolve().parents[2]
 EVADE = Path(sys.executable).parent / "evade"
 HEAVY = ("torch", "ray", "mlflow", "numba", "matplotlib", "gymnasium", "trimesh", "pyrender", "h5py", "scipy")
-
-
-@pytest.fixture(scope="module")
-def launcher():
-    spec = importlib.util.spec_from_file_location("launch_under_test", ROOT / "platform" / "launch.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def launch(launcher, monkeypatch, capsys, tmp_path):
-    """Run the launcher in this process, in an empty folder; returns status, stdout, stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["evade", *words])
-        try:
-            status = launcher.main()
-        except SystemExit as leaving:
-            status = leaving.code or 0
-        return status, *capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
-def job(launcher, monkeypatch):
-    """Replace the job `train` by a function, and return the configurations that it was given."""
-
-    def replace(function) -> None:
-        module = types.ModuleType("jobs_under_test")
-        module.run = function
-        monkeypatch.setitem(sys.modules, "jobs_under_test", module)
-        monkeypatch.setitem(launcher.JOBS, "train", "jobs_under_test")
-
-    return replace
 
 
 def processor_time_s() -> float:

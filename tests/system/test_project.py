@@ -1,3 +1,4 @@
+import ast
 import importlib
 import importlib.metadata
 import os
@@ -154,3 +155,32 @@ def test_no_file_names_a_package_index_or_a_folder_of_one_machine():
     assert {"Makefile", "requirements.lock", "platform/launch.py", "conf/config.yaml", ".ci/run"} <= set(
         found
     )
+
+
+def test_no_test_imports_another_test_module_nor_does_a_script_that_it_starts():
+    def imported(text: str) -> set[str]:
+        modules = set()
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Import):
+                modules.update(name.name for name in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                modules.update(f"{node.module}.{name.name}" for name in node.names)
+        return modules
+
+    found = {}
+    for path in (ROOT / "tests").rglob("*.py"):
+        text = path.read_text()
+        modules = {name for name in imported(text) if re.search(r"(^|\.)test_", name)}
+        scripts = [
+            node.value
+            for node in ast.walk(ast.parse(text))
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and "import" in node.value
+        ]
+        modules.update(
+            name
+            for text in scripts
+            for name in re.findall(r"^from (tests\.[\w.]*\btest_\w+)", text, re.MULTILINE)
+        )
+        found[str(path.relative_to(ROOT))] = modules
+    assert {name: modules for name, modules in found.items() if modules} == {}
+    assert "tests/system/test_project.py" in found

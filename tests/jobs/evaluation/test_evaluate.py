@@ -4,7 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
+from envs.config import CameraConfig, sensor_settings
 from envs.corridor import CorridorEnv
 from envs.sensor import Sensor
 from jobs.analysis.tables import summarise
@@ -30,27 +30,10 @@ from jobs.rollout.tasks import read_episodes
 from jobs.run.files import write_json
 from jobs.run.folder import finished, open_run
 from jobs.tracking.tracker import open_tracker
-from models.encoder.evae import EventVAE
 from models.kinds import KINDS
-from models.policy import load_policy, save_policy
-from models.policy.networks import build_networks
-from tests.jobs.run.test_folder import small_config
-
-HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
-
-
-def save_untrained(path, env_config=HELD_OUT, name="bytestream"):
-    """A policy folder with random weights; large ones, so that its actions differ."""
-    kind, sensor = KINDS[name], sensor_settings(env_config)
-    sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
-    parts = {"latent": 8 if kind.encoder else None, "hidden": [16] if kind.network == "mlp" else None}
-    about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {}}
-    networks = build_networks({"name": name, **sizes, **parts}, seed=3)
-    for value in networks["pi"].parameters():
-        value.data *= 1000.0
-    evae = EventVAE(context=64).freeze() if kind.encoder else None
-    manifest = {"name": name, **sizes, **parts, **about}
-    return save_policy(path, networks, manifest, evae, {"reconstruction_step": 0.5})
+from models.policy import load_policy
+from tests.support.configs import small_config
+from tests.support.policies import HELD_OUT, save_untrained
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,10 @@ import pytest
 from jobs.evaluation.sweep import announce, run
 from jobs.rollout.drift import FIGURES
 from jobs.run.folder import open_run
-from jobs.tracking.tracker import open_store
 from models.policy.policy import NETWORKS
-from tests.jobs.evaluation.test_sweep_plan import planned, save_training, sweep_config
+from tests.support.configs import sweep_config
+from tests.support.policies import save_training
+from tests.support.runs import in_store, planned, tracked_sweeps
 
 
 def test_who_flies_and_whose_sensor_differs_is_said(tmp_path, capsys):
@@ -22,26 +23,6 @@ def test_who_flies_and_whose_sensor_differs_is_said(tmp_path, capsys):
         "Group: oracle",
         f"Flown with its own sensor: {slow}: control_hz = 100.0 instead of 200.0",
     ]
-
-
-def tracked_sweeps(config, kind="condition", parent="sweep"):
-    """Client, and the children of a kind by name of each sweep's parent run, or of each of another kind."""
-    client, experiment = open_store(config.tracking.uri, config.tracking.experiment)
-    parents = client.search_runs([experiment], f"tags.kind = '{parent}'")
-    below = "tags.`mlflow.parentRunId` = '{}'"
-    children = {
-        run.info.run_id: client.search_runs(
-            [experiment], f"{below.format(run.info.run_id)} and tags.kind = '{kind}'"
-        )
-        for run in parents
-    }
-    return client, {parent: {run.info.run_name: run for run in runs} for parent, runs in children.items()}
-
-
-def in_store(config, tmp_path):
-    return dataclasses.replace(
-        config, tracking=dataclasses.replace(config.tracking, uri=f"sqlite:///{tmp_path}/m.db")
-    )
 
 
 def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_rerun_adds_no_point(

@@ -8,38 +8,16 @@ from jobs.config.config import ConfigError
 from jobs.evaluation.sweep_plan import NOMINAL, find_entries, plan, read_entry, text, with_sensor
 from jobs.run.folder import open_run
 from models.policy.policy import MANIFEST
-from tests.jobs.evaluation.test_evaluate import save_untrained
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import AXES, sweep_config
+from tests.support.policies import save_training
+from tests.support.runs import planned
 
-AXES = {
-    "sparsity": {"faults.sparsity": [0.0, 0.5]},
-    "rate": {"env.control_hz": [100, 200], "env.scene": ["poles_eval"]},
-}
 OTHER_CAMERA = {
     "threshold_mismatch": 0.03,
     "threshold_seed": 1,
     "response": "lin_log",
     "encoding": "linear8",
 }
-
-
-def sweep_config(tmp_path, trials=2, policies=("straight",), axes=AXES, **changes):
-    """A sweep of short flights."""
-    config = small_config(tmp_path, job="sweep", exp="robustness")
-    settings = dataclasses.replace(config.sweep, axes=axes, trials=trials, policies=list(policies), **changes)
-    return dataclasses.replace(config, sweep=settings, env={**config.env, "time_limit_s": 0.2})
-
-
-def save_training(path, group, seed, env_config, name="event_columns"):
-    """An untrained policy that says it is a training of `group`; returns the folder."""
-    save_untrained(path, env_config, name)
-    manifest = json.loads((path / MANIFEST).read_text())
-    (path / MANIFEST).write_text(json.dumps({**manifest, "exp": group, "seed": seed}))
-    return str(path)
-
-
-def planned(config, *agents):
-    return plan(config, [read_entry(agent) for agent in agents])
 
 
 def at(sweep, axis, value):

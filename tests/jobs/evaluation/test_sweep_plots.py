@@ -9,7 +9,7 @@ from jobs.evaluation.sweep_plots import BOUNDS, STYLES, axis_figure, collision_f
 from jobs.rollout.episodes import EPISODE
 from jobs.run.provenance import REPOSITORY
 from models.policy.policy import MANIFEST
-from tests.jobs.evaluation.test_group_stats import flights
+from tests.support.episodes import flights
 
 
 def rows_of(axis, values, groups):

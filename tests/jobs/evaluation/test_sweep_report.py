@@ -14,8 +14,10 @@ from jobs.rollout.scheduler import flown
 from jobs.rollout.tasks import accuracy_file
 from jobs.run.files import write_json
 from jobs.run.folder import open_run
-from tests.jobs.evaluation.test_group_stats import flights
-from tests.jobs.evaluation.test_sweep_plan import planned, save_training, sweep_config
+from tests.support.configs import sweep_config
+from tests.support.episodes import flights
+from tests.support.policies import save_training
+from tests.support.runs import planned
 
 
 def test_groups_are_compared_with_the_reference_under_the_same_condition(tmp_path):

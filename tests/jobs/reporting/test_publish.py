@@ -11,8 +11,8 @@ from jobs.reporting import publish as shipping
 from jobs.reporting.learning_curves import as_csv, read_curves
 from jobs.reporting.publish import curve, newest_trainings, ship
 from models.policy import load_policy
-from tests.jobs.evaluation.test_evaluate import save_untrained
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.policies import save_untrained
 
 
 def finish_training(tmp_path, name, exp="bytestream", seed=0, env_steps=500_000, iterations=120, **changes):

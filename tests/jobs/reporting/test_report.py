@@ -16,8 +16,8 @@ from jobs.reporting.report import breaks, find_study, read_flights, write_result
 from jobs.rollout.episodes import write_episodes
 from jobs.run.files import write_json
 from models.policy.policy import MANIFEST
-from tests.jobs.evaluation.test_group_stats import flights
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.episodes import flights
 
 ABOUT = {
     "run": "robustness-short-s0-1",

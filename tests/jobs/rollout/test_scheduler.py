@@ -20,7 +20,9 @@ from jobs.rollout.scheduler import (
 from jobs.rollout.tasks import MAX_FLIGHTS, read_episodes, read_kept, split, unflown
 from jobs.run.files import write_json
 from jobs.run.folder import open_run
-from tests.jobs.evaluation.test_sweep_plan import AXES, planned, save_training, sweep_config
+from tests.support.configs import AXES, sweep_config
+from tests.support.policies import save_training
+from tests.support.runs import planned
 
 SEEN = {"speed": {"env.speed_mps": [20, 10]}, "rate": AXES["rate"]}  # changes that bounds notice
 

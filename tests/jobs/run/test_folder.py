@@ -14,25 +14,12 @@ from jobs.run import folder as runs
 from jobs.run.files import RunError, write_json
 from jobs.run.folder import UNNAMED, finish, finished, holding, latest_policies, open_run, run_name
 from jobs.run.provenance import REPOSITORY, git_commit
+from tests.support.configs import small_config
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> Config:
     return small_config(tmp_path)
-
-
-def small_config(tmp_path: Path, **changes: object) -> Config:
-    """A checked configuration whose runs lie in a folder of the test's own."""
-    from hydra import compose, initialize_config_dir
-    from omegaconf import OmegaConf
-
-    from jobs.config.config import parse
-
-    conf = Path(__file__).resolve().parents[3] / "conf"
-    with initialize_config_dir(str(conf), version_base="1.3"):
-        composed = compose("config", ["+exp=bytestream", "budget=smoke"])
-    values = OmegaConf.to_container(composed, resolve=True)
-    return parse({**values, "runs_dir": str(tmp_path / "runs"), **changes})
 
 
 def test_the_same_settings_find_the_same_folder_whatever_job_tracker_or_cluster(config):

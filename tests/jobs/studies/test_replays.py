@@ -12,7 +12,7 @@ from jobs.studies import replays
 from jobs.studies.replays import latent_error, latents_of, measure, replay, steps, take_turns
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
-from tests.jobs.evaluation.test_evaluate import save_untrained
+from tests.support.policies import save_untrained
 
 SHORT = EnvConfig(scene="poles_eval", split="eval", time_limit_s=0.1)
 

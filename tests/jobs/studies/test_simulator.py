@@ -10,7 +10,7 @@ from jobs.run.folder import locate_run
 from jobs.studies import simulator as trade_simulator
 from jobs.studies.front_plots import pareto
 from jobs.studies.simulator import Row, columns, step_costs_us
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 POINTS = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=12)
 

@@ -14,8 +14,8 @@ from jobs.tracking.model_registry import register, register_training
 from jobs.tracking.served_policy import ACTIONS
 from jobs.tracking.tracker import open_tracker
 from models.policy import load_policy
-from tests.jobs.evaluation.test_sweep_plan import save_training
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.policies import save_training
 
 STEPS = 12
 SEEN = ("bytestream", "event_image", "rgb")

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs.browser import CHROMIUM, Browser, served
 from jobs import pipeline
 from jobs.evaluation.sweep import run as run_sweep
 from jobs.rollout import scheduler as flying
@@ -25,8 +26,8 @@ from jobs.tracking.pages import (
 )
 from jobs.tracking.store import dashboard_command, server_command
 from jobs.tracking.tracker import open_store
-from tests.jobs.evaluation.test_sweep_plan import save_training, sweep_config
-from tests.support.browser import CHROMIUM, Browser, served
+from tests.support.configs import sweep_config
+from tests.support.policies import save_training
 
 PAGE = Page(
     experiment_id="1",

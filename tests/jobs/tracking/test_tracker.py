@@ -18,7 +18,7 @@ from jobs.tracking.child_runs import Child, write_children
 from jobs.tracking.pages import PAGE_WIDTH, chart_view
 from jobs.tracking.store import check_metrics, flatten, store_uri
 from jobs.tracking.tracker import TrackingError, open_store, open_tracker
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,8 @@ from jobs.training.ppo import build_ppo
 from models.encoder.weights import load_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
-from tests.jobs.training.test_train import SHORT, make_config, write_encoder
+from tests.support.configs import SHORT, make_config
+from tests.support.runs import write_encoder
 
 
 class StackFeatures(ConnectorV2):

@@ -9,7 +9,8 @@ from models.encoder.evae import EventVAE
 from models.policy import load_policy, save_policy
 from models.policy import onnx as export
 from models.policy.onnx import export_onnx
-from tests.models.policy.test_policy import EVENT, FLOWN, SIDE, make_networks, make_settings, save
+from tests.support.encoders import EVENT
+from tests.support.policies import FLOWN, SIDE, make_networks, make_settings, save
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
 EDGES = [(1, 0, 0, 1), (5000, SIDE - 1, SIDE - 1, -1), (4999, SIDE - 1, 0, 1), (5000, 0, SIDE - 1, -1)]

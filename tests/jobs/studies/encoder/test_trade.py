@@ -26,8 +26,8 @@ from jobs.studies.encoder.trials import spread, squeezed
 from models.encoder.evae import EventVAE, event_targets, reconstruct
 from models.encoder.event_batch import EventBatch, batch_windows
 from models.encoder.table import EncoderTable
-from tests.jobs.run.test_folder import small_config
-from tests.models.encoder.test_table import WINDOW_US, make_evae, make_events
+from tests.support.configs import small_config
+from tests.support.encoders import WINDOW_US, make_evae, make_events
 
 WINDOWS = [(make_events(count, seed=count), 0, WINDOW_US) for count in (0, 1, 40, 300)]
 

@@ -17,7 +17,7 @@ from jobs.studies.probe.dataset import (
 from models.encoder.event_batch import Grid
 from models.encoder.table import EncoderTable
 from models.policy.features import push_features
-from tests.models.encoder.test_table import make_evae
+from tests.support.encoders import make_evae
 
 GRID = Grid(64, 64, 1024)
 

@@ -10,7 +10,7 @@ from jobs.run.folder import locate_run
 from jobs.studies.probe import probe
 from jobs.studies.probe.probe import Form, Row, as_columns, cells_of, headings, key, probe_figure
 from jobs.studies.probe.readout import Scores
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 
 def small_probe(tmp_path, **changes):

@@ -5,7 +5,7 @@ from jobs.analysis.tables import summarise
 from jobs.studies.front_plots import choice_figure
 from jobs.studies.replays import Measured
 from jobs.studies.trade.page import HEADINGS, RULE, Row, advice, fronts, lines, metrics, page, panels, verdict
-from tests.jobs.evaluation.test_group_stats import flights
+from tests.support.episodes import flights
 
 ABOUT = {
     "run": "trade-short-s0-1",

@@ -14,10 +14,10 @@ from jobs.studies.trade import trade
 from jobs.tracking.store import check_metrics
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
-from tests.jobs.evaluation.test_group_stats import flights
-from tests.jobs.evaluation.test_sweep import in_store, tracked_sweeps
-from tests.jobs.evaluation.test_sweep_plan import save_training
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.episodes import flights
+from tests.support.policies import save_training
+from tests.support.runs import in_store, tracked_sweeps
 
 
 def trade_config(tmp_path, policy="bytestream-s0", **changes):
