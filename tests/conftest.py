@@ -6,7 +6,6 @@ for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MK
 import platform  # noqa: E402
 from pathlib import Path  # noqa: E402
 
-import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 # The first example of a property may compile kernels.
@@ -16,15 +15,3 @@ settings.load_profile("patient")
 # Started as `pytest`, the standard library's module is loaded before the repository's.
 if not hasattr(platform, "__path__"):
     platform.__path__ = [str(Path(__file__).resolve().parents[1] / "platform")]
-
-
-@pytest.fixture
-def stub(monkeypatch):
-    """Cells are flown by `tests.support.stub_tuner.StubTuner`, whose lists say what was flown."""
-    from jobs.rollout import scheduler as flying
-    from tests.support.stub_tuner import StubTuner
-
-    StubTuner.flown, StubTuner.measured, StubTuner.broken, StubTuner.dying = [], [], {}, set()
-    monkeypatch.setattr(flying, "_tuner", StubTuner)
-    monkeypatch.setattr(flying, "start_ray", lambda *given: None)
-    return StubTuner

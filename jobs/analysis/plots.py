@@ -69,7 +69,7 @@ def trajectory_figure(tracks: Sequence[Trajectory]) -> Figure:
         _draw_scene(panel, flown[0].scene, flown[0].height_m)
         for track in flown:
             _draw_way(panel, track)
-        ends = ", ".join(f"{track.agent} {track.way_m[-1, 1]:.0f} m" for track in flown)
+        ends = ", ".join(f"{track.agent} {track.xy_m[-1, 1]:.0f} m" for track in flown)
         panel.set_title(f"corridor {seed}: {ends}", loc="left", fontsize=8.5, color=INK)
         panel.tick_params(labelsize=8)
     for panel in grid.flat[len(seeds) :]:
@@ -105,7 +105,7 @@ def _outline(section: np.ndarray) -> Patch:
 def _draw_way(panel: Axes, track: Trajectory) -> None:
     bound = track.agent == "oracle"
     colour = ORACLE if bound else OUTCOMES[track.outcome]
-    x_m, y_m = track.way_m.T
+    x_m, y_m = track.xy_m.T
     panel.plot(y_m, x_m, color=colour, lw=1.2 if bound else 2.0, ls="--" if bound else "-", zorder=3)
     panel.plot(y_m[0], x_m[0], "o", color=colour, ms=4, zorder=4)
     if track.outcome == "collision":

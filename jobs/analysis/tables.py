@@ -46,7 +46,7 @@ class Summary:
 
 
 def summarise(label: Sequence[str], episodes: np.ndarray) -> Summary:
-    """Rates, means and intervals of the episodes (dtype `jobs.evaluation.evaluate.EPISODE`) of one condition.
+    """Rates, means and intervals of the episodes (dtype `jobs.rollout.episodes.EPISODE`) of one condition.
 
     The resamples are drawn from a fixed seed: the same episodes give the same interval.
     """

@@ -20,17 +20,18 @@ from jobs.config.config import Config, ConfigError
 from jobs.evaluation.group_stats import (
     LABELS,
     Condition,
-    Flights,
-    details,
+    TrainingEpisodes,
+    details_table,
+    episode_values,
     estimate_text,
-    matrix,
+    success_table,
     summarise_group,
-    table_of,
 )
-from jobs.evaluation.sweep_plan import NOMINAL, PRETRAINED
+from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.reporting.learning_curves import mean_success, read_curves
 from jobs.reporting.paper_claims import CLAIMS, LEARNT, RULE, Claim, Finding, judge, judge_learning
 from jobs.rollout.episodes import EPISODE
+from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
@@ -181,7 +182,7 @@ def opening(about: Mapping[str, Any]) -> list[str]:
 
 def commits(about: Mapping[str, Any]) -> str:
     """Where the code stood that flew, shortened as git does."""
-    return ", ".join(commit[:7] for commit in about["flown_at"])
+    return ", ".join(commit[:7] for commit in about["evaluated_at"])
 
 
 def breaks(about: Mapping[str, Any], flown: Flown) -> list[str]:
@@ -192,11 +193,11 @@ def breaks(about: Mapping[str, Any], flown: Flown) -> list[str]:
         own = flown.get((usual, group), {None: np.empty(0, EPISODE)})
         if None in own:  # a bound, or not flown
             continue
-        before = table_of(own, "success")
+        before = episode_values(own, "success")
         lost = {}
         for (condition, other), trainings in flown.items():
             if other == group and condition != usual and trainings.keys() == own.keys():
-                change = table_of(trainings, "success") - before
+                change = episode_values(trainings, "success") - before
                 found = two_stage_estimate(change, np.random.default_rng(0))
                 if found.interval is not None and found.interval[1] < 0:
                     lost[condition] = found
@@ -234,7 +235,7 @@ def learnt(pretrained: Path) -> dict[str, list[float]]:
 def claims(flown: Flown, trainings: Mapping[str, Sequence[float]]) -> list[str]:
     """The paper's claims with our findings."""
 
-    def find(condition: Condition, group: str) -> Flights:
+    def find(condition: Condition, group: str) -> TrainingEpisodes:
         return flown.get((condition, group), {})
 
     lines = [_claim_line(claim, judge(claim, find)) for claim in CLAIMS]
@@ -276,12 +277,12 @@ def tables(about: Mapping[str, Any], flown: Flown) -> list[str]:
         for group in groups
         if (at, group) in flown
     ]
-    head, lines = matrix(rows, conditions, groups, {})
+    head, lines = success_table(rows, conditions, groups, {})
     success = ["## Success [%]", "", markdown_table(head, lines, 2)]
     note = (
         f"Differences are taken against `{reference}` on the same corridors (success in points of per cent)."
     )
-    return [*success, "## Every estimate", "", note, "", details(rows, reference)]
+    return [*success, "## Every estimate", "", note, "", details_table(rows, reference)]
 
 
 def exactness(about: Mapping[str, Any]) -> list[str]:
