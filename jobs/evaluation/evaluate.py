@@ -9,6 +9,7 @@ and a video of one episode. A stopped evaluation continues; one that asks for mo
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -41,6 +42,7 @@ LABELS = ("Agent", "Scene", "Renderer")
 Label = tuple[str, str, str]  # what was evaluated, as in `LABELS`
 SHOWN_CORRIDORS = range(4)
 VIEW_COLUMNS = ("eval/success_rate", "eval/success_rate_low", "eval/success_rate_high", "eval/distance_m")
+Renderer = Literal["raycast", "pyrender"]
 ACTIONS = ("deterministic", "stochastic")  # the likeliest action, or one drawn as in training
 
 
@@ -73,7 +75,7 @@ def evaluate(
     """
     policy = find_policy(config, folder)
     manifest = load_policy(policy.agent).manifest
-    check_sensor(manifest["sensor"], config.env_config())
+    check_sensor(manifest["sensor"], config.env)
     asked = {"evaluate": as_dict(config)["evaluate"], "policy": manifest["sha256"]}
     done = finished(folder, "evaluate")
     if done is not None and done["asked"] == asked and not done.get("missing"):
@@ -89,12 +91,12 @@ def evaluate(
     write_episodes(folder.evaluation / "episodes.csv", LABELS, episodes)
     publish(folder, tracker, summaries, trajectories(tasks))
     found = evaluation_metrics(summaries) | drift_by_label(results)
-    found |= measure_event_error(config.env_config(scene=HELD_OUT_SCENE))
+    found |= measure_event_error(dataclasses.replace(config.env, scene=HELD_OUT_SCENE))
     tracker.log(config.train.env_steps, found)
     if config.evaluate.video:
         task, file = tasks[0], folder.evaluation / "episode.mp4"
         seed = seed_to_film(results[label_of(task)].episodes)
-        env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
+        env_config = dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval")
         tracker.artifact(film_episode(task.policy.agent, task.action, env_config, seed, file), "eval")
     missing = [" ".join(label) for label in map(label_of, tasks) if label not in results]
     commits = sorted({commit for result in results.values() for commit in result.commits})
@@ -111,7 +113,7 @@ def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationT
     the configured one comes first and is the one that metrics without a suffix belong to.
     """
     first, *others = config.evaluate.renderers
-    scenes = dict.fromkeys((HELD_OUT_SCENE, config.env_config().scene))
+    scenes = dict.fromkeys((HELD_OUT_SCENE, config.env.scene))
     actions = sorted(ACTIONS, key=lambda action: action != config.evaluate.action)
     agents = [(policy, action) for action in actions]
     agents += [(read_policy(name), name) for name in BASELINES]
@@ -121,8 +123,11 @@ def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationT
     ]
 
 
-def _task(config: Config, policy: EvaluatedPolicy, action: str, scene: str, renderer: str) -> EvaluationTask:
-    env, episodes = config.env_config(scene=scene, split="eval", renderer=renderer), config.evaluate.episodes
+def _task(
+    config: Config, policy: EvaluatedPolicy, action: str, scene: str, renderer: Renderer
+) -> EvaluationTask:
+    env = dataclasses.replace(config.env, scene=scene, split="eval", renderer=renderer)
+    episodes = config.evaluate.episodes
     if renderer == "pyrender":  # for another picture, not for one as exact as the tolerance asks
         env = dataclasses.replace(env, fidelity=dataclasses.replace(env.fidelity, samples=2))
         episodes = config.evaluate.pyrender_episodes

@@ -1,13 +1,15 @@
 """What a sweep evaluates: every policy under every condition, each pair as one task."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import pydantic
 
 from envs.config import EnvConfig, settings_hash
-from jobs.config.conditions import Condition, Setting, axis_points, env_with
+from jobs.config.conditions import Condition, Setting, axis_points
 from jobs.config.config import Config, ConfigError
+from jobs.config.env_keys import env_with
 from jobs.rollout.policies import Differences, EvaluatedPolicy, own_sensor_differences, with_sensor
 from jobs.rollout.tasks import EvaluationTask, make_task
 
@@ -57,7 +59,7 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
     Raises:
         ConfigError: If a policy's own sensor and a changed setting exclude each other.
     """
-    configured = config.env_config(scene=config.sweep.scene, split="eval")
+    configured = dataclasses.replace(config.env, scene=config.sweep.scene, split="eval")
     axes: Axes = {NOMINAL: {config.sweep.scene: {}}}
     for axis, settings in config.sweep.axes.items():
         axes[axis] = {value_text(next(iter(point.values()))): point for point in axis_points(settings)}

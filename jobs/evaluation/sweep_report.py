@@ -133,7 +133,7 @@ def write_plots(
         if axis != NOMINAL and own:
             paths.append(place / f"{axis}.png")
             axis_figure(axis, points, own).savefig(paths[-1], dpi=120)
-    scene = make_scene(config.sweep.scene, np.random.default_rng(0), **config.env["layout"])
+    scene = make_scene(config.sweep.scene, np.random.default_rng(0), **config.env.layout)
     ends = {group: contacts(found, group) for group in found.sweep.groups}
     paths.append(place / "contacts.png")
     collision_figure(ends, scene.length_m, scene.width_m / 2).savefig(paths[-1], dpi=120)

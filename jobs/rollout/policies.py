@@ -1,6 +1,5 @@
 """Policies by name: the folder that a name stands for, what it says, and its sensor in training."""
 
-import dataclasses
 import json
 import re
 from collections.abc import Mapping
@@ -8,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_differences, settings_hash
+from envs.config import EnvConfig, sensor_differences, settings_hash
 from jobs.config.config import Config, ConfigError
+from jobs.config.env_keys import ENV_KEYS, env_with
 from jobs.rollout.agents import BASELINES
 from jobs.run.folder import Run, latest_policies, named_policy
 from jobs.run.provenance import REPOSITORY
@@ -17,6 +17,7 @@ from models.kinds import kind_of
 from models.policy.policy import MANIFEST
 
 PRETRAINED = REPOSITORY / "models" / "pretrained"
+SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
 Differences = dict[str, tuple[object, object]]  # sensor setting -> (the policy's value, the environment's)
 
 
@@ -153,13 +154,7 @@ def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is out of range.
     """
-    groups = {"camera": CameraConfig, "fidelity": FidelityConfig}
-    changes = dict(sensor)
-    for name, group in groups.items():
-        # Together, because some settings of a camera exclude each other.
-        own = {part.name: changes.pop(part.name) for part in dataclasses.fields(group) if part.name in sensor}
-        changes[name] = dataclasses.replace(getattr(env, name), **own)
-    return dataclasses.replace(env, **changes)
+    return env_with(env, {SENSOR_KEYS.get(name, name): value for name, value in sensor.items()})
 
 
 def own_sensor_differences(policy: EvaluatedPolicy, env: EnvConfig) -> Differences:

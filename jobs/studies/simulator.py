@@ -72,7 +72,7 @@ def run(config: Config) -> dict[str, Any]:
 
 def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> dict[str, float]:
     """Cost against error in one scene; the figures of the default."""
-    default = config.env_config(scene=scene, split="validation", observation="events")
+    default = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
     named = [("default", "", default)]
     for knob, settings in KNOBS.items():
         named += [(knob, setting_text(setting), changed(default, setting)) for setting in settings]
@@ -112,7 +112,7 @@ def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
             # The same way at every rate: as many steps as fit into the time of the slowest.
             steps = max(1, round(trade.steps * hz / min(rates_hz) / 4))
             for memory in MEMORIES:
-                default = config.env_config(control_hz=hz, split="validation")
+                default = dataclasses.replace(config.env, control_hz=hz, split="validation")
                 accuracy = measure(env_with(default, {"camera.memory": memory}), trade.flights, steps)
                 events_hz[memory].append(accuracy.events[0] * hz)
                 advance(1, note=memory)

@@ -97,7 +97,7 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
         rule = f"must be a run folder with an encoder, or an encoder file, got {named!r}"
         raise ConfigError(f"pretrain.encoder: {rule}: {error}") from error
     with torch.device("meta"):  # its settings alone, without memory for weights
-        wanted = build_evae(config.model, sensor_settings(config.env_config())).settings
+        wanted = build_evae(config.model, sensor_settings(config.env)).settings
     differ = [
         f"{name}: {evae.settings[name]!r} there, {value!r} here"
         for name, value in wanted.items()

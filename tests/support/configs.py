@@ -53,4 +53,4 @@ def sweep_config(tmp_path, trials=2, policies=("straight",), axes=AXES, **change
     """A sweep of short episodes."""
     config = small_config(tmp_path, job="sweep", exp="robustness")
     settings = dataclasses.replace(config.sweep, axes=axes, trials=trials, policies=list(policies), **changes)
-    return dataclasses.replace(config, sweep=settings, env={**config.env, "time_limit_s": 0.2})
+    return dataclasses.replace(config, sweep=settings, env=dataclasses.replace(config.env, time_limit_s=0.2))

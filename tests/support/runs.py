@@ -38,7 +38,7 @@ def tracked_sweeps(config, kind="condition", parent="sweep"):
 
 def write_encoder(folder, config):
     torch.manual_seed(0)
-    sensor = sensor_settings(config.env_config())
+    sensor = sensor_settings(config.env)
     evae = build_evae(config.model, sensor)
     for parameter in evae.ecn.parameters():  # random weights see little; make latents differ
         parameter.data.mul_(1.5)

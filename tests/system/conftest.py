@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from jobs.config.registry import Job
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -42,6 +44,6 @@ def job(launcher, monkeypatch):
         module = types.ModuleType("jobs_under_test")
         module.run = function
         monkeypatch.setitem(sys.modules, "jobs_under_test", module)
-        monkeypatch.setitem(launcher.JOBS, "train", "jobs_under_test")
+        monkeypatch.setitem(launcher.JOBS, "train", Job("jobs_under_test", ""))
 
     return replace

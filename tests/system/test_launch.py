@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from jobs.config.config import Config
 
@@ -90,7 +91,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["+env.split=eval"], "env.split: no such key, got 'eval'; every job chooses it itself"),
         (["seed=null"], "seed: Input should be a valid integer, got None"),
         (["seed="], "seed: Input should be a valid integer, got ''"),
-        (["job=os.system"], "job: Input should be 'pipeline'"),
+        (["job=os.system"], "job: must be one of pipeline, collect, "),
         (["budget=huge"], "budget: must be one of paper, short, smoke, got 'huge'"),
         (["env=3"], "env=3: "),
         (["seed=[1"], "seed=[1: "),
@@ -159,8 +160,8 @@ def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folde
     assert shlex.split(command) == [sys.executable, "-m", "platform.launch", "+exp=train", *words]
     (config,) = given
     assert isinstance(config, Config)
-    assert (config.job, config.seed, config.renderer, config.resume) == ("train", 3, "raycast", "runs/x")
-    assert config.env_config().layout == {"num_obstacles": 60.0}
+    assert (config.job, config.seed, config.env.renderer, config.resume) == ("train", 3, "raycast", "runs/x")
+    assert config.env.layout == {"num_obstacles": 60.0}
     assert list(tmp_path.iterdir()) == []
     assert "HYDRA_FULL_ERROR" not in os.environ
 
@@ -201,12 +202,16 @@ def test_an_unexpected_failure_shows_its_traceback_and_ends_with_status_1(launch
     assert err.endswith("evade: failed: KeyError: 'renderer'\n")
 
 
-def test_the_traceback_of_a_refusal_is_shown_on_demand(launch, job, monkeypatch):
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+@pytest.mark.parametrize(("value", "shown"), [("1", True), ("0", False), ("", False)])
+def test_the_traceback_of_a_wrong_value_is_shown_if_hydra_full_error_is_1(
+    launch, job, monkeypatch, value, shown
+):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", value)
     job(unknown_scene)
     status, _, err = launch("+exp=train")
     assert status == 2
-    assert "Traceback" in err
+    assert ("Traceback" in err) == shown
+    assert os.environ["HYDRA_FULL_ERROR"] == value
 
 
 def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):
@@ -221,9 +226,11 @@ def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):
     assert len(err.splitlines()) == 1
 
 
-def test_every_job_has_a_module(launcher):
-    assert [path for path in launcher.JOBS.values() if importlib.util.find_spec(path) is None] == []
-    assert set(launcher.JOBS) == set(Config.__annotations__["job"].__args__)
+def test_every_job_has_a_module_and_an_experiment_that_runs_it(launcher):
+    missing = [job.module for job in launcher.JOBS.values() if importlib.util.find_spec(job.module) is None]
+    assert missing == []
+    experiments = [yaml.safe_load(file.read_text()) for file in (ROOT / "conf" / "exp").glob("*.yaml")]
+    assert {experiment["job"] for experiment in experiments} == set(launcher.JOBS)
 
 
 def test_the_launcher_says_so_when_conf_is_not_there(launch, launcher, monkeypatch, tmp_path):

@@ -6,6 +6,7 @@ they are kept in the run folder, so that a killed job goes on. Two tables and th
 and figures of what the latent holds, in the run folder under `trade/` and in MLflow.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -146,7 +147,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
     steps = 10 * config.trade_encoder.windows
     with progress("Fly in other scenes", steps * len(OTHER_SCENES), "steps") as advance:
         for scene in OTHER_SCENES:
-            world = config.env_config(scene=scene, split="validation", observation="events")
+            world = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
             recording = record([(world, steps)], config.seed, advance)
             scenes[scene] = held_out_windows(recording, config.pretrain, evae.grid)["four_steps"]
     shares = {scene: explained(evae, batch) for scene, batch in scenes.items()}

@@ -40,7 +40,7 @@ def trained(config: Config, folder: Run, changes: dict[str, Any], seed: int) -> 
 
 def trial_settings(config: Config, changes: dict[str, Any]) -> dict[str, Any]:
     """The settings of the run's event VAE with some of them changed."""
-    return build_evae(config.model, sensor_settings(config.env_config())).settings | changes
+    return build_evae(config.model, sensor_settings(config.env)).settings | changes
 
 
 def kept(
@@ -50,7 +50,7 @@ def kept(
     if not file.with_suffix(".json").exists():
         train = read_recording(data_file(folder, "train"))
         evae = train_short(config, train, settings, seed, iterations, f"Train {file.stem}")
-        sensor = sensor_settings(config.env_config())
+        sensor = sensor_settings(config.env)
         save_encoder(file, evae, {"sensor": sensor, "iterations": iterations})
     return load_encoder(file)[0]
 

@@ -6,6 +6,7 @@ quarter of an hour; the trainings are kept in the run folder, so that a killed j
 figure, in the run folder under `probe/` and in MLflow.
 """
 
+import dataclasses
 import functools
 import re
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from envs.config import Split
 from jobs.analysis.plots import GRID, INK, MUTED
 from jobs.analysis.tables import draw_figure, publish_table
 from jobs.config.config import Config, ConfigError
@@ -109,10 +111,14 @@ def run(config: Config) -> dict[str, Any]:
 
 def fly_both(config: Config) -> tuple[ProbeData, ProbeData]:
     """Flights to fit the probes to, and flights through validation corridors to judge them by."""
-    sizes = {"train": config.probe.num_steps, "validation": config.probe.num_validation_steps}
+    env = dataclasses.replace(config.env, observation="events")
+    sizes: dict[Split, int] = {
+        "train": config.probe.num_steps,
+        "validation": config.probe.num_validation_steps,
+    }
     with progress("Fly and look", sum(sizes.values()), "steps") as advance:
         train, held_out = (
-            fly_and_look(config.env_config(split=split, observation="events"), steps, config.seed, advance)
+            fly_and_look(dataclasses.replace(env, split=split), steps, config.seed, advance)
             for split, steps in sizes.items()
         )
     return train, held_out

@@ -8,6 +8,7 @@ the same command is given again: what was flown is never flown twice; costs and 
 anew.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -124,7 +125,7 @@ def plan(config: Config, policy: EvaluatedPolicy, evae: EventVAE) -> list[Evalua
     Raises:
         ConfigError: If the policy's own sensor and a setting exclude each other.
     """
-    own = with_sensor(config.env_config(scene=HELD_OUT_SCENE, split="eval"), policy.sensor)
+    own = with_sensor(dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval"), policy.sensor)
     timed = evae.ecn.coding != "none"
     found: dict[str, EvaluationTask] = {}
     for knob, text, simulation, table in changes(timed):

@@ -208,16 +208,17 @@ def test_the_metrics_name_agent_scene_and_renderer(tmp_path):
 
 def trained(tmp_path, name="bytestream"):
     """The folder of a policy that says it was trained."""
-    return save_training(tmp_path / name, name, 0, small_config(tmp_path).env_config(), name)
+    return save_training(tmp_path / name, name, 0, small_config(tmp_path).env, name)
 
 
 @pytest.mark.parametrize("name", ["bytestream", "rgb"])
 def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.6})
+    env = dataclasses.replace(config.env, time_limit_s=0.6)
+    config = dataclasses.replace(config, evaluate=settings, env=env)
     run = open_run(config)
-    save_training(run.policy, name, 0, config.env_config(), name)
+    save_training(run.policy, name, 0, config.env, name)
     with open_tracker(config, run) as tracker:
         figures = evaluate(config, run, tracker, run_serially)
         assert evaluate(config, run, tracker, run_serially) == figures
@@ -288,9 +289,11 @@ def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_sto
 def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.05})
+    config = dataclasses.replace(
+        config, evaluate=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)
+    )
     run, executor = open_run(config), FakeExecutor(evaluate_part)
-    save_training(run.policy, "a", 0, config.env_config(), "event_columns")
+    save_training(run.policy, "a", 0, config.env, "event_columns")
     drawn = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
     with open_tracker(config, run) as tracker:
         for broken, evaluated, missing in ((drawn, 10, 1), ({}, 11, 0), (drawn, 11, 0)):

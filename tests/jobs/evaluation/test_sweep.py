@@ -16,8 +16,8 @@ from tests.support.runs import in_store, planned, tracked_sweeps
 
 def test_who_is_evaluated_and_whose_sensor_differs_is_said(tmp_path, capsys):
     config = sweep_config(tmp_path)
-    same = save_training(tmp_path / "same", "a", 0, config.env_config())
-    slow = save_training(tmp_path / "slow", "a", 1, config.env_config(control_hz=100.0))
+    same = save_training(tmp_path / "same", "a", 0, config.env)
+    slow = save_training(tmp_path / "slow", "a", 1, dataclasses.replace(config.env, control_hz=100.0))
     announce(planned(config, same, slow, "oracle"))
     assert capsys.readouterr().out.splitlines() == [
         "Group: a (training seeds 0, 1)",
@@ -92,7 +92,7 @@ def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differ
     tmp_path,
 ):
     config = in_store(sweep_config(tmp_path), tmp_path)
-    agent = save_training(tmp_path / "policy", "a", 0, config.env_config(control_hz=100.0))
+    agent = save_training(tmp_path / "policy", "a", 0, dataclasses.replace(config.env, control_hz=100.0))
     for policies, trials in (([agent], 2), ([agent, "straight"], 2), ([agent], 3)):
         settings = dataclasses.replace(config.sweep, policies=policies, trials=trials)
         run(dataclasses.replace(config, sweep=settings), FakeExecutor())
@@ -109,7 +109,7 @@ def test_tasks_evaluated_as_tune_trials_come_back_with_their_episodes_and_one_th
     tmp_path,
 ):
     config = sweep_config(tmp_path)
-    env = config.env_config()
+    env = config.env
     kinds = {"bytestream": 0, "event_columns": 0, "event_image": 1}
     agents = [save_training(tmp_path / name, name, seed, env, name) for name, seed in kinds.items()]
     (tmp_path / "event_image" / NETWORKS).write_bytes(b"")

@@ -28,7 +28,7 @@ def at(sweep, axis, value):
 
 def test_axes_change_their_settings_alone_and_share_the_unchanged_task(tmp_path):
     config = sweep_config(tmp_path)
-    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env))
     assert sweep.conditions == [
         (NOMINAL, "poles_eval"), ("sparsity", "0"), ("sparsity", "0.5"), ("rate", "100"), ("rate", "200")
     ]  # fmt: skip
@@ -53,7 +53,7 @@ def test_faults_change_no_accuracy_and_anything_else_does(tmp_path):
 
 def test_another_policy_is_another_task(tmp_path):
     config = sweep_config(tmp_path)
-    one = save_training(tmp_path / "one", "a", 0, config.env_config())
+    one = save_training(tmp_path / "one", "a", 0, config.env)
     keys = {planned(config, name).tasks[0].key for name in ("straight", "oracle", one)}
     manifest = json.loads((tmp_path / "one" / MANIFEST).read_text())
     (tmp_path / "one" / MANIFEST).write_text(json.dumps({**manifest, "sha256": {}}))
@@ -67,9 +67,7 @@ def test_what_an_agent_does_not_see_makes_no_task_of_its_own(tmp_path):
         "exactness": {"fidelity.samples": [1, 8]},
     }
     config = sweep_config(tmp_path, axes=axes)
-    agents = [
-        save_training(tmp_path / name, name, 0, config.env_config(), name) for name in ("rgb", "event_image")
-    ]
+    agents = [save_training(tmp_path / name, name, 0, config.env, name) for name in ("rgb", "event_image")]
     sweep = planned(config, "straight", *agents)
     keys = {
         group: {task.condition: task.key for task in sweep.tasks if task.policy.group == group}
@@ -87,7 +85,7 @@ def test_what_an_agent_does_not_see_makes_no_task_of_its_own(tmp_path):
 
 def test_a_policy_keeps_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
     config = sweep_config(tmp_path)
-    trained = config.env_config(control_hz=100.0, camera=CameraConfig(memory="frame"))
+    trained = dataclasses.replace(config.env, control_hz=100.0, camera=CameraConfig(memory="frame"))
     agent = save_training(tmp_path / "policy", "a", 0, trained)
     sweep = planned(config, agent, "straight")
     assert sweep.differences == {agent: {"control_hz": (100.0, 200.0), "memory": ("frame", "reference")}}
@@ -101,7 +99,9 @@ def test_a_policy_keeps_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
 
 def test_an_own_sensor_that_an_axis_excludes_is_refused_with_both_named(tmp_path):
     config = sweep_config(tmp_path, axes={"dead_time": {"camera.refractory_us": [0, 10]}})
-    agent = save_training(tmp_path / "policy", "a", 0, config.env_config(camera=CameraConfig(memory="frame")))
+    agent = save_training(
+        tmp_path / "policy", "a", 0, dataclasses.replace(config.env, camera=CameraConfig(memory="frame"))
+    )
     with pytest.raises(ConfigError, match=r"^sweep\.axes\.dead_time: .*refractory_us.* 10.*got 10$"):
         planned(config, agent)
 
@@ -123,7 +123,7 @@ def test_every_sensor_setting_of_a_manifest_reaches_the_simulation():
 
 def test_policies_of_one_group_stand_together_by_their_training_seed(tmp_path):
     config = sweep_config(tmp_path)
-    folder, env = open_run(config), config.env_config()
+    folder, env = open_run(config), config.env
     for place, group, seed in (("x", "b", 1), ("y", "a", 0), ("z", "b", 0)):
         save_training(tmp_path / "pretrained" / place, group, seed, env)
     named = sweep_config(tmp_path, policies=["pretrained", "oracle", "pretrained"])
@@ -148,7 +148,7 @@ def test_a_policy_without_an_experiment_is_of_the_group_of_its_kind(tmp_path):
 def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_path):
     config = sweep_config(tmp_path)
     folder = open_run(config)
-    path = save_training(tmp_path / "runs" / "trained" / "policy", "a", 0, config.env_config(), "bytestream")
+    path = save_training(tmp_path / "runs" / "trained" / "policy", "a", 0, config.env, "bytestream")
     for name in ("newest", path, path.removesuffix("/policy")):
         (policy,) = find_sweep_policies(sweep_config(tmp_path, policies=[name]), folder)
         assert policy.agent == path
@@ -156,7 +156,7 @@ def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_pat
 
 def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
     config = sweep_config(tmp_path, policies=["one"])
-    path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env_config())
+    path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env)
     (policy,) = find_sweep_policies(config, open_run(config), tmp_path / "pretrained")
     assert policy.agent == path
 
@@ -164,7 +164,7 @@ def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
 def test_a_group_of_the_pretrained_folder_is_all_its_trainings_and_no_other_group(tmp_path):
     config = sweep_config(tmp_path, policies=["a", "straight"])
     for place, group, seed in (("a-s1", "a", 1), ("a-set-s0", "a-set", 0), ("a-s0", "a", 0)):
-        save_training(tmp_path / "pretrained" / place, group, seed, config.env_config())
+        save_training(tmp_path / "pretrained" / place, group, seed, config.env)
     policies = find_sweep_policies(config, open_run(config), tmp_path / "pretrained")
     assert [(policy.group, policy.training) for policy in policies] == [
         ("a", 0),

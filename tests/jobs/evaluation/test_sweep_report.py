@@ -56,7 +56,7 @@ def test_a_group_of_which_nothing_was_evaluated_has_no_result(tmp_path):
 def test_contacts_of_the_sweeps_scene_are_told_by_what_was_changed_and_counted_once(tmp_path):
     axes = {"sparsity": {"faults.sparsity": [0.0, 0.5]}, "world": {"env.scene": ["poles_eval", "poles"]}}
     config = sweep_config(tmp_path, axes=axes)
-    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env))
     found = results_of(sweep, {task.key: flights(3) for task in sweep.tasks}, tmp_path)
     usual, changed = contacts(found, "a")
     assert (len(usual), len(changed)) == (20, 20)
@@ -73,7 +73,7 @@ def test_typical_crashes_are_those_in_the_middle():
 def test_crashes_of_each_groups_first_training_are_filmed_once(tmp_path):
     config = sweep_config(tmp_path)
     agents = [
-        save_training(tmp_path / f"{group}{seed}", group, seed, config.env_config())
+        save_training(tmp_path / f"{group}{seed}", group, seed, config.env)
         for group, seed in (("a", 0), ("a", 1), ("b", 4))
     ]
     sweep = planned(config, *agents, "straight")

@@ -97,7 +97,7 @@ def test_a_task_of_which_a_part_dies_keeps_the_others_and_tries_that_part_again(
 
 def test_a_policy_is_evaluated_alone_and_the_accuracy_measured_where_asked(tmp_path, store):
     config = sweep_config(tmp_path)
-    path = save_training(tmp_path / "policy", "a", 0, config.env_config())
+    path = save_training(tmp_path / "policy", "a", 0, config.env)
     (task, *_) = planned(config, path).tasks
     (part,), (unmeasured,) = (plan_parts([task], store, measure) for measure in (True, False))
     first, again = evaluate_part(part), evaluate_part(unmeasured)

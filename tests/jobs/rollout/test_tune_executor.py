@@ -69,7 +69,7 @@ def test_a_longer_part_may_take_longer(tmp_path):
 
 def test_a_worker_evaluates_the_policy_of_the_driver_though_it_cannot_see_its_folder(tmp_path):
     config = sweep_config(tmp_path)
-    path = Path(save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    path = Path(save_training(tmp_path / "policy", "a", 0, config.env))
     part = first_part(config, str(path))
     here = evaluate_part(part)
     files = policy_files([part])

@@ -10,10 +10,12 @@ import pytest
 
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError
+from jobs.config.env_keys import env_with
 from jobs.run import folder as runs
 from jobs.run.files import RunError, write_json
-from jobs.run.folder import UNNAMED, finish, finished, holding, latest_policies, open_run, run_name
+from jobs.run.folder import NOT_IN_RUN_NAME, finish, finished, holding, latest_policies, open_run, run_name
 from jobs.run.provenance import REPOSITORY, git_commit
+from models.kinds import KINDS
 from tests.support.configs import small_config
 
 
@@ -34,11 +36,12 @@ def test_the_same_settings_find_the_same_folder_whatever_job_tracker_or_cluster(
 
 
 def test_every_setting_that_changes_results_changes_the_folder(config):
+    noisy = env_with(config.env, {"faults.sparsity": 0.1})
     names = {
         run_name(config),
         run_name(dataclasses.replace(config, seed=1)),
         run_name(dataclasses.replace(config, algo=dataclasses.replace(config.algo, lr=1e-5))),
-        run_name(dataclasses.replace(config, faults=dataclasses.replace(config.faults, sparsity=0.1))),
+        run_name(dataclasses.replace(config, env=noisy)),
     }
     assert len(names) == 4
 
@@ -150,10 +153,34 @@ def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(confi
     del stored["collect"]["recordings"], stored["train"]["conditions"]
     (run.path / "config.json").write_text(json.dumps(stored))
     assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
-    settings = {name: value for name, value in stored.items() if name not in UNNAMED}
+    settings = {name: value for name, value in stored.items() if name not in NOT_IN_RUN_NAME}
     assert run.path.name.endswith(settings_hash(settings)[:8])
     noisy = dataclasses.replace(config.train, conditions=[{"faults.sparsity": 0.5}])
     assert run_name(dataclasses.replace(config, train=noisy)) != run.path.name
+
+
+@pytest.mark.parametrize(("old", "new"), runs.RENAMED_MODELS.items())
+def test_a_run_folder_of_a_model_that_was_renamed_is_not_continued_and_says_its_new_name(config, old, new):
+    assert new in KINDS
+    run = open_run(config)
+    stored = json.loads((run.path / "config.json").read_text())
+    stored["model"]["name"] = old
+    (run.path / "config.json").write_text(json.dumps(stored))
+    with pytest.raises(ConfigError, match=rf"^resume: .* {old}, .* {new} now") as error:
+        open_run(dataclasses.replace(config, resume=str(run.path)))
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_keep_their_names(config):
+    stored = json.loads((open_run(config).path / "config.json").read_text())
+    assert list(stored)[:11] == [
+        "job", "exp", "budget", "seed", "resume", "runs_dir",
+        "env", "camera", "faults", "renderer", "fidelity",
+    ]  # fmt: skip
+    assert set(stored["env"]) == {
+        "scene", "layout", "control_hz", "speed_mps", "vehicle_radius_m", "camera_height_m", "time_limit_s",
+        "window_capacity",
+    }  # fmt: skip
 
 
 def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):

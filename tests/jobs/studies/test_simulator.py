@@ -67,6 +67,6 @@ def test_the_job_leaves_tables_and_figures_and_a_second_run_replaces_them(tmp_pa
     assert [row[1].strip() for row in rows] == ["default", "renders", "renders", "encoding"]
     assert [int(row[6]) for row in rows[1:3]] == [1, 3]
     assert 0.0 < figures["sim/event_error_poles"] < 1.0
-    exact = measure(config.env_config(split="validation"), 1, 1)
+    exact = measure(dataclasses.replace(config.env, split="validation"), 1, 1)
     assert figures["sim/events_per_second_reference_200_hz"] == pytest.approx(200.0 * exact.events[0])
     assert figures["sim/events_per_second_reference_200_hz"] > figures["sim/events_per_second_legacy_200_hz"]

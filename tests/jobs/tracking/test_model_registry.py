@@ -28,7 +28,7 @@ def store(tmp_path_factory):
     folder = open_run(small_config(tmp_path_factory.mktemp("registry")))
     with open_tracker(folder.config, folder) as tracker:
         pass
-    env = folder.config.env_config()
+    env = folder.config.env
     return tracker, {name: Path(save_training(folder.path / name, name, 3, env, name)) for name in SEEN}
 
 

@@ -97,7 +97,7 @@ def evaluated_training(config) -> Run:
     evaluation = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"])
     config = dataclasses.replace(config, job="pipeline", exp="bytestream", evaluate=evaluation)
     folder = open_run(config)
-    save_training(folder.policy, "bytestream", 0, config.env_config(), "bytestream")
+    save_training(folder.policy, "bytestream", 0, config.env, "bytestream")
     for stage in ("collect", "pretrain", "train"):
         finish(folder, stage, {"train/success_rate": 0.5} if stage == "train" else {})
     pipeline.run(config)

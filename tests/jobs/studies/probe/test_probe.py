@@ -18,7 +18,7 @@ def small_probe(tmp_path, **changes):
     settings = {"num_steps": 120, "num_validation_steps": 60, "iterations": 1, "seeds": 2}
     return dataclasses.replace(
         config,
-        env={**config.env, "time_limit_s": 0.1},
+        env=dataclasses.replace(config.env, time_limit_s=0.1),
         model=dataclasses.replace(config.model, context=32),
         collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
         pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),

@@ -25,7 +25,8 @@ def trade_config(tmp_path, policy="bytestream-s0", **changes):
     config = small_config(tmp_path, job="trade", exp="trade")
     settings = dataclasses.replace(config.trade, policy=policy, **changes)
     return in_store(
-        dataclasses.replace(config, trade=settings, env={**config.env, "time_limit_s": 0.05}), tmp_path
+        dataclasses.replace(config, trade=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)),
+        tmp_path,
     )
 
 
@@ -35,7 +36,7 @@ def planned(config, policy):
 
 @pytest.fixture
 def policy(tmp_path):
-    return save_training(tmp_path / "policy", "a", 0, small_config(tmp_path).env_config(), "bytestream")
+    return save_training(tmp_path / "policy", "a", 0, small_config(tmp_path).env, "bytestream")
 
 
 def test_the_default_comes_first_the_most_exact_last_and_nothing_twice(tmp_path, policy):
