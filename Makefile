@@ -15,6 +15,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 LAUNCH := $(BIN)/python -m platform.launch
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4
 # A local dashboard runs no jobs of its own and sends no telemetry.
 MLFLOW_ENV := MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true \
 	MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false
@@ -25,7 +26,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-faults test-cluster lint check bench docs lock clean
+.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -68,8 +69,14 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine on
 	$(MLFLOW_ENV) $(BIN)/mlflow server --workers 1 --host 127.0.0.1 --port 5000 \
 	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
 
-test: setup ## the quick tests (ARGS="-m slow" for the slow ones)
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
+test: setup ## the quick tests (4 minutes on two cores)
+	$(PYTEST) --dist worksteal $(ARGS)
+
+test-system: setup ## whole jobs, Ray, the launcher, and every kind of policy (8 minutes)
+	$(PYTEST) -m "system and not slow" --dist loadgroup $(ARGS)
+
+test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
+	$(PYTEST) -m slow --dist loadgroup $(ARGS)
 
 test-faults: setup ## inject faults into running jobs and print what was lost (15 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 2 --dist worksteal $(ARGS)
@@ -87,7 +94,7 @@ lint: setup ## check style, format, types, and who imports whom
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: lint test ## what must pass before a change is merged
+check: lint test test-system ## what must pass before a change is merged
 
 bench: setup ## measure the speed of the parts, and what accuracy of the simulator costs
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done

@@ -19,18 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from jobs.config.registry import JOBS
+from jobs.run.provenance import REPOSITORY as ROOT
+from jobs.run.threads import ONE_THREAD
 
-ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "conf"
-
-# Two threads beside other busy processes ran ten times slower than one.
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-    "LP_NUM_THREADS": "0",
-}
 
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
 OPEN_GROUPS = ("env.layout", "sweep.axes")  # take entries that conf/ does not have

@@ -16,9 +16,19 @@ import torch
 
 from envs.config import WITHOUT_EVENTS, EnvConfig
 from envs.corridor import CorridorEnv
-from jobs.analysis.plots import trajectory_figure
-from jobs.analysis.tables import Summary, columns, markdown, metrics, show, summarise, table
-from jobs.analysis.video import Decode, Film
+from jobs.analysis.plots import plot_trajectories
+from jobs.analysis.tables import (
+    CAPTION,
+    SUMMARY_HEADINGS,
+    Summary,
+    publish_plot,
+    publish_table,
+    summarise,
+    summary_cells,
+    summary_columns,
+    summary_metrics,
+)
+from jobs.analysis.video import Decode, open_film
 from jobs.config.config import HELD_OUT_SCENE, Config, as_dict
 from jobs.rollout.agents import BASELINES, StepInfo, make_agent
 from jobs.rollout.diagnostics import measure_event_error
@@ -28,7 +38,6 @@ from jobs.rollout.policies import EvaluatedPolicy, check_sensor, find_policy, re
 from jobs.rollout.scheduler import default_executor, evaluate_tasks
 from jobs.rollout.store import EpisodeStore, TaskResult
 from jobs.rollout.tasks import EvaluationTask, make_task
-from jobs.run.files import write_atomic
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console
 from jobs.tracking.tracker import Tracker, open_tracker
@@ -180,14 +189,10 @@ def announce(config: Config, folder: Run, policy: EvaluatedPolicy) -> None:
 
 def publish(folder: Run, tracker: Tracker, summaries: Sequence[Summary], shown: Sequence[Trajectory]) -> None:
     """Print, write and track the table and the trajectories."""
-    text = markdown(LABELS, summaries)
-    show(table("Held-out corridors", LABELS, summaries))
-    write_atomic(folder.evaluation / "table.md", text)
-    tracker.text("eval/table.md", text)
-    tracker.table("eval/results", columns(LABELS, summaries))
-    figure = trajectory_figure(shown)
-    figure.savefig(folder.evaluation / "trajectories.png", dpi=120)
-    tracker.figure("eval/trajectories.png", figure)
+    head, lines = (*LABELS, *SUMMARY_HEADINGS), [summary_cells(summary) for summary in summaries]
+    publish_table(folder, tracker, "eval/table", "Held-out corridors", head, lines, len(LABELS), CAPTION)
+    tracker.table("eval/results", summary_columns(LABELS, summaries))
+    publish_plot(folder, tracker, "eval/trajectories", plot_trajectories(shown))
 
 
 def evaluation_metrics(summaries: Sequence[Summary]) -> dict[str, float]:
@@ -200,9 +205,9 @@ def evaluation_metrics(summaries: Sequence[Summary]) -> dict[str, float]:
     for summary in summaries:
         suffix = metric_suffix(summary.label, first)
         if not suffix:
-            found |= metrics(summary)
+            found |= summary_metrics(summary)
         elif summary.label[0] == first[0] or summary.label[1] == first[1]:
-            found |= {f"{name}{suffix}": metrics(summary)[name] for name in VIEW_COLUMNS[::3]}
+            found |= {f"{name}{suffix}": summary_metrics(summary)[name] for name in VIEW_COLUMNS[::3]}
     return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
@@ -233,13 +238,13 @@ def film_episode(name: str, action: str, env_config: EnvConfig, seed: int, path:
     """Film an episode of a policy's folder, or of a baseline, in one corridor; return the file."""
     decode = latent_decoder(Path(name)) if (Path(name) / ENCODER).is_file() else None
     agent = make_agent(name, action)
-    with Film(path, env_config.control_hz, decode) as reel:
+    with open_film(path, env_config.control_hz, decode) as film:
 
         def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: StepInfo) -> None:
             caption = f"{env_config.scene} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
             ending = "   goal" if info["success"] else "   collision" if info["collision"] else ""
             events = None if agent.observation in WITHOUT_EVENTS else env.events
-            reel.step(env.luminance, events, observation, f"{caption}{ending}")
+            film.step(env.luminance, events, observation, f"{caption}{ending}")
 
         roll_out(agent, env_config, [seed], watch=watch)
     return path

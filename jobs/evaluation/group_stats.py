@@ -14,7 +14,13 @@ from jobs.analysis.statistics import (
     two_stage_estimate,
     wilson_interval,
 )
-from jobs.analysis.tables import events_texts, markdown_table
+from jobs.analysis.tables import (
+    estimate_metrics,
+    estimate_text,
+    events_texts,
+    markdown_table,
+    percent_text,
+)
 
 Condition = tuple[str, str]  # axis and value
 LABELS = ("Axis", "Value", "Group", "Training")
@@ -165,16 +171,7 @@ def details_table(results: Sequence[GroupResult], reference: str) -> str:
 
 def success_text(result: GroupResult) -> str:
     """The success rate [%] with its interval."""
-    low, high = result.success_interval
-    return f"{100 * result.success.value:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
-
-
-def estimate_text(estimate: Estimate | None, scale: float = 1, form: str = ".1f") -> str:
-    """A value with its interval, as text."""
-    if estimate is None:
-        return "-"
-    ends = ", ".join(format(scale * end, form) for end in estimate.interval or ())
-    return f"{scale * estimate.value:{form}}" + (f" [{ends}]" if ends else "")
+    return percent_text(Estimate(result.success.value, result.success_interval))
 
 
 def result_columns(results: Sequence[GroupResult]) -> dict[str, list[str | float]]:
@@ -194,15 +191,13 @@ def result_columns(results: Sequence[GroupResult]) -> dict[str, list[str | float
 
 def result_metrics(result: GroupResult) -> dict[str, float]:
     """Metrics under the names that trackers and tables share; what is not known is left out."""
-    low, high = result.success_interval
+    success = Estimate(result.success.value, result.success_interval)
     metrics = {
-        "eval/success_rate": result.success.value,
-        "eval/success_rate_low": low,
-        "eval/success_rate_high": high,
-        **_estimate_metrics("eval/distance_m", result.distance_m),
-        **_estimate_metrics("sweep/middle_half_m", result.middle_m),
-        **_estimate_metrics("sweep/success_difference", result.success_difference),
-        **_estimate_metrics("sweep/distance_difference_m", result.distance_difference_m),
+        **estimate_metrics("eval/success_rate", success),
+        **estimate_metrics("eval/distance_m", result.distance_m),
+        **estimate_metrics("sweep/middle_half_m", result.middle_m),
+        **estimate_metrics("sweep/success_difference", result.success_difference),
+        **estimate_metrics("sweep/distance_difference_m", result.distance_difference_m),
     }
     if result.events_per_step > 0.0:
         metrics["sim/events_per_step"] = result.events_per_step
@@ -236,10 +231,3 @@ def axis_curves(
                 f"sweep/{axis}{unit}_distance_m": {x: point.distance_m.value for x, point in points.items()},
             }
     return {}
-
-
-def _estimate_metrics(name: str, estimate: Estimate | None) -> dict[str, float]:
-    if estimate is None:
-        return {}
-    ends = zip((f"{name}_low", f"{name}_high"), estimate.interval or (), strict=False)
-    return {name: estimate.value, **dict(ends)}

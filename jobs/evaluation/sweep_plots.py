@@ -6,26 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import GRID, INK, MUTED
+from jobs.analysis.plots import INK, MUTED, panel_grid, style_of, tidy
 from jobs.analysis.statistics import Interval
 from jobs.config.conditions import axis_numbers, moving_settings
 from jobs.evaluation.group_stats import GroupResult
+from jobs.rollout.agents import BASELINES
 
-# Okabe and Ito's colours, told apart by the colour-blind too, and a marker each; the yellow is left out.
-STYLES = {
-    "bytestream": ("#0072b2", "o"),
-    "bytestream_xy": ("#56b4e9", "s"),
-    "event_columns": ("#009e73", "^"),
-    "event_set": ("#000000", "D"),
-    "event_image": ("#d55e00", "v"),
-    "event_image_vae": ("#e69f00", "P"),
-    "rgb": ("#cc79a7", "X"),
-    "bytestream_1500k": ("#7a5195", "<"),
-    "bytestream_paper": ("#5b6b1f", "h"),
-    "bytestream_robust": ("#b0003a", ">"),
-}
-BASELINE_STYLES = {"oracle": ("#6b7280", "."), "straight": ("#9ca3af", "."), "random": ("#c4c9d1", ".")}
-OTHERS = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
 SCALES = {
     "env.control_hz": ("Control rate [Hz]", "log"),
     "env.speed_mps": ("Speed [m/s]", "linear"),
@@ -42,11 +28,6 @@ MAX_BANDS = 4  # of groups in one panel; more would cover each other, and become
 DODGE = 0.012  # between such points, as a share of the axis
 MAX_ACROSS = 2  # panels of the collision map side by side
 Quantity = Callable[[GroupResult], tuple[float, Interval]]
-
-
-def style_of(group: str) -> tuple[str, str]:
-    """Colour and marker of a group, the same in every figure."""
-    return {**STYLES, **BASELINE_STYLES}.get(group) or OTHERS[sum(group.encode()) % len(OTHERS)]
 
 
 def axis_figure(
@@ -75,7 +56,7 @@ def axis_figure(
         else:
             _draw_lines(panel, groups, results, quantity, scale)
         panel.set_xlabel(label if len(moving) < 2 else f"{label}, and what changes with it")
-        panel.grid(axis="y", color=GRID)
+        tidy(panel, "y")
         panel.set_axisbelow(True)
         panel.spines[["top", "right"]].set_visible(False)
     panels[0].set(ylim=(0, 103), ylabel="Episodes that reached the goal [%]")
@@ -90,7 +71,7 @@ def _draw_lines(
     panel: Axes, groups: Sequence[str], results: Sequence[GroupResult], quantity: Quantity, scale: str
 ) -> None:
     """A line for each group with its intervals: a band, or bars where there are many groups."""
-    seen = [group for group in groups if group not in BASELINE_STYLES]
+    seen = [group for group in groups if group not in BASELINES]
     crowded = len(seen) > MAX_BANDS
     panel.set_xscale(scale)
     ticks = sorted({float(result.condition[1]) for result in results})
@@ -102,7 +83,7 @@ def _draw_lines(
         if crowded and group in seen:
             x = _set_apart(x, ticks, scale, seen.index(group) - (len(seen) - 1) / 2)
         y, low, high = np.array([(value, *interval) for value, interval in map(quantity, own)]).T
-        dashes = "--" if group in BASELINE_STYLES else "-"
+        dashes = "--" if group in BASELINES else "-"
         panel.plot(
             x, y, color=colour, marker=marker, ms=6, lw=1.8, ls=dashes, mec="white", mew=0.6, label=group
         )
@@ -194,17 +175,12 @@ def collision_figure(
         length_m: Where the goal line is [m].
         half_width_m: Where the walls are [m].
     """
-    across = min(MAX_ACROSS, len(ends))
-    down = -(-len(ends) // across)
-    figure = Figure(figsize=(6.6 * across, 0.7 + 2.3 * down), layout="constrained")
-    grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    for panel, (group, (unchanged, changed)) in zip(grid.flat, ends.items(), strict=False):
+    figure, panels = panel_grid(len(ends), MAX_ACROSS, (6.6, 2.3), (0.0, 0.7), sharex=True, sharey=True)
+    for panel, (group, (unchanged, changed)) in zip(panels, ends.items(), strict=True):
         _draw_contacts(panel, group, unchanged, changed)
         panel.hlines([-half_width_m, half_width_m], 0, length_m, color=INK, lw=1.5)
         panel.vlines(length_m, -half_width_m, half_width_m, color=MUTED, lw=1.2, ls=":")
         panel.set(xlim=(-2, length_m + 2), ylim=(half_width_m + 1.5, -half_width_m - 1.5))
-    for panel in grid.flat[len(ends) :]:
-        panel.set_visible(False)
     figure.supxlabel(
         "y, along the corridor [m]; large dots: nothing changed, small dots: all changes", fontsize=8
     )

@@ -4,13 +4,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table
 
 from envs.scene import make_scene
-from jobs.analysis.tables import markdown_table, show
+from jobs.analysis.plots import style_of
+from jobs.analysis.tables import markdown_table, show_table
 from jobs.config.conditions import axis_numbers
 from jobs.config.config import Config
 from jobs.evaluation.evaluate import VIEW_COLUMNS, film_episode
@@ -26,8 +26,8 @@ from jobs.evaluation.group_stats import (
     success_text,
     summarise_group,
 )
-from jobs.evaluation.sweep_plan import NOMINAL, Sweep
-from jobs.evaluation.sweep_plots import axis_figure, collision_figure, style_of
+from jobs.evaluation.sweep_plan import NOMINAL, Axes, Sweep
+from jobs.evaluation.sweep_plots import axis_figure, collision_figure
 from jobs.rollout.diagnostics import mean_drift
 from jobs.rollout.episodes import EPISODE, write_episodes
 from jobs.rollout.policies import own_sensor_differences
@@ -37,7 +37,7 @@ from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run
 from jobs.run.progress import console
 from jobs.run.provenance import command, git_commit, today
-from jobs.tracking.child_runs import Child, write_children
+from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.pages import COLOUR, NOTE, chart_view, table_view
 from jobs.tracking.tracker import Tracker
 
@@ -47,6 +47,34 @@ CURVES_NOTE = (
     "One group along every axis of numbers: the step of a metric is the axis value. See the parent run."
 )
 TITLE = "Success [%] with 95 % intervals; rows: what is changed, columns: groups"
+
+
+class Exactness(TypedDict):
+    """How exact the events of a condition were: the error that was asked, and what was achieved."""
+
+    condition: tuple[str, str]
+    asked: float
+    event_error: float
+    renders_per_step: float
+
+
+class SweepFacts(TypedDict):
+    """What made a sweep, as its about.json says it."""
+
+    run: str
+    identity: str
+    command: str
+    commit: str
+    evaluated_at: list[str]
+    date: str
+    budget: str
+    scene: str
+    trials: int
+    reference: str
+    action: str
+    groups: dict[str, list[int | None]]
+    axes: Axes
+    exactness: list[Exactness]
 
 
 @dataclass(frozen=True)
@@ -177,7 +205,7 @@ def typical_crashes(episodes: np.ndarray) -> list[int]:
     return [int(seed) for seed in hit["seed"][np.lexsort((hit["seed"], far))][:FILMED]]
 
 
-def about(config: Config, folder: Run, found: SweepResults) -> dict[str, object]:
+def about(config: Config, folder: Run, found: SweepResults) -> SweepFacts:
     """What made the plots and tables: command, commits and date, policies and axes; no path of a machine."""
     sweep = found.sweep
     return {
@@ -198,13 +226,18 @@ def about(config: Config, folder: Run, found: SweepResults) -> dict[str, object]
     }
 
 
-def exactness(found: SweepResults) -> list[dict[str, object]]:
+def exactness(found: SweepResults) -> list[Exactness]:
     """How exact each condition was simulated: asked and achieved, as far as it was measured."""
     first: dict[Condition, EvaluationTask] = {}
     for task in found.sweep.tasks:
         first.setdefault(task.condition, task)
     return [
-        {"condition": list(condition), "asked": task.env.fidelity.tolerance, **asdict(accuracy)}
+        Exactness(
+            condition=condition,
+            asked=task.env.fidelity.tolerance,
+            event_error=accuracy.event_error,
+            renders_per_step=accuracy.renders_per_step,
+        )
         for condition, task in ((condition, first[condition]) for condition in found.sweep.conditions)
         if (accuracy := found.store.accuracy(task)) is not None
     ]
@@ -217,12 +250,7 @@ def write_tables(
     sweep, failed = found.sweep, [task for task in found.sweep.tasks if task.key in found.failed]
     gaps = {(*task.condition, task.policy.group): "failed" for task in failed}
     head, lines = success_table(groups, sweep.conditions, list(sweep.groups), gaps)
-    shown = Table(title=TITLE, title_justify="left")
-    for name in head:
-        shown.add_column(escape(name), overflow="fold")
-    for line in lines:
-        shown.add_row(*map(escape, line))
-    show(shown)
+    show_table(TITLE, head, lines, len(head))
     text = f"{TITLE}.\n\n{markdown_table(head, lines, 2)}"
     if failed:
         reasons = sorted(
@@ -242,10 +270,10 @@ def write_tables(
 
 def track_conditions(tracker: Tracker, found: SweepResults, groups: Sequence[GroupResult]) -> None:
     """Write a child run for each condition and group."""
-    write_children(tracker, "condition", [condition_run(found, result) for result in groups])
+    write_child_runs(tracker, "condition", [condition_run(found, result) for result in groups])
 
 
-def condition_run(found: SweepResults, result: GroupResult) -> Child:
+def condition_run(found: SweepResults, result: GroupResult) -> ChildRun:
     """The child run of a group under one condition; a tag says what of it could not be evaluated."""
     axis, value = result.condition
     tasks = found.tasks(result.condition, result.group)
@@ -269,7 +297,7 @@ def condition_run(found: SweepResults, result: GroupResult) -> Child:
         "episodes": result.episodes,
         **found.sweep.axes[axis][value],
     }
-    return Child(result.name, params, tags, result_metrics(result) | found.event_error(tasks[0]) | drift)
+    return ChildRun(result.name, params, tags, result_metrics(result) | found.event_error(tasks[0]) | drift)
 
 
 def track_groups(tracker: Tracker, sweep: Sweep, groups: Sequence[GroupResult]) -> None:
@@ -277,10 +305,10 @@ def track_groups(tracker: Tracker, sweep: Sweep, groups: Sequence[GroupResult]) 
     names = dict.fromkeys(result.group for result in groups)
     curves = {name: group_curves(sweep, name, groups) for name in names}
     children = [
-        Child(name, {"group": name}, {NOTE: CURVES_NOTE, COLOUR: style_of(name)[0]}, {}, own)
+        ChildRun(name, {"group": name}, {NOTE: CURVES_NOTE, COLOUR: style_of(name)[0]}, {}, own)
         for name, own in curves.items()
     ]
-    write_children(tracker, "group", children)
+    write_child_runs(tracker, "group", children)
     save_views(tracker, list(dict.fromkeys(metric for own in curves.values() for metric in own)))
 
 

@@ -4,12 +4,9 @@ A folder is named after the configuration that fills it, so that the same comman
 the same folder and continues there. Each finished stage leaves a marker with its results.
 """
 
-import contextlib
 import dataclasses
-import fcntl
 import json
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +15,7 @@ import yaml
 
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
-from jobs.run.files import RunError, read_json, write_atomic, write_json
+from jobs.run.files import read_json, write_atomic, write_json
 from jobs.run.provenance import provenance
 
 # Sections that do not change what is trained: where a run is computed and recorded, and what is
@@ -120,29 +117,6 @@ def reopen(path: Path, config: Config) -> Run:
     values |= {section: {**added, **values[section]} for section, added in ADDED_SETTINGS.items()}
     run = parse({**values, **here})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
-
-
-@contextlib.contextmanager
-def holding(run: Run) -> Iterator[None]:
-    """Work in a run folder as the only process: two would do everything twice, and mix their results.
-
-    A process that is killed lets go.
-
-    Raises:
-        RunError: Another process holds the folder.
-    """
-    run.path.mkdir(parents=True, exist_ok=True)
-    with (run.path / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            who = file.read() or "another process"
-            raise RunError(f"{run.path}: {who} works there; wait until it has ended") from None
-        file.truncate(0)
-        file.write(f"process {os.getpid()} of {os.uname().nodename}")
-        file.flush()
-        yield
 
 
 def run_name(config: Config) -> str:

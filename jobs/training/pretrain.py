@@ -16,7 +16,7 @@ import torch
 
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
-from jobs.analysis.plots import reconstruction_figure
+from jobs.analysis.plots import plot_reconstructions
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import EVAE_SETTINGS, ModelConfig, PretrainConfig
 from jobs.run.files import write_atomic
@@ -268,7 +268,7 @@ def freeze(
     }
     save_encoder(encoder_file(folder), evae, manifest)
     tracker.artifact(encoder_file(folder).with_suffix(".json"), "encoder")
-    figure = reconstruction_figure(*example_pictures(evae, held_out))
+    figure = plot_reconstructions(*example_pictures(evae, held_out))
     tracker.figure("evae/reconstructions.png", figure)
     return finish(folder, "pretrain", figures)
 

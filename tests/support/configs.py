@@ -21,7 +21,7 @@ TINY = (
     *SHORT,
     "algo.train_batch_size_per_learner=64",
     "algo.num_epochs=1",
-    "train.env_steps=4000",
+    "train.env_steps=1600",
     "train.checkpoint_every=1",
 )
 

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 import torch
 
 from envs.config import EnvConfig, sensor_settings, settings_hash
@@ -18,6 +19,11 @@ SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789a
 FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
 
 
+def kinds(names, quick=("bytestream", "rgb")):
+    """Parameters of a test: the quick suite takes two kinds of policy, `make check` all."""
+    return [pytest.param(name, marks=() if name in quick else pytest.mark.system) for name in names]
+
+
 def save_untrained(path, env_config=HELD_OUT, name="bytestream"):
     """A policy folder with random weights; large ones, so that its actions differ."""
     kind, sensor = KINDS[name], sensor_settings(env_config)
@@ -27,6 +33,7 @@ def save_untrained(path, env_config=HELD_OUT, name="bytestream"):
     networks = build_networks({"name": name, **sizes, **parts}, seed=3)
     for value in networks["pi"].parameters():
         value.data *= 1000.0
+    torch.manual_seed(0)
     evae = EventVAE(context=64).freeze() if kind.encoder else None
     manifest = {"name": name, **sizes, **parts, **about}
     return save_policy(path, networks, manifest, evae, {"reconstruction_step": 0.5})

@@ -1,6 +1,5 @@
 import importlib.util
 import os
-import resource
 import shlex
 import signal
 import subprocess
@@ -17,22 +16,18 @@ EVADE = Path(sys.executable).parent / "evade"
 HEAVY = ("torch", "ray", "mlflow", "numba", "matplotlib", "gymnasium", "trimesh", "pyrender", "h5py", "scipy")
 
 
-def processor_time_s() -> float:
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-
-
 def shell(*command: str | Path, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("words", [["--help"], ["--cfg", "job", "+exp=train"], ["+exp=train", "seed=-1"]])
 def test_answers_come_without_importing_anything_heavy(words):
-    began = processor_time_s()
     result = shell(sys.executable, "-X", "importtime", "-m", "platform.launch", *words)
-    assert processor_time_s() - began < 3.0
     imported = {line.rpartition("|")[2].strip() for line in result.stderr.splitlines() if "|" in line}
     assert "hydra" in imported
     assert imported.isdisjoint(HEAVY)
+    assert len(imported) < 600
 
 
 def test_help_names_every_job_experiment_and_budget(launch, launcher):
@@ -58,6 +53,7 @@ def test_the_module_refuses_with_one_message_and_no_traceback(tmp_path):
     assert result.stderr == "evade: refused: algo.lr: Input should be a finite number, got nan\n"
 
 
+@pytest.mark.system
 @pytest.mark.skipif(not EVADE.exists(), reason="the command is not installed; run `pip install -e .`")
 def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
     words = ("+exp=bytestream", "seed=five")

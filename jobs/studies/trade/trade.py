@@ -2,16 +2,16 @@
 
 Run: python -m platform.launch +exp=trade
 Expect: by estimate a quarter of an hour on two idle cores. In the run folder under `trade/`, and in
-MLflow, a table, a figure, and the page that says what to choose, which `+exp=report` puts into docs/.
-One policy, `trade.policy`, flies the same corridors under every setting. A stopped job continues when
-the same command is given again: what was flown is never flown twice; costs and errors are measured
-anew.
+MLflow, a table, a plot, and the page that says what to choose, which `+exp=report` puts into docs/.
+One policy, `trade.policy`, is evaluated in the same corridors under every setting. A stopped job
+continues when the same command is given again: no episode is evaluated twice; costs and errors are
+measured anew.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pydantic
@@ -21,7 +21,7 @@ from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from envs.event_error import converged
 from jobs.analysis.statistics import paired_rate_difference
-from jobs.analysis.tables import draw_figure, publish_table, summarise
+from jobs.analysis.tables import publish_plot, publish_table, summarise
 from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError
 from jobs.rollout.agents import PolicyAgent, make_agent
 from jobs.rollout.executors import Executor
@@ -35,18 +35,28 @@ from jobs.run.progress import console, progress
 from jobs.run.provenance import command, provenance, today
 from jobs.studies.encoder.costs import CAPS, TIME_BINS
 from jobs.studies.encoder.trade import EVENT_ENCODERS
-from jobs.studies.front_plots import choice_figure
-from jobs.studies.replays import Measured, measure
-from jobs.studies.simulator import KNOBS, changed, setting_text
-from jobs.studies.trade.page import DEFAULT, EXACT, HEADINGS, Row, lines, metrics, page, panels, verdict
-from jobs.tracking.child_runs import Child, write_children
+from jobs.studies.front_plots import plot_choices
+from jobs.studies.replays import Measured, measure_settings
+from jobs.studies.simulator import KNOBS, Setting, changed, setting_text
+from jobs.studies.trade.page import (
+    DEFAULT,
+    EXACT,
+    HEADINGS,
+    TradedSetting,
+    TradeFacts,
+    panels,
+    trade_lines,
+    trade_metrics,
+    trade_page,
+)
+from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.tracker import Tracker, open_tracker
 from models.encoder.evae import EventVAE
 from models.encoder.table import PRECISIONS
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
 
-# Knob of the simulator's trade -> which of its settings fly: the whole of its span.
+# Knob of the simulator's trade -> which of its settings are evaluated: the whole of its span.
 SPANS = {
     "tolerance": slice(1, None),
     "renders": slice(2),
@@ -56,15 +66,14 @@ SPANS = {
     "culling": slice(None, None, 2),
     "memory": slice(None),
 }
-Changes = dict[str, Any]
 # Several at once, of the simulation and of the table; the paper's camera sees one 8-bit frame a step.
-TOGETHER: dict[str, tuple[Changes, Changes]] = {
+TOGETHER: dict[str, tuple[Setting, Setting]] = {
     "coarse": ({"fidelity.tolerance": 0.5}, {"precision": PRECISIONS[-1]}),
     "the paper's camera": ({"camera.memory": "frame", "camera.encoding": "gamma8"}, {}),
 }
 
 
-def run(config: Config, executor: Executor | None = None) -> dict[str, Any]:
+def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     """Evaluate and measure every setting, and say what to choose; return the default's metrics.
 
     Args:
@@ -73,7 +82,7 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, Any]:
 
     Raises:
         ConfigError: The policy has no frozen encoder of single events.
-        RuntimeError: The default or the most exact setting failed.
+        RuntimeError: The default or the most exact setting could not be evaluated.
     """
     policy, evae = find_encoder_policy(config)
     folder = open_run(config)
@@ -90,16 +99,17 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, Any]:
                 what, reason = task.condition[0], failed[task.key]
                 raise RuntimeError(f"{what}: not evaluated: {reason}; the same command tries again")
         able = [task for task in every if task.key in results]
-        usual = results[every[0].key].episodes
+        measured = replay_all(config, able, evae)
+        default = results[every[0].key].episodes
         rows = [
-            row_of(task, measured, results[task.key].episodes, usual)
-            for task, measured in zip(able, replay_all(config, able, evae), strict=True)
+            traded_setting(task, own, results[task.key].episodes, default)
+            for task, own in zip(able, measured, strict=True)
         ]
         reasons = {" ".join(task.condition): failed[task.key] for task in every if task.key in failed}
-        publish(folder, tracker, rows, about(config, folder, policy, every[0].env, reasons))
-        tracker.log(0, metrics(rows[0]))
+        write_trade(folder, tracker, rows, facts_of(config, folder, policy, every[0].env, reasons))
+        tracker.log(0, trade_metrics(rows[0]))
         console.print(tracker.dashboard(), markup=False)
-    return finish(folder, "trade", metrics(rows[0]))
+    return finish(folder, "trade", trade_metrics(rows[0]))
 
 
 def find_encoder_policy(config: Config) -> tuple[EvaluatedPolicy, EventVAE]:
@@ -120,7 +130,7 @@ def find_encoder_policy(config: Config) -> tuple[EvaluatedPolicy, EventVAE]:
 
 
 def plan(config: Config, policy: EvaluatedPolicy, evae: EventVAE) -> list[EvaluationTask]:
-    """The settings as tasks, the default first and the most exact last; none twice.
+    """The settings as cells, the default first and the most exact last; none twice.
 
     Raises:
         ConfigError: If the policy's own sensor and a setting exclude each other.
@@ -140,16 +150,16 @@ def plan(config: Config, policy: EvaluatedPolicy, evae: EventVAE) -> list[Evalua
     return [*found.values(), _task(config, policy, (EXACT, ""), exact_env(own), table)]
 
 
-def changes(timed: bool) -> list[tuple[str, str, Changes, Changes]]:
+def changes(timed: bool) -> list[tuple[str, str, Setting, Setting]]:
     """What is changed: nothing, each setting of the simulator, each of the encoder, and several at once.
 
     Args:
         timed: Whether the encoder sees time.
 
     Returns:
-        Knob, setting, what changes of the simulation, what of the encoder's table.
+        Knob, setting, what changes in the simulation, what in the encoder's table.
     """
-    found: list[tuple[str, str, Changes, Changes]] = [(DEFAULT, "", {}, {})]
+    found: list[tuple[str, str, Setting, Setting]] = [(DEFAULT, "", {}, {})]
     for knob, span in SPANS.items():
         found += [(knob, setting_text(setting), setting, {}) for setting in KNOBS[knob][span]]
     found += [("precision", name, {}, {"precision": name}) for name in PRECISIONS[1:]]
@@ -169,11 +179,7 @@ def exact_env(env: EnvConfig) -> EnvConfig:
 
 
 def _task(
-    config: Config,
-    policy: EvaluatedPolicy,
-    condition: tuple[str, str],
-    env: EnvConfig,
-    table: Mapping[str, Any],
+    config: Config, policy: EvaluatedPolicy, condition: tuple[str, str], env: EnvConfig, table: Setting
 ) -> EvaluationTask:
     trade = config.trade
     trials = min(trade.trials, trade.pyrender_trials) if env.renderer == "pyrender" else trade.trials
@@ -181,25 +187,27 @@ def _task(
 
 
 def replay_all(config: Config, every: Sequence[EvaluationTask], evae: EventVAE) -> list[Measured]:
-    """Cost and errors of each task's setting on the recorded flights."""
+    """Measure cost and errors of each task's setting on recorded episodes."""
     torch.set_num_threads(1)
     agents = [make_agent(task.policy.agent, task.action, task.table) for task in every]
     settings = [(task.env, cast(PolicyAgent, agent)) for task, agent in zip(every, agents, strict=True)]
     seeds = range(config.trade.replays)
-    with progress("Replay", len(seeds) * len(settings), "flights") as advance:
-        return measure(settings, evae, seeds, advance)
+    with progress("Replay", len(seeds) * len(settings), "episodes") as advance:
+        return measure_settings(settings, evae, seeds, advance)
 
 
-def row_of(task: EvaluationTask, measured: Measured, episodes: np.ndarray, usual: np.ndarray) -> Row:
-    """The row of a task, beside the default's episodes."""
-    difference = paired_rate_difference(episodes["success"], usual["success"][: len(episodes)])
-    return Row(*task.condition, measured, summarise(task.condition, episodes), difference)
+def traded_setting(
+    task: EvaluationTask, measured: Measured, episodes: np.ndarray, default: np.ndarray
+) -> TradedSetting:
+    """The row of a task, compared with the default's episodes in the same corridors."""
+    difference = paired_rate_difference(episodes["success"], default["success"][: len(episodes)])
+    return TradedSetting(*task.condition, measured, summarise(task.condition, episodes), difference)
 
 
-def about(
+def facts_of(
     config: Config, folder: Run, policy: EvaluatedPolicy, env: EnvConfig, failed: Mapping[str, str]
-) -> dict[str, Any]:
-    """What made the figures: command, commit, machine and date, policy and corridors."""
+) -> TradeFacts:
+    """What made the numbers."""
     return {
         "run": folder.path.name,
         "command": command(),
@@ -214,19 +222,22 @@ def about(
     }
 
 
-def publish(folder: Run, tracker: Tracker, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
-    """Print the table; write it, the figure and the page into run folder and tracker, a child run a row."""
+def write_trade(folder: Run, tracker: Tracker, rows: Sequence[TradedSetting], facts: TradeFacts) -> None:
+    """Print the table; write table, plot and page into run folder and tracker, and a child run per row."""
     place = folder.path / "trade"
     (place / "images").mkdir(parents=True, exist_ok=True)
-    publish_table(folder, tracker, "trade/table", "What each setting costs and gives", HEADINGS, lines(rows))
+    title = "What each setting costs and gives"
+    publish_table(folder, tracker, "trade/table", title, HEADINGS, trade_lines(rows))
     named = [(row.knob, row.setting, row.steps_per_s) for row in rows]
-    draw_figure(folder, tracker, "trade/images/trade", choice_figure(named, panels(rows)))
-    text = page(facts, rows)
+    publish_plot(folder, tracker, "trade/images/trade", plot_choices(named, panels(rows)))
+    text = trade_page(facts, rows)
     write_atomic(place / "trade.md", text)
     tracker.text("trade/trade.md", text)
     children = [
-        Child(row.name, {"knob": row.knob, "setting": row.setting}, {"verdict": verdict(row)}, metrics(row))
+        ChildRun(
+            row.name, {"knob": row.knob, "setting": row.setting}, {"verdict": row.verdict}, trade_metrics(row)
+        )
         for row in rows
     ]
-    write_children(tracker, "setting", children)
-    write_json(place / "about.json", dict(facts))  # the last: it says that the rest is there
+    write_child_runs(tracker, "setting", children)
+    write_json(place / "about.json", facts)  # the last: it says that the rest is there

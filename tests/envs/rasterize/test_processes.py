@@ -9,6 +9,7 @@ from envs.rasterize import PyrenderRenderer
 from envs.scene import make_scene
 from tests.support.rendering import POSE, picture
 
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[3]
 
 

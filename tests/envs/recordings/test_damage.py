@@ -115,6 +115,7 @@ def test_flipped_cut_and_scrambled_files_are_read_or_refused_by_name(tmp_path):
         assert results.count(f"{path.name} refused") > 15, path.name
 
 
+@pytest.mark.system
 def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
     bomb = tmp_path / "bomb.npz"
     header = {"descr": "<i8", "fortran_order": False, "shape": (2,)}

@@ -308,7 +308,7 @@ def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done
 
 def test_a_caption_has_room_under_a_single_panel():
     panel = ("luminance", np.zeros((64, 64, 3), np.uint8))
-    caption = "shape_change 99   9.99 s    99.9 m   collision   4x slower than flown"
+    caption = "shape_change 99   9.99 s    99.9 m   collision   4x slower"
     one, three = (frame([panel] * count, caption)[-40:] for count in (1, 3))
     np.testing.assert_array_equal(one, three[:, : one.shape[1]])
     assert (three[:, one.shape[1] :] == three[0, -1]).all(), "all of the caption is in the narrow one"

@@ -110,6 +110,6 @@ def test_how_exact_a_condition_was_is_told_once_it_was_measured(tmp_path):
     found.store.add(task, PartResult(flights(1, trials=1), {}, SimulationAccuracy(0.01, 5.0)), "c0ffee")
     told = exactness(found)
     values = {"event_error": 0.01, "renders_per_step": 5.0}
-    assert {"condition": list(task.condition), "asked": 0.05, **values} in told
+    assert {"condition": task.condition, "asked": 0.05, **values} in told
     same = [one.simulation == task.simulation for one in sweep.tasks if one.policy == task.policy]
     assert len(told) == sum(same)

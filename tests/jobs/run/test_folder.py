@@ -11,9 +11,17 @@ import pytest
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import env_with
-from jobs.run import folder as runs
 from jobs.run.files import RunError, write_json
-from jobs.run.folder import NOT_IN_RUN_NAME, finish, finished, holding, latest_policies, open_run, run_name
+from jobs.run.folder import (
+    NOT_IN_RUN_NAME,
+    RENAMED_MODELS,
+    finish,
+    finished,
+    latest_policies,
+    open_run,
+    run_name,
+)
+from jobs.run.locks import held_alone
 from jobs.run.provenance import REPOSITORY, git_commit
 from models.kinds import KINDS
 from tests.support.configs import small_config
@@ -112,20 +120,21 @@ def test_a_full_disk_leaves_the_old_file_and_no_part(config, monkeypatch):
     def full(handle):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(runs.os, "fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
         finish(run, "train", {"loss": 2.0})
     assert finished(run, "train") == {"loss": 1.0}
     assert [path.name for path in (run.path / "stages").iterdir()] == ["train.json"]
 
 
+@pytest.mark.system
 def test_one_process_works_in_a_run_folder_and_lets_go_when_it_is_killed(config):
     run = open_run(config)
     code = f"""
 import sys
 from pathlib import Path
-from jobs.run.folder import Run, holding
-with holding(Run(Path({str(run.path)!r}), None)):
+from jobs.run.locks import held_alone
+with held_alone(Path({str(run.path)!r})):
     print("in", flush=True)
     sys.stdin.read()
 """
@@ -134,11 +143,11 @@ with holding(Run(Path({str(run.path)!r}), None)):
         other.stdout.readline()
         with (
             pytest.raises(RunError, match=rf"process {other.pid} of .* works there; wait until"),
-            holding(run),
+            held_alone(run.path),
         ):
             pass
         other.kill()
-    with holding(run):
+    with held_alone(run.path):
         pass
 
 
@@ -159,7 +168,7 @@ def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(confi
     assert run_name(dataclasses.replace(config, train=noisy)) != run.path.name
 
 
-@pytest.mark.parametrize(("old", "new"), runs.RENAMED_MODELS.items())
+@pytest.mark.parametrize(("old", "new"), RENAMED_MODELS.items())
 def test_a_run_folder_of_a_model_that_was_renamed_is_not_continued_and_says_its_new_name(config, old, new):
     assert new in KINDS
     run = open_run(config)

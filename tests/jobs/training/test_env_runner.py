@@ -17,6 +17,7 @@ from models.encoder.weights import load_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
 from tests.support.configs import SHORT, make_config
+from tests.support.policies import kinds
 from tests.support.runs import write_encoder
 
 
@@ -64,7 +65,7 @@ def samples_of(runner, sizes):
     return [runner.sample(num_timesteps=size) for size in sizes]
 
 
-@pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_set", "event_image", "rgb"])
+@pytest.mark.parametrize("name", kinds(["bytestream", "event_columns", "event_set", "event_image", "rgb"]))
 def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
     ours, theirs = make_runners(name, tmp_path)
     for mine, other in zip(*(samples_of(runner, (40, 1, 17, 64)) for runner in (ours, theirs)), strict=True):

@@ -17,6 +17,7 @@ from models.kinds import KINDS
 from models.policy import load_policy, save_policy
 from models.policy.features import feature_of
 from tests.support.configs import SHORT, make_config
+from tests.support.policies import kinds
 from tests.support.runs import write_encoder
 
 FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "rgb", "finetuned")
@@ -53,7 +54,7 @@ def is_frozen(name):
     return name == "bytestream"
 
 
-@pytest.fixture(scope="module", params=FLOWN)
+@pytest.fixture(scope="module", params=kinds(FLOWN))
 def name(request):
     return request.param
 

@@ -172,23 +172,23 @@ train(config, open_run(config), Path(sys.argv[2]), lambda step, metrics: None)
 """
 
 
+@pytest.mark.system
 def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     command = [sys.executable, "-c", SCRIPT, str(tmp_path), str(encoder)]
     config = make_config(*TINY, f"runs_dir={tmp_path}")
     folder = open_run(config)
     results = folder.train / "results.jsonl"
     killed = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"HOME": "/nowhere"})
-    deadline = time.monotonic() + 120
-    while reported_so_far(results)[0] < 400 and killed.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.1)
+    while reported_so_far(results)[0] < 256 and killed.poll() is None:
+        time.sleep(0.05)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
     before = reported_so_far(results)[0]
-    assert 400 <= before < 4000
+    assert 256 <= before < 1600
     subprocess.run(command, cwd=ROOT, check=True, timeout=200)
     steps = [json.loads(line)["env_steps"] for line in results.read_text().splitlines()]
     assert steps == sorted(set(steps))
-    assert steps[-1] >= 4000
+    assert steps[-1] >= 1600
     rows = [json.loads(line) for line in results.read_text().splitlines()]
     assert {row["evae/drift"] is None for row in rows} == {True, False}  # not measured in each iteration
     assert json.loads((folder.policy / "encoder.json").read_text())["figures"] == {"reconstruction_step": 0.5}

@@ -164,6 +164,7 @@ def test_an_encoder_is_saved_if_and_only_if_the_policy_has_one(tmp_path):
             save_policy(tmp_path, make_networks(name), make_settings(name), evae)
 
 
+@pytest.mark.system
 def test_flying_needs_no_ray():
     code = "import sys, models.policy.policy; sys.exit('ray' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
