@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
 
-import jobs.rollout.accuracy
 from envs import event_error as accuracy
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
 from envs.event_error import converged, event_error, measure
 from envs.events import EVENT
 from envs.fidelity import plan
 from envs.scene import make_scene
+from jobs.rollout import diagnostics
 
 TIMES = st.integers(0, 30)
 
@@ -163,10 +163,8 @@ def test_the_error_achieved_is_within_the_tolerance_asked_everywhere(scene):
 
 @pytest.mark.parametrize(("error", "says"), [(0.02, False), (0.2, True)])
 def test_a_job_says_what_it_achieves_and_whether_that_is_less_than_asked(monkeypatch, capsys, error, says):
-    monkeypatch.setattr(
-        jobs.rollout.accuracy, "measure", lambda config: accuracy.Accuracy(error, (9.0, 10.0), 3.0)
-    )
-    found = jobs.rollout.accuracy.achieved(EnvConfig())
+    monkeypatch.setattr(diagnostics, "measure", lambda config: accuracy.Accuracy(error, (9.0, 10.0), 3.0))
+    found = diagnostics.measure_event_error(EnvConfig())
     assert found == {"sim/event_error": error, "sim/renders_per_step": 3.0}
     text = " ".join(capsys.readouterr().out.split())
     assert f"{error:.1%} (asked: at most 5.0%)" in text
