@@ -59,7 +59,7 @@ class CameraConfig:
             threshold; fixed for each pixel, ON and OFF apart, at least a tenth of the
             nominal. Real sensors: about 0.03.
         threshold_seed: Which sensor of its kind: seed of the pixels' thresholds.
-        refractory_us: Dead time of a pixel after an event [us]; at its end the pixel takes
+        refractory_us: Refractory period of a pixel after an event [us]; at its end the pixel takes
             the level of that moment as its reference.
         encoding: What the luminance, white = 1, goes through before the response.
             "linear32": nothing. "linear8": clipped to [0, 1] and rounded to 8 bits.
@@ -83,7 +83,7 @@ class CameraConfig:
 
     @field_validator("refractory_us")
     @classmethod
-    def _dead_time_needs_memory(cls, value: int, info: ValidationInfo) -> int:
+    def _refractory_period_needs_memory(cls, value: int, info: ValidationInfo) -> int:
         if value > 0 and info.data.get("memory", "reference") != "reference":
             raise ValueError(f"needs memory 'reference' or must be 0, got {value}")
         return value
@@ -128,12 +128,12 @@ class FaultsConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class FidelityConfig:
-    """How exact the events have to be; `envs.fidelity.plan` chooses the cheapest way to that.
+    """How exact the events have to be; `envs.fidelity.plan_renders` chooses the cheapest way to that.
 
     Attributes:
         tolerance: Accepted share of events that differ from the converged ones in pixel,
             polarity or by more than 5 % of a control step in time, see `envs.event_error`.
-        max_step_m: Longest way flown between two renders [m]; None: chosen.
+        max_step_m: Longest way between two renders [m]; None: chosen.
         samples: Anti-aliasing of the renderer; None: chosen.
         cull_m: Obstacles farther than this are not drawn [m]; None: chosen.
     """

@@ -1,7 +1,7 @@
 """What a job's simulation asks of its events, and what it achieves: said, and logged with the run."""
 
 from envs.config import EnvConfig
-from envs.event_error import measure
+from envs.event_error import measure_event_error
 from jobs.run.progress import console
 
 
@@ -11,7 +11,7 @@ def achieved(config: EnvConfig) -> dict[str, float]:
     A camera that follows the paper's two-frame difference is measured against one that
     remembers, so its error is what that difference loses; the tolerance does not bind it.
     """
-    accuracy = measure(config)
+    accuracy = measure_event_error(config)
     asked = config.fidelity.tolerance
     text = (
         f"Event error in {config.scene}: {accuracy.error:.1%} (asked: at most {asked:.1%}), "

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from ray import tune
 
-from envs.event_error import measure
+from envs.event_error import measure_event_error
 from jobs.config.config import Config
 from jobs.rollout.agents import BOUNDS, Agent, make_agent
 from jobs.rollout.drift import DriftWatch
@@ -267,7 +267,7 @@ def flown(cell: Cell, measured: bool) -> dict[str, Any]:
     bad = [name for name in EPISODE.names or () if not np.isfinite(episodes[name]).all()]
     if bad:
         raise ValueError(f"episodes must be finite, got NaN or infinity in {', '.join(bad)}")
-    accuracy = measure(cell.env) if measured else None
+    accuracy = measure_event_error(cell.env) if measured else None
     return {
         "episodes": episodes.tolist(),
         "encoder": drift.figures(),

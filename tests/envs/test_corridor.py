@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, seen_settings
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import unpack_window
-from envs.kinematics import clock_us, fly, planned_position
+from envs.kinematics import advance, clock_us, planned_position
 from envs.scene import Scene
 from envs.scene.scene import OBSTACLE, POLE
 
@@ -122,7 +122,7 @@ def test_a_flight_to_the_side_ends_at_the_wall(action):
     ],
 )
 def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
-    outcome = fly(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5, 2.0)
+    outcome = advance(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5, 2.0)
     assert (outcome.success, outcome.collision) == (success, not success)
     assert outcome.reward == pytest.approx(reward, abs=1e-9)
     assert outcome.end == (0.0, pytest.approx(end_y, abs=1e-9))
@@ -130,14 +130,14 @@ def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
 
 def test_a_success_ends_exactly_on_the_goal_line():
     for start_y, end_y in np.random.default_rng(0).uniform((0.0, 100.0), (100.0, 1e5), (200, 2)):
-        outcome = fly(corridor(), (0.0, start_y), (0.3, end_y), 0.3, 2.0)
+        outcome = advance(corridor(), (0.0, start_y), (0.3, end_y), 0.3, 2.0)
         assert outcome.success
         assert outcome.end[1] == 100.0
         assert outcome.reward == 100.0 - start_y + 100.0
 
 
 def test_a_start_in_contact_is_a_collision_without_progress():
-    outcome = fly(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3, 2.0)
+    outcome = advance(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3, 2.0)
     assert outcome == ((0.0, 0.0), 0.0, -100.0, False, True)
 
 
@@ -268,7 +268,7 @@ def test_a_reward_that_is_not_finite_is_refused():
     endless = corridor()
     object.__setattr__(endless, "length_m", math.nan)  # which a scene itself refuses
     with pytest.raises(ValueError, match="finite"):
-        fly(endless, (0.0, math.nan), (0.0, 1.0), 0.0, 2.0)
+        advance(endless, (0.0, math.nan), (0.0, 1.0), 0.0, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -347,5 +347,5 @@ def test_flights_with_equal_seen_settings_are_equal(observation, same, other):
     like, unlike = dataclasses.replace(plain, **same), dataclasses.replace(plain, **other)
     seen = [seen_settings(config, observation) for config in (plain, like, unlike)]
     assert seen[0] == seen[1] != seen[2]
-    flown = [flight_bytes(CorridorEnv(config), 1, [0, 1, 2] * 30) for config in (plain, like, unlike)]
-    assert flown[0] == flown[1] != flown[2]
+    episodes = [flight_bytes(CorridorEnv(config), 1, [0, 1, 2] * 30) for config in (plain, like, unlike)]
+    assert episodes[0] == episodes[1] != episodes[2]
