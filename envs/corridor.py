@@ -10,8 +10,8 @@ of its own, made of (split, seed, episode): a corridor of one split never occurs
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
 
 import gymnasium
 import numpy as np
@@ -25,6 +25,32 @@ from envs.config import EnvConfig
 from envs.observations import observation_space, observe, picture
 from envs.scene import make_scene
 from envs.sensor import Sensor
+
+
+class Info(TypedDict):
+    """What `CorridorEnv` tells beside the observation.
+
+    Attributes:
+        episode_seed: Seed of the series of episodes.
+        episode: Number of the episode in its series.
+        x_m, y_m: Position of the vehicle [m].
+        distance_m: Progress along y since the start [m].
+        success, collision: What ended the episode; at most one of them.
+        num_events: Events of the last step, faults included.
+        dropped_events: Events of the last step lost to the camera's cap or the window's capacity.
+        t_us: Simulated time [us].
+    """
+
+    episode_seed: int | None
+    episode: int
+    x_m: float
+    y_m: float
+    distance_m: float
+    success: bool
+    collision: bool
+    num_events: int
+    dropped_events: int
+    t_us: int
 
 
 class CorridorEnv(gymnasium.Env):
@@ -62,8 +88,8 @@ class CorridorEnv(gymnasium.Env):
         self._done = True
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Mapping[str, object] | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start an episode; its first render makes no events.
 
         Args:
@@ -92,7 +118,7 @@ class CorridorEnv(gymnasium.Env):
         observation, lost = self._observe(0, kinematics.clock_us(1, self.config.control_hz))
         return observation, self._info(lost)
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Simulate one control step.
 
         Raises:
@@ -148,7 +174,7 @@ class CorridorEnv(gymnasium.Env):
         observation, excess = observe(self.config, self.events, self.luminance, start_us, end_us)
         return observation, self._sensor.dropped + excess
 
-    def _info(self, lost: int, outcome: kinematics.Outcome | None = None) -> dict[str, Any]:
+    def _info(self, lost: int, outcome: kinematics.Outcome | None = None) -> Info:
         return {
             "episode_seed": self._seed,
             "episode": self._episode,
@@ -207,8 +233,8 @@ class CorridorVectorEnv(VectorEnv):
         self._over = np.zeros(num_envs, bool)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | list[int | None] | None = None, options: Mapping[str, object] | None = None
+    ) -> tuple[Any, dict[str, np.ndarray]]:
         """Reset all environments.
 
         Args:
@@ -223,7 +249,9 @@ class CorridorVectorEnv(VectorEnv):
         results = [env.reset(seed=s, options=options) for env, s in zip(self.envs, seeds, strict=True)]
         return self._batch([r[0] for r in results]), _stack_infos([r[1] for r in results])
 
-    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Step all environments, or reset those that were over.
 
         Raises:
@@ -259,9 +287,9 @@ class CorridorVectorEnv(VectorEnv):
         return np.stack(observations)
 
 
-def _stack_infos(infos: Any) -> dict[str, Any]:
+def _stack_infos(infos: Any) -> dict[str, np.ndarray]:
     """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
-    stacked: dict[str, Any] = {key: np.array([info[key] for info in infos]) for key in infos[0]}
+    stacked = {key: np.array([info[key] for info in infos]) for key in infos[0]}
     mask = np.ones(len(infos), bool)
     return stacked | {f"_{key}": mask for key in infos[0]}
 

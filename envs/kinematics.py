@@ -1,8 +1,8 @@
 """Kinematics, clock, reward and random streams of a corridor episode (appendix D.1)."""
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,7 +45,7 @@ def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Gener
     return tuple(np.random.default_rng(stream) for stream in streams)
 
 
-def choose_episode(following: int, options: dict[str, Any]) -> int:
+def choose_episode(following: int, options: Mapping[str, object]) -> int:
     """The episode that reset `options` ask for, or the `following` one.
 
     Raises:

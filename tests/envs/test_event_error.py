@@ -106,7 +106,7 @@ def test_the_converged_simulation_renders_six_times_as_often_and_no_setting_spoi
 def test_a_flight_weighs_as_much_as_its_events(monkeypatch):
     one, many = events([(1, 0, 0, 1)]), events([(t, 0, 0, 1) for t in range(8)])
     flights = iter([(one, one, 1), (many, many[:0], 2)])
-    monkeypatch.setattr(accuracy, "_flight", lambda *_: next(flights))
+    monkeypatch.setattr(accuracy, "_measure_flight", lambda *_: next(flights))
     found = measure_event_error(EnvConfig(), flights=2, steps=1)
     assert found.error == pytest.approx(8 / 10)  # of ten events of both streams two have a partner
     assert found.events == (4.5, 0.5)
