@@ -15,7 +15,8 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 LAUNCH := $(BIN)/python -m platform.launch
-# Locally nothing is computed by the dashboard, and nothing is sent away.
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4
+# A local dashboard runs no jobs of its own and sends no telemetry.
 MLFLOW_ENV := MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true \
 	MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false
 
@@ -25,13 +26,13 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-faults test-cluster lint check bench docs lock clean
+.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-17s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this one
+setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this package
 
 $(INSTALLED): requirements.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -44,7 +45,7 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 	&& ls /usr/lib/*/dri/*swrast_dri.so /usr/lib/*/libgallium*.so 2>/dev/null | grep -q . \
 	|| if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	    { apt-get update && apt-get install --yes --no-install-recommends $(GL_PACKAGES); } \
-	    || echo "warning: no OpenGL, so renderer=pyrender will not run; renderer=raycast does without"; \
+	    || echo "warning: no OpenGL, so renderer=pyrender will not run; renderer=raycast does not need it"; \
 	else \
 	    echo "renderer=pyrender needs OpenGL; install it with:"; \
 	    echo "    sudo apt-get install --no-install-recommends $(GL_PACKAGES)"; \
@@ -53,55 +54,61 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 bytestream: setup ## from nothing to an evaluated policy (20 minutes; ARGS="budget=smoke": a minute)
 	$(LAUNCH) +exp=bytestream $(ARGS)
 
-train-all: setup ## every policy with three seeds into models/pretrained (hours; a stopped one continues)
+train-all: setup ## train every policy with three seeds into models/pretrained (hours; give it again to continue)
 	for seed in $(SEEDS); do for exp in $(POLICIES); do \
 	    $(LAUNCH) +exp=$$exp job=train seed=$$seed train.env_steps=$(STEPS) $(ARGS) || exit 1; \
 	done; done
 	$(LAUNCH) +exp=ship $(ARGS)
 
-# `train=true` trains $(POLICIES) anew first, as train-all does, and flies these.
-sweep-robustness: $(if $(filter true,$(train)),train-all,setup) ## fly trained policies at other rates, thresholds, in other worlds, with faults
+# `train=true` first trains $(POLICIES), as train-all does, and evaluates the new policies.
+sweep-robustness: $(if $(filter true,$(train)),train-all,setup) ## evaluate trained policies at other rates and thresholds, in other worlds, with faults
 	$(LAUNCH) +exp=robustness $(if $(filter true,$(train)),$(TRAINED)) $(ARGS)
 
-mlflow: setup ## serve the results on http://127.0.0.1:5000, to this machine only
+mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine only
 	@echo "Open http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=results"
 	$(MLFLOW_ENV) $(BIN)/mlflow server --workers 1 --host 127.0.0.1 --port 5000 \
 	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
 
-test: setup ## the quick tests (ARGS="-m slow" for the slow ones)
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
+test: setup ## the quick tests (4 minutes on two cores)
+	$(PYTEST) --dist worksteal $(ARGS)
 
-test-faults: setup ## inject faults into running jobs, and print what was lost (15 minutes)
+test-system: setup ## whole jobs, Ray, the launcher, and every kind of policy (8 minutes)
+	$(PYTEST) -m "system and not slow" --dist loadgroup $(ARGS)
+
+test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
+	$(PYTEST) -m slow --dist loadgroup $(ARGS)
+
+test-faults: setup ## inject faults into running jobs and print what was lost (15 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 2 --dist worksteal $(ARGS)
 
 test-cluster: setup ## the same sweep on a Ray cluster, and eight at once into PostgreSQL (20 minutes)
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 \
 	|| { [ "$$(id -u)" = 0 ] && apt-get update && apt-get install --yes --no-install-recommends postgresql; } \
-	|| echo "warning: no PostgreSQL, so its test is left out; apt-get install postgresql"
+	|| echo "warning: no PostgreSQL, so its test is skipped; apt-get install postgresql"
 	$(BIN)/python -c 'import psycopg' 2>/dev/null || $(BIN)/python -m pip install --quiet $(PSYCOPG)
 	$(BIN)/python -m pytest -m cluster -rs tests/cluster $(ARGS)
 
-lint: setup ## style, format, types, and who imports whom
+lint: setup ## check style, format, types, and who imports whom
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: lint test ## what must pass before a change is merged
+check: lint test test-system ## what must pass before a change is merged
 
-bench: setup ## measure the speed of the parts, and what the simulator's accuracy costs
+bench: setup ## measure the speed of the parts, and what accuracy of the simulator costs
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
 	$(LAUNCH) +exp=trade_simulator $(ARGS)
 
-docs: setup ## the guide and the API as web pages in docs/_build
+docs: setup ## build the guide and the API as web pages in docs/_build
 	$(BIN)/python -m sphinx -q -b html docs docs/_build
 
-lock: setup ## write requirements.lock anew (ARGS=--upgrade: with the newest versions)
+lock: setup ## update requirements.lock (ARGS=--upgrade: to the newest versions)
 	$(BIN)/pip-compile --quiet --extra dev,docs --strip-extras --allow-unsafe \
 	    --no-annotate --no-header --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 	    --output-file requirements.lock $(ARGS) pyproject.toml
-	sed -i 's/+cpu$$//' requirements.lock # a CPU wheel at hand serves the same pin
+	sed -i 's/+cpu$$//' requirements.lock # so that a CPU wheel satisfies the same pin
 
-clean: ## remove what tools left behind; .venv, runs and results stay
+clean: ## remove caches and build files; .venv, runs and results stay
 	rm -rf build dist *.egg-info .benchmarks .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +

@@ -14,3 +14,13 @@ html_title = "Evade"
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_mock_imports = ["ray", "mlflow"]
 exclude_patterns = ["_build"]
+
+
+def _skip_fields(_app, _what, _name, member, skip, _options):
+    """Whether to leave a member out: fields of a NamedTuple are described by its docstring."""
+    return skip or (getattr(member, "__doc__", None) or "").startswith("Alias for field number")
+
+
+def setup(app):
+    """Called by Sphinx."""
+    app.connect("autodoc-skip-member", _skip_fields)

@@ -2,7 +2,7 @@
 
 Run from the repository root: python -m docs.draw_dashboard [mlflow.db]
 Needs Chromium and a store with a sweep, an evaluated training and a registered `bytestream`. Writes
-docs/images/dashboard_*.png of the newest of each, in `COLOURS` colours.
+docs/images/dashboard_*.png with the newest of each, in `COLOURS` colours.
 """
 
 import io
@@ -13,20 +13,20 @@ from pathlib import Path
 
 from PIL import Image
 
+from docs.browser import Browser, served
 from jobs.tracking.pages import run_address, view_address
 from jobs.tracking.tracker import open_store
-from tests.support.browser import Browser, served
 
 IMAGES = Path(__file__).resolve().parent / "images"
 COLOURS = 160
 SETTLE_S = 6.0
 DRAWN = "document.querySelectorAll('.js-plotly-plot .scatterlayer .trace').length > 3"
-# What MLflow folds and a click unfolds.
+# Texts of MLflow's buttons that unfold a part of a page.
 FOLDED = {"sweep": ["Show more"], "training": ["Show more"], "model": ["Inputs (4)", "Outputs (5)"]}
 
 
 def main() -> None:
-    """Open each page, unfold its text, and write what the window shows."""
+    """Open each page, unfold its text, and save a screenshot."""
     store = Path(sys.argv[1] if len(sys.argv) > 1 else "mlflow.db").resolve()
     uri = f"sqlite:///{store}"
     with (
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def pages(uri: str) -> dict[str, tuple[str, str]]:
-    """Name -> address of each page, and a text that it shows once it is there."""
+    """Name -> address of each page, and a text that appears once it is loaded."""
     client, experiment = open_store(uri, "evade")
     newest = {}
     for kind, search in {
@@ -59,7 +59,7 @@ def pages(uri: str) -> dict[str, tuple[str, str]]:
             [experiment], search, order_by=["attributes.start_time DESC"], max_results=1
         )
         newest[kind] = found[0].info.run_id
-    # Of a policy that sees events, whose signature the page of the guide tells of.
+    # A policy on events, whose signature docs/dashboard.md describes.
     versions = client.search_model_versions("name LIKE 'evade-bytestream%'")
     version = max(versions, key=lambda version: version.creation_timestamp)
     model = f"#/models/{version.name}/versions/{version.version}?workflowType=machine_learning"

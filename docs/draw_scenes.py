@@ -1,4 +1,4 @@
-"""Draw every scene for docs/scenes.md and print the figures of its table.
+"""Draw every scene for docs/scenes.md and print the numbers of its table.
 
 Run from the repository root: python docs/draw_scenes.py [NAME ...]
 Writes docs/images/scene_NAME.png, three panels each: the corridor from above the start, what
@@ -34,7 +34,7 @@ SEED, CORRIDORS = 1, 200
 def main() -> None:
     """Draw the scenes named on the command line, or all, and measure those that are layouts."""
     names = sys.argv[1:] or [*LAYOUTS, "mesh"]
-    sys.stdout.write("scene: passable at the first draw, straight flights that hit, draw, check [ms]\n")
+    sys.stdout.write("scene: passable at the first draw, straight flights colliding, drawing, search [ms]\n")
     for name in names:
         if name == "mesh":
             with tempfile.TemporaryDirectory() as folder:
@@ -53,7 +53,7 @@ def draw(scene: Scene) -> Image.Image:
     panels = [grey(above), grey(renderer(scene, SIZE, SIZE).render(x, y, HEIGHT_M))]
     small = renderer(scene, 64, 64)
     camera = EventCamera(CameraConfig())
-    for step in range(-STEPS, 1):  # some steps before, so that pixels remember what they have seen
+    for step in range(-STEPS, 1):  # a few steps earlier, so that each pixel has its own level
         luminance = small.render(x, y + step * STEP_M, HEIGHT_M, 0.0, (step + STEPS) * STEP_US * 1e-6)
         if step == -STEPS:
             camera.reset(luminance, 0)
@@ -73,7 +73,7 @@ def grey(luminance: np.ndarray) -> np.ndarray:
 
 
 def viewpoint(scene: Scene) -> tuple[float, float]:
-    """A place from which something stands near ahead, but not in the way [m]."""
+    """A position with an obstacle near ahead, but not in the way [m]."""
     for y in np.arange(8.0, 40.0, 1.0):
         for x in (0.0, -2.0, 2.0, -4.0, 4.0):
             near = scene.collides((x - 2.5, y + 4.0), (x + 2.5, y + 4.0), 0.5, HEIGHT_M)
@@ -83,7 +83,7 @@ def viewpoint(scene: Scene) -> tuple[float, float]:
 
 
 def example_mesh(folder: str) -> str:
-    """A file with a ring, a ball and a tower, as a modelling tool would write it."""
+    """A file with a ring, a ball and two towers, as a modelling tool would write it."""
     scene = trimesh.Scene()
     ring = trimesh.creation.torus(2.5, 0.4)
     ring.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
@@ -103,7 +103,7 @@ def example_mesh(folder: str) -> str:
 
 
 def figures(name: str) -> str:
-    """How many corridors are passable and what they cost, over `CORRIDORS` seeds."""
+    """The row of a scene: share of passable corridors, share of collisions, times; over `CORRIDORS` seeds."""
     starts = np.random.default_rng(0)
     passable = hits = 0
     drawing, checking = [], []

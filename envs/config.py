@@ -33,6 +33,7 @@ Value = Annotated[float | bool, PlainValidator(_number_or_truth)]
 
 Setting = float | int | str | None  # of the sensor
 Observation = Literal["window", "event_image", "luminance", "events", "none"]
+Split = Literal["train", "validation", "eval"]
 WITHOUT_EVENTS = ("luminance", "none")  # observations for which no event camera is simulated
 
 
@@ -176,7 +177,7 @@ class EnvConfig:
     time_limit_s: Positive = 10.0
     observation: Observation = "window"
     window_capacity: Annotated[int, Field(ge=1, le=10_000_000)] = 4096
-    split: Literal["train", "validation", "eval"] = "train"
+    split: Split = "train"
     renderer: Literal["auto", "raycast", "pyrender"] = "auto"
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     faults: FaultsConfig = dataclasses.field(default_factory=FaultsConfig)

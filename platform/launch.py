@@ -1,7 +1,7 @@
 """Compose conf/ and the command line into one checked configuration, and run the job it names.
 
 Run: python -m platform.launch +exp=NAME [group=file] [key=value]
-Expect: exit status 0 when the job is done, 2 with one message when a value is refused, 1
+Expect: exit status 0 when the job is done, 2 with one message when a value is wrong, 1
 when the job fails, 130 after Ctrl+C.
 """
 
@@ -18,32 +18,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from jobs.config.registry import JOBS
+from jobs.run.provenance import REPOSITORY as ROOT
+from jobs.run.threads import ONE_THREAD
+
 CONF = ROOT / "conf"
-
-JOBS = {
-    "pipeline": "jobs.pipeline",
-    "collect": "jobs.training.collect",
-    "pretrain": "jobs.training.pretrain",
-    "train": "jobs.training.train",
-    "evaluate": "jobs.evaluation.evaluate",
-    "sweep": "jobs.evaluation.sweep",
-    "ship": "jobs.reporting.publish",
-    "report": "jobs.reporting.report",
-    "trade": "jobs.studies.trade.trade",
-    "trade_simulator": "jobs.studies.simulator",
-    "trade_encoder": "jobs.studies.encoder.trade",
-    "probe": "jobs.studies.probe.probe",
-}
-
-# Two threads beside other busy processes ran ten times slower than one.
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-    "LP_NUM_THREADS": "0",
-}
 
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
 OPEN_GROUPS = ("env.layout", "sweep.axes")  # take entries that conf/ does not have
@@ -51,7 +30,7 @@ DONE, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 
 
 def main() -> int:
-    """Do what the command line says; return the exit status."""
+    """Run the command line; return the exit status."""
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
     try:
@@ -67,11 +46,11 @@ def main() -> int:
 
 
 def command(words: list[str]) -> str:
-    """What a shell in the repository's root takes to do the same again."""
+    """The same command line for a shell in the repository's root."""
     return shlex.join([sys.executable, "-m", "platform.launch", *words])
 
 
-def compose(words: list[str]) -> dict[str, Any] | None:
+def compose(words: list[str]) -> dict[str, object] | None:
     """The composed configuration as plain containers; None if Hydra only answered a question.
 
     Args:
@@ -85,12 +64,11 @@ def compose(words: list[str]) -> dict[str, Any] | None:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from jobs.config.config import ConfigError
-    from jobs.config.errors import redacted
+    from jobs.config.errors import ConfigError, redacted
 
-    reasons = refused_words(words)
-    if reasons:
-        raise ConfigError("\n".join(reasons))
+    errors = word_errors(words)
+    if errors:
+        raise ConfigError("\n".join(errors))
     composed: list[Any] = []
     answer = io.StringIO()
 
@@ -112,21 +90,21 @@ def compose(words: list[str]) -> dict[str, Any] | None:
     return composed[0] if composed else None
 
 
-def refused_words(words: list[str]) -> list[str]:
-    """Reasons against what Hydra would take and this launcher does not do."""
+def word_errors(words: list[str]) -> list[str]:
+    """One line for each word that Hydra would accept and this launcher does not support."""
     if not (CONF / "config.yaml").is_file():
         return [f"conf/config.yaml: not found in {str(ROOT)!r}; install from a clone with `pip install -e .`"]
-    reasons = []
+    errors = []
     for word in words:
         if word in ("-m", "--multirun") or re.match(r"\+*hydra\.(mode|sweep)", word):
-            reasons.append(f"{word}: {SWEEP}")
+            errors.append(f"{word}: {SWEEP}")
         elif re.match(r"[+~]*hydra[./=@]|--experimental-rerun", word):
-            reasons.append(f"{word}: Hydra's own settings are fixed; results go to runs_dir")
-    return reasons
+            errors.append(f"{word}: Hydra's own settings are fixed; results go to runs_dir")
+    return errors
 
 
 def explain(error: Exception, words: list[str]) -> str:
-    """What Hydra says against a command line, in one line with the nearest key or the choices."""
+    """Hydra's error about a command line, in one line with the nearest key or the choices."""
     from jobs.config.config import known_keys
     from jobs.config.errors import nearest
 
@@ -148,32 +126,32 @@ def explain(error: Exception, words: list[str]) -> str:
     return message if any(word in message for word in words) else f"{' '.join(words)}: {message}"
 
 
-def run(values: dict[str, Any]) -> None:
+def run(values: dict[str, object]) -> None:
     """Check a composed configuration and run its job.
 
     Raises:
-        ConfigError: If a value is refused; nothing has been started or written by then.
+        ConfigError: If a value is wrong; nothing has been started or written by then.
     """
     from jobs.config.config import ConfigError, parse
     from jobs.config.errors import redacted
 
-    reasons = dict.fromkeys(refused_values(values))
-    if reasons:
-        raise ConfigError("\n".join(reasons))
+    errors = dict.fromkeys(value_errors(values))
+    if errors:
+        raise ConfigError("\n".join(errors))
     config = parse(values)
     print(f"If this is stopped, it continues with: {redacted(command(sys.argv[1:]))}", flush=True)
-    importlib.import_module(JOBS[config.job]).run(config)
+    importlib.import_module(JOBS[config.job].module).run(config)
 
 
-def refused_values(values: Any, key: str = "") -> Iterator[str]:
-    """Reasons against whatever in a configuration is missing, or is not a plain value."""
+def value_errors(values: object, key: str = "") -> Iterator[str]:
+    """One line for each value of a configuration that is missing, or is not plain data."""
     if isinstance(values, dict | list):
         for name, value in values.items() if isinstance(values, dict) else enumerate(values):
             inner = f"{key}.{name}" if key else str(name)
             if re.fullmatch(r"_\w+_", str(name)):
                 yield f"{inner}: such keys make Hydra call code; name a job with +exp=NAME, got {value!r}"
             else:
-                yield from refused_values(value, inner)
+                yield from value_errors(value, inner)
     elif values == "???":
         names = sorted(path.stem for path in (CONF / "exp").glob("*.yaml"))
         yield f"exp: not given; name an experiment with +exp=NAME, one of {', '.join(names)}"
@@ -182,11 +160,11 @@ def refused_values(values: Any, key: str = "") -> Iterator[str]:
 
 
 def report(error: Exception) -> int:
-    """Say what went wrong, with a traceback where it helps; return the exit status.
+    """Print what went wrong, with a traceback where it helps; return the exit status.
 
-    A ValueError that this repository raises is a refused value, a RuntimeError a documented
-    failure, and so is a full disk: their messages say all. HYDRA_FULL_ERROR=1 shows the traceback
-    of those too. No password of an address is shown.
+    A ValueError that this repository raises is a wrong value, a RuntimeError a documented failure,
+    and so is a full disk: their messages suffice. HYDRA_FULL_ERROR=1 shows the traceback of those
+    too. Passwords in addresses are never shown.
     """
     from jobs.config.errors import redacted
 
@@ -194,7 +172,7 @@ def report(error: Exception) -> int:
     refused = isinstance(error, ValueError) and ours
     full = getattr(error, "errno", None) == errno.ENOSPC
     documented = refused or (isinstance(error, RuntimeError) and ours) or full
-    if "HYDRA_FULL_ERROR" in os.environ or not documented:
+    if os.environ.get("HYDRA_FULL_ERROR") == "1" or not documented:
         print(redacted("".join(traceback.format_exception(error))), end="", file=sys.stderr)
     message = redacted(str(error) if documented else f"{type(error).__name__}: {error}")
     message = "\n  ".join(["", *message.splitlines()]) if "\n" in message else f" {message}"
@@ -203,7 +181,7 @@ def report(error: Exception) -> int:
 
 
 def raised_here(error: Exception) -> bool:
-    """Whether the statement that raised stands in this repository's own rooms."""
+    """Whether the statement that raised is in this repository's own packages."""
     frames = traceback.extract_tb(error.__traceback__)
     rooms = [ROOT / room for room in ("envs", "models", "jobs", "platform")]
     return bool(frames) and any(Path(frames[-1].filename).is_relative_to(room) for room in rooms)

@@ -4,10 +4,17 @@ for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MK
     os.environ.setdefault(name, "1")
 
 import platform  # noqa: E402
+import subprocess  # noqa: E402
+import sys  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
+# A quick test takes at most this much processor time; EVADE_TEST_SECONDS is for slow machines.
+QUICK_S = float(os.environ.get("EVADE_TEST_SECONDS", "5"))
+NOT_QUICK = ("system", "slow", "benchmark", "faults", "cluster")
 
 # The first example of a property may compile kernels.
 settings.register_profile("patient", deadline=None)
@@ -15,7 +22,35 @@ settings.load_profile("patient")
 
 # Started as `pytest`, the standard library's module is loaded before the repository's.
 if not hasattr(platform, "__path__"):
-    platform.__path__ = [str(Path(__file__).resolve().parents[1] / "platform")]
+    platform.__path__ = [str(ROOT / "platform")]
+
+
+def pytest_sessionstart(session):
+    """Compile the kernels once, before workers start that would each compile them."""
+    if getattr(session.config.option, "numprocesses", None) and not hasattr(session.config, "workerinput"):
+        subprocess.run([sys.executable, "-m", "tests.support.kernels"], cwd=ROOT, check=False)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Fail a quick test that is not quick.
+
+    It is processor time that counts, of this process and of children that have ended: what else the
+    machine does changes it little.
+    """
+    began = _processor_s()
+    result = yield
+    spent = _processor_s() - began
+    if spent > QUICK_S and not any(item.get_closest_marker(name) for name in NOT_QUICK):
+        kinds = "`system` (it starts Ray, the launcher or another process) or `slow`"
+        pytest.fail(
+            f"took {spent:.1f} s of the {QUICK_S:g} s of a quick test; make it cheaper, or mark it {kinds}"
+        )
+    return result
+
+
+def _processor_s() -> float:
+    return sum(os.times()[:4])
 
 
 @pytest.fixture

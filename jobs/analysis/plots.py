@@ -1,7 +1,8 @@
-"""Figures of results: ways seen from above, event pictures and their copies."""
+"""Plots of results: trajectories from above, event pictures, learning curves; the colours of all plots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,16 +16,80 @@ from envs.scene import Scene
 from jobs.analysis.statistics import half_width
 from jobs.rollout.episodes import Trajectory
 
-OFF_COLOUR, NONE_COLOUR, ON_COLOUR = "#f97316", "#15181f", "#60a5fa"
-EVENT_COLOURS = LinearSegmentedColormap.from_list("events", [OFF_COLOUR, NONE_COLOUR, ON_COLOUR])
 INK, MUTED, GRID = "#1f2430", "#6b7280", "#e5e7eb"
-POLICY, ORACLE, STRAIGHT = "#2563eb", "#059669", "#b45309"
-AGENT_COLOURS = {"oracle": ORACLE, "straight": STRAIGHT}
-OUTCOMES = {"goal": POLICY, "collision": "#dc2626", "time limit": STRAIGHT}
+BLACK, SLATE = "#111827", "#64748b"
+BLUE, CYAN, GREEN, LIME = "#2563eb", "#0891b2", "#059669", "#65a30d"
+AMBER, BROWN, RED, PINK, PURPLE, VIOLET = "#d97706", "#b45309", "#dc2626", "#db2777", "#7c3aed", "#9333ea"
+GREYS = ("#9ca3af", "#6b7280", "#374151", "#111827")  # of what is shown for comparison, from light to dark
+EVENT_COLOURS = LinearSegmentedColormap.from_list("events", ["#f97316", "#15181f", "#60a5fa"])  # OFF, no, ON
+# Colours by what is drawn.
+COLOURS = {
+    # outcomes of episodes
+    "goal": BLUE, "collision": RED, "time limit": BROWN,
+    # settings of the simulator
+    "default": BLACK, "most exact": BLACK, "together": SLATE, "tolerance": BLUE, "renders": GREEN,
+    "anti-aliasing": AMBER, "pyrender": PURPLE, "encoding": PINK, "culling": CYAN, "memory": RED,
+    # settings of the encoder
+    "precision": LIME, "time bins": VIOLET, "newest events": BROWN, "torch": RED, "chunks": GREEN,
+    "context": CYAN,
+    # codings of time, targets of the decoder, memory modes
+    "additive": BLUE, "eventnet": AMBER, "none": MUTED,
+    "occupancy": BLUE, "signed": AMBER, "aged": GREEN, "counts": PINK,
+    "reference": BLUE, "frame": AMBER, "legacy": RED,
+}  # fmt: skip
+# Colour and marker of each group of policies: Okabe and Ito's colours, which the colour-blind tell apart
+# too, without the yellow; then of the baselines, and of groups that have no look of their own.
+GROUP_STYLES = {
+    "bytestream": ("#0072b2", "o"), "bytestream_xy": ("#56b4e9", "s"), "event_columns": ("#009e73", "^"),
+    "event_set": ("#000000", "D"), "event_image": ("#d55e00", "v"), "event_image_vae": ("#e69f00", "P"),
+    "rgb": ("#cc79a7", "X"), "bytestream_1500k": ("#7a5195", "<"), "bytestream_paper": ("#5b6b1f", "h"),
+    "bytestream_robust": ("#b0003a", ">"),
+}  # fmt: skip
+BASELINE_STYLES = {
+    "oracle": ("#6b7280", "."),
+    "straight": ("#9ca3af", "."),
+    "random": ("#c4c9d1", "."),
+}
+OTHER_STYLES = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
 
 
-def reconstruction_figure(targets: np.ndarray, pictures: np.ndarray) -> Figure:
-    """Event pictures above what the event VAE made of them.
+def style_of(group: str) -> tuple[str, str]:
+    """Colour and marker of a group, the same in every plot."""
+    return (GROUP_STYLES | BASELINE_STYLES).get(group) or OTHER_STYLES[
+        sum(group.encode()) % len(OTHER_STYLES)
+    ]
+
+
+def tidy(panel: Axes, grid: str = "both") -> None:
+    """Draw a light grid along the named axis or "both", and no frame above and to the right."""
+    panel.grid(axis=grid, color=GRID)  # type: ignore[arg-type]
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+def panel_grid(
+    count: int, max_across: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure of `count` panels in rows of at most `max_across`.
+
+    Args:
+        count: Panels.
+        max_across: Panels side by side.
+        size: Width and height of a panel [inches].
+        margin: Width and height beside all panels [inches].
+        **shared: Arguments of `Figure.subplots`, such as sharex.
+    """
+    across = min(max_across, count)
+    down = -(-count // across)
+    inches = size[0] * across + margin[0], size[1] * down + margin[1]
+    figure = Figure(figsize=inches, layout="constrained")
+    panels = list(figure.subplots(down, across, squeeze=False, **shared).flat)
+    for panel in panels[count:]:
+        panel.set_visible(False)
+    return figure, panels[:count]
+
+
+def plot_reconstructions(targets: np.ndarray, pictures: np.ndarray) -> Figure:
+    """Draw event pictures above what the event VAE decodes of them.
 
     Args:
         targets: Event pictures, shape (N, H, W), in [-1, 1] or [0, 1].
@@ -55,40 +120,35 @@ def reconstruction_figure(targets: np.ndarray, pictures: np.ndarray) -> Figure:
     return figure
 
 
-def trajectory_figure(tracks: Sequence[Trajectory]) -> Figure:
-    """Ways from above, one corridor per seed; the policy's ways have the colour of their outcome."""
+def plot_trajectories(tracks: Sequence[Trajectory]) -> Figure:
+    """Draw trajectories from above, one corridor per seed; a policy's has the colour of its outcome."""
     seeds = list(dict.fromkeys(track.seed for track in tracks))
-    widest = max(track.scene.width_m for track in tracks)
-    across = min(2, len(seeds))
-    down = -(-len(seeds) // across)
-    height = 0.6 + down * (0.4 + 6.0 * (widest + 2) / 104)
-    figure = Figure(figsize=(6.6 * across, height), layout="constrained")
-    grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    for panel, seed in zip(grid.flat, seeds, strict=False):
-        flown = [track for track in tracks if track.seed == seed]
-        _draw_scene(panel, flown[0].scene, flown[0].height_m)
-        for track in flown:
-            _draw_way(panel, track)
-        ends = ", ".join(f"{track.agent} {track.way_m[-1, 1]:.0f} m" for track in flown)
+    height = 0.4 + 6.0 * (max(track.scene.width_m for track in tracks) + 2) / 104
+    figure, panels = panel_grid(len(seeds), 2, (6.6, height), (0.0, 0.6), sharex=True, sharey=True)
+    for panel, seed in zip(panels, seeds, strict=True):
+        own = [track for track in tracks if track.seed == seed]
+        _draw_scene(panel, own[0].scene, own[0].height_m)
+        for track in own:
+            _draw_trajectory(panel, track)
+        ends = ", ".join(f"{track.agent} {track.way_m[-1, 1]:.0f} m" for track in own)
         panel.set_title(f"corridor {seed}: {ends}", loc="left", fontsize=8.5, color=INK)
         panel.tick_params(labelsize=8)
-    for panel in grid.flat[len(seeds) :]:
-        panel.set_visible(False)
     figure.supxlabel("y, along the corridor [m]", fontsize=8)
     figure.supylabel("x, to the right [m]", fontsize=8)
-    keys = [Line2D([], [], color=colour, lw=2, label=f"ends: {name}") for name, colour in OUTCOMES.items()]
-    keys.append(Line2D([], [], color=ORACLE, lw=1.2, ls="--", label="oracle"))
+    outcomes = ("goal", "collision", "time limit")
+    keys = [Line2D([], [], color=COLOURS[name], lw=2, label=f"ends: {name}") for name in outcomes]
+    keys.append(Line2D([], [], color=GREEN, lw=1.2, ls="--", label="oracle"))
     figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), frameon=False, fontsize=9)
     return figure
 
 
 def _draw_scene(panel: Axes, scene: Scene, height_m: float) -> None:
-    """Walls, goal line and obstacles; right of the flight is down, as seen by the agent."""
+    """Draw walls, goal line and obstacles; the agent's right is down."""
     half = scene.width_m / 2
     shapes = [_outline(section) for section in scene.sections(height_m)]
-    panel.add_collection(PatchCollection(shapes, facecolor="#6b7280", edgecolor="#6b7280", lw=0.5, zorder=2))
+    panel.add_collection(PatchCollection(shapes, facecolor=MUTED, edgecolor=MUTED, lw=0.5, zorder=2))
     panel.hlines([-half, half], 0, scene.length_m, color=INK, lw=2)
-    panel.vlines(scene.length_m, -half, half, color=ORACLE, lw=1.5, ls=":")
+    panel.vlines(scene.length_m, -half, half, color=GREEN, lw=1.5, ls=":")
     panel.set(xlim=(-2, scene.length_m + 2), ylim=(half + 1, -half - 1), aspect="equal", facecolor="#fafafa")
     panel.spines[:].set_visible(False)
 
@@ -102,19 +162,19 @@ def _outline(section: np.ndarray) -> Patch:
     return Polygon([(y + a * uy + b * ux, x + a * ux - b * uy) for a, b in corners])
 
 
-def _draw_way(panel: Axes, track: Trajectory) -> None:
-    bound = track.agent == "oracle"
-    colour = ORACLE if bound else OUTCOMES[track.outcome]
+def _draw_trajectory(panel: Axes, track: Trajectory) -> None:
+    oracle = track.agent == "oracle"
+    colour = GREEN if oracle else COLOURS[track.outcome]
     x_m, y_m = track.way_m.T
-    panel.plot(y_m, x_m, color=colour, lw=1.2 if bound else 2.0, ls="--" if bound else "-", zorder=3)
+    panel.plot(y_m, x_m, color=colour, lw=1.2 if oracle else 2.0, ls="--" if oracle else "-", zorder=3)
     panel.plot(y_m[0], x_m[0], "o", color=colour, ms=4, zorder=4)
     if track.outcome == "collision":
-        panel.plot(y_m[-1], x_m[-1], "X", color=OUTCOMES["collision"], ms=10, mec="white", mew=1, zorder=5)
+        panel.plot(y_m[-1], x_m[-1], "X", color=RED, ms=10, mec="white", mew=1, zorder=5)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """How one training of an experiment went: environment steps, and means over the last flights (n,)."""
+    """One training of an experiment: environment steps, and means over the last episodes, (n,) each."""
 
     exp: str
     seed: int
@@ -123,43 +183,41 @@ class Curve:
     distance_m: np.ndarray
 
 
-def learning_figure(curves: Sequence[Curve]) -> Figure:
-    """Success in training against steps: a line per training, their mean in bold, a panel per experiment.
+def plot_learning_curves(curves: Sequence[Curve]) -> Figure:
+    """Draw success in training against steps: a panel per experiment, a line per training, the mean in bold.
 
     The mean, with its 95 % interval over trainings, is drawn where every one has a point before and after.
     """
     names = list(dict.fromkeys(curve.exp for curve in curves))
-    across = min(4, len(names))
-    down = -(-len(names) // across)
-    figure = Figure(figsize=(2.9 * across + 0.4, 2.3 * down + 0.5), layout="constrained")
-    panels = figure.subplots(down, across, squeeze=False, sharey=True)
-    for panel, name in zip(panels.flat, names, strict=False):
+    figure, panels = panel_grid(len(names), 4, (2.9, 2.3), (0.4, 0.5), sharey=True)
+    for panel, name in zip(panels, names, strict=True):
         own = [curve for curve in curves if curve.exp == name and curve.env_steps.size]
         for curve in own:
-            panel.plot(curve.env_steps / 1e3, 100 * curve.success_rate, color=POLICY, lw=0.8, alpha=0.5)
+            panel.plot(curve.env_steps / 1e3, 100 * curve.success_rate, color=BLUE, lw=0.8, alpha=0.5)
         if own:
-            steps = np.linspace(
-                max(curve.env_steps[0] for curve in own), min(curve.env_steps[-1] for curve in own), 100
-            )
-            every = [np.interp(steps, curve.env_steps, curve.success_rate) for curve in own]
-            mean = 100 * np.mean(every, axis=0)
-            if len(own) > 1:
-                half = 100 * half_width(np.array(every))
-                ends = np.clip([mean - half, mean + half], 0, 100)
-                panel.fill_between(steps / 1e3, *ends, color=POLICY, alpha=0.15, lw=0)
-            panel.plot(steps / 1e3, mean, color=POLICY, lw=2.2)
-            panel.annotate(
-                f"{mean[-1]:.0f} %", (steps[-1] / 1e3, mean[-1]), (-2, -14), textcoords="offset points",
-                ha="right", fontsize=9, color=INK,
-            )  # fmt: skip
+            _draw_mean(panel, own)
         plural = "s" if len(own) != 1 else ""
         panel.set_title(f"{name}, {len(own)} training{plural}", loc="left", fontsize=9, color=INK)
-        panel.grid(axis="y", color=GRID)
         panel.set(ylim=(-3, 103))
         panel.tick_params(labelsize=8)
-        panel.spines[["top", "right"]].set_visible(False)
-    for panel in panels.flat[len(names) :]:
-        panel.set_visible(False)
+        tidy(panel, "y")
     figure.supxlabel("Environment steps [thousands]", fontsize=9)
-    figure.supylabel("Success of the last 100 flights [%]", fontsize=9)
+    figure.supylabel("Success of the last 100 episodes [%]", fontsize=9)
     return figure
+
+
+def _draw_mean(panel: Axes, curves: Sequence[Curve]) -> None:
+    """Draw the mean of the curves with its interval, where all of them have points."""
+    first, last = max(curve.env_steps[0] for curve in curves), min(curve.env_steps[-1] for curve in curves)
+    steps = np.linspace(first, last, 100)
+    every = np.array([np.interp(steps, curve.env_steps, curve.success_rate) for curve in curves])
+    mean = 100 * every.mean(axis=0)
+    if len(curves) > 1:
+        half = 100 * half_width(every)
+        ends = np.clip([mean - half, mean + half], 0, 100)
+        panel.fill_between(steps / 1e3, *ends, color=BLUE, alpha=0.15, lw=0)
+    panel.plot(steps / 1e3, mean, color=BLUE, lw=2.2)
+    panel.annotate(
+        f"{mean[-1]:.0f} %", (steps[-1] / 1e3, mean[-1]), (-2, -14), textcoords="offset points",
+        ha="right", fontsize=9, color=INK,
+    )  # fmt: skip

@@ -1,13 +1,15 @@
-"""Intervals: of a rate, of a mean, over several trainings, and of a difference on the same corridors.
+"""95 % intervals of a rate, of a mean, over several trainings, and of a difference on the same corridors.
 
-All are 95 % intervals, and every draw comes from a generator that is given.
+Every random draw comes from a generator that the caller gives. scipy computes what it can; it has no
+bootstrap in two stages, and no interval of a difference of paired rates.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, t, trim_mean
+from scipy.stats import binomtest, bootstrap, sem, t, trim_mean, ttest_ind
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -19,7 +21,7 @@ Statistic = Callable[[np.ndarray], np.ndarray]  # (resamples, n) -> (resamples,)
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % interval; None where a single flight leaves nothing to resample."""
+    """A value with its 95 % interval; None where a single episode leaves nothing to resample."""
 
     value: float
     interval: Interval | None
@@ -32,7 +34,7 @@ def wilson_interval(successes: int, trials: int) -> Interval:
         ValueError: If there are no trials, or more successes than trials.
     """
     if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"need 0 <= successes <= trials and a trial, got {successes} of {trials}; fly first")
+        raise ValueError(f"need 0 <= successes <= trials and a trial, got {successes} of {trials}")
     interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
     return float(interval.low), float(interval.high)
 
@@ -52,7 +54,9 @@ def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval
         raise ValueError(f"values must be a list of finite numbers, got {values!r}; leave out what failed")
     if values.size == 1:
         return None
-    return _percentiles(values[rng.integers(values.size, size=(RESAMPLES, values.size))].mean(axis=1))
+    found = bootstrap([values], np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE,
+                      method="percentile", rng=rng)  # fmt: skip
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
 def mean(values: np.ndarray) -> np.ndarray:
@@ -68,7 +72,7 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
 def two_stage_estimate(values: np.ndarray, rng: np.random.Generator, statistic: Statistic = mean) -> Estimate:
     """A statistic over trainings and corridors, its interval from a two-stage bootstrap.
 
-    Trainings are drawn first, then corridors, which all trainings share (as they flew the same).
+    Trainings are drawn first, then corridors, which all trainings share.
     Of n trainings n - 1 are drawn, which makes the variance of the resamples that of the mean
     (Rao and Wu 1988); n draws would make intervals over three trainings a fifth too narrow.
 
@@ -92,7 +96,7 @@ def two_stage_estimate(values: np.ndarray, rng: np.random.Generator, statistic: 
 def paired_difference(ours: np.ndarray, theirs: np.ndarray, rng: np.random.Generator) -> Estimate:
     """Mean of ours minus mean of theirs on the same corridors, with its paired bootstrap interval.
 
-    The trainings of each side are drawn apart, the corridors for both together.
+    The trainings of each side are drawn separately, the corridors for both together.
 
     Args:
         ours: Shape (trainings, corridors).
@@ -104,9 +108,7 @@ def paired_difference(ours: np.ndarray, theirs: np.ndarray, rng: np.random.Gener
     """
     ours, theirs = _checked(ours, "ours"), _checked(theirs, "theirs")
     if ours.shape[1] != theirs.shape[1]:
-        raise ValueError(
-            f"both must have flown the same corridors, got {ours.shape[1]} and {theirs.shape[1]}"
-        )
+        raise ValueError(f"both must be of the same corridors, got {ours.shape[1]} and {theirs.shape[1]}")
     value = float(ours.mean() - theirs.mean())
     if ours.size == theirs.size == 1:
         return Estimate(value, None)
@@ -129,11 +131,11 @@ def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
         theirs: Successes bool (n,), corridor by corridor.
 
     Raises:
-        ValueError: If there are no flights, or not as many of both.
+        ValueError: If there are no episodes, or not as many of both.
     """
     ours, theirs = np.asarray(ours, bool), np.asarray(theirs, bool)
     if ours.shape != theirs.shape or ours.ndim != 1 or ours.size == 0:
-        rule = "both must be flights of the same corridors, at least one"
+        rule = "both must be episodes of the same corridors, at least one"
         raise ValueError(f"{rule}, got shapes {ours.shape} and {theirs.shape}")
     count = ours.size
     both, neither = int((ours & theirs).sum()), int((~ours & ~theirs).sum())
@@ -153,33 +155,33 @@ def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
 
 
 def half_width(values: np.ndarray) -> np.ndarray:
-    """Half of the 95 % interval of the mean over trainings, Student's, at each of k points: (k,).
+    """Half of the 95 % interval (Student's t) of the mean over trainings at each of k points: (k,).
 
     Args:
         values: Shape (trainings, k), two trainings at least.
 
     Raises:
-        ValueError: There are fewer trainings.
+        ValueError: There is only one training.
     """
     count = len(values)
     if count < 2:
         raise ValueError(f"an interval over trainings needs two of them, got {count}")
-    return float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * values.std(axis=0, ddof=1) / count**0.5
+    return t.ppf((1 + CONFIDENCE) / 2, count - 1) * sem(values, axis=0)
 
 
 def mean_difference(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
-    """Mean of ours minus mean of theirs, of trainings that have nothing in common, with its 95 % interval.
+    """Mean of ours minus mean of theirs, of independent trainings, with its 95 % interval.
 
-    The interval is Welch's (1947), which allows unequal variances; None where a side has less than
-    two values, or all are equal on both.
+    The interval is Welch's (1947), which allows unequal variances; None where a side has fewer than
+    two values, or all values of each side are equal.
     """
     value = float(np.mean(ours) - np.mean(theirs))
     if min(len(ours), len(theirs)) < 2 or np.ptp(ours) == np.ptp(theirs) == 0:
         return Estimate(value, None)
-    parts = np.array([np.var(side, ddof=1) / len(side) for side in (ours, theirs)])
-    freedom = parts.sum() ** 2 / (parts**2 / [len(ours) - 1, len(theirs) - 1]).sum()
-    half = float(t.ppf((1 + CONFIDENCE) / 2, freedom) * np.sqrt(parts.sum()))
-    return Estimate(value, (value - half, value + half))
+    with warnings.catch_warnings():  # scipy warns where the values of one side are equal
+        warnings.simplefilter("ignore", RuntimeWarning)
+        interval = ttest_ind(ours, theirs, equal_var=False).confidence_interval(CONFIDENCE)
+    return Estimate(value, (float(interval.low), float(interval.high)))
 
 
 def _checked(values: np.ndarray, name: str) -> np.ndarray:
@@ -191,12 +193,12 @@ def _checked(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def _trainings(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Which trainings each resample holds, (resamples, count - 1); the one, where there is one."""
+    """Draw the trainings of each resample, (resamples, count - 1); where there is one, that one."""
     return rng.integers(count, size=(TWO_STAGE_RESAMPLES, max(count - 1, 1)))
 
 
 def _corridors(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Which corridors each resample holds, (resamples, count)."""
+    """Draw the corridors of each resample, (resamples, count)."""
     return rng.integers(count, size=(TWO_STAGE_RESAMPLES, count))
 
 

@@ -1,90 +1,82 @@
-"""Films of flights: what the camera sees, its events, and what the latents hold of them."""
+"""Films of episodes: what the camera sees, its events, and what the latents hold of them."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any
 
-import imageio.v2 as imageio
+import av
 import numpy as np
+from av.container import OutputContainer
+from av.video.stream import VideoStream
 from PIL import Image, ImageDraw, ImageFont
 
+from envs.events import event_image
+from envs.events.windows import GREY_OFF, GREY_ON
 from jobs.analysis.plots import EVENT_COLOURS, INK
+from jobs.run.files import replaced
+from models.policy.features import grey_picture
 
 ZOOM, GAP, BAR = 5, 12, 40
-FILM_FPS, FRAMES_PER_FLOWN_S = 25, 50
+FILM_FPS, FRAMES_PER_FLIGHT_S = 25, 50
+QUALITY = {"crf": "15"}  # of libx264: lower is better and larger, 23 is its default
 
 Decode = Callable[[np.ndarray], np.ndarray]
 
 
+@dataclass
 class Film:
-    """An MP4 file of one flight: luminance, events if any are made, with a decoder what the latents hold.
+    """An MP4 file of one episode that is being written, see `open_film`."""
 
-    A context manager; `step` takes what one control step has shown. Frames are
-    `FRAMES_PER_FLOWN_S` per second of flight, played `FILM_FPS` per second.
-    """
-
-    def __init__(self, path: Path, control_hz: float, decode: Decode | None) -> None:
-        """Open the file.
-
-        Args:
-            path: Where it is written, whole or not at all.
-            control_hz: Control steps per second of flight [Hz].
-            decode: Event window -> picture in [-1, 1], float (H, W), of a third panel; None: there is none.
-        """
-        self.path, self.decode = path, decode
-        self.stride = max(1, round(control_hz / FRAMES_PER_FLOWN_S))
-        self.slower = control_hz / self.stride / FILM_FPS
-        self._recent: list[np.ndarray | None] = []
-        self._part = path.with_name(f".{path.stem}.part.mp4")
-
-    def __enter__(self) -> "Film":
-        """Start the encoder."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._writer: Any = imageio.get_writer(
-            self._part, fps=FILM_FPS, codec="libx264", quality=7, macro_block_size=2, ffmpeg_log_level="error"
-        )
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the file; it takes its name only if nothing went wrong."""
-        self._writer.close()
-        if kind is None:
-            self._part.replace(self.path)
-        else:
-            self._part.unlink(missing_ok=True)
+    container: OutputContainer
+    stream: VideoStream
+    control_hz: float
+    decode: Decode | None
+    _recent: list[np.ndarray | None] = field(default_factory=list)
 
     def step(
         self, luminance: np.ndarray, events: np.ndarray | None, window: np.ndarray, caption: str
     ) -> None:
         """Show a control step: its luminance (H, W), its EVENT array or None if none are made, its window."""
         self._recent.append(events)
-        if len(self._recent) < self.stride:
+        stride = max(1, round(self.control_hz / FRAMES_PER_FLIGHT_S))
+        if len(self._recent) < stride:
             return
         shown = [batch for batch in self._recent if batch is not None]
         self._recent = []
-        panels = [("luminance", grey(luminance))]
+        panels = [("luminance", np.repeat(grey_picture(luminance)[:, :, None], 3, axis=2))]
         if shown:
-            panels.append(("events", coloured(polarity(np.concatenate(shown), luminance.shape))))
+            panels.append(("events", coloured(last_polarity(np.concatenate(shown), luminance.shape))))
         if self.decode is not None:
             panels.append(("decoded from the latents", coloured(self.decode(window))))
-        note = f"{caption}   {self.slower:.0f}x slower than flown" if self.slower > 1 else caption
-        self._writer.append_data(frame(panels, note))
+        slower = self.control_hz / stride / FILM_FPS
+        picture = frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption)
+        self.stream.height, self.stream.width = picture.shape[:2]
+        self.container.mux(self.stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
 
 
-def grey(luminance: np.ndarray) -> np.ndarray:
-    """Linear luminance (H, W) as uint8 (H, W, 3), with the display's gamma."""
-    shade = np.rint(255 * np.clip(luminance, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-    return np.repeat(shade[:, :, None], 3, axis=2)
+@contextlib.contextmanager
+def open_film(path: Path, control_hz: float, decode: Decode | None) -> Iterator[Film]:
+    """Write an MP4 file of one episode: luminance, events if there are any, what the latents hold if decoded.
+
+    Frames are `FRAMES_PER_FLIGHT_S` per second of flight, played `FILM_FPS` per second. The file is
+    written whole or not at all.
+
+    Args:
+        path: The file.
+        control_hz: Control steps per second of flight [Hz].
+        decode: Event window -> picture in [-1, 1], float (H, W), of a third panel; None: there is none.
+    """
+    with replaced(path) as part, av.open(str(part), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", FILM_FPS, options=QUALITY)
+        yield Film(container, stream, control_hz, decode)
+        container.mux(stream.encode())
 
 
-def polarity(events: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The last polarity of each pixel, -1, 0 or +1, float64 (H, W); events in time order."""
-    picture = np.zeros(shape)
-    picture[events["y"], events["x"]] = events["p"]
-    return picture
+def last_polarity(events: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The last polarity of each pixel, -1, 0 or +1, (H, W); events in time order."""
+    image = event_image(events, shape[1], shape[0])
+    return np.select([image == GREY_ON, image == GREY_OFF], [1, -1])
 
 
 def coloured(picture: np.ndarray) -> np.ndarray:
@@ -95,8 +87,9 @@ def coloured(picture: np.ndarray) -> np.ndarray:
 def frame(panels: Sequence[tuple[str, np.ndarray]], caption: str) -> np.ndarray:
     """Panels uint8 (H, W, 3) side by side under their names, above a caption; uint8 with even sizes."""
     height, width = panels[0][1].shape[:2]
-    # The caption needs the room of two.
-    size = (max(2, len(panels)) * (width * ZOOM + GAP) + GAP, height * ZOOM + 2 * BAR)
+    across = max(2, len(panels))  # the caption needs the room of two
+    sizes = (across * (width * ZOOM + GAP) + GAP, height * ZOOM + 2 * BAR)
+    size = (sizes[0] + sizes[0] % 2, sizes[1] + sizes[1] % 2)  # as the encoder asks
     picture = Image.new("RGB", size, INK)
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(17)

@@ -59,7 +59,7 @@ def random_policy(name: str) -> Policy:
     networks = build_networks(network_settings(config))
     encoder = None
     if KINDS[name].encoder:
-        encoder = encoder_of(build_evae(config.model, sensor_settings(config.env_config())).freeze())
+        encoder = encoder_of(build_evae(config.model, sensor_settings(config.env)).freeze())
     return Policy(networks.requires_grad_(False), network_settings(config), encoder)
 
 

@@ -8,6 +8,7 @@ learns 10 epochs. Seconds are wall time, medians over the rounds: `ppo_fast` fli
 of its own, so the machine should be quiet. The second table is ours for every kind of policy.
 """
 
+import dataclasses
 import statistics
 import tempfile
 import time
@@ -181,7 +182,7 @@ def encoder_file(evae: EventVAE, folder: Path) -> Path:
 
 def stable_baselines(config: Config, table: EncoderTable) -> PPO:
     """PPO of stable-baselines3 with an experiment's settings."""
-    algo, flown = config.algo, config.env_config(split="train", observation="window")
+    algo, flown = config.algo, dataclasses.replace(config.env, split="train", observation="window")
     corridors = EncodedCorridors(algo.num_envs_per_env_runner, flown, table, config.model.stack)
     return PPO(
         "MlpPolicy",

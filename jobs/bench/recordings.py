@@ -20,8 +20,9 @@ from envs.corridor import CorridorEnv
 from envs.recordings import WRITERS, downscale_events, read_events, write_events
 from jobs.bench.throughput import interleaved
 from jobs.run.progress import console
+from jobs.run.provenance import REPOSITORY
 
-DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+DATA = Path(os.environ.get("EVADE_DATA", REPOSITORY.parent / "shared" / "data"))
 SAMPLE = DATA / "expelliarmus_evt" / "evt3_sample.raw"
 FLIGHT_STEPS = 600
 

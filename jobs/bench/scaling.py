@@ -33,7 +33,7 @@ from jobs.evaluation.sweep_plan import PRETRAINED
 from jobs.rollout.episodes import fly
 from jobs.rollout.scheduler import loaded
 from jobs.run.progress import console
-from jobs.run.ray_cluster import ONE_THREAD, QUIET
+from jobs.run.ray_cluster import QUIET, WORKER_THREADS
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
 
@@ -235,7 +235,7 @@ def simulated(nodes: int, cores: int) -> Iterator[None]:
     try:
         for _ in range(nodes - 1):
             cluster.add_node(num_cpus=cores, object_store_memory=OBJECT_STORE)
-        ray.init(cluster.address, runtime_env={"env_vars": ONE_THREAD}, log_to_driver=False)
+        ray.init(cluster.address, runtime_env={"env_vars": WORKER_THREADS}, log_to_driver=False)
         yield
     finally:
         ray.shutdown()

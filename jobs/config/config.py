@@ -1,23 +1,25 @@
 """Every setting of an experiment, checked; the values are in conf/, their ranges in `jobs.config.schema`.
 
-`parse` turns the composed configuration into one frozen `Config`, or raises one
-`ConfigError` that lists each refused key with its value and the rule. Nothing has been
-started or written by then.
+`parse` turns the composed configuration into one frozen `Config`, or raises one `ConfigError`
+with a line for each wrong key. Nothing has been started or written by then.
 """
 
 import dataclasses
 import itertools
-import typing
-from collections.abc import Collection, Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Annotated, Literal, TypeVar
 
 import pydantic
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
+from pydantic_core import ErrorDetails
 
-from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
-from jobs.config.conditions import refused_axes, refused_conditions
-from jobs.config.errors import JOBS_CHOOSE, explain, nearest, redacted, refused_scenes
+from envs.config import STRICT, EnvConfig
+from jobs.config.conditions import axis_errors, condition_errors
+from jobs.config.env_keys import BESIDE_ENV, ENV_FIELDS, ENV_GROUPS, fields_of, flat_env, key_of
+from jobs.config.errors import SET_BY_JOBS, ConfigError, nearest, redacted
+from jobs.config.registry import JOBS
+from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
     AlgoConfig,
     ClusterConfig,
@@ -36,29 +38,30 @@ from jobs.config.schema import (
 )
 from models.kinds import KINDS, MIN_IMAGE
 
+__all__ = ["HELD_OUT_SCENE", "Config", "ConfigError", "as_dict", "known_keys", "parse"]
 
-class ConfigError(ValueError):
-    """A configuration that was refused; the message names key, value and rule."""
+HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
+
+Part = TypeVar("Part")
+
+
+def _job(name: str) -> str:
+    if name not in JOBS:
+        raise ValueError(f"must be one of {', '.join(JOBS)}, got {name!r}")
+    return name
 
 
 @dataclass(frozen=True, config=STRICT)
 class Config:
-    """One experiment, checked."""
+    """One experiment, checked. `env` is the simulation as it is handed on to whatever needs one."""
 
-    job: Literal[
-        "pipeline", "collect", "pretrain", "train", "evaluate", "sweep", "report", "ship",
-        "trade", "trade_simulator", "trade_encoder", "probe",
-    ]  # fmt: skip
+    job: Annotated[str, AfterValidator(_job)]
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
     budget: Literal["smoke", "short", "paper"]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     resume: str | None
     runs_dir: Name
-    env: dict[str, Any]
-    camera: CameraConfig
-    faults: FaultsConfig
-    renderer: Literal["auto", "raycast", "pyrender"]
-    fidelity: FidelityConfig
+    env: EnvConfig
     model: ModelConfig
     algo: AlgoConfig
     collect: CollectConfig
@@ -73,101 +76,141 @@ class Config:
     cluster: ClusterConfig
     tracking: TrackingConfig
 
-    def env_config(self, **changes: Any) -> EnvConfig:
-        """The simulation that this experiment flies, with some of its fields replaced."""
-        parts = {name: getattr(self, name) for name in ENV_PARTS}
-        return EnvConfig(**{**self.env, **parts, **changes})
 
-
-HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
-ENV_PARTS = ("camera", "faults", "renderer", "fidelity")
-ENV_KEYS = [
-    part.name
-    for part in dataclasses.fields(typing.cast(Any, EnvConfig))
-    if part.name not in (*ENV_PARTS, *JOBS_CHOOSE)
-]
 SECTIONS = {
-    part.name: part.type for part in dataclasses.fields(Config) if dataclasses.is_dataclass(part.type)
+    name: section
+    for name, section in fields_of(Config).items()
+    if dataclasses.is_dataclass(section) and section is not EnvConfig
 }
 
 
-def parse(values: Mapping[str, Any]) -> Config:
+def parse(values: Mapping[str, object]) -> Config:
     """Check a composed configuration.
 
     Args:
         values: Plain containers, as `conf/` composes them or `as_dict` returns them.
 
     Raises:
-        ConfigError: With one line per refused key: the key, the rule, the value received.
+        ConfigError: With one line per wrong key: the key, the rule, the value received.
     """
-    refused: list[str] = []
-    parts = {name: _build(section, values.get(name), name, refused) for name, section in SECTIONS.items()}
-    parts["env"] = world = _build(EnvConfig, values.get("env"), "env", refused)
-    if world is not None:  # 100 and 100.0 become the same setting, so that they name the same run
-        parts["env"] = {name: getattr(world, name) for name in ENV_KEYS}
-    refused_parts = [name for name, part in parts.items() if part is None]
-    config = _build(Config, {**values, **parts}, "", refused, refused_parts)
-    if not refused:
-        named = [("env.scene", config.env["scene"]), ("sweep.scene", config.sweep.scene)]
-        named += [("evaluate", HELD_OUT_SCENE)]
-        named += [("trade_simulator.scenes", name) for name in config.trade_simulator.scenes]
-        named += [("collect.scenes", name) for name in config.collect.scenes]
-        trained = [condition.get("env.scene") for condition in config.train.conditions]
-        named += [("train.conditions", name) for name in trained if isinstance(name, str)]
-        swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
-        named += [("sweep.axes", name) for name in dict.fromkeys(swept) if isinstance(name, str)]
-        vehicle = config.env["vehicle_radius_m"], config.env["camera_height_m"]
-        refused = _refused_picture(config) + refused_axes(config.sweep.axes, config.env_config())
-        refused += refused_conditions(config.train.conditions, config.env_config())
-        at_once, wanted = config.algo.num_envs_per_env_runner, len(config.train.conditions)
-        if wanted > at_once:
-            rule = f"must be at most the {at_once} of algo.num_envs_per_env_runner"
-            refused.append(f"train.conditions: {rule}, got {wanted}")
-        if not config.collect.scenes and not config.collect.recordings:
-            refused.append("collect.scenes: must name a scene where collect.recordings is empty, got []")
-        refused += refused_scenes(named, config.env["layout"], vehicle)
-    if refused:
-        raise ConfigError("\n".join(refused))
-    return typing.cast(Config, config)
+    errors: list[str] = []
+    parts: dict[str, object] = {"env": _env(values, errors)}
+    parts |= {name: _section(section, values.get(name), name, errors) for name, section in SECTIONS.items()}
+    top = {name: value for name, value in values.items() if name not in BESIDE_ENV}
+    wrong = [name for name, part in parts.items() if part is None]
+    config = _build(Config, {**top, **parts}, "", errors, skip=wrong)
+    if config is not None and not errors:
+        errors += [
+            *_image_errors(config),
+            *axis_errors(config.sweep.axes, config.env),
+            *condition_errors(config.train.conditions, config.env),
+            *_size_errors(config),
+            *scene_errors(list(_named_scenes(config)), config.env),
+        ]
+    if config is None or errors:
+        raise ConfigError("\n".join(errors))
+    return config
+
+
+def as_dict(config: Config) -> dict[str, object]:
+    """The configuration as plain containers in the groups of conf/, without the tracker's password."""
+    tracking = dataclasses.replace(config.tracking, uri=redacted(config.tracking.uri))
+    values: dict[str, object] = {}
+    for name, value in dataclasses.asdict(dataclasses.replace(config, tracking=tracking)).items():
+        values |= flat_env(config.env) if name == "env" else {name: value}
+    return values
 
 
 def known_keys() -> list[str]:
     """Every key that a configuration may have."""
-    keys = [field.name for field in dataclasses.fields(Config)]
-    for name, section in SECTIONS.items():
-        keys += [f"{name}.{field.name}" for field in dataclasses.fields(typing.cast(Any, section))]
-    return keys + [f"env.{name}" for name in ENV_KEYS]
+    keys = [*fields_of(Config), *BESIDE_ENV]
+    for name, section in (SECTIONS | ENV_GROUPS).items():
+        keys += [f"{name}.{field}" for field in fields_of(section)]
+    return keys + [f"env.{name}" for name in ENV_FIELDS]
 
 
-def as_dict(config: Config) -> dict[str, Any]:
-    """The configuration as plain containers, for files and trackers: without the tracker's password."""
-    values = dataclasses.asdict(typing.cast(Any, config))
-    values["tracking"]["uri"] = redacted(config.tracking.uri)
-    return values
+def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:
+    """The simulation, made of `env` and of the groups that stand beside it."""
+    env = values.get("env")
+    if not isinstance(env, Mapping):
+        return _section(EnvConfig, env, "env", errors)
+    parts = {name: _section(group, values.get(name), name, errors) for name, group in ENV_GROUPS.items()}
+    misplaced = [name for name in env if name in (*BESIDE_ENV, *SET_BY_JOBS)]
+    for name in misplaced:
+        errors.append(f"env.{name}: no such key, got {env[name]!r}{nearest(f'env.{name}', [])}")
+    fields = {name: value for name, value in env.items() if name not in misplaced}
+    valid = {name: part for name, part in parts.items() if part is not None}
+    built = _build(EnvConfig, {**fields, **valid, "renderer": values.get("renderer")}, "env", errors)
+    return built if len(valid) == len(parts) else None
 
 
-def _build(section: Any, values: Any, name: str, refused: list[str], skip: Collection[str] = ()) -> Any:
-    """The section made of its values, or None, with the reasons added to `refused`."""
+def _section(section: Callable[..., Part], values: object, name: str, errors: list[str]) -> Part | None:
+    """The section made of its values; None if they are wrong, with the reasons added to `errors`."""
     if not isinstance(values, Mapping):
-        refused.append(f"{name}: must be a group of settings, got {values!r}")
+        errors.append(f"{name}: must be a group of settings, got {values!r}")
         return None
-    if section is EnvConfig:
-        taken = [key for key in values if key in (*ENV_PARTS, *JOBS_CHOOSE)]
-        refused += [
-            f"env.{key}: no such key, got {values[key]!r}{nearest(f'env.{key}', [])}" for key in taken
-        ]
-        values = {key: value for key, value in values.items() if key not in taken}
+    return _build(section, values, name, errors)
+
+
+def _build(
+    section: Callable[..., Part],
+    values: Mapping[str, object],
+    name: str,
+    errors: list[str],
+    skip: Collection[str] = (),
+) -> Part | None:
+    """As `_section`, of a mapping; says nothing about the fields in `skip`."""
     try:
         return section(**{str(key): value for key, value in values.items()})
     except pydantic.ValidationError as error:
-        refused += [line for line in explain(error, name, known_keys()) if line.partition(":")[0] not in skip]
+        problems = [problem for problem in error.errors() if not {*problem["loc"][:1]} & {*skip}]
+        errors += [_line(problem, key_of(name, problem["loc"])) for problem in problems]
         return None
 
 
-def _refused_picture(config: Config) -> list[str]:
-    """Sides of the sensor's picture that the policy's network cannot take."""
+def _line(problem: ErrorDetails, key: str) -> str:
+    """What pydantic found, as key, rule and value."""
+    if problem["type"] == "unexpected_keyword_argument":
+        return f"{key}: no such key, got {problem['input']!r}{nearest(key, known_keys())}"
+    if problem["type"] in ("missing", "missing_argument", "value_error"):
+        return f"{key}: {problem['msg'].removeprefix('Value error, ')}"
+    return f"{key}: {problem['msg']}, got {problem['input']!r}"
+
+
+def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
+    """Each scene that the configuration names, behind the key that names it."""
+    yield "env.scene", config.env.scene
+    yield "sweep.scene", config.sweep.scene
+    yield "evaluate", HELD_OUT_SCENE
+    for name in config.trade_simulator.scenes:
+        yield "trade_simulator.scenes", name
+    for name in config.collect.scenes:
+        yield "collect.scenes", name
+    for condition in config.train.conditions:
+        if isinstance(scene := condition.get("env.scene"), str):
+            yield "train.conditions", scene
+    swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
+    for scene in dict.fromkeys(swept):
+        if isinstance(scene, str):
+            yield "sweep.axes", scene
+
+
+def _size_errors(config: Config) -> Iterator[str]:
+    """Lists that are too long, or empty where something is needed."""
+    at_once, wanted = config.algo.num_envs_per_env_runner, len(config.train.conditions)
+    if wanted > at_once:
+        rule = f"must be at most the {at_once} of algo.num_envs_per_env_runner"
+        yield f"train.conditions: {rule}, got {wanted}"
+    if not config.collect.scenes and not config.collect.recordings:
+        yield "collect.scenes: must name a scene where collect.recordings is empty, got []"
+
+
+def _image_errors(config: Config) -> Iterator[str]:
+    """Sides of the sensor's image that are too small for the policy's network."""
     if KINDS[config.model.name].network != "cnn" and config.model.name != "event_image_vae":
-        return []
-    sides = {name: getattr(config.camera, name) for name in ("width", "height")}
-    rule = f"must be at least {MIN_IMAGE} for the network of {config.model.name}"
-    return [f"camera.{name}: {rule}, got {side}" for name, side in sides.items() if side < MIN_IMAGE]
+        return
+    for name in ("width", "height"):
+        side = getattr(config.env.camera, name)
+        if side < MIN_IMAGE:
+            rule = f"must be at least {MIN_IMAGE} for the network of {config.model.name}"
+            yield f"camera.{name}: {rule}, got {side}"

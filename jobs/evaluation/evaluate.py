@@ -16,9 +16,20 @@ import torch
 
 from envs.config import WITHOUT_EVENTS, EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
-from jobs.analysis.plots import trajectory_figure
-from jobs.analysis.tables import Summary, columns, markdown, metrics, show, summarise, table
-from jobs.analysis.video import Decode, Film
+from jobs.analysis.plots import plot_trajectories
+from jobs.analysis.tables import (
+    CAPTION,
+    SUMMARY_HEADINGS,
+    Summary,
+    markdown_table,
+    publish_plot,
+    show_table,
+    summarise,
+    summary_cells,
+    summary_columns,
+    summary_metrics,
+)
+from jobs.analysis.video import Decode, open_film
 from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
 from jobs.rollout.accuracy import achieved
 from jobs.rollout.agents import BOUNDS, make_agent
@@ -86,7 +97,7 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     """
     path = find_policy(config, folder)
     manifest = load_policy(path).manifest
-    check_sensor(manifest, config.env_config())
+    check_sensor(manifest, config.env)
     asked = {"evaluate": as_dict(config)["evaluate"], "policy": manifest["sha256"]}
     done = finished(folder, "evaluate")
     if done is not None and done["asked"] == asked and not done.get("missing"):
@@ -105,22 +116,23 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     write_episodes(folder.evaluation / "episodes.csv", LABELS, {task.label: flown[task] for task in flown})
     publish(folder, tracker, rows, tracks)
     figures = tracked_figures(rows) | drift_metrics({task: note["encoder"] for task, note in notes.items()})
-    figures |= achieved(config.env_config(scene=HELD_OUT_SCENE))
+    figures |= achieved(dataclasses.replace(config.env, scene=HELD_OUT_SCENE))
     tracker.log(config.train.env_steps, figures)
     if config.evaluate.video:
         seed = film_seed(flown[plan[0]])
-        env_config = config.env_config(scene=HELD_OUT_SCENE, split="eval")
+        env_config = dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval")
         file = folder.evaluation / "episode.mp4"
         tracker.artifact(film(str(path), config.evaluate.action, env_config, seed, file), "eval")
     missing = [" ".join(task.label) for task in plan if task not in flown]
     flown_at = sorted({commit for note in notes.values() for commit in note["commits"]})
     marker = {"asked": asked, "figures": figures, "missing": missing, "flown_at": flown_at}
-    return finish(folder, "evaluate", marker)["figures"]
+    finish(folder, "evaluate", marker)
+    return figures
 
 
 def cell_of(task: Task, config: Config, path: Path, of_policy: tuple[str, str]) -> Cell:
     """A task as a cell of flights; `path` is the policy's, `of_policy` its identity and observation."""
-    env_config = config.env_config(scene=task.scene, split="eval", renderer=task.renderer)
+    env_config = dataclasses.replace(config.env, scene=task.scene, split="eval", renderer=task.renderer)
     if task.renderer == "pyrender":  # to see another picture, not to see it as exactly as the tolerance asks
         fidelity = dataclasses.replace(env_config.fidelity, samples=2)
         env_config = dataclasses.replace(env_config, fidelity=fidelity)
@@ -160,7 +172,7 @@ def tasks(config: Config) -> list[Task]:
     the configured one comes first and is the one that figures without a suffix belong to.
     """
     first, *others = config.evaluate.renderers
-    scenes = dict.fromkeys((HELD_OUT_SCENE, config.env_config().scene))
+    scenes = dict.fromkeys((HELD_OUT_SCENE, config.env.scene))
     actions = sorted(ACTIONS, key=lambda action: action != config.evaluate.action)
     policies = [f"policy {action}" for action in actions]
     pairs = [(agent, scene) for scene in scenes for agent in (*policies, *BOUNDS)]
@@ -205,14 +217,13 @@ def announce(config: Config, folder: Run, path: Path) -> None:
 
 def publish(folder: Run, tracker: Tracker, rows: Sequence[Summary], tracks: Sequence[Trajectory]) -> None:
     """Show, store and track the table and the ways."""
-    text = markdown(LABELS, rows)
-    show(table("Held-out corridors", LABELS, rows))
+    head, lines = (*LABELS, *SUMMARY_HEADINGS), [summary_cells(row) for row in rows]
+    text = markdown_table(head, lines, len(LABELS))
+    show_table("Held-out corridors", head, lines, len(LABELS), CAPTION)
     write_atomic(folder.evaluation / "table.md", text)
     tracker.text("eval/table.md", text)
-    tracker.table("eval/results", columns(LABELS, rows))
-    figure = trajectory_figure(tracks)
-    figure.savefig(folder.evaluation / "trajectories.png", dpi=120)
-    tracker.figure("eval/trajectories.png", figure)
+    tracker.table("eval/results", summary_columns(LABELS, rows))
+    publish_plot(folder, tracker, "eval/trajectories", plot_trajectories(tracks))
 
 
 def tracked_figures(rows: Sequence[Summary]) -> dict[str, float]:
@@ -222,9 +233,9 @@ def tracked_figures(rows: Sequence[Summary]) -> dict[str, float]:
     for row in rows:
         ending = suffix(row.label, first)
         if not ending:
-            figures |= metrics(row)
+            figures |= summary_metrics(row)
         elif row.label[0] == first[0] or row.label[1] == first[1]:
-            figures |= {f"{name}{ending}": metrics(row)[name] for name in VIEW_COLUMNS[::3]}
+            figures |= {f"{name}{ending}": summary_metrics(row)[name] for name in VIEW_COLUMNS[::3]}
     return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
@@ -255,7 +266,7 @@ def film(source: str, action: str, env_config: EnvConfig, seed: int, path: Path)
     """Film a flight of a policy's folder, or of a bound, through one corridor; return the file."""
     decode = decoder(Path(source)) if (Path(source) / ENCODER).is_file() else None
     agent = make_agent(source, action)
-    with Film(path, env_config.control_hz, decode) as reel:
+    with open_film(path, env_config.control_hz, decode) as reel:
 
         def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: Mapping[str, Any]) -> None:
             caption = f"{env_config.scene} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"

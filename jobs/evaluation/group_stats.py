@@ -14,7 +14,13 @@ from jobs.analysis.statistics import (
     two_stage_estimate,
     wilson_interval,
 )
-from jobs.analysis.tables import events_texts, markdown_table
+from jobs.analysis.tables import (
+    estimate_metrics,
+    estimate_text,
+    events_texts,
+    markdown_table,
+    percent_text,
+)
 
 Condition = tuple[str, str]  # axis and value
 LABELS = ("Axis", "Value", "Group", "Training")
@@ -155,20 +161,7 @@ def details(rows: Sequence[Row], reference: str) -> str:
 
 def success_text(row: Row) -> str:
     """The success rate [%] with its interval."""
-    low, high = row.success_interval
-    return f"{100 * row.success.value:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
-
-
-def estimate_text(estimate: Estimate | None, scale: float = 1, form: str = ".1f") -> str:
-    """A value with its interval, as text."""
-    if estimate is None:
-        return "-"
-    bounds = (
-        ""
-        if estimate.interval is None
-        else " [{}, {}]".format(*(format(scale * bound, form) for bound in estimate.interval))
-    )
-    return f"{scale * estimate.value:{form}}{bounds}"
+    return percent_text(Estimate(row.success.value, row.success_interval))
 
 
 def columns(rows: Sequence[Row]) -> dict[str, list[str | float]]:
@@ -198,10 +191,10 @@ def metrics(row: Row) -> dict[str, float]:
         "eval/success_rate": row.success.value,
         "eval/success_rate_low": low,
         "eval/success_rate_high": high,
-        **_named("eval/distance_m", row.distance_m),
-        **_named("sweep/middle_half_m", row.middle_m),
-        **_named("sweep/success_difference", row.success_difference),
-        **_named("sweep/distance_difference_m", row.distance_difference_m),
+        **estimate_metrics("eval/distance_m", row.distance_m),
+        **estimate_metrics("sweep/middle_half_m", row.middle_m),
+        **estimate_metrics("sweep/success_difference", row.success_difference),
+        **estimate_metrics("sweep/distance_difference_m", row.distance_difference_m),
     }
     if row.events_per_step > 0.0:
         figures |= {"sim/events_per_step": row.events_per_step, "sim/dropped_events": float(row.dropped)}
@@ -232,10 +225,3 @@ def axis_curves(axis: str, numbers: Mapping[str, float], rows: Sequence[Row]) ->
                 f"sweep/{axis}{unit}_distance_m": {x: row.distance_m.value for x, row in points.items()},
             }
     return {}
-
-
-def _named(name: str, estimate: Estimate | None) -> dict[str, float]:
-    if estimate is None:
-        return {}
-    bounds = zip((f"{name}_low", f"{name}_high"), estimate.interval or (), strict=False)
-    return {name: estimate.value, **dict(bounds)}

@@ -138,7 +138,7 @@ def plan(config: Config, entries: Sequence[Entry]) -> Sweep:
     Raises:
         ConfigError: If a policy's own sensor and a changed setting exclude each other.
     """
-    configured = config.env_config(scene=config.sweep.scene, split="eval")
+    configured = dataclasses.replace(config.env, scene=config.sweep.scene, split="eval")
     axes: dict[str, dict[str, dict[str, Any]]] = {NOMINAL: {config.sweep.scene: {}}}
     for axis, settings in config.sweep.axes.items():
         axes[axis] = {text(next(iter(point.values()))): point for point in axis_points(settings)}

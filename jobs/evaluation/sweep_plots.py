@@ -7,26 +7,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import GRID, INK, MUTED
+from jobs.analysis.plots import INK, MUTED, panel_grid, style_of, tidy
 from jobs.analysis.statistics import Interval
 from jobs.config.conditions import axis_numbers, moving_settings
 from jobs.evaluation.group_stats import Row
+from jobs.rollout.agents import BOUNDS
 
-# Okabe and Ito's colours, told apart by the colour-blind too, and a marker each; the yellow is left out.
-STYLES = {
-    "bytestream": ("#0072b2", "o"),
-    "bytestream_xy": ("#56b4e9", "s"),
-    "event_columns": ("#009e73", "^"),
-    "event_set": ("#000000", "D"),
-    "event_image": ("#d55e00", "v"),
-    "event_image_vae": ("#e69f00", "P"),
-    "rgb": ("#cc79a7", "X"),
-    "bytestream_1500k": ("#7a5195", "<"),
-    "bytestream_paper": ("#5b6b1f", "h"),
-    "bytestream_robust": ("#b0003a", ">"),
-}
-BOUNDS = {"oracle": ("#6b7280", "."), "straight": ("#9ca3af", "."), "random": ("#c4c9d1", ".")}
-OTHERS = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
 SCALES = {
     "env.control_hz": ("Control rate [Hz]", "log"),
     "env.speed_mps": ("Speed [m/s]", "linear"),
@@ -43,11 +29,6 @@ MAX_BANDS = 4  # of groups in one panel; more would cover each other, and become
 DODGE = 0.012  # between such points, as a share of the axis
 MAX_ACROSS = 2  # panels of the collision map side by side
 Measure = Callable[[Row], tuple[float, Interval]]
-
-
-def style_of(group: str) -> tuple[str, str]:
-    """Colour and marker of a group, the same in every figure."""
-    return {**STYLES, **BOUNDS}.get(group) or OTHERS[sum(group.encode()) % len(OTHERS)]
 
 
 def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Sequence[Row]) -> Figure:
@@ -74,9 +55,8 @@ def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Seq
         else:
             _draw_lines(panel, groups, rows, measure, scale)
         panel.set_xlabel(label if len(moving) < 2 else f"{label}, and what changes with it")
-        panel.grid(axis="y", color=GRID)
+        tidy(panel, "y")
         panel.set_axisbelow(True)
-        panel.spines[["top", "right"]].set_visible(False)
     panels[0].set(ylim=(0, 103), ylabel="Flights that reached the goal [%]")
     panels[1].set(ylim=(0, 103), ylabel="Mean distance without collision [m]")
     handles, names = panels[0].get_legend_handles_labels()
@@ -180,11 +160,8 @@ def collision_figure(
         length_m: Where the goal line is [m].
         half_width_m: Where the walls are [m].
     """
-    across = min(MAX_ACROSS, len(ends))
-    down = -(-len(ends) // across)
-    figure = Figure(figsize=(6.6 * across, 0.7 + 2.3 * down), layout="constrained")
-    grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    for panel, (group, parts) in zip(grid.flat, ends.items(), strict=False):
+    figure, panels = panel_grid(len(ends), MAX_ACROSS, (6.6, 2.3), (0.0, 0.7), sharex=True, sharey=True)
+    for panel, (group, parts) in zip(panels, ends.items(), strict=True):
         said = []
         colour = style_of(group)[0]
         looks: tuple[dict[str, Any], ...] = (
@@ -202,8 +179,6 @@ def collision_figure(
         panel.set_title(f"{group}: contacts {', '.join(said)}", loc="left", fontsize=9, color=INK)
         panel.spines[:].set_visible(False)
         panel.tick_params(labelsize=8)
-    for panel in grid.flat[len(ends) :]:
-        panel.set_visible(False)
     figure.supxlabel(
         "y, along the corridor [m]; large dots: nothing changed, small dots: all changes", fontsize=8
     )

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table
 
 from envs.scene import make_scene
-from jobs.analysis.tables import markdown_table, show
+from jobs.analysis.plots import style_of
+from jobs.analysis.tables import markdown_table, show_table
 from jobs.config.conditions import axis_numbers
 from jobs.config.config import Config
 from jobs.evaluation.evaluate import VIEW_COLUMNS, film
@@ -28,7 +27,7 @@ from jobs.evaluation.group_stats import (
     summarise_group,
 )
 from jobs.evaluation.sweep_plan import NOMINAL, Sweep
-from jobs.evaluation.sweep_plots import axis_figure, collision_figure, style_of
+from jobs.evaluation.sweep_plots import axis_figure, collision_figure
 from jobs.rollout.drift import mean_figures
 from jobs.rollout.episodes import EPISODE, check_sensor, write_episodes
 from jobs.rollout.tasks import Cell, accuracy_file
@@ -36,7 +35,7 @@ from jobs.run.files import read_json, write_atomic, write_json
 from jobs.run.folder import Run
 from jobs.run.progress import console
 from jobs.run.provenance import command, git_commit, today
-from jobs.tracking.child_runs import Child, write_children
+from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.pages import COLOUR, NOTE, chart_view, table_view
 from jobs.tracking.tracker import Tracker
 
@@ -124,7 +123,7 @@ def write_figures(
         if axis != NOMINAL and own:
             paths.append(place / f"{axis}.png")
             axis_figure(axis, points, own).savefig(paths[-1], dpi=120)
-    scene = make_scene(config.sweep.scene, np.random.default_rng(0), **config.env["layout"])
+    scene = make_scene(config.sweep.scene, np.random.default_rng(0), **config.env.layout)
     ends = {group: contacts(sweep, group, episodes) for group in sweep.groups}
     paths.append(place / "contacts.png")
     collision_figure(ends, scene.length_m, scene.width_m / 2).savefig(paths[-1], dpi=120)
@@ -208,12 +207,7 @@ def write_tables(
     head, lines = matrix(rows, sweep.conditions, list(sweep.groups), gaps)
     reasons = sorted({(*cell.label, cell.entry.group, training_text(cell), failed[cell.key])
                       for cell in sweep.cells if cell.key in failed})  # fmt: skip
-    shown = Table(title=TITLE, title_justify="left")
-    for name in head:
-        shown.add_column(escape(name), overflow="fold")
-    for line in lines:
-        shown.add_row(*map(escape, line))
-    show(shown)
+    show_table(TITLE, head, lines, len(head))
     text = f"{TITLE}.\n\n{markdown_table(head, lines, 2)}"
     if reasons:
         text += (
@@ -262,20 +256,20 @@ def track_rows(
             [kept[cell.key] for cell in cells if cell.key in kept]
         )
         children.append(
-            Child(
+            ChildRun(
                 f"{name_of(row.condition)} {row.group}",
                 params | sweep.axes[axis][value],
                 tags,
                 metrics(row) | simulated,
             )
         )
-    write_children(tracker, "condition", children)
+    write_child_runs(tracker, "condition", children)
     along = {row.group: group_curves(sweep, row.group, rows) for row in rows}
-    write_children(
+    write_child_runs(
         tracker,
         "group",
         [
-            Child(group, {"group": group}, {NOTE: CURVES_NOTE, COLOUR: style_of(group)[0]}, {}, curves)
+            ChildRun(group, {"group": group}, {NOTE: CURVES_NOTE, COLOUR: style_of(group)[0]}, {}, curves)
             for group, curves in along.items()
         ],
     )

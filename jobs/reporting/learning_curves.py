@@ -1,4 +1,4 @@
-"""Learning curves that ship with the policies: as a table, and as one number for each training."""
+"""Learning curves of the published policies: as a table, and as one number for each training."""
 
 import csv
 import io
@@ -15,9 +15,9 @@ COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
 
 
 def read_curves(folder: Path) -> dict[tuple[str, int], Curve]:
-    """Experiment and seed -> curve, of `curves.csv` in `folder`, as far as their policies are there too."""
+    """Read `curves.csv` in `folder`: group and seed -> curve, for policies that are in the folder too."""
     file = folder / "curves.csv"
-    rows = csv.DictReader(io.StringIO(file.read_text() if file.is_file() else ""))
+    rows = csv.DictReader(file.read_text().splitlines() if file.is_file() else [])
     found: dict[tuple[str, int], list[list[float]]] = defaultdict(list)
     for row in rows:
         found[row["exp"], int(row["seed"])].append([float(row[name]) for name in COLUMNS[2:]])
@@ -42,7 +42,7 @@ def as_csv(curves: Sequence[Curve]) -> str:
 def mean_success(curve: Curve, env_steps: int) -> float:
     """Success rate, 0..1, averaged over a training's first steps: high if it learns early and well.
 
-    Between its points a curve is straight; it begins with none at step 0.
+    A curve is linear between its points, and 0 at step 0.
 
     Args:
         curve: With a point at `env_steps` or later.

@@ -1,4 +1,4 @@
-"""What the paper says of its policies, and what a sweep found of it, by one stated rule."""
+"""The paper's claims about its policies, tested on a sweep with the rule of templates/results.md.j2."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
@@ -8,19 +8,10 @@ import numpy as np
 from jobs.analysis.statistics import Estimate, mean_difference, paired_difference
 from jobs.evaluation.group_stats import Condition, Flights, table_of
 
-RULE = (
-    "A claim is tested on the paper's own values, by the difference of two groups on the same corridors "
-    "with its paired 95 % bootstrap interval. It *holds* if the interval of the mean over all conditions "
-    "lies above 0 and no single condition's lies below; it *holds partly* if that interval or a single "
-    "condition's lies above 0; it *does not hold* if the interval of the mean excludes a gain of 10 points "
-    "of success, or of 5 m; else it is *undecided*: more flights or trainings would tell. How fast a group "
-    "learns is its success averaged over the first 500,000 steps of training "
-    "(`models/pretrained/curves.csv`), and the interval Welch's over trainings."
-)
-GAIN = {"success": 0.1, "distance_m": 5.0}  # the least that a claim has to mean
+GAIN = {"success": 0.1, "distance_m": 5.0}  # the smallest gain that a claim has to mean
 Verdict = Literal["holds", "holds partly", "does not hold", "undecided", "not tested"]
 Measure = Literal["success", "distance_m"]
-Find = Callable[[Condition, str], Flights]  # flights of a group under a condition; empty if there are none
+Find = Callable[[Condition, str], Flights]  # episodes of a group under a condition; empty if there are none
 
 
 class Claim(NamedTuple):
@@ -43,7 +34,7 @@ class Claim(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """What came of a claim: the verdict, the mean difference, and that of each condition."""
+    """The verdict on a claim, the mean difference, and the difference of each condition."""
 
     verdict: Verdict
     overall: Estimate | None
@@ -91,21 +82,21 @@ CLAIMS = (
     Claim(BEST, "F.1", "bytestream_xy", "bytestream", "distance_m", (("world", "dynamic"),)),
     Claim(VAE, "D.1.2", "event_image", "event_image_vae", "success", (("world", "poles_eval"),)),
 )
-# Said by learning curves, and by no condition of a sweep.
+# Tested on learning curves, and on no condition of a sweep.
 LEARNT = tuple(
     Claim(FASTER, "abstract", ours, "event_image", "success", ()) for ours in ("bytestream", "bytestream_xy")
 )
 
 
 def judge(claim: Claim, find: Find) -> Finding:
-    """Test a claim by `RULE` on those of its conditions that both groups flew.
+    """Test a claim on those of its conditions under which both groups were evaluated.
 
     Args:
         claim: What is said.
-        find: Looks up flights.
+        find: Looks up episodes.
     """
-    flown = {at: (find(at, claim.ours), find(at, claim.theirs)) for at in claim.conditions}
-    both = {at: pair for at, pair in flown.items() if all(pair)}
+    pairs = {at: (find(at, claim.ours), find(at, claim.theirs)) for at in claim.conditions}
+    both = {at: pair for at, pair in pairs.items() if all(pair)}
     if not both:
         return Finding("not tested", None, {})
     ours, theirs = ([table_of(pair[side], claim.measure) for pair in both.values()] for side in (0, 1))
@@ -117,7 +108,7 @@ def judge(claim: Claim, find: Find) -> Finding:
 
 
 def judge_learning(claim: Claim, trainings: Mapping[str, Sequence[float]]) -> Finding:
-    """Test a claim of `LEARNT` by `RULE`.
+    """Test a claim of `LEARNT`.
 
     Args:
         claim: What is said.

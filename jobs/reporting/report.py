@@ -1,4 +1,4 @@
-"""Write docs/results.md from a flown sweep, and docs/trade.md from a trade; what a sweep says of the paper.
+"""Write docs/results.md from a finished sweep, and docs/trade.md from a finished trade.
 
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
@@ -6,39 +6,30 @@ docs/images/trade.png of the newest trade; with `resume` of what that run folder
 """
 
 import csv
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from PIL import Image
 
 from jobs.analysis.statistics import two_stage_estimate
-from jobs.analysis.tables import markdown_table
+from jobs.analysis.tables import estimate_text, markdown_table
 from jobs.config.config import Config, ConfigError
-from jobs.evaluation.group_stats import (
-    LABELS,
-    Condition,
-    Flights,
-    details,
-    estimate_text,
-    matrix,
-    summarise_group,
-    table_of,
-)
+from jobs.evaluation.group_stats import LABELS, Condition, details, matrix, summarise_group, table_of
 from jobs.evaluation.sweep_plan import NOMINAL, PRETRAINED
 from jobs.reporting.learning_curves import mean_success, read_curves
-from jobs.reporting.paper_claims import CLAIMS, LEARNT, RULE, Claim, Finding, judge, judge_learning
+from jobs.reporting.paper_claims import CLAIMS, GAIN, LEARNT, Claim, Finding, judge, judge_learning
 from jobs.rollout.episodes import EPISODE
-from jobs.run.files import write_atomic
+from jobs.run.files import read_json, write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
+from jobs.run.templates import render
 
-Flown = dict[tuple[Condition, str], dict[int | None, np.ndarray]]
-COLOURS = 128  # of a copied figure
-PER_CENT = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
+TEMPLATE = Path(__file__).parent / "templates" / "results.md.j2"
+MAX_COLOURS = 128  # of a copied plot
+UNITS = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
 TITLES = {
     "control_hz": "Control rate",
     "control_hz_dense": "Control rate among more poles",
@@ -51,17 +42,46 @@ TITLES = {
     "memory_400hz": "Memory of the pixels at 400 Hz",
     "speed": "Speed",
     "worst": "Several at once",
-    "contacts": "Where flights end in contact",
+    "contacts": "Where episodes end in contact",
 }
+SweptEpisodes = dict[
+    tuple[Condition, str], dict[int | None, np.ndarray]
+]  # of each group under each condition
+
+
+class Exactness(TypedDict):
+    """How exact the events of a condition were: the error that was asked, and what was achieved."""
+
+    condition: tuple[str, str]
+    asked: float
+    event_error: float
+    renders_per_step: float
+
+
+class SweepFacts(TypedDict):
+    """What made a sweep, as its about.json says it; see `jobs.evaluation.sweep_report.about`."""
+
+    run: str
+    identity: str
+    command: str
+    flown_at: list[str]
+    date: str
+    scene: str
+    trials: int
+    reference: str
+    action: str
+    groups: dict[str, list[int | None]]
+    axes: dict[str, dict[str, object]]
+    exactness: list[Exactness]
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Write what the newest sweep and the newest trade found, or those of the run in `resume`, into docs/.
+    """Write the results of the newest sweep and trade, or of those in the run folder `resume`, into docs/.
 
     Raises:
         ConfigError: If there is neither.
     """
-    # In this order: one shows the other's figure.
+    # In this order: the page of a sweep shows the plot of the trade.
     writers: dict[str, Callable[[Path, Path], Path]] = {"trade": write_trade, "sweep": write_results}
     found = {name: find_study(config, name) for name in writers}
     if not any(found.values()):
@@ -76,7 +96,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def find_study(config: Config, name: str) -> Path | None:
-    """The folder `name` of the run folder in `resume`, else the newest of all runs; None: there is none.
+    """The folder `name` in the run folder `resume`, else the newest of all run folders; None: there is none.
 
     Args:
         config: The experiment.
@@ -89,11 +109,11 @@ def find_study(config: Config, name: str) -> Path | None:
 
 
 def write_trade(trade: Path, docs: Path) -> Path:
-    """Copy the page of a trade and its figure.
+    """Copy the page of a trade and its plot.
 
     Args:
         trade: The folder that the job has left in its run folder.
-        docs: Where trade.md goes, its picture into `images`.
+        docs: Where trade.md goes, its plot into `images`.
 
     Returns:
         The file.
@@ -105,47 +125,53 @@ def write_trade(trade: Path, docs: Path) -> Path:
 
 
 def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Path:
-    """Write results.md and copy the figures.
+    """Write results.md and copy the plots.
 
     Args:
         sweep: The folder that a sweep has left in its run folder.
-        docs: Where results.md goes, its pictures into `images`.
-        pretrained: Where the learning curves of shipped policies are.
+        docs: Where results.md goes, its plots into `images`.
+        pretrained: Where the learning curves of published policies are.
 
     Returns:
         The file.
     """
-    about = json.loads((sweep / "about.json").read_text())
-    flown = read_flights(sweep / "episodes.csv")
-    pictures = {path.stem: path for path in sorted(sweep.glob("*.png"))}
-    shown = [name for name in (*about["axes"], "contacts") if name in pictures]
+    about: SweepFacts = read_json(sweep / "about.json")
+    plots = [name for name in (*about["axes"], "contacts") if (sweep / f"{name}.png").is_file()]
     (docs / "images").mkdir(parents=True, exist_ok=True)
-    for name in shown:
-        copy_small(pictures[name], docs / "images" / f"results_{name}.png")
-    parts = [
-        *opening(about),
-        *breaks(about, flown),
-        *claims(flown, learnt(pretrained)),
-        *figures(about, shown),
-        *cost(docs),
-        *tables(about, flown),
-        *exactness(about),
-    ]
-    text = "\n".join(parts)
+    for name in plots:
+        copy_small(sweep / f"{name}.png", docs / "images" / f"results_{name}.png")
+    episodes = read_sweep_episodes(sweep / "episodes.csv")
+    success, every = estimate_tables(about, episodes)
+    text = render(
+        TEMPLATE,
+        about=about,
+        commits=", ".join(commit[:7] for commit in about["flown_at"]),
+        groups=", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
+        breaks=breaks_table(about, episodes),
+        claims=claims_table(episodes, learning_success(pretrained)),
+        gain=GAIN,
+        compared_steps=COMPARED_STEPS,
+        plots=[(name, TITLES.get(name, name)) for name in plots],
+        trade=(docs / "images" / "trade.png").is_file(),
+        success=success,
+        details=every,
+        exactness=exactness_table(about.get("exactness", [])),
+    )
     write_atomic(docs / "results.md", text)
     return docs / "results.md"
 
 
 def copy_small(picture: Path, target: Path) -> None:
-    """A figure in `COLOURS` colours, a third of the size: enough for lines and print."""
+    """Copy a plot in `MAX_COLOURS` colours, at a third of the size: enough for lines and print."""
     with Image.open(picture) as whole:
-        small = whole.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        colours = Image.Quantize.MAXCOVERAGE
+        small = whole.convert("RGB").quantize(MAX_COLOURS, colours, dither=Image.Dither.NONE)
     small.save(target, optimize=True)
 
 
-def read_flights(file: Path) -> Flown:
+def read_sweep_episodes(file: Path) -> SweptEpisodes:
     """EPISODE by condition, group and training seed, from the sweep's episodes.csv."""
-    rows: dict[tuple[Condition, str], dict[int | None, list[tuple[Any, ...]]]] = {}
+    rows: dict[tuple[Condition, str], dict[int | None, list[tuple[object, ...]]]] = {}
     with file.open() as stream:
         for row in csv.DictReader(stream):
             axis, value, group, training = (row[name] for name in LABELS)
@@ -154,48 +180,23 @@ def read_flights(file: Path) -> Flown:
     return {key: {seed: np.array(own, EPISODE) for seed, own in parts.items()} for key, parts in rows.items()}
 
 
-def _episode(row: Mapping[str, str]) -> tuple[Any, ...]:
-    kinds: dict[str, Callable[[str], Any]] = {"b": "True".__eq__, "i": int, "f": float}
+def _episode(row: Mapping[str, str]) -> tuple[object, ...]:
+    kinds: dict[str, Callable[[str], object]] = {"b": "True".__eq__, "i": int, "f": float}
     return tuple(kinds[EPISODE[name].kind](row[name]) for name in EPISODE.names or ())
 
 
-def opening(about: Mapping[str, Any]) -> list[str]:
-    """What was flown, by which command, at which commit."""
-    groups = ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items())
-    return [
-        "# Results",
-        "",
-        f"Made on {about['date']} by `{about['command']}`, then `python -m platform.launch +exp=report`; "
-        f"run `{about['run']}`, sweep `{about['identity']}`, flown at commit {commits(about)}. Films of "
-        "typical contacts, at most two of each group, are in the sweep's run in MLflow, under "
-        "`sweep/crashes`.",
-        "",
-        f"Groups, with their number of trainings: {groups}. Each training flies the same {about['trials']} "
-        f"held-out corridors of `{about['scene']}` under each condition; actions are {about['action']}. "
-        "Intervals are 95 %. Those of distances and differences come from a two-stage bootstrap (trainings, "
-        "then corridors); those of success also hold Wilson's interval of all flights. With few trainings "
-        "they are rather too narrow. The middle half is the interquartile mean.",
-        "",
-    ]
-
-
-def commits(about: Mapping[str, Any]) -> str:
-    """Where the code stood that flew, shortened as git does."""
-    return ", ".join(commit[:7] for commit in about["flown_at"])
-
-
-def breaks(about: Mapping[str, Any], flown: Flown) -> list[str]:
-    """What takes success from each trained group, against itself where nothing is changed."""
-    (usual,) = [(NOMINAL, value) for value in about["axes"][NOMINAL]]
+def breaks_table(about: SweepFacts, episodes: SweptEpisodes) -> str:
+    """The conditions that take success from each trained group, against itself with nothing changed."""
+    (nominal,) = [(NOMINAL, value) for value in about["axes"][NOMINAL]]
     lines = []
     for group in about["groups"]:
-        own = flown.get((usual, group), {None: np.empty(0, EPISODE)})
-        if None in own:  # a bound, or not flown
+        own = episodes.get((nominal, group), {None: np.empty(0, EPISODE)})
+        if None in own:  # a baseline, or not evaluated
             continue
         before = table_of(own, "success")
         lost = {}
-        for (condition, other), trainings in flown.items():
-            if other == group and condition != usual and trainings.keys() == own.keys():
+        for (condition, other), trainings in episodes.items():
+            if other == group and condition != nominal and trainings.keys() == own.keys():
                 change = table_of(trainings, "success") - before
                 found = two_stage_estimate(change, np.random.default_rng(0))
                 if found.interval is not None and found.interval[1] < 0:
@@ -203,27 +204,12 @@ def breaks(about: Mapping[str, Any], flown: Flown) -> list[str]:
         worst = sorted(lost, key=lambda condition: lost[condition].value)
         texts = [f"{axis} {value}: {estimate_text(lost[axis, value], 100, '+.0f')}" for axis, value in worst]
         lines.append((f"`{group}`", f"{100 * before.mean():.0f}", "; ".join(texts) or "none is certain"))
-    note = (
-        "Conditions under which a group succeeds less often than the same trainings on the same corridors "
-        "with nothing changed, by a difference whose 95 % interval lies below 0, in points, worst first. "
-        "What is missing here may break a policy too: few flights show only large losses. Of all these "
-        "tests one in forty would say so by chance."
-    )
     head = ("Group", "Nothing changed [%]", "Breaks under")
-    return ["## What breaks each policy", "", note, "", markdown_table(head, lines, len(head)), ""]
+    return markdown_table(head, lines, len(head))
 
 
-def cost(docs: Path) -> list[str]:
-    """The figure of the trade, where one was made."""
-    if not (docs / "images" / "trade.png").is_file():
-        return []
-    title = "Success against cost"
-    made = "(`python -m platform.launch +exp=trade`; every setting, run and commit: [trade.md](trade.md))"
-    return [f"## {title}", "", f"![{title}](images/trade.png)", "", made, ""]
-
-
-def learnt(pretrained: Path) -> dict[str, list[float]]:
-    """Group -> success averaged over the compared steps, of each shipped training that took so many."""
+def learning_success(pretrained: Path) -> dict[str, list[float]]:
+    """Group -> success averaged over the compared steps, of each published training that took so many."""
     found: dict[str, list[float]] = {}
     for curve in read_curves(pretrained).values():
         if curve.env_steps[-1] >= COMPARED_STEPS:
@@ -231,84 +217,60 @@ def learnt(pretrained: Path) -> dict[str, list[float]]:
     return found
 
 
-def claims(flown: Flown, trainings: Mapping[str, Sequence[float]]) -> list[str]:
+def claims_table(episodes: SweptEpisodes, trainings: Mapping[str, Sequence[float]]) -> str:
     """The paper's claims with our findings."""
-
-    def find(condition: Condition, group: str) -> Flights:
-        return flown.get((condition, group), {})
-
-    lines = [_claim_line(claim, judge(claim, find)) for claim in CLAIMS]
+    lines = [
+        _claim_line(claim, judge(claim, lambda condition, group: episodes.get((condition, group), {})))
+        for claim in CLAIMS
+    ]
     lines += [_claim_line(claim, judge_learning(claim, trainings)) for claim in LEARNT]
     head = ("The paper says of", "Source", "Against", "Finding", "Difference, all conditions", "By condition")
-    return ["## The paper's claims", "", RULE, "", markdown_table(head, lines, len(head))]
+    return markdown_table(head, lines, len(head))
 
 
 def _claim_line(claim: Claim, finding: Finding) -> tuple[str, ...]:
-    scale, form, unit = PER_CENT[claim.measure]
+    scale, form, unit = UNITS[claim.measure]
+    overall = f"{estimate_text(finding.overall, scale, form)}{unit}"
     each = [
         f"{axis} {value}: {estimate_text(found, scale, form)}"
         for (axis, value), found in finding.conditions.items()
     ]
-    overall = (
-        f"{estimate_text(finding.overall, scale, form)}{unit}"
-        if finding.overall
-        else "one of them is missing"
-    )
     return (
         f"`{claim.ours}`: {claim.text}",
         claim.source,
         f"`{claim.theirs}`",
         finding.verdict,
-        overall,
+        overall if finding.overall else "one of them is missing",
         "; ".join(each),
     )
 
 
-def tables(about: Mapping[str, Any], flown: Flown) -> list[str]:
+def estimate_tables(about: SweepFacts, episodes: SweptEpisodes) -> tuple[str, str]:
     """Success of all groups under all conditions, and every estimate."""
     conditions = [(axis, value) for axis, points in about["axes"].items() for value in points]
     groups, reference = list(about["groups"]), about["reference"]
     rows = [
         summarise_group(
-            at, group, flown[at, group], flown.get((at, reference)) if group != reference else None
+            at, group, episodes[at, group], episodes.get((at, reference)) if group != reference else None
         )
         for at in conditions
         for group in groups
-        if (at, group) in flown
+        if (at, group) in episodes
     ]
     head, lines = matrix(rows, conditions, groups, {})
-    success = ["## Success [%]", "", markdown_table(head, lines, 2)]
-    note = (
-        f"Differences are taken against `{reference}` on the same corridors (success in points of per cent)."
-    )
-    return [*success, "## Every estimate", "", note, "", details(rows, reference)]
+    return markdown_table(head, lines, 2), details(rows, reference)
 
 
-def exactness(about: Mapping[str, Any]) -> list[str]:
-    """How exact the events of each condition were: asked, achieved, and what it took."""
+def exactness_table(found: Sequence[Exactness]) -> str:
+    """How exact the events of each condition were: asked, achieved, and what it took; "" if none is known."""
     lines = [
         (
-            *found["condition"],
-            f"{100 * found['asked']:g}",
-            f"{100 * found['event_error']:.1f}",
-            f"{found['renders_per_step']:.0f}",
+            *one["condition"],
+            f"{100 * one['asked']:g}",
+            f"{100 * one['event_error']:.1f}",
+            f"{one['renders_per_step']:.0f}",
         )
-        for found in about.get("exactness", [])
+        for one in found
     ]
-    note = (
-        "Share of events without a partner in the converged simulation (same pixel, same polarity, within a "
-        "twentieth of a control step), of a sensor without faults. The paper's cameras, `frame` and "
-        "`legacy`, see one frame a step: their error is the model's."
-    )
     head = ("Axis", "Value", "Event error asked [%]", "achieved [%]", "Renders a step")
-    return ["## How exact", "", note, "", markdown_table(head, lines, 2)] if lines else []
-
-
-def figures(about: Mapping[str, Any], names: list[str]) -> list[str]:
-    """Each picture with what made it."""
-    made = f"`{about['command']}`, run `{about['run']}`, commit {commits(about)}, {about['date']}"
-    lines = []
-    for name in names:
-        title = TITLES.get(name, name)
-        lines += [f"## {title}", "", f"![{title}](images/results_{name}.png)", "", f"({made})", ""]
-    return lines
+    return markdown_table(head, lines, 2) if lines else ""

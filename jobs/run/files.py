@@ -1,22 +1,24 @@
 """Files that are written whole or not at all: text, bytes and JSON."""
 
+import contextlib
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 
 class RunError(RuntimeError):
-    """A run folder that cannot be worked in; the message says why in one line, and what to do."""
+    """A run folder cannot be used; the message says why in one line, and what to do."""
 
 
-def write_json(path: Path, values: Any) -> None:
+def write_json(path: Path, values: object) -> None:
     """Write plain containers as JSON, whole or not at all; NaN and infinity are refused."""
     write_atomic(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:
-    """What `write_json` wrote.
+    """Read what `write_json` wrote.
 
     Raises:
         RunError: The file is damaged.
@@ -31,16 +33,21 @@ def read_json(path: Path) -> Any:
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader sees the old content or the new one, never a part.
 
-    On the disk too: the content is there before its name, and a full disk leaves the old file.
+    This holds on the disk too: the content is stored before its name, and a full disk leaves the old file.
     """
+    with replaced(path) as part, part.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yield a path to write to; the file takes its final name when the block ends without an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
+        yield part
         part.replace(path)
-    except OSError:
+    finally:
         part.unlink(missing_ok=True)
-        raise

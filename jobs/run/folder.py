@@ -1,35 +1,43 @@
 """Run folders: where one experiment keeps everything it made, and how it is found again.
 
 A folder is named after the configuration that fills it, so that the same command finds
-the same folder and continues there. Each finished stage leaves a marker with its figures.
+the same folder and continues there. Each finished stage leaves a marker with its results.
 """
 
-import contextlib
 import dataclasses
-import fcntl
 import json
-import os
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
-from jobs.run.files import RunError, read_json, write_atomic, write_json
+from jobs.run.files import read_json, write_atomic, write_json
 from jobs.run.provenance import provenance
 
-# Where a run is computed and written down, and how its policy is flown afterwards, does not
-# change what is trained.
-UNNAMED = (
+# Sections that do not change what is trained: where a run is computed and recorded, and what is
+# done with its policy afterwards.
+NOT_IN_RUN_NAME = (
     "job", "resume", "runs_dir", "cluster", "tracking",
     "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe",
 )  # fmt: skip
-# Settings that older run folders lack, with the value that does what they did.
-LATER: dict[str, dict[str, Any]] = {"collect": {"recordings": []}, "train": {"conditions": [{}]}}
-COMPARED_STEPS = 500_000  # the paper's; of every training that is compared with others
+# Settings that older run folders lack, each with the value that does what was done before it existed.
+ADDED_SETTINGS: dict[str, dict[str, object]] = {
+    "collect": {"recordings": []},
+    "train": {"conditions": [{}]},
+}
+RENAMED_MODELS = {  # in run folders of older versions -> now
+    "brp_full": "bytestream",
+    "brp_xy": "bytestream_xy",
+    "eip": "event_image",
+    "eivae": "event_image_vae",
+}
+COMPARED_STEPS = 500_000  # length of the trainings that are compared with each other; the paper's
+
+Results = TypeVar("Results", bound=Mapping[str, object])
 
 
 @dataclass(frozen=True)
@@ -56,20 +64,20 @@ class Run:
 
     @property
     def policy(self) -> Path:
-        """The trained policy, ready to fly."""
+        """The trained policy, as `models.policy.load_policy` reads it."""
         return self.path / "policy"
 
     @property
     def evaluation(self) -> Path:
-        """Episodes, tables, figures and videos."""
+        """Episodes, tables, plots and videos."""
         return self.path / "eval"
 
 
 def open_run(config: Config) -> Run:
-    """The folder of a configuration: the one it names, the one to resume, or a new one.
+    """The run folder of a configuration, with the configuration written to it if it is new.
 
     Raises:
-        ConfigError: If `resume` names no run folder.
+        ConfigError: If `resume` names no run folder, or one that this version cannot continue.
     """
     run = locate_run(config)
     if not (run.path / "config.json").exists():
@@ -80,87 +88,78 @@ def open_run(config: Config) -> Run:
 
 
 def locate_run(config: Config) -> Run:
-    """The same as `open_run`, without making anything: for jobs that may refuse to begin."""
+    """As `open_run`, but nothing is written: for jobs that check more before they start."""
     if config.resume is not None:
         return reopen(Path(config.resume), config)
     return Run(Path(config.runs_dir).resolve() / run_name(config), config)
 
 
 def reopen(path: Path, config: Config) -> Run:
-    """An existing run folder with its own stored configuration; only `UNNAMED` is taken from `config`."""
+    """An existing run folder with its stored configuration; `NOT_IN_RUN_NAME` is taken from `config`.
+
+    Raises:
+        ConfigError: If `path` is no run folder, or was made with a model that has another name now.
+    """
     stored = path.resolve() / "config.json"
     if not stored.is_file():
         raise ConfigError(
             f"resume: must be a run folder (one that holds config.json), got {str(path)!r}; "
             f"run folders are in {str(Path(config.runs_dir).resolve())!r}"
         )
-    here = {name: value for name, value in as_dict(config).items() if name in UNNAMED}
+    here = {name: value for name, value in as_dict(config).items() if name in NOT_IN_RUN_NAME}
     values = read_json(stored)
-    values |= {section: {**late, **values[section]} for section, late in LATER.items()}
+    old = values["model"]["name"]
+    if old in RENAMED_MODELS:
+        raise ConfigError(
+            f"resume: {str(path)!r} was made with model {old}, which is called {RENAMED_MODELS[old]} now and "
+            "cannot be continued; train it anew, or check out the commit that its stages/ name"
+        )
+    values |= {section: {**added, **values[section]} for section, added in ADDED_SETTINGS.items()}
     run = parse({**values, **here})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
-
-
-@contextlib.contextmanager
-def holding(run: Run) -> Iterator[None]:
-    """Work in a run folder as the only process: two would do everything twice, and mix their results.
-
-    A process that is killed lets go.
-
-    Raises:
-        RunError: Another process holds the folder.
-    """
-    run.path.mkdir(parents=True, exist_ok=True)
-    with (run.path / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            who = file.read() or "another process"
-            raise RunError(f"{run.path}: {who} works there; wait until it has ended") from None
-        file.truncate(0)
-        file.write(f"process {os.getpid()} of {os.uname().nodename}")
-        file.flush()
-        yield
 
 
 def run_name(config: Config) -> str:
     """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained.
 
-    A setting of `LATER` counts only where it changes something, so that older folders keep their names.
+    `ADDED_SETTINGS` count only where they change something, so that older folders keep their names.
     """
-    settings = {name: value for name, value in as_dict(config).items() if name not in UNNAMED}
-    for section, late in LATER.items():
-        values = settings[section].items()
-        settings[section] = {name: value for name, value in values if late.get(name, ...) != value}
+    settings = {name: value for name, value in as_dict(config).items() if name not in NOT_IN_RUN_NAME}
+    for section, added in ADDED_SETTINGS.items():
+        values = dataclasses.asdict(getattr(config, section)).items()
+        settings[section] = {name: value for name, value in values if added.get(name, ...) != value}
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
 
 
 def group_name(exp: str, env_steps: int) -> str:
-    """What a training is one of: its experiment, with its length if that is not the compared one."""
+    """The group that a training belongs to: its experiment, and its length unless it is `COMPARED_STEPS`."""
     return exp + ("" if env_steps == COMPARED_STEPS else f"_{env_steps // 1000}k")
 
 
 def finished(run: Run, stage: str) -> dict[str, Any] | None:
-    """The figures of a finished stage, or None while it is not finished."""
+    """The results of a finished stage, or None while it is not finished."""
     marker = run.path / "stages" / f"{stage}.json"
     return read_json(marker)["figures"] if marker.is_file() else None
 
 
-def finish(run: Run, stage: str, figures: dict[str, Any]) -> dict[str, Any]:
-    """Mark a stage as finished, with its figures; return them."""
-    write_json(run.path / "stages" / f"{stage}.json", {"figures": figures, **provenance()})
-    return figures
+def finish(run: Run, stage: str, results: Results) -> Results:
+    """Mark a stage as finished, with its results; return them.
+
+    Raises:
+        ValueError: If a result is NaN or infinite.
+    """
+    write_json(run.path / "stages" / f"{stage}.json", {"figures": results, **provenance()})
+    return results
 
 
 def latest_policies(runs_dir: str | Path) -> dict[str, Path]:
-    """The policy folder that was finished last of each kind: name of the model -> folder."""
+    """The policy folder of each kind that was finished last: name of the model -> folder."""
     manifests = Path(runs_dir).resolve().glob("*/policy/policy.json")
     ordered = sorted(manifests, key=lambda path: path.stat().st_mtime_ns)
     return {json.loads(path.read_text()).get("name", ""): path.parent for path in ordered}
 
 
 def named_policy(name: str) -> Path | None:
-    """The policy folder that a path names, itself or as its run folder; None if there is none."""
+    """The policy folder at a path, or in the run folder at that path; None if there is none."""
     found = (path for path in (Path(name), Path(name) / "policy") if (path / "policy.json").is_file())
     return next((path.resolve() for path in found), None)

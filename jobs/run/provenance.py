@@ -7,14 +7,23 @@ import subprocess
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-ELSEWHERE = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say where, not what
+PLACES = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say where, not what
 
 
-def provenance() -> dict[str, Any]:
-    """Commit and machine: what to name beside a figure so that it can be trusted."""
+class Provenance(TypedDict):
+    """What to name beside a number so that it can be trusted: the commit and the machine."""
+
+    commit: str
+    host: str
+    cpus: int | None
+    python: str
+
+
+def provenance() -> Provenance:
+    """The commit and the machine of this process."""
     python = ".".join(map(str, sys.version_info[:3]))
     return {"commit": git_commit(), "host": os.uname().nodename, "cpus": os.cpu_count(), "python": python}
 
@@ -28,7 +37,7 @@ def git_commit() -> str:
 
 
 def _git(*arguments: str) -> str | None:
-    """What git prints, or None when there is no git or no repository."""
+    """The output of a git command, or None without git or a repository."""
     try:
         command = ["git", "-C", str(REPOSITORY), *arguments]
         result = subprocess.run(  # noqa: S603  own words, no shell
@@ -40,11 +49,9 @@ def _git(*arguments: str) -> str | None:
 
 
 def command() -> str:
-    """The command that is running, without where it runs and writes: no path of a machine."""
+    """The command that is running, without the words that say where it runs and writes; no local paths."""
     words = [
-        re.sub(r"/[^\s,\]]*/", "", word)
-        for word in sys.argv[1:]
-        if not word.lstrip("+").startswith(ELSEWHERE)
+        re.sub(r"/[^\s,\]]*/", "", word) for word in sys.argv[1:] if not word.lstrip("+").startswith(PLACES)
     ]
     return f"python -m platform.launch {shlex.join(words)}"
 

@@ -1,29 +1,22 @@
 """Start or join Ray: quietly, authenticated, one thread per worker."""
 
 import contextlib
-import fcntl
 import logging
 import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from jobs.config.config import ConfigError
 from jobs.config.schema import ClusterConfig
+from jobs.run.locks import locked, private_folder
+from jobs.run.threads import ONE_THREAD
 
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "LP_NUM_THREADS": "0",
-    # A learner of a large network takes more threads (`training.ppo_learner`); those that wait must sleep:
-    # spinning beside one busy program made a gradient three times slower.
-    "OMP_WAIT_POLICY": "PASSIVE",
-}
+# A learner of a large network takes more threads (`training.ppo_learner`); those that wait must sleep:
+# spinning beside one busy program made a gradient three times slower.
+WORKER_THREADS = {**ONE_THREAD, "OMP_WAIT_POLICY": "PASSIVE"}
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -77,13 +70,14 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     for name in ("ray", "ray.rllib", "ray.tune"):
         logging.getLogger(name).setLevel(logging.ERROR)
     settings = {
-        "runtime_env": {"env_vars": ONE_THREAD},
+        "runtime_env": {"env_vars": WORKER_THREADS},
         "log_to_driver": False,
         "logging_level": logging.ERROR,
         "configure_logging": True,
     }
     if cluster.name == "local":
-        with one_at_a_time():
+        # Two processes that started Ray within seconds of each other have waited for each other forever.
+        with locked(private_folder() / "start-ray.lock"):
             _start_local({"num_cpus": cluster.num_cpus, **settings})
         return
     try:
@@ -136,18 +130,6 @@ def holds(place: str, start: str) -> bool:
     system, root = pyarrow.fs.FileSystem.from_uri(place)
     inside = system.get_file_info(pyarrow.fs.FileSelector(root, allow_not_found=True))
     return any(info.base_name.startswith(start) for info in inside)
-
-
-@contextlib.contextmanager
-def one_at_a_time() -> Iterator[None]:
-    """Let one process of this user after the other start a local Ray.
-
-    Two that started within seconds of each other have been seen to wait for each other forever.
-    """
-    lock = Path(tempfile.gettempdir()) / f"evade-start-ray-{os.getuid()}.lock"
-    with lock.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # let go of when the file is closed, or the process ends
-        yield
 
 
 def check_mode(cluster: ClusterConfig) -> None:

@@ -1,1 +1,1 @@
-"""Studies of the simulator, the encoder, and what a representation tells."""
+"""Studies: what accuracy of the simulator and the encoder costs, and what a representation holds."""

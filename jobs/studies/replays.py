@@ -1,7 +1,7 @@
-"""What a setting changes on flights that were recorded: events, latents, actions, and the cost of a step.
+"""What a setting changes on recorded episodes: events, latents, actions, and the cost of a step.
 
-A recorded flight is its corridor and its actions. Flown again with these actions under another setting,
-it comes to the same places: whatever differs is the setting's doing.
+A recorded episode is its corridor and its actions. Replayed under another setting, it visits the same
+places, so that every difference is due to the setting.
 """
 
 import time
@@ -25,12 +25,12 @@ Setting = tuple[EnvConfig, PolicyAgent]
 
 
 class Replay(NamedTuple):
-    """One flight of T steps.
+    """One episode of T steps.
 
     Attributes:
         actions: What the agent chose at each step, int64 (T,).
-        windows: What it saw before that: packed windows int32 (rows, 4), T of them.
-        events: EVENT, all of the flight.
+        windows: What it saw before each choice: packed windows int32 (rows, 4), T of them.
+        events: EVENT, all of the episode.
         step_us: Mean process time of a step: the choice and the simulation [us].
     """
 
@@ -40,14 +40,14 @@ class Replay(NamedTuple):
     step_us: float
 
 
-Flight = Generator[None, None, Replay]
+Episode = Generator[None, None, Replay]
 
 
 class Measured(NamedTuple):
-    """What a setting comes to over all recorded flights.
+    """Cost and errors of a setting over all recorded episodes.
 
     Attributes:
-        step_us: Process time of a step, median over flights [us].
+        step_us: Process time of a step, median over episodes [us].
         event_error: Against the reference's events, see `envs.event_error`.
         latent_error: Against the exact latents of the reference's events, see `latent_error`.
         other_action: Share of steps at which the policy chooses another action than the reference.
@@ -59,8 +59,8 @@ class Measured(NamedTuple):
     other_action: float
 
 
-class _Note(NamedTuple):
-    """One flight under one setting, beside the reference."""
+class _Comparison(NamedTuple):
+    """One episode under one setting, compared with the reference."""
 
     step_us: float
     event_error: float
@@ -69,80 +69,80 @@ class _Note(NamedTuple):
     others: np.ndarray
 
 
-def measure(
+def measure_settings(
     settings: Sequence[Setting], evae: EventVAE, seeds: Sequence[int], advance: Callable[[int], None]
 ) -> list[Measured]:
-    """Record one flight per seed under the first setting, and fly it again under each.
+    """Record one episode per seed under the first setting, and replay it under each.
 
-    The settings take turns every `TURN` steps, so that a busy machine hits all alike. A policy that
-    draws its actions draws with the same numbers under each.
+    The settings take turns every `TURN` steps, so that a busy machine slows all of them alike. A policy
+    that draws its actions draws the same random numbers under each.
 
     Args:
         settings: Simulation and policy of each; the last one is the reference.
         evae: The policy's encoder, for latents in float64 with exact time.
         seeds: Of the corridors.
-        advance: Told 1 for each setting and flight.
+        advance: Called with 1 for each setting and episode.
     """
     exact: list[np.ndarray] = []
-    notes: list[list[_Note]] = [[] for _ in settings]
+    found: list[list[_Comparison]] = [[] for _ in settings]
     for seed in seeds:
         actions = replay(*settings[0], seed).actions
-        flown = take_turns([steps(*setting, seed, actions) for setting in settings], advance)
-        reference = flown[-1]
+        replays = take_turns([steps(*setting, seed, actions) for setting in settings], advance)
+        reference = replays[-1]
         windows = [unpack_window(window) for window in reference.windows]
         exact.append(exact_latents(evae, [(events, 0, window_us) for events, window_us in windows])[0])
-        for notes_of, own, setting in zip(notes, flown, settings, strict=True):
-            notes_of.append(_note(own, reference, *setting))
-    return [_measured(own, np.concatenate(exact)) for own in notes]
+        for comparisons, own, setting in zip(found, replays, settings, strict=True):
+            comparisons.append(_compare(own, reference, *setting))
+    return [_mean(own, np.concatenate(exact)) for own in found]
 
 
-def _note(own: Replay, reference: Replay, env: EnvConfig, agent: PolicyAgent) -> _Note:
+def _compare(own: Replay, reference: Replay, env: EnvConfig, agent: PolicyAgent) -> _Comparison:
     error = event_error(own.events, reference.events, TIME_SHARE * 1e6 / env.control_hz)
     others = own.actions != reference.actions
     events = own.events.size + reference.events.size
-    return _Note(own.step_us, error, events, latents_of(agent, own.windows), others)
+    return _Comparison(own.step_us, error, events, latents_of(agent, own.windows), others)
 
 
-def _measured(notes: Sequence[_Note], exact: np.ndarray) -> Measured:
-    weights = [note.events for note in notes]
-    errors = [note.event_error for note in notes]
+def _mean(found: Sequence[_Comparison], exact: np.ndarray) -> Measured:
+    weights = [one.events for one in found]
+    errors = [one.event_error for one in found]
     return Measured(
-        step_us=float(np.median([note.step_us for note in notes])),
+        step_us=float(np.median([one.step_us for one in found])),
         event_error=float(np.average(errors, weights=weights)) if sum(weights) else 0.0,
-        latent_error=latent_error(np.concatenate([note.latents for note in notes]), exact),
-        other_action=float(np.concatenate([note.others for note in notes]).mean()),
+        latent_error=latent_error(np.concatenate([one.latents for one in found]), exact),
+        other_action=float(np.concatenate([one.others for one in found]).mean()),
     )
 
 
-def take_turns(flights: Sequence[Flight], advance: Callable[[int], None]) -> list[Replay]:
-    """Fly all to their ends, one turn of each after the other; `advance` is told 1 at each end."""
+def take_turns(episodes: Sequence[Episode], advance: Callable[[int], None]) -> list[Replay]:
+    """Run all episodes to their ends, one turn of each after the other; call `advance(1)` at each end."""
     done: dict[int, Replay] = {}
-    while len(done) < len(flights):
-        for place, flight in enumerate(flights):
+    while len(done) < len(episodes):
+        for place, episode in enumerate(episodes):
             if place in done:
                 continue
             try:
-                next(flight)
+                next(episode)
             except StopIteration as end:
                 done[place] = end.value
                 advance(1)
-    return [done[place] for place in range(len(flights))]
+    return [done[place] for place in range(len(episodes))]
 
 
 def replay(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray | None = None) -> Replay:
-    """Fly a flight of `steps` in one go."""
+    """Run an episode of `steps` without interruption."""
     return take_turns([steps(config, agent, seed, actions)], lambda count: None)[0]
 
 
-def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray | None = None) -> Flight:
-    """Fly the corridor of a seed, in turns of `TURN` steps.
+def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray | None = None) -> Episode:
+    """Run an episode in the corridor of a seed, in turns of `TURN` steps.
 
     Args:
         config: The simulation.
-        agent: Chooses at every step; it remembers one flight at a time.
+        agent: Chooses at every step; it remembers one episode at a time.
         seed: Of the corridor.
-        actions: Flown in place of those that the agent chooses, int64 (T,); None: its own, until the
-            flight ends.
+        actions: Executed in place of those that the agent chooses, int64 (T,); None: its own, until the
+            episode ends.
     """
     env = CorridorEnv(config, observation=agent.observation)
     try:
@@ -182,8 +182,8 @@ def latents_of(agent: PolicyAgent, windows: Sequence[np.ndarray]) -> np.ndarray:
 def latent_error(latents: np.ndarray, exact: np.ndarray) -> float:
     """Root of the mean squared error of latents (T, latent), in standard deviations of the exact ones.
 
-    Both are taken over all units together, so that a unit that says nothing weighs nothing: 0 for
-    the exact latents, 1 for their mean, which knows nothing of the single step.
+    Both are taken over all units together, so that a unit without information has no weight: 0
+    for the exact latents, 1 for their mean, which ignores the single step.
     """
     deviation = float(np.sqrt(exact.var(axis=0).sum()))
     error = float(np.sqrt(np.square(latents - exact).sum(axis=1).mean()))

@@ -1,7 +1,7 @@
 """What exact events cost: every knob of the simulator, its cost against its event error.
 
 Run: python -m platform.launch +exp=trade_simulator
-Expect: about four minutes on one core. A table and a figure per scene with the Pareto front and the
+Expect: about four minutes on one core. A table and a plot per scene with the Pareto front and the
 default marked, and the events of each memory mode at each control rate, in the run folder
 under `trade/` and in MLflow. An event error is measured against the converged simulation of
 the same flights, see `envs.event_error`; a cost is process time of `CorridorEnv.step`.
@@ -10,26 +10,25 @@ the same flights, see `envs.event_error`; a cost is process time of `CorridorEnv
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from rich.table import Table
 
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from envs.event_error import Accuracy, measure_event_error
-from jobs.analysis.tables import show
+from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import env_with
 from jobs.config.config import Config
-from jobs.run.files import write_atomic
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.progress import console, progress
-from jobs.studies.front_plots import memory_figure, pareto, trade_figure
+from jobs.studies.front_plots import CostedSetting, pareto, plot_costs, plot_memory_modes
 from jobs.tracking.tracker import Tracker, open_tracker
 
+Setting = Mapping[str, float | str]  # key of the simulation -> value
 MEMORIES = ("reference", "frame", "legacy")
 # Knob -> settings of it; every other setting is the default's. Renders are per default control step.
-KNOBS: dict[str, list[dict[str, Any]]] = {
+KNOBS: dict[str, list[Setting]] = {
     "tolerance": [{"fidelity.tolerance": value} for value in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)],
     "renders": [{"renders": value} for value in (1, 2, 3, 4, 6, 8, 16)],
     "anti-aliasing": [{"fidelity.samples": value} for value in (1, 2, 4, 8)],
@@ -38,10 +37,11 @@ KNOBS: dict[str, list[dict[str, Any]]] = {
     "culling": [{"fidelity.cull_m": value} for value in (20.0, 30.0, 50.0, 70.0)],
     "memory": [{"camera.memory": value} for value in MEMORIES[1:]],
 }
+HEADINGS = ("Knob", "Setting", "Cost [us/step]", "Event error [%]", "Events/step", "Renders/step", "Front")
 
 
-class Row(NamedTuple):
-    """One setting in one scene.
+class MeasuredSetting(NamedTuple):
+    """One setting of the simulator in one scene.
 
     Attributes:
         knob: What is varied; "default" for the unchanged simulation.
@@ -56,23 +56,23 @@ class Row(NamedTuple):
     accuracy: Accuracy
 
 
-def run(config: Config) -> dict[str, Any]:
-    """Measure every setting, and show what it comes to."""
+def run(config: Config) -> dict[str, float]:
+    """Measure every setting; return the metrics of the default."""
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:
-        figures: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         for scene in config.trade_simulator.scenes:
-            figures |= trade_scene(config, folder, tracker, scene)
-        figures |= trade_memory(config, folder, tracker)
-        tracker.log(0, figures)
+            metrics |= trade_scene(config, folder, tracker, scene)
+        metrics |= trade_memory(config, folder, tracker)
+        tracker.log(0, metrics)
         console.print(tracker.dashboard(), markup=False)
-    return finish(folder, "trade_simulator", figures)
+    return finish(folder, "trade_simulator", metrics)
 
 
 def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> dict[str, float]:
-    """Cost against error in one scene; the figures of the default."""
-    default = config.env_config(scene=scene, split="validation", observation="events")
+    """Measure cost and error of every setting in one scene; return the metrics of the default."""
+    default = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
     named = [("default", "", default)]
     for knob, settings in KNOBS.items():
         named += [(knob, setting_text(setting), changed(default, setting)) for setting in settings]
@@ -84,26 +84,25 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
             advance(1, note=knob)
     costs = step_costs_us([simulation for *_, simulation in named], trade.steps, trade.rounds)
     rows = [
-        Row(knob, setting, cost, accuracy)
+        MeasuredSetting(knob, setting, cost, accuracy)
         for (knob, setting, _), cost, accuracy in zip(named, costs, accuracies, strict=True)
     ]
     front = pareto([(row.cost_us, row.accuracy.error) for row in rows])
-    text = markdown(rows, front)
-    show(as_table(scene, rows, front))
-    write_atomic(folder.path / "trade" / f"{scene}.md", text)
-    tracker.text(f"trade/{scene}.md", text)
-    tracker.table(f"trade/{scene}", columns(rows))
-    figure = trade_figure(
-        scene, [(*row[:3], row.accuracy.error) for row in rows], front, default.fidelity.tolerance
-    )
-    figure.savefig(folder.path / "trade" / f"{scene}.png", dpi=120)
-    tracker.figure(f"trade/{scene}.png", figure)
-    first = rows[0]
-    return {f"sim/event_error_{scene}": first.accuracy.error, f"perf/env_step_us_{scene}": first.cost_us}
+    title = f"Scene {scene}: one setting changed at a time; * marks the Pareto front"
+    lines = [setting_cells(row, place in front) for place, row in enumerate(rows)]
+    publish_table(folder, tracker, f"trade/{scene}", title, HEADINGS, lines, 2)
+    tracker.table(f"trade/{scene}", setting_columns(rows))
+    points = [CostedSetting(*row[:3], row.accuracy.error) for row in rows]
+    plot = plot_costs(scene, points, front, default.fidelity.tolerance)
+    publish_plot(folder, tracker, f"trade/{scene}", plot)
+    return {
+        f"sim/event_error_{scene}": rows[0].accuracy.error,
+        f"perf/env_step_us_{scene}": rows[0].cost_us,
+    }
 
 
 def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
-    """Events per second of flight at each control rate, for each memory mode; those at 200 Hz as figures."""
+    """Measure events per second of flight at each control rate for each memory mode; return the metrics."""
     trade = config.trade_simulator
     rates_hz = trade.control_hz
     events_hz: dict[str, list[float]] = {memory: [] for memory in MEMORIES}
@@ -112,21 +111,16 @@ def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
             # The same way at every rate: as many steps as fit into the time of the slowest.
             steps = max(1, round(trade.steps * hz / min(rates_hz) / 4))
             for memory in MEMORIES:
-                default = config.env_config(control_hz=hz, split="validation")
+                default = dataclasses.replace(config.env, control_hz=hz, split="validation")
                 accuracy = measure_event_error(
                     env_with(default, {"camera.memory": memory}), trade.flights, steps
                 )
                 events_hz[memory].append(accuracy.events[0] * hz)
                 advance(1, note=memory)
-    figure = memory_figure(rates_hz, events_hz)
-    figure.savefig(folder.path / "trade" / "memory.png", dpi=120)
-    tracker.figure("trade/memory.png", figure)
     head = ["Memory", *(f"{hz:g} Hz" for hz in rates_hz)]
     lines = [[memory, *(f"{value:,.0f}" for value in values)] for memory, values in events_hz.items()]
-    text = _markdown(head, lines)
-    console.print(f"Events per second of flight\n{text}", markup=False)
-    write_atomic(folder.path / "trade" / "memory.md", text)
-    tracker.text("trade/memory.md", text)
+    publish_table(folder, tracker, "trade/memory", "Events per second of flight", head, lines)
+    publish_plot(folder, tracker, "trade/memory", plot_memory_modes(rates_hz, events_hz))
     return {
         f"sim/events_per_second_{memory}_{hz:g}_hz": value
         for memory, values in events_hz.items()
@@ -152,54 +146,32 @@ def step_costs_us(configs: Sequence[EnvConfig], steps: int, rounds: int) -> list
     return (1e6 * np.median(costs[1:], axis=0)).tolist()
 
 
-def changed(default: EnvConfig, setting: Mapping[str, Any]) -> EnvConfig:
-    """The default with the settings of a knob replaced; "renders" is a number per control step."""
+def changed(default: EnvConfig, setting: Setting) -> EnvConfig:
+    """The default with some settings replaced; "renders" is a number per control step."""
     for key, value in setting.items():
         if key == "renders":
             step_m = default.speed_mps / default.control_hz
-            fidelity = dataclasses.replace(default.fidelity, max_step_m=step_m / value)
+            fidelity = dataclasses.replace(default.fidelity, max_step_m=step_m / float(value))
             default = dataclasses.replace(default, fidelity=fidelity)
         else:
             default = env_with(default, {key: value})
     return default
 
 
-def setting_text(setting: Mapping[str, Any]) -> str:
-    """The settings of a knob as text, such as "tolerance 0.1"."""
+def setting_text(setting: Setting) -> str:
+    """A setting as text, such as "tolerance 0.1"."""
     return ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in setting.items())
 
 
-def as_table(scene: str, rows: Sequence[Row], front: Sequence[int]) -> Table:
-    """The rows for a terminal; * marks the Pareto front."""
-    table = Table(title=f"Scene {scene}: one setting changed at a time", title_justify="left")
-    for place, heading in enumerate(HEADINGS):
-        table.add_column(heading, justify="left" if place < 2 else "right")
-    for place, row in enumerate(rows):
-        table.add_row(*_cells(row, place in front))
-    return table
-
-
-HEADINGS = ("Knob", "Setting", "Cost [us/step]", "Event error [%]", "Events/step", "Renders/step", "Front")
-
-
-def _cells(row: Row, on_front: bool) -> tuple[str, ...]:
+def setting_cells(row: MeasuredSetting, on_front: bool) -> tuple[str, ...]:
+    """A text for each of `HEADINGS`."""
     accuracy = row.accuracy
     numbers = (f"{row.cost_us:,.0f}", f"{100 * accuracy.error:.1f}", f"{accuracy.events[0]:.0f}")
     return (row.knob, row.setting, *numbers, f"{accuracy.renders:.0f}", "*" if on_front else "")
 
 
-def markdown(rows: Sequence[Row], front: Sequence[int]) -> str:
-    """The rows as a Markdown table."""
-    return _markdown(HEADINGS, [_cells(row, place in front) for place, row in enumerate(rows)])
-
-
-def _markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    rule = ["---:" if place else "---" for place in range(len(head))]
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, rule, *lines)) + "\n"
-
-
-def columns(rows: Sequence[Row]) -> dict[str, list[str | float]]:
-    """The rows as columns for a tracker; the first is unique."""
+def setting_columns(rows: Sequence[MeasuredSetting]) -> dict[str, list[str | float]]:
+    """The columns of a tracker's table; the first is unique."""
     return {
         "setting": [f"{row.knob} {row.setting}".strip() for row in rows],
         "cost_us": [row.cost_us for row in rows],

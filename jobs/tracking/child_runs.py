@@ -11,7 +11,7 @@ from jobs.tracking.tracker import Tracker
 MAX_CHILDREN = 10_000  # of one run
 
 
-class Child(NamedTuple):
+class ChildRun(NamedTuple):
     """A finished run below another, with all that it holds."""
 
     name: str
@@ -21,7 +21,7 @@ class Child(NamedTuple):
     curves: Mapping[str, Mapping[int, float]] = {}  # metric -> its value at each step
 
 
-def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> None:
+def write_child_runs(parent: Tracker, kind: str, children: Sequence[ChildRun]) -> None:
     """Write finished runs below `parent`: three calls each, and none for one that is there unchanged.
 
     One whose content has changed takes the place of the run of the same name.
@@ -51,7 +51,7 @@ def write_children(parent: Tracker, kind: str, children: Sequence[Child]) -> Non
         client.set_terminated(run_id)
 
 
-def _points(child: Child) -> list[tuple[str, int, float]]:
+def _points(child: ChildRun) -> list[tuple[str, int, float]]:
     """Name, step and value of everything that a child measured; what is no curve is at step 0."""
     curves = {name: {0: value} for name, value in child.metrics.items()} | dict(child.curves)
     check_metrics({name: sum(points.values()) for name, points in curves.items()})

@@ -1,4 +1,4 @@
-"""Trained policies in MLflow's model registry: one name for each group, one version for each training.
+"""Trained policies in MLflow's model registry: one name for each experiment, one version for each training.
 
 A version is sufficient alone: the policy folder (safetensors and JSON), the script `tracking.served_policy`
 and the package `models`. Nothing is pickled, and nothing is installed to find out what it needs.
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envs.config import settings_hash
-from jobs.run.folder import group_name
 from jobs.run.provenance import REPOSITORY
 from jobs.tracking.tracker import Tracker
 from models.kinds import kind_of
@@ -33,7 +32,7 @@ NEEDED = (
     "torch",
 )  # by `jobs.tracking.served_policy` and `models`
 ABOUT = """\
-Policies of the group `{group}`, a version for each training; its tags name seed, commit and figures.
+Policies of `{group}`, a version for each training; its tags name seed, length, commit and figures.
 
     model = mlflow.pyfunc.load_model("models:/{name}/1")
     actions = model.predict(what_a_flight_has_seen)["action"]
@@ -65,8 +64,9 @@ def register_training(tracker: Tracker, path: Path) -> str:
     if evaluated.is_file():
         figures |= json.loads(evaluated.read_text())["figures"]["figures"]
     tags = {name: config[name] for name in ("seed", "budget")} | {"run": path.name, "commit": about["commit"]}
+    tags["env_steps"] = config["train"]["env_steps"]  # another length is no other model
     tags |= {name: figures[name] for name in SHOWN if name in figures}
-    return register(tracker, path / "policy", group_name(config["exp"], config["train"]["env_steps"]), tags)
+    return register(tracker, path / "policy", config["exp"], tags)
 
 
 def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, Any]) -> str:
@@ -75,7 +75,7 @@ def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, Any]
     Args:
         tracker: The run that trained it.
         policy: Its folder.
-        group: What it is one training of.
+        group: The experiment that it is one training of.
         tags: What a reader of the version wants to know; floats are shortened.
 
     Returns:

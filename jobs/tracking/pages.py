@@ -15,6 +15,8 @@ from typing import Any
 
 from PIL import Image
 
+from jobs.config.registry import JOBS
+
 WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
 # MLflow's own names: of the text on a page, of a run's colour in charts, of stored views.
 NOTE, COLOUR, VIEW_TAG = "mlflow.note.content", "mlflow.runColor", "mlflow.sharedViewState"
@@ -22,19 +24,6 @@ MAX_CHARACTERS = 8000  # of a run's page; MLflow cuts what is longer, and does n
 PAGE_WIDTH = 860  # pixels of a picture beside MLflow's side panels on a screen of 1600
 PREVIEWS = "page"
 
-KINDS = {
-    "pipeline": "From nothing to an evaluated policy",
-    "collect": "Recordings of flights, to pretrain on",
-    "pretrain": "An event VAE, whose frozen encoder a policy sees by",
-    "train": "A policy trained by PPO",
-    "evaluate": "A policy and its bounds in corridors never trained on",
-    "sweep": "Policies at other rates and thresholds, in other worlds, with sensor faults",
-    "ship": "The trained policies of models/pretrained, and how they learnt",
-    "trade": "What exactness costs from end to end",
-    "trade_simulator": "What exact events cost",
-    "trade_encoder": "What an exact encoder costs",
-    "probe": "What a representation of events tells an agent",
-}
 FIGURES = {  # metric: what it is, how it is written
     "eval/success_rate": ("success in held-out corridors", "{:.0%}"),
     "eval/distance_m": ("distance without collision", "{:.1f} m"),
@@ -146,7 +135,7 @@ def experiment_note(experiment_id: str, tags: Mapping[str, str]) -> str:
     usual = [key for key, *_ in usual_views() if key in views]
     newest = [key for key in views if key not in usual][:2]  # of the newest sweep
     links = " · ".join(f"[{views[key]}]({view_address(experiment_id, key)})" for key in (*usual, *newest))
-    kinds = "\n".join(f"| `{job}` | {text} |" for job, text in KINDS.items())
+    kinds = "\n".join(f"| `{name}` | {job.summary} |" for name, job in JOBS.items())
     title = "**Evade**: policies that fly by the events of an event camera."
     return f"{title} Open {links}\n{READING.format(kinds=kinds)}"
 
@@ -191,7 +180,8 @@ def run_note(page: Page) -> str:
 
 def headline(page: Page) -> str:
     """What the run is, and its main figures."""
-    what = KINDS.get(page.tags.get("job", ""), "A run")
+    job = JOBS.get(page.tags.get("job", ""))
+    what = job.summary if job else "A run"
     named = ", ".join(page.params[name] for name in ("exp", "budget") if name in page.params)
     figures = [_figure(page, name) for name in FIGURES if name in page.metrics]
     seed = page.params.get("seed", "-")

@@ -10,7 +10,6 @@ stops with what is computed in the run folder, from where the same command recor
 
 import contextlib
 import dataclasses
-import fcntl
 import json
 import logging
 import math
@@ -27,7 +26,8 @@ from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
 from jobs.config.errors import redacted
 from jobs.run.files import read_json, write_json
-from jobs.run.folder import Run, holding
+from jobs.run.folder import Run
+from jobs.run.locks import held_alone, locked, private_folder
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
 from jobs.tracking.pages import (
@@ -231,7 +231,7 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
     uri = store_uri(config)
     name = folder.path.name if key == "run" else f"{folder.path.name} {key}"
     facts = {"run_folder": folder.path, "job": config.job, **provenance()}
-    with holding(folder), _answering(uri, folder):
+    with held_alone(folder.path), _answering(uri, folder):
         client, experiment_id = open_store(uri, config.tracking.experiment, config.cluster.storage)
         waiting = folder.path / f"undelivered-{quote(key, safe='')}.jsonl"
         store = Tracker(client, redacted(uri), experiment_id, "", RetryQueue(waiting))
@@ -330,17 +330,15 @@ def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["
     from mlflow import MlflowClient
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    location, name = None, f"evade-store-{os.getuid()}-{settings_hash({'uri': uri})[:8]}.lock"
-    lock = Path(tempfile.gettempdir(), name)
+    name = quote(experiment, safe="")
     if uri.startswith("sqlite:///"):
         file = Path(uri.removeprefix("sqlite:///"))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        lock, beside = file.with_suffix(".lock"), file.parent / "mlartifacts"
-        location = (beside / quote(experiment, safe="")).as_uri()
+        lock, location = file.with_suffix(".lock"), (file.parent / "mlartifacts" / name).as_uri()
+    else:
+        lock, location = private_folder() / f"store-{settings_hash({'uri': uri})[:8]}.lock", None
     if storage is not None:
-        location = f"{storage.rstrip('/')}/mlartifacts/{quote(experiment, safe='')}"
-    with lock.open("w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
+        location = f"{storage.rstrip('/')}/mlartifacts/{name}"
+    with locked(lock):
         client = MlflowClient(tracking_uri=uri)
         known = client.get_experiment_by_name(experiment)
         return client, known.experiment_id if known else client.create_experiment(experiment, location)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.config import WITHOUT_EVENTS, EnvConfig, Observation, sensor_settings, settings_hash
+from envs.config import WITHOUT_EVENTS, EnvConfig, Observation, Split, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
 from envs.kinematics import NUM_ACTIONS
@@ -48,7 +48,10 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     if done is not None:
         return done
     policy, recorded = check_collect(folder)
-    sizes = {"train": config.collect.num_steps, "validation": config.collect.num_validation_steps}
+    sizes: dict[Split, int] = {
+        "train": config.collect.num_steps,
+        "validation": config.collect.num_validation_steps,
+    }
     figures: dict[str, Any] = {}
     with progress("Collect flights", sum(sizes.values()), "steps") as advance:
         for split, num_steps in sizes.items():
@@ -56,10 +59,10 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
             parts = np.array_split(np.arange(num_steps), len(scenes) + len(recorded))
             shares = [len(part) for part in parts]
             flights = [
-                (config.env_config(scene=scene, split=split, observation="events"), share)
+                (dataclasses.replace(config.env, scene=scene, split=split, observation="events"), share)
                 for scene, share in zip(scenes, shares, strict=False)
             ]
-            recording = no_flights(config.env_config())
+            recording = no_flights(config.env)
             if flights:
                 recording = record(flights, config.seed, advance, policy, config.collect.policy_share)
             if recorded:
@@ -69,7 +72,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_flights"] = recording.about["flights"]
     if config.collect.scenes:
-        figures |= achieved(config.env_config(scene=config.collect.scenes[0]))
+        figures |= achieved(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
     tracker.log(0, figures)
     return finish(folder, "collect", figures)
 
@@ -91,7 +94,7 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
     settings = config.collect
     share = settings.num_validation_steps / (settings.num_steps + settings.num_validation_steps)
     try:
-        return policy, [read_recorded(path, config.env_config(), share) for path in settings.recordings]
+        return policy, [read_recorded(path, config.env, share) for path in settings.recordings]
     except ValueError as error:
         raise ConfigError(f"collect.recordings: {error}") from error
 
@@ -109,7 +112,7 @@ def check_policy(folder: Run) -> Path | None:
     if path is None:
         raise ConfigError(f"collect.policy: must be a run folder or a policy folder, got {named!r}")
     try:
-        check_sensor(load_policy(path).manifest, folder.config.env_config())
+        check_sensor(load_policy(path).manifest, folder.config.env)
     except ValueError as error:
         raise ConfigError(f"collect.policy: {error}") from error
     return path

@@ -5,7 +5,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
 
-from envs.config import sensor_differences, sensor_settings, settings_hash
+from envs.config import Observation, sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from jobs.config.conditions import env_with
 from jobs.config.config import Config, ConfigError
@@ -227,8 +227,9 @@ def corridor_settings(config: Config) -> dict[str, Any]:
     Tune continues a stopped training only under the keys and kinds of values that it began with,
     so a setting of later versions appears only where it is used.
     """
+    observation = KINDS[config.model.name].observation
     settings: dict[str, Any] = {
-        "config": config.env_config(split="train", observation=KINDS[config.model.name].observation)
+        "config": dataclasses.replace(config.env, split="train", observation=cast(Observation, observation))
     }
     if config.train.conditions != [{}]:
         settings["conditions"] = config.train.conditions
@@ -243,7 +244,7 @@ def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
 
 def network_settings(config: Config) -> dict[str, Any]:
     """What the policy's networks are built from."""
-    model, camera = config.model, config.camera
+    model, camera = config.model, config.env.camera
     return {
         "name": model.name,
         "width": camera.width,
@@ -258,11 +259,11 @@ def network_settings(config: Config) -> dict[str, Any]:
 
 def policy_settings(config: Config) -> dict[str, Any]:
     """What a policy must be flown with, for its manifest."""
-    sensor = sensor_settings(config.env_config())
+    sensor = sensor_settings(config.env)
     return {
         "exp": config.exp,
         "observation": KINDS[config.model.name].observation,
-        "window_capacity": config.env_config().window_capacity,
+        "window_capacity": config.env.window_capacity,
         "sensor": sensor,
         "sensor_hash": settings_hash(sensor),
         "seed": config.seed,
@@ -284,7 +285,7 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
     if path is None:
         return None
     _, about = load_encoder(path)
-    differ = sensor_differences(about["sensor"], config.env_config())
+    differ = sensor_differences(about["sensor"], config.env)
     if differ:
         values = ", ".join(
             f"{name}: {there!r} there, {here!r} here" for name, (there, here) in differ.items()

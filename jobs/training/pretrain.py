@@ -16,7 +16,7 @@ import torch
 
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
-from jobs.analysis.plots import reconstruction_figure
+from jobs.analysis.plots import plot_reconstructions
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import EVAE_SETTINGS, ModelConfig, PretrainConfig
 from jobs.run.files import write_atomic
@@ -97,7 +97,7 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
         rule = f"must be a run folder with an encoder, or an encoder file, got {named!r}"
         raise ConfigError(f"pretrain.encoder: {rule}: {error}") from error
     with torch.device("meta"):  # its settings alone, without memory for weights
-        wanted = build_evae(config.model, sensor_settings(config.env_config())).settings
+        wanted = build_evae(config.model, sensor_settings(config.env)).settings
     differ = [
         f"{name}: {evae.settings[name]!r} there, {value!r} here"
         for name, value in wanted.items()
@@ -268,7 +268,7 @@ def freeze(
     }
     save_encoder(encoder_file(folder), evae, manifest)
     tracker.artifact(encoder_file(folder).with_suffix(".json"), "encoder")
-    figure = reconstruction_figure(*example_pictures(evae, held_out))
+    figure = plot_reconstructions(*example_pictures(evae, held_out))
     tracker.figure("evae/reconstructions.png", figure)
     return finish(folder, "pretrain", figures)
 

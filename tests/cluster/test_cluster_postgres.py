@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from jobs.tracking.tracker import open_store
-from tests.jobs.evaluation.test_sweep_plan import sweep_config
+from tests.support.configs import sweep_config
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
 WRITERS = 8

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.faults.test_fault_node import SMALL, cluster, on  # noqa: F401
+from tests.support.clusters import SMALL, on
 from tests.support.faults import SWEEP, launch
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
@@ -10,7 +10,7 @@ AXIS = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}"
 WORDS = (*SWEEP, "~sweep.axes", AXIS, "sweep.policies=[straight,random]")
 
 
-def test_a_sweep_on_a_cluster_gives_the_bytes_of_a_sweep_on_one_machine(tmp_path, cluster):  # noqa: F811
+def test_a_sweep_on_a_cluster_gives_the_bytes_of_a_sweep_on_one_machine(tmp_path, cluster):
     for _ in range(2):
         cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"])
     far = launch(tmp_path / "far", *WORDS, *on(cluster), f"cluster.storage={tmp_path / 'shared'}")

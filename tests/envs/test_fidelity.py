@@ -46,6 +46,7 @@ def test_a_plan_makes_its_renderer():
     assert drawn.render(0.0, 0.0, 2.0).shape == (6, 8)
 
 
+@pytest.mark.system
 def test_a_scene_without_a_mesh_never_loads_opengl():
     code = "import sys, envs.corridor as c; e = c.CorridorEnv(); e.reset(seed=0); e.step(0)"
     code += "; sys.exit(any(m in sys.modules for m in ('pyrender', 'OpenGL', 'trimesh')))"

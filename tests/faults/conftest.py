@@ -2,6 +2,7 @@ import subprocess
 
 import pytest
 
+from tests.support.clusters import cluster  # noqa: F401  a fixture
 from tests.support.faults import TABLE
 
 

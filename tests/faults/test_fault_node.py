@@ -4,28 +4,10 @@ import csv
 
 import pytest
 
-from tests.faults.test_fault_training import FINE, check_complete
-from tests.support.faults import SWEEP, TRAIN, launch, outcome
+from tests.support.clusters import SMALL, on
+from tests.support.faults import FINE, SWEEP, TRAIN, check_complete, launch, outcome
 
 pytestmark = pytest.mark.faults
-TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
-SMALL = {"object_store_memory": 100 * 2**20, "include_dashboard": False}
-
-
-@pytest.fixture
-def cluster(monkeypatch):
-    """A head that computes nothing, and a machine of one core."""
-    for name, value in TOKEN.items():
-        monkeypatch.setenv(name, value)
-    from ray.cluster_utils import Cluster
-
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **SMALL})
-    yield cluster
-    cluster.shutdown()
-
-
-def on(cluster):
-    return "cluster=ray", f"cluster.address={cluster.address}"
 
 
 def test_a_training_whose_machine_is_lost_goes_on_elsewhere_from_its_checkpoint(tmp_path, cluster):

@@ -9,20 +9,9 @@ import tempfile
 
 import pytest
 
-from models.policy import load_policy
-from tests.support.faults import TRAIN, launch, outcome, start
+from tests.support.faults import FINE, TRAIN, check_complete, launch, outcome, start
 
 pytestmark = pytest.mark.faults
-FINE = ("train.env_steps=960", "train.checkpoint_every=1")
-
-
-def check_complete(job):
-    """A training that has ended well: each step reported once, all there, and a policy that flies."""
-    assert job.end() == 0, job.said
-    steps = [row["env_steps"] for row in job.rows()]
-    assert steps == sorted(set(steps))
-    assert steps[-1] >= 960
-    load_policy(job.run / "policy")
 
 
 def checkpoints(job):

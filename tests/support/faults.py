@@ -188,3 +188,17 @@ def command_line(pid: int) -> str:
         return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
     except OSError:
         return ""
+
+
+FINE = ("train.env_steps=960", "train.checkpoint_every=1")
+
+
+def check_complete(job):
+    """A training that has ended well: each step reported once, all there, and a policy that flies."""
+    assert job.end() == 0, job.said
+    steps = [row["env_steps"] for row in job.rows()]
+    assert steps == sorted(set(steps))
+    assert steps[-1] >= 960
+    from models.policy import load_policy
+
+    load_policy(job.run / "policy")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
 KERNEL = "import numba\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + {}\n"
 CALLER = (

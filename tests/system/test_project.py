@@ -1,3 +1,4 @@
+import ast
 import importlib
 import importlib.metadata
 import os
@@ -16,6 +17,14 @@ import jobs
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 LOCK = [line for line in (ROOT / "requirements.lock").read_text().splitlines() if line and line[0] != "#"]
+ROOMS = ("envs", "models", "jobs")
+# Functions whose bodies have still 40 lines or more: file, name.
+LONG = {
+    ("jobs/evaluation/sweep_report.py", "track_rows"),
+    ("jobs/studies/trade/page.py", "advice"),
+    ("jobs/training/collect.py", "record"),
+    ("jobs/training/ppo.py", "build_ppo"),
+}
 SOURCES = ("*.*", "Makefile", ".ci/*", "conf/**/*.yaml", "docker/*", "docs/*.md", "[a-z]*/**/*.py")
 
 
@@ -70,9 +79,16 @@ def test_the_command_says_so_when_the_launcher_is_not_there(monkeypatch, capsys,
     assert "pip install -e ." in capsys.readouterr().err
 
 
+@pytest.mark.system
 def test_importing_the_rooms_is_light():
     code = "import sys, envs, jobs, models; print({'torch', 'ray', 'mlflow', 'hydra'} & set(sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True) == "set()\n"
+
+
+TARGETS = (
+    *("setup", "bytestream", "train-all", "sweep-robustness", "mlflow", "lint", "check", "bench", "docs"),
+    *("test", "test-system", "test-slow", "test-faults", "test-cluster", "lock", "clean"),
+)
 
 
 def test_make_help_lists_every_target():
@@ -84,40 +100,11 @@ def test_make_help_lists_every_target():
         return subprocess.check_output(["make", *words], cwd=ROOT, env=environment, text=True)
 
     listed = make("help")
-    targets = {
-        "setup",
-        "bytestream",
-        "train-all",
-        "sweep-robustness",
-        "mlflow",
-        "test",
-        "test-faults",
-        "test-cluster",
-        "lint",
-        "check",
-        "bench",
-        "docs",
-    }
-    assert {line.split()[0] for line in listed.splitlines()[1:]} == targets | {"lock", "clean", "help"}
+    assert {line.split()[0] for line in listed.splitlines()[1:]} == {*TARGETS, "help"}
     assert make() == listed
 
 
-@pytest.mark.parametrize(
-    "target",
-    [
-        "setup",
-        "bytestream",
-        "train-all",
-        "sweep-robustness",
-        "mlflow",
-        "lint",
-        "check",
-        "bench",
-        "docs",
-        "lock",
-        "clean",
-    ],
-)
+@pytest.mark.parametrize("target", TARGETS)
 def test_make_knows_how_to_reach_every_target(target):
     subprocess.run(["make", "--dry-run", target], cwd=ROOT, check=True, capture_output=True)
 
@@ -154,3 +141,53 @@ def test_no_file_names_a_package_index_or_a_folder_of_one_machine():
     assert {"Makefile", "requirements.lock", "platform/launch.py", "conf/config.yaml", ".ci/run"} <= set(
         found
     )
+
+
+def test_no_test_imports_another_test_module_nor_does_a_script_that_it_starts():
+    def imported(text: str) -> set[str]:
+        modules = set()
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Import):
+                modules.update(name.name for name in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                modules.update(f"{node.module}.{name.name}" for name in node.names)
+        return modules
+
+    found = {}
+    for path in (ROOT / "tests").rglob("*.py"):
+        text = path.read_text()
+        modules = {name for name in imported(text) if re.search(r"(^|\.)test_", name)}
+        scripts = [
+            node.value
+            for node in ast.walk(ast.parse(text))
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and "import" in node.value
+        ]
+        modules.update(
+            name
+            for text in scripts
+            for name in re.findall(r"^from (tests\.[\w.]*\btest_\w+)", text, re.MULTILINE)
+        )
+        found[str(path.relative_to(ROOT))] = modules
+    assert {name: modules for name, modules in found.items() if modules} == {}
+    assert "tests/system/test_project.py" in found
+
+
+def test_the_body_of_a_function_stays_below_forty_lines():
+    def body_lines(function: ast.FunctionDef) -> int:
+        body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+        return body[-1].end_lineno - body[0].lineno + 1 if body else 0
+
+    sizes = [
+        (str(path.relative_to(ROOT)), node.name, body_lines(node))
+        for room in ROOMS
+        for path in (ROOT / room).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+    assert [found for found in sizes if found[2] >= 40 and found[:2] not in LONG] == []
+    assert len(sizes) > 1000
+
+
+def test_files_stand_in_packages_not_in_the_rooms_themselves():
+    top = [path for room in ROOMS for path in (ROOT / room).glob("*.py")]
+    assert len(top) <= 16

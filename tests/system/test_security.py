@@ -15,8 +15,7 @@ from jobs.run.folder import open_run
 from jobs.tracking import tracker as tracking
 from jobs.tracking.store import dashboard_command, page, store_uri
 from jobs.tracking.tracker import open_tracker
-from tests.jobs.run.test_folder import small_config
-from tests.system.test_launch import job, launch, launcher  # noqa: F401  fixtures
+from tests.support.configs import small_config
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = [path for room in ("envs", "models", "jobs", "platform") for path in (ROOT / room).rglob("*.py")]
@@ -222,7 +221,7 @@ def test_an_address_that_was_written_down_without_its_password_is_refused(tmp_pa
         ["+exp=train", f"tracking.uri=http://ann:{PASSWORD}@tracker", "budget=smoke"],
     ],
 )
-def test_the_launcher_prints_no_password_whatever_it_answers(launch, job, monkeypatch, words):  # noqa: F811
+def test_the_launcher_prints_no_password_whatever_it_answers(launch, job, monkeypatch, words):
     def fail(config):
         if config.tracking.uri.startswith("http"):
             raise KeyError(f"nobody at {config.tracking.uri}")

@@ -1,4 +1,4 @@
-"""What an encoding of events costs, and how far its latent is from float64 with exact time."""
+"""Cost of several ways to encode events, and the latent's error of each against float64 with exact time."""
 
 import copy
 import time
@@ -21,7 +21,7 @@ TIMED_WINDOWS = 8
 Encode = Callable[[Window], np.ndarray]
 
 
-class Form(NamedTuple):
+class Encoding(NamedTuple):
     """One way to encode a window: what was changed, to what, and the function to mu (latent,)."""
 
     knob: str
@@ -30,11 +30,11 @@ class Form(NamedTuple):
     evae: EventVAE
 
 
-class Row(NamedTuple):
-    """What a form comes to.
+class EncodingCost(NamedTuple):
+    """Cost and accuracy of one way to encode.
 
     Attributes:
-        knob, setting: As in `Form`.
+        knob, setting: As in `Encoding`.
         step_us, dense_us: Process time per window of one control step, and of 2,000 events [us].
         error_max, error_mean: Distance of mu from float64 with exact time, as share of the
             standard deviation of the posterior, over latents and windows.
@@ -50,7 +50,7 @@ class Row(NamedTuple):
     explained: float
 
 
-def default_forms(evae: EventVAE) -> list[Form]:
+def default_encodings(evae: EventVAE) -> list[Encoding]:
     """The lookup table as it is used, the network itself, and the table with one setting changed."""
     table = EncoderTable.from_evae(evae)
     forms = [("default", "", encode_whole(table)), ("torch", "plain network", encode_by_network(evae))]
@@ -62,12 +62,14 @@ def default_forms(evae: EventVAE) -> list[Form]:
     forms += [("newest events", str(most), encode_newest(table, most)) for most in CAPS]
     forms += [("chunks", str(count), encode_in_chunks(table, count)) for count in CHUNKS]
     forms.append(("chunks", "per event", encode_in_chunks(table, None)))
-    return [Form(*form, evae) for form in forms]
+    return [Encoding(*form, evae) for form in forms]
 
 
-def size_form(evae: EventVAE) -> Form:
+def sized_encoding(evae: EventVAE) -> Encoding:
     """The table of a model of another context size."""
-    return Form("context", str(evae.settings["context"]), encode_whole(EncoderTable.from_evae(evae)), evae)
+    return Encoding(
+        "context", str(evae.settings["context"]), encode_whole(EncoderTable.from_evae(evae)), evae
+    )
 
 
 def encode_whole(table: EncoderTable) -> Encode:
@@ -131,8 +133,7 @@ def exact_latents(evae: EventVAE, windows: Sequence[Window]) -> tuple[np.ndarray
 def explained(evae: EventVAE, batch: EventBatch, mu: torch.Tensor | None = None) -> float:
     """Share of the variance of the windows' pictures that the decoded ones explain (R2).
 
-    1 - squared error / squared error of the mean picture: 0 for what knows nothing of the single
-    window, 1 for perfection.
+    1 - squared error / squared error of the mean picture: 0 for the mean picture, 1 for perfection.
 
     Args:
         evae: Frozen model.
@@ -145,43 +146,50 @@ def explained(evae: EventVAE, batch: EventBatch, mu: torch.Tensor | None = None)
     return 1.0 - float(error / (targets.mean(0) - targets).square().sum().clamp_min(1e-12))
 
 
-def measure(
-    forms: Sequence[Form], windows: list[Window], timed: tuple[list[Window], list[Window]], rounds: int,
+def measure_encodings(
+    encodings: Sequence[Encoding],
+    windows: list[Window],
+    timed: tuple[list[Window], list[Window]],
+    rounds: int,
     advance: Callable[[int], None],
-) -> list[Row]:  # fmt: skip
-    """Cost and accuracy of each form.
+) -> list[EncodingCost]:
+    """Measure cost and accuracy of each encoding.
 
     Args:
-        forms: What to measure.
+        encodings: What to measure.
         windows: Held-out windows for the accuracy.
         timed: Windows of one control step, and dense ones, for the cost.
         rounds: Of timing.
-        advance: Told 1 after each form.
+        advance: Called with 1 after each encoding.
     """
-    costs = costs_us(forms, timed, rounds)
-    rows: list[Row] = []
+    costs = costs_us(encodings, timed, rounds)
+    rows: list[EncodingCost] = []
     reference: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    for form, (step_us, dense_us) in zip(forms, costs.tolist(), strict=True):
-        if id(form.evae) not in reference:
-            reference[id(form.evae)] = exact_latents(form.evae, windows)
-        mu, deviation = reference[id(form.evae)]
-        own = np.stack([form.encode(window) for window in windows])
+    for encoding, (step_us, dense_us) in zip(encodings, costs.tolist(), strict=True):
+        if id(encoding.evae) not in reference:
+            reference[id(encoding.evae)] = exact_latents(encoding.evae, windows)
+        mu, deviation = reference[id(encoding.evae)]
+        own = np.stack([encoding.encode(window) for window in windows])
         error = np.abs(own - mu) / deviation
-        share = explained(form.evae, batch_windows(windows, form.evae.grid), torch.from_numpy(own))
-        rows.append(Row(*form[:2], step_us, dense_us, float(error.max()), float(error.mean()), float(share)))
+        share = explained(encoding.evae, batch_windows(windows, encoding.evae.grid), torch.from_numpy(own))
+        rows.append(
+            EncodingCost(
+                *encoding[:2], step_us, dense_us, float(error.max()), float(error.mean()), float(share)
+            )
+        )
         advance(1)
     return rows
 
 
-def costs_us(forms: Sequence[Form], timed: tuple[list[Window], ...], rounds: int) -> np.ndarray:
-    """Process time per window [us] (forms, kinds of windows): medians of interleaved rounds."""
-    seconds = np.empty((rounds + 1, len(forms), len(timed)))  # the first round compiles
+def costs_us(encodings: Sequence[Encoding], timed: tuple[list[Window], ...], rounds: int) -> np.ndarray:
+    """Process time per window [us] (encodings, kinds of windows): medians of interleaved rounds."""
+    seconds = np.empty((rounds + 1, len(encodings), len(timed)))  # the first round compiles
     for turn in range(rounds + 1):
-        for place, form in enumerate(forms):
+        for place, encoding in enumerate(encodings):
             for kind, windows in enumerate(timed):
-                form.encode(windows[0])  # its table comes back into the cache, as it is in a flight
+                encoding.encode(windows[0])  # its table comes back into the cache, as in an episode
                 start = time.process_time()
                 for window in windows[:TIMED_WINDOWS]:
-                    form.encode(window)
+                    encoding.encode(window)
                 seconds[turn, place, kind] = (time.process_time() - start) / len(windows[:TIMED_WINDOWS])
     return 1e6 * np.median(seconds[1:], axis=0)

@@ -1,25 +1,15 @@
-"""Figures of the event encoder: cost against error, codings of time, pictures side by side."""
+"""Plots of the event encoder: cost against error, codings of time, pictures side by side."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import EVENT_COLOURS, GRID, INK, MUTED
-from jobs.studies.encoder.costs import Row
+from jobs.analysis.plots import COLOURS, EVENT_COLOURS, GRID, INK, MUTED, tidy
+from jobs.studies.encoder.costs import EncodingCost
 from models.encoder.embedding import temporal_embedding
 
-COLOURS = {
-    "default": "#111827",
-    "torch": "#dc2626",
-    "precision": "#7c3aed",
-    "time bins": "#2563eb",
-    "newest events": "#d97706",
-    "chunks": "#059669",
-    "context": "#0891b2",
-}
 # Where the labels of a knob stand from their points [points], so that near ones stay apart.
 LABELS = {
     "torch": ((0, 8), "center"),
@@ -27,11 +17,10 @@ LABELS = {
     "newest events": ((-6, -3), "right"),
     "chunks": ((0, -13), "center"),
 }
-CODING_COLOURS = {"additive": "#2563eb", "eventnet": "#d97706", "none": "#6b7280"}
 
 
-def cost_figure(rows: Sequence[Row], front: set[int]) -> Figure:
-    """Cost of 2,000 events against the latent's error, and of context sizes against what they explain."""
+def plot_encoding_costs(rows: Sequence[EncodingCost], front: set[int]) -> Figure:
+    """Draw the cost of 2,000 events against the latent's error, and against what context sizes explain."""
     figure = Figure(figsize=(11.5, 5.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     same = [place for place, row in enumerate(rows) if row.knob != "context"]
@@ -45,49 +34,60 @@ def cost_figure(rows: Sequence[Row], front: set[int]) -> Figure:
     for panel in (left, right):
         panel.margins(x=0.1)
         panel.set_xlabel("Process time for 2,000 events [us]")
-        panel.grid(color=GRID)
-        panel.spines[["top", "right"]].set_visible(False)
+        tidy(panel)
         panel.legend(frameon=False, fontsize=8)
     return figure
 
 
-def draw_rows(panel: Axes, rows: Sequence[Row], places: Sequence[int], front: set[int], height) -> None:  # type: ignore[no-untyped-def]
-    """One point per row, labelled with its setting; the front is a dashed line."""
+def draw_rows(
+    panel: Axes, rows: Sequence[EncodingCost], places: Sequence[int], front: set[int],
+    height: Callable[[EncodingCost], float],
+) -> None:  # fmt: skip
+    """Draw a point per row, labelled with its setting; the front is a dashed line."""
     points = {place: (rows[place].dense_us, height(rows[place])) for place in places}
     line = sorted(points[place] for place in places if place in front)
     panel.plot(*np.transpose(line), color=MUTED, lw=1.2, ls="--", zorder=1, label="Pareto front")
     for knob in dict.fromkeys(rows[place].knob for place in places):
         own = [place for place in places if rows[place].knob == knob]
-        marker, size, above = ("*", 16, 4) if knob == "default" else ("o", 6, 3)
+        marker, size, order = ("*", 16, 4) if knob == "default" else ("o", 6, 3)
         spots = np.array([points[place] for place in own])
-        panel.plot(*spots.T, marker, ms=size, mew=0, zorder=above, color=COLOURS[knob], label=knob)
+        panel.plot(*spots.T, marker, ms=size, mew=0, zorder=order, color=COLOURS[knob], label=knob)
         (right, up), side = LABELS.get(knob, ((6, 3), "left"))
-        look: dict[str, Any] = {"textcoords": "offset points", "ha": side, "fontsize": 7}
         for step, place in enumerate(own):
             offset = (right, up - 9 * (step % 3)) if knob == "chunks" else (right, up)
-            panel.annotate(rows[place].setting, points[place], offset, color=COLOURS[knob], **look)
+            panel.annotate(
+                rows[place].setting, points[place], offset, color=COLOURS[knob],
+                textcoords="offset points", ha=side, fontsize=7,
+            )  # fmt: skip
 
 
-def coding_figure(spreads: Mapping[str, Mapping[str, tuple[float, float]]]) -> Figure:
-    """Explained share (mean, half interval) of each coding under each condition."""
+def plot_codings(spreads: Mapping[str, Mapping[str, tuple[float, float]]]) -> Figure:
+    """Draw the explained share (mean, half interval) of each coding under each condition."""
     figure = Figure(figsize=(8.8, 4.2), layout="constrained")
     panel = figure.subplots()
     for shift, (coding, own) in zip((-0.16, 0.0, 0.16), spreads.items(), strict=False):
         means, halves = 100 * np.array(list(own.values())).T
         x = np.arange(len(means)) + shift
-        style: dict[str, Any] = {"fmt": "o", "ms": 6, "capsize": 4, "color": CODING_COLOURS[coding]}
-        panel.errorbar(x, means, yerr=np.nan_to_num(halves), label=coding, **style)
+        panel.errorbar(
+            x,
+            means,
+            yerr=np.nan_to_num(halves),
+            label=coding,
+            fmt="o",
+            ms=6,
+            capsize=4,
+            color=COLOURS[coding],
+        )
         panel.set_xticks(np.arange(len(means)), list(own))
     panel.axhline(0, color=MUTED, lw=0.8)
     panel.set_ylabel("Explained of held-out pictures [%]")
-    panel.grid(axis="y", color=GRID)
-    panel.spines[["top", "right"]].set_visible(False)
+    tidy(panel, "y")
     panel.legend(frameon=False, title="coding of time")
     return figure
 
 
-def embedding_figure(context: int = 1024, times: int = 400) -> Figure:
-    """The code of each time of a window, as the paper's figure 6, and a few features of it over time."""
+def plot_embedding(context: int = 1024, times: int = 400) -> Figure:
+    """Draw the code of each time of a window, as the paper's figure 6, and a few features of it over time."""
     figure = Figure(figsize=(11.0, 4.0), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
     t = (np.arange(times) + 0.5) / times
@@ -98,7 +98,7 @@ def embedding_figure(context: int = 1024, times: int = 400) -> Figure:
     left.set_title("Additive code", loc="left", fontsize=10)
     for place, colour in ((0, "#93c5fd"), (context // 4, "#3b82f6"), (context // 2 - 1, "#1e3a8a")):
         right.plot(t, code[:, place], color=colour, label=f"additive, feature {place}")
-    right.plot(t, t - 1, color=CODING_COLOURS["eventnet"], lw=2, label="eventnet, all features")
+    right.plot(t, t - 1, color=COLOURS["eventnet"], lw=2, label="eventnet, all features")
     right.set(xlabel="Time in the window", ylim=(-1.1, 1.9))
     right.set_title("Added to a feature", loc="left", fontsize=10)
     right.legend(frameon=False, fontsize=8, loc="upper right")
@@ -106,8 +106,8 @@ def embedding_figure(context: int = 1024, times: int = 400) -> Figure:
     return figure
 
 
-def picture_grid(rows: Mapping[str, Sequence[np.ndarray]], heads: Sequence[str]) -> Figure:
-    """Event pictures (H, W) in [-1, 1] in labelled rows, under the headings of their columns."""
+def plot_pictures(rows: Mapping[str, Sequence[np.ndarray]], heads: Sequence[str]) -> Figure:
+    """Draw event pictures (H, W) in [-1, 1] in labelled rows, under the headings of their columns."""
     figure = Figure(figsize=(1.25 * len(heads) + 0.6, 1.3 * len(rows) + 0.3), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(len(rows), len(heads), squeeze=False)

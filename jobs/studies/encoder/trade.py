@@ -2,24 +2,30 @@
 
 Run: python -m platform.launch +exp=trade_encoder
 Expect: about 20 minutes on one core beyond the run's own encoder, nearly all of it short trainings;
-they are kept in the run folder, so that a killed job goes on. Two tables and their figures,
-and figures of what the latent holds, in the run folder under `trade/` and in MLflow.
+they are kept in the run folder, so that a killed job goes on. Two tables and their plots,
+and plots of what the latent holds, in the run folder under `trade/` and in MLflow.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from envs.recordings import read_recording
-from jobs.analysis.tables import draw_figure, publish_table
+from jobs.analysis.tables import publish_plot, publish_table, short
 from jobs.config.config import Config, ConfigError
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
-from jobs.studies.encoder.costs import Row, default_forms, explained, measure, size_form
-from jobs.studies.encoder.plots import coding_figure, cost_figure, embedding_figure, picture_grid
+from jobs.studies.encoder.costs import (
+    EncodingCost,
+    default_encodings,
+    explained,
+    measure_encodings,
+    sized_encoding,
+)
+from jobs.studies.encoder.plots import plot_codings, plot_embedding, plot_encoding_costs, plot_pictures
 from jobs.studies.encoder.trials import (
     DENSE_EVENTS,
     MAX_EVENTS,
@@ -51,8 +57,8 @@ HEADINGS = (
 )  # fmt: skip
 
 
-def run(config: Config) -> dict[str, Any]:
-    """Make the run's encoder if there is none yet, then measure.
+def run(config: Config) -> dict[str, float]:
+    """Train the run's encoder if there is none yet, then measure; return the metrics.
 
     Raises:
         ConfigError: The policy has no encoder that reads events one by one.
@@ -70,30 +76,30 @@ def run(config: Config) -> dict[str, Any]:
     with open_tracker(config, folder) as tracker:
         prepare_encoder(config, folder, tracker)
         evae, _ = load_encoder(encoder_file(folder))
-        figures = trade_inference(config, folder, tracker, evae)
-        figures |= trade_coding(config, folder, tracker)
-        figures |= show_latent(config, folder, tracker, evae)
-        tracker.log(0, figures)
-    return finish(folder, "trade_encoder", figures)
+        metrics = trade_inference(config, folder, tracker, evae)
+        metrics |= trade_coding(config, folder, tracker)
+        metrics |= show_latent(config, folder, tracker, evae)
+        tracker.log(0, metrics)
+    return finish(folder, "trade_encoder", metrics)
 
 
 def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
-    """Cost against error of every way to encode; the figures of the default."""
+    """Measure cost against error of every way to encode; return the metrics of the default."""
     trade = config.trade_encoder
     models = [trained(config, folder, {"context": size}, 0) for size in CONTEXTS]
     validation = read_recording(data_file(folder, "validation"))
     usual = draw(config, validation, "mixed", MAX_EVENTS, trade.windows)
     dense = draw(config, validation, "count", DENSE_EVENTS, trade.windows)
-    forms = [*default_forms(evae), *map(size_form, models)]
-    with progress("Measure encodings", len(forms), "forms") as advance:
+    encodings = [*default_encodings(evae), *map(sized_encoding, models)]
+    with progress("Measure encodings", len(encodings), "encodings") as advance:
         timed = control_steps(validation, trade.windows), dense
-        rows = measure(forms, usual, timed, trade.rounds, advance)
+        rows = measure_encodings(encodings, usual, timed, trade.rounds, advance)
     front = fronts(rows)
-    lines = [cells(row, rows[1].dense_us, place in front) for place, row in enumerate(rows)]
+    lines = [cost_cells(row, rows[1].dense_us, place in front) for place, row in enumerate(rows)]
     title = "Encoding a window, one setting changed at a time"
     publish_table(folder, tracker, "trade/inference", title, HEADINGS, lines)
-    tracker.table("trade/inference", columns(rows))
-    draw_figure(folder, tracker, "trade/inference", cost_figure(rows, front))
+    tracker.table("trade/inference", cost_columns(rows))
+    publish_plot(folder, tracker, "trade/inference", plot_encoding_costs(rows, front))
     first, network = rows[:2]
     return {
         "perf/encode_step_us": first.step_us,
@@ -105,7 +111,7 @@ def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVA
 
 
 def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
-    """Explained reconstruction of each coding of time, trained side by side; means over seeds."""
+    """Train each coding of time side by side; return what each explains, as means over seeds."""
     trade = config.trade_encoder
     validation = read_recording(data_file(folder, "validation"))
     shares: dict[str, dict[str, list[float]]] = {coding: {} for coding in CODINGS}
@@ -124,9 +130,9 @@ def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
     lines = [(coding, *map(percent, own.values())) for coding, own in spreads.items()]
     title = f"Explained [%] by coding of time, mean and 95 % interval over {trade.seeds} trainings"
     publish_table(folder, tracker, "trade/coding", title, ("Coding", *conditions), lines)
-    draw_figure(folder, tracker, "trade/coding", coding_figure(spreads))
+    publish_plot(folder, tracker, "trade/coding", plot_codings(spreads))
     rows = {name: side_by_side(models, conditions[name]) for name in SHOWN}
-    draw_figure(folder, tracker, "trade/coding_pictures", picture_grid(rows, ("events", *CODINGS) * 2))
+    publish_plot(folder, tracker, "trade/coding_pictures", plot_pictures(rows, ("events", *CODINGS) * 2))
     return {
         f"evae/explained_{coding}_{name.replace(' ', '_')}": mean
         for coding, own in spreads.items()
@@ -135,18 +141,18 @@ def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
 
 
 def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
-    """Figures of the code of time, of the way between two latents, and of scenes never trained on."""
-    draw_figure(folder, tracker, "trade/embedding", embedding_figure())
+    """Draw the code of time, pictures between latents, and other scenes; return what is explained."""
+    publish_plot(folder, tracker, "trade/embedding", plot_embedding())
     validation = read_recording(data_file(folder, "validation"))
     batch = held_out_windows(validation, config.pretrain, evae.grid)["four_steps"]
     heads = ("events", *(f"{share:.2f}" for share in np.linspace(0, 1, STEPS_BETWEEN)), "events")
-    draw_figure(folder, tracker, "trade/interpolation", picture_grid(between(evae, batch), heads))
+    publish_plot(folder, tracker, "trade/interpolation", plot_pictures(between(evae, batch), heads))
     names = [*config.collect.scenes, *(Path(path).name for path in config.collect.recordings)]
     scenes = {" and ".join(names): batch}
     steps = 10 * config.trade_encoder.windows
-    with progress("Fly in other scenes", steps * len(OTHER_SCENES), "steps") as advance:
+    with progress("Record other scenes", steps * len(OTHER_SCENES), "steps") as advance:
         for scene in OTHER_SCENES:
-            world = config.env_config(scene=scene, split="validation", observation="events")
+            world = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
             recording = record([(world, steps)], config.seed, advance)
             scenes[scene] = held_out_windows(recording, config.pretrain, evae.grid)["four_steps"]
     shares = {scene: explained(evae, batch) for scene, batch in scenes.items()}
@@ -154,13 +160,13 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
         f"{scene}\n{shares[scene]:.0%} explained": side_by_side({"": evae}, batch, PICTURES)
         for scene, batch in scenes.items()
     }
-    draw_figure(folder, tracker, "trade/scenes", picture_grid(rows, ("events", "decoded") * PICTURES))
+    publish_plot(folder, tracker, "trade/scenes", plot_pictures(rows, ("events", "decoded") * PICTURES))
     return {f"evae/explained_in_{scene.replace(' ', '_')}": share for scene, share in shares.items()}
 
 
 @torch.no_grad()
 def side_by_side(models: Mapping[str, EventVAE], batch: EventBatch, count: int = 2) -> list[np.ndarray]:
-    """Pictures of some windows, each followed by what each model makes of it: (H, W) each."""
+    """Pictures of some windows, each followed by what each model decodes of it: (H, W) each."""
     places = np.argsort(-np.diff(batch.offsets), kind="stable")[: max(count, len(batch) // 2)]
     chosen = places[:: len(places) // count][:count]  # of the fuller half, from the fullest on
     first = next(iter(models.values()))
@@ -188,7 +194,7 @@ def between(evae: EventVAE, batch: EventBatch) -> dict[str, list[np.ndarray]]:
     return rows
 
 
-def fronts(rows: Sequence[Row]) -> set[int]:
+def fronts(rows: Sequence[EncodingCost]) -> set[int]:
     """Places of the rows that no other beats: one model by its error, context sizes by what they explain."""
     sizes = [place for place, row in enumerate(rows) if row.knob == "context"]
     same = [place for place, row in enumerate(rows) if row.knob != "context"]
@@ -197,23 +203,18 @@ def fronts(rows: Sequence[Row]) -> set[int]:
     return {same[place] for place in by_error} | {sizes[place] for place in by_share}
 
 
-def cells(row: Row, network_us: float, on_front: bool) -> tuple[str, ...]:
-    """A row as text; the network's cost of 2,000 events is what "times faster" refers to."""
+def cost_cells(row: EncodingCost, network_us: float, on_front: bool) -> tuple[str, ...]:
+    """A text for each of `HEADINGS`; "times faster" refers to the network's cost of 2,000 events."""
     costs = f"{row.step_us:,.0f}", f"{row.dense_us:,.0f}", f"{network_us / row.dense_us:,.0f}"
     errors = short(100 * row.error_mean), short(100 * row.error_max)
     mark = ("*" if on_front else "") + (" default" if row.knob == "default" else "")
     return (row.knob, row.setting, *costs, *errors, f"{100 * row.explained:.1f}", mark.strip())
 
 
-def short(value: float) -> str:
-    """A number with two digits that count, or whole from 100 on."""
-    return f"{value:,.0f}" if value >= 100 else f"{value:.2g}"
-
-
-def columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
-    """The rows as columns for a tracker; the first is unique."""
-    named = {"form": [f"{row.knob} {row.setting}".strip() for row in rows]}
-    return named | {name: [getattr(row, name) for row in rows] for name in Row._fields[2:]}
+def cost_columns(rows: Sequence[EncodingCost]) -> dict[str, list[str | float]]:
+    """The columns of a tracker's table; the first is unique."""
+    named: dict[str, list[str | float]] = {"form": [f"{row.knob} {row.setting}".strip() for row in rows]}
+    return named | {name: [getattr(row, name) for row in rows] for name in EncodingCost._fields[2:]}
 
 
 def percent(spread_of: tuple[float, float]) -> str:

@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy import stats
 
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
+from jobs.analysis.statistics import half_width
 from jobs.config.config import Config
 from jobs.run.folder import Run
 from jobs.run.progress import progress
@@ -40,7 +40,7 @@ def trained(config: Config, folder: Run, changes: dict[str, Any], seed: int) -> 
 
 def trial_settings(config: Config, changes: dict[str, Any]) -> dict[str, Any]:
     """The settings of the run's event VAE with some of them changed."""
-    return build_evae(config.model, sensor_settings(config.env_config())).settings | changes
+    return build_evae(config.model, sensor_settings(config.env)).settings | changes
 
 
 def kept(
@@ -50,7 +50,7 @@ def kept(
     if not file.with_suffix(".json").exists():
         train = read_recording(data_file(folder, "train"))
         evae = train_short(config, train, settings, seed, iterations, f"Train {file.stem}")
-        sensor = sensor_settings(config.env_config())
+        sensor = sensor_settings(config.env)
         save_encoder(file, evae, {"sensor": sensor, "iterations": iterations})
     return load_encoder(file)[0]
 
@@ -126,8 +126,5 @@ def squeezed(batch: EventBatch, youngest: float, oldest: float) -> EventBatch:
 
 def spread(values: Sequence[float]) -> tuple[float, float]:
     """Mean, and half the width of its 95 % interval (Student's t); NaN for a single value."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return mean, float("nan")
-    half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
-    return mean, float(half)
+    half = float(half_width(np.array(values))) if len(values) > 1 else float("nan")
+    return float(np.mean(values)), half

@@ -1,4 +1,4 @@
-"""Random flights with what an agent would have to know at each step, and what their events say of it."""
+"""Random episodes with the proximity of obstacles at each step, and representations of their events."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,25 +18,25 @@ from models.encoder.frozen import encoder_of
 from models.policy.features import FEATURES
 
 SECTORS = 24  # of the field of view
-RAYS = 8  # in each: at 90 degrees no pole of 0.2 m stands unseen at 20 m
-ALARM_M = 15.0  # what stands nearer is what an agent has to turn away from
-CELLS = (8, 16)  # each way; the finer ones say nearly all that a picture says
+RAYS = 8  # in each sector: at 90 degrees no pole of 0.2 m is missed at 20 m
+ALARM_M = 15.0  # an agent has to turn away from nearer obstacles
+CELLS = (8, 16)  # in each direction; the finer ones hold nearly all that a picture holds
 
 
 @dataclass(frozen=True)
 class ProbeData:
-    """Control steps of whole flights, in their order.
+    """Control steps of whole episodes, in their order.
 
     Attributes:
         windows: Events of each step.
-        flight: int64 (N,), number of each step's flight, ascending.
+        episode: int64 (N,), number of each step's episode, ascending.
         proximity: float64 (N, SECTORS), of the nearest obstacle in each sector at the end of the step,
             from left to right; see `envs.scene.range_scan.proximity`.
         bearing_deg: float64 (SECTORS,), middle of each sector, to the right [degrees].
     """
 
     windows: list[Window]
-    flight: np.ndarray
+    episode: np.ndarray
     proximity: np.ndarray
     bearing_deg: np.ndarray
 
@@ -46,51 +46,53 @@ class ProbeData:
         return self.proximity.max(axis=1) >= np.exp(-ALARM_M / NEAR_M)
 
 
-def fly_and_look(config: EnvConfig, num_steps: int, seed: int, advance: Callable[[int], None]) -> ProbeData:
-    """Fly at random, as `jobs.training.collect` does but elsewhere, and keep the truth beside the events.
+def record_probe_data(
+    config: EnvConfig, num_steps: int, seed: int, advance: Callable[[int], None]
+) -> ProbeData:
+    """Record random episodes as `jobs.training.collect` does, in other corridors, and the proximity.
 
     Args:
         config: Environment.
         num_steps: Control steps [-].
         seed: Of corridors and actions.
-        advance: Told the number of steps after each flight.
+        advance: Called with the number of steps after each episode.
     """
     env = CorridorEnv(config)
     agent = HoldingAgent(np.random.SeedSequence([seed, 4]))
     bearings = sector_bearings(config.camera.fov_deg, SECTORS, RAYS)
     windows: list[Window] = []
-    flight: list[int] = []
+    episode: list[int] = []
     near: list[np.ndarray] = []
     started = env.reset(seed=seed + SEED_STRIDE)  # not the corridors that the encoder was trained in
     while len(windows) < num_steps:
-        start_us, number, done = 0, (flight[-1] + 1 if flight else 0), len(windows)
+        start_us, number, done = 0, (episode[-1] + 1 if episode else 0), len(windows)
         agent.reset([env], [number])
         for end_us in steps_of(env, agent, started, num_steps - len(windows)):
             windows.append((env.events.copy(), start_us, end_us - start_us))
-            flight.append(number)
+            episode.append(number)
             rays = proximity(env.scene, env.camera_pose(), bearings.ravel())
             near.append(rays.reshape(bearings.shape).max(axis=1))
             start_us = end_us
         advance(len(windows) - done)
         started = env.reset()
     env.close()
-    return ProbeData(windows, np.array(flight), np.stack(near), np.degrees(bearings.mean(axis=1)))
+    return ProbeData(windows, np.array(episode), np.stack(near), np.degrees(bearings.mean(axis=1)))
 
 
 def nothing(probe_data: ProbeData) -> np.ndarray:
-    """Zeros (N, 1): what is known without looking."""
-    return np.zeros((len(probe_data.flight), 1), np.float32)
+    """Zeros (N, 1): no information."""
+    return np.zeros((len(probe_data.episode), 1), np.float32)
 
 
-def columns(probe_data: ProbeData, grid: Grid) -> np.ndarray:
-    """What the policy event_columns sees of each step, float32 (N, 2 width)."""
+def column_features(probe_data: ProbeData, grid: Grid) -> np.ndarray:
+    """The features of the policy event_columns at each step, float32 (N, 2 width)."""
     settings = {"width": grid.width, "height": grid.height}
     make = FEATURES["columns"].from_events
     assert make is not None  # noqa: S101  for the type checker
     return np.stack([make(window, settings, None) for window in probe_data.windows])
 
 
-def cells(probe_data: ProbeData, grid: Grid, across: int) -> np.ndarray:
+def cell_features(probe_data: ProbeData, grid: Grid, across: int) -> np.ndarray:
     """log(1 + count) of OFF and ON events in `across` x `across` cells, float32 (N, 2 across^2)."""
     return np.log1p(cell_counts(batch_windows(probe_data.windows, grid), across))
 
@@ -101,17 +103,17 @@ def latents(probe_data: ProbeData, evae: EventVAE) -> np.ndarray:
     return np.stack([encoder.encode(*window) for window in probe_data.windows])
 
 
-def stacked(features: np.ndarray, flight: np.ndarray, stack: int) -> np.ndarray:
+def stacked(features: np.ndarray, episode: np.ndarray, stack: int) -> np.ndarray:
     """The last `stack` rows at each step, oldest first, as `models.policy.features.push_features` keeps them.
 
     Args:
         features: (N, D).
-        flight: int64 (N,), ascending; the first row of a flight fills all places before it.
+        episode: int64 (N,), ascending; the first row of an episode fills all places before it.
         stack: Rows.
 
     Returns:
         (N, stack D).
     """
-    first = np.searchsorted(flight, flight)
-    places = np.arange(len(flight))[:, None] - np.arange(stack)[::-1]
+    first = np.searchsorted(episode, episode)
+    places = np.arange(len(episode))[:, None] - np.arange(stack)[::-1]
     return features[np.maximum(places, first[:, None])].reshape(len(features), -1)

@@ -1,22 +1,24 @@
-"""What a representation of events tells an agent: bearing and proximity of the obstacles ahead.
+"""What an agent can read from a representation of events: bearing and proximity of the obstacles ahead.
 
 Run: python -m platform.launch +exp=probe
 Expect: beyond the run's own encoder 32 short trainings, an hour on one core, and their probes, a
-quarter of an hour; the trainings are kept in the run folder, so that a killed job goes on. One table and one
-figure, in the run folder under `probe/` and in MLflow.
+quarter of an hour; the trainings are kept in the run folder, so that a killed job continues. One table
+and one plot, in the run folder under `probe/` and in MLflow.
 """
 
+import dataclasses
 import functools
 import re
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import GRID, INK, MUTED
-from jobs.analysis.tables import draw_figure, publish_table
+from envs.config import Split
+from jobs.analysis.plots import COLOURS, GREYS, INK, MUTED, tidy
+from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.config import Config, ConfigError
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
@@ -25,11 +27,11 @@ from jobs.studies.probe.dataset import (
     ALARM_M,
     CELLS,
     ProbeData,
-    cells,
-    columns,
-    fly_and_look,
+    cell_features,
+    column_features,
     latents,
     nothing,
+    record_probe_data,
     stacked,
 )
 from jobs.studies.probe.readout import Interval, Scores, probe, scores
@@ -40,15 +42,13 @@ from models.encoder.weights import load_encoder
 from models.kinds import KINDS
 
 OWN = "run's encoder"
-TARGET_COLOURS = {"occupancy": "#2563eb", "signed": "#d97706", "aged": "#059669", "counts": "#db2777"}
-LEVEL_COLOURS = ("#9ca3af", "#6b7280", "#374151", "#111827")
 
 
-class Form(NamedTuple):
-    """A representation.
+class Representation(NamedTuple):
+    """A representation of events.
 
     Attributes:
-        name: As the table says it.
+        name: As in the table.
         represent: ProbeData -> float32 (N, D), one function per training.
         place: Latent size and target of an event VAE trained here, or None.
     """
@@ -58,22 +58,22 @@ class Form(NamedTuple):
     place: tuple[int, str] | None = None
 
 
-class Row(NamedTuple):
-    """What one representation tells.
+class ProbeResult(NamedTuple):
+    """How much one representation holds.
 
     Attributes:
-        form: Which.
-        numbers: How many it has for each step.
+        representation: Which.
+        numbers: Numbers for each step [-].
         scores: Of each number of steps that are read together.
     """
 
-    form: Form
+    representation: Representation
     numbers: int
     scores: dict[int, Scores]
 
 
-def run(config: Config) -> dict[str, Any]:
-    """Make the run's encoder if there is none yet, then probe it and its rivals.
+def run(config: Config) -> dict[str, float]:
+    """Train the run's encoder if there is none yet, then probe it and its rivals; return the metrics.
 
     Raises:
         ConfigError: The policy has no event VAE.
@@ -88,49 +88,56 @@ def run(config: Config) -> dict[str, Any]:
     with open_tracker(config, folder) as tracker:
         prepare_encoder(config, folder, tracker)
         own, _ = load_encoder(encoder_file(folder))
-        flown = fly_both(config)
-        rows = measure(config, forms(config, folder, own), *flown)
+        train, held_out = record_both(config)
+        rows = probe_representations(config, representations(config, folder, own), train, held_out)
         title = (
-            f"Proximity read from each representation [%], and error of the bearing of what is within "
-            f"{ALARM_M:g} m; {len(np.unique(flown[1].flight))} flights, 95 % intervals"
+            f"Proximity read from each representation [%], and error of the bearing of obstacles within "
+            f"{ALARM_M:g} m; {len(np.unique(held_out.episode))} episodes, 95 % intervals"
         )
         shown = config.model.stack
-        lines = [cells_of(row, shown) for row in rows]
+        lines = [result_cells(row, shown) for row in rows]
         publish_table(folder, tracker, "probe/table", title, headings(rows[0], shown), lines)
-        tracker.table("probe/results", as_columns(rows))
-        draw_figure(folder, tracker, "probe/probe", probe_figure(rows))
+        tracker.table("probe/results", result_columns(rows))
+        publish_plot(folder, tracker, "probe/probe", plot_probes(rows))
         read = {f"evae/probe_r2_{key(row)}": row.scores[shown].network[0] for row in rows}
         turned = {f"evae/probe_bearing_deg_{key(row)}": row.scores[shown].bearing_deg[0] for row in rows}
         tracker.log(0, read)
         tracker.log(0, turned)
-    figures = {name: value for name, value in (read | turned).items() if np.isfinite(value)}
-    return finish(folder, "probe", figures)
+    metrics = {name: value for name, value in (read | turned).items() if np.isfinite(value)}
+    return finish(folder, "probe", metrics)
 
 
-def fly_both(config: Config) -> tuple[ProbeData, ProbeData]:
-    """Flights to fit the probes to, and flights through validation corridors to judge them by."""
-    sizes = {"train": config.probe.num_steps, "validation": config.probe.num_validation_steps}
-    with progress("Fly and look", sum(sizes.values()), "steps") as advance:
+def record_both(config: Config) -> tuple[ProbeData, ProbeData]:
+    """Record episodes to fit the probes to, and others in validation corridors to judge them by."""
+    env = dataclasses.replace(config.env, observation="events")
+    sizes: dict[Split, int] = {
+        "train": config.probe.num_steps,
+        "validation": config.probe.num_validation_steps,
+    }
+    with progress("Record probe data", sum(sizes.values()), "steps") as advance:
         train, held_out = (
-            fly_and_look(config.env_config(split=split, observation="events"), steps, config.seed, advance)
+            record_probe_data(dataclasses.replace(env, split=split), steps, config.seed, advance)
             for split, steps in sizes.items()
         )
     return train, held_out
 
 
-def forms(config: Config, folder: Run, own: EventVAE) -> list[Form]:
+def representations(config: Config, folder: Run, own: EventVAE) -> list[Representation]:
     """The representations to compare; the event VAEs among them are trained, or read if they were before."""
     grid, settings = own.grid, config.probe
-    compared = [Form("nothing", [nothing]), Form("image columns", [functools.partial(columns, grid=grid)])]
+    compared = [
+        Representation("nothing", [nothing]),
+        Representation("image columns", [functools.partial(column_features, grid=grid)]),
+    ]
     for across in CELLS:
-        counted = functools.partial(cells, grid=grid, across=across)
-        compared.append(Form(f"{across} x {across} cells", [counted]))
-    compared.append(Form(OWN, [functools.partial(latents, evae=own)]))
+        counted = functools.partial(cell_features, grid=grid, across=across)
+        compared.append(Representation(f"{across} x {across} cells", [counted]))
+    compared.append(Representation(OWN, [functools.partial(latents, evae=own)]))
     for target in settings.targets:
         for latent in settings.latents:
             models = [trained(config, folder, latent, target, seed) for seed in range(settings.seeds)]
             represent = [functools.partial(latents, evae=evae) for evae in models]
-            compared.append(Form(f"{target}, latent {latent}", represent, (latent, target)))
+            compared.append(Representation(f"{target}, latent {latent}", represent, (latent, target)))
     return compared
 
 
@@ -142,46 +149,48 @@ def trained(config: Config, folder: Run, latent: int, target: str, seed: int) ->
     return kept(config, folder, file, settings, seed, iterations)
 
 
-def measure(config: Config, compared: Sequence[Form], train: ProbeData, held_out: ProbeData) -> list[Row]:
+def probe_representations(
+    config: Config, compared: Sequence[Representation], train: ProbeData, held_out: ProbeData
+) -> list[ProbeResult]:
     """Fit the probes to every representation, for every number of steps read together."""
     stacks = sorted({*config.probe.stacks, config.model.stack})
     rows = []
-    fits = len(stacks) * sum(len(form.represent) for form in compared)
+    fits = len(stacks) * sum(len(one.represent) for one in compared)
     with progress("Probe", fits, "fits") as advance:
-        for form in compared:
-            features = [[represent(part) for part in (train, held_out)] for represent in form.represent]
-            told = {}
+        for one in compared:
+            features = [[represent(part) for part in (train, held_out)] for represent in one.represent]
+            found = {}
             for stack in stacks:
                 errors = []
                 for seed, (x, x_held_out) in enumerate(features):
-                    inputs = stacked(x, train.flight, stack), stacked(x_held_out, held_out.flight, stack)
+                    inputs = stacked(x, train.episode, stack), stacked(x_held_out, held_out.episode, stack)
                     errors.append(probe(inputs[0], train, inputs[1], held_out, seed))
-                    advance(1, note=form.name)
-                told[stack] = scores(errors, held_out)
-            rows.append(Row(form, features[0][0].shape[1], told))
+                    advance(1, note=one.name)
+                found[stack] = scores(errors, held_out)
+            rows.append(ProbeResult(one, features[0][0].shape[1], found))
     return rows
 
 
-def headings(row: Row, shown: int) -> tuple[str, ...]:
-    """Of the table: ridge and bearing are shown for one number of steps."""
+def headings(row: ProbeResult, shown: int) -> tuple[str, ...]:
+    """The headings of the table, which shows ridge and bearing for one number of steps."""
     networks = [f"Network, {_steps(stack)}" for stack in row.scores]
     linear, bearing = f"Ridge, {_steps(shown)}", f"Bearing, {_steps(shown)} [deg]"
     return "Representation", "Numbers a step", linear, *networks, bearing
 
 
-def cells_of(row: Row, shown: int) -> tuple[str, ...]:
-    """A row as text."""
+def result_cells(row: ProbeResult, shown: int) -> tuple[str, ...]:
+    """A text for each of `headings`."""
     networks = [_percent(part.network) for part in row.scores.values()]
     bearing, low, high = row.scores[shown].bearing_deg
     turned = f"{bearing:.1f} [{low:.1f}, {high:.1f}]"
-    return row.form.name, str(row.numbers), _percent(row.scores[shown].ridge), *networks, turned
+    return row.representation.name, str(row.numbers), _percent(row.scores[shown].ridge), *networks, turned
 
 
-def as_columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
-    """All scores as columns for a tracker; the first is unique."""
+def result_columns(rows: Sequence[ProbeResult]) -> dict[str, list[str | float]]:
+    """All scores as columns of a tracker's table; the first is unique."""
     pairs = [(row, stack) for row in rows for stack in row.scores]
-    table: dict[str, list[Any]] = {
-        "representation": [f"{row.form.name}, {_steps(stack)}" for row, stack in pairs],
+    table: dict[str, list[str | float]] = {
+        "representation": [f"{row.representation.name}, {_steps(stack)}" for row, stack in pairs],
         "numbers": [row.numbers * stack for row, stack in pairs],
     }
     for score in Scores._fields:
@@ -190,13 +199,13 @@ def as_columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
     return table
 
 
-def key(row: Row) -> str:
-    """The name of a representation as part of a metric's."""
-    return re.sub(r"[^a-z0-9]+", "_", row.form.name.replace("'", ""))
+def key(row: ProbeResult) -> str:
+    """The name of a representation as a part of a metric's name."""
+    return re.sub(r"[^a-z0-9]+", "_", row.representation.name.replace("'", ""))
 
 
-def probe_figure(rows: Sequence[Row]) -> Figure:
-    """Proximity read and error of the bearing against the latent size, a column for each number of steps."""
+def plot_probes(rows: Sequence[ProbeResult]) -> Figure:
+    """Draw proximity read and error of the bearing against the latent size, a column per number of steps."""
     stacks = list(rows[0].scores)
     figure = Figure(figsize=(4.2 * len(stacks) + 0.8, 7.2), layout="constrained")
     grid = figure.subplots(2, len(stacks), squeeze=False, sharex=True, sharey="row")
@@ -212,29 +221,32 @@ def probe_figure(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _draw(panel: Axes, rows: Sequence[Row], values: Sequence[Interval]) -> None:
-    """A line for each target over the latent sizes, a level for each representation without training."""
+def _draw(panel: Axes, rows: Sequence[ProbeResult], values: Sequence[Interval]) -> None:
+    """Draw a line per target over the latent sizes, and a level per representation without training."""
     pairs = list(zip(rows, values, strict=True))
-    levels = [(row.form.name, value) for row, value in pairs if row.form.place is None]
-    for (name, value), colour in zip(levels[:-1], LEVEL_COLOURS, strict=True):
+    levels = [(row.representation.name, value) for row, value in pairs if row.representation.place is None]
+    for (name, value), colour in zip(levels[:-1], GREYS, strict=True):
         panel.axhspan(*value[1:], color=colour, alpha=0.08, lw=0)
         panel.axhline(value[0], color=colour, lw=1.2, ls="--", label=name)
     panel.axhline(levels[-1][1][0], color=INK, lw=1.6, ls=":", label=levels[-1][0])
-    placed = [(*row.form.place, value) for row, value in pairs if row.form.place is not None]
+    placed = [
+        (*row.representation.place, value) for row, value in pairs if row.representation.place is not None
+    ]
     targets = list(dict.fromkeys(target for _, target, _ in placed))
     for shift, target in enumerate(targets):
         sizes, points = zip(*((size, value) for size, own, value in placed if own == target), strict=True)
         middle, low, high = np.transpose(points)
         x = np.array(sizes) * 1.04 ** (shift - (len(targets) - 1) / 2)  # so that intervals stand apart
-        style: dict[str, Any] = {"marker": "o", "ms": 5, "capsize": 3, "color": TARGET_COLOURS[target]}
-        panel.errorbar(x, middle, yerr=(middle - low, high - middle), label=target, **style)
+        spread = (middle - low, high - middle)
+        panel.errorbar(
+            x, middle, yerr=spread, label=target, marker="o", ms=5, capsize=3, color=COLOURS[target]
+        )
     shown = sorted({size for size, _, _ in placed})
     panel.set_xscale("log", base=2)
     panel.set_xticks(shown, [str(size) for size in shown])
     panel.set_xticks([], minor=True)
-    panel.grid(axis="y", color=GRID)
     panel.tick_params(colors=MUTED)
-    panel.spines[["top", "right"]].set_visible(False)
+    tidy(panel, "y")
 
 
 def _steps(stack: int) -> str:

@@ -2,15 +2,16 @@
 
 Run: python -m platform.launch +exp=trade
 Expect: by estimate a quarter of an hour on two idle cores. In the run folder under `trade/`, and in
-MLflow, a table, a figure, and the page that says what to choose, which `+exp=report` puts into docs/.
-One policy, `trade.policy`, flies the same corridors under every setting. A stopped job continues when
-the same command is given again: what was flown is never flown twice; costs and errors are measured
-anew.
+MLflow, a table, a plot, and the page that says what to choose, which `+exp=report` puts into docs/.
+One policy, `trade.policy`, is evaluated in the same corridors under every setting. A stopped job
+continues when the same command is given again: no episode is evaluated twice; costs and errors are
+measured anew.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pydantic
@@ -20,7 +21,7 @@ from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from envs.event_error import converged
 from jobs.analysis.statistics import paired_rate_difference
-from jobs.analysis.tables import draw_figure, publish_table, summarise
+from jobs.analysis.tables import publish_plot, publish_table, summarise
 from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError
 from jobs.evaluation.sweep_plan import find_agents, read_entry, with_sensor
 from jobs.rollout.agents import PolicyAgent, make_agent
@@ -32,18 +33,28 @@ from jobs.run.progress import console, progress
 from jobs.run.provenance import command, provenance, today
 from jobs.studies.encoder.costs import CAPS, TIME_BINS
 from jobs.studies.encoder.trade import EVENT_ENCODERS
-from jobs.studies.front_plots import choice_figure
-from jobs.studies.replays import Measured, measure
-from jobs.studies.simulator import KNOBS, changed, setting_text
-from jobs.studies.trade.page import DEFAULT, EXACT, HEADINGS, Row, lines, metrics, page, panels, verdict
-from jobs.tracking.child_runs import Child, write_children
+from jobs.studies.front_plots import plot_choices
+from jobs.studies.replays import Measured, measure_settings
+from jobs.studies.simulator import KNOBS, Setting, changed, setting_text
+from jobs.studies.trade.page import (
+    DEFAULT,
+    EXACT,
+    HEADINGS,
+    TradedSetting,
+    TradeFacts,
+    panels,
+    trade_lines,
+    trade_metrics,
+    trade_page,
+)
+from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.tracker import Tracker, open_tracker
 from models.encoder.evae import EventVAE
 from models.encoder.table import PRECISIONS
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
 
-# Knob of the simulator's trade -> which of its settings fly: the whole of its span.
+# Knob of the simulator's trade -> which of its settings are evaluated: the whole of its span.
 SPANS = {
     "tolerance": slice(1, None),
     "renders": slice(2),
@@ -53,20 +64,19 @@ SPANS = {
     "culling": slice(None, None, 2),
     "memory": slice(None),
 }
-Changes = dict[str, Any]
 # Several at once, of the simulation and of the table; the paper's camera sees one 8-bit frame a step.
-TOGETHER: dict[str, tuple[Changes, Changes]] = {
+TOGETHER: dict[str, tuple[Setting, Setting]] = {
     "coarse": ({"fidelity.tolerance": 0.5}, {"precision": PRECISIONS[-1]}),
     "the paper's camera": ({"camera.memory": "frame", "camera.encoding": "gamma8"}, {}),
 }
 
 
-def run(config: Config) -> dict[str, Any]:
-    """Fly and measure every setting, and say what to choose; return the default's figures.
+def run(config: Config) -> dict[str, float]:
+    """Evaluate and measure every setting, and say what to choose; return the default's metrics.
 
     Raises:
         ConfigError: The policy has no frozen encoder of single events.
-        RuntimeError: The default or the most exact setting could not be flown.
+        RuntimeError: The default or the most exact setting could not be evaluated.
     """
     entry, evae = find_policy(config)
     folder = open_run(config)
@@ -75,27 +85,28 @@ def run(config: Config) -> dict[str, Any]:
     identity = settings_hash({"cells": [[cell.key, len(cell.seeds)] for cell in every]})
     with open_tracker(config, folder, key=f"trade {identity[:8]}") as tracker:
         tracker.tags({"kind": "trade", "policy": entry.group})
-        flown, failed = fly_cells(config, folder.path / "trade", every, "Trade", measuring=False)
+        episodes, failed = fly_cells(config, folder.path / "trade", every, "Trade", measuring=False)
         for cell in (every[0], every[-1]):
             if cell.key in failed:
                 raise RuntimeError(
-                    f"{cell.label[0]}: not flown: {failed[cell.key]}; the same command tries again"
+                    f"{cell.label[0]}: not evaluated: {failed[cell.key]}; the same command tries again"
                 )
-        able = [cell for cell in every if cell.key in flown]
-        figures = replay_all(config, able, evae)
-        usual = flown[every[0].key]
+        able = [cell for cell in every if cell.key in episodes]
+        measured = replay_all(config, able, evae)
+        default = episodes[every[0].key]
         rows = [
-            row_of(cell, found, flown[cell.key], usual) for cell, found in zip(able, figures, strict=True)
+            traded_setting(cell, own, episodes[cell.key], default)
+            for cell, own in zip(able, measured, strict=True)
         ]
         reasons = {" ".join(cell.label): failed[cell.key] for cell in every if cell.key in failed}
-        publish(folder, tracker, rows, about(config, folder, entry, every[0].env, reasons))
-        tracker.log(0, metrics(rows[0]))
+        write_trade(folder, tracker, rows, facts_of(config, folder, entry, every[0].env, reasons))
+        tracker.log(0, trade_metrics(rows[0]))
         console.print(tracker.dashboard(), markup=False)
-    return finish(folder, "trade", metrics(rows[0]))
+    return finish(folder, "trade", trade_metrics(rows[0]))
 
 
 def find_policy(config: Config) -> tuple[Entry, EventVAE]:
-    """The policy that flies, and its encoder.
+    """The policy that is evaluated, and its encoder.
 
     Raises:
         ConfigError: If `trade.policy` names none, several, or one that has no such encoder.
@@ -117,7 +128,7 @@ def plan(config: Config, entry: Entry, evae: EventVAE) -> list[Cell]:
     Raises:
         ConfigError: If the policy's own sensor and a setting exclude each other.
     """
-    own = with_sensor(config.env_config(scene=HELD_OUT_SCENE, split="eval"), entry.sensor)
+    own = with_sensor(dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval"), entry.sensor)
     timed = evae.ecn.coding != "none"
     found: dict[str, Cell] = {}
     for knob, text, simulation, table in changes(timed):
@@ -131,16 +142,16 @@ def plan(config: Config, entry: Entry, evae: EventVAE) -> list[Cell]:
     return [*found.values(), _cell(config, entry, (EXACT, ""), exact_env(own), table)]
 
 
-def changes(timed: bool) -> list[tuple[str, str, Changes, Changes]]:
+def changes(timed: bool) -> list[tuple[str, str, Setting, Setting]]:
     """What is changed: nothing, each setting of the simulator, each of the encoder, and several at once.
 
     Args:
         timed: Whether the encoder sees time.
 
     Returns:
-        Knob, setting, what changes of the simulation, what of the encoder's table.
+        Knob, setting, what changes in the simulation, what in the encoder's table.
     """
-    found: list[tuple[str, str, Changes, Changes]] = [(DEFAULT, "", {}, {})]
+    found: list[tuple[str, str, Setting, Setting]] = [(DEFAULT, "", {}, {})]
     for knob, span in SPANS.items():
         found += [(knob, setting_text(setting), setting, {}) for setting in KNOBS[knob][span]]
     found += [("precision", name, {}, {"precision": name}) for name in PRECISIONS[1:]]
@@ -159,34 +170,34 @@ def exact_env(env: EnvConfig) -> EnvConfig:
     return converged(env, corridor.scene)
 
 
-def _cell(
-    config: Config, entry: Entry, label: tuple[str, str], env: EnvConfig, table: Mapping[str, Any]
-) -> Cell:
+def _cell(config: Config, entry: Entry, label: tuple[str, str], env: EnvConfig, table: Setting) -> Cell:
     trade = config.trade
     trials = min(trade.trials, trade.pyrender_trials) if env.renderer == "pyrender" else trade.trials
     return make_cell(label, entry, config.evaluate.action, env, trials, table)
 
 
 def replay_all(config: Config, every: Sequence[Cell], evae: EventVAE) -> list[Measured]:
-    """Cost and errors of each cell's setting on the recorded flights."""
+    """Measure cost and errors of each cell's setting on recorded episodes."""
     torch.set_num_threads(1)
     agents = [make_agent(cell.entry.agent, cell.action, dict(cell.table)) for cell in every]
     settings = [(cell.env, cast(PolicyAgent, agent)) for cell, agent in zip(every, agents, strict=True)]
     seeds = range(config.trade.replays)
-    with progress("Replay", len(seeds) * len(settings), "flights") as advance:
-        return measure(settings, evae, seeds, advance)
+    with progress("Replay", len(seeds) * len(settings), "episodes") as advance:
+        return measure_settings(settings, evae, seeds, advance)
 
 
-def row_of(cell: Cell, figures: Measured, episodes: np.ndarray, usual: np.ndarray) -> Row:
-    """The row of a cell, beside the default's episodes."""
-    difference = paired_rate_difference(episodes["success"], usual["success"][: len(episodes)])
-    return Row(*cell.label, figures, summarise(cell.label, episodes), difference)
+def traded_setting(
+    cell: Cell, measured: Measured, episodes: np.ndarray, default: np.ndarray
+) -> TradedSetting:
+    """The row of a cell, compared with the default's episodes in the same corridors."""
+    difference = paired_rate_difference(episodes["success"], default["success"][: len(episodes)])
+    return TradedSetting(*cell.label, measured, summarise(cell.label, episodes), difference)
 
 
-def about(
+def facts_of(
     config: Config, folder: Run, entry: Entry, env: EnvConfig, failed: Mapping[str, str]
-) -> dict[str, Any]:
-    """What made the figures: command, commit, machine and date, policy and corridors."""
+) -> TradeFacts:
+    """What made the numbers."""
     return {
         "run": folder.path.name,
         "command": command(),
@@ -201,19 +212,22 @@ def about(
     }
 
 
-def publish(folder: Run, tracker: Tracker, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
-    """Print the table; write it, the figure and the page into run folder and tracker, a child run a row."""
+def write_trade(folder: Run, tracker: Tracker, rows: Sequence[TradedSetting], facts: TradeFacts) -> None:
+    """Print the table; write table, plot and page into run folder and tracker, and a child run per row."""
     place = folder.path / "trade"
     (place / "images").mkdir(parents=True, exist_ok=True)
-    publish_table(folder, tracker, "trade/table", "What each setting costs and gives", HEADINGS, lines(rows))
+    title = "What each setting costs and gives"
+    publish_table(folder, tracker, "trade/table", title, HEADINGS, trade_lines(rows))
     named = [(row.knob, row.setting, row.steps_per_s) for row in rows]
-    draw_figure(folder, tracker, "trade/images/trade", choice_figure(named, panels(rows)))
-    text = page(facts, rows)
+    publish_plot(folder, tracker, "trade/images/trade", plot_choices(named, panels(rows)))
+    text = trade_page(facts, rows)
     write_atomic(place / "trade.md", text)
     tracker.text("trade/trade.md", text)
     children = [
-        Child(row.name, {"knob": row.knob, "setting": row.setting}, {"verdict": verdict(row)}, metrics(row))
+        ChildRun(
+            row.name, {"knob": row.knob, "setting": row.setting}, {"verdict": row.verdict}, trade_metrics(row)
+        )
         for row in rows
     ]
-    write_children(tracker, "setting", children)
-    write_json(place / "about.json", dict(facts))  # the last: it says that the rest is there
+    write_child_runs(tracker, "setting", children)
+    write_json(place / "about.json", facts)  # the last: it says that the rest is there

@@ -7,18 +7,10 @@ import pytest
 
 from envs.rasterize import PyrenderRenderer
 from envs.scene import make_scene
+from tests.support.rendering import POSE, picture
 
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[3]
-POSE = (0.5, 20.0, 2.0, 0.1)
-
-
-def picture() -> np.ndarray:
-    """What a renderer of its own draws, in whatever process this runs."""
-    renderer = PyrenderRenderer(make_scene("poles", np.random.default_rng(1)), 64, 64)
-    try:
-        return renderer.render(*POSE)
-    finally:
-        renderer.close()
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +60,9 @@ def test_a_forked_child_renders_beside_its_parent(expected):
     code = f"""
 import os, sys
 import numpy as np
-sys.path.insert(0, 'tests')
-from tests.envs.rasterize.test_processes import POSE, PyrenderRenderer, make_scene, picture
+from tests.support.rendering import POSE, picture
+from envs.rasterize import PyrenderRenderer
+from envs.scene import make_scene
 parent = PyrenderRenderer(make_scene('poles', np.random.default_rng(1)), 64, 64)
 before = parent.render(*POSE)
 child = os.fork()

@@ -1,9 +1,11 @@
 """Damaged and hostile files of every format: one ValueError, in bounded memory and time."""
 
+import base64
 import os
 import subprocess
 import sys
 import zipfile
+import zlib
 from pathlib import Path
 
 import h5py
@@ -12,6 +14,7 @@ import pytest
 
 from envs.events import EVENT
 from envs.recordings import FORMATS, read_events, write_events
+from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2
 
 ROOT = Path(__file__).resolve().parents[3]
 MEMORY_BYTES = 3 << 30  # of address space, most of it taken by the libraries
@@ -78,8 +81,6 @@ def some_events() -> np.ndarray:
 
 def one_of_each(folder: Path) -> list[Path]:
     """A good file of every format."""
-    from tests.envs.recordings.test_aedat import LZ4_FILE, ZSTD_FILE, aedat2, base64, zlib
-
     events, paths = some_events(), []
     for format in ("npz", "hdf5", "txt", "csv", "dat", "evt2", "evt3"):
         suffix = {"txt": ".txt", "csv": ".csv", "hdf5": ".h5"}.get(format, "")
@@ -114,6 +115,7 @@ def test_flipped_cut_and_scrambled_files_are_read_or_refused_by_name(tmp_path):
         assert results.count(f"{path.name} refused") > 15, path.name
 
 
+@pytest.mark.system
 def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
     bomb = tmp_path / "bomb.npz"
     header = {"descr": "<i8", "fortran_order": False, "shape": (2,)}

@@ -208,7 +208,7 @@ def test_paired_rate_differences_hold_the_true_one_about_as_often_as_they_say():
 
 @pytest.mark.parametrize(("ours", "theirs"), [([], []), ([True], [True, False]), ([[True]], [[True]])])
 def test_pairs_that_are_none_are_refused(ours, theirs):
-    with pytest.raises(ValueError, match="both must be flights of the same corridors"):
+    with pytest.raises(ValueError, match="same corridors"):
         paired_rate_difference(np.array(ours, bool), np.array(theirs, bool))
 
 

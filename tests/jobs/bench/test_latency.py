@@ -5,11 +5,12 @@ from jobs.bench.latency import load, random_events, random_policy
 from models.kinds import KINDS
 from models.policy.features import FEATURES
 from models.policy.onnx import export_onnx
+from tests.support.policies import kinds
 
 FROM_EVENTS = [name for name, kind in KINDS.items() if FEATURES[kind.feature].from_events is not None]
 
 
-@pytest.mark.parametrize("name", FROM_EVENTS)
+@pytest.mark.parametrize("name", kinds(FROM_EVENTS, quick=("bytestream", "event_image")))
 def test_the_policies_that_are_timed_have_the_default_sizes_and_choose_from_any_number_of_events(name):
     policy = random_policy(name)
     for size in (0, 300):

@@ -3,18 +3,18 @@ import pytest
 
 from envs.config import EnvConfig
 from jobs.config.conditions import (
-    KEYS,
+    CONDITION_KEYS,
+    axis_errors,
     axis_numbers,
     axis_points,
-    env_with,
+    condition_errors,
     moving_settings,
-    refused_axes,
-    refused_conditions,
 )
+from jobs.config.env_keys import env_with
 
 
-def refusals(axis):
-    return refused_axes({"here": axis}, EnvConfig())
+def errors_of(axis):
+    return axis_errors({"here": axis}, EnvConfig())
 
 
 def test_settings_of_the_world_can_be_replaced_by_their_keys():
@@ -72,16 +72,16 @@ def test_settings_of_an_axis_go_together_and_a_single_value_stays():
         ),
     ],
 )
-def test_what_cannot_be_flown_is_refused_in_one_line_that_names_key_and_value(axis, reason):
-    assert refusals(axis) == [f"sweep.axes.here: {reason}"]
+def test_a_setting_that_is_not_valid_gives_one_line_that_names_key_and_value(axis, reason):
+    assert errors_of(axis) == [f"sweep.axes.here: {reason}"]
 
 
 def test_each_bad_value_has_its_line():
-    assert len(refusals({"env.control_hz": [45, 0, -1]})) == 2
+    assert len(errors_of({"env.control_hz": [45, 0, -1]})) == 2
 
 
 def test_every_key_that_an_axis_may_hold_is_a_field_of_the_simulation():
-    for key in KEYS:
+    for key in CONDITION_KEYS:
         section, _, name = key.rpartition(".")
         owner = EnvConfig() if section in ("", "env") else getattr(EnvConfig(), section)
         assert hasattr(owner, name), key
@@ -95,11 +95,11 @@ def test_an_axis_of_numbers_changes_one_setting_and_no_words():
     assert axis_numbers({"poles": {"env.scene": "poles"}, "dynamic": {"env.scene": "dynamic"}}) is None
 
 
-def test_conditions_of_a_training_are_refused_line_by_line_and_keep_the_networks_picture():
+def test_conditions_of_a_training_have_an_error_for_each_line_and_keep_the_networks_image():
     conditions = [{}, {"faults.sparsity": 2.0}, {"env.hz": 5}, {"camera.width": 32}]
-    assert refused_conditions(conditions, EnvConfig()) == [
+    assert condition_errors(conditions, EnvConfig()) == [
         "train.conditions[1]: faults.sparsity=2.0: Input should be less than or equal to 1",
         "train.conditions[2]: env.hz: no such setting, got 5; --cfg job shows every key",
         "train.conditions[3]: camera.width: must be the same for all of a training, got 32",
     ]
-    assert refused_conditions([{}, {"faults.sparsity": 0.5, "env.control_hz": 100}], EnvConfig()) == []
+    assert condition_errors([{}, {"faults.sparsity": 0.5, "env.control_hz": 100}], EnvConfig()) == []

@@ -8,8 +8,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from envs.config import EnvConfig
-from jobs.config.config import ENV_PARTS, SECTIONS, Config, ConfigError, as_dict, known_keys, parse
-from jobs.config.errors import JOBS_CHOOSE
+from jobs.config.config import ConfigError, as_dict, known_keys, parse
+from jobs.config.env_keys import flat_env
+from jobs.config.errors import SET_BY_JOBS
 from jobs.config.schema import EVAE_SETTINGS
 from jobs.run.folder import run_name
 from models.kinds import KINDS
@@ -68,15 +69,16 @@ def test_every_file_of_every_group_is_accepted(composed, choice):
 
 
 def test_the_yaml_of_the_world_says_what_its_dataclasses_say(values):
-    defaults = dataclasses.asdict(EnvConfig())
-    defaults = {name: value for name, value in defaults.items() if name not in JOBS_CHOOSE}
-    assert {**values["env"], **{part: values[part] for part in ENV_PARTS}} == defaults
+    defaults = flat_env(EnvConfig())
+    assert {group: values[group] for group in defaults} == defaults
 
 
-@pytest.mark.parametrize("section", [*SECTIONS, ""])
-def test_no_key_is_given_without_being_checked_nor_checked_without_being_given(values, section):
-    fields = {field.name for field in dataclasses.fields(SECTIONS.get(section, Config))}
-    assert set(values[section] if section else values) == fields
+def test_no_key_is_given_without_being_checked_nor_checked_without_being_given(values):
+    given = {*values}
+    for group, settings in values.items():
+        if isinstance(settings, dict):
+            given |= {f"{group}.{name}" for name in settings}
+    assert given == {*known_keys()}
 
 
 @pytest.mark.parametrize(
@@ -259,18 +261,15 @@ def test_a_picture_too_small_for_the_network_is_refused(composed, exp):
 def test_all_refusals_come_at_once(values):
     with pytest.raises(ConfigError) as refusal:
         parse(changed(changed(changed(values, "seed", -1), "algo.lr", -1.0), "env.control_hz", -1.0))
-    assert [line.partition(":")[0] for line in str(refusal.value).splitlines()] == [
-        "algo.lr",
-        "env.control_hz",
-        "seed",
-    ]
+    keys = [line.partition(":")[0] for line in str(refusal.value).splitlines()]
+    assert sorted(keys) == ["algo.lr", "env.control_hz", "seed"]
 
 
-def test_what_jobs_choose_is_no_key_and_reaches_no_run(values):
-    assert {f"env.{name}" for name in JOBS_CHOOSE}.isdisjoint(known_keys())
+def test_what_jobs_set_is_no_key_and_reaches_no_run(values):
+    assert {f"env.{name}" for name in SET_BY_JOBS}.isdisjoint(known_keys())
     config = parse(values)
-    assert set(config.env).isdisjoint(JOBS_CHOOSE)
-    assert (config.env_config().split, config.env_config().observation) == ("train", "window")
+    assert set(as_dict(config)["env"]).isdisjoint(SET_BY_JOBS)
+    assert (config.env.split, config.env.observation) == ("train", "window")
 
 
 def test_every_known_key_can_be_replaced(values):

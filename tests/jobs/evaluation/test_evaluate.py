@@ -4,7 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
+from envs.config import CameraConfig, sensor_settings
 from envs.corridor import CorridorEnv
 from envs.sensor import Sensor
 from jobs.analysis.tables import summarise
@@ -30,27 +30,10 @@ from jobs.rollout.tasks import read_episodes
 from jobs.run.files import write_json
 from jobs.run.folder import finished, open_run
 from jobs.tracking.tracker import open_tracker
-from models.encoder.evae import EventVAE
 from models.kinds import KINDS
-from models.policy import load_policy, save_policy
-from models.policy.networks import build_networks
-from tests.jobs.run.test_folder import small_config
-
-HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
-
-
-def save_untrained(path, env_config=HELD_OUT, name="bytestream"):
-    """A policy folder with random weights; large ones, so that its actions differ."""
-    kind, sensor = KINDS[name], sensor_settings(env_config)
-    sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
-    parts = {"latent": 8 if kind.encoder else None, "hidden": [16] if kind.network == "mlp" else None}
-    about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {}}
-    networks = build_networks({"name": name, **sizes, **parts}, seed=3)
-    for value in networks["pi"].parameters():
-        value.data *= 1000.0
-    evae = EventVAE(context=64).freeze() if kind.encoder else None
-    manifest = {"name": name, **sizes, **parts, **about}
-    return save_policy(path, networks, manifest, evae, {"reconstruction_step": 0.5})
+from models.policy import load_policy
+from tests.support.configs import small_config
+from tests.support.policies import HELD_OUT, save_untrained
 
 
 @pytest.fixture(scope="module")
@@ -220,13 +203,15 @@ def test_the_tracked_figures_name_agent_scene_and_renderer(tmp_path):
     assert len(figures) <= 40
 
 
-@pytest.mark.parametrize("name", ["bytestream", "rgb"])
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["bytestream", pytest.param("rgb", marks=pytest.mark.slow)])
 def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.6})
+    env = dataclasses.replace(config.env, time_limit_s=0.6)
+    config = dataclasses.replace(config, evaluate=settings, env=env)
     run = open_run(config)
-    save_untrained(run.policy, config.env_config(), name)
+    save_untrained(run.policy, config.env, name)
     with open_tracker(config, run) as tracker:
         figures = evaluate(config, run, tracker)
         assert evaluate(config, run, tracker) == figures
@@ -303,9 +288,10 @@ def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_sto
 def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path, monkeypatch):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)
-    config = dataclasses.replace(config, evaluate=settings, env={**config.env, "time_limit_s": 0.05})
+    env = dataclasses.replace(config.env, time_limit_s=0.05)
+    config = dataclasses.replace(config, evaluate=settings, env=env)
     run, asked = open_run(config), []
-    save_untrained(run.policy, config.env_config(), "event_columns")
+    save_untrained(run.policy, config.env, "event_columns")
 
     def flown_here(config, place, cells, *given, **named):
         asked.append(len(cells))
@@ -330,7 +316,7 @@ def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done
 
 def test_a_caption_has_room_under_a_single_panel():
     panel = ("luminance", np.zeros((64, 64, 3), np.uint8))
-    caption = "shape_change 99   9.99 s    99.9 m   collision   4x slower than flown"
+    caption = "shape_change 99   9.99 s    99.9 m   collision   4x slower"
     one, three = (frame([panel] * count, caption)[-40:] for count in (1, 3))
     np.testing.assert_array_equal(one, three[:, : one.shape[1]])
     assert (three[:, one.shape[1] :] == three[0, -1]).all(), "all of the caption is in the narrow one"

@@ -5,20 +5,10 @@ import pytest
 
 from jobs.analysis.tables import markdown_table
 from jobs.evaluation.group_stats import axis_curves, columns, details, matrix, metrics, summarise_group
-from jobs.rollout.episodes import EPISODE
 from jobs.tracking.store import check_metrics
+from tests.support.episodes import flights
 
 AT = ("sparsity", "0.2")
-
-
-def flights(success, trials=20, offset_m=0.0):
-    """EPISODE of one training that succeeds in its first corridors."""
-    flown = np.zeros(trials, EPISODE)
-    flown["seed"] = np.arange(trials)
-    flown["success"][:success] = True
-    flown["distance_m"] = np.where(flown["success"], 100.0, 40.0 + flown["seed"]) + offset_m
-    flown["events_per_step"] = 300.0
-    return flown
 
 
 def test_a_group_pools_its_trainings():

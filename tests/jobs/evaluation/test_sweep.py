@@ -7,41 +7,22 @@ import pytest
 from jobs.evaluation.sweep import announce, run
 from jobs.rollout.drift import FIGURES
 from jobs.run.folder import open_run
-from jobs.tracking.tracker import open_store
 from models.policy.policy import NETWORKS
-from tests.jobs.evaluation.test_sweep_plan import planned, save_training, sweep_config
+from tests.support.configs import sweep_config
+from tests.support.policies import save_training
+from tests.support.runs import in_store, planned, tracked_sweeps
 
 
 def test_who_flies_and_whose_sensor_differs_is_said(tmp_path, capsys):
     config = sweep_config(tmp_path)
-    same = save_training(tmp_path / "same", "a", 0, config.env_config())
-    slow = save_training(tmp_path / "slow", "a", 1, config.env_config(control_hz=100.0))
+    same = save_training(tmp_path / "same", "a", 0, config.env)
+    slow = save_training(tmp_path / "slow", "a", 1, dataclasses.replace(config.env, control_hz=100.0))
     announce(planned(config, same, slow, "oracle"))
     assert capsys.readouterr().out.splitlines() == [
         "Group: a (training seeds 0, 1)",
         "Group: oracle",
         f"Flown with its own sensor: {slow}: control_hz = 100.0 instead of 200.0",
     ]
-
-
-def tracked_sweeps(config, kind="condition", parent="sweep"):
-    """Client, and the children of a kind by name of each sweep's parent run, or of each of another kind."""
-    client, experiment = open_store(config.tracking.uri, config.tracking.experiment)
-    parents = client.search_runs([experiment], f"tags.kind = '{parent}'")
-    below = "tags.`mlflow.parentRunId` = '{}'"
-    children = {
-        run.info.run_id: client.search_runs(
-            [experiment], f"{below.format(run.info.run_id)} and tags.kind = '{kind}'"
-        )
-        for run in parents
-    }
-    return client, {parent: {run.info.run_name: run for run in runs} for parent, runs in children.items()}
-
-
-def in_store(config, tmp_path):
-    return dataclasses.replace(
-        config, tracking=dataclasses.replace(config.tracking, uri=f"sqlite:///{tmp_path}/m.db")
-    )
 
 
 def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_rerun_adds_no_point(
@@ -109,7 +90,7 @@ def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differ
     tmp_path, stub
 ):
     config = in_store(sweep_config(tmp_path), tmp_path)
-    agent = save_training(tmp_path / "policy", "a", 0, config.env_config(control_hz=100.0))
+    agent = save_training(tmp_path / "policy", "a", 0, dataclasses.replace(config.env, control_hz=100.0))
     for policies, trials in (([agent], 2), ([agent, "straight"], 2), ([agent], 3)):
         settings = dataclasses.replace(config.sweep, policies=policies, trials=trials)
         run(dataclasses.replace(config, sweep=settings))
@@ -126,7 +107,7 @@ def test_cells_flown_as_tune_trials_come_back_with_their_episodes_and_one_that_r
     tmp_path,
 ):
     config = sweep_config(tmp_path)
-    env = config.env_config()
+    env = config.env
     kinds = {"bytestream": 0, "event_columns": 0, "event_image": 1}
     agents = [save_training(tmp_path / name, name, seed, env, name) for name, seed in kinds.items()]
     (tmp_path / "event_image" / NETWORKS).write_bytes(b"")

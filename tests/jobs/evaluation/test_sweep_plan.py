@@ -8,38 +8,16 @@ from jobs.config.config import ConfigError
 from jobs.evaluation.sweep_plan import NOMINAL, find_entries, plan, read_entry, text, with_sensor
 from jobs.run.folder import open_run
 from models.policy.policy import MANIFEST
-from tests.jobs.evaluation.test_evaluate import save_untrained
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import AXES, sweep_config
+from tests.support.policies import save_training
+from tests.support.runs import planned
 
-AXES = {
-    "sparsity": {"faults.sparsity": [0.0, 0.5]},
-    "rate": {"env.control_hz": [100, 200], "env.scene": ["poles_eval"]},
-}
 OTHER_CAMERA = {
     "threshold_mismatch": 0.03,
     "threshold_seed": 1,
     "response": "lin_log",
     "encoding": "linear8",
 }
-
-
-def sweep_config(tmp_path, trials=2, policies=("straight",), axes=AXES, **changes):
-    """A sweep of short flights."""
-    config = small_config(tmp_path, job="sweep", exp="robustness")
-    settings = dataclasses.replace(config.sweep, axes=axes, trials=trials, policies=list(policies), **changes)
-    return dataclasses.replace(config, sweep=settings, env={**config.env, "time_limit_s": 0.2})
-
-
-def save_training(path, group, seed, env_config, name="event_columns"):
-    """An untrained policy that says it is a training of `group`; returns the folder."""
-    save_untrained(path, env_config, name)
-    manifest = json.loads((path / MANIFEST).read_text())
-    (path / MANIFEST).write_text(json.dumps({**manifest, "exp": group, "seed": seed}))
-    return str(path)
-
-
-def planned(config, *agents):
-    return plan(config, [read_entry(agent) for agent in agents])
 
 
 def at(sweep, axis, value):
@@ -49,7 +27,7 @@ def at(sweep, axis, value):
 
 def test_axes_change_their_settings_alone_and_share_the_unchanged_cell(tmp_path):
     config = sweep_config(tmp_path)
-    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env))
     assert sweep.conditions == [
         (NOMINAL, "poles_eval"), ("sparsity", "0"), ("sparsity", "0.5"), ("rate", "100"), ("rate", "200")
     ]  # fmt: skip
@@ -74,7 +52,7 @@ def test_faults_change_no_accuracy_and_anything_else_does(tmp_path):
 
 def test_another_policy_is_another_cell(tmp_path):
     config = sweep_config(tmp_path)
-    one = save_training(tmp_path / "one", "a", 0, config.env_config())
+    one = save_training(tmp_path / "one", "a", 0, config.env)
     keys = {planned(config, name).cells[0].key for name in ("straight", "oracle", one)}
     manifest = json.loads((tmp_path / "one" / MANIFEST).read_text())
     (tmp_path / "one" / MANIFEST).write_text(json.dumps({**manifest, "sha256": {}}))
@@ -88,9 +66,7 @@ def test_what_a_agent_does_not_see_makes_no_cell_of_its_own(tmp_path):
         "exactness": {"fidelity.samples": [1, 8]},
     }
     config = sweep_config(tmp_path, axes=axes)
-    agents = [
-        save_training(tmp_path / name, name, 0, config.env_config(), name) for name in ("rgb", "event_image")
-    ]
+    agents = [save_training(tmp_path / name, name, 0, config.env, name) for name in ("rgb", "event_image")]
     sweep = planned(config, "straight", *agents)
     keys = {
         group: {cell.label: cell.key for cell in sweep.cells if cell.entry.group == group}
@@ -108,7 +84,7 @@ def test_what_a_agent_does_not_see_makes_no_cell_of_its_own(tmp_path):
 
 def test_a_policy_flies_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
     config = sweep_config(tmp_path)
-    trained = config.env_config(control_hz=100.0, camera=CameraConfig(memory="frame"))
+    trained = dataclasses.replace(config.env, control_hz=100.0, camera=CameraConfig(memory="frame"))
     agent = save_training(tmp_path / "policy", "a", 0, trained)
     sweep = planned(config, agent, "straight")
     assert sweep.differ == {agent: {"control_hz": (100.0, 200.0), "memory": ("frame", "reference")}}
@@ -122,7 +98,9 @@ def test_a_policy_flies_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
 
 def test_an_own_sensor_that_an_axis_excludes_is_refused_with_both_named(tmp_path):
     config = sweep_config(tmp_path, axes={"dead_time": {"camera.refractory_us": [0, 10]}})
-    agent = save_training(tmp_path / "policy", "a", 0, config.env_config(camera=CameraConfig(memory="frame")))
+    agent = save_training(
+        tmp_path / "policy", "a", 0, dataclasses.replace(config.env, camera=CameraConfig(memory="frame"))
+    )
     with pytest.raises(ConfigError, match=r"^sweep\.axes\.dead_time: .*refractory_us.* 10.*got 10$"):
         planned(config, agent)
 
@@ -144,7 +122,7 @@ def test_every_sensor_setting_of_a_manifest_reaches_the_simulation():
 
 def test_policies_of_one_group_stand_together_by_their_training_seed(tmp_path):
     config = sweep_config(tmp_path)
-    folder, env = open_run(config), config.env_config()
+    folder, env = open_run(config), config.env
     for place, group, seed in (("x", "b", 1), ("y", "a", 0), ("z", "b", 0)):
         save_training(tmp_path / "pretrained" / place, group, seed, env)
     named = sweep_config(tmp_path, policies=["pretrained", "oracle", "pretrained"])
@@ -169,7 +147,7 @@ def test_a_policy_without_an_experiment_is_of_the_group_of_its_kind(tmp_path):
 def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_path):
     config = sweep_config(tmp_path)
     folder = open_run(config)
-    path = save_training(tmp_path / "runs" / "trained" / "policy", "a", 0, config.env_config(), "bytestream")
+    path = save_training(tmp_path / "runs" / "trained" / "policy", "a", 0, config.env, "bytestream")
     for name in ("newest", path, path.removesuffix("/policy")):
         (entry,) = find_entries(sweep_config(tmp_path, policies=[name]), folder)
         assert entry.agent == path
@@ -177,7 +155,7 @@ def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_pat
 
 def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
     config = sweep_config(tmp_path, policies=["one"])
-    path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env_config())
+    path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env)
     (entry,) = find_entries(config, open_run(config), tmp_path / "pretrained")
     assert entry.agent == path
 
@@ -185,7 +163,7 @@ def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
 def test_a_group_of_the_pretrained_folder_is_all_its_trainings_and_no_other_group(tmp_path):
     config = sweep_config(tmp_path, policies=["a", "straight"])
     for place, group, seed in (("a-s1", "a", 1), ("a-set-s0", "a-set", 0), ("a-s0", "a", 0)):
-        save_training(tmp_path / "pretrained" / place, group, seed, config.env_config())
+        save_training(tmp_path / "pretrained" / place, group, seed, config.env)
     entries = find_entries(config, open_run(config), tmp_path / "pretrained")
     assert [(entry.group, entry.training) for entry in entries] == [("a", 0), ("a", 1), ("straight", None)]
 

@@ -2,14 +2,15 @@ import numpy as np
 import pytest
 import yaml
 
+from jobs.analysis.plots import BASELINE_STYLES, GROUP_STYLES, style_of
 from jobs.config.conditions import axis_points
 from jobs.evaluation.group_stats import summarise_group
 from jobs.evaluation.sweep_plan import PRETRAINED, text
-from jobs.evaluation.sweep_plots import BOUNDS, STYLES, axis_figure, collision_figure, style_of
+from jobs.evaluation.sweep_plots import axis_figure, collision_figure
 from jobs.rollout.episodes import EPISODE
 from jobs.run.provenance import REPOSITORY
 from models.policy.policy import MANIFEST
-from tests.jobs.evaluation.test_group_stats import flights
+from tests.support.episodes import flights
 
 
 def rows_of(axis, values, groups):
@@ -85,9 +86,9 @@ def test_a_condition_that_was_not_flown_leaves_a_gap():
 
 
 def test_every_experiment_has_a_colour_and_marker_of_its_own():
-    looks = [style_of(group) for group in (*STYLES, *BOUNDS)]
+    looks = [style_of(group) for group in (*GROUP_STYLES, *BASELINE_STYLES)]
     assert len({colour for colour, _ in looks}) == len(looks)
-    assert len({marker for _, marker in looks[: len(STYLES)]}) == len(STYLES)
+    assert len({marker for _, marker in looks[: len(GROUP_STYLES)]}) == len(GROUP_STYLES)
     assert style_of("mine") == style_of("mine")
 
 
@@ -104,4 +105,4 @@ def test_the_map_shows_contacts_alone():
 
 def test_every_policy_that_is_shipped_has_a_look_of_its_own():
     shipped = {path.parent.name.rpartition("-s")[0] for path in PRETRAINED.glob(f"*/{MANIFEST}")}
-    assert shipped <= STYLES.keys()
+    assert shipped <= GROUP_STYLES.keys()

@@ -14,8 +14,10 @@ from jobs.rollout.scheduler import flown
 from jobs.rollout.tasks import accuracy_file
 from jobs.run.files import write_json
 from jobs.run.folder import open_run
-from tests.jobs.evaluation.test_group_stats import flights
-from tests.jobs.evaluation.test_sweep_plan import planned, save_training, sweep_config
+from tests.support.configs import sweep_config
+from tests.support.episodes import flights
+from tests.support.policies import save_training
+from tests.support.runs import planned
 
 
 def test_groups_are_compared_with_the_reference_under_the_same_condition(tmp_path):
@@ -46,7 +48,7 @@ def test_a_group_of_which_nothing_was_flown_has_no_row(tmp_path):
 def test_contacts_of_the_sweeps_scene_are_told_by_what_was_changed_and_counted_once(tmp_path):
     axes = {"sparsity": {"faults.sparsity": [0.0, 0.5]}, "world": {"env.scene": ["poles_eval", "poles"]}}
     config = sweep_config(tmp_path, axes=axes)
-    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env))
     usual, changed = contacts(sweep, "a", {cell.key: flights(3) for cell in sweep.cells})
     assert (len(usual), len(changed)) == (20, 20)
 
@@ -62,7 +64,7 @@ def test_typical_crashes_are_those_in_the_middle():
 def test_crashes_of_each_groups_first_training_are_filmed_once(tmp_path):
     config = sweep_config(tmp_path)
     agents = [
-        save_training(tmp_path / f"{group}{seed}", group, seed, config.env_config())
+        save_training(tmp_path / f"{group}{seed}", group, seed, config.env)
         for group, seed in (("a", 0), ("a", 1), ("b", 4))
     ]
     sweep = plan(config, [read_entry(agent) for agent in (*agents, "straight")])

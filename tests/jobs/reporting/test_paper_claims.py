@@ -1,7 +1,7 @@
 import pytest
 
 from jobs.reporting.paper_claims import CLAIMS, LEARNT, Claim, judge, judge_learning
-from tests.jobs.evaluation.test_group_stats import flights
+from tests.support.episodes import flights
 
 AT = (("world", "a"), ("world", "b"))
 CLAIM = Claim("it is better", "D.3", "ours", "theirs", "success", AT)
@@ -47,8 +47,8 @@ def test_a_condition_with_a_training_less_is_still_compared():
 
 
 def test_the_papers_claims_are_about_conditions_that_the_default_sweep_flies(tmp_path):
-    from tests.jobs.evaluation.test_sweep_plan import planned, sweep_config
-    from tests.jobs.run.test_folder import small_config
+    from tests.support.configs import small_config, sweep_config
+    from tests.support.runs import planned
 
     axes = small_config(tmp_path, job="sweep").sweep.axes
     conditions = planned(sweep_config(tmp_path, axes=axes), "straight").conditions

@@ -7,12 +7,12 @@ import pytest
 from mlflow import MlflowClient
 
 from jobs.config.config import ConfigError, as_dict
-from jobs.reporting import publish as shipping
+from jobs.reporting import publish as publishing
 from jobs.reporting.learning_curves import as_csv, read_curves
-from jobs.reporting.publish import curve, newest_trainings, ship
+from jobs.reporting.publish import learning_curve, newest_trainings, publish
 from models.policy import load_policy
-from tests.jobs.evaluation.test_evaluate import save_untrained
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.policies import save_untrained
 
 
 def finish_training(tmp_path, name, exp="bytestream", seed=0, env_steps=500_000, iterations=120, **changes):
@@ -55,9 +55,9 @@ def test_the_newest_training_of_each_group_and_seed_is_taken(tmp_path):
     ]
 
 
-def test_a_shipped_policy_decides_nearly_as_the_trained_one_in_a_fraction_of_the_space(tmp_path):
+def test_a_published_policy_decides_nearly_as_the_trained_one_in_a_fraction_of_the_space(tmp_path):
     (training,) = [finish_training(tmp_path, "run")] and newest_trainings(tmp_path / "runs", "smoke")
-    target = ship(training, tmp_path / "pretrained")
+    target = publish(training, tmp_path / "pretrained")
     assert target.name == "bytestream-s0"
     manifest = json.loads((target / "policy.json").read_text())
     assert (manifest["exp"], manifest["run"], manifest["commit"]) == ("bytestream", "run", "abc")
@@ -71,18 +71,18 @@ def test_a_shipped_policy_decides_nearly_as_the_trained_one_in_a_fraction_of_the
     ours, theirs = lean.logits(windows), whole.logits(windows)
     assert not np.array_equal(ours, theirs)
     np.testing.assert_allclose(ours, theirs, atol=0.01 * np.abs(theirs).max())
-    ship(training, tmp_path / "pretrained")  # a second time replaces it
+    publish(training, tmp_path / "pretrained")  # a second time replaces it
 
 
 def test_a_curve_keeps_both_ends_and_the_order_and_leaves_out_what_was_not_measured(tmp_path):
     finish_training(tmp_path, "run")
-    one = curve(newest_trainings(tmp_path / "runs", "smoke")[0])
-    assert len(one.env_steps) == shipping.POINTS
+    one = learning_curve(newest_trainings(tmp_path / "runs", "smoke")[0])
+    assert len(one.env_steps) == publishing.MAX_POINTS
     assert (one.env_steps[0], one.env_steps[-1]) == (2 * 2048, 120 * 2048)
     assert (np.diff(one.env_steps) > 0).all()
     np.testing.assert_allclose(one.success_rate, (one.env_steps / 2048 - 1) / 120)
     rows = list(csv.DictReader(as_csv([one]).splitlines()))
-    assert len(rows) == shipping.POINTS
+    assert len(rows) == publishing.MAX_POINTS
     assert list(rows[-1]) == ["exp", "seed", "env_steps", "success_rate", "distance_m"]
     assert list(rows[-1].values()) == ["bytestream", "0", str(120 * 2048), "0.992", "119.00"]
 
@@ -93,35 +93,35 @@ def test_curves_are_read_back_as_written_if_their_policies_are_still_there(tmp_p
     finish_training(tmp_path, "gone", exp="rgb")
     trainings = newest_trainings(tmp_path / "runs", "smoke")
     assert read_curves(tmp_path) == {}
-    (tmp_path / "curves.csv").write_text(as_csv([curve(training) for training in trainings]))
+    (tmp_path / "curves.csv").write_text(as_csv([learning_curve(training) for training in trainings]))
     for training in trainings:
         if training.group != "rgb":
-            ship(training, tmp_path)
+            publish(training, tmp_path)
     found = read_curves(tmp_path)
     assert list(found) == [("bytestream", 0), ("event_set", 3)]
     kept = [training for training in trainings if training.group != "rgb"]
-    assert as_csv(list(found.values())) == as_csv([curve(training) for training in kept])
+    assert as_csv(list(found.values())) == as_csv([learning_curve(training) for training in kept])
 
 
-def test_nothing_to_ship_is_said_with_where_it_was_sought(tmp_path):
+def test_nothing_to_publish_is_said_with_where_it_was_sought(tmp_path):
     with pytest.raises(ConfigError, match="runs_dir: no finished training with budget=paper in"):
-        shipping.run(small_config(tmp_path, job="ship", exp="ship", budget="paper"))
+        publishing.run(small_config(tmp_path, job="ship", exp="ship", budget="paper"))
 
 
-def test_trainings_that_learn_nothing_are_not_shipped(tmp_path):
+def test_trainings_that_learn_nothing_are_not_published(tmp_path):
     finish_training(tmp_path, "run")
     with pytest.raises(ConfigError, match="budget: smoke learns nothing"):
-        shipping.run(small_config(tmp_path, job="ship", exp="ship"))
+        publishing.run(small_config(tmp_path, job="ship", exp="ship"))
 
 
-def test_the_job_writes_policies_curves_and_their_figure(tmp_path, monkeypatch):
-    monkeypatch.setattr(shipping, "PRETRAINED", shipping.REPOSITORY / tmp_path / "pretrained")
-    monkeypatch.setattr(shipping, "REPOSITORY", tmp_path)
-    monkeypatch.setattr(shipping, "FIGURE", tmp_path / "learning.png")
+def test_the_job_writes_policies_curves_and_their_plot(tmp_path, monkeypatch):
+    monkeypatch.setattr(publishing, "PRETRAINED", publishing.REPOSITORY / tmp_path / "pretrained")
+    monkeypatch.setattr(publishing, "REPOSITORY", tmp_path)
+    monkeypatch.setattr(publishing, "PLOT", tmp_path / "learning.png")
     for seed in (0, 1):
         finish_training(tmp_path, f"run{seed}", seed=seed, budget="paper")
     finish_training(tmp_path, "rival", exp="event_set", budget="paper")
-    assert shipping.run(small_config(tmp_path, job="ship", exp="ship", budget="paper")) == {
+    assert publishing.run(small_config(tmp_path, job="ship", exp="ship", budget="paper")) == {
         "bytestream": 2,
         "event_set": 1,
     }

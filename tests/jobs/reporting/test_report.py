@@ -12,12 +12,12 @@ from jobs.config.config import ConfigError
 from jobs.evaluation.group_stats import LABELS
 from jobs.reporting import report as results
 from jobs.reporting.learning_curves import as_csv
-from jobs.reporting.report import breaks, find_study, read_flights, write_results, write_trade
+from jobs.reporting.report import breaks_table, find_study, read_sweep_episodes, write_results, write_trade
 from jobs.rollout.episodes import write_episodes
 from jobs.run.files import write_json
 from models.policy.policy import MANIFEST
-from tests.jobs.evaluation.test_group_stats import flights
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.episodes import flights
 
 ABOUT = {
     "run": "robustness-short-s0-1",
@@ -71,8 +71,9 @@ def shipped(tmp_path):
 
 def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_path):
     text = write_results(sweep, tmp_path / "docs", shipped(tmp_path)).read_text()
-    assert "Made on 2026-01-02 by `python -m platform.launch +exp=robustness`, then" in text
-    assert "flown at commit c0ffee" in text
+    for fact in ("2026-01-02", "`python -m platform.launch +exp=robustness`", "commit c0ffee", "sweep `abc`"):
+        assert fact in text
+    assert "\n\n\n" not in text
     assert "bytestream (2), event_image (1), oracle (1)" in text
     assert "| sparsity | 0.5 | 5 | 1.6 | 5 |" in text
     assert text.index("(images/results_sparsity.png)") < text.index("## Success [%]")
@@ -91,7 +92,7 @@ def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_pa
 
 
 def test_flights_survive_their_file(sweep):
-    found = read_flights(sweep / "episodes.csv")
+    found = read_sweep_episodes(sweep / "episodes.csv")
     assert set(found[("sparsity", "0.2"), "bytestream"]) == {0, 1}
     np.testing.assert_array_equal(found[("sparsity", "0.5"), "oracle"][None], flights(20))
 
@@ -142,12 +143,12 @@ def test_nothing_finished_is_refused_with_the_remedy(tmp_path):
 
 
 def test_a_condition_breaks_a_policy_where_its_own_loss_is_certain(sweep, tmp_path):
-    flown = read_flights(sweep / "episodes.csv")
+    flown = read_sweep_episodes(sweep / "episodes.csv")
     for seed in (0, 1):
         flown[("sparsity", "0.5"), "bytestream"][seed]["success"][:10] = False
         flown[("sparsity", "0.2"), "bytestream"][seed]["success"][:1] = False
     flown[("sparsity", "0.5"), "event_image"][0]["success"] = True
-    text = "\n".join(breaks(ABOUT, flown))
+    text = breaks_table(ABOUT, flown)
     assert re.search(r"\| `bytestream` \| 80 \| sparsity 0.5: -50 \[-\d+, -\d+\] \|", text)
     assert "| `event_image` | 20 | none is certain |" in text
     assert "oracle" not in text

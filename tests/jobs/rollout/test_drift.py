@@ -11,7 +11,7 @@ from models.encoder.evae import EventVAE, event_targets, validate
 from models.encoder.event_batch import batch_packed
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
-from tests.jobs.evaluation.test_evaluate import save_untrained
+from tests.support.policies import save_untrained
 
 
 def window(count, seed=0):

@@ -20,7 +20,9 @@ from jobs.rollout.scheduler import (
 from jobs.rollout.tasks import MAX_FLIGHTS, read_episodes, read_kept, split, unflown
 from jobs.run.files import write_json
 from jobs.run.folder import open_run
-from tests.jobs.evaluation.test_sweep_plan import AXES, planned, save_training, sweep_config
+from tests.support.configs import AXES, sweep_config
+from tests.support.policies import save_training
+from tests.support.runs import planned
 
 SEEN = {"speed": {"env.speed_mps": [20, 10]}, "rate": AXES["rate"]}  # changes that bounds notice
 
@@ -113,7 +115,7 @@ def test_cells_can_be_sent_to_workers(tmp_path):
 @pytest.mark.timeout(900)  # where no kernel is compiled yet
 def test_a_cell_is_flown_as_its_policy_alone_and_measured_where_asked(tmp_path):
     config = sweep_config(tmp_path)
-    path = save_training(tmp_path / "policy", "a", 0, config.env_config())
+    path = save_training(tmp_path / "policy", "a", 0, config.env)
     cell = plan(config, [read_entry(path)]).cells[0]
     first, again = flown(cell, True), flown(cell, False)
     assert first["episodes"] == again["episodes"]
@@ -185,7 +187,7 @@ def test_what_was_kept_with_one_commit_is_still_read(tmp_path):
 
 def test_a_worker_flies_the_policy_that_the_driver_has_though_it_cannot_see_its_folder(tmp_path):
     config = sweep_config(tmp_path)
-    path = Path(save_training(tmp_path / "policy", "a", 0, config.env_config()))
+    path = Path(save_training(tmp_path / "policy", "a", 0, config.env))
     cell = plan(config, [read_entry(str(path))]).cells[0]
     here = flown(cell, False)
     files = packed([cell])

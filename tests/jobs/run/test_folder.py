@@ -10,29 +10,26 @@ import pytest
 
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError
-from jobs.run import folder as runs
+from jobs.config.env_keys import env_with
 from jobs.run.files import RunError, write_json
-from jobs.run.folder import UNNAMED, finish, finished, holding, latest_policies, open_run, run_name
+from jobs.run.folder import (
+    NOT_IN_RUN_NAME,
+    RENAMED_MODELS,
+    finish,
+    finished,
+    latest_policies,
+    open_run,
+    run_name,
+)
+from jobs.run.locks import held_alone
 from jobs.run.provenance import REPOSITORY, git_commit
+from models.kinds import KINDS
+from tests.support.configs import small_config
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> Config:
     return small_config(tmp_path)
-
-
-def small_config(tmp_path: Path, **changes: object) -> Config:
-    """A checked configuration whose runs lie in a folder of the test's own."""
-    from hydra import compose, initialize_config_dir
-    from omegaconf import OmegaConf
-
-    from jobs.config.config import parse
-
-    conf = Path(__file__).resolve().parents[3] / "conf"
-    with initialize_config_dir(str(conf), version_base="1.3"):
-        composed = compose("config", ["+exp=bytestream", "budget=smoke"])
-    values = OmegaConf.to_container(composed, resolve=True)
-    return parse({**values, "runs_dir": str(tmp_path / "runs"), **changes})
 
 
 def test_the_same_settings_find_the_same_folder_whatever_job_tracker_or_cluster(config):
@@ -47,11 +44,12 @@ def test_the_same_settings_find_the_same_folder_whatever_job_tracker_or_cluster(
 
 
 def test_every_setting_that_changes_results_changes_the_folder(config):
+    noisy = env_with(config.env, {"faults.sparsity": 0.1})
     names = {
         run_name(config),
         run_name(dataclasses.replace(config, seed=1)),
         run_name(dataclasses.replace(config, algo=dataclasses.replace(config.algo, lr=1e-5))),
-        run_name(dataclasses.replace(config, faults=dataclasses.replace(config.faults, sparsity=0.1))),
+        run_name(dataclasses.replace(config, env=noisy)),
     }
     assert len(names) == 4
 
@@ -122,20 +120,21 @@ def test_a_full_disk_leaves_the_old_file_and_no_part(config, monkeypatch):
     def full(handle):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(runs.os, "fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
         finish(run, "train", {"loss": 2.0})
     assert finished(run, "train") == {"loss": 1.0}
     assert [path.name for path in (run.path / "stages").iterdir()] == ["train.json"]
 
 
+@pytest.mark.system
 def test_one_process_works_in_a_run_folder_and_lets_go_when_it_is_killed(config):
     run = open_run(config)
     code = f"""
 import sys
 from pathlib import Path
-from jobs.run.folder import Run, holding
-with holding(Run(Path({str(run.path)!r}), None)):
+from jobs.run.locks import held_alone
+with held_alone(Path({str(run.path)!r})):
     print("in", flush=True)
     sys.stdin.read()
 """
@@ -144,11 +143,11 @@ with holding(Run(Path({str(run.path)!r}), None)):
         other.stdout.readline()
         with (
             pytest.raises(RunError, match=rf"process {other.pid} of .* works there; wait until"),
-            holding(run),
+            held_alone(run.path),
         ):
             pass
         other.kill()
-    with holding(run):
+    with held_alone(run.path):
         pass
 
 
@@ -163,10 +162,34 @@ def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(confi
     del stored["collect"]["recordings"], stored["train"]["conditions"]
     (run.path / "config.json").write_text(json.dumps(stored))
     assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
-    settings = {name: value for name, value in stored.items() if name not in UNNAMED}
+    settings = {name: value for name, value in stored.items() if name not in NOT_IN_RUN_NAME}
     assert run.path.name.endswith(settings_hash(settings)[:8])
     noisy = dataclasses.replace(config.train, conditions=[{"faults.sparsity": 0.5}])
     assert run_name(dataclasses.replace(config, train=noisy)) != run.path.name
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED_MODELS.items())
+def test_a_run_folder_of_a_model_that_was_renamed_is_not_continued_and_says_its_new_name(config, old, new):
+    assert new in KINDS
+    run = open_run(config)
+    stored = json.loads((run.path / "config.json").read_text())
+    stored["model"]["name"] = old
+    (run.path / "config.json").write_text(json.dumps(stored))
+    with pytest.raises(ConfigError, match=rf"^resume: .* {old}, .* {new} now") as error:
+        open_run(dataclasses.replace(config, resume=str(run.path)))
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_keep_their_names(config):
+    stored = json.loads((open_run(config).path / "config.json").read_text())
+    assert list(stored)[:11] == [
+        "job", "exp", "budget", "seed", "resume", "runs_dir",
+        "env", "camera", "faults", "renderer", "fidelity",
+    ]  # fmt: skip
+    assert set(stored["env"]) == {
+        "scene", "layout", "control_hz", "speed_mps", "vehicle_radius_m", "camera_height_m", "time_limit_s",
+        "window_capacity",
+    }  # fmt: skip
 
 
 def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):

@@ -1,10 +1,7 @@
-import multiprocessing
 import os
 import stat
 import subprocess
 import sys
-import tempfile
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier
@@ -23,7 +20,6 @@ from jobs.run.ray_cluster import (
     check_private,
     holds,
     make_token,
-    one_at_a_time,
     storage,
     use_token,
 )
@@ -55,39 +51,6 @@ def test_a_folder_is_searched_by_its_path_and_by_its_address(tmp_path):
         assert holds(place, "experiment_state-")
         assert not holds(place, "tuner")
         assert not holds(f"{place}/none", "experiment_state-")
-
-
-def start(results, name):
-    with one_at_a_time():
-        results.put((name, "in"))
-        time.sleep(0.3)
-        results.put((name, "out"))
-
-
-def test_two_processes_start_ray_one_after_the_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    context = multiprocessing.get_context("fork")
-    results = context.Queue()
-    processes = [context.Process(target=start, args=(results, name)) for name in "ab"]
-    for process in processes:
-        process.start()
-    order = [results.get(timeout=20) for _ in range(4)]
-    for process in processes:
-        process.join()
-    assert [place for _, place in order] == ["in", "out", "in", "out"]
-    assert order[0][0] == order[1][0] != order[2][0] == order[3][0]
-
-
-def test_a_process_that_dies_lets_go(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    context = multiprocessing.get_context("fork")
-    process = context.Process(target=start, args=(context.Queue(), "a"))
-    process.start()
-    time.sleep(0.1)
-    process.kill()
-    process.join()
-    with one_at_a_time():
-        pass
 
 
 @pytest.fixture
@@ -196,6 +159,7 @@ print("joined")
 """
 
 
+@pytest.mark.system
 def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_token):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
     environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # of joining; Ray's own 20 take as many seconds

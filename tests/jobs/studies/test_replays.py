@@ -9,10 +9,10 @@ from envs.event_error import converged
 from jobs.config.conditions import env_with
 from jobs.rollout.agents import make_agent
 from jobs.studies import replays
-from jobs.studies.replays import latent_error, latents_of, measure, replay, steps, take_turns
+from jobs.studies.replays import latent_error, latents_of, measure_settings, replay, steps, take_turns
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
-from tests.jobs.evaluation.test_evaluate import save_untrained
+from tests.support.policies import save_untrained
 
 SHORT = EnvConfig(scene="poles_eval", split="eval", time_limit_s=0.1)
 
@@ -41,22 +41,22 @@ def test_a_flight_repeats_itself_from_its_actions(policy):
 
 def test_given_actions_are_flown_whatever_the_agent_would_do(policy):
     turns = np.array([1, 2] * 10)
-    flown = replay(SHORT, agent_of(policy), 0, turns)
+    found = replay(SHORT, agent_of(policy), 0, turns)
     env = CorridorEnv(SHORT)
     env.reset(seed=0)
     for action in turns:
         env.step(int(action))
-    assert not np.array_equal(flown.actions, turns)
-    np.testing.assert_array_equal(flown.events["t"][-5:], env.events["t"][-5:])
+    assert not np.array_equal(found.actions, turns)
+    np.testing.assert_array_equal(found.events["t"][-5:], env.events["t"][-5:])
 
 
 def test_flights_that_take_turns_are_flown_as_each_alone(policy, monkeypatch):
     monkeypatch.setattr(replays, "TURN", 7)
     turns = np.array([1, 2] * 10)
     told = []
-    flown = take_turns([steps(SHORT, agent_of(policy), seed, turns) for seed in (0, 1)], told.append)
+    found = take_turns([steps(SHORT, agent_of(policy), seed, turns) for seed in (0, 1)], told.append)
     assert told == [1, 1]
-    for seed, own in enumerate(flown):
+    for seed, own in enumerate(found):
         alone = replay(SHORT, agent_of(policy), seed, turns)
         np.testing.assert_array_equal(own.actions, alone.actions)
         np.testing.assert_array_equal(own.events, alone.events)
@@ -99,7 +99,7 @@ def test_the_reference_has_no_error_and_what_changes_less_has_less(policy):
         (exact, agent_of(policy, time_bins=65536)),
     ]
     told = []
-    usual, binned, forgetful, reference = measure(settings, evae, range(2), told.append)
+    usual, binned, forgetful, reference = measure_settings(settings, evae, range(2), told.append)
     assert sum(told) == 8
     assert reference.event_error == reference.other_action == 0.0
     assert reference.latent_error < 1e-3

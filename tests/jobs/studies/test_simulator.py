@@ -9,8 +9,8 @@ from envs.event_error import Accuracy, measure_event_error
 from jobs.run.folder import locate_run
 from jobs.studies import simulator as trade_simulator
 from jobs.studies.front_plots import pareto
-from jobs.studies.simulator import Row, columns, step_costs_us
-from tests.jobs.run.test_folder import small_config
+from jobs.studies.simulator import MeasuredSetting, setting_columns, step_costs_us
+from tests.support.configs import small_config
 
 POINTS = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=12)
 
@@ -40,7 +40,9 @@ def test_more_renders_cost_more():
 
 
 def test_a_row_becomes_columns_under_their_names():
-    found = columns([Row("renders", "renders 1", 90.0, Accuracy(0.25, (300.0, 320.0), 1.0))])
+    found = setting_columns(
+        [MeasuredSetting("renders", "renders 1", 90.0, Accuracy(0.25, (300.0, 320.0), 1.0))]
+    )
     assert found == {
         "setting": ["renders renders 1"],
         "cost_us": [90.0],
@@ -58,15 +60,15 @@ def test_the_job_leaves_tables_and_figures_and_a_second_run_replaces_them(tmp_pa
         config.trade_simulator, scenes=["poles"], control_hz=[200.0], flights=1, steps=3, rounds=1
     )
     config = dataclasses.replace(config, trade_simulator=trade)
-    figures = trade_simulator.run(config)
-    assert trade_simulator.run(config).keys() == figures.keys()
+    metrics = trade_simulator.run(config)
+    assert trade_simulator.run(config).keys() == metrics.keys()
     folder = locate_run(config).path / "trade"
     made = {path.name for path in folder.iterdir()}
     assert made == {"poles.md", "poles.png", "memory.md", "memory.png"}
     rows = [row.split("|") for row in (folder / "poles.md").read_text().splitlines()[2:]]
     assert [row[1].strip() for row in rows] == ["default", "renders", "renders", "encoding"]
     assert [int(row[6]) for row in rows[1:3]] == [1, 3]
-    assert 0.0 < figures["sim/event_error_poles"] < 1.0
-    exact = measure_event_error(config.env_config(split="validation"), 1, 1)
-    assert figures["sim/events_per_second_reference_200_hz"] == pytest.approx(200.0 * exact.events[0])
-    assert figures["sim/events_per_second_reference_200_hz"] > figures["sim/events_per_second_legacy_200_hz"]
+    assert 0.0 < metrics["sim/event_error_poles"] < 1.0
+    exact = measure_event_error(dataclasses.replace(config.env, split="validation"), 1, 1)
+    assert metrics["sim/events_per_second_reference_200_hz"] == pytest.approx(200.0 * exact.events[0])
+    assert metrics["sim/events_per_second_reference_200_hz"] > metrics["sim/events_per_second_legacy_200_hz"]

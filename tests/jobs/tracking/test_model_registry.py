@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import mlflow
@@ -7,13 +8,14 @@ import pytest
 
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
+from jobs.run.files import write_json
 from jobs.run.folder import open_run
-from jobs.tracking.model_registry import register
+from jobs.tracking.model_registry import register, register_training
 from jobs.tracking.served_policy import ACTIONS
 from jobs.tracking.tracker import open_tracker
 from models.policy import load_policy
-from tests.jobs.evaluation.test_sweep_plan import save_training
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.policies import save_training
 
 STEPS = 12
 SEEN = ("bytestream", "event_image", "rgb")
@@ -26,7 +28,7 @@ def store(tmp_path_factory):
     folder = open_run(small_config(tmp_path_factory.mktemp("registry")))
     with open_tracker(folder.config, folder) as tracker:
         pass
-    env = folder.config.env_config()
+    env = folder.config.env
     return tracker, {name: Path(save_training(folder.path / name, name, 3, env, name)) for name in SEEN}
 
 
@@ -79,6 +81,23 @@ def test_a_training_is_registered_once_and_its_tags_are_renewed(store):
     assert one.run_id == tracker.run_id
     assert {"seed": "3", "commit": "c0ffee", "eval/success_rate": "0.5"}.items() <= one.tags.items()
     assert "evade-once/1" in client.get_registered_model("evade-once").description
+
+
+def test_trainings_of_any_length_are_versions_of_their_experiments_model(store, tmp_path):
+    tracker, folders = store
+    lengths = {"event_image": 500_000, "rgb": 1_500_000}
+    for name, env_steps in lengths.items():
+        run = tmp_path / name
+        shutil.copytree(folders[name], run / "policy")
+        settings = {"exp": "lengths", "seed": 0, "budget": "paper", "train": {"env_steps": env_steps}}
+        write_json(run / "config.json", settings)
+        write_json(run / "stages" / "train.json", {"commit": "c0ffee", "figures": {}})
+    assert [register_training(tracker, tmp_path / name) for name in lengths] == [
+        "evade-lengths/1",
+        "evade-lengths/2",
+    ]
+    versions = tracker.client.search_model_versions("name = 'evade-lengths'")
+    assert {version.tags["env_steps"] for version in versions} == {"500000", "1500000"}
 
 
 def test_a_model_holds_the_policys_own_files_and_the_code_that_reads_them_and_no_pickle(store):

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs.browser import CHROMIUM, Browser, served
 from jobs import pipeline
 from jobs.evaluation.sweep import run as run_sweep
 from jobs.rollout import scheduler as flying
@@ -25,8 +26,8 @@ from jobs.tracking.pages import (
 )
 from jobs.tracking.store import dashboard_command, server_command
 from jobs.tracking.tracker import open_store
-from tests.jobs.evaluation.test_sweep_plan import save_training, sweep_config
-from tests.support.browser import CHROMIUM, Browser, served
+from tests.support.configs import sweep_config
+from tests.support.policies import save_training
 
 PAGE = Page(
     experiment_id="1",
@@ -103,7 +104,7 @@ def evaluated_training(config) -> Run:
     evaluation = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"])
     config = dataclasses.replace(config, job="pipeline", exp="bytestream", evaluate=evaluation)
     folder = open_run(config)
-    save_training(folder.policy, "bytestream", 0, config.env_config(), "bytestream")
+    save_training(folder.policy, "bytestream", 0, config.env, "bytestream")
     for stage in ("collect", "pretrain", "train"):
         finish(folder, stage, {"train/success_rate": 0.5} if stage == "train" else {})
     pipeline.run(config)
@@ -134,7 +135,7 @@ def store(tmp_path_factory):
         "sweep": run_address(experiment, sweep.info.run_id),
         "charts": view_address(experiment, f"charts-{sweep.info.run_id}"),
         "crash": run_address(experiment, sweep.info.run_id, films[0]),
-        "model": "#/models/evade-bytestream_4k/versions/1?workflowType=machine_learning",
+        "model": "#/models/evade-bytestream/versions/1?workflowType=machine_learning",
     }
 
 
@@ -180,7 +181,7 @@ def test_a_trainings_page_shows_its_figures_settings_and_origin(pages):
     browser.open(
         at["training"], "From nothing to an evaluated policy", "success in held-out corridors", "Commit",
         "Event error asked: at most 0.05; achieved:", "policy stochastic", "camera.contrast_threshold",
-        "host", "evade-bytestream_4k",
+        "host", "evade-bytestream",
     )  # fmt: skip
     assert browser.wait(f"{pictures_shown} >= 1", "the ways flown")
 
@@ -208,9 +209,7 @@ def test_charts_show_each_group_over_each_axis(pages):
 @in_browser
 def test_the_registered_model_shows_its_signature(pages):
     browser, at = pages
-    browser.open(
-        at["model"], "evade-bytestream_4k", "Version 1", "events t [us], x, y, p", "eval/success_rate"
-    )
+    browser.open(at["model"], "evade-bytestream", "Version 1", "events t [us], x, y, p", "eval/success_rate")
     browser.click("Inputs (4)")
     browser.click("Outputs (5)")
     browser.shows("t (required)", "p (required)", "long", "action", "forward", "left", "right", "float")

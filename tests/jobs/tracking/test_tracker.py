@@ -11,14 +11,15 @@ from PIL import Image
 
 from jobs.config.config import ConfigError
 from jobs.run.files import RunError
-from jobs.run.folder import Run, holding, open_run
+from jobs.run.folder import Run, open_run
+from jobs.run.locks import held_alone
 from jobs.tracking import retry_queue as retry_queue
 from jobs.tracking import tracker as tracking
-from jobs.tracking.child_runs import Child, write_children
+from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.pages import PAGE_WIDTH, chart_view
 from jobs.tracking.store import check_metrics, flatten, store_uri
 from jobs.tracking.tracker import TrackingError, open_store, open_tracker
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 
 @pytest.fixture(scope="module")
@@ -149,13 +150,13 @@ def test_children_are_written_once_and_replaced_where_their_content_has_changed(
     def child(name, success):
         curves = {"sweep/rate_success": {45: success, 100: 1.0}}
         params = {"axis": "rate", "env": {"hz": 45}}
-        return Child(name, params, {"note": "x"}, {"eval/success_rate": success}, curves)
+        return ChildRun(name, params, {"note": "x"}, {"eval/success_rate": success}, curves)
 
     with open_tracker(folder.config, folder, key="children") as parent:
         search = [parent.experiment_id], f"tags.`mlflow.parentRunId` = '{parent.run_id}'"
-        write_children(parent, "condition", [child("a", 0.5), child("b", 0.5)])
+        write_child_runs(parent, "condition", [child("a", 0.5), child("b", 0.5)])
         before = {run.info.run_name: run for run in parent.client.search_runs(*search)}
-        write_children(parent, "condition", [child("a", 0.5), child("b", 1.0)])
+        write_child_runs(parent, "condition", [child("a", 0.5), child("b", 1.0)])
         after = {run.info.run_name: run for run in parent.client.search_runs(*search)}
     assert set(after) == {"a", "b"}
     assert after["a"].info.run_id == before["a"].info.run_id
@@ -212,7 +213,7 @@ def test_a_store_that_does_not_answer_stops_with_one_error_that_says_where_the_r
 
 def test_a_second_process_is_kept_out_of_the_run_folder(folder):
     with (
-        holding(folder),
+        held_alone(folder.path),
         pytest.raises(RunError, match=r"works there; wait until it has ended"),
         open_tracker(folder.config, folder),
     ):

@@ -11,8 +11,8 @@ from jobs.rollout.agents import PolicyAgent
 from jobs.run.folder import finish, locate_run, open_run
 from jobs.training import collect
 from jobs.training.collect import FLIGHT_GAP_US, check_policy, record
-from tests.jobs.evaluation.test_evaluate import save_untrained
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.policies import save_untrained
 
 
 def flights(**fields):

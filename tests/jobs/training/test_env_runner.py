@@ -16,7 +16,9 @@ from jobs.training.ppo import build_ppo
 from models.encoder.weights import load_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
-from tests.jobs.training.test_train import SHORT, make_config, write_encoder
+from tests.support.configs import SHORT, make_config
+from tests.support.policies import kinds
+from tests.support.runs import write_encoder
 
 
 class StackFeatures(ConnectorV2):
@@ -63,7 +65,7 @@ def samples_of(runner, sizes):
     return [runner.sample(num_timesteps=size) for size in sizes]
 
 
-@pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_set", "event_image", "rgb"])
+@pytest.mark.parametrize("name", kinds(["bytestream", "event_columns", "event_set", "event_image", "rgb"]))
 def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
     ours, theirs = make_runners(name, tmp_path)
     for mine, other in zip(*(samples_of(runner, (40, 1, 17, 64)) for runner in (ours, theirs)), strict=True):

@@ -16,7 +16,9 @@ from models.encoder.weights import EncoderFileError, load_encoder
 from models.kinds import KINDS
 from models.policy import load_policy, save_policy
 from models.policy.features import feature_of
-from tests.jobs.training.test_train import SHORT, make_config, write_encoder
+from tests.support.configs import SHORT, make_config
+from tests.support.policies import kinds
+from tests.support.runs import write_encoder
 
 FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "rgb", "finetuned")
 CNN_WEIGHTS = 32 * (3 * 64 + 1) + 64 * (32 * 16 + 1) + 64 * (64 * 9 + 1) + 512 * (1024 + 1)
@@ -52,7 +54,7 @@ def is_frozen(name):
     return name == "bytestream"
 
 
-@pytest.fixture(scope="module", params=FLOWN)
+@pytest.fixture(scope="module", params=kinds(FLOWN))
 def name(request):
     return request.param
 

@@ -10,7 +10,8 @@ from ray.rllib.utils.postprocessing.value_predictions import compute_value_targe
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
 from jobs.training.ppo_learner import PlainPPOLearner, advantages
-from tests.jobs.training.test_train import SHORT, make_config, write_encoder
+from tests.support.configs import SHORT, make_config
+from tests.support.runs import write_encoder
 
 FIGURES = ("policy_loss", "vf_loss", "entropy", "total_loss", "vf_explained_var")
 NORM = "gradients_default_optimizer_global_norm"

@@ -25,7 +25,7 @@ from jobs.training.pretrain import (
 from models.encoder.evae import EventVAE, event_targets, train_step
 from models.encoder.event_batch import batch_windows
 from models.encoder.weights import load_encoder, save_encoder
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 SETTINGS = PretrainConfig(
     encoder=None,

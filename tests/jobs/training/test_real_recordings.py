@@ -13,7 +13,7 @@ from jobs.run.folder import open_run
 from jobs.training import collect
 from jobs.training.pretrain import _window_by_count, _window_by_time
 from jobs.training.real_recordings import GAP_US, cropped, no_flights, read_recorded, with_recorded
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 SLIDER = Path(os.environ.get("EVADE_DATA", "../shared/data")) / "rpg_slider_depth" / "events_chunk.txt"
 ENV = EnvConfig(observation="events")

@@ -17,32 +17,9 @@ from models.encoder.evae import (
     validate,
 )
 from models.encoder.event_batch import batch_windows
+from tests.support.encoders import bars, events, small
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
-SMALL = {"width": 12, "height": 10, "context": 64, "time_bins": 32}
-
-
-def events(*rows):
-    return np.array(list(rows), EVENT)
-
-
-def bars(evae, windows, rng):
-    """Windows of a vertical bar each, at a random column, its polarity by the side of the sensor."""
-    parts = []
-    for _ in range(windows):
-        count, column = int(rng.integers(20, 120)), int(rng.integers(0, 11))
-        window = np.zeros(count, EVENT)
-        window["t"] = np.sort(rng.integers(1, 5001, count))
-        window["x"] = column + rng.integers(0, 2, count)
-        window["y"] = rng.integers(0, 10, count)
-        window["p"] = 1 if column < 5 else -1
-        parts.append((window, 0, 5000))
-    return batch_windows(parts, evae.grid)
-
-
-def small(seed=0, **settings):
-    torch.manual_seed(seed)
-    return EventVAE(**{**SMALL, **settings})
 
 
 def count(module):

@@ -4,7 +4,7 @@ import torch
 
 from models.encoder.evae import TARGETS, event_targets, pictures, reconstruct, target_shape
 from models.encoder.event_batch import EventBatch, batch_windows
-from tests.models.encoder.test_evae import bars, events, small
+from tests.support.encoders import bars, events, small
 
 
 def test_the_signed_target_is_the_polarity_of_the_pixels_last_event():

@@ -13,7 +13,7 @@ from models.encoder.table import EncoderTable
 from models.policy import load_policy, save_policy
 from models.policy.features import feature_of
 from models.policy.networks import build_networks
-from tests.models.policy.test_policy import SENSOR, make_windows
+from tests.support.policies import SENSOR, make_windows
 
 SIDE, BINS = 40, 1024
 ENCODERS = [

@@ -6,7 +6,7 @@ from models.encoder.evae import EventVAE
 from models.encoder.frozen import encoder_part, read_encoder_part, tabulate
 from models.encoder.table import EncoderTable
 from models.encoder.weights import save_encoder
-from tests.models.policy.test_policy import make_windows
+from tests.support.policies import make_windows
 
 
 @pytest.fixture

@@ -6,32 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from models.encoder.evae import EventVAE
 from models.encoder.event_batch import batch_windows
 from models.encoder.table import PRECISIONS, EncoderTable
+from tests.support.encoders import WINDOW_US, make_evae, make_events
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
-WINDOW_US = 5000
-
-
-def make_evae(variant="bytestream", dtype=torch.float32, **settings):
-    """A model whose running statistics are not the initial ones."""
-    torch.manual_seed(2)
-    evae = EventVAE(
-        **{"variant": variant, "width": 16, "height": 12, "context": 128, "time_bins": 64} | settings
-    )
-    for _ in range(20):
-        evae.ecn(batch_windows([(make_events(400, seed), 0, WINDOW_US) for seed in range(2)], evae.grid))
-    return evae.to(dtype).freeze()
-
-
-def make_events(count, seed=0, start_us=0):
-    rng = np.random.default_rng(seed)
-    events = np.zeros(count, EVENT)
-    events["t"] = start_us + np.sort(rng.integers(1, WINDOW_US + 1, count))
-    events["x"], events["y"] = rng.integers(0, 16, count), rng.integers(0, 12, count)
-    events["p"] = rng.choice([-1, 1], count)
-    return events
 
 
 def pack(events, capacity):

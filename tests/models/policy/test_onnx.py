@@ -9,7 +9,8 @@ from models.encoder.evae import EventVAE
 from models.policy import load_policy, save_policy
 from models.policy import onnx as export
 from models.policy.onnx import export_onnx
-from tests.models.policy.test_policy import EVENT, FLOWN, SIDE, make_networks, make_settings, save
+from tests.support.encoders import EVENT
+from tests.support.policies import FLOWN, SIDE, kinds, make_networks, make_settings, save
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
 EDGES = [(1, 0, 0, 1), (5000, SIDE - 1, SIDE - 1, -1), (4999, SIDE - 1, 0, 1), (5000, 0, SIDE - 1, -1)]
@@ -44,7 +45,7 @@ def fly_exported(file, shown, shape, dtype):
     return np.array(logits)
 
 
-@pytest.fixture(scope="module", params=[*FLOWN, "bytestream_xy", "eventnet"])
+@pytest.fixture(scope="module", params=kinds([*FLOWN, "bytestream_xy", "eventnet"]))
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
     if name not in ("bytestream_xy", "eventnet"):
@@ -81,6 +82,7 @@ def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_a_flight(folde
     assert np.ptp(np.array(expected), axis=0).max() > 0.01 * scale
 
 
+@pytest.mark.system
 def test_the_rest_of_the_package_does_without_onnx():
     code = "import models.policy.policy, models.policy.onnx, sys; sys.exit('onnx' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0

@@ -8,50 +8,14 @@ import pytest
 import torch
 from torch import nn
 
-from models.encoder.evae import EventVAE
 from models.encoder.frozen import encoder_of
-from models.kinds import KINDS, kind_of
+from models.kinds import kind_of
 from models.policy import Policy, load_policy, save_policy
 from models.policy.features import feature_of
-from models.policy.networks import build_networks
 from models.policy.policy import ENCODER, MANIFEST
+from tests.support.policies import FLOWN, SIDE, make_evae, make_networks, make_settings, make_windows, save
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
-SIDE = 40
-SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789ab"}
-FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
-
-
-def make_evae(seed=0, variant="bytestream"):
-    torch.manual_seed(seed)
-    return EventVAE(variant, width=SIDE, height=SIDE, context=64, time_bins=32).freeze()
-
-
-def make_settings(name):
-    """Of a kind of policy, or of "finetuned": bytestream with an encoder that learnt on."""
-    if name == "finetuned":
-        evae = make_evae().settings
-        own = {key: evae[key] for key in ("context", "norm", "target", "time_bins", "coding")}
-        return {**make_settings("bytestream"), **own, "encoder": "finetuned"}
-    kind = KINDS[name]
-    sizes = {"width": SIDE, "height": SIDE, "stack": 3, "num_actions": 3}
-    parts = {
-        "latent": 8 if kind.encoder else None,
-        "hidden": [64, 64] if kind.network == "mlp" else None,
-    }
-    return {"name": name, **sizes, **parts, **SENSOR, "figures": {"return": 1.5}}
-
-
-def make_networks(name):
-    networks = build_networks(make_settings(name), seed=3)
-    *_, last = networks["pi"].modules()
-    last.weight.data.mul_(100.0)  # so that actions differ
-    return networks
-
-
-def save(path, name):
-    evae = make_evae(variant=name) if kind_of(make_settings(name)).encoder else None
-    return save_policy(path, make_networks(name), make_settings(name), evae)
 
 
 @pytest.fixture(scope="module", params=FLOWN)
@@ -67,17 +31,6 @@ def folder(tmp_path, name):
 @pytest.fixture
 def encoded(tmp_path):
     return save(tmp_path / "policy", "bytestream")
-
-
-def make_windows(rng, count, capacity=40, side=16):
-    windows = np.zeros((count, capacity + 1, 4), np.int32)
-    for window in windows:
-        events = int(rng.integers(0, capacity + 1))
-        window[0] = events, 0, 5000, 0
-        window[1 : events + 1, 0] = np.sort(rng.integers(1, 5001, events))
-        window[1 : events + 1, 1:3] = rng.integers(0, side, (events, 2))
-        window[1 : events + 1, 3] = rng.choice([-1, 1], events)
-    return windows
 
 
 def make_observations(name, rng, count):
@@ -211,6 +164,7 @@ def test_an_encoder_is_saved_if_and_only_if_the_policy_has_one(tmp_path):
             save_policy(tmp_path, make_networks(name), make_settings(name), evae)
 
 
+@pytest.mark.system
 def test_flying_needs_no_ray():
     code = "import sys, models.policy.policy; sys.exit('ray' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

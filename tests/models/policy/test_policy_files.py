@@ -8,7 +8,7 @@ from models.encoder.weights import save_encoder
 from models.policy import PolicyFileError, load_policy, save_policy
 from models.policy.networks import build_networks
 from models.policy.policy import ENCODER, MANIFEST, MAX_BYTES, NETWORKS
-from tests.models.policy.test_policy import make_evae, make_settings, save
+from tests.support.policies import make_evae, make_settings, save
 
 
 @pytest.fixture

@@ -11,29 +11,29 @@ from jobs.run.folder import locate_run
 from jobs.studies.encoder import costs as encoder_costs
 from jobs.studies.encoder import trade as trade_encoder
 from jobs.studies.encoder.costs import (
-    Form,
-    Row,
+    Encoding,
+    EncodingCost,
     costs_us,
-    default_forms,
+    default_encodings,
     encode_in_chunks,
     encode_newest,
     encode_whole,
     exact_latents,
     explained,
 )
-from jobs.studies.encoder.trade import cells, columns, fronts, percent
+from jobs.studies.encoder.trade import cost_cells, cost_columns, fronts, percent
 from jobs.studies.encoder.trials import spread, squeezed
 from models.encoder.evae import EventVAE, event_targets, reconstruct
 from models.encoder.event_batch import EventBatch, batch_windows
 from models.encoder.table import EncoderTable
-from tests.jobs.run.test_folder import small_config
-from tests.models.encoder.test_table import WINDOW_US, make_evae, make_events
+from tests.support.configs import small_config
+from tests.support.encoders import WINDOW_US, make_evae, make_events
 
 WINDOWS = [(make_events(count, seed=count), 0, WINDOW_US) for count in (0, 1, 40, 300)]
 
 
 def make_row(knob="default", cost=10.0, error=0.01, share=0.2):
-    return Row(knob, "", cost / 2, cost, 2 * error, error, share)
+    return EncodingCost(knob, "", cost / 2, cost, 2 * error, error, share)
 
 
 @pytest.mark.parametrize("coding", ["additive", "none"])
@@ -54,7 +54,7 @@ def test_exact_latents_of_complex_contexts_are_refused():
 
 def test_every_form_but_the_coarse_ones_gives_the_default_latent():
     evae = make_evae()
-    forms = {(form.knob, form.setting): form.encode for form in default_forms(evae)}
+    forms = {(form.knob, form.setting): form.encode for form in default_encodings(evae)}
     default = np.stack([forms["default", ""](window) for window in WINDOWS])
     for key in [("chunks", text) for text in ("1", "2", "5", "20", "per event")] + [("newest events", "500")]:
         assert np.array_equal(np.stack([forms[key](window) for window in WINDOWS]), default), key
@@ -73,7 +73,9 @@ def test_the_newest_events_are_the_last_ones():
 def test_more_chunks_cost_more():
     evae = make_evae()
     table = EncoderTable.from_evae(evae)
-    forms = [Form("", "", encode, evae) for encode in (encode_whole(table), encode_in_chunks(table, None))]
+    forms = [
+        Encoding("", "", encode, evae) for encode in (encode_whole(table), encode_in_chunks(table, None))
+    ]
     costs = costs_us(forms, (WINDOWS[-1:], WINDOWS[2:3]), rounds=3)
     assert costs.shape == (2, 2)
     assert (costs[1] > 5 * costs[0]).all()
@@ -133,12 +135,12 @@ def test_fronts_compare_one_model_by_its_error_and_context_sizes_by_what_they_ex
 
 
 def test_a_row_becomes_text_and_columns():
-    row = Row("precision", "int16", 60.4, 250.0, 0.0123, 0.001, 0.234)
+    row = EncodingCost("precision", "int16", 60.4, 250.0, 0.0123, 0.001, 0.234)
     expected = ("precision", "int16", "60", "250", "100", "0.1", "1.2", "23.4", "*")
-    assert cells(row, 25_000.0, True) == expected
-    assert cells(make_row(), 10.0, True)[-1] == "* default"
-    assert cells(make_row(error=12.5), 10.0, False)[5:7] == ("1,250", "2,500")
-    assert columns([row]) == {
+    assert cost_cells(row, 25_000.0, True) == expected
+    assert cost_cells(make_row(), 10.0, True)[-1] == "* default"
+    assert cost_cells(make_row(error=12.5), 10.0, False)[5:7] == ("1,250", "2,500")
+    assert cost_columns([row]) == {
         "form": ["precision int16"],
         "step_us": [60.4],
         "dense_us": [250.0],
@@ -148,6 +150,7 @@ def test_a_row_becomes_text_and_columns():
     }
 
 
+@pytest.mark.system
 def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_path, monkeypatch):
     monkeypatch.setattr(trade_encoder, "CONTEXTS", (16, 32))
     monkeypatch.setattr(trade_encoder, "CODING_CONTEXT", 16)
@@ -160,7 +163,7 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
         pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
         trade_encoder=dataclasses.replace(config.trade_encoder, iterations=1, seeds=2, windows=4),
     )
-    figures = trade_encoder.run(config)
+    metrics = trade_encoder.run(config)
     folder = locate_run(config).path / "trade"
     pictures = {"inference", "coding", "coding_pictures", "embedding", "interpolation", "scenes"}
     assert {path.stem for path in folder.glob("*.png")} == pictures
@@ -169,8 +172,8 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
     assert [line[1].strip() for line in lines].count("newest events") == 5
     assert "default" in lines[0][-2]
     assert (folder / "coding.md").read_text().count("±") == 3 * 7
-    assert figures["perf/encode_step_us"] > 0
-    assert {f"evae/explained_{coding}_dense" for coding in ("additive", "eventnet", "none")} <= figures.keys()
+    assert metrics["perf/encode_step_us"] > 0
+    assert {f"evae/explained_{coding}_dense" for coding in ("additive", "eventnet", "none")} <= metrics.keys()
 
     def refuse(*arguments):
         raise AssertionError("trained again")
@@ -178,16 +181,16 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
     monkeypatch.setattr("jobs.studies.encoder.trials.train_short", refuse)
     again = trade_encoder.run(config)
     assert {name: value for name, value in again.items() if name.startswith("evae/")} == {
-        name: value for name, value in figures.items() if name.startswith("evae/")
+        name: value for name, value in metrics.items() if name.startswith("evae/")
     }
 
 
 @pytest.mark.benchmark
 def test_the_table_is_tens_of_times_faster_than_the_network_and_as_fast_as_memory():
-    figures = compare("additive")
-    assert figures["times_faster_than_network"] >= 60
-    assert figures["us_300_events"] < 100
-    assert figures["of_copying"] < 2
+    found = compare("additive")
+    assert found["times_faster_than_network"] >= 60
+    assert found["us_300_events"] < 100
+    assert found["of_copying"] < 2
 
 
 def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(tmp_path):

@@ -8,9 +8,17 @@ from jobs.config.config import ConfigError
 from jobs.config.schema import EVAE_SETTINGS, ModelConfig
 from jobs.run.folder import locate_run
 from jobs.studies.probe import probe
-from jobs.studies.probe.probe import Form, Row, as_columns, cells_of, headings, key, probe_figure
+from jobs.studies.probe.probe import (
+    ProbeResult,
+    Representation,
+    headings,
+    key,
+    plot_probes,
+    result_cells,
+    result_columns,
+)
 from jobs.studies.probe.readout import Scores
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
 
 
 def small_probe(tmp_path, **changes):
@@ -18,7 +26,7 @@ def small_probe(tmp_path, **changes):
     settings = {"num_steps": 120, "num_validation_steps": 60, "iterations": 1, "seeds": 2}
     return dataclasses.replace(
         config,
-        env={**config.env, "time_limit_s": 0.1},
+        env=dataclasses.replace(config.env, time_limit_s=0.1),
         model=dataclasses.replace(config.model, context=32),
         collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
         pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
@@ -28,12 +36,13 @@ def small_probe(tmp_path, **changes):
 
 def make_row(name="signed, latent 8", place=(8, "signed"), share=0.5):
     told = Scores((0.1, 0.05, 0.2), (share, share - 0.1, share + 0.1), (7.0, 6.0, 9.0))
-    return Row(Form(name, [], place), 8, {1: told, 3: told})
+    return ProbeResult(Representation(name, [], place), 8, {1: told, 3: told})
 
 
+@pytest.mark.system
 def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, monkeypatch):
     config = small_probe(tmp_path, latents=[4], targets=["occupancy", "signed", "aged", "counts"])
-    figures = probe.run(config)
+    metrics = probe.run(config)
     folder = locate_run(config).path / "probe"
     assert (folder / "probe.png").stat().st_size > 10_000
     names = {file.stem for file in (folder / "encoders").glob("*.safetensors")}
@@ -53,15 +62,15 @@ def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, 
         str(config.model.latent),
     ] + 4 * ["4"]
     assert {"evae/probe_r2_nothing", "evae/probe_r2_runs_encoder", "evae/probe_r2_counts_latent_4"} <= set(
-        figures
+        metrics
     )
-    assert figures["evae/probe_r2_nothing"] <= 0
+    assert metrics["evae/probe_r2_nothing"] <= 0
 
     def refuse(*arguments):
         raise AssertionError("trained again")
 
     monkeypatch.setattr("jobs.studies.encoder.trials.train_short", refuse)
-    assert probe.run(config) == figures
+    assert probe.run(config) == metrics
     with pytest.raises(AssertionError, match="trained again"):
         probe.run(dataclasses.replace(config, probe=dataclasses.replace(config.probe, iterations=2)))
 
@@ -82,10 +91,10 @@ def test_a_row_becomes_text_and_columns():
         "Representation", "Numbers a step", "Ridge, 3 steps", "Network, 1 step", "Network, 3 steps",
         "Bearing, 3 steps [deg]",
     )  # fmt: skip
-    assert cells_of(row, 3) == (
+    assert result_cells(row, 3) == (
         "signed, latent 8", "8", "10 [5, 20]", "50 [40, 60]", "50 [40, 60]", "7.0 [6.0, 9.0]"
     )  # fmt: skip
-    table = as_columns([row])
+    table = result_columns([row])
     assert table["representation"] == ["signed, latent 8, 1 step", "signed, latent 8, 3 steps"]
     assert (table["numbers"], table["network_low"]) == ([8, 24], [0.4, 0.4])
     assert table["bearing_deg_high"] == [9.0, 9.0]
@@ -97,7 +106,7 @@ def test_the_figure_has_a_line_for_each_target_and_a_level_for_the_rest():
     names = ("nothing", "image columns", "8 x 8 cells", "16 x 16 cells", "run's encoder")
     rows = [make_row(name, None, 0.1 * place) for place, name in enumerate(names)]
     rows += [make_row("", (size, target)) for target in ("aged", "counts") for size in (8, 32)]
-    figure = probe_figure(rows)
+    figure = plot_probes(rows)
     assert len(figure.axes) == 4
     _, labels = figure.axes[0].get_legend_handles_labels()
     assert sorted(labels) == sorted((*names, "aged", "counts"))

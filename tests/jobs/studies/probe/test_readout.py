@@ -4,9 +4,9 @@ import pytest
 from jobs.studies.probe import readout as probes
 from jobs.studies.probe.dataset import SECTORS, ProbeData
 from jobs.studies.probe.readout import (
-    inner_flights,
+    inner_episodes,
     network,
-    per_flight,
+    per_episode,
     probe,
     ratio_interval,
     ridge,
@@ -47,8 +47,8 @@ def test_a_representation_that_is_the_geometry_tells_everything():
 def test_noise_and_constants_tell_nothing():
     rng = np.random.default_rng(5)
     for make in (
-        lambda part: rng.normal(size=(len(part.flight), 6)),
-        lambda part: np.ones((len(part.flight), 2)),
+        lambda part: rng.normal(size=(len(part.episode), 6)),
+        lambda part: np.ones((len(part.episode), 2)),
     ):
         result = told(make)
         assert -0.2 < result.ridge[0] <= 0.0
@@ -58,7 +58,7 @@ def test_noise_and_constants_tell_nothing():
 
 def test_the_representation_of_other_flights_tells_nothing():
     def shuffled(part):
-        order = np.random.default_rng(2).permutation(part.flight.max() + 1)
+        order = np.random.default_rng(2).permutation(part.episode.max() + 1)
         return part.proximity.reshape(len(order), -1, SECTORS)[order].reshape(-1, SECTORS)
 
     result = told(shuffled)
@@ -78,7 +78,7 @@ def test_a_network_reads_what_no_line_can():
 def test_the_order_of_the_held_out_flights_does_not_matter():
     order = np.random.default_rng(3).permutation(12)
     near = HELD_OUT.proximity.reshape(12, -1, SECTORS)[order].reshape(-1, SECTORS)
-    turned = ProbeData([], HELD_OUT.flight, near, BEARINGS)
+    turned = ProbeData([], HELD_OUT.episode, near, BEARINGS)
     one, other = (told(lambda part: part.proximity[:, ::3], held_out=part) for part in (HELD_OUT, turned))
     for name in one._fields:
         assert getattr(one, name)[0] == pytest.approx(getattr(other, name)[0], rel=1e-5)
@@ -107,7 +107,7 @@ def test_ridge_takes_the_penalty_that_serves_other_flights_and_redundant_columns
 
 def test_the_same_seed_gives_the_same_network_and_another_seed_another():
     x, y = TRAIN.proximity[:400, ::4].astype(np.float32), TRAIN.proximity[:400]
-    inner = inner_flights(TRAIN.flight[:400])
+    inner = inner_episodes(TRAIN.episode[:400])
     one, again, other = (network(x, y, inner, x, seed) for seed in (0, 0, 1))
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)
@@ -123,16 +123,16 @@ def test_the_network_kept_is_the_one_that_served_other_flights_best(monkeypatch)
     assert np.square(noise[inner] - y[inner]).mean() < 1.1 * np.square(y[inner] - y.mean()).mean()
 
 
-def test_inner_flights_are_whole_and_last():
+def test_inner_episodes_are_whole_and_last():
     flight = np.repeat(np.arange(10), [3, 1, 4, 1, 5, 9, 2, 6, 5, 3])
-    assert np.array_equal(inner_flights(flight), flight >= 8)
-    assert inner_flights(np.array([4, 4, 7])).tolist() == [False, False, True]
-    with pytest.raises(ValueError, match=r"two training flights or more, got 1; raise probe.num_steps"):
-        inner_flights(np.zeros(5, int))
+    assert np.array_equal(inner_episodes(flight), flight >= 8)
+    assert inner_episodes(np.array([4, 4, 7])).tolist() == [False, False, True]
+    with pytest.raises(ValueError, match=r"two training episodes or more, got 1; raise probe.num_steps"):
+        inner_episodes(np.zeros(5, int))
 
 
-def test_sums_are_per_flight():
-    assert per_flight(np.array([1.0, 2.0, 4.0]), np.array([3, 3, 8])).tolist() == [3.0, 4.0]
+def test_sums_are_per_episode():
+    assert per_episode(np.array([1.0, 2.0, 4.0]), np.array([3, 3, 8])).tolist() == [3.0, 4.0]
 
 
 def test_an_interval_is_over_flights_and_trainings():
@@ -149,6 +149,6 @@ def test_an_interval_is_over_flights_and_trainings():
 
 
 def test_a_representation_that_is_not_finite_is_refused():
-    x = np.full((len(TRAIN.flight), 2), np.nan)
+    x = np.full((len(TRAIN.episode), 2), np.nan)
     with pytest.raises(ValueError, match="representation must be finite"):
         probe(x, TRAIN, x, TRAIN, 0)

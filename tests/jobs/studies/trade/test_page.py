@@ -2,10 +2,19 @@ import pytest
 
 from jobs.analysis.statistics import Estimate
 from jobs.analysis.tables import summarise
-from jobs.studies.front_plots import choice_figure
+from jobs.studies.front_plots import plot_choices
 from jobs.studies.replays import Measured
-from jobs.studies.trade.page import HEADINGS, RULE, Row, advice, fronts, lines, metrics, page, panels, verdict
-from tests.jobs.evaluation.test_group_stats import flights
+from jobs.studies.trade.page import (
+    HEADINGS,
+    TradedSetting,
+    advise,
+    fronts,
+    panels,
+    trade_lines,
+    trade_metrics,
+    trade_page,
+)
+from tests.support.episodes import flights
 
 ABOUT = {
     "run": "trade-short-s0-1",
@@ -24,9 +33,9 @@ ABOUT = {
 
 
 def make_row(knob, setting="", step_us=250.0, error=0.02, low=-0.05, high=0.05, won=18, other=0.01):
-    flown = summarise((knob, setting), flights(won))
+    summary = summarise((knob, setting), flights(won))
     measured = Measured(step_us, error, 0.1, other)
-    return Row(knob, setting, measured, flown, Estimate((low + high) / 2, (low, high)))
+    return TradedSetting(knob, setting, measured, summary, Estimate((low + high) / 2, (low, high)))
 
 
 DEFAULT = make_row("default")
@@ -49,9 +58,9 @@ ROWS = [DEFAULT, COARSE, FORGETFUL, FEW, ROUNDED, EXACT]
 )
 def test_a_verdict_follows_the_interval_of_the_difference(low, high, expected):
     row = make_row("tolerance")._replace(difference=Estimate(0.0, (low, high)))
-    assert verdict(row) == expected
-    assert verdict(row._replace(knob="default")) == "default"
-    assert "-10 points" in RULE
+    assert row.verdict == expected
+    assert row._replace(knob="default").verdict == "default"
+    assert "-10 points" in trade_page(ABOUT, ROWS)
 
 
 def test_fronts_hold_what_is_not_beaten_and_know_no_event_error_of_an_encoder():
@@ -61,7 +70,7 @@ def test_fronts_hold_what_is_not_beaten_and_know_no_event_error_of_an_encoder():
 
 
 def test_every_line_has_a_word_for_each_heading():
-    text = lines(ROWS)
+    text = trade_lines(ROWS)
     assert {len(line) for line in text} == {len(HEADINGS)}
     assert text[0][:6] == ("default", "", "4,000", "2", "10", "1")
     assert text[0][8] == ""
@@ -69,42 +78,47 @@ def test_every_line_has_a_word_for_each_heading():
     assert [line[10] for line in text] == ["default", "as good", "worse", "undecided", "as good", "as good"]
 
 
-def test_advice_names_the_fastest_of_the_good_and_what_to_leave_alone():
-    said = "\n".join(advice(ROWS))
-    assert "choose tolerance 0.5, the fastest setting as good as the default: 8,000 steps/s, 2 times" in said
-    assert "tolerance 0.5 has the largest event error: 11 %" in said
-    assert "the fastest as good as the default is precision int8: 1.2 times" in said
-    assert "what costs success [points]: memory legacy (-65 [-70, -60])" in said
-    assert "**Undecided** with so many flights: pyrender samples 1." in said
-    assert "Of 5 verdicts" in said
+def test_advice_is_the_fastest_of_the_good_and_what_to_avoid():
+    found = advise(ROWS)
+    assert found.fastest is found.coarsest is COARSE
+    assert found.encoder is ROUNDED
+    assert (found.worse, found.undecided) == ([FORGETFUL], [FEW])
+    text = trade_page(ABOUT, ROWS)
+    assert "choose tolerance 0.5" in text
+    assert "8,000 steps/s, 2 times" in text
+    assert "memory legacy (-65 [-70, -60])" in text
 
 
 def test_another_camera_is_reported_and_never_advised():
     as_good = make_row("memory", "memory legacy", 100.0, 0.8)
-    said = advice([DEFAULT, COARSE, as_good, EXACT])
-    assert said[0].startswith("**To fly fast**, choose tolerance 0.5")
-    assert "tolerance 0.5 has the largest event error" in said[2]
-    assert "memory legacy: 80 % of the events differ, success +0 [-5, +5] points, as good." in said[3]
+    found = advise([DEFAULT, COARSE, as_good, EXACT])
+    assert found.fastest is found.coarsest is COARSE
+    assert found.cameras == [as_good]
+    assert "memory legacy: 80 %" in trade_page(ABOUT, [DEFAULT, COARSE, as_good, EXACT])
 
 
 def test_where_nothing_faster_is_as_good_the_default_stays():
-    said = advice([DEFAULT, FORGETFUL, EXACT])
-    assert said[0] == "**To fly fast**, keep the default: no faster setting is known to be as good."
-    assert not any("encoder" in line or "Undecided" in line for line in said)
+    found = advise([DEFAULT, FORGETFUL, EXACT])
+    assert found.fastest is DEFAULT
+    assert found.encoder is None
+    text = trade_page(ABOUT, [DEFAULT, FORGETFUL, EXACT])
+    assert "keep the default" in text
+    assert "Undecided" not in text
+    assert "\n\n-" not in text.split("## What to choose")[1].split("- **For speed**")[1], "one list"
 
 
-def test_the_page_says_what_made_it_and_what_could_not_fly():
-    text = page(ABOUT, ROWS)
+def test_the_page_says_what_made_it_and_what_could_not_be_evaluated():
+    text = trade_page(ABOUT, ROWS)
     assert (
         "Made on 2026-01-02 by `python -m platform.launch +exp=trade` at commit c0ffee on `somewhere`" in text
     )
-    assert "Not flown: pyrender samples 1: RuntimeError: no OpenGL." in text
+    assert "pyrender samples 1: RuntimeError: no OpenGL." in text
     assert text.count("(images/trade.png)") == 1
     assert text.count("\n| ") == len(ROWS) + 2
 
 
 def test_every_number_of_the_advice_is_in_the_table():
-    text = page(ABOUT, ROWS)
+    text = trade_page(ABOUT, ROWS)
     advised, table = text.split("## Every setting")
     for word in ("8,000", "11", "-65 [-70, -60]"):
         assert word in advised
@@ -112,15 +126,15 @@ def test_every_number_of_the_advice_is_in_the_table():
 
 
 def test_metrics_leave_out_what_was_not_measured():
-    assert metrics(DEFAULT)["perf/env_steps_per_second"] == 4000.0
-    assert metrics(DEFAULT)["sim/event_error"] == 0.02
-    assert "sim/event_error" not in metrics(ROUNDED)
-    assert all(value == value for row in ROWS for value in metrics(row).values())
+    assert trade_metrics(DEFAULT)["perf/env_steps_per_second"] == 4000.0
+    assert trade_metrics(DEFAULT)["sim/event_error"] == 0.02
+    assert "sim/event_error" not in trade_metrics(ROUNDED)
+    assert all(value == value for row in ROWS for value in trade_metrics(row).values())
 
 
 def test_the_figure_has_a_panel_for_each_measure_and_a_point_for_each_setting():
     named = [(row.knob, row.setting, row.steps_per_s) for row in ROWS]
-    figure = choice_figure(named, panels(ROWS))
+    figure = plot_choices(named, panels(ROWS))
     assert [axes.get_ylabel() for axes in figure.axes] == [panel.label for panel in panels(ROWS)]
     drawn = [sum(len(points.get_offsets()) for points in axes.collections[-6:]) for axes in figure.axes]
     assert drawn == [len(ROWS)] * 3

@@ -14,17 +14,18 @@ from jobs.studies.trade import trade
 from jobs.tracking.store import check_metrics
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
-from tests.jobs.evaluation.test_group_stats import flights
-from tests.jobs.evaluation.test_sweep import in_store, tracked_sweeps
-from tests.jobs.evaluation.test_sweep_plan import save_training
-from tests.jobs.run.test_folder import small_config
+from tests.support.configs import small_config
+from tests.support.episodes import flights
+from tests.support.policies import save_training
+from tests.support.runs import in_store, tracked_sweeps
 
 
 def trade_config(tmp_path, policy="bytestream-s0", **changes):
     config = small_config(tmp_path, job="trade", exp="trade")
     settings = dataclasses.replace(config.trade, policy=policy, **changes)
     return in_store(
-        dataclasses.replace(config, trade=settings, env={**config.env, "time_limit_s": 0.05}), tmp_path
+        dataclasses.replace(config, trade=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)),
+        tmp_path,
     )
 
 
@@ -34,7 +35,7 @@ def planned(config, policy):
 
 @pytest.fixture
 def policy(tmp_path):
-    return save_training(tmp_path / "policy", "a", 0, small_config(tmp_path).env_config(), "bytestream")
+    return save_training(tmp_path / "policy", "a", 0, small_config(tmp_path).env, "bytestream")
 
 
 def test_the_default_comes_first_the_most_exact_last_and_nothing_twice(tmp_path, policy):
@@ -105,11 +106,12 @@ def stub(monkeypatch):
     return StubTuner
 
 
+@pytest.mark.system
 @pytest.mark.timeout(900)  # where no kernel is compiled yet
 def test_the_job_leaves_table_figure_and_page_and_a_second_run_flies_only_what_failed(tmp_path, policy, stub):
     config = trade_config(tmp_path, policy)
     stub.broken = "pyrender"
-    figures = trade.run(config)
+    metrics = trade.run(config)
     place = locate_run(config).path / "trade"
     table = (place / "table.md").read_text().splitlines()[2:]
     knobs = [line.split("|")[1].strip() for line in table]
@@ -117,13 +119,12 @@ def test_the_job_leaves_table_figure_and_page_and_a_second_run_flies_only_what_f
     assert knobs == ["default", "tolerance", *encoder, "together", "together", "most exact"]
     assert (place / "images" / "trade.png").is_file()
     assert (
-        "Not flown: pyrender renderer pyrender, samples 1: RuntimeError: no OpenGL."
-        in (place / "trade.md").read_text()
+        "pyrender renderer pyrender, samples 1: RuntimeError: no OpenGL." in (place / "trade.md").read_text()
     )
     assert str(tmp_path) not in (place / "trade.md").read_text()
     assert json.loads((place / "about.json").read_text())["policy"] == "a-s0"
-    assert check_metrics(figures)["perf/env_steps_per_second"] > 0
-    assert 0 < figures["sim/event_error"] < 1
+    assert check_metrics(metrics)["perf/env_steps_per_second"] > 0
+    assert 0 < metrics["sim/event_error"] < 1
     stub.flown.clear()
     trade.run(config)
     assert stub.flown == []
@@ -136,14 +137,16 @@ def test_the_job_leaves_table_figure_and_page_and_a_second_run_flies_only_what_f
 
 def test_without_the_default_there_is_nothing_to_compare(tmp_path, policy, stub):
     stub.broken = "default"
-    with pytest.raises(RuntimeError, match=r"^default: not flown: RuntimeError: no OpenGL; the same command"):
+    with pytest.raises(
+        RuntimeError, match=r"^default: not evaluated: RuntimeError: no OpenGL; the same command"
+    ):
         trade.run(trade_config(tmp_path, policy))
 
 
 def test_a_difference_is_taken_on_the_corridors_that_both_flew(tmp_path, policy):
     cell = planned(trade_config(tmp_path), policy)[0]
     usual, few = flights(18), flights(5)[:10]
-    row = trade.row_of(cell, Measured(1.0, 0.0, 0.0, 0.0), few, usual)
+    row = trade.traded_setting(cell, Measured(1.0, 0.0, 0.0, 0.0), few, usual)
     assert row.difference.value == pytest.approx(-0.5)
-    assert row.flown.episodes == 10
+    assert row.summary.episodes == 10
     assert np.isfinite(row.difference.interval).all()

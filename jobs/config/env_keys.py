@@ -1,0 +1,62 @@
+"""How a user spells the settings of `EnvConfig`: env.*, camera.*, faults.*, fidelity.* and renderer.
+
+`EnvConfig` holds camera, faults, fidelity and renderer as fields of its own. On the command line,
+in conf/ and in the files of a run they stand beside `env`. Only this file knows both shapes.
+"""
+
+import dataclasses
+import typing
+from collections.abc import Mapping, Sequence
+
+from envs.config import EnvConfig
+from jobs.config.errors import SET_BY_JOBS
+
+if typing.TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+BESIDE_ENV = ("camera", "faults", "renderer", "fidelity")  # fields of EnvConfig that stand beside `env`
+
+
+def fields_of(section: "type[DataclassInstance]") -> dict[str, type]:
+    """Name -> type of each field of a dataclass of settings."""
+    return {part.name: typing.cast(type, part.type) for part in dataclasses.fields(section)}
+
+
+ENV_GROUPS = {name: fields_of(EnvConfig)[name] for name in BESIDE_ENV if name != "renderer"}
+ENV_FIELDS = [name for name in fields_of(EnvConfig) if name not in (*BESIDE_ENV, *SET_BY_JOBS)]
+ENV_KEYS = {  # key -> the fields of EnvConfig that lead to its value
+    **{f"env.{name}": (name,) for name in ENV_FIELDS},
+    **{f"{group}.{name}": (group, name) for group, cls in ENV_GROUPS.items() for name in fields_of(cls)},
+    "renderer": ("renderer",),
+}
+
+
+def key_of(section: str, path: Sequence[int | str]) -> str:
+    """The key of a field of a section, as users write it: env.scene, camera.width, renderer."""
+    beside = section == "env" and path[:1] and path[0] in BESIDE_ENV
+    return ".".join([*([section] if section and not beside else []), *map(str, path)])
+
+
+def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
+    """The simulation with settings replaced together, such as {"camera.memory": "frame"}.
+
+    Raises:
+        pydantic.ValidationError: If a setting is unknown or its value is not valid.
+    """
+    fields: dict[str, typing.Any] = {}
+    groups: dict[str, dict[str, object]] = {}
+    for key, value in changes.items():
+        path = ENV_KEYS.get(key, (key,))
+        if len(path) == 2:
+            groups.setdefault(path[0], {})[path[1]] = value
+        else:
+            fields[path[0]] = value
+    parts = {group: dataclasses.replace(getattr(env, group), **values) for group, values in groups.items()}
+    return dataclasses.replace(env, **fields, **parts)
+
+
+def flat_env(env: EnvConfig) -> dict[str, object]:
+    """The settings as plain containers in the groups of conf/: `env` and those that stand beside it."""
+    values = dataclasses.asdict(env)
+    beside = {name: values[name] for name in BESIDE_ENV}
+    return {"env": {name: values[name] for name in ENV_FIELDS}, **beside}

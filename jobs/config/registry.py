@@ -1,0 +1,34 @@
+"""The jobs that `job=NAME` can run: which module does each, and what it is for."""
+
+from typing import NamedTuple
+
+
+class Job(NamedTuple):
+    """One job.
+
+    Attributes:
+        module: Its `run(config)` does the job.
+        summary: What comes of it, as the dashboard says it.
+    """
+
+    module: str
+    summary: str
+
+
+JOBS = {
+    "pipeline": Job("jobs.pipeline", "From nothing to an evaluated policy"),
+    "collect": Job("jobs.training.collect", "Recordings of flights, to pretrain on"),
+    "pretrain": Job("jobs.training.pretrain", "An event VAE, whose frozen encoder a policy sees by"),
+    "train": Job("jobs.training.train", "A policy trained by PPO"),
+    "evaluate": Job("jobs.evaluation.evaluate", "A policy and its baselines in corridors never trained on"),
+    "sweep": Job(
+        "jobs.evaluation.sweep",
+        "Policies at other rates and thresholds, in other worlds, with sensor faults",
+    ),
+    "report": Job("jobs.reporting.report", "The page of results, written from the newest sweep"),
+    "ship": Job("jobs.reporting.publish", "The trained policies of models/pretrained, and how they learnt"),
+    "trade": Job("jobs.studies.trade.trade", "What exactness costs from end to end"),
+    "trade_simulator": Job("jobs.studies.simulator", "What exact events cost"),
+    "trade_encoder": Job("jobs.studies.encoder.trade", "What an exact encoder costs"),
+    "probe": Job("jobs.studies.probe.probe", "What a representation of events tells an agent"),
+}

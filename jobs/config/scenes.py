@@ -1,0 +1,36 @@
+"""Whether the scenes that a configuration names can be made."""
+
+from collections.abc import Sequence
+
+from envs.config import EnvConfig
+
+
+def scene_errors(named: Sequence[tuple[str, str]], env: EnvConfig) -> list[str]:
+    """One line for each scene that cannot be made: for its name, its file or the values of env.layout.
+
+    A layout of `envs.scene.LAYOUTS` as it stands is known to be passable for the default vehicle
+    (tests/jobs/config/test_scenes.py), so only changed ones and mesh files are drawn.
+
+    Args:
+        named: Pairs of the key that names a scene, and the scene; env.layout applies to each.
+        env: Gives env.layout, and the vehicle that has to get through.
+    """
+    # Imported here because numba takes long to load, which errors about other keys can do without.
+    import numpy as np
+
+    from envs.scene import LAYOUTS, make_scene
+
+    vehicle = env.vehicle_radius_m, env.camera_height_m
+    default = vehicle == (EnvConfig.vehicle_radius_m, EnvConfig.camera_height_m) and not env.layout
+    errors: dict[str, str] = {}
+    for key, scene in named:
+        if default and scene in LAYOUTS:
+            continue
+        try:
+            make_scene(scene, np.random.default_rng(0), *vehicle, **env.layout)
+        except ValueError as error:
+            text = str(error)
+            key = "env.layout" if text.startswith("layout") else key
+            line = f"{key}: {text.removeprefix('layout: ').removeprefix('scene ')}"
+            errors.setdefault(f"{key} {scene}", line)
+    return list(dict.fromkeys(errors.values()))

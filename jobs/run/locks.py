@@ -1,0 +1,54 @@
+"""Locks between processes: one holds a file at a time; a process that ends, even killed, lets go of it."""
+
+import contextlib
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from jobs.run.files import RunError
+
+
+@contextlib.contextmanager
+def locked(file: Path) -> Iterator[None]:
+    """Hold a lock file, which is made if it is missing; wait while another process holds it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(file):
+        yield
+
+
+@contextlib.contextmanager
+def held_alone(folder: Path) -> Iterator[None]:
+    """Work in a folder as the only process: two would do everything twice, and mix their results.
+
+    Raises:
+        RunError: Another process holds the folder; the message names it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / ".lock"
+    try:
+        lock = FileLock(file).acquire(blocking=False)
+    except Timeout:
+        holder = file.read_text() or "another process"
+        raise RunError(f"{folder}: {holder} works there; wait until it has ended") from None
+    with lock:
+        file.write_text(f"process {os.getpid()} of {os.uname().nodename}")
+        yield
+
+
+def private_folder() -> Path:
+    """A temporary folder of this user that no other user can read or fill with links; made if it is missing.
+
+    Raises:
+        RunError: The folder belongs to someone else, or others may enter it.
+    """
+    folder = Path(tempfile.gettempdir(), f"evade-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    info = folder.lstat()
+    if not stat.S_ISDIR(info.st_mode) or info.st_uid != os.getuid() or info.st_mode & 0o077:
+        found = f"mode {stat.S_IMODE(info.st_mode):04o} of user {info.st_uid}"
+        raise RunError(f"{folder}: must be a folder that its owner alone can enter, got {found}; delete it")
+    return folder

@@ -1,0 +1,1 @@
+from tests.support.clusters import cluster  # noqa: F401  a fixture

@@ -1,0 +1,43 @@
+"""Compiles the kernels into numba's cache, by using each once: python -m tests.support.kernels."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from envs.config import CameraConfig, EnvConfig, FaultsConfig
+from envs.corridor import CorridorEnv
+from envs.event_error import measure
+from envs.events import EVENT
+from envs.recordings import read_events, write_events
+from models.encoder.evae import EventVAE
+from models.encoder.table import EncoderTable
+
+CAMERA = {"width": 16, "height": 16}
+
+
+def main() -> None:
+    """Move through a few corridors, encode what is seen, and write and read a recording."""
+    noisy = FaultsConfig(sparsity=0.1, background_activity=0.1, shot_noise_hz=10.0, leak_hz=1.0)
+    worlds = (
+        EnvConfig(camera=CameraConfig(**CAMERA), faults=noisy),
+        EnvConfig(camera=CameraConfig(**CAMERA, memory="frame"), observation="event_image", scene="gates"),
+        EnvConfig(camera=CameraConfig(**CAMERA, refractory_us=100), scene="texture_change"),
+        EnvConfig(camera=CameraConfig(**CAMERA), observation="luminance", scene="dynamic"),
+    )
+    for config in worlds:
+        env = CorridorEnv(config)
+        env.reset(seed=0)
+        env.step(1)
+    measure(EnvConfig(camera=CameraConfig(**CAMERA)), flights=1, steps=1)
+    events = np.zeros(100, EVENT)
+    events["t"], events["p"] = np.arange(100), 1
+    EncoderTable.from_evae(EventVAE(context=64).freeze()).encode(events, 0, 5000)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("evt2", "evt3"):
+            write_events(Path(folder) / name, events, 16, 16, name)
+            read_events(Path(folder) / name)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""What runs start from and leave behind: planned sweeps, encoder files, runs in a tracking store."""
+
+import dataclasses
+
+import torch
+
+from envs.config import sensor_settings, settings_hash
+from jobs.evaluation.sweep_plan import plan, read_entry
+from jobs.tracking.tracker import open_store
+from jobs.training.pretrain import build_evae
+from models.encoder.weights import save_encoder
+
+
+def planned(config, *agents):
+    return plan(config, [read_entry(agent) for agent in agents])
+
+
+def in_store(config, tmp_path):
+    return dataclasses.replace(
+        config, tracking=dataclasses.replace(config.tracking, uri=f"sqlite:///{tmp_path}/m.db")
+    )
+
+
+def tracked_sweeps(config, kind="condition", parent="sweep"):
+    """Client, and the children of a kind by name of each sweep's parent run, or of each of another kind."""
+    client, experiment = open_store(config.tracking.uri, config.tracking.experiment)
+    parents = client.search_runs([experiment], f"tags.kind = '{parent}'")
+    below = "tags.`mlflow.parentRunId` = '{}'"
+    children = {
+        run.info.run_id: client.search_runs(
+            [experiment], f"{below.format(run.info.run_id)} and tags.kind = '{kind}'"
+        )
+        for run in parents
+    }
+    return client, {parent: {run.info.run_name: run for run in runs} for parent, runs in children.items()}
+
+
+def write_encoder(folder, config):
+    torch.manual_seed(0)
+    sensor = sensor_settings(config.env)
+    evae = build_evae(config.model, sensor)
+    for parameter in evae.ecn.parameters():  # random weights see little; make latents differ
+        parameter.data.mul_(1.5)
+    path = folder / "encoder.safetensors"
+    about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {"reconstruction_step": 0.5}}
+    save_encoder(path, evae.freeze(), about)
+    return path
