@@ -17,7 +17,7 @@ import numpy as np
 
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
-from envs.event_error import measure
+from envs.event_error import measure_event_error
 from jobs.rollout.agents import StepInfo
 from jobs.run.progress import console
 from models.encoder.evae import EventVAE, event_targets, validate
@@ -29,13 +29,13 @@ DRIFT_METRICS = ("policy_reconstruction", "policy_kl", "policy_explained", "poli
 MAX_WINDOWS = 512
 
 
-def measure_event_error(config: EnvConfig) -> dict[str, float]:
+def report_event_error(config: EnvConfig) -> dict[str, float]:
     """Measure the event error of a simulation, print it, and return it as metrics.
 
     A camera that follows the paper's two-frame difference is measured against one that
     remembers, so its error is what that difference loses; the tolerance does not bind it.
     """
-    accuracy = measure(config)
+    accuracy = measure_event_error(config)
     asked = config.fidelity.tolerance
     text = (
         f"Event error in {config.scene}: {accuracy.error:.1%} (asked: at most {asked:.1%}), "

@@ -60,7 +60,7 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     if missing:
         raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")
     group = str(manifest.get("exp", manifest["name"]))
-    identity, observation = settings_hash(manifest), find_kind(manifest).observation
+    identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
     return EvaluatedPolicy(agent, group, int(manifest["seed"]), identity, manifest["sensor"], observation)
 
 

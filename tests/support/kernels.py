@@ -7,7 +7,7 @@ import numpy as np
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
-from envs.event_error import measure
+from envs.event_error import measure_event_error
 from envs.events import EVENT
 from envs.raycast.renderer import sample_luminance
 from envs.recordings import read_events, write_events
@@ -32,7 +32,7 @@ def main() -> None:
         env = CorridorEnv(config)
         env.reset(seed=0)
         env.step(1)
-    measure(EnvConfig(camera=CameraConfig(**CAMERA)), flights=1, steps=1)
+    measure_event_error(EnvConfig(camera=CameraConfig(**CAMERA)), flights=1, steps=1)
     events = np.zeros(100, EVENT)
     events["t"], events["p"] = np.arange(100), 1
     sample_luminance(make_scene("poles", np.random.default_rng(0)), (0.0, 0.0, 2.0, 0.0), 8, 8)
