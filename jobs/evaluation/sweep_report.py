@@ -127,7 +127,7 @@ def report(config: Config, folder: Run, tracker: Tracker, found: SweepResults) -
     write_episodes(place / "episodes.csv", LABELS, episodes)
     write_json(place / "about.json", about(config, folder, found))
     write_tables(place, tracker, config.sweep.reference, found, groups)
-    track_conditions(tracker, found, groups)
+    write_child_runs(tracker, "condition", [condition_run(found, result) for result in groups])
     track_groups(tracker, sweep, groups)
     track_sweep(tracker, found)
     return {result.name: result.success.value for result in groups}
@@ -266,11 +266,6 @@ def write_tables(
     artifacts = tracker.client.list_artifacts(tracker.run_id, "sweep")
     if "sweep/results.json" not in {file.path for file in artifacts}:  # MLflow would append to it
         tracker.table("sweep/results", result_columns(groups))
-
-
-def track_conditions(tracker: Tracker, found: SweepResults, groups: Sequence[GroupResult]) -> None:
-    """Write a child run for each condition and group."""
-    write_child_runs(tracker, "condition", [condition_run(found, result) for result in groups])
 
 
 def condition_run(found: SweepResults, result: GroupResult) -> ChildRun:
