@@ -51,7 +51,8 @@ class Film:
             panels.append(("decoded from the latents", coloured(self.decode(window))))
         slower = self.control_hz / stride / FILM_FPS
         picture = frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption)
-        self.stream.height, self.stream.width = picture.shape[:2]
+        if not self.stream.codec_context.is_open:
+            self.stream.height, self.stream.width = picture.shape[:2]
         self.container.mux(self.stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
 
 
