@@ -1,4 +1,4 @@
-"""How far a simulation's events are from the converged ones: the error that fidelity is asked by."""
+"""Event error: the share of a simulation's events that differ from those of the converged simulation."""
 
 import dataclasses
 from typing import Literal, NamedTuple
@@ -23,7 +23,7 @@ ENTROPY = 20_210_608  # the corridors measured in are those of no split
 
 
 class Accuracy(NamedTuple):
-    """What a simulation achieves.
+    """Event error, events and renders of a simulation.
 
     Attributes:
         error: Event error against the converged simulation.
@@ -72,7 +72,7 @@ def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, se
 
 
 def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
-    """The simulation of the same flight without any error of rendering, see `measure_event_error`."""
+    """The settings of the same simulation without any error of rendering, see `measure_event_error`."""
     renderer: Literal["raycast", "pyrender"] = "raycast" if scene.mesh is None else "pyrender"
     asked = dataclasses.replace(config, faults=FaultsConfig(), renderer=renderer)
     camera = dataclasses.replace(config.camera, memory="reference", encoding="linear32")
@@ -94,12 +94,12 @@ def _measure_flight(
     config = dataclasses.replace(config, faults=FaultsConfig())
     events, renders = _events_along(Sensor(config), config, scene, way)
     exact = converged(config, scene)
-    flight = f"{exact!r} {way}"
-    if flight not in _CONVERGED:
+    key = f"{exact!r} {way}"
+    if key not in _CONVERGED:
         if len(_CONVERGED) == MAX_KEPT:
             _CONVERGED.clear()
-        _CONVERGED[flight] = _events_along(Sensor(exact), config, scene, way)[0]
-    return events, _CONVERGED[flight], renders
+        _CONVERGED[key] = _events_along(Sensor(exact), config, scene, way)[0]
+    return events, _CONVERGED[key], renders
 
 
 def _free_way(config: EnvConfig, scene: Scene, steps: int, rng: np.random.Generator) -> list[Point]:

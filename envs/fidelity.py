@@ -1,4 +1,4 @@
-"""What a scene requires: which renderer, how many renders, how much anti-aliasing, from one tolerance.
+"""From one tolerance to the renderer, renders per control step and anti-aliasing that a scene needs.
 
 The tolerance is the accepted event error of `envs.event_error`. The rules below are fitted to
 that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5

@@ -19,7 +19,7 @@ Point = tuple[float, float]
 
 
 class Outcome(NamedTuple):
-    """What one control step came to.
+    """Result of one control step.
 
     Attributes:
         end: Where the vehicle is after it, x and y [m].

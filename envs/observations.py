@@ -4,9 +4,9 @@ import numpy as np
 from gymnasium import spaces
 
 from envs.config import EnvConfig
-from envs.events import EVENT, event_image, pack_window
+from envs.events import EVENT, event_image
 from envs.events.photoreceptor import GAMMA
-from envs.events.windows import GREY_OFF, GREY_ON
+from envs.events.windows import GREY_OFF, GREY_ON, fill_window
 
 ZOOM = 4
 
@@ -38,13 +38,13 @@ def observe(
 
     Args:
         config: Says which.
-        events: EVENT of (start_us, end_us].
+        events: EVENT of (start_us, end_us], valid and in time order.
         luminance: float32 (H, W), the last render.
         start_us: Start of the step [us].
         end_us: Its end [us].
     """
     if config.observation == "window":
-        window = pack_window(events, start_us, end_us - start_us, config.window_capacity)
+        window = fill_window(events, start_us, end_us - start_us, config.window_capacity)
         return window, int(window[0, 1])
     if config.observation == "event_image":
         return event_image(events, config.camera.width, config.camera.height), 0

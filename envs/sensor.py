@@ -39,7 +39,7 @@ class Sensor:
         self.plan: RenderPlan
 
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
-        """Look at a new scene from `place` (x, y) [m] at `t_us`; `rng` draws the faults. No events."""
+        """Start in a new scene at `place` (x, y) [m], without events; `rng` draws the faults."""
         camera, self._rng = self._config.camera, rng
         if self._config.observation == "none":
             self.luminance = np.zeros((camera.height, camera.width), np.float32)
@@ -96,7 +96,7 @@ class Sensor:
         self.events = events
 
     def _picture(self, place: Point, t_us: int) -> np.ndarray:
-        """What is seen from a place (x, y) [m] at a time."""
+        """Luminance rendered from a place (x, y) [m] at a time, float32 (H, W)."""
         poses = self._poses(place, place, np.ones(1), np.array([t_us]))
         picture = self._renderer.render_way(poses)[0]
         if not (picture.min() >= 0.0 and picture.max() < np.inf):
@@ -120,7 +120,7 @@ class Sensor:
         return poses
 
     def _set_renderer(self, scene: Scene) -> None:
-        """Keep the renderer from episode to episode while scenes ask for the same."""
+        """Keep the renderer from episode to episode while its settings stay the same."""
         chosen, camera = plan_renders(self._config, scene), self._config.camera
         same = self._renderer is not None
         same = same and (chosen.renderer, chosen.samples) == (self.plan.renderer, self.plan.samples)

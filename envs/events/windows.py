@@ -33,13 +33,19 @@ def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int
         raise ValueError(
             f"window_us must be in [1, {MAX_WINDOW_US}] and capacity >= 1; got {window_us} and {capacity}."
         )
-    window = np.zeros((capacity + 1, 4), np.int32)
-    bad = _pack(events, start_us, window_us, window)
+    bad = _first_out_of_place(events, start_us, window_us)
     if bad >= 0:
         raise ValueError(
             f"events must be sorted by t within ({start_us}, {start_us + window_us}] us with p in {{-1, 1}}; "
             f"event {bad} is {events[bad]}."
         )
+    return fill_window(events, start_us, window_us, capacity)
+
+
+def fill_window(events: np.ndarray, start_us: int, window_us: int, capacity: int) -> np.ndarray:
+    """As `pack_window`, for events that are known to be valid, such as those of `EventCamera`."""
+    window = np.zeros((capacity + 1, 4), np.int32)
+    _fill(events, start_us, window_us, window)
     return window
 
 
@@ -85,21 +91,26 @@ def event_image(events: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pack(events, start_us, window_us, window):
-    """Fill the window; return the first event that breaks a rule, or -1."""
+def _first_out_of_place(events, start_us, window_us):
+    """Index of the first event that is out of time or order or has no polarity, or -1."""
     last = start_us + 1
     for i in range(events.size):
         event = events[i]
         if not last <= event.t <= start_us + window_us or abs(event.p) != 1:
             return i
         last = event.t
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill(events, start_us, window_us, window):
+    """Write the newest events, and the numbers of row 0, into an empty window."""
     dropped = max(events.size - (window.shape[0] - 1), 0)
     window[0, 0], window[0, 1], window[0, 2] = events.size - dropped, dropped, window_us
     for i in range(dropped, events.size):
         event, row = events[i], i - dropped + 1
         window[row, 0], window[row, 1] = event.t - start_us, event.x
         window[row, 2], window[row, 3] = event.y, event.p
-    return -1
 
 
 @numba.njit(cache=True, error_model="numpy")

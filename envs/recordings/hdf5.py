@@ -1,7 +1,7 @@
 """HDF5 event files in the layout of the DSEC data set, and the recordings that add to it.
 
 `/events/{t,x,y,p}`, `/t_offset` and `/ms_to_idx` are what other tools read; `/index/*` and
-the attribute `about` are ours: where each control step and flight begins, and how the
+the attribute `about` are ours: where each control step and episode begins, and how the
 events were made. Polarity is 0 or 1 on disk, as in DSEC; files with -1 and 1 are read too.
 """
 
