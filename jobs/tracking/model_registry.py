@@ -37,8 +37,8 @@ the artifacts of the model, `artifacts/policy`, for `models.policy.load_policy`.
 """
 INTERFACE = (
     "The observations of one episode, from its start: events t [us], x, y, p (-1 or +1), or pictures of "
-    "luminance. Out come, for its start and after each control step, the likeliest action (0 forward, 1 left, "
-    "2 right) and the logits of all."
+    "luminance. Out come, for its start and after each control step, the likeliest action (0 forward, "
+    "1 left, 2 right) and the logits of all."
 )
 SHOWN = ("eval/success_rate", "eval/success_rate_low", "eval/success_rate_high", "eval/distance_m",
          "train/success_rate", "sim/event_error")  # fmt: skip
