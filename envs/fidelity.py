@@ -12,8 +12,7 @@ from typing import Any
 
 from envs.config import EnvConfig
 from envs.raycast import RaycastRenderer
-from envs.scene import Scene
-from envs.scene.scene import CONE, ELLIPSOID
+from envs.scene import CONE, ELLIPSOID, Scene
 
 RENDERERS = ("auto", "raycast", "pyrender")
 

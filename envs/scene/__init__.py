@@ -1,4 +1,4 @@
-"""The world: obstacles, textures and layouts, what the vehicle hits, and how far it sees."""
+"""The world: obstacles, textures and layouts, collisions, and range scans."""
 
 from envs.scene.layouts import LAYOUTS, Layout
 from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE

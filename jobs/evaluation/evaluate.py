@@ -43,7 +43,7 @@ from jobs.tracking.tracker import Tracker, open_tracker
 from models.encoder.evae import pictures, reconstruct
 from models.encoder.event_batch import batch_packed
 from models.encoder.weights import load_encoder
-from models.kinds import kind_of
+from models.kinds import find_kind
 from models.policy import load_policy
 from models.policy.policy import ENCODER
 
@@ -106,7 +106,7 @@ def evaluate(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     announce(config, folder, path)
     tracker.tags({"policy": manifest["name"]})
     plan = tasks(config)
-    of_policy = settings_hash(dict(manifest)), kind_of(manifest).observation
+    of_policy = settings_hash(dict(manifest)), find_kind(manifest["name"]).observation
     cells = {task: cell_of(task, config, path, of_policy) for task in plan}
     flown = fly_tasks(cells, config, folder)
     tracks = [track for task in plan if shown(task, plan) for track in tracks_of(task, cells[task])]

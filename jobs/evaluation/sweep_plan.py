@@ -19,7 +19,7 @@ from jobs.rollout.episodes import check_sensor
 from jobs.rollout.tasks import Cell, Entry, make_cell
 from jobs.run.folder import Run, named_policy
 from jobs.run.provenance import REPOSITORY
-from models.kinds import kind_of
+from models.kinds import find_kind
 from models.policy.policy import MANIFEST
 
 PRETRAINED = REPOSITORY / "models" / "pretrained"
@@ -128,7 +128,7 @@ def read_entry(agent: str) -> Entry:
     if missing:
         raise ConfigError(f"sweep.policies: the manifest of {agent!r} lacks {missing}; train it anew")
     group = str(manifest.get("exp", manifest["name"]))
-    identity, observation = settings_hash(manifest), kind_of(manifest).observation
+    identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
     return Entry(agent, group, int(manifest["seed"]), identity, manifest["sensor"], observation)
 
 

@@ -17,7 +17,7 @@ from envs.config import settings_hash
 from jobs.run.files import read_json
 from jobs.run.provenance import REPOSITORY
 from jobs.tracking.tracker import Tracker
-from models.kinds import kind_of
+from models.kinds import find_kind
 from models.policy.policy import MANIFEST
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def signature(manifest: Mapping[str, Any]) -> "ModelSignature":
     given = Schema(
         [ColSpec("long", "step"), ColSpec("long", "action"), *(ColSpec("float", name) for name in ACTIONS)]
     )
-    if kind_of(manifest).observation == "luminance":
+    if find_kind(manifest["name"]).observation == "luminance":
         shape = (-1, manifest["height"], manifest["width"])
         return ModelSignature(Schema([TensorSpec(np.dtype(np.float32), shape)]), given)
     window_us = round(1e6 / manifest["sensor"]["control_hz"])

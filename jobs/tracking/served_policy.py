@@ -44,7 +44,7 @@ class ServedPolicy(PythonModel):
         Raises:
             ValueError: Events before the episode's start, or not in time order.
         """
-        policy = Policy(self.loaded.networks, self.loaded.manifest, self.loaded.encoder)
+        policy = Policy(self.loaded.networks, self.loaded.spec, self.loaded.encoder)
         if policy.observation == "luminance":
             logits = [policy.logits(picture[None])[0] for picture in np.asarray(model_input)]
         else:

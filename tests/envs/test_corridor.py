@@ -12,8 +12,7 @@ from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, s
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import unpack_window
 from envs.kinematics import clock_us, fly, planned_position
-from envs.scene import Scene
-from envs.scene.scene import OBSTACLE, POLE
+from envs.scene import OBSTACLE, POLE, Scene
 
 SMALL = CameraConfig(width=16, height=16)
 EMPTY = {"layout": {"num_obstacles": 0}, "camera": SMALL}

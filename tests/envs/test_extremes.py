@@ -9,8 +9,7 @@ from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from envs.corridor import CorridorEnv
 from envs.events.windows import MAX_US
 from envs.kinematics import Outcome, clock_us
-from envs.scene import Scene
-from envs.scene.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
+from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene
 from envs.sensor import Sensor
 
 TINY = CameraConfig(width=8, height=8)

@@ -116,7 +116,7 @@ def find_policy(config: Config) -> tuple[Entry, EventVAE]:
     file = Path(agents[0]) / ENCODER
     if len(agents) == 1 and file.is_file():
         evae, _ = load_encoder(file)
-        if evae.settings["variant"] in EVENT_ENCODERS and evae.ecn.coding != "eventnet":
+        if evae.settings.variant in EVENT_ENCODERS and evae.ecn.coding != "eventnet":
             return read_entry(agents[0]), evae
     rule = f"must be one policy with a frozen encoder of {' or '.join(EVENT_ENCODERS)}, not EventNet's"
     raise ConfigError(f"trade.policy: {rule}, got {name!r}")
