@@ -4,7 +4,7 @@ It was pretrained on other flights than the policy's own. `drift` is the mean re
 error of a pixel over windows of one control step that the policy met, divided by the same error
 over the held-out windows of one control step of the encoder's own recording: 1 where the policy
 meets what the encoder knows, 1.2 where a pixel's error is a fifth larger. A picture with more
-events has a larger error too; `policy_explained` and `policy_auc` say whether it is told from
+events has a larger error too; `policy_explained_loss` and `policy_auc` say whether it is told from
 others as well as before.
 """
 
@@ -21,7 +21,7 @@ from models.encoder.event_batch import batch_packed, cut_packed
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
 
-FIGURES = ("policy_reconstruction", "policy_kl", "policy_explained", "policy_auc", "drift")
+FIGURES = ("policy_reconstruction", "policy_kl", "policy_explained_loss", "policy_auc", "drift")
 MAX_WINDOWS = 512
 
 
@@ -77,13 +77,13 @@ def drift_figures(
         held_out: The encoder's own figures, of its manifest.
 
     Returns:
-        `policy_reconstruction`, `policy_kl`, `policy_explained` and `policy_auc` as
+        `policy_reconstruction`, `policy_kl`, `policy_explained_loss` and `policy_auc` as
         `models.encoder.evae.validate` defines them, and `drift` where the encoder's own error of one
         control step is known.
     """
     batch = batch_packed(windows, evae.grid)
     values = validate(evae, batch, event_targets(batch, evae.target))
-    figures = {f"policy_{name}": values[name] for name in ("reconstruction", "kl", "explained", "auc")}
+    figures = {f"policy_{name}": values[name] for name in ("reconstruction", "kl", "explained_loss", "auc")}
     own = held_out.get("reconstruction_step", 0.0)
     return figures | ({"drift": values["reconstruction"] / own} if own > 0 else {})
 

@@ -45,7 +45,7 @@ def test_the_figures_are_those_of_the_windows_and_drift_is_the_ratio_to_the_enco
 def test_windows_without_events_have_figures_too(evae):
     figures = drift_figures(evae, [window(0)[:1]] * 2, {"reconstruction_step": 0.2})
     assert np.isfinite(list(figures.values())).all()
-    assert (figures["policy_auc"], figures["policy_explained"]) == (0.5, 0.0)
+    assert (figures["policy_auc"], figures["policy_explained_loss"]) == (0.5, 0.0)
 
 
 @pytest.mark.parametrize("flights", [1, 2, 3, 7, 8, 9, 10])
