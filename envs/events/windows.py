@@ -5,8 +5,8 @@ import numpy as np
 
 from envs.events.camera import EVENT
 
-ON, OFF = 255, 125  # picture values of polarities (appendix D.1.2)
-MAX_US = 2**31 - 1
+GREY_ON, GREY_OFF = 255, 125  # of an event picture (appendix D.1.2)
+MAX_WINDOW_US = 2**31 - 1
 
 
 def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int) -> np.ndarray:
@@ -29,9 +29,9 @@ def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int
     """
     if events.dtype != EVENT or events.ndim != 1:
         raise ValueError(f"events must be a 1-D EVENT array; got {events.dtype}, {events.ndim}-D.")
-    if not 0 < window_us <= MAX_US or capacity < 1:
+    if not 0 < window_us <= MAX_WINDOW_US or capacity < 1:
         raise ValueError(
-            f"window_us must be in [1, {MAX_US}] and capacity >= 1; got {window_us} and {capacity}."
+            f"window_us must be in [1, {MAX_WINDOW_US}] and capacity >= 1; got {window_us} and {capacity}."
         )
     window = np.zeros((capacity + 1, 4), np.int32)
     bad = _pack(events, start_us, window_us, window)
@@ -109,5 +109,5 @@ def _draw(events, image):
         event = events[i]
         if event.y >= image.shape[0] or event.x >= image.shape[1]:
             return i
-        image[event.y, event.x] = ON if event.p > 0 else OFF
+        image[event.y, event.x] = GREY_ON if event.p > 0 else GREY_OFF
     return -1

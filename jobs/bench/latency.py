@@ -18,16 +18,15 @@ import onnxruntime
 import torch
 from rich.table import Table
 
-from envs.config import EnvConfig, sensor_settings
+from envs.config import EnvConfig
 from envs.events import EVENT
 from jobs.bench.throughput import composed
 from jobs.run.progress import console
-from jobs.training.ppo import network_settings
-from jobs.training.pretrain import build_evae
+from jobs.training.ppo import policy_spec
+from models.encoder.evae import EventVAE
 from models.encoder.frozen import encoder_of
 from models.kinds import KINDS
 from models.policy import Policy
-from models.policy.features import FEATURES
 from models.policy.networks import build_networks
 from models.policy.onnx import export_onnx
 
@@ -45,7 +44,7 @@ def main() -> None:
         table.add_column(f"{size:,} events", justify="right")
     with tempfile.TemporaryDirectory() as folder:
         for name, kind in KINDS.items():
-            if FEATURES[kind.feature].from_events is None:
+            if kind.observation == "luminance":
                 continue
             policy = random_policy(name)
             session = load(export_onnx(policy, Path(folder) / f"{name}.onnx"))
@@ -56,11 +55,9 @@ def main() -> None:
 def random_policy(name: str) -> Policy:
     """A policy of the kind with its default sizes and random weights."""
     config = composed(f"model={name}")
-    networks = build_networks(network_settings(config))
-    encoder = None
-    if KINDS[name].encoder:
-        encoder = encoder_of(build_evae(config.model, sensor_settings(config.env)).freeze())
-    return Policy(networks.requires_grad_(False), network_settings(config), encoder)
+    spec = policy_spec(config)
+    encoder = encoder_of(EventVAE.of(spec.evae).freeze()) if spec.frozen else None
+    return Policy(build_networks(spec).requires_grad_(False), spec, encoder)
 
 
 def load(file: Path) -> Any:

@@ -29,10 +29,10 @@ from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.bench.throughput import composed
 from jobs.config.config import Config
-from jobs.config.schema import EVAE_SETTINGS
 from jobs.run.progress import console
 from jobs.run.ray_cluster import start_ray
-from jobs.training.ppo import build_ppo
+from jobs.training.ppo import build_ppo, policy_spec
+from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
 from models.encoder.weights import save_encoder
@@ -139,8 +139,7 @@ def seconds_of(work: dict[str, Callable[[], object]], rounds: int) -> dict[str, 
 
 def against_others(folder: Path) -> dict[str, Callable[[], object]]:
     """One iteration on bytestream of our learner, RLlib's and stable-baselines3's."""
-    flown = composed().model
-    evae = EventVAE(flown.name, **{key: getattr(flown, key) for key in EVAE_SETTINGS}).freeze()
+    evae = EventVAE.of(evae_settings(composed())).freeze()
     path, table = encoder_file(evae, folder), EncoderTable.from_evae(evae)
     work: dict[str, Callable[[], object]] = {}
     for size in MINIBATCHES:
@@ -164,9 +163,8 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
     rows["bytestream, fine-tuned"] = ["model=bytestream", "model.encoder=finetuned"]
     for name, words in rows.items():
         config = composed(*words, CONSTANT)
-        model = config.model
-        settings = {key: getattr(model, key) for key in EVAE_SETTINGS}
-        evae = EventVAE(model.name, **settings).freeze() if KINDS[model.name].encoder else None
+        needed = KINDS[config.model.name].encoder
+        evae = EventVAE.of(evae_settings(config)).freeze() if needed else None
         path = encoder_file(evae, folder) if evae else None
         work[name] = build_ppo(config, path).build_algo().train
     return work
@@ -175,7 +173,7 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
 def encoder_file(evae: EventVAE, folder: Path) -> Path:
     """The file of an encoder for the default sensor."""
     sensor = sensor_settings(EnvConfig())
-    path = folder / f"{evae.settings['variant']}.safetensors"
+    path = folder / f"{evae.settings.variant}.safetensors"
     save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
     return path
 
@@ -197,7 +195,7 @@ def stable_baselines(config: Config, table: EncoderTable) -> PPO:
         vf_coef=algo.vf_loss_coeff,
         ent_coef=algo.entropy_coeff,
         max_grad_norm=algo.grad_clip,
-        policy_kwargs={"net_arch": list(config.model.hidden or ())},
+        policy_kwargs={"net_arch": policy_spec(config).hidden},
         device="cpu",
     )
 

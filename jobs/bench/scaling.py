@@ -29,9 +29,9 @@ from rich.table import Table
 from envs.config import EnvConfig
 from jobs.bench.throughput import composed
 from jobs.config.config import HELD_OUT_SCENE
-from jobs.evaluation.sweep_plan import PRETRAINED
-from jobs.rollout.episodes import fly
-from jobs.rollout.scheduler import loaded
+from jobs.rollout.episodes import roll_out
+from jobs.rollout.executors import cached_agent
+from jobs.rollout.policies import PRETRAINED
 from jobs.run.progress import console
 from jobs.run.ray_cluster import QUIET, WORKER_THREADS
 from jobs.training.env_runner import PlainEnvRunner
@@ -217,8 +217,8 @@ def do_nothing(params: dict[str, Any]) -> None:
 def fly_condition(params: dict[str, Any]) -> None:
     """A trial that flies what a policy flies under the default condition."""
     first = CELL_FLIGHTS * params["trial"]
-    agent = loaded(str(PRETRAINED / POLICY), "stochastic")
-    fly(
+    agent = cached_agent(str(PRETRAINED / POLICY), "stochastic")
+    roll_out(
         agent, EnvConfig(scene=HELD_OUT_SCENE, split="eval"), range(first, first + CELL_FLIGHTS), CELL_FLIGHTS
     )
     tune.report({"key": params["trial"]})

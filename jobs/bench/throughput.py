@@ -25,8 +25,8 @@ from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
 from jobs.config.config import Config, parse
-from jobs.config.schema import EVAE_SETTINGS
 from jobs.run.progress import console
+from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
 from models.encoder.weights import save_encoder
@@ -40,8 +40,7 @@ def main() -> None:
     """Measure and print both tables."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    model = composed().model
-    evae = EventVAE(model.name, **{key: getattr(model, key) for key in EVAE_SETTINGS}).freeze()
+    evae = EventVAE.of(evae_settings(composed())).freeze()
     parts = [*frame_rows(), *step_rows(evae)]
     with TemporaryDirectory() as folder:
         loops = loop_rows(evae, Path(folder))

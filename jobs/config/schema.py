@@ -8,61 +8,11 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
 from jobs.config.conditions import Axis, AxisName, Condition
-from models.kinds import FINETUNED, KINDS, MAX_TIME_BINS
+from models.kinds import Latent, Stack, Target
 
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
 Name = Annotated[str, Field(min_length=1)]
-Latent = Annotated[int, Field(ge=1, le=256)]
-Stack = Annotated[int, Field(ge=1, le=32)]
-Target = Literal["signed", "occupancy", "aged", "counts"]  # models.encoder.evae.TARGETS
-EVAE_SETTINGS = ("context", "latent", "norm", "target", "time_bins", "coding")
-
-
-@dataclass(frozen=True, config=STRICT)
-class ModelConfig:
-    """The policy's representation and network (appendix A.1, D.1.2).
-
-    The settings of the event VAE (`EVAE_SETTINGS`) and what PPO does with its encoder are None
-    for a policy without one, `hidden` for one whose network has fixed sizes.
-    """
-
-    name: str
-    context: Annotated[int, Field(ge=8, le=8192, multiple_of=2)] | None
-    latent: Latent | None
-    norm: Literal["batch", "none"] | None
-    target: Target | None
-    time_bins: Annotated[int, Field(ge=2, le=65536)] | None
-    coding: Literal["additive", "eventnet", "none"] | None
-    encoder: Literal["frozen", "finetuned"] | None
-    stack: Stack
-    hidden: list[Count] | None
-
-    @pydantic.model_validator(mode="after")
-    def _fits_its_kind(self) -> "ModelConfig":
-        if self.name not in KINDS:
-            raise ValueError(f"name must be one of {', '.join(KINDS)}, got {self.name!r}")
-        kind = KINDS[self.name]
-        wanted = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
-        for setting, wants in wanted.items():
-            value = getattr(self, setting)
-            if wants != (value is not None):
-                rule = f"be given for {self.name}" if wants else f"be null: {self.name} has no such part"
-                raise ValueError(f"{setting} must {rule}, got {value!r}")
-        if self.coding == "eventnet" and self.name != "bytestream":
-            rule = f"must be additive or none for {self.name}, which has no time"
-            raise ValueError(f"coding {rule}, got 'eventnet'")
-        if self.encoder == "finetuned":
-            self._can_be_finetuned()
-        return self
-
-    def _can_be_finetuned(self) -> None:
-        if self.name not in FINETUNED:
-            rule = f"must be frozen for {self.name}; {', '.join(FINETUNED)} can be fine-tuned"
-            raise ValueError(f"encoder {rule}, got 'finetuned'")
-        if self.time_bins is None or self.time_bins > MAX_TIME_BINS:
-            rule = f"must be at most {MAX_TIME_BINS} for encoder=finetuned"
-            raise ValueError(f"time_bins {rule}, got {self.time_bins}")
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -18,14 +18,12 @@ from envs.config import Observation, sensor_differences, sensor_settings, settin
 from envs.corridor import CorridorVectorEnv
 from jobs.config.conditions import env_with
 from jobs.config.config import Config, ConfigError
-from jobs.config.schema import EVAE_SETTINGS
-from jobs.rollout.drift import drift_figures
+from jobs.rollout.diagnostics import drift_metrics
 from jobs.training.env_runner import MAX_SAMPLE_S, PlainEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
 from models.encoder.evae import EventVAE
-from models.encoder.finetuned import evae_settings
-from models.encoder.weights import EncoderFileError, load_encoder
-from models.kinds import KINDS
+from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
+from models.kinds import KINDS, PolicySpec
 from models.policy.rllib_module import module_spec
 
 
@@ -85,7 +83,7 @@ class FlightMetrics(RLlibCallback):
         self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
         self._unfinished: dict[str, float] = {}
         self._rounds = 0
-        self._encoder: tuple[EventVAE, dict[str, Any]] | None = None
+        self._encoder: tuple[EventVAE, EncoderManifest] | None = None
 
     def on_sample_end(
         self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
@@ -121,24 +119,24 @@ class FlightMetrics(RLlibCallback):
             self._flights.extend(flight for flight in self._begun.popleft().values() if flight)
 
     def _drift(self, module: Any) -> dict[str, float]:
-        """The `jobs.rollout.drift.drift_figures` of the windows that the module met.
+        """The `jobs.rollout.diagnostics.drift_metrics` of the windows that the module met.
 
         None without an encoder, or where its file is no longer there: the frozen part that
         flies has no decoder.
         """
-        about = module.model_config["encoder_file"]
-        if about is None or not module.met:
+        file = module.model_config["encoder_file"]
+        if file is None or not module.met:
             return {}
         if self._encoder is None:
             try:
                 with torch.random.fork_rng(devices=[]):  # a model is made with random weights first
-                    self._encoder = load_encoder(about["path"])
+                    self._encoder = load_encoder(file.path)
             except EncoderFileError:
                 return {}
         evae, manifest = self._encoder
-        if manifest["sha256"] != about["digest"]:
+        if manifest["sha256"] != file.digest:
             return {}
-        return drift_figures(evae, module.met, manifest.get("figures", {}))
+        return drift_metrics(evae, module.met, manifest.get("figures", {}))
 
 
 def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:
@@ -165,12 +163,12 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
         ConfigError: If the encoder was made for another sensor, or for another model than the
             one to fine-tune.
     """
-    algo, settings = config.algo, network_settings(config)
+    algo = config.algo
     # It learns while the processes that fly, if any, wait: together they need a core for each of these.
     runners = algo.num_env_runners
     own_cpus = LITTLE if runners else 1
     register_env(ENV, make_corridors)
-    spec = module_spec(settings, config.seed, pretrained_encoder(config, encoder_path))
+    spec = module_spec(policy_spec(config), config.seed, pretrained_encoder(config, encoder_path))
     return (
         PPOConfig()
         .environment(ENV, env_config=corridor_settings(config), disable_env_checking=True)
@@ -242,23 +240,14 @@ def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
     return CorridorVectorEnv(context["num_envs"], worlds)
 
 
-def network_settings(config: Config) -> dict[str, Any]:
+def policy_spec(config: Config) -> PolicySpec:
     """What the policy's networks are built from."""
-    model, camera = config.model, config.env.camera
-    return {
-        "name": model.name,
-        "width": camera.width,
-        "height": camera.height,
-        "encoder": model.encoder,
-        **{name: getattr(model, name) for name in EVAE_SETTINGS},
-        "stack": model.stack,
-        "hidden": model.hidden,
-        "num_actions": NUM_ACTIONS,
-    }
+    camera = config.env.camera
+    return PolicySpec(config.model, camera.width, camera.height, NUM_ACTIONS)
 
 
-def policy_settings(config: Config) -> dict[str, Any]:
-    """What a policy must be flown with, for its manifest."""
+def policy_about(config: Config) -> dict[str, object]:
+    """What a policy's manifest records of its environment and training, beside its `policy_spec`."""
     sensor = sensor_settings(config.env)
     return {
         "exp": config.exp,
@@ -267,12 +256,11 @@ def policy_settings(config: Config) -> dict[str, Any]:
         "sensor": sensor,
         "sensor_hash": settings_hash(sensor),
         "seed": config.seed,
-        **network_settings(config),
         "ppo": dataclasses.asdict(config.algo),
     }
 
 
-def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, dict[str, Any]] | None:
+def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, EncoderManifest] | None:
     """The encoder file with its manifest; None for a policy without one.
 
     Raises:
@@ -292,8 +280,7 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
         )
         remedy = "use its settings, or pretrain an encoder for these"
         raise ConfigError(f"encoder: was made for another sensor: {values}; {remedy}")
-    if config.model.encoder == "finetuned":
-        wanted = evae_settings(network_settings(config))
-        if wanted != about["model"]:
-            raise ConfigError(f"encoder: must be one of {wanted} to be fine-tuned, got {about['model']}")
+    spec = policy_spec(config)
+    if spec.finetuned and spec.evae != about["model"]:
+        raise ConfigError(f"encoder: must be one of {spec.evae} to be fine-tuned, got {about['model']}")
     return path, about

@@ -24,17 +24,16 @@ from ray import tune
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.config.config import Config, ConfigError
-from jobs.rollout.drift import FIGURES
+from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage
 from jobs.tracking.tracker import open_tracker
 from jobs.training.env_runner import FlightError
-from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_settings
+from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_about, policy_spec
 from jobs.training.pretrain import check_sources, prepare_encoder
-from models.encoder.weights import load_encoder
-from models.kinds import kind_of
+from models.encoder.weights import EncoderManifest, load_encoder
 from models.policy import save_policy
 
 OnResult = Callable[[int, Mapping[str, float]], None]
@@ -53,7 +52,7 @@ METRICS = {
     "train/gradient_norm": ("learners", "default_policy", "gradients_default_optimizer_global_norm"),
     "sim/events_per_step": ("env_runners", "events_per_step"),
     "sim/dropped_events": ("env_runners", "dropped_events"),
-    **{f"evae/{name}": ("env_runners", name) for name in FIGURES},
+    **{f"evae/{name}": ("env_runners", name) for name in DRIFT_METRICS},
     "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
     "perf/trial_restarts": ("trial_restarts",),
 }
@@ -190,16 +189,16 @@ def export_policy(
         TrainingError: If the checkpoint's encoder is not the one in the file.
     """
     module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
-    settings = policy_settings(config)
-    evae, about = None, dict[str, Any]()
-    if encoder_path is not None and kind_of(settings).encoder:
-        evae, about = load_encoder(encoder_path)
+    spec = policy_spec(config)
+    evae, of_encoder = None, EncoderManifest()
+    if encoder_path is not None and spec.frozen:
+        evae, of_encoder = load_encoder(encoder_path)
     frozen = {} if evae is None else evae.state_dict()
     flown = {} if module.encoder is None else module.encoder.state_dict()
     if not all(torch.equal(value, frozen[name]) for name, value in flown.items()):
         raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
-    manifest = {**settings, "figures": figures}
-    save_policy(target, module.networks(), manifest, evae, about.get("figures"))
+    about = {**policy_about(config), "figures": figures}
+    save_policy(target, module.networks(), spec, about, evae, of_encoder.get("figures"))
 
 
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:

@@ -5,14 +5,16 @@ import dataclasses
 import torch
 
 from envs.config import sensor_settings, settings_hash
-from jobs.evaluation.sweep_plan import plan, read_entry
+from jobs.evaluation.sweep_plan import plan_sweep
+from jobs.rollout.policies import read_policy
 from jobs.tracking.tracker import open_store
-from jobs.training.pretrain import build_evae
+from jobs.training.pretrain import evae_settings
+from models.encoder.evae import EventVAE
 from models.encoder.weights import save_encoder
 
 
 def planned(config, *agents):
-    return plan(config, [read_entry(agent) for agent in agents])
+    return plan_sweep(config, [read_policy(agent) for agent in agents])
 
 
 def in_store(config, tmp_path):
@@ -38,7 +40,7 @@ def tracked_sweeps(config, kind="condition", parent="sweep"):
 def write_encoder(folder, config):
     torch.manual_seed(0)
     sensor = sensor_settings(config.env)
-    evae = build_evae(config.model, sensor)
+    evae = EventVAE.of(evae_settings(config))
     for parameter in evae.ecn.parameters():  # random weights see little; make latents differ
         parameter.data.mul_(1.5)
     path = folder / "encoder.safetensors"

@@ -43,6 +43,7 @@ from models.encoder.embedding import CODINGS
 from models.encoder.evae import EventVAE, event_targets, pictures, reconstruct
 from models.encoder.event_batch import EventBatch
 from models.encoder.weights import load_encoder
+from models.kinds import EncoderModel
 
 EVENT_ENCODERS = ("bytestream", "bytestream_xy")
 CONTEXTS = (128, 256, 512, 1024)
@@ -68,7 +69,7 @@ def run(config: Config) -> dict[str, float]:
         raise ConfigError(
             f"model: {model.name} has no encoder of single events; choose bytestream or bytestream_xy"
         )
-    if model.coding == "eventnet":
+    if isinstance(model, EncoderModel) and model.coding == "eventnet":
         raise ConfigError("model.coding: must be additive or none for this study, got 'eventnet'")
     check_sources(config)
     folder = open_run(config)

@@ -9,9 +9,8 @@ from envs.config import EnvConfig
 from jobs.config.config import ConfigError, as_dict, known_keys, parse
 from jobs.config.env_keys import flat_env
 from jobs.config.errors import SET_BY_JOBS
-from jobs.config.schema import EVAE_SETTINGS
 from jobs.run.folder import run_name
-from models.kinds import KINDS
+from models.kinds import KINDS, model_keys
 from tests.support.configs import CONF, compose
 
 POLICIES = {
@@ -137,14 +136,18 @@ def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_i
 
 @pytest.mark.parametrize("name", sorted(KINDS))
 def test_a_kind_has_the_settings_of_its_parts_and_no_others(name):
-    values = compose("+exp=bytestream", f"model={name}")
-    kind = KINDS[name]
-    needed = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
-    usual = compose("+exp=bytestream")["model"]
-    for key, wanted in needed.items():
-        other, rule = (None, f"be given for {name}") if wanted else (usual[key], f"be null: {name} has no")
-        with pytest.raises(ConfigError, match=f"^model: {key} must {rule}.*got"):
-            parse(changed(values, f"model.{key}", other))
+    values, usual = compose("+exp=bytestream", f"model={name}"), compose("+exp=bytestream")["model"]
+    own = model_keys(name)
+    assert list(values["model"]) == own
+    for key in own:
+        if key != "name":
+            with pytest.raises(ConfigError, match=rf"^model\.{key}: .*got None"):
+                parse(changed(values, f"model.{key}", None))
+    for key in usual.keys() - {*own}:
+        with pytest.raises(
+            ConfigError, match=rf"^model\.{key}: no such key, got .*; this kind of model has none"
+        ):
+            parse(changed(values, f"model.{key}", usual[key]))
 
 
 @pytest.mark.parametrize("name", ["bytestream_xy", "event_image_vae"])
@@ -235,9 +238,8 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("env.layout", {"num_obstacles": 2.5}, "num_obstacles must be a whole number"),
         ("env.layout", {"num_pole": 3}, "has no 'num_pole'"),
         ("env.layout", {"name": 3}, "has no 'name'"),
-        ("model.name", "snn", f"name must be one of {', '.join(KINDS)}, got 'snn'"),
-        ("model.latent", None, "latent must be given for bytestream, got None"),
-        ("model.hidden", None, "hidden must be given for bytestream, got None"),
+        ("model.name", "snn", f"must be one of {', '.join(KINDS)}, got 'snn'"),
+        ("model.name", "eip", "which is called event_image now"),
         (
             "train.conditions",
             [{"env.scene": "moon"}],

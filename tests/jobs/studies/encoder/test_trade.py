@@ -6,7 +6,6 @@ import torch
 
 from jobs.bench.encoder import compare
 from jobs.config.config import ConfigError
-from jobs.config.schema import EVAE_SETTINGS, ModelConfig
 from jobs.run.folder import locate_run
 from jobs.studies.encoder import costs as encoder_costs
 from jobs.studies.encoder import trade as trade_encoder
@@ -26,6 +25,7 @@ from jobs.studies.encoder.trials import spread, squeezed
 from models.encoder.evae import EventVAE, event_targets, reconstruct
 from models.encoder.event_batch import EventBatch, batch_windows
 from models.encoder.table import EncoderTable
+from models.kinds import DenseModel
 from tests.support.configs import small_config
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
@@ -194,8 +194,7 @@ def test_the_table_is_tens_of_times_faster_than_the_network_and_as_fast_as_memor
 
 
 def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(tmp_path):
-    nothing = dict.fromkeys(EVAE_SETTINGS)
-    model = ModelConfig(name="event_columns", stack=3, hidden=[64, 64], encoder=None, **nothing)
+    model = DenseModel(name="event_columns", stack=3, hidden=[64, 64])
     config = dataclasses.replace(small_config(tmp_path, job="trade_encoder"), model=model)
     with pytest.raises(ConfigError, match="event_columns has no encoder of single events"):
         trade_encoder.run(config)
