@@ -17,6 +17,7 @@ from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.run.files import read_json, write_atomic, write_json
 from jobs.run.provenance import provenance
+from models.kinds import RENAMED, renamed
 
 # Sections that do not change what is trained: where a run is computed and recorded, and what is
 # done with its policy afterwards.
@@ -28,12 +29,6 @@ NOT_IN_RUN_NAME = (
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "collect": {"recordings": []},
     "train": {"conditions": [{}]},
-}
-RENAMED_MODELS = {  # in run folders of older versions -> now
-    "brp_full": "bytestream",
-    "brp_xy": "bytestream_xy",
-    "eip": "event_image",
-    "eivae": "event_image_vae",
 }
 COMPARED_STEPS = 500_000  # length of the trainings that are compared with each other; the paper's
 
@@ -108,12 +103,14 @@ def reopen(path: Path, config: Config) -> Run:
         )
     here = {name: value for name, value in as_dict(config).items() if name in NOT_IN_RUN_NAME}
     values = read_json(stored)
-    old = values["model"]["name"]
-    if old in RENAMED_MODELS:
+    model = values["model"]["name"]
+    if model in RENAMED:
         raise ConfigError(
-            f"resume: {str(path)!r} was made with model {old}, which is called {RENAMED_MODELS[old]} now and "
-            "cannot be continued; train it anew, or check out the commit that its stages/ name"
+            f"resume: {str(path)!r} was made with model {model}{renamed(model)}, and cannot be continued; "
+            "train it anew, or check out the commit that its stages/ name"
         )
+    # Older versions wrote null for the settings that a kind of model does not have.
+    values["model"] = {name: value for name, value in values["model"].items() if value is not None}
     values |= {section: {**added, **values[section]} for section, added in ADDED_SETTINGS.items()}
     run = parse({**values, **here})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password

@@ -1,12 +1,9 @@
 import dataclasses
 import importlib
 import re
-from pathlib import Path
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from envs.config import EnvConfig
 from jobs.config.config import ConfigError, as_dict, known_keys, parse
@@ -14,8 +11,7 @@ from jobs.config.env_keys import flat_env
 from jobs.config.errors import SET_BY_JOBS
 from jobs.run.folder import run_name
 from models.kinds import KINDS, model_keys
-
-CONF = Path(__file__).resolve().parents[3] / "conf"
+from tests.support.configs import CONF, compose
 
 POLICIES = {
     "bytestream": "bytestream",
@@ -40,14 +36,8 @@ CHOICES = [f"{group}={option}" for group in GROUPS if group != "exp" for option 
 
 
 @pytest.fixture(scope="module")
-def composed():
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        yield lambda *words: OmegaConf.to_container(compose("config", list(words)))
-
-
-@pytest.fixture(scope="module")
-def values(composed):
-    return composed("+exp=bytestream")
+def values():
+    return compose("+exp=bytestream")
 
 
 def changed(values: dict, key: str, value: object) -> dict:
@@ -57,15 +47,15 @@ def changed(values: dict, key: str, value: object) -> dict:
 
 @pytest.mark.parametrize("budget", options("budget"))
 @pytest.mark.parametrize("exp", options("exp"))
-def test_every_experiment_is_accepted_with_every_budget(composed, exp, budget):
-    config = parse(composed(f"+exp={exp}", f"budget={budget}"))
+def test_every_experiment_is_accepted_with_every_budget(exp, budget):
+    config = parse(compose(f"+exp={exp}", f"budget={budget}"))
     assert config.budget == budget
     assert config.job == ("sweep" if exp == "robustness" else "pipeline" if exp in POLICIES else exp)
 
 
 @pytest.mark.parametrize("choice", CHOICES)
-def test_every_file_of_every_group_is_accepted(composed, choice):
-    parse(composed("+exp=bytestream", choice))
+def test_every_file_of_every_group_is_accepted(choice):
+    parse(compose("+exp=bytestream", choice))
 
 
 def test_the_yaml_of_the_world_says_what_its_dataclasses_say(values):
@@ -107,8 +97,8 @@ def test_every_group_names_the_class_that_its_keys_are_fields_of(file):
         assert group.keys() - {"defaults"} <= fields
 
 
-def test_ppo_is_the_papers(composed):
-    algo = parse(composed("+exp=bytestream", "budget=paper", "algo=ppo")).algo
+def test_ppo_is_the_papers():
+    algo = parse(compose("+exp=bytestream", "budget=paper", "algo=ppo")).algo
     assert dataclasses.asdict(algo) == {
         "lr": 3e-4,
         "lr_schedule": "constant",
@@ -127,26 +117,26 @@ def test_ppo_is_the_papers(composed):
     }
 
 
-def test_the_stages_of_an_experiment_share_its_run_folder(composed):
+def test_the_stages_of_an_experiment_share_its_run_folder():
     stages = ("bytestream", "collect", "pretrain", "train", "evaluate")
-    assert len({run_name(parse(composed(f"+exp={stage}"))) for stage in stages}) == 1
+    assert len({run_name(parse(compose(f"+exp={stage}"))) for stage in stages}) == 1
 
 
 @pytest.mark.parametrize(
     ("exp", "name"),
     POLICIES.items(),
 )
-def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_its_name(composed, exp, name):
+def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_its_name(exp, name):
     jobs = ("pipeline", "train", "evaluate", "sweep")
-    configs = [parse(composed(f"+exp={exp}", f"job={job}", "budget=short")) for job in jobs]
+    configs = [parse(compose(f"+exp={exp}", f"job={job}", "budget=short")) for job in jobs]
     assert [(config.job, config.model.name) for config in configs] == [(job, name) for job in jobs]
     (folder,) = {run_name(config) for config in configs}
     assert folder.startswith(f"{exp}-short-s0-")
 
 
 @pytest.mark.parametrize("name", sorted(KINDS))
-def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
-    values, usual = composed("+exp=bytestream", f"model={name}"), composed("+exp=bytestream")["model"]
+def test_a_kind_has_the_settings_of_its_parts_and_no_others(name):
+    values, usual = compose("+exp=bytestream", f"model={name}"), compose("+exp=bytestream")["model"]
     own = model_keys(name)
     assert list(values["model"]) == own
     for key in own:
@@ -161,25 +151,25 @@ def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
 
 
 @pytest.mark.parametrize("name", ["bytestream_xy", "event_image_vae"])
-def test_eventnets_coding_is_an_error_where_there_is_no_time(composed, name):
+def test_eventnets_coding_is_an_error_where_there_is_no_time(name):
     with pytest.raises(ConfigError, match=f"coding must be additive or none for {name}.*got 'eventnet'"):
-        parse(composed("+exp=bytestream", f"model={name}", "model.coding=eventnet"))
-    assert parse(composed("+exp=bytestream", "model.coding=eventnet")).model.coding == "eventnet"
+        parse(compose("+exp=bytestream", f"model={name}", "model.coding=eventnet"))
+    assert parse(compose("+exp=bytestream", "model.coding=eventnet")).model.coding == "eventnet"
 
 
-def test_an_encoder_learns_on_only_where_its_events_can_be_kept(composed):
-    assert parse(composed("+exp=bytestream_finetuned")).model.encoder == "finetuned"
+def test_an_encoder_learns_on_only_where_its_events_can_be_kept():
+    assert parse(compose("+exp=bytestream_finetuned")).model.encoder == "finetuned"
     with pytest.raises(
         ConfigError, match="encoder must be frozen for event_image_vae; bytestream, bytestream_xy can be"
     ):
-        parse(composed("+exp=event_image_vae", "model.encoder=finetuned"))
+        parse(compose("+exp=event_image_vae", "model.encoder=finetuned"))
     with pytest.raises(ConfigError, match="time_bins must be at most 32768 for encoder=finetuned, got 40000"):
-        parse(composed("+exp=bytestream_finetuned", "model.time_bins=40000"))
+        parse(compose("+exp=bytestream_finetuned", "model.time_bins=40000"))
 
 
-def test_a_whole_number_names_the_same_run_as_its_float(composed):
+def test_a_whole_number_names_the_same_run_as_its_float():
     words = ("env.control_hz=100", "env.control_hz=100.0")
-    assert len({run_name(parse(composed("+exp=bytestream", word))) for word in words}) == 1
+    assert len({run_name(parse(compose("+exp=bytestream", word))) for word in words}) == 1
 
 
 def test_a_configuration_survives_being_written_and_read(values):
@@ -269,12 +259,12 @@ def test_a_configuration_error_names_the_key_the_rule_and_the_value(values, key,
 
 
 @pytest.mark.parametrize("exp", ["event_image", "event_image_vae", "rgb"])
-def test_an_image_too_small_for_the_network_is_an_error(composed, exp):
+def test_an_image_too_small_for_the_network_is_an_error(exp):
     rule = f"camera.width: must be at least 36 for the network of {POLICIES[exp]}, got 35"
     with pytest.raises(ConfigError, match=f"^{re.escape(rule)}$"):
-        parse(composed(f"+exp={exp}", "camera.width=35"))
-    parse(composed(f"+exp={exp}", "camera.width=36"))
-    parse(composed("+exp=event_columns", "camera.width=35"))
+        parse(compose(f"+exp={exp}", "camera.width=35"))
+    parse(compose(f"+exp={exp}", "camera.width=36"))
+    parse(compose("+exp=event_columns", "camera.width=35"))
 
 
 def test_all_errors_come_at_once(values):

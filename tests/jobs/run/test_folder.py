@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from envs.config import settings_hash
-from jobs.config.config import Config, ConfigError
+from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
 from jobs.run.files import RunError, write_json
 from jobs.run.folder import (
     NOT_IN_RUN_NAME,
-    RENAMED_MODELS,
     finish,
     finished,
     latest_policies,
@@ -23,7 +22,7 @@ from jobs.run.folder import (
 )
 from jobs.run.locks import held_alone
 from jobs.run.provenance import REPOSITORY, git_commit
-from models.kinds import KINDS
+from models.kinds import KINDS, RENAMED
 from tests.support.configs import small_config
 
 
@@ -168,7 +167,7 @@ def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(confi
     assert run_name(dataclasses.replace(config, train=noisy)) != run.path.name
 
 
-@pytest.mark.parametrize(("old", "new"), RENAMED_MODELS.items())
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
 def test_a_run_folder_of_a_model_that_was_renamed_is_not_continued_and_says_its_new_name(config, old, new):
     assert new in KINDS
     run = open_run(config)
@@ -178,6 +177,16 @@ def test_a_run_folder_of_a_model_that_was_renamed_is_not_continued_and_says_its_
     with pytest.raises(ConfigError, match=rf"^resume: .* {old}, .* {new} now") as error:
         open_run(dataclasses.replace(config, resume=str(run.path)))
     assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_run_folder_with_null_for_what_its_model_does_not_have_is_continued(config):
+    values = {**as_dict(config), "model": {"name": "event_columns", "stack": 3, "hidden": [64, 64]}}
+    run = open_run(parse(values))
+    stored = json.loads((run.path / "config.json").read_text())
+    stored["model"] |= {"context": None, "latent": None, "encoder": None}
+    (run.path / "config.json").write_text(json.dumps(stored))
+    again = open_run(dataclasses.replace(config, resume=str(run.path)))
+    assert again.config.model == run.config.model
 
 
 def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_keep_their_names(config):
