@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PREFIX = "evade-"
 # Packages that `jobs.tracking.served_policy` and `models` import.
-NEEDED = ("mlflow", "numba", "numpy", "pandas", "safetensors", "torch")
+NEEDED = ("mlflow", "numba", "numpy", "pandas", "pydantic", "safetensors", "torch")
 ABOUT = """\
 Policies of `{group}`, a version for each training; its tags name seed, length, commit and metrics.
 

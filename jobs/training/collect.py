@@ -10,7 +10,7 @@ Expect: about 3,000 control steps per second on one core; `data/train.h5` and
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -34,7 +34,7 @@ MEAN_HOLD_M = 2.0
 POLICY_EPISODES = 10**6  # number of a policy's first flight: corridors that no random flight came to
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: Config) -> dict[str, float]:
     """Collect the data sets of a run; return its folder."""
     check_collect(locate_run(config))
     folder = open_run(config)
@@ -42,7 +42,7 @@ def run(config: Config) -> dict[str, Any]:
         return collect(folder.config, folder, tracker)
 
 
-def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
+def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     """Write the training and validation recordings of a run, unless they are there already."""
     done = finished(folder, "collect")
     if done is not None:
@@ -52,7 +52,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
         "train": config.collect.num_steps,
         "validation": config.collect.num_validation_steps,
     }
-    figures: dict[str, Any] = {}
+    figures: dict[str, float] = {}
     with progress("Collect flights", sum(sizes.values()), "steps") as advance:
         for split, num_steps in sizes.items():
             scenes = config.collect.scenes
@@ -103,7 +103,7 @@ def check_policy(folder: Run) -> Path | None:
     """The folder of the policy that a run still has to collect flights of; None if there is none.
 
     Raises:
-        ConfigError: `collect.policy` names none, or one that cannot fly here.
+        ConfigError: `collect.policy` names none, or one for another sensor.
     """
     named = folder.config.collect.policy
     if named is None or finished(folder, "collect") is not None:
@@ -125,13 +125,13 @@ def record(
     policy: Path | None = None,
     policy_share: float = 0.5,
 ) -> Recording:
-    """Fly each environment for a number of control steps; join all flights on one clock.
+    """Roll out each environment for a number of control steps; join all flights on one clock.
 
     Args:
         flights: Environment and number of control steps [-], one pair per scene.
         seed: Seed of corridors and actions.
         advance: Told the number of steps after each flight.
-        policy: Folder of a policy that flies a share of the steps, whole flights of its own,
+        policy: Folder of a policy that acts in a share of the steps, in whole flights of its own,
             drawing its actions as in training; None: all are random.
         policy_share: That share, 0..1.
 
@@ -142,17 +142,17 @@ def record(
     parts: list[np.ndarray] = []
     steps: list[tuple[int, int, int]] = []
     clock_us, flight = 0, 0
-    for config, num_steps, flown_by in stints(flights, policy, policy_share):
+    for config, num_steps, by_policy in stints(flights, policy, policy_share):
         actions, draws = (np.random.SeedSequence([seed, len(parts), stream]) for stream in (1, 2))
-        agent = make_agent(str(flown_by), "stochastic") if flown_by else HoldingAgent(actions)
+        agent = make_agent(str(by_policy), "stochastic") if by_policy else HoldingAgent(actions)
         flight_seeds = np.random.default_rng(draws)
         blind = agent.observation in WITHOUT_EVENTS  # its flights are recorded with events all the same
         env = CorridorEnv(config, observation="events" if blind else agent.observation)
-        started = env.reset(seed=seed, options={"episode": POLICY_EPISODES if flown_by else 0})
-        flown = 0
-        while flown < num_steps:
+        started = env.reset(seed=seed, options={"episode": POLICY_EPISODES if by_policy else 0})
+        taken = 0
+        while taken < num_steps:
             agent.reset([env], [int(flight_seeds.integers(2**63))])
-            flight_events, ends_us = fly_once(env, agent, started, num_steps - flown)
+            flight_events, ends_us = fly_once(env, agent, started, num_steps - taken)
             for events in flight_events:
                 shifted = events.copy()
                 shifted["t"] += clock_us
@@ -161,7 +161,7 @@ def record(
                 (clock_us + start, clock_us + end, flight)
                 for start, end in zip([0, *ends_us], ends_us, strict=False)
             ]
-            flown += len(ends_us)
+            taken += len(ends_us)
             flight += 1
             clock_us += ends_us[-1] + FLIGHT_GAP_US
             advance(len(ends_us))
@@ -186,7 +186,7 @@ def record(
 def stints(
     flights: Sequence[tuple[EnvConfig, int]], policy: Path | None, policy_share: float
 ) -> list[tuple[EnvConfig, int, Path | None]]:
-    """What each agent flies of each scene: environment, control steps, and the policy or None for random."""
+    """Each agent's share of each scene: environment, control steps, and the policy or None for random."""
     parts = []
     for config, num_steps in flights:
         of_policy = 0 if policy is None else round(policy_share * num_steps)
@@ -209,7 +209,7 @@ class HoldingAgent:
         self._hold_steps = max(1.0, MEAN_HOLD_M * config.control_hz / config.speed_mps)
         self._action = self._rng.integers(NUM_ACTIONS)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, object]]) -> np.ndarray:
         """The action, int (1,)."""
         if self._rng.random() < 1.0 / self._hold_steps:
             self._action = self._rng.integers(NUM_ACTIONS)
@@ -217,7 +217,7 @@ class HoldingAgent:
 
 
 def fly_once(
-    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, Any]], most_steps: int
+    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, object]], most_steps: int
 ) -> tuple[list[np.ndarray], list[int]]:
     """One flight of an environment and an agent that were just reset; `started` is what the reset gave.
 
@@ -232,9 +232,9 @@ def fly_once(
 
 
 def steps_of(
-    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, Any]], most_steps: int
+    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, object]], most_steps: int
 ) -> Iterator[int]:
-    """The steps of such a flight, for who wants to look at the environment after each one.
+    """The steps of such a flight, to look at the environment after each one.
 
     Yields:
         The time at which the step ended [us since take-off].

@@ -242,7 +242,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return [episode for _, episode in sorted(done, key=lambda pair: pair[0])], going_on
 
     def _episode(
-        self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: list[dict[str, Any]]
+        self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: list[dict[str, object]]
     ) -> SingleAgentEpisode:
         """The next piece of the episode in a row."""
         name, begun = self._episodes[row]
@@ -264,6 +264,6 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         )
 
 
-def _of_row(infos: dict[str, np.ndarray], row: int) -> dict[str, Any]:
+def _of_row(infos: dict[str, np.ndarray], row: int) -> dict[str, object]:
     """The info of one environment; names with an underscore are Gymnasium's masks."""
     return {name: values[row] for name, values in infos.items() if not name.startswith("_")}

@@ -16,6 +16,7 @@ from ray.tune.registry import register_env
 
 from envs.config import Observation, sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
+from envs.kinematics import NUM_ACTIONS
 from jobs.config.conditions import env_with
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.diagnostics import drift_metrics
@@ -28,11 +29,11 @@ from models.policy.rllib_module import module_spec
 
 
 class PPO(RLlibPPO):
-    """RLlib's PPO; what its construction raises is raised by the first iteration instead.
+    """RLlib's PPO; an error of its construction is raised by the first iteration instead.
 
-    Ray ends a process whose construction failed once all that it owns is released, which processes
-    that fly never do: the launcher would wait forever. Its name is RLlib's, because Tune
-    continues a training only under the name that it began with.
+    Ray ends an actor whose construction failed once everything it owns is released, and env runners
+    never are: the launcher would wait forever. Its name is RLlib's, because Tune continues a training
+    only under the name that it began with.
     """
 
     _refused: Exception | None = None
@@ -62,24 +63,23 @@ class PPO(RLlibPPO):
 
 
 ENV = "evade-corridors"
-NUM_ACTIONS = 3
 EPISODES = 100  # that a rate is averaged over
 DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
-LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
+WAITING_CPUS = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 
 
 class EpisodeMetrics(RLlibCallback):
-    """What flights look like, read off the environments' infos; rewards are the true ones.
+    """Metrics of episodes, from the environments' infos; rewards are not scaled.
 
-    An iteration ends two or three flights, so their figures are means over the last `EPISODES`. Flights
-    count in the order in which they began, those of one round of sampling together: of flights begun
+    An iteration ends two or three episodes, so metrics are means over the last `EPISODES`. Episodes
+    count in the order in which they began, those of one round of sampling together: of those begun
     at once the short ones end first, and these are crashes.
     """
 
     def __init__(self) -> None:
-        """Begin without flights."""
-        self._flights: deque[dict[str, float]] = deque(maxlen=EPISODES)
+        """Begin without episodes."""
+        self._episodes: deque[dict[str, float]] = deque(maxlen=EPISODES)
         self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
         self._unfinished: dict[str, float] = {}
         self._rounds = 0
@@ -88,7 +88,7 @@ class EpisodeMetrics(RLlibCallback):
     def on_sample_end(
         self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
     ) -> None:
-        """Count the events of each step and the outcome of each flight that ended; measure drift at times."""
+        """Count events and the outcome of each episode that ended; measure drift at times."""
         if env_runner is not None and self._rounds % DRIFT_EVERY == 0:
             for name, value in self._drift(env_runner.module).items():
                 metrics_logger.log_value(name, value, window=1)
@@ -100,12 +100,12 @@ class EpisodeMetrics(RLlibCallback):
         metrics_logger.log_value("events_per_step", float(events.mean()), window=1)
         metrics_logger.log_value("dropped_events", float(dropped.sum()), window=1)
         self._count(samples)
-        for name in self._flights[0] if self._flights else ():
-            mean = float(np.mean([flight[name] for flight in self._flights]))
+        for name in self._episodes[0] if self._episodes else ():
+            mean = float(np.mean([episode[name] for episode in self._episodes]))
             metrics_logger.log_value(name, mean, window=1)
 
     def _count(self, samples: Any) -> None:
-        """Add the flights that ended to those that figures are taken from, as soon as it is their turn."""
+        """Add the episodes that ended to those of the metrics, as soon as it is their turn."""
         self._begun.append({chunk.id_: None for chunk in samples if chunk.id_ not in self._unfinished})
         for chunk in samples:
             self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
@@ -116,13 +116,13 @@ class EpisodeMetrics(RLlibCallback):
         for name in broken_off:
             del self._unfinished[name], next(begun for begun in self._begun if name in begun)[name]
         while self._begun and None not in self._begun[0].values():
-            self._flights.extend(flight for flight in self._begun.popleft().values() if flight)
+            self._episodes.extend(ended for ended in self._begun.popleft().values() if ended)
 
     def _drift(self, module: Any) -> dict[str, float]:
         """The `jobs.rollout.diagnostics.drift_metrics` of the windows that the module met.
 
         None without an encoder, or where its file is no longer there: the frozen part that
-        flies has no decoder.
+        acts has no decoder.
         """
         file = module.model_config["encoder_file"]
         if file is None or not module.met:
@@ -139,8 +139,8 @@ class EpisodeMetrics(RLlibCallback):
         return drift_metrics(evae, module.met, manifest.get("figures", {}))
 
 
-def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:
-    """The figures of a flight that has ended, from its last info."""
+def outcome(info: Mapping[str, float], episode_return: float) -> dict[str, float]:
+    """The metrics of an episode that has ended, from its last info."""
     return {
         "episode_return": episode_return,
         "success_rate": float(info["success"]),
@@ -164,9 +164,9 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             one to fine-tune.
     """
     algo = config.algo
-    # It learns while the processes that fly, if any, wait: together they need a core for each of these.
+    # The learner works while the env runners, if any, wait: together they need a core for each of these.
     runners = algo.num_env_runners
-    own_cpus = LITTLE if runners else 1
+    own_cpus = WAITING_CPUS if runners else 1
     register_env(ENV, make_corridors)
     spec = module_spec(policy_spec(config), config.seed, pretrained_encoder(config, encoder_path))
     return (
@@ -175,7 +175,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
         .framework("torch")
         .env_runners(
             num_env_runners=runners,
-            num_cpus_per_env_runner=1.0 - LITTLE / max(1, runners),
+            num_cpus_per_env_runner=1.0 - WAITING_CPUS / max(1, runners),
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
             sample_timeout_s=MAX_SAMPLE_S + 60.0,  # a process that hangs ends itself before
             gym_env_vectorize_mode="vector_entry_point",
@@ -219,14 +219,14 @@ def learning_rate(config: Config) -> float | list[list[float]]:
     return [[0, config.algo.lr], [config.train.env_steps, 0.0]]
 
 
-def corridor_settings(config: Config) -> dict[str, Any]:
-    """What `make_corridors` makes the flights of a training from.
+def corridor_settings(config: Config) -> dict[str, object]:
+    """What `make_corridors` makes the environments of a training from.
 
     Tune continues a stopped training only under the keys and kinds of values that it began with,
     so a setting of later versions appears only where it is used.
     """
     observation = KINDS[config.model.name].observation
-    settings: dict[str, Any] = {
+    settings: dict[str, object] = {
         "config": dataclasses.replace(config.env, split="train", observation=cast(Observation, observation))
     }
     if config.train.conditions != [{}]:

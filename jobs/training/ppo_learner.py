@@ -84,7 +84,7 @@ class PlainPPOLearner(PPOTorchLearner):
         *,
         training_data: TrainingData | None = None,
         episodes: list[Any] | None = None,
-        timesteps: Mapping[str, Any] | None = None,
+        timesteps: Mapping[str, int] | None = None,
         num_epochs: int = 1,
         minibatch_size: int | None = None,
         **kwargs: Any,

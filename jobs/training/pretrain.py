@@ -9,8 +9,8 @@ continues from its last checkpoint.
 import dataclasses
 import hashlib
 import io
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -51,7 +51,7 @@ COLLAPSED = (
 )
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: Config) -> dict[str, float]:
     """Collect if there is no data yet, then train the event VAE; return its figures.
 
     Raises:
@@ -119,7 +119,7 @@ def prepare_encoder(config: Config, folder: Run, tracker: Tracker) -> Path | Non
     return encoder_file(folder)
 
 
-def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
+def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     """Train an event VAE on the run's recordings and write its encoder file."""
     done = finished(folder, "pretrain")
     if done is not None:
@@ -284,9 +284,9 @@ def freeze(
     folder: Run,
     tracker: Tracker,
     evae: EventVAE,
-    about: dict[str, Any],
+    about: Mapping[str, object],
     held_out: dict[str, EventBatch],
-) -> dict[str, Any]:
+) -> dict[str, float]:
     """Write the encoder file and a picture of its reconstructions; return its held-out figures."""
     figures = held_out_figures(evae, held_out)
     manifest = {

@@ -58,8 +58,8 @@ METRICS = {
 }
 ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
 ENV_STEPS = "num_env_steps_sampled_lifetime"
-FLOWN = ("env_runners", "num_env_steps_sampled")
-MAX_PAUSE_S = 600.0  # while every process that flies starts again: a busy machine takes minutes
+SAMPLED = ("env_runners", "num_env_steps_sampled")
+MAX_PAUSE_S = 600.0  # while all env runners restart: a busy machine takes minutes
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
@@ -67,7 +67,7 @@ LISTENER = "train"
 FAILURE = re.compile(r"^Failure # \d+ .*$", re.MULTILINE)  # begins each error that Tune writes about a trial
 RAISED = re.compile(r"^(?:\w+\.)*\w+(?:Error|Exception|Exit|Interrupt)\b.*$", re.MULTILINE)
 
-_LISTENERS: dict[str, Callable[[Mapping[str, Any]], None]] = {}
+_LISTENERS: dict[str, Callable[[Mapping[str, object]], None]] = {}
 
 
 class TrainingError(RuntimeError):
@@ -118,7 +118,7 @@ def newest_error(file: str | None) -> str:
     return FAILURE.split(Path(file).read_text())[-1].strip()
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: Config) -> dict[str, float]:
     """Collect and pretrain where the policy needs that and it is not done; train; return the figures."""
     check_sources(config)
     folder = open_run(config)
@@ -194,8 +194,8 @@ def export_policy(
     if encoder_path is not None and spec.frozen:
         evae, of_encoder = load_encoder(encoder_path)
     frozen = {} if evae is None else evae.state_dict()
-    flown = {} if module.encoder is None else module.encoder.state_dict()
-    if not all(torch.equal(value, frozen[name]) for name, value in flown.items()):
+    trained_on = {} if module.encoder is None else module.encoder.state_dict()
+    if not all(torch.equal(value, frozen[name]) for name, value in trained_on.items()):
         raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
     about = {**policy_about(config), "figures": figures}
     save_policy(target, module.networks(), spec, about, evae, of_encoder.get("figures"))
@@ -251,14 +251,14 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     paused_s: float | None = None
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
-        def listen(result: Mapping[str, Any]) -> None:
+        def listen(result: Mapping[str, object]) -> None:
             nonlocal reported, since_s, paused_s
             now_s = time.monotonic()
-            if not _lookup(result, FLOWN) > 0:
+            if not _lookup(result, SAMPLED) > 0:
                 paused_s = now_s if paused_s is None else paused_s
                 check_pause(now_s - paused_s, result, config.algo.num_env_runners)
                 return
-            paused_s, env_steps = None, int(result[ENV_STEPS])
+            paused_s, env_steps = None, int(_lookup(result, (ENV_STEPS,)))
             last.update(read_metrics(result, now_s - since_s))
             since_s = now_s
             if env_steps <= reported:
@@ -277,8 +277,8 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             del _LISTENERS[LISTENER]
 
 
-def check_pause(seconds: float, result: Mapping[str, Any], env_runners: int) -> None:
-    """Let a training wait for processes that fly and have ended, unless they do not come back.
+def check_pause(seconds: float, result: Any, env_runners: int) -> None:
+    """Let a training wait for env runners that died, unless they do not come back.
 
     Raises:
         TrainingError: All have been started as often as they may be, or after `MAX_PAUSE_S`.
@@ -286,9 +286,9 @@ def check_pause(seconds: float, result: Mapping[str, Any], env_runners: int) -> 
     known = result.get("fault_tolerance", {})
     restarts, alive = known.get("num_remote_worker_restarts", 0), known.get("num_healthy_workers", 1)
     if seconds > MAX_PAUSE_S or (alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)):
-        ended = f"every process that flies has ended, some {MAX_RESTARTS + 1} times"
+        ended = f"every env runner has died, some {MAX_RESTARTS + 1} times"
         raise TrainingError(
-            f"no step was flown for {seconds:.0f} s: {ended}; see /tmp/ray/session_latest/logs"
+            f"no step was sampled for {seconds:.0f} s: {ended}; see /tmp/ray/session_latest/logs"
         )
 
 
@@ -307,7 +307,7 @@ def whole_lines(file: Path) -> bytes:
     return text[: text.rfind(b"\n") + 1]
 
 
-def read_metrics(result: Mapping[str, Any], seconds: float) -> dict[str, float]:
+def read_metrics(result: Mapping[str, object], seconds: float) -> dict[str, float]:
     """The metrics worth keeping of an RLlib result; NaN where nothing was measured.
 
     `seconds` have passed since the one before it, on a clock that does not jump as RLlib's may.
@@ -316,7 +316,7 @@ def read_metrics(result: Mapping[str, Any], seconds: float) -> dict[str, float]:
         TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
     """
     metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
-    steps = _lookup(result, FLOWN)
+    steps = _lookup(result, SAMPLED)
     metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
     bad = [f"{name} = {metrics[name]}" for name in ALWAYS_FINITE if not math.isfinite(metrics[name])]
     if bad:
@@ -325,7 +325,7 @@ def read_metrics(result: Mapping[str, Any], seconds: float) -> dict[str, float]:
     return metrics
 
 
-def _lookup(result: Mapping[str, Any], path: tuple[str, ...]) -> float:
+def _lookup(result: Mapping[str, object], path: tuple[str, ...]) -> float:
     value: Any = result
     for key in path:
         value = value.get(key) if isinstance(value, Mapping) else None

@@ -233,6 +233,8 @@ def load_policy(
 ) -> Policy:
     """Read a policy folder and check it: format, SHA-256, shapes, finite weights.
 
+    Torch keeps its number of threads: call `torch.set_num_threads(1)` if other processes are busy.
+
     Raises:
         PolicyFileError: If the folder is not a whole, unchanged policy of this format.
     """
