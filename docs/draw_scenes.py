@@ -41,7 +41,7 @@ def main() -> None:
                 scene = make_scene(example_mesh(folder), np.random.default_rng(SEED))
         else:
             scene = make_scene(name, np.random.default_rng(SEED))
-            sys.stdout.write(figures(name) + "\n")
+            sys.stdout.write(measurements(name) + "\n")
         draw(scene).save(IMAGES / f"scene_{name}.png", optimize=True)
 
 
@@ -102,7 +102,7 @@ def example_mesh(folder: str) -> str:
     return path
 
 
-def figures(name: str) -> str:
+def measurements(name: str) -> str:
     """The row of a scene: share of passable corridors, share of collisions, times; over `CORRIDORS` seeds."""
     starts = np.random.default_rng(0)
     passable = hits = 0

@@ -2,17 +2,19 @@
 
 import math
 
-LIMIT_M = 1e6
+LIMIT_M = 1e6  # how far from the origin a pose may be
 LIMIT_S = 1e9
 
 
-def check_image(width: int, height: int, fov_deg: float, samples: int) -> None:
-    """ValueError unless width, height and samples are at least 1 and fov_deg is in [1, 170]."""
+def check_image(width: int, height: int, fov_deg: float, samples: int, cull_m: float = math.inf) -> None:
+    """ValueError unless sizes and samples are at least 1, fov_deg is in [1, 170] and cull_m positive."""
     if not (min(width, height, samples) >= 1 and 1.0 <= fov_deg <= 170.0):
         raise ValueError(
             "width, height and samples must be >= 1 and fov_deg in [1, 170], "
             f"got {width}, {height}, {samples}, {fov_deg}"
         )
+    if not cull_m > 0.0:
+        raise ValueError(f"cull_m must be > 0 m (inf: draw everything), got {cull_m!r}")
 
 
 def check_pose(pose: tuple[float, float, float, float], t_s: float = 0.0) -> None:

@@ -1,50 +1,359 @@
-"""Which policies there are: what each one sees, what it keeps of that, what decides (appendix D.1.2).
+"""Which kinds of policy there are, and the settings of each (appendix D.1.2).
 
     observation --feature, once per step--> stack of the last ones --network--> logits and value
 
-The words of a row name the entries of other tables: `envs.observations`, `models.policy.features.FEATURES`
-and `models.policy.networks.NETWORKS`. Imports no package, so that a configuration is checked in no time.
+To add a kind: a row in `KINDS`, a module with its feature and network unless existing ones do, and
+`conf/model/NAME.yaml` with its settings. A row names features and networks as "module:attribute",
+so that a configuration is checked without importing torch.
+
+The ranges of all settings stand here; configurations, encoder files and policy folders share them.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, cast, get_args
+
+import pydantic
+from pydantic import AfterValidator, Field
+from pydantic.dataclasses import dataclass
+
+T = TypeVar("T")
+STRICT = pydantic.ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+Variant = Literal["bytestream", "bytestream_xy", "event_image_vae"]
+Norm = Literal["batch", "none"]
+Target = Literal["signed", "occupancy", "aged", "counts"]
+Coding = Literal["additive", "eventnet", "none"]
+TARGETS: tuple[str, ...] = get_args(Target)
+
+Side = Annotated[int, Field(ge=1, le=4096)]
+Context = Annotated[int, Field(ge=2, le=8192, multiple_of=2)]
+Latent = Annotated[int, Field(ge=1, le=256)]
+TimeBins = Annotated[int, Field(ge=1, le=65536)]
+Stack = Annotated[int, Field(ge=1, le=32)]
+Size = Annotated[int, Field(ge=1, le=65536)]
+
+MAX_ROW_TIME_BINS = 1 << 15  # of an encoder that PPO trains on: events are kept as rows of int16
+MIN_IMAGE = 36  # pixels, of the picture that leaves the third convolution of `nature_cnn` one pixel
+
+
+def _of_a_kind(name: str) -> str:
+    if name not in KINDS:
+        raise ValueError(f"must be one of {', '.join(KINDS)}, got {name!r}{renamed(name)}")
+    return name
+
+
+KindName = Annotated[str, AfterValidator(_of_a_kind)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class EvaeSettings:
+    """Settings of an event VAE; `models.encoder.evae.EventVAE` says what each means."""
+
+    variant: Variant
+    width: Side
+    height: Side
+    context: Context
+    latent: Latent
+    norm: Norm
+    target: Target
+    time_bins: TimeBins
+    coding: Coding
+
+    @pydantic.model_validator(mode="after")
+    def _has_time(self) -> "EvaeSettings":
+        _check_coding(self.variant, self.coding)
+        return self
+
+
+@dataclass(frozen=True, config=STRICT)
+class EncoderModel:
+    """A policy whose dense layers read the latents of an event VAE (appendix A.1, D.1.2).
+
+    Attributes:
+        name: The kind, also the variant of the event VAE.
+        context, latent, norm, target, time_bins, coding: As `EvaeSettings`.
+        encoder: What PPO does with the pretrained encoder.
+        stack: Latest latents that the policy sees.
+        hidden: Neurons of each dense layer.
+    """
+
+    has_encoder: ClassVar[bool] = True
+
+    name: KindName
+    context: Context
+    latent: Latent
+    norm: Norm
+    target: Target
+    time_bins: TimeBins
+    coding: Coding
+    encoder: Literal["frozen", "finetuned"]
+    stack: Stack
+    hidden: list[Size]
+
+    @pydantic.model_validator(mode="after")
+    def _fits_its_kind(self) -> "EncoderModel":
+        _check_coding(self.name, self.coding)
+        if self.encoder == "finetuned":
+            if not KINDS[self.name].finetuning:
+                able = ", ".join(name for name, kind in KINDS.items() if kind.finetuning)
+                rule = f"must be frozen for {self.name}; {able} can be fine-tuned"
+                raise ValueError(f"encoder {rule}, got 'finetuned'")
+            if self.time_bins > MAX_ROW_TIME_BINS:
+                rule = f"must be at most {MAX_ROW_TIME_BINS} for encoder=finetuned"
+                raise ValueError(f"time_bins {rule}, got {self.time_bins}")
+        return self
+
+    def evae(self, width: int, height: int) -> EvaeSettings:
+        """Settings of its event VAE on a sensor of so many pixels."""
+        own = (self.context, self.latent, self.norm, self.target, self.time_bins, self.coding)
+        return EvaeSettings(cast(Variant, self.name), width, height, *own)
+
+
+@dataclass(frozen=True, config=STRICT)
+class DenseModel:
+    """A policy whose dense layers read a stack of features that are computed without an encoder."""
+
+    has_encoder: ClassVar[bool] = False
+
+    name: KindName
+    stack: Stack
+    hidden: list[Size]
+
+
+@dataclass(frozen=True, config=STRICT)
+class FixedModel:
+    """A policy whose network has fixed sizes and is trained end to end on a stack of features."""
+
+    has_encoder: ClassVar[bool] = False
+
+    name: KindName
+    stack: Stack
+
+
+Model = EncoderModel | DenseModel | FixedModel
 
 
 class Kind(NamedTuple):
     """How a policy turns observations into decisions.
 
     Attributes:
-        observation: What the environment shows it.
-        feature: What is kept of each step.
-        network: What reads the stack of features.
-        encoder: Whether a frozen event VAE makes the feature.
+        observation: What the environment shows it (`envs.observations`).
+        feature: What is kept of each step, a `models.policy.features.Feature`.
+        network: What reads the stack of features, a function as in `models.policy.networks`.
+        settings: The dataclass of its settings, which says whether it has an event VAE.
+        onnx: The feature as a function of tensors, as in `models.policy.onnx`; None: no ONNX export.
+        min_side: Smallest side of the sensor that its network takes [pixels].
+        finetuning: Whether PPO may train its encoder on (`encoder: finetuned`).
     """
 
     observation: str
     feature: str
     network: str
-    encoder: bool
+    settings: type[Model]
+    onnx: str | None = None
+    min_side: int = 1
+    finetuning: bool = False
+
+    @property
+    def encoder(self) -> bool:
+        """Whether it needs a pretrained event VAE."""
+        return self.settings.has_encoder
 
 
+_FEATURES, _NETWORKS, _ONNX = "models.policy.features", "models.policy.networks", "models.policy.onnx"
+_LATENT = Kind(
+    observation="window",
+    feature=f"{_FEATURES}:LATENT",
+    network=f"{_NETWORKS}:two_mlps",
+    settings=EncoderModel,
+    onnx=f"{_ONNX}:table_latent",
+)
 KINDS = {
-    "bytestream": Kind("window", "latent", "mlp", encoder=True),
-    "bytestream_xy": Kind("window", "latent", "mlp", encoder=True),
-    "event_columns": Kind("window", "columns", "mlp", encoder=False),
-    "event_set": Kind("window", "events", "set", encoder=False),
-    "event_image": Kind("event_image", "event_image", "cnn", encoder=False),
-    "event_image_vae": Kind("window", "latent", "mlp", encoder=True),
-    "rgb": Kind("luminance", "grey", "cnn", encoder=False),
+    "bytestream": _LATENT._replace(finetuning=True),
+    "bytestream_xy": _LATENT._replace(finetuning=True),
+    "event_columns": Kind(
+        observation="window",
+        feature=f"{_FEATURES}:COLUMNS",
+        network=f"{_NETWORKS}:two_mlps",
+        settings=DenseModel,
+        onnx=f"{_ONNX}:columns",
+    ),
+    "event_set": Kind(
+        observation="window",
+        feature=f"{_FEATURES}:EVENT_SET",
+        network=f"{_NETWORKS}:event_set",
+        settings=FixedModel,
+        onnx=f"{_ONNX}:event_set",
+    ),
+    "event_image": Kind(
+        observation="event_image",
+        feature=f"{_FEATURES}:EVENT_IMAGE",
+        network=f"{_NETWORKS}:nature_cnn",
+        settings=FixedModel,
+        onnx=f"{_ONNX}:event_image",
+        min_side=MIN_IMAGE,
+    ),
+    "event_image_vae": _LATENT._replace(onnx=f"{_ONNX}:picture_latent", min_side=MIN_IMAGE),
+    "rgb": Kind(
+        observation="luminance",
+        feature=f"{_FEATURES}:GREY",
+        network=f"{_NETWORKS}:nature_cnn",
+        settings=FixedModel,
+        onnx=f"{_ONNX}:grey",
+        min_side=MIN_IMAGE,
+    ),
 }
-# With `encoder: finetuned` the events are kept, and the encoder learns on as part of the network.
-FINETUNED = {
-    name: KINDS[name]._replace(feature="event_rows", network="finetuned", encoder=False)
-    for name in ("bytestream", "bytestream_xy")
+RENAMED = {
+    "brp_full": "bytestream",
+    "brp_xy": "bytestream_xy",
+    "eip": "event_image",
+    "eivae": "event_image_vae",
 }
-MAX_TIME_BINS = 1 << 15  # of an encoder that learns on: events are kept as rows of int16
-MIN_IMAGE = 36  # pixels, of the picture that leaves the third convolution of "cnn" one pixel
 
 
-def kind_of(settings: Mapping[str, Any]) -> Kind:
-    """The kind that a policy's settings (`name`, `encoder`) name; `KINDS` has it before any fine-tuning."""
-    kinds = FINETUNED if settings.get("encoder") == "finetuned" else KINDS
-    return kinds[settings["name"]]
+@dataclass(frozen=True, config=STRICT)
+class PolicySpec:
+    """All that a policy's networks are built from.
+
+    Attributes:
+        model: Settings of its kind.
+        width, height: Pixels of the sensor.
+        num_actions: Actions to choose from.
+    """
+
+    model: Model
+    width: Size
+    height: Size
+    num_actions: Size = 3
+
+    @property
+    def kind(self) -> Kind:
+        """Its row in `KINDS`, with another feature and network where PPO trains the encoder on."""
+        kind = KINDS[self.model.name]
+        if not self.finetuned:
+            return kind
+        return kind._replace(feature=f"{_FEATURES}:EVENT_ROWS", network=f"{_NETWORKS}:finetuned_mlps")
+
+    @property
+    def finetuned(self) -> bool:
+        """Whether PPO trains the encoder on, as a part of the networks."""
+        return isinstance(self.model, EncoderModel) and self.model.encoder == "finetuned"
+
+    @property
+    def frozen(self) -> bool:
+        """Whether its features come from a frozen encoder, which has a file of its own."""
+        return self.model.has_encoder and not self.finetuned
+
+    @property
+    def evae(self) -> EvaeSettings:
+        """Settings of its event VAE.
+
+        Raises:
+            ValueError: It has none.
+        """
+        if not isinstance(self.model, EncoderModel):
+            raise ValueError(f"{self.model.name} has no event VAE")
+        return self.model.evae(self.width, self.height)
+
+    @property
+    def hidden(self) -> list[int]:
+        """Neurons of each of its dense layers.
+
+        Raises:
+            ValueError: It has none.
+        """
+        if isinstance(self.model, FixedModel):
+            raise ValueError(f"{self.model.name} has no dense layers")
+        return self.model.hidden
+
+    def manifest(self) -> dict[str, object]:
+        """Its settings as JSON values, for `read_spec`."""
+        sizes = {"width": self.width, "height": self.height, "num_actions": self.num_actions}
+        return {**dataclasses.asdict(self.model), **sizes}
+
+
+def find_kind(name: object) -> Kind:
+    """The kind of a name.
+
+    Raises:
+        ValueError: There is none of this name.
+    """
+    if not isinstance(name, str) or name not in KINDS:
+        checked(read_model, {"name": name})  # raises
+    return KINDS[str(name)]
+
+
+def renamed(name: object) -> str:
+    """What to add to the refusal of a kind's name of an earlier version; empty for any other name."""
+    now = RENAMED.get(name) if isinstance(name, str) else None
+    return f", which is called {now} now" if now else ""
+
+
+def read_model(**values: object) -> Model:
+    """The settings of a model, checked; `name` says which kind it is, and so which settings it has.
+
+    Raises:
+        pydantic.ValidationError: A setting is missing, unknown to this kind, or has a wrong value.
+    """
+    name = values.get("name")
+    section: Any = KINDS[name].settings if isinstance(name, str) and name in KINDS else None
+    return FixedModel(name=cast(str, name), stack=1) if section is None else section(**values)
+
+
+def model_keys(*kinds: str) -> list[str]:
+    """The settings of some kinds, of all if none is named."""
+    sections = [KINDS[name].settings for name in kinds or KINDS]
+    return list(dict.fromkeys(field.name for section in sections for field in dataclasses.fields(section)))
+
+
+def read_spec(values: Mapping[str, object]) -> PolicySpec:
+    """The specification of a manifest, which may hold more than that.
+
+    Raises:
+        ValueError: A setting is missing, of another type or out of its range; the message names it.
+    """
+    name, sizes = values.get("name"), ("width", "height", "num_actions")
+    own = model_keys(name) if isinstance(name, str) and name in KINDS else ["name"]
+    missing = [key for key in (*own, *sizes) if key not in values]
+    if missing:
+        raise ValueError(f"the settings lack {', '.join(missing)}")
+    model = checked(read_model, {key: values[key] for key in own})
+    spec = checked(PolicySpec, {"model": model} | {key: values[key] for key in sizes})
+    if min(spec.width, spec.height) < spec.kind.min_side:
+        rule = f"must be at least {spec.kind.min_side} for {model.name}"
+        raise ValueError(f"width and height {rule}, got {spec.width} x {spec.height}")
+    return spec
+
+
+def checked(section: Callable[..., T], values: Mapping[str, object]) -> T:
+    """The dataclass of some values.
+
+    Raises:
+        ValueError: On one line, each setting that was refused, with the rule and the value.
+    """
+    try:
+        return section(**values)
+    except pydantic.ValidationError as error:
+        raise ValueError("; ".join(map(_one_line, error.errors()))) from None
+
+
+def resolve(reference: str) -> Any:
+    """The object of a "module:attribute"."""
+    module, _, name = reference.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _check_coding(name: str, coding: str) -> None:
+    """Raises ValueError for a code of time that an encoder without time cannot have."""
+    if coding == "eventnet" and name != "bytestream":
+        raise ValueError(f"coding must be additive or none for {name}, which has no time, got 'eventnet'")
+
+
+def _one_line(problem: Mapping[str, Any]) -> str:
+    """A refusal of pydantic's, with key, rule and value."""
+    key = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "value_error":
+        return f"{key} {problem['msg'].removeprefix('Value error, ')}".strip()
+    return f"{key}: {problem['msg']}, got {problem['input']!r}"

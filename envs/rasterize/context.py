@@ -1,4 +1,8 @@
-"""pyrender's OpenGL renderer as the simulator needs it: headless, linear, in float32, with its own shaders.
+"""The OpenGL context of the rasteriser, and what is drawn in it: headless, linear, in float32.
+
+pyrender holds only the context: it opens EGL, uploads vertices, links shader programs and keeps
+the camera. What it would draw with is replaced here by subclasses: its shaders, framebuffers,
+materials, lights and draw loop. They override private methods, so pyrender is pinned to one version.
 
 Importing this loads OpenGL; only `envs.rasterize.renderer` does, when a renderer is made.
 """
@@ -25,7 +29,11 @@ MULTISAMPLES = 4
 
 
 def start(width: int, height: int, antialias: bool) -> tuple["Platform", "LuminanceRenderer"]:
-    """A context of its own and a renderer in it, for images of `width` x `height` pixels."""
+    """Open a context of its own and a renderer in it, for images of `width` x `height` pixels.
+
+    Raises:
+        Exception: Whatever EGL, OpenGL or a missing library raises; the renderer names the packages.
+    """
     device = egl.get_device_by_index(int(os.environ.get("EGL_DEVICE_ID", "0")))
     platform = Platform(width, height, device=device)
     platform.init_context()
@@ -44,7 +52,7 @@ class Platform(egl.EGLPlatform):
     _egl_context: Any
 
     def make_uncurrent(self) -> None:
-        """Let another thread have the context."""
+        """Release the context, so that another thread can use it."""
         if self._egl_display is not None:
             EGL.eglMakeCurrent(self._egl_display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
 
@@ -72,7 +80,7 @@ class Platform(egl.EGLPlatform):
 
 
 class Program(ShaderProgram):
-    """pyrender's shader program, from the text of its stages; it reads its uniforms from block 0."""
+    """pyrender's shader program, made from source text instead of files; its uniforms are in block 0."""
 
     def __init__(self, surface: int, pattern: int) -> None:
         """Compile and link in the current context."""
@@ -103,7 +111,7 @@ class Camera(PerspectiveCamera):
 
 
 class Draw(NamedTuple):
-    """What one program draws.
+    """One draw call: a program and the faces that it draws.
 
     Attributes:
         program: Surface and pattern, as in `shaders.source`.
@@ -117,9 +125,10 @@ class Draw(NamedTuple):
 
 
 class LuminanceRenderer(Renderer):
-    """pyrender's renderer with one float channel, multisampled or not, and the shaders of this package.
+    """Draws into one float channel, multisampled or not, with the shaders of this package.
 
-    The context is its own, so what never changes is set once.
+    Of pyrender's renderer only the upload of vertices is left. The context is not shared, so
+    state that never changes is set once.
     """
 
     def __init__(self, width: int, height: int, antialias: bool) -> None:
@@ -142,7 +151,7 @@ class LuminanceRenderer(Renderer):
         self.frame = np.zeros(0)
 
     def use(self, draws: list[Draw], sky: float) -> None:
-        """Prepare for a scene: compile what is missing, and load the noise."""
+        """Prepare for a scene: compile missing programs and upload its noise."""
         GL.glClearColor(sky, sky, sky, 1.0)
         self._drop_tiles()
         for draw in draws:
@@ -162,7 +171,7 @@ class LuminanceRenderer(Renderer):
         super().delete()
 
     def __del__(self) -> None:
-        """Nothing: pyrender would free its objects in whatever context is current then."""
+        """Do nothing: pyrender would free its objects in whatever context is current then."""
 
     def _drop_tiles(self) -> None:
         for texture in self._tiles.values():
@@ -170,7 +179,7 @@ class LuminanceRenderer(Renderer):
         self._tiles.clear()
 
     def _forward_pass(self, scene: Any, flags: int, seg_node_map: Any = None) -> np.ndarray:
-        """All of the frame, without pyrender's materials and lights."""
+        """Draw the frame: replaces pyrender's loop over nodes, materials and lights."""
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._main_fb_ms)
         GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
         GL.glBufferData(GL.GL_UNIFORM_BUFFER, self.frame.nbytes, self.frame, GL.GL_STREAM_DRAW)

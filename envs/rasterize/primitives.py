@@ -1,7 +1,7 @@
-"""What the shaders read of a scene: one record per vertex, and triangles between them.
+"""A scene as vertices and triangles for the shaders of `envs.rasterize.shaders`.
 
-Flat faces, the ground, the walls and a scene's own mesh are as in `envs.scene.triangles`. A round body
-is a few rings of corners around its centre, which `envs.rasterize.shaders` turns towards the camera.
+Flat faces, the ground, the walls and a scene's own mesh are as in `envs.scene.triangles`. A round
+body is a few rings of corners around its centre, which the vertex shader turns towards the camera.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -52,7 +52,7 @@ class Batch(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """All that can be seen of a scene, counter-clockwise seen from outside.
+    """The triangles of a scene, counter-clockwise seen from outside.
 
     Attributes:
         vertices: (V,) VERTEX.

@@ -1,9 +1,10 @@
-"""pyrender renderer for all that a scene can hold: same interface and luminance as the ray caster.
+"""OpenGL renderer for everything that a scene can hold: same interface and luminance as the ray caster.
 
-Headless EGL, one draw call per kind of surface with the shaders of `envs.rasterize.shaders`, read back from a
-32-bit float framebuffer: linear, without gamma, not rounded to 8 bits. Nothing of OpenGL
-is imported before a renderer is made. A renderer belongs to the process that made it; it
-may be used from any thread, one at a time.
+Headless EGL, one draw call per kind of surface with the shaders of `envs.rasterize.shaders`, read
+back from a 32-bit float framebuffer: linear, without gamma, not rounded to 8 bits. pyrender holds
+only the OpenGL context; `envs.rasterize.context` says what is replaced in it. OpenGL is not
+imported before a renderer is made. A renderer belongs to the process that made it; it may be
+used from any thread, one at a time.
 
 At the same sample points the picture is that of `raycast.sample_luminance` but for the edges,
 which a rasteriser rounds to 1/256 pixel, and for the polygons that stand for the rims of poles
@@ -23,8 +24,8 @@ from envs.rasterize.shaders import TEXTURE_OF
 from envs.scene import BOX, Scene, Texture
 from envs.scene.textures import PATTERNS
 
-NEAR_M = 0.02  # nothing nearer is drawn
-# The uniforms of a frame, as `shaders` has them in memory.
+MIN_DEPTH_M = 0.02  # nothing nearer is drawn
+# The uniforms of a frame, as the shaders expect them in memory.
 FRAME = np.dtype(
     [
         ("clip", "f4", (4, 4)),
@@ -69,16 +70,14 @@ class PyrenderRenderer:
             ValueError: If a size is not at least 1, fov_deg not in [1, 170], or cull_m not > 0.
             RuntimeError: If EGL or a system library it needs is missing; names the packages.
         """
-        check_image(width, height, fov_deg, samples)
-        if not cull_m > 0.0:
-            raise ValueError(f"cull_m must be > 0 (inf: draw everything), got {cull_m!r}")
+        check_image(width, height, fov_deg, samples, cull_m)
         self.width, self.height, self.samples, self.cull_m = width, height, samples, cull_m
         self._platform, self._renderer = _start(width * samples, height * samples, samples > 1)
         self._slope = math.tan(0.5 * math.radians(fov_deg))
         from envs.rasterize.context import Camera
 
         self._camera = Camera(
-            2.0 * math.atan(self._slope * height / width), NEAR_M, aspectRatio=width / height
+            2.0 * math.atan(self._slope * height / width), MIN_DEPTH_M, aspectRatio=width / height
         )
         with self._platform.current():
             self._projection = self._camera.get_projection_matrix(width * samples, height * samples)
@@ -140,7 +139,7 @@ class PyrenderRenderer:
         return _mean_of_blocks(fine, self.samples)[::-1].copy()
 
     def _set_frame(self, pose: np.ndarray, t_s: float) -> None:
-        """Write the uniforms that change; without whole repeats of textures, so that float32 is enough."""
+        """Write the uniforms of a pose. Whole repeats of textures are left out, so that float32 is enough."""
         frame = self._renderer.frame
         view = np.eye(4)
         view[:3, :3] = pose[:3, :3].T
@@ -152,7 +151,7 @@ class PyrenderRenderer:
                 frame["moved"][i, :2] = [v * t_s % repeat for v in texture.velocity_mps]
 
     def _cull(self, eye_m: np.ndarray) -> None:
-        """Draw what is no obstacle, and the obstacles within `cull_m`."""
+        """Draw only obstacles within `cull_m`, and everything that is no obstacle."""
         near = np.append(_distances(self._bodies, eye_m) <= self.cull_m, True)  # the last: of no obstacle
         for i, batch in enumerate(self._batches):
             self._renderer.draws[i] = self._renderer.draws[i]._replace(runs=_runs(batch, near))

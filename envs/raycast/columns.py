@@ -2,7 +2,7 @@
 
 Columns of pixels are cut at each silhouette. In a strip between two cuts all edges are taken
 as straight; what is nearer is painted first, and what remains uncovered is kept as gaps
-between edges. Input is assumed valid; `envs.raycast.renderer` checks it.
+between edges. Input but poses is assumed valid.
 """
 
 import math
@@ -10,187 +10,213 @@ import math
 import numba
 import numpy as np
 
-from envs.raycast import bodies as b
-from envs.raycast import coverage as v
-from envs.raycast.bodies import FIRST, KIND, KNOWN, LAST, SLOPE, WALL_AFTER, WALL_DEPTH, WALL_SIDE, WEIGHT
-from envs.raycast.coverage import EYE_X, EYE_Y, EYE_Z, FOCAL, HORIZON, inlined, kernel
+from envs.checks import LIMIT_M, LIMIT_S
+from envs.raycast.bodies import MIN_DEPTH, corner, depths, is_before, outline, see_bodies
+from envs.raycast.coverage import LAYERS, PADDING, cover_ground, ends, put, resolve
 from envs.raycast.patterns import texture_cell
-from envs.raycast.surfaces import (
-    enter_gap,
-    show_body,
-    show_walls,
-    wall_depth,
-)
+from envs.raycast.records import BODY, CUT, GAP, STRIP, Canvas, Ends, Record, inlined, kernel
+from envs.raycast.surfaces import enter_gap, show_body, show_walls, wall_depth
 from envs.scene import BOX, CONE, ELLIPSOID
 
-TOGETHER = 1e-9  # [pixels] cuts nearer than this are one
+MIN_STRIP = 1e-9  # [pixels] cuts nearer than this are one
 ARC_PARTS = 3  # strips of equal height at either end of an ellipsoid's outline
 MAX_CUTS = 2 + 2 * max(2, ARC_PARTS)  # of one body: its ends, and corners or arcs
 
 
 @numba.njit(cache=True, error_model="numpy")
-def render_area(
-    scene: tuple, world: np.ndarray, pose: tuple, focal: float, image: np.ndarray, samples: int, cull: float
-) -> None:
-    """Fill `image` (H, W) with the mean luminance over the area of each pixel.
+def render_way(
+    bodies: np.ndarray,
+    stacks: np.ndarray,
+    scene_frame: np.ndarray,
+    poses: np.ndarray,
+    images: np.ndarray,
+    cull: float,
+) -> int:
+    """Fill images with the mean luminance over the area of each pixel.
 
     Args:
-        scene: Bodies (N, 9) and stacks of noise, as their kernels read them.
-        world: (VIEW,) float64 as `envs.raycast.coverage` reads it; the frame's part is filled in here.
-        pose: x, y, z [m], yaw [rad], time [s].
-        focal: Focal length [pixels].
-        image: Float32.
-        samples: Strips per pixel.
+        bodies: (N,) BODY, what `envs.raycast.records` describes.
+        stacks: Float32, the filtered tiles of all noise.
+        scene_frame: (1,) FRAME, which lacks what a pose determines.
+        poses: (K, 5) float64 x, y, z [m], yaw [rad], time [s].
+        images: (K, H, W) float32.
         cull: Bodies farther than this are not drawn [m].
+
+    Returns:
+        The index of the first pose that `envs.checks.check_pose` would refuse, or -1.
     """
-    bodies, stacks = scene
+    # A record does not keep its array alive: these two must outlive all that is called here.
+    frames, strips = scene_frame.copy(), np.zeros(1, STRIP)
+    for k in range(len(poses)):
+        x, y, z, yaw, time = poses[k]
+        near = abs(x) <= LIMIT_M and abs(y) <= LIMIT_M and 0.0 <= z <= LIMIT_M
+        if not (near and abs(yaw) < np.inf and abs(time) <= LIMIT_S):
+            return k
+        _aim(frames[0], poses[k], images.shape[1])
+        _render(frames[0], strips[0], bodies, stacks, images[k], cull)
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _render(
+    frame: Record, strip: Record, bodies: np.ndarray, stacks: np.ndarray, image: np.ndarray, cull: float
+) -> None:
+    """Fill one image (H, W)."""
     height, width = image.shape
-    view, most = world.copy(), len(bodies)
-    _look(view, pose, focal, height, samples)
-    seen, order = np.empty((most, b.FIELDS)), np.empty(most, np.int64)
-    positions, codes = np.empty(MAX_CUTS * most + 5), np.empty(MAX_CUTS * most + 5, np.int64)
-    count = b.see_bodies(bodies, view, 0.5 * width / focal, cull, seen)
-    size, total = _events(view, seen, count, width, positions, codes, order)
-    rank = np.argsort(positions[:size])
-    positions, codes = positions[:size][rank], codes[:size][rank]
-    sheet = np.zeros((v.SHEET, max(height + v.PADDING, 2 * count + 32, KNOWN)))
-    _sweep(view, seen, (order, total), (positions, codes), image, sheet, stacks)
+    seen, order = np.empty(len(bodies), BODY), np.empty(len(bodies), np.int64)
+    cuts = np.empty(MAX_CUTS * len(bodies) + 5, CUT)
+    count = see_bodies(bodies, frame, 0.5 * width / frame.focal, cull, seen)
+    size, total = _find_cuts(frame, seen[:count], width, cuts, order)
+    cuts = cuts[np.argsort(cuts[:size]["position"])]
+    gaps = np.empty(max(height + PADDING, 2 * count + 32), GAP)
+    canvas = Canvas(frame, strip, gaps, np.zeros((LAYERS, height + PADDING)), stacks)
+    _sweep(canvas, seen, order, total, cuts, image)
 
 
 @kernel
-def _sweep(view, seen, begun: tuple, cuts: tuple, image: np.ndarray, sheet: np.ndarray, stacks):
-    """Paint the strips between cuts from left to right, with the bodies that are there in each."""
-    (order, total), (positions, codes) = begun, cuts
-    hit, half, samples = sheet[v.HIT], 0.5 * image.shape[1], int(view[v.SAMPLES])
-    known, event = 0, 0
+def _sweep(
+    canvas: Canvas, seen: np.ndarray, order: np.ndarray, total: int, cuts: np.ndarray, image: np.ndarray
+) -> None:
+    """Paint the strips between cuts from left to right, with the bodies that are there in each.
+
+    `order` holds the `total` bodies that have begun at the left edge.
+    """
+    frame, slopes = canvas.frame, canvas.strip.slopes
+    half, samples, focal = 0.5 * image.shape[1], frame.samples, frame.focal
+    known, passed = 0, 0
     for cell in range(image.shape[1] * samples):
         left, edge = cell / samples, (cell + 1) / samples
-        middle = (0.5 * (left + edge) - half) / view[FOCAL]
-        while edge - left > TOGETHER:
+        middle = (0.5 * (left + edge) - half) / focal
+        while edge - left > MIN_STRIP:
             right = edge
-            if event < len(codes) and positions[event] < edge - TOGETHER:
-                right = positions[event]
-            known = _settle(view, seen, order, known, total, (0.5 * (left + right) - half) / view[FOCAL])
-            hit[FIRST], hit[LAST] = (left - half) / view[FOCAL], (right - half) / view[FOCAL]
-            _paint_strip(view, seen, order, known, sheet, stacks)
+            if passed < len(cuts) and cuts[passed].position < edge - MIN_STRIP:
+                right = cuts[passed].position
+            _sort_new(frame, seen, order, known, total, (0.5 * (left + right) - half) / focal)
+            known = total
+            put(slopes, Ends((left - half) / focal, (right - half) / focal))
+            _paint_strip(canvas, seen, order[:known])
             left = right
-            while event < len(codes) and positions[event] <= left + TOGETHER:
-                known, total = _pass(order, known, total, codes[event])
-                event += 1
-        texture_cell(view, stacks, sheet, middle)
+            while passed < len(cuts) and cuts[passed].position <= left + MIN_STRIP:
+                known, total = _pass(order, known, total, cuts[passed])
+                passed += 1
+        texture_cell(canvas, middle)
         if (cell + 1) % samples == 0:
-            v.develop(view, sheet, image, cell // samples)
+            resolve(frame, canvas.accumulators, image, cell // samples)
 
 
 @kernel
-def _look(view: np.ndarray, pose: tuple, focal: float, height: int, samples: int) -> None:
-    """Fill in what a frame adds to the numbers of the scene."""
-    view[EYE_X], view[EYE_Y], view[EYE_Z], yaw, view[v.TIME] = pose
+def _aim(frame: Record, pose: np.ndarray, height: int) -> None:
+    """Fill in what a pose adds to the frame."""
+    frame.eye_x, frame.eye_y, frame.eye_z, yaw, frame.time = pose
     cos, sin = math.cos(yaw), math.sin(yaw)
-    view[v.COS], view[v.SIN] = cos, sin
-    view[HORIZON], view[FOCAL], view[v.SAMPLES] = 0.5 * height, focal, samples
-    view[v.SUN_RIGHT] = view[v.SUN_X] * cos + view[v.SUN_Y] * sin
-    view[v.SUN_FORWARD] = view[v.SUN_Y] * cos - view[v.SUN_X] * sin
+    frame.cos, frame.sin, frame.horizon = cos, sin, 0.5 * height
+    frame.sun_right = frame.sun_x * cos + frame.sun_y * sin
+    frame.sun_forward = frame.sun_y * cos - frame.sun_x * sin
+
+
+@inlined
+def _add_cut(cuts: np.ndarray, size: int, width: int, position: float, shown: bool) -> int:
+    """Note where a column is cut, if it is `shown` and in the image; the new number of cuts."""
+    cuts[size].position, cuts[size].body = position, -1
+    return size + (shown and 0.0 < position < width)
 
 
 @kernel
-def _events(view, seen, count, width, positions, codes, order) -> tuple:
-    """Collect the cuts inside the image [pixels]; their codes: 2 i, body i begins; 2 i + 1, it ends; -1.
+def _find_cuts(
+    frame: Record, seen: np.ndarray, width: int, cuts: np.ndarray, order: np.ndarray
+) -> tuple[int, int]:
+    """Collect the cuts inside the image.
 
     Returns:
         The number of cuts, and that of bodies already begun at the left edge, in `order`.
     """
     size = total = 0
-    centre, focal = 0.5 * width, view[FOCAL]
-    for i in range(count):
-        low, high = centre + focal * seen[i, b.LOW], centre + focal * seen[i, b.HIGH]
+    centre, focal = 0.5 * width, frame.focal
+    for i in range(len(seen)):
+        body = seen[i]
+        low, high = centre + focal * body.low, centre + focal * body.high
         if low <= 0.0:
             order[total] = i
             total += 1
         else:
-            positions[size], codes[size] = low, 2 * i
+            cuts[size].position, cuts[size].body, cuts[size].begins = low, i, 1
             size += 1
-        positions[size], codes[size] = high, 2 * i + 1
+        cuts[size].position, cuts[size].body, cuts[size].begins = high, i, 0
         size += high < width
-        if seen[i, KIND] == CONE:
-            size = _cone_cuts(view, seen, i, width, positions, codes, size)
-        if seen[i, KIND] == ELLIPSOID:
-            size = _arc_cuts(view, seen, i, width, positions, codes, size)
-        if seen[i, KIND] == BOX:
-            size = _corner_cuts(view, seen, i, width, positions, codes, size)
+        if body.kind == CONE:
+            size = _cone_cuts(frame, body, width, cuts, size)
+        if body.kind == ELLIPSOID:
+            size = _arc_cuts(frame, body, width, cuts, size)
+        if body.kind == BOX:
+            size = _corner_cuts(frame, body, width, cuts, size)
     for k in range(4):
-        dx = (view[v.WALL_HALF] if k < 2 else -view[v.WALL_HALF]) - view[EYE_X]
-        dy = (view[v.WALL_NEAR] if k % 2 else view[v.WALL_FAR]) - view[EYE_Y]
-        forward = dy * view[v.COS] - dx * view[v.SIN]
-        right = dx * view[v.COS] + dy * view[v.SIN]
-        positions[size], codes[size] = centre + focal * right / forward, -1
-        size += forward > 0.0 and 0.0 < positions[size] < width
+        dx = (frame.wall_half if k < 2 else -frame.wall_half) - frame.eye_x
+        dy = (frame.wall_near if k % 2 else frame.wall_far) - frame.eye_y
+        forward = dy * frame.cos - dx * frame.sin
+        right = dx * frame.cos + dy * frame.sin
+        size = _add_cut(cuts, size, width, centre + focal * right / forward, forward > 0.0)
     return size, total
 
 
 @kernel
-def _cone_cuts(view, seen, i: int, width: int, positions, codes, size: int) -> int:
+def _cone_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: int) -> int:
     """Add the axis of a cone, and where its straight outlines meet the edge of its base."""
-    right, forward, radius = seen[i, b.RIGHT], seen[i, b.FORWARD], seen[i, b.RX]
+    right, forward, radius = body.right, body.forward, body.rx
     square = right * right + forward * forward
-    rise = seen[i, b.TOP] - view[EYE_Z]
+    rise = body.top - frame.eye_z
     # Of the turn about the axis from the eye to the outline, the cosine over the distance.
-    cosine = radius * radius * rise / ((seen[i, b.TOP] - seen[i, b.BOTTOM]) * max(square, b.NEAR))
-    rest = radius * radius / max(square, b.NEAR) - cosine * cosine
+    cosine = radius * radius * rise / ((body.top - body.bottom) * max(square, MIN_DEPTH))
+    rest = radius * radius / max(square, MIN_DEPTH) - cosine * cosine
     for k in range(-1, 2):
         sine = k * math.sqrt(max(0.0, rest))
         back = abs(k) * cosine
         ahead = forward - back * forward + sine * right
-        positions[size], codes[size] = (right - back * right - sine * forward) / max(b.NEAR, ahead), -1
-        positions[size] = 0.5 * width + view[FOCAL] * positions[size]
-        size += ahead > 0.0 and rest > 0.0 and 0.0 < positions[size] < width
+        u = (right - back * right - sine * forward) / max(MIN_DEPTH, ahead)
+        size = _add_cut(cuts, size, width, 0.5 * width + frame.focal * u, ahead > 0.0 and rest > 0.0)
     return size
 
 
 @kernel
-def _arc_cuts(view, seen, i: int, width: int, positions, codes, size: int) -> int:
+def _arc_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: int) -> int:
     """Add cuts where an ellipsoid's outline bends most: in the outermost cell at its left and right end.
 
     The outline rises there as a square root does, and so cuts divide its height evenly.
     """
-    low, high = seen[i, b.LOW], seen[i, b.HIGH]
-    reach = min(0.5 * (high - low), 1.0 / (view[v.SAMPLES] * view[FOCAL]))
+    low, high = body.low, body.high
+    reach = min(0.5 * (high - low), 1.0 / (frame.samples * frame.focal))
     for k in range(1, ARC_PARTS + 1):
         bend = reach * (k / ARC_PARTS) ** 2
         for u in (low + bend, high - bend):
-            positions[size], codes[size] = 0.5 * width + view[FOCAL] * u, -1
-            size += 0.0 < positions[size] < width
+            size = _add_cut(cuts, size, width, 0.5 * width + frame.focal * u, True)
     return size
 
 
 @kernel
-def _corner_cuts(view, seen, i: int, width: int, positions, codes, size: int) -> int:
+def _corner_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: int) -> int:
     """Add the corners of a box at which what it shows changes: the nearest; all, from above or below."""
-    level = view[EYE_Z] > seen[i, b.TOP] or view[EYE_Z] < seen[i, b.BOTTOM]
+    level = frame.eye_z > body.top or frame.eye_z < body.bottom
     nearest, least = 0, math.inf
     for k in range(4):
-        right, forward = b.corner(seen, i, view, k)
+        right, forward = corner(body, frame, k)
         if right * right + forward * forward < least:
             nearest, least = k, right * right + forward * forward
     for k in range(4):
-        right, forward = b.corner(seen, i, view, k)
-        if forward > 0.0 and (level or k == nearest):
-            positions[size], codes[size] = 0.5 * width + view[FOCAL] * right / forward, -1
-            size += 0.0 < positions[size] < width
+        right, forward = corner(body, frame, k)
+        shown = forward > 0.0 and (level or k == nearest)
+        size = _add_cut(cuts, size, width, 0.5 * width + frame.focal * right / forward, shown)
     return size
 
 
 @kernel
-def _pass(order: np.ndarray, known: int, total: int, code: int) -> tuple:
+def _pass(order: np.ndarray, known: int, total: int, cut: Record) -> tuple[int, int]:
     """Begin or end a body: `order` holds `total` of them, of which the first `known` are sorted."""
-    if code < 0:
+    if cut.body < 0:
         return known, total
-    i = code // 2
-    if code % 2 == 0:
-        order[total] = i
+    if cut.begins:
+        order[total] = cut.body
         return known, total + 1
     for k in range(total):
-        if order[k] == i:
+        if order[k] == cut.body:
             for j in range(k, total - 1):
                 order[j] = order[j + 1]
             return known - (k < known), total - 1
@@ -198,50 +224,50 @@ def _pass(order: np.ndarray, known: int, total: int, code: int) -> tuple:
 
 
 @kernel
-def _settle(view: np.ndarray, seen: np.ndarray, order: np.ndarray, known: int, total: int, u: float) -> int:
-    """Sort the newly begun bodies in among the others by what hides what along `u`; all are known then.
+def _sort_new(frame: Record, seen: np.ndarray, order: np.ndarray, known: int, total: int, u: float) -> None:
+    """Sort the newly begun bodies in among the `known` others by what hides what along `u`.
 
     Bodies are convex and do not overlap, so that this order holds as long as both are there.
     """
     for k in range(known, total):
         new = order[k]
         j = k
-        while j > 0 and b.before(seen, new, order[j - 1], view, u):
+        while j > 0 and is_before(seen[new], seen[order[j - 1]], frame, u):
             order[j] = order[j - 1]
             j -= 1
         order[j] = new
-    return total
 
 
 @inlined
-def _paint_strip(view, seen, order: np.ndarray, known: int, sheet: np.ndarray, stacks) -> None:
+def _paint_strip(canvas: Canvas, seen: np.ndarray, order: np.ndarray) -> None:
     """Paint one strip: bodies and walls from near to far, then the ground in the gaps."""
-    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
-    u = 0.5 * (hit[FIRST] + hit[LAST])
-    gaps[0, 0] = gaps[1, 0] = 0.0
-    gaps[2, 0] = gaps[3, 0] = 2.0 * view[HORIZON]
-    gaps[4, 0], gaps[5, 0] = 0.0, 1.0
+    frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
+    u = 0.5 * (strip.slopes.left + strip.slopes.right)
+    put(gaps[0].top, Ends(0.0, 0.0))
+    put(gaps[0].bottom, Ends(2.0 * frame.horizon, 2.0 * frame.horizon))
+    put(gaps[0].reach, Ends(0.0, 1.0))
     count = 1
-    east, west = wall_depth(view, 1.0, u), wall_depth(view, -1.0, u)
-    hit[WALL_SIDE] = 1.0 if east < west else -1.0
-    hit[WALL_DEPTH], hit[WALL_AFTER] = min(east, west), max(east, west)
-    highest = max(0.0, view[v.TALLEST] - view[EYE_Z]) * view[FOCAL]
-    for k in range(known):
-        i = order[k]
-        entry, leave = b.depths(seen, i, view, u)
+    east, west = wall_depth(frame, 1.0, u), wall_depth(frame, -1.0, u)
+    strip.wall_side = 1.0 if east < west else -1.0
+    strip.wall_depth, strip.wall_after = min(east, west), max(east, west)
+    highest = max(0.0, frame.tallest - frame.eye_z) * frame.focal
+    for i in order:
+        body = seen[i]
+        entry, leave = depths(body, frame, u)
         if leave <= max(0.0, entry):
             continue
-        count = show_walls(view, sheet, count, entry)
+        count = show_walls(canvas, count, entry)
         # Nothing behind can rise above this row, and below the gap is only ground.
-        rise = view[HORIZON] - highest / max(b.NEAR, entry)
-        if count == 0 or (count == 1 and gaps[2, 0] <= rise and gaps[3, 0] <= rise):
+        rise = frame.horizon - highest / max(MIN_DEPTH, entry)
+        bottom = gaps[0].bottom
+        if count == 0 or (count == 1 and bottom.left <= rise and bottom.right <= rise):
             return
-        hit[b.MEAN_ROOT] = b.outline(seen, i, view, (hit[FIRST], hit[LAST]), hit)
-        hit[b.ENTRY], hit[b.EXIT] = max(b.NEAR, entry), max(b.NEAR, leave)
-        count = show_body(view, seen, i, sheet, stacks, count)
-    count = show_walls(view, sheet, count, math.inf)
-    if view[v.GROUND + v.CONTRAST] > 0.0:
+        strip.mean_root = outline(body, frame, strip)
+        strip.entry, strip.leave = max(MIN_DEPTH, entry), max(MIN_DEPTH, leave)
+        count = show_body(canvas, body, count)
+    count = show_walls(canvas, count, math.inf)
+    if frame.ground_texture.contrast > 0.0:
         for k in range(count):
-            enter_gap(view, gaps, k, hit)
-            top, bottom = (gaps[0, k], gaps[1, k]), (gaps[2, k], gaps[3, k])
-            v.cover_ground(view, sheet, top, bottom, hit[WEIGHT], hit[SLOPE])
+            enter_gap(frame, strip, gaps[k])
+            top, bottom = ends(gaps[k].top), ends(gaps[k].bottom)
+            cover_ground(frame, canvas.accumulators, top, bottom, strip.weight, strip.slope)

@@ -1,123 +1,128 @@
-"""Kernels that paint one column: flat spans between straight edges, by exact coverage.
+"""Kernels that paint one column: areas between straight edges, by exact coverage.
 
-All that is known while an image is painted is one array, the sheet, of which each row holds
-one thing: short lists of arguments are what kernels are fast by. SPANS holds how much
-brighter each row of pixels is than the one above, so that a flat span of any length costs few
-additions; PAINT holds luminance added to a single row. The background, sky above the horizon
-and plain ground below, is added once per column by `develop`, so a span is painted as its
-difference from the background and what nothing hides costs nothing.
+Layer STEPS of the accumulators holds how much brighter each row of pixels is than the one
+above, so that a flat area of any height costs few additions; PAINT holds luminance added to a
+single row. The background, sky above the horizon and plain ground below, is added once per
+column by `resolve`: an area is painted as its difference from the background, and background
+that nothing hides costs nothing.
 
 An edge is straight from the left to the right end of the strip being painted, and given by
-its rows there. Where edges part a strip, the shares of each row add up to one exactly.
+its rows there. Where edges divide a strip, the shares of each row add up to one exactly.
 """
 
-import numba
+from enum import IntEnum
+
 import numpy as np
 
-# Kernels allocate nothing, so that arrays need no counting of references: that, by atomic
-# instructions at each call, took five times as long as the work.
-kernel = numba.njit(cache=True, error_model="numpy", _nrt=False)
-inlined = numba.njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
-# What holds for a whole frame, in one array: row of the horizon, focal length [pixels], eye
-# [m], heading, time [s], strips per pixel; of the scene: luminance of sky and ground, height
-# of the tallest [m], walls (half width, top, ends [m], albedo), Lambert weights, the sun in
-# the world and in the camera's frame, and the weight of albedo on level and upright faces.
-HORIZON, FOCAL, EYE_X, EYE_Y, EYE_Z, COS, SIN, TIME, SAMPLES = range(9)
-SKY, FLOOR, TALLEST, WALL_HALF, WALL_TOP, WALL_NEAR, WALL_FAR, WALL_ALBEDO = range(9, 17)
-AMBIENT, DIFFUSE, SUN_X, SUN_Y, SUN_Z, SUN_RIGHT, SUN_FORWARD = range(17, 24)
-LIT_UP, LIT_DOWN, LIT_EAST, LIT_WEST, LIT_NORTH, LIT_SOUTH = range(24, 30)
-# The textures follow: where in the array each begins, and what it consists of.
-GROUND, WALL, BODY, VIEW = 30, 36, 42, 48
-PATTERN, FREQUENCY, CONTRAST, SPEED_S, SPEED_Q, STACK = range(6)
-FINEST = 1e-9  # [rows] an edge that slopes less is level
-# Rows of the sheet: the column that is painted; what shows of ground and walls in it, three
-# rows each, see `cover`; the gaps, one edge's end each; what is known of the strip; columns
-# that wait for being developed together, because sums that do not wait for each other are fast.
-SPANS, PAINT, GROUND_SHOWN, RIGHT_SHOWN, LEFT_SHOWN, GAPS, HIT, WAITING, SHEET = 0, 1, 2, 5, 8, 11, 17, 18, 26
-BLOCK = 4
-PADDING = 3  # numbers beyond the rows of the image; the last of SPANS is what changes at the horizon
+from envs.raycast.records import Ends, Record, inlined, kernel
+
+MIN_RISE = 1e-9  # [rows] an edge that slopes less is level
+BLOCK = 4  # columns that are resolved together, because sums that do not wait for each other are fast
+PADDING = 3  # elements of a layer beyond the rows of the image
+
+
+class Layer(IntEnum):
+    """Where the layers of the accumulators begin."""
+
+    STEPS = 0  # the last element is what changes at the horizon
+    PAINT = 1
+    GROUND = 2  # what shows of ground and walls, three layers each, see `cover`
+    RIGHT_WALL = 5
+    LEFT_WALL = 8
+    WAITING = 11  # columns that wait for being resolved: their STEPS, then their PAINT
+
+
+LAYERS = Layer.WAITING + 2 * BLOCK
 
 
 @kernel
-def _step(sheet: np.ndarray, layer: int, row: float, change: float) -> None:
+def _step(layer: np.ndarray, row: float, change: float) -> None:
     """From `row` downwards all is greater by `change`; exact for a row cut by it."""
     r = int(row)
     below = change * (row - r)
-    sheet[layer, r] += change - below
-    sheet[layer, r + 1] += below
+    layer[r] += change - below
+    layer[r + 1] += below
 
 
 @kernel
-def _ramp(sheet: np.ndarray, layer: int, left: float, right: float, change: float) -> None:
+def _ramp(layer: np.ndarray, left: float, right: float, change: float) -> None:
     """Below an edge from row `left` to row `right` all is greater by `change`; exact for the rows it cuts."""
     low, high = min(left, right), max(left, right)
     first, last = int(low), int(high)
-    if first == last or high - low < FINEST:
-        _step(sheet, layer, 0.5 * (low + high), change)
+    if first == last or high - low < MIN_RISE:
+        _step(layer, 0.5 * (low + high), change)
         return
     part = 0.5 * change / (high - low)
     share = total = 0.0
     for row in range(first, last):
         reach = part * (row + 1.0 - low) * (row + 1.0 - low)
-        sheet[layer, row] += reach - total - share
+        layer[row] += reach - total - share
         share, total = reach - total, reach
     rest = part * (high - low) * (high - low) - total + change * (last + 1.0 - high)
-    sheet[layer, last] += rest - share
-    sheet[layer, last + 1] += change - rest
+    layer[last] += rest - share
+    layer[last + 1] += change - rest
 
 
 @kernel
-def share_below(row: float, left: float, right: float) -> float:
-    """Share of a row that lies below an edge from row `left` to row `right`."""
-    low, high = min(left, right), max(left, right)
+def share_below(row: float, edge: Ends) -> float:
+    """Share of a row that lies below an edge."""
+    low, high = min(edge.left, edge.right), max(edge.left, edge.right)
     spread = high - low
-    if spread < FINEST:
+    if spread < MIN_RISE:
         return min(1.0, max(0.0, row + 1.0 - low))
     above, below = min(max(row - low, 0.0), spread), min(max(row + 1.0 - low, 0.0), spread)
     return 0.5 * (below - above) * (below + above) / spread + min(1.0, max(0.0, row + 1.0 - high))
 
 
 @kernel
-def _edge(view: np.ndarray, sheet: np.ndarray, edge: tuple, luminance: float, weight: float) -> None:
+def _paint_below(frame: Record, steps: np.ndarray, edge: Ends, luminance: float, weight: float) -> None:
     """Paint all below an edge with one luminance over the background."""
     left, right = edge
-    horizon = view[HORIZON]
-    over_sky, over_floor = weight * (luminance - view[SKY]), weight * (luminance - view[FLOOR])
+    horizon = frame.horizon
+    over_sky, over_floor = weight * (luminance - frame.sky), weight * (luminance - frame.floor)
     if left >= horizon and right >= horizon:
-        _ramp(sheet, SPANS, left, right, over_floor)
+        _ramp(steps, left, right, over_floor)
     elif left <= horizon and right <= horizon:
-        _ramp(sheet, SPANS, left, right, over_sky)
-        sheet[SPANS, -1] += over_floor - over_sky
+        _ramp(steps, left, right, over_sky)
+        steps[-1] += over_floor - over_sky
     else:
         low, high = min(left, right), max(left, right)
         part = (horizon - low) / (high - low)
-        _ramp(sheet, SPANS, low, horizon, part * over_sky)
-        _ramp(sheet, SPANS, horizon, high, (1.0 - part) * over_floor)
-        sheet[SPANS, -1] += part * (over_floor - over_sky)
+        _ramp(steps, low, horizon, part * over_sky)
+        _ramp(steps, horizon, high, (1.0 - part) * over_floor)
+        steps[-1] += part * (over_floor - over_sky)
 
 
 @kernel
-def fill(view, sheet: np.ndarray, top: tuple, bottom: tuple, luminance: float, weight: float) -> None:
+def fill(
+    frame: Record, accumulators: np.ndarray, top: Ends, bottom: Ends, luminance: float, weight: float
+) -> None:
     """Paint what lies between two edges, which must lie in the image, with one luminance."""
-    _edge(view, sheet, top, luminance, weight)
-    _edge(view, sheet, bottom, luminance, -weight)
+    steps = accumulators[Layer.STEPS]
+    _paint_below(frame, steps, top, luminance, weight)
+    _paint_below(frame, steps, bottom, luminance, -weight)
 
 
 @kernel
-def develop(view: np.ndarray, sheet: np.ndarray, image: np.ndarray, column: int) -> None:
-    """Take the painted column off the sheet; once there are enough, write them into the image."""
+def resolve(frame: Record, accumulators: np.ndarray, image: np.ndarray, column: int) -> None:
+    """Set the painted column aside; once there are `BLOCK`, or it is the last, write them into the image."""
     rows, place = image.shape[0] + 2, column % BLOCK
-    _step(sheet, SPANS, view[HORIZON], view[FLOOR] - view[SKY] + sheet[SPANS, -1])
+    steps, paint, waiting = (
+        accumulators[Layer.STEPS],
+        accumulators[Layer.PAINT],
+        accumulators[Layer.WAITING :],
+    )
+    _step(steps, frame.horizon, frame.floor - frame.sky + steps[-1])
     for row in range(rows):
-        sheet[WAITING + place, row] = sheet[SPANS, row]
-        sheet[WAITING + BLOCK + place, row] = sheet[PAINT, row]
-        sheet[SPANS, row] = sheet[PAINT, row] = 0.0
-    sheet[SPANS, -1] = 0.0
+        waiting[place, row] = steps[row]
+        waiting[BLOCK + place, row] = paint[row]
+        steps[row] = paint[row] = 0.0
+    steps[-1] = 0.0
     if place == BLOCK - 1:
-        _sum_block(view[SKY], sheet[WAITING:], image, column - place)
+        _sum_block(frame.sky, waiting, image, column - place)
     elif column == image.shape[1] - 1:
         for first in range(column - place, column + 1):
-            _sum_column(view[SKY], sheet[WAITING + first % BLOCK :: BLOCK], image, first)
+            _sum_column(frame.sky, waiting[first % BLOCK :: BLOCK], image, first)
 
 
 @kernel
@@ -145,79 +150,103 @@ def _sum_column(sky: float, waiting: np.ndarray, image: np.ndarray, column: int)
 
 
 @kernel
-def cover(sheet: np.ndarray, layer: int, top: tuple, bottom: tuple, weight: float, u: float) -> None:
-    """Note that what lies between two edges shows the surface of `layer`; its pattern follows once per cell.
+def cover(shown: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float) -> None:
+    """Note that a surface shows between two edges; `patterns.texture_cell` adds its pattern once per cell.
 
-    Two more layers say where the part that shows of a row has its middle, the first moments:
-    in the row, and along the slopes, of which `u` is that of the middle here.
+    Args:
+        shown: The surface's three layers: the share of each row that shows it, and where in the
+            row and along the slopes this part has its middle, as first moments.
+        top: Upper edge.
+        bottom: Lower edge.
+        weight: Width [pixels].
+        u: Slope of the middle.
     """
-    _ramp(sheet, layer, top[0], top[1], weight)
-    _ramp(sheet, layer, bottom[0], bottom[1], -weight)
-    _ramp(sheet, layer + 2, top[0], top[1], weight * u)
-    _ramp(sheet, layer + 2, bottom[0], bottom[1], -weight * u)
-    high, low = 0.5 * (top[0] + top[1]), 0.5 * (bottom[0] + bottom[1])
+    _ramp(shown[0], top.left, top.right, weight)
+    _ramp(shown[0], bottom.left, bottom.right, -weight)
+    _ramp(shown[2], top.left, top.right, weight * u)
+    _ramp(shown[2], bottom.left, bottom.right, -weight * u)
+    high, low = 0.5 * (top.left + top.right), 0.5 * (bottom.left + bottom.right)
     first, last = int(high), int(low)
     above, below = high - first, low - last
-    sheet[layer + 1, first] += 0.5 * weight * above * (1.0 - above)
-    sheet[layer + 1, last] -= 0.5 * weight * below * (1.0 - below)
+    shown[1, first] += 0.5 * weight * above * (1.0 - above)
+    shown[1, last] -= 0.5 * weight * below * (1.0 - below)
 
 
 @kernel
-def cover_ground(view, sheet: np.ndarray, top: tuple, bottom: tuple, weight: float, u: float) -> None:
-    """As `cover`, for what shows of the ground between two edges."""
-    horizon = view[HORIZON]
-    top = (max(top[0], horizon), max(top[1], horizon))
-    bottom = (max(bottom[0], horizon), max(bottom[1], horizon))
-    if top[0] < bottom[0] or top[1] < bottom[1]:
-        cover(sheet, GROUND_SHOWN, top, bottom, weight, u)
+def cover_ground(
+    frame: Record, accumulators: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float
+) -> None:
+    """As `cover`, for the ground between two edges, of which nothing shows above the horizon."""
+    top = Ends(max(top.left, frame.horizon), max(top.right, frame.horizon))
+    bottom = Ends(max(bottom.left, frame.horizon), max(bottom.right, frame.horizon))
+    if is_open(top, bottom):
+        cover(accumulators[Layer.GROUND : Layer.RIGHT_WALL], top, bottom, weight, u)
 
 
 @inlined
-def beyond(edge: tuple, limit: tuple) -> tuple[float, float]:
+def ends(record: Record) -> Ends:
+    """The value of an ENDS record."""
+    return Ends(record.left, record.right)
+
+
+@inlined
+def put(record: Record, value: Ends) -> None:
+    """Write the value of an ENDS record."""
+    record.left, record.right = value
+
+
+@inlined
+def beyond(edge: Ends, limit: Ends) -> Ends:
     """An edge, moved below a limit where it is above.
 
     Where they cross, what lies between them is a triangle that ends there: it is drawn as one
     of the same area that reaches through the strip.
     """
-    one, other = edge[0] - limit[0], edge[1] - limit[1]
+    one, other = edge.left - limit.left, edge.right - limit.right
     if one >= 0.0 and other >= 0.0:
         return edge
     if one > 0.0:
-        return limit[0] + one * one / (one - other), limit[1]
+        return Ends(limit.left + one * one / (one - other), limit.right)
     if other > 0.0:
-        return limit[0], limit[1] + other * other / (other - one)
+        return Ends(limit.left, limit.right + other * other / (other - one))
     return limit
 
 
 @inlined
-def is_open(top: tuple, bottom: tuple) -> bool:
+def is_open(top: Ends, bottom: Ends) -> bool:
     """Whether anything lies between two edges."""
-    return top[0] < bottom[0] or top[1] < bottom[1]
+    return top.left < bottom.left or top.right < bottom.right
+
+
+@inlined
+def _cut_ends(left: Record, right: Record, part: float) -> None:
+    """Cut what `left` and, as a copy, `right` say, so that each says its own part of it."""
+    left.right = right.left = left.left + part * (left.right - left.left)
 
 
 @kernel
 def cut_gap(gaps: np.ndarray, k: int, new: int, part: float) -> None:
     """Cut gap `k` after a part of its width; the rest becomes gap `new`."""
-    for row in range(6):
-        gaps[row, new] = gaps[row, k]
-    for row in (0, 2, 4):
-        middle = gaps[row, k] + part * (gaps[row + 1, k] - gaps[row, k])
-        gaps[row + 1, k] = gaps[row, new] = middle
+    gaps[new] = gaps[k]
+    left, right = gaps[k], gaps[new]
+    _cut_ends(left.top, right.top, part)
+    _cut_ends(left.bottom, right.bottom, part)
+    _cut_ends(left.reach, right.reach, part)
 
 
 @inlined
-def left_of_row(edges: tuple, start: float, end: float) -> tuple[float, float]:
+def left_of_row(top: Ends, bottom: Ends, start: float, end: float) -> tuple[float, float]:
     """From where to where in the strip, of 0 .. 1, two edges leave something of rows start .. end."""
-    (top, bottom), left, right = edges, 0.0, 1.0
-    if top[0] != top[1]:  # below the upper edge
-        crossing = (end - top[0]) / (top[1] - top[0])
-        if top[0] < top[1]:
+    left, right = 0.0, 1.0
+    if top.left != top.right:  # below the upper edge
+        crossing = (end - top.left) / (top.right - top.left)
+        if top.left < top.right:
             right = min(right, max(0.0, crossing))
         else:
             left = max(left, min(1.0, crossing))
-    if bottom[0] != bottom[1]:  # above the lower edge
-        crossing = (start - bottom[0]) / (bottom[1] - bottom[0])
-        if bottom[0] > bottom[1]:
+    if bottom.left != bottom.right:  # above the lower edge
+        crossing = (start - bottom.left) / (bottom.right - bottom.left)
+        if bottom.left > bottom.right:
             right = min(right, max(0.0, crossing))
         else:
             left = max(left, min(1.0, crossing))

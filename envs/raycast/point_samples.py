@@ -16,6 +16,29 @@ from envs.scene import CONE, ELLIPSOID, POLE, Scene
 from envs.scene.textures import around, pattern_points
 
 SKY, GROUND, WALL, BODY = range(4)  # what a ray hits
+kernel = numba.njit(cache=True, error_model="numpy")
+
+
+class Camera(NamedTuple):
+    """Where the eye is [m], where it looks, and an image of `focal` pixels focal length."""
+
+    x: float
+    y: float
+    z: float
+    cos: float
+    sin: float
+    width: int
+    height: int
+    focal: float
+
+
+class Walls(NamedTuple):
+    """At x = +-half; how high they are, where they begin and end in y [m]."""
+
+    half: float
+    height: float
+    near: float
+    far: float
 
 
 class Hits(NamedTuple):
@@ -36,7 +59,7 @@ class Hits(NamedTuple):
     point: np.ndarray
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enter_round(eye: np.ndarray, ray: np.ndarray, radius: float) -> tuple[float, float]:
     """Where a ray enters and leaves an endless upright cylinder around the origin; (inf, -inf): never."""
     square = ray[0] * ray[0] + ray[1] * ray[1]
@@ -48,7 +71,7 @@ def _enter_round(eye: np.ndarray, ray: np.ndarray, radius: float) -> tuple[float
     return middle - math.sqrt(rest), middle + math.sqrt(rest)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enter_slab(eye: float, ray: float, half: float) -> tuple[float, float]:
     """Where a ray enters and leaves -half < coordinate < half."""
     if ray == 0.0:
@@ -57,7 +80,7 @@ def _enter_slab(eye: float, ray: float, half: float) -> tuple[float, float]:
     return min(one, other), max(one, other)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enter_pole(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
     near, far = _enter_round(eye, ray, size[0])
     low, high = _enter_slab(eye[2], ray[2], size[2])
@@ -72,7 +95,7 @@ def _enter_pole(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.n
     return depth
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enter_box(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
     depth, end, axis = -math.inf, math.inf, 0
     for k in range(3):
@@ -87,7 +110,7 @@ def _enter_box(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.nd
     return depth
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enter_ellipsoid(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
     """As a unit sphere, in coordinates divided by the half-axes."""
     a = b = c = 0.0
@@ -112,7 +135,7 @@ def _enter_ellipsoid(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal:
     return depth
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enter_cone(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
     """The side where x^2 + y^2 = k^2 (apex - z)^2 and the ray comes from outside; else the base."""
     k = size[0] / (2.0 * size[2])
@@ -141,7 +164,7 @@ def _enter_cone(eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.n
     return best
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _enter(kind: int, eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal: np.ndarray) -> float:
     if kind == POLE:
         return _enter_pole(eye, ray, size, normal)
@@ -152,49 +175,41 @@ def _enter(kind: int, eye: np.ndarray, ray: np.ndarray, size: np.ndarray, normal
     return _enter_box(eye, ray, size, normal)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _trace_flat(eye: np.ndarray, ray: np.ndarray, flats: np.ndarray, normal: np.ndarray) -> tuple:
+@kernel
+def _trace_flat(eye: np.ndarray, ray: np.ndarray, walls: Walls, normal: np.ndarray) -> tuple[float, int, int]:
     """Depth, surface and thing of the ground, a wall or the sky along a ray."""
     best, surface, thing = math.inf, SKY, 0
-    half, height, near, far = flats
     if ray[2] < 0.0:
         best, surface = max(-eye[2] / ray[2], 1e-300), GROUND
         normal[:] = (0.0, 0.0, 1.0)
     for side in (-1.0, 1.0):
-        depth = (side * half - eye[0]) / ray[0]
+        depth = (side * walls.half - eye[0]) / ray[0]
         y, z = eye[1] + depth * ray[1], eye[2] + depth * ray[2]
-        if 0.0 < depth < best and near <= y <= far and 0.0 <= z <= height:
+        if 0.0 < depth < best and walls.near <= y <= walls.far and 0.0 <= z <= walls.height:
             best, surface, thing = depth, WALL, (0 if side < 0.0 else 1)
-            normal[:] = (-1.0 if eye[0] < side * half else 1.0, 0.0, 0.0)
+            normal[:] = (-1.0 if eye[0] < side * walls.half else 1.0, 0.0, 0.0)
     return best, surface, thing
 
 
-@numba.njit(cache=True, error_model="numpy")
-def trace(
-    kinds: np.ndarray, bodies: np.ndarray, flats: np.ndarray, pose: np.ndarray, image: tuple, out: tuple
-) -> None:
-    """Fill `out` with what each pixel centre's ray hits.
+@kernel
+def _trace(kinds: np.ndarray, bodies: np.ndarray, walls: Walls, camera: Camera, hits: Hits) -> None:
+    """Fill `hits` with what each pixel centre's ray hits.
 
     Args:
-        kinds: (N,) int64.
+        kinds: (N,) of the bodies.
         bodies: (N, 6) float64 centre and half-axes [m].
-        flats: (4,) float64 walls: half width, height, where they begin and end [m].
-        pose: (5,) float64 x, y, z [m], cosine and sine of the yaw.
-        image: width, height, focal length [pixels].
-        out: The arrays of `Hits`.
+        walls: Both.
+        camera: The eye and its image.
+        hits: Arrays of the shape of the image.
     """
-    width, height, focal = image
-    surface, thing, depths, normals, points = out
-    ray, normal, eye = np.empty(3), np.empty(3), pose[:3]
+    ray, normal, eye = np.empty(3), np.empty(3), np.array([camera.x, camera.y, camera.z])
     eyes, reach = eye - bodies[:, :3], 1.001 * (bodies[:, 3] ** 2 + bodies[:, 4] ** 2)
-    for row in range(height):
-        ray[2] = (0.5 * height - row - 0.5) / focal
-        for column in range(width):
-            u = (column + 0.5 - 0.5 * width) / focal
-            ray[0], ray[1] = u * pose[3] - pose[4], u * pose[4] + pose[3]
-            best, surface[row, column], thing[row, column] = _trace_flat(
-                eye, ray, flats, normals[row, column]
-            )
+    for row in range(camera.height):
+        ray[2] = (0.5 * camera.height - row - 0.5) / camera.focal
+        for column in range(camera.width):
+            u = (column + 0.5 - 0.5 * camera.width) / camera.focal
+            ray[0], ray[1] = u * camera.cos - camera.sin, u * camera.sin + camera.cos
+            best, surface, thing = _trace_flat(eye, ray, walls, hits.normal[row, column])
             square = ray[0] * ray[0] + ray[1] * ray[1]
             for i in range(len(kinds)):
                 beside = eyes[i, 0] * ray[1] - eyes[i, 1] * ray[0]
@@ -202,30 +217,33 @@ def trace(
                     continue  # the ray passes beside a circle around the body: most do
                 depth = _enter(kinds[i], eyes[i], ray, bodies[i, 3:], normal)
                 if depth < best:
-                    best, surface[row, column], thing[row, column] = depth, BODY, i
-                    normals[row, column] = normal
-            depths[row, column] = best
+                    best, surface, thing = depth, BODY, i
+                    hits.normal[row, column] = normal
+            hits.surface[row, column], hits.thing[row, column], hits.depth[row, column] = surface, thing, best
             for k in range(3):
-                points[row, column, k] = eye[k] + best * ray[k]
+                hits.point[row, column, k] = eye[k] + best * ray[k]
 
 
 def trace_scene(
     scene: Scene, pose: tuple[float, float, float, float], width: int, height: int, focal: float
 ) -> Hits:
-    """What the ray through each pixel centre hits; `pose` is (x, y, z [m], yaw [rad])."""
+    """What the ray through each pixel centre hits.
+
+    Args:
+        scene: What to look at; its mesh is left out.
+        pose: x, y, z [m], yaw [rad].
+        width: Columns of the image.
+        height: Rows of the image.
+        focal: Focal length [pixels].
+    """
+    x, y, z, yaw = map(float, pose)
+    camera = Camera(x, y, z, math.cos(yaw), math.sin(yaw), width, height, focal)
+    walls = Walls(0.5 * scene.width_m, float(scene.wall_height_m), *map(float, scene.walls_y_m))
     bodies = np.stack([scene.obstacles[key] for key in ("x", "y", "z", "rx", "ry", "rz")], axis=1)
-    flats = np.array([0.5 * scene.width_m, scene.wall_height_m, *scene.walls_y_m])
-    eye = np.array([*pose[:3], math.cos(pose[3]), math.sin(pose[3])])
     shape = (height, width)
-    hits = Hits(
-        np.empty(shape, np.int8),
-        np.empty(shape, np.int64),
-        np.empty(shape),
-        np.zeros((*shape, 3)),
-        np.empty((*shape, 3)),
-    )
-    kinds = scene.obstacles["kind"].astype(np.int64)
-    trace(kinds, bodies.astype(np.float64), flats, eye, (width, height, float(focal)), tuple(hits))
+    surface, thing, depth = np.empty(shape, np.int8), np.empty(shape, np.int64), np.empty(shape)
+    hits = Hits(surface, thing, depth, np.zeros((*shape, 3)), np.empty((*shape, 3)))
+    _trace(scene.obstacles["kind"].astype(np.int64), bodies, walls, camera, hits)
     return hits
 
 

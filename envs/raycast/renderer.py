@@ -13,71 +13,66 @@ another.
 
 import math
 
-import numba
 import numpy as np
 
-from envs.checks import LIMIT_M, LIMIT_S, check_image, check_pose
-from envs.raycast import coverage as spans
-from envs.raycast.columns import render_area
+from envs.checks import check_image, check_pose
+from envs.raycast.columns import render_way
 from envs.raycast.point_samples import shade_hits, trace_scene
-from envs.scene import CONE, ELLIPSOID, Scene
-from envs.scene.textures import NOISE, PATTERNS, around, noise_stack
+from envs.raycast.records import BODY, FRAME
+from envs.scene import CONE, ELLIPSOID, Scene, Texture
+from envs.scene.textures import PATTERNS, around, noise_stack
 
 NO_STACKS = np.zeros(1, np.float32)
 
 
-def check_scene(scene: Scene) -> None:
-    """ValueError if the scene holds a mesh, which only pyrender draws."""
+def _check_scene(scene: Scene) -> None:
+    """ValueError if the scene has a mesh, which only pyrender draws."""
     if scene.mesh is not None:
         raise ValueError("raycast draws no meshes, and the scene has one; use pyrender")
 
 
-def make_bodies(scene: Scene) -> np.ndarray:
-    """(M, 9) float64 what stands above the ground of the obstacles, as `envs.raycast.bodies` reads them."""
+def _make_bodies(scene: Scene) -> np.ndarray:
+    """(M,) BODY the obstacles as far as they stand above the ground."""
     o = scene.obstacles[scene.obstacles["z"] + scene.obstacles["rz"] > 0.0]
-    turns = [around(scene.obstacle_texture, radius) for radius in o["rx"].tolist()]
-    bottom, top, radius = o["z"] - o["rz"], o["z"] + o["rz"], o["rx"].copy()
+    bottom, top = o["z"] - o["rz"], o["z"] + o["rz"]
     sunk = (bottom < 0.0) & (o["kind"] != ELLIPSOID)
     cut = sunk & (o["kind"] == CONE)
-    radius[cut] *= (top / (top - bottom))[cut]
-    bottom[sunk] = 0.0
-    columns = (o["kind"], o["x"], o["y"], bottom, top, radius, o["ry"], o["albedo"], turns)
-    return np.ascontiguousarray(np.stack(columns, axis=1), np.float64)
+    bodies = np.zeros(len(o), BODY)
+    for name in ("kind", "x", "y", "rx", "ry", "albedo"):
+        bodies[name] = o[name]
+    bodies["rx"][cut] *= (top / (top - bottom))[cut]
+    bodies["bottom"], bodies["top"] = np.where(sunk, 0.0, bottom), top
+    bodies["turn"] = [around(scene.obstacle_texture, radius) for radius in o["rx"].tolist()]
+    return bodies
 
 
-def make_textures(scene: Scene) -> tuple[list[float], np.ndarray]:
-    """The textures of ground, walls and obstacles, six numbers each, and the stacks of the noisy ones."""
-    numbers: list[float] = []
+def _make_frame(scene: Scene, focal: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """(1,) FRAME without what a pose determines, and float32 the filtered tiles of the scene's noise."""
+    frame = np.zeros(1, FRAME)
+    faces = np.array([(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)], np.float64)
+    lit = scene.shade(np.ones(6), faces).tolist()
+    frame["focal"], frame["samples"] = focal, samples
+    frame["sky"], frame["floor"] = scene.sky_luminance, scene.shade(scene.ground_albedo, faces[0])
+    frame["tallest"] = max([scene.wall_height_m, *(scene.obstacles["z"] + scene.obstacles["rz"]).tolist()])
+    frame["wall_half"], frame["wall_top"] = 0.5 * scene.width_m, scene.wall_height_m
+    frame["wall_near"], frame["wall_far"] = scene.walls_y_m
+    frame["wall_albedo"], frame["ambient"], frame["diffuse"] = scene.wall_albedo, scene.ambient, scene.diffuse
+    frame["sun_x"], frame["sun_y"], frame["sun_z"] = scene.sun
+    for side, light in zip(("up", "down", "east", "west", "north", "south"), lit, strict=True):
+        frame[f"lit_{side}"] = light
     stacks: list[np.ndarray] = []
-    for texture in (scene.ground_texture, scene.wall_texture, scene.obstacle_texture):
-        contrast = 0.0 if texture.plain else texture.contrast
-        kind = PATTERNS.index(texture.pattern)
-        numbers += [kind, 1.0 / texture.period_m, contrast, *texture.velocity_mps, len(stacks)]
-        if kind == NOISE and not texture.plain:
+    textures = {"ground": scene.ground_texture, "wall": scene.wall_texture, "body": scene.obstacle_texture}
+    for name, texture in textures.items():
+        frame[f"{name}_texture"] = _texture_record(texture, len(stacks))
+        if texture.pattern == "noise" and not texture.plain:
             stacks.append(noise_stack(texture.seed).ravel())
-    return numbers, np.concatenate(stacks) if stacks else NO_STACKS
+    return frame, np.concatenate(stacks) if stacks else NO_STACKS
 
 
-def make_view(scene: Scene, textures: list[float]) -> np.ndarray:
-    """(VIEW,) float64 what the kernels need of the scene; a frame fills in the rest."""
-    view = np.zeros(spans.VIEW)
-    faces = ((0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
-    tops = (scene.obstacles["z"] + scene.obstacles["rz"]).tolist()
-    view[spans.SKY : spans.SUN_Z + 1] = (
-        scene.sky_luminance,
-        float(scene.shade(scene.ground_albedo, faces[0])),
-        max([scene.wall_height_m, *tops]),
-        0.5 * scene.width_m,
-        scene.wall_height_m,
-        *scene.walls_y_m,
-        scene.wall_albedo,
-        scene.ambient,
-        scene.diffuse,
-        *scene.sun,
-    )
-    view[spans.LIT_UP : spans.GROUND] = scene.shade(np.ones(6), np.array(faces, np.float64))
-    view[spans.GROUND :] = textures
-    return view
+def _texture_record(texture: Texture, stack: int) -> tuple[float, ...]:
+    """A TEXTURE record, of which `stack` tells where its filtered tiles are, if it is noise."""
+    kind = PATTERNS.index(texture.pattern)
+    return (kind, 1.0 / texture.period_m, texture.depth, *texture.velocity_mps, stack)
 
 
 def focal_length(width: int, fov_deg: float) -> float:
@@ -86,7 +81,7 @@ def focal_length(width: int, fov_deg: float) -> float:
 
 
 class RaycastRenderer:
-    """Renders one scene after the other; holds no state but the scene and the image's geometry."""
+    """Renders one scene after the other; its only state is the scene and the shape of the image."""
 
     def __init__(
         self,
@@ -112,19 +107,16 @@ class RaycastRenderer:
             ValueError: If a size is not at least 1, fov_deg not in [1, 170], cull_m not
                 positive, or the scene holds what this renderer cannot draw.
         """
-        check_image(width, height, fov_deg, samples)
-        if not cull_m > 0.0:
-            raise ValueError(f"cull_m must be > 0 m (inf: draw all); got {cull_m!r}.")
+        check_image(width, height, fov_deg, samples, cull_m)
         self.width, self.height, self.fov_deg, self.samples = width, height, fov_deg, samples
         self.cull_m = float(cull_m)
         self.set_scene(scene)
 
     def set_scene(self, scene: Scene) -> None:
         """Draw `scene` from now on. Raises ValueError if it holds what this renderer cannot draw."""
-        check_scene(scene)
-        textures, stacks = make_textures(scene)
-        self._scene, self._view = (make_bodies(scene), stacks), make_view(scene, textures)
-        self._focal = focal_length(self.width, self.fov_deg)
+        _check_scene(scene)
+        self._bodies = _make_bodies(scene)
+        self._frame, self._stacks = _make_frame(scene, focal_length(self.width, self.fov_deg), self.samples)
 
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
@@ -161,31 +153,11 @@ class RaycastRenderer:
             ValueError: As `render`, for the first pose that is refused.
         """
         images = np.empty((len(poses), self.height, self.width), np.float32)
-        bad = _render_way(self._scene, self._view, poses, self._focal, images, self.samples, self.cull_m)
+        bad = render_way(self._bodies, self._stacks, self._frame, poses, images, self.cull_m)
         if bad >= 0:
             x_m, y_m, z_m, yaw_rad, t_s = poses[bad].tolist()
             check_pose((x_m, y_m, z_m, yaw_rad), t_s)
         return images
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _render_way(
-    scene: tuple,
-    view: np.ndarray,
-    poses: np.ndarray,
-    focal: float,
-    images: np.ndarray,
-    samples: int,
-    cull: float,
-) -> int:
-    """Fill `images` (K, H, W); the index of the first pose that `check_pose` would refuse, or -1."""
-    for k in range(len(poses)):
-        x, y, z, yaw, t = poses[k]
-        near = abs(x) <= LIMIT_M and abs(y) <= LIMIT_M and 0.0 <= z <= LIMIT_M
-        if not (near and abs(yaw) < np.inf and abs(t) <= LIMIT_S):
-            return k
-        render_area(scene, view, (x, y, z, yaw, t), focal, images[k], samples, cull)
-    return -1
 
 
 def sample_luminance(
@@ -205,7 +177,7 @@ def sample_luminance(
     """
     check_image(width, height, fov_deg, samples)
     check_pose(pose, t_s)
-    check_scene(scene)
+    _check_scene(scene)
     focal = focal_length(width * samples, fov_deg)
     points = shade_hits(scene, trace_scene(scene, pose, width * samples, height * samples, focal), t_s)
     return points.reshape(height, samples, width, samples).mean(axis=(1, 3)).astype(np.float32)

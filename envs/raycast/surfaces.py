@@ -1,8 +1,6 @@
 """Kernels that show a wall or a body in one strip: clip it to the gaps, paint it, close them.
 
-A strip's gaps are what nothing nearer covers, each between two straight edges: rows
-`gaps[0, k]` and `gaps[1, k]` are the left and the right end of the upper one, 2 and 3 of the
-lower; 4 and 5 are from where to where in the strip it reaches, of 0 .. 1. What is shown is
+A strip's gaps are what nothing nearer covers, each between two straight edges. What is shown is
 clipped to gaps at both ends, so that it and the gaps always part the strip. Input is assumed valid.
 """
 
@@ -10,330 +8,312 @@ import math
 
 import numpy as np
 
-from envs.raycast import bodies as b
-from envs.raycast import coverage as v
-from envs.raycast import patterns as p
-from envs.raycast.bodies import (
-    CAP,
-    END,
-    ENTRY,
-    FIRST,
-    KIND,
-    LAST,
-    LEFT_END,
-    LEVEL_LIGHT,
-    LIGHT,
-    MEAN_ROOT,
-    RIGHT_END,
-    SIDE,
-    SLOPE,
-    UNDER,
-    WALL_AFTER,
-    WALL_DEPTH,
-    WALL_SIDE,
-    WEIGHT,
-)
-from envs.raycast.coverage import EYE_X, EYE_Y, EYE_Z, FOCAL, HORIZON, inlined, kernel
+from envs.raycast import coverage, patterns
+from envs.raycast.bodies import MIN_DEPTH, box_slab, cosine, depths, mean_root, root
+from envs.raycast.coverage import Layer, beyond, ends, is_open, put
+from envs.raycast.patterns import Quadric, Rows
+from envs.raycast.records import Canvas, Ends, Record, inlined, kernel
 from envs.scene import BOX, ELLIPSOID, POLE
 
-SLIGHT = 0.02  # [rows] edges that cross by less are not cut there
+MIN_CROSSING = 0.02  # [rows] edges that cross by less are not cut there
 GAUSS = 0.5 / math.sqrt(3.0)  # how far from the middle two points stand that stand for a length of 1
-BROAD = 0.1  # [widths of a body] a strip wider than this is lit by two points
+MAX_SHARE = 0.1  # [widths of a body] a strip wider than this is lit by two points
 
 
 @kernel
-def wall_depth(view: np.ndarray, side: float, u: float) -> float:
+def wall_depth(frame: Record, side: float, u: float) -> float:
     """Depth at which slope `u` meets the wall at x = side * half width [m]; inf: never."""
-    depth = (side * view[v.WALL_HALF] - view[EYE_X]) / (u * view[v.COS] - view[v.SIN])
-    y = view[EYE_Y] + depth * (u * view[v.SIN] + view[v.COS])
-    return depth if depth > b.NEAR and view[v.WALL_NEAR] <= y <= view[v.WALL_FAR] else math.inf
+    depth = (side * frame.wall_half - frame.eye_x) / (u * frame.cos - frame.sin)
+    y = frame.eye_y + depth * (u * frame.sin + frame.cos)
+    return depth if depth > MIN_DEPTH and frame.wall_near <= y <= frame.wall_far else math.inf
 
 
 @inlined
-def _ends(gaps: np.ndarray, k: int, hit: np.ndarray, edge: int) -> tuple[float, float]:
-    """Rows of an edge of what is shown at both ends of gap `k`."""
-    left, right = hit[edge], hit[edge + 1]
-    return left + gaps[4, k] * (right - left), right + (1.0 - gaps[5, k]) * (left - right)
+def _in_gap(gap: Record, edge: Record) -> Ends:
+    """An edge of what is shown, at both ends of a gap."""
+    left, right = edge.left, edge.right
+    return Ends(left + gap.reach.left * (right - left), right + (1.0 - gap.reach.right) * (left - right))
 
 
 @inlined
-def _clip(gaps: np.ndarray, k: int, hit: np.ndarray, edge: int) -> tuple[float, float]:
-    """An edge of what is shown, moved into gap `k`."""
-    left, right = v.beyond(_ends(gaps, k, hit, edge), (gaps[0, k], gaps[1, k]))
-    left, right = v.beyond((-left, -right), (-gaps[2, k], -gaps[3, k]))
-    return -left, -right
+def _clip(gap: Record, edge: Record) -> Ends:
+    """An edge of what is shown, moved into a gap."""
+    left, right = beyond(_in_gap(gap, edge), ends(gap.top))
+    left, right = beyond(Ends(-left, -right), Ends(-gap.bottom.left, -gap.bottom.right))
+    return Ends(-left, -right)
 
 
 @inlined
-def _cut_gaps(gaps: np.ndarray, hit: np.ndarray, count: int) -> int:
+def _cut_gaps(gaps: np.ndarray, strip: Record, count: int) -> int:
     """Cut the gaps where an edge of what is shown crosses one of theirs; their new number."""
-    count = _cut_by(gaps, hit, count, CAP)
-    count = _cut_by(gaps, hit, count, END)
-    if hit[SIDE] > hit[CAP] or hit[SIDE + 1] > hit[CAP + 1]:
-        count = _cut_by(gaps, hit, count, SIDE)
-    if hit[END] > hit[UNDER] or hit[END + 1] > hit[UNDER + 1]:
-        count = _cut_by(gaps, hit, count, UNDER)
+    count = _cut_by(gaps, strip.cap, count)
+    count = _cut_by(gaps, strip.end, count)
+    if strip.side.left > strip.cap.left or strip.side.right > strip.cap.right:
+        count = _cut_by(gaps, strip.side, count)
+    if strip.end.left > strip.under.left or strip.end.right > strip.under.right:
+        count = _cut_by(gaps, strip.under, count)
     return count
 
 
 @kernel
-def _cut_by(gaps: np.ndarray, hit: np.ndarray, count: int, edge: int) -> int:
+def _cut_by(gaps: np.ndarray, edge: Record, count: int) -> int:
     """Cut the gaps where one edge crosses theirs, as long as less than half the room is used."""
     k = 0
     while k < count:
-        for limit in (0, 2):
-            left, right = _ends(gaps, k, hit, edge)
-            one, other = left - gaps[limit, k], right - gaps[limit + 1, k]
-            if one * other < 0.0 and min(abs(one), abs(other)) > SLIGHT and 2 * count < gaps.shape[1]:
-                v.cut_gap(gaps, k, count, one / (one - other))
-                count += 1
+        count = _cut_at(gaps, k, edge, gaps[k].top, count)
+        count = _cut_at(gaps, k, edge, gaps[k].bottom, count)
         k += 1
     return count
 
 
 @inlined
-def enter_gap(view: np.ndarray, gaps: np.ndarray, k: int, hit: np.ndarray) -> None:
-    """Note where gap `k` is, and its weight."""
-    wide = hit[LAST] - hit[FIRST]
-    hit[LEFT_END], hit[RIGHT_END] = hit[FIRST] + gaps[4, k] * wide, hit[FIRST] + gaps[5, k] * wide
-    hit[SLOPE] = 0.5 * (hit[LEFT_END] + hit[RIGHT_END])
-    hit[WEIGHT] = view[FOCAL] * (hit[RIGHT_END] - hit[LEFT_END])
+def _cut_at(gaps: np.ndarray, k: int, edge: Record, limit: Record, count: int) -> int:
+    """Cut gap `k` where an edge crosses one of its own, `limit`; the new number of gaps."""
+    left, right = _in_gap(gaps[k], edge)
+    one, other = left - limit.left, right - limit.right
+    if one * other < 0.0 and min(abs(one), abs(other)) > MIN_CROSSING and 2 * count < len(gaps):
+        coverage.cut_gap(gaps, k, count, one / (one - other))
+        return count + 1
+    return count
+
+
+@inlined
+def enter_gap(frame: Record, strip: Record, gap: Record) -> None:
+    """Note in the strip where a gap is, and its weight."""
+    first, wide = strip.slopes.left, strip.slopes.right - strip.slopes.left
+    left, right = first + gap.reach.left * wide, first + gap.reach.right * wide
+    put(strip.gap_slopes, Ends(left, right))
+    strip.slope, strip.weight = 0.5 * (left + right), frame.focal * (right - left)
 
 
 @kernel
-def _carve(view, sheet, count: int, k: int, standing: bool) -> int:
+def _carve(canvas: Canvas, count: int, k: int, standing: bool) -> int:
     """Take what is shown out of gap `k`; below what stands on the ground only the ground is left."""
-    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
-    first, last = _clip(gaps, k, hit, CAP), _clip(gaps, k, hit, END)
-    top, bottom = (gaps[0, k], gaps[1, k]), (gaps[2, k], gaps[3, k])
-    below = v.is_open(last, bottom) and count < gaps.shape[1]
+    frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
+    gap = gaps[k]
+    first, last = _clip(gap, strip.cap), _clip(gap, strip.end)
+    top, bottom = ends(gap.top), ends(gap.bottom)
+    below = is_open(last, bottom) and count < len(gaps)
     if below and standing:
-        if view[v.GROUND + v.CONTRAST] > 0.0:
-            v.cover_ground(view, sheet, last, bottom, hit[WEIGHT], hit[SLOPE])
+        if frame.ground_texture.contrast > 0.0:
+            coverage.cover_ground(frame, canvas.accumulators, last, bottom, strip.weight, strip.slope)
         below = False
-    if v.is_open(top, first):
-        gaps[2, k], gaps[3, k] = first
+    if is_open(top, first):
         if below:
-            gaps[0, count], gaps[1, count] = last
-            gaps[2, count], gaps[3, count] = bottom
-            gaps[4, count], gaps[5, count] = gaps[4, k], gaps[5, k]
-            return count + 1
-        return count
+            gaps[count] = gap
+            put(gaps[count].top, last)
+        put(gap.bottom, first)
+        return count + below
     if below:
-        gaps[0, k], gaps[1, k] = last
+        put(gap.top, last)
         return count
-    for row in range(6):
-        gaps[row, k] = gaps[row, count - 1]
+    gaps[k] = gaps[count - 1]
     return count - 1
 
 
+@inlined
+def _outline_wall(frame: Record, strip: Record) -> None:
+    """Note in the strip the rows of the wall that comes next."""
+    away = frame.focal / (strip.wall_side * frame.wall_half - frame.eye_x)
+    left = max(0.0, away * (strip.slopes.left * frame.cos - frame.sin))
+    right = max(0.0, away * (strip.slopes.right * frame.cos - frame.sin))
+    over_top, horizon = frame.eye_z - frame.wall_top, frame.horizon
+    top = Ends(horizon + left * over_top, horizon + right * over_top)
+    foot = Ends(horizon + left * frame.eye_z, horizon + right * frame.eye_z)
+    put(strip.cap, top)
+    put(strip.side, top)
+    put(strip.under, foot)
+    put(strip.end, foot)
+
+
 @kernel
-def show_walls(view: np.ndarray, sheet: np.ndarray, count: int, limit: float) -> int:
+def show_walls(canvas: Canvas, count: int, limit: float) -> int:
     """Paint the walls nearer than `limit` [m] that are still to come into the gaps; their new number."""
-    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
-    while hit[WALL_DEPTH] < limit:
-        side = hit[WALL_SIDE]
-        away = view[FOCAL] / (side * view[v.WALL_HALF] - view[EYE_X])
-        for k in range(2):
-            scale = max(0.0, away * (hit[FIRST + k] * view[v.COS] - view[v.SIN]))
-            hit[CAP + k] = view[HORIZON] + scale * (view[EYE_Z] - view[v.WALL_TOP])
-            hit[END + k] = view[HORIZON] + scale * view[EYE_Z]
-        for k in range(2):
-            hit[SIDE + k], hit[UNDER + k] = hit[CAP + k], hit[END + k]
-        facing = view[v.LIT_EAST] if view[EYE_X] > side * view[v.WALL_HALF] else view[v.LIT_WEST]
-        count = _cut_gaps(gaps, hit, count)
+    frame, strip, gaps, accumulators = canvas.frame, canvas.strip, canvas.gaps, canvas.accumulators
+    while strip.wall_depth < limit:
+        side = strip.wall_side
+        _outline_wall(frame, strip)
+        facing = frame.lit_east if frame.eye_x > side * frame.wall_half else frame.lit_west
+        count = _cut_gaps(gaps, strip, count)
         for k in range(count - 1, -1, -1):
-            top, bottom = _clip(gaps, k, hit, CAP), _clip(gaps, k, hit, END)
-            if v.is_open(top, bottom):
-                enter_gap(view, gaps, k, hit)
-                v.fill(view, sheet, top, bottom, view[v.WALL_ALBEDO] * facing, hit[WEIGHT])
-                if view[v.WALL + v.CONTRAST] > 0.0:
-                    layer = v.RIGHT_SHOWN if side > 0.0 else v.LEFT_SHOWN
-                    v.cover(sheet, layer, top, bottom, hit[WEIGHT], hit[SLOPE])
-                count = _carve(view, sheet, count, k, True)
-        hit[WALL_SIDE], hit[WALL_DEPTH], hit[WALL_AFTER] = -side, hit[WALL_AFTER], math.inf
+            top, bottom = _clip(gaps[k], strip.cap), _clip(gaps[k], strip.end)
+            if is_open(top, bottom):
+                enter_gap(frame, strip, gaps[k])
+                coverage.fill(frame, accumulators, top, bottom, frame.wall_albedo * facing, strip.weight)
+                if frame.wall_texture.contrast > 0.0:
+                    layer = Layer.RIGHT_WALL if side > 0.0 else Layer.LEFT_WALL
+                    coverage.cover(accumulators[layer : layer + 3], top, bottom, strip.weight, strip.slope)
+                count = _carve(canvas, count, k, True)
+        strip.wall_side, strip.wall_depth, strip.wall_after = -side, strip.wall_after, math.inf
     return count
 
 
 @kernel
-def _lit_part(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> float:
+def _lit_part(frame: Record, body: Record, strip: Record) -> float:
     """Mean cosine over a strip of which the sun lights one side, up to where its rays graze the pole."""
-    length = math.sqrt(view[v.SUN_RIGHT] * view[v.SUN_RIGHT] + view[v.SUN_FORWARD] * view[v.SUN_FORWARD])
-    right, forward = -view[v.SUN_FORWARD] / length, view[v.SUN_RIGHT] / length
-    away = right * seen[i, b.RIGHT] + forward * seen[i, b.FORWARD]
-    radius = -math.copysign(seen[i, b.RX], away)
-    grazed = (seen[i, b.RIGHT] + radius * right) / max(b.NEAR, seen[i, b.FORWARD] + radius * forward)
-    grazed = min(max(grazed, hit[FIRST]), hit[LAST])
-    low, high = (hit[FIRST], grazed) if hit[b.COSINES] > 0.0 else (grazed, hit[LAST])
-    arc = b.mean_root(seen, i, low, high, (b.root(seen, i, low), b.root(seen, i, high)))
-    return b.cosine(seen, i, view, 0.5 * (low + high), arc) * (high - low) / (hit[LAST] - hit[FIRST])
+    length = math.sqrt(frame.sun_right * frame.sun_right + frame.sun_forward * frame.sun_forward)
+    right, forward = -frame.sun_forward / length, frame.sun_right / length
+    away = right * body.right + forward * body.forward
+    radius = -math.copysign(body.rx, away)
+    grazed = (body.right + radius * right) / max(MIN_DEPTH, body.forward + radius * forward)
+    first, last = strip.slopes.left, strip.slopes.right
+    grazed = min(max(grazed, first), last)
+    low, high = (first, grazed) if strip.cosine.left > 0.0 else (grazed, last)
+    arc = mean_root(body, low, high, root(body, low), root(body, high))
+    return cosine(body, frame, 0.5 * (low + high), arc) * (high - low) / (last - first)
 
 
 @inlined
-def _side_light(view: np.ndarray, seen: np.ndarray, i: int, hit: np.ndarray) -> float:
+def _side_light(frame: Record, body: Record, strip: Record) -> float:
     """Mean luminance of a pole's or box's side over the strip."""
-    middle = 0.5 * (hit[FIRST] + hit[LAST])
-    if seen[i, KIND] == POLE:
-        one, other = hit[b.COSINES], hit[b.COSINES + 1]
+    middle = 0.5 * (strip.slopes.left + strip.slopes.right)
+    if body.kind == POLE:
+        one, other = strip.cosine.left, strip.cosine.right
         if one < 0.0 or other < 0.0:
-            cosine = _lit_part(view, seen, i, hit) if max(one, other) > 0.0 else 0.0
+            towards = _lit_part(frame, body, strip) if max(one, other) > 0.0 else 0.0
         else:
-            cosine = b.cosine(seen, i, view, middle, hit[MEAN_ROOT])
-        return seen[i, b.ALBEDO] * (view[v.AMBIENT] + view[v.DIFFUSE] * min(1.0, max(0.0, cosine)))
-    along_x, along_y = middle * view[v.COS] - view[v.SIN], middle * view[v.SIN] + view[v.COS]
-    near_x, near_y, _ = b.box_slab(seen, i, along_x, along_y)
+            towards = cosine(body, frame, middle, strip.mean_root)
+        return body.albedo * (frame.ambient + frame.diffuse * min(1.0, max(0.0, towards)))
+    along_x, along_y = middle * frame.cos - frame.sin, middle * frame.sin + frame.cos
+    near_x, near_y, _ = box_slab(body, along_x, along_y)
     if near_x > near_y:
-        return seen[i, b.ALBEDO] * (view[v.LIT_WEST] if along_x > 0.0 else view[v.LIT_EAST])
-    return seen[i, b.ALBEDO] * (view[v.LIT_SOUTH] if along_y > 0.0 else view[v.LIT_NORTH])
+        return body.albedo * (frame.lit_west if along_x > 0.0 else frame.lit_east)
+    return body.albedo * (frame.lit_south if along_y > 0.0 else frame.lit_north)
+
+
+@inlined
+def _is_curved(body: Record) -> bool:
+    """Whether a body's side bends along a column, so that each row has a light of its own."""
+    return body.kind != POLE and body.kind != BOX
 
 
 @kernel
-def _cut_for_body(view, seen, i: int, sheet: np.ndarray, count: int) -> int:
+def _cut_for_body(canvas: Canvas, body: Record, count: int) -> int:
     """Cut the gaps where a body's edges cross theirs, and in two for a pattern that bends around it."""
-    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
-    count = _cut_gaps(gaps, hit, count)
-    broad = hit[LAST] - hit[FIRST] > BROAD * (seen[i, b.HIGH] - seen[i, b.LOW])
-    if view[v.BODY + v.CONTRAST] > 0.0 and seen[i, KIND] != BOX and broad and 2 * count < gaps.shape[1]:
+    gaps, strip = canvas.gaps, canvas.strip
+    count = _cut_gaps(gaps, strip, count)
+    broad = strip.slopes.right - strip.slopes.left > MAX_SHARE * (body.high - body.low)
+    textured = canvas.frame.body_texture.contrast > 0.0
+    if textured and body.kind != BOX and broad and 2 * count < len(gaps):
         for k in range(count):
-            v.cut_gap(gaps, k, count + k, 0.5)
+            coverage.cut_gap(gaps, k, count + k, 0.5)
         count *= 2
     return count
 
 
 @inlined
-def _paint_faces(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges: tuple) -> None:
+def _paint_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: Ends, bottom: Ends) -> None:
     """Paint what lies between four edges: a body's level top, its side, its underside."""
-    hit, (top, first, last, bottom) = sheet[v.HIT], edges
-    if v.is_open(first, last):
-        v.fill(view, sheet, first, last, hit[LIGHT], hit[WEIGHT])
-        if seen[i, KIND] != POLE and seen[i, KIND] != BOX:
-            _shade_rows(view, seen, i, sheet, stacks, (first, last))
-    if v.is_open(top, first):
-        v.fill(view, sheet, top, first, hit[LEVEL_LIGHT], hit[WEIGHT])
-    if v.is_open(last, bottom):
-        v.fill(view, sheet, last, bottom, hit[LEVEL_LIGHT], hit[WEIGHT])
-    if view[v.BODY + v.CONTRAST] > 0.0:
-        _texture_faces(view, seen, i, sheet, stacks, edges)
+    frame, strip, accumulators = canvas.frame, canvas.strip, canvas.accumulators
+    if is_open(first, last):
+        coverage.fill(frame, accumulators, first, last, strip.light, strip.weight)
+        if _is_curved(body):
+            _shade_rows(canvas, body, first, last)
+    if is_open(top, first):
+        coverage.fill(frame, accumulators, top, first, strip.level_light, strip.weight)
+    if is_open(last, bottom):
+        coverage.fill(frame, accumulators, last, bottom, strip.level_light, strip.weight)
+    if frame.body_texture.contrast > 0.0:
+        _texture_faces(canvas, body, top, first, last, bottom)
 
 
 @inlined
-def show_body(view, seen: np.ndarray, i: int, sheet: np.ndarray, stacks: np.ndarray, count: int) -> int:
+def show_body(canvas: Canvas, body: Record, count: int) -> int:
     """Paint what the strip knows of a body into the gaps; their new number."""
-    gaps, hit = sheet[v.GAPS : v.HIT], sheet[v.HIT]
-    curved = seen[i, KIND] != POLE and seen[i, KIND] != BOX
-    hit[LIGHT] = 0.0 if curved else _side_light(view, seen, i, hit)
-    lit = view[v.LIT_UP] if view[EYE_Z] > seen[i, b.TOP] else view[v.LIT_DOWN]
-    hit[LEVEL_LIGHT] = seen[i, b.ALBEDO] * lit
-    count = _cut_for_body(view, seen, i, sheet, count)
+    frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
+    strip.light = 0.0 if _is_curved(body) else _side_light(frame, body, strip)
+    strip.level_light = body.albedo * (frame.lit_up if frame.eye_z > body.top else frame.lit_down)
+    count = _cut_for_body(canvas, body, count)
     for k in range(count - 1, -1, -1):
-        top, bottom = _clip(gaps, k, hit, CAP), _clip(gaps, k, hit, END)
-        if v.is_open(top, bottom):
-            first, last = _clip(gaps, k, hit, SIDE), _clip(gaps, k, hit, UNDER)
-            enter_gap(view, gaps, k, hit)
-            _paint_faces(view, seen, i, sheet, stacks, (top, first, last, bottom))
+        top, bottom = _clip(gaps[k], strip.cap), _clip(gaps[k], strip.end)
+        if is_open(top, bottom):
+            first, last = _clip(gaps[k], strip.side), _clip(gaps[k], strip.under)
+            enter_gap(frame, strip, gaps[k])
+            _paint_faces(canvas, body, top, first, last, bottom)
             # Under the belly of an ellipsoid more than the ground can be seen.
-            standing = seen[i, b.BOTTOM] <= b.NEAR and seen[i, KIND] != ELLIPSOID
-            count = _carve(view, sheet, count, k, standing)
+            standing = body.bottom <= MIN_DEPTH and body.kind != ELLIPSOID
+            count = _carve(canvas, count, k, standing)
     return count
 
 
 @kernel
-def _texture_faces(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges: tuple) -> None:
+def _texture_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: Ends, bottom: Ends) -> None:
     """Add the pattern to a body's flat faces: between four edges, the level top, the side, the underside."""
-    top, first, last, bottom = edges
-    hit = sheet[v.HIT]
-    ray = (
-        0.5 * (hit[LEFT_END] + hit[RIGHT_END]),
-        hit[RIGHT_END] - hit[LEFT_END],
-        hit[WEIGHT] * hit[LEVEL_LIGHT],
-    )
-    if v.is_open(top, first):
-        p.texture_level(view, stacks, sheet, top, first, seen[i, b.TOP], ray)
-    if v.is_open(last, bottom):
-        p.texture_level(view, stacks, sheet, last, bottom, seen[i, b.BOTTOM], ray)
-    if not v.is_open(first, last):
-        return
-    if seen[i, KIND] == BOX:
-        s, e = p.along_face(view, seen, i, hit)
-        side = (s, e, hit[ENTRY], 0.0, hit[WEIGHT] * hit[LIGHT])
-        p.texture_side(view, stacks, sheet, first, last, side)
-    if seen[i, KIND] == POLE:
-        s, e = p.around_pole(view, seen, i, hit)
-        side = (s, e, hit[ENTRY], seen[i, b.Y], hit[WEIGHT] * hit[LIGHT])
-        p.texture_side(view, stacks, sheet, first, last, side)
+    if is_open(top, first):
+        patterns.texture_level(canvas, top, first, body.top)
+    if is_open(last, bottom):
+        patterns.texture_level(canvas, last, bottom, body.bottom)
+    if is_open(first, last) and not _is_curved(body):
+        patterns.texture_side(canvas, body, first, last)
 
 
 @inlined
-def _cosine(view: np.ndarray, shape: tuple, ray: tuple, fall: float, span: tuple) -> float:
-    """Cosine between the sun and a quadric, at least 0, where the ray of `fall` per depth meets it.
-
-    `ray` is its slope, and right and forward of the body's axis [m].
-    """
-    u, right, forward = ray
-    _, _, _, ratio, _, size = shape
-    depth, up = p.meet(shape, fall, span)
-    length = math.sqrt(max(1e-300, size + ratio * (ratio - 1.0) * up * up))
-    east, north = depth * u - right, depth - forward
-    towards = east * view[v.SUN_RIGHT] + north * view[v.SUN_FORWARD] + ratio * up * view[v.SUN_Z]
+def _cosine(
+    frame: Record, body: Record, shape: Quadric, u: float, fall: float, nearest: float, farthest: float
+) -> float:
+    """Cosine between the sun and a quadric, at least 0, where the ray of `fall` per depth meets it."""
+    depth, up = patterns.meet(shape, fall, nearest, farthest)
+    length = math.sqrt(max(1e-300, shape.size + shape.ratio * (shape.ratio - 1.0) * up * up))
+    right, forward = depth * u - body.right, depth - body.forward
+    towards = right * frame.sun_right + forward * frame.sun_forward + shape.ratio * up * frame.sun_z
     return min(1.0, max(0.0, towards / length))
 
 
 @kernel
-def _shade_rows(view, seen, i: int, sheet: np.ndarray, stacks: np.ndarray, edges: tuple) -> None:
+def _shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
     """Light a cone's side or an ellipsoid between two edges, row by row."""
-    hit = sheet[v.HIT]
-    top, bottom = edges
-    wide = hit[RIGHT_END] - hit[LEFT_END]
-    broad = wide > BROAD * (seen[i, b.HIGH] - seen[i, b.LOW])
-    u, second = hit[SLOPE] - broad * GAUSS * wide, hit[SLOPE] + GAUSS * wide
-    shape, other, span = p.quadric(seen, i, view, u), p.quadric(seen, i, view, second), (0.0, math.inf)
-    ray = (u, seen[i, b.RIGHT], seen[i, b.FORWARD])
-    ambient = hit[WEIGHT] * seen[i, b.ALBEDO] * view[v.AMBIENT]
-    diffuse = hit[WEIGHT] * seen[i, b.ALBEDO] * view[v.DIFFUSE]
-    textured = view[v.BODY + v.CONTRAST] > 0.0
+    frame, strip, slopes = canvas.frame, canvas.strip, canvas.strip.gap_slopes
+    wide = slopes.right - slopes.left
+    broad = wide > MAX_SHARE * (body.high - body.low)
+    u, second = strip.slope - broad * GAUSS * wide, strip.slope + GAUSS * wide
+    shape, other = patterns.quadric(body, frame, u), patterns.quadric(body, frame, second)
+    ambient = strip.weight * body.albedo * frame.ambient
+    diffuse = strip.weight * body.albedo * frame.diffuse
+    textured = frame.body_texture.contrast > 0.0
     left = right = middle = shape
     if textured:
-        left, right = p.quadric(seen, i, view, hit[LEFT_END]), p.quadric(seen, i, view, hit[RIGHT_END])
-        middle = p.quadric(seen, i, view, hit[SLOPE])
-    high, low = min(top[0], top[1]), max(bottom[0], bottom[1])
-    per_row, whole, rest = 1.0 / view[FOCAL], max(top[0], top[1]), min(bottom[0], bottom[1])
+        left, right = patterns.quadric(body, frame, slopes.left), patterns.quadric(body, frame, slopes.right)
+        middle = patterns.quadric(body, frame, strip.slope)
+    high, low = min(top.left, top.right), max(bottom.left, bottom.right)
+    per_row, whole, rest = 1.0 / frame.focal, max(top.left, top.right), min(bottom.left, bottom.right)
     for row in range(int(high), math.ceil(low)):
         start, end = max(high, row), min(low, row + 1.0)
-        fall = (0.5 * (start + end) - view[HORIZON]) * per_row
         if row >= whole and row + 1 <= rest:
-            share, cosine = 1.0, _cosine(view, shape, ray, fall, span)
+            fall = (0.5 * (start + end) - frame.horizon) * per_row
+            share, towards = 1.0, _cosine(frame, body, shape, u, fall, 0.0, math.inf)
             if broad:
-                cosine = 0.5 * (_cosine(view, other, (second, *ray[1:]), fall, span) + cosine)
+                towards = 0.5 * (_cosine(frame, body, other, second, fall, 0.0, math.inf) + towards)
         else:
-            share = v.share_below(row, top[0], top[1]) - v.share_below(row, bottom[0], bottom[1])
-            cosine = _cut_row(view, seen, i, hit, edges, (start, end))
-        light = ambient + diffuse * cosine
+            share = coverage.share_below(row, top) - coverage.share_below(row, bottom)
+            towards = _cut_row(frame, body, strip, top, bottom, start, end)
+        light = ambient + diffuse * towards
         if textured:
-            rows = start, max(start, end)
-            light *= 1.0 + p.curved_pattern(view, seen, i, hit, (left, right, middle), rows, stacks)
-        sheet[v.PAINT, row] += share * light
+            rows = Rows(start, max(start, end))
+            light *= 1.0 + patterns.curved_pattern(canvas, body, (left, right, middle), rows)
+        canvas.accumulators[Layer.PAINT, row] += share * light
 
 
 @kernel
-def _cut_row(view, seen, i: int, hit: np.ndarray, edges: tuple, rows: tuple) -> float:
+def _cut_row(
+    frame: Record, body: Record, strip: Record, top: Ends, bottom: Ends, start: float, end: float
+) -> float:
     """Cosine between the sun and what the edges leave of a row of a curved body.
 
     Luminance changes fastest next to the outline: four points of what is left, at each of
     two slopes the quarters of the rows between the edges.
     """
-    (top, bottom), (start, end) = edges, rows
-    left, right = v.left_of_row(edges, start, end)
+    left, right = coverage.left_of_row(top, bottom, start, end)
     total = tall = 0.0
     for k in range(2):
         x = left + (0.5 + (2 * k - 1) * GAUSS) * (right - left)
-        u = hit[LEFT_END] + x * (hit[RIGHT_END] - hit[LEFT_END])
-        upper = max(start, top[0] + x * (top[1] - top[0]))
-        lower = max(upper, min(end, bottom[0] + x * (bottom[1] - bottom[0])))
-        shape, ray = p.quadric(seen, i, view, u), (u, seen[i, b.RIGHT], seen[i, b.FORWARD])
-        span = b.depths(seen, i, view, u)
-        span = (max(b.NEAR, span[0]), max(b.NEAR, span[1]))
+        u = strip.gap_slopes.left + x * (strip.gap_slopes.right - strip.gap_slopes.left)
+        upper = max(start, top.left + x * (top.right - top.left))
+        lower = max(upper, min(end, bottom.left + x * (bottom.right - bottom.left)))
+        shape = patterns.quadric(body, frame, u)
+        entry, leave = depths(body, frame, u)
+        entry, leave = max(MIN_DEPTH, entry), max(MIN_DEPTH, leave)
         for j in range(2):
-            fall = (upper + (0.5 + (2 * j - 1) * GAUSS) * (lower - upper) - view[HORIZON]) / view[FOCAL]
-            total += 0.5 * (lower - upper) * _cosine(view, shape, ray, fall, span)
+            fall = (upper + (0.5 + (2 * j - 1) * GAUSS) * (lower - upper) - frame.horizon) / frame.focal
+            total += 0.5 * (lower - upper) * _cosine(frame, body, shape, u, fall, entry, leave)
         tall += lower - upper
     return total / max(tall, 1e-9)

@@ -1,7 +1,7 @@
-"""Distances that matter: swept contact, exact for any length; whether a way leads through; points apart.
+"""Collision kernels: first contact of a swept disc, ways through a corridor, points kept apart.
 
 Bodies are level sections, rows (x, y, ux, uy, hx, hy, r) as `envs.scene.obstacles` describes them.
-Kernels assume finite input; what they get is checked in `envs.scene.scene`.
+Kernels assume finite input; `envs.scene.scene` checks it.
 """
 
 import math
@@ -9,8 +9,8 @@ import math
 import numba
 import numpy as np
 
-CELL_M = 0.1  # of the lattice on which ways are sought
-SURELY = 1.0 + 1e-9  # times a size: rounding cannot make it too small
+CELL_M = 0.1  # of the lattice on which ways are searched
+MARGIN = 1.0 + 1e-9  # times a size: rounding cannot make it too small
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -19,7 +19,7 @@ def first_contact(segment: tuple, radius: float, half_width: float, sections: np
 
     Args:
         segment: Way of the centre of a disc [m].
-        radius: Of the disc [m].
+        radius: Radius of the disc [m].
         half_width: The walls are at x = +-half_width, endless [m].
         sections: (N, 7) float64.
     """
@@ -29,9 +29,9 @@ def first_contact(segment: tuple, radius: float, half_width: float, sections: np
     for i in range(len(sections)):
         x, y, hx, hy = sections[i, 0], sections[i, 1], sections[i, 4], sections[i, 5]
         reach = sections[i, 6] + radius
-        size = (hx + hy + reach) * SURELY
+        size = (hx + hy + reach) * MARGIN
         if left - x > size or x - right > size or near - y > size or y - far > size:
-            continue  # most are far away, and this is quickly asked
+            continue  # most are far away, and this test is quick
         ux, uy = sections[i, 2], sections[i, 3]
         a = ((ax - x) * ux + (ay - y) * uy, (ay - y) * ux - (ax - x) * uy)
         b = ((bx - x) * ux + (by - y) * uy, (by - y) * ux - (bx - x) * uy)
@@ -126,7 +126,7 @@ def ways_to_goal(
 
     Args:
         sections: (N, 7) float64.
-        radius: Of the vehicle [m].
+        radius: Radius of the vehicle [m].
         half_width: The walls are at x = +-half_width [m].
         length: The goal line is at y = length [m].
         columns: Of the lattice, on either side of x = 0.

@@ -1,20 +1,20 @@
 """Layouts of corridors as data: what stands in them, how much of it, how it looks.
 
 A new corridor is one more `Layout` in `LAYOUTS`. The sources are the appendix's B.1 (poles,
-cones and gates, of which the event data are made), D.1 (the lane of training), D.2 (what is
-flown in evaluation) and F.1 (moving textures); it gives words and few numbers, so the
-numbers are choices, made for a camera at 2 m above the ground and a vehicle of radius 0.3 m.
+cones and gates, from which the event data are made), D.1 (the training lane), D.2 (the
+evaluation scenes) and F.1 (moving textures). It describes them in words with few numbers, so
+the numbers are our choices, made for a camera at 2 m above the ground and a vehicle of radius 0.3 m.
 """
 
 import dataclasses
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from envs.scene.collision import keep_apart
 from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
 from envs.scene.textures import Texture
 
@@ -22,7 +22,7 @@ SPAWN_RANGE_M = (-10.0, 10.0)  # appendix D.1
 SHAPES = {"pole": POLE, "cone": CONE, "ellipsoid": ELLIPSOID, "gate": BOX}
 GATE_BAR_M = 0.4  # thickness of a gate's posts, lintel and sill
 TRIES_PER_OBSTACLE = 200
-DENSEST = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
+MAX_COVERED = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
 PLAIN_SURFACE = Texture()
 
 
@@ -36,7 +36,7 @@ def refuse_unless(rules: dict[str, bool], what: str, record: Any) -> None:
 
 
 def check_types(layout: Any) -> None:
-    """Refuse what is no number in [0, 100000], no truth value or no texture, as the field's default says.
+    """Check that each field is a number in [0, 100000], a boolean or a texture, as its default is.
 
     Raises:
         ValueError: Names the field and the value.
@@ -139,10 +139,11 @@ class MeshLayout:
         refuse_unless(rules, "layout", self)
 
 
+AnyLayout = TypeVar("AnyLayout", Layout, MeshLayout)
 POLES_EVAL = Layout(num_obstacles=80, width_m=50.0)
 
 # Cones are as wide as poles where the camera flies, 2 m above the ground; so are ellipsoids,
-# whose middle is there. Hence the places that can be flown through are the same, and a
+# whose middle is there. Hence the places where a vehicle fits through are the same, and a
 # difference in success between these layouts and `poles_eval` is one of looks alone.
 LAYOUTS: dict[str, Layout] = {
     "poles": Layout(),
@@ -169,7 +170,7 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
-def with_overrides(layout: Any, overrides: dict[str, Any]) -> Any:
+def with_overrides(layout: AnyLayout, overrides: Mapping[str, object]) -> AnyLayout:
     """The layout with some of its fields replaced.
 
     Raises:
@@ -179,7 +180,7 @@ def with_overrides(layout: Any, overrides: dict[str, Any]) -> Any:
     for key in overrides:
         if key not in known:
             raise ValueError(f"layout has no {key!r}; it has {', '.join(known)}")
-    return dataclasses.replace(layout, **overrides)
+    return dataclasses.replace(layout, **overrides)  # type: ignore[arg-type]  # __post_init__ checks them
 
 
 def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
@@ -194,12 +195,14 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
     count = int(layout.num_obstacles)
     bar = GATE_BAR_M if layout.shape == "gate" else 0.0
     half = 0.5 * layout.width_m - layout.radius_max_m - bar
-    if _share_covered(layout, half) > DENSEST:  # asked first: the tries would take minutes
+    if _share_covered(layout, half) > MAX_COVERED:  # asked first: the tries would take minutes
         raise ValueError(
             f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart; "
             "lower num_obstacles or min_gap_m, or widen the lane"
         )
     tries = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (TRIES_PER_OBSTACLE * count, 2))
+    from envs.scene.collision import keep_apart  # loads numba, which a check of names does without
+
     kept = keep_apart(tries, layout.min_gap_m, count)
     if len(kept) < count:
         raise ValueError(

@@ -16,7 +16,7 @@ Y_UP = (".glb", ".gltf")
 
 
 def is_mesh_path(name: str) -> bool:
-    """Whether a scene's name means a file: it has a suffix or a folder in it."""
+    """Whether the name of a scene is the path of a file: it has a suffix or a folder in it."""
     return bool(Path(name).suffix) or os.sep in name
 
 
@@ -31,7 +31,7 @@ def read_mesh(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     is read at the corners of the triangles only. Transparency is ignored.
 
     Args:
-        path: Of the file; textures and materials are looked for beside it.
+        path: Path of the file; textures and materials are looked for beside it.
 
     Returns:
         Corners (F, 3, 3) float64 [m], unit normals (F, 3) float64 and albedos (F, 3)

@@ -1,4 +1,4 @@
-"""Obstacles as plain records: what kinds there are, and what a level plane cuts from them.
+"""Obstacles as plain records, and their sections by a level plane.
 
 x, y, z is the centre of an obstacle and rx, ry, rz are its half-axes [m]; the bottom is at
 z - rz, the top at z + rz. Bodies stand upright: poles, cones and ellipsoids are round about
@@ -33,7 +33,7 @@ def checked_obstacles(obstacles: np.ndarray, contrast: float) -> np.ndarray:
     """A read-only copy of obstacles whose texture raises the albedo by `contrast` at most.
 
     Raises:
-        ValueError: They are not OBSTACLE records, or one of them cannot be; it is named.
+        ValueError: They are not OBSTACLE records, or one breaks a rule; both are named.
     """
     if getattr(obstacles, "dtype", None) != OBSTACLE or obstacles.ndim != 1:
         raise ValueError(f"obstacles must be a 1-D array of scene.OBSTACLE, got {obstacles!r:.80}")
@@ -60,7 +60,7 @@ def checked_mesh(vertices: np.ndarray, faces: np.ndarray, luminance: np.ndarray)
     """Read-only vertices (V, 3) [m], faces (F, 3) and luminance (V,) of a mesh.
 
     Raises:
-        ValueError: A shape or a value cannot be.
+        ValueError: A shape or a value is wrong.
     """
     points, corners, shades = np.asarray(vertices), np.asarray(faces), np.asarray(luminance)
     if points.shape[1:] != (3,) or corners.shape[1:] != (3,) or shades.shape != points.shape[:1]:

@@ -1,7 +1,7 @@
-"""What an agent needs to know: in which directions something stands, and how near it is.
+"""Range scan: how near the first obstacle is in each direction, the truth that probes compare with.
 
-A ray is the way of a point, so where it ends is where that point first touches a section
-(`envs.scene.collision`): exact, for every kind of body and for meshes.
+A ray is the way of a point, and ends where that point first touches a section
+(`envs.scene.collision`): exact for every kind of body and for meshes.
 """
 
 import math
@@ -15,25 +15,25 @@ from envs.scene.collision import first_contact
 if TYPE_CHECKING:
     from envs.scene.scene import Scene
 
-REACH_M = 100.0  # nothing is seen beyond it
+MAX_RANGE_M = 100.0  # obstacles farther away count as none
 NEAR_M = 10.0  # proximity falls by e with each such distance: half a second of flight at 20 m/s
 
 
 def proximity(
     scene: "Scene", pose: tuple[float, float, float, float], bearings_rad: np.ndarray
 ) -> np.ndarray:
-    """How near the first obstacle in each bearing is: exp(-distance / NEAR_M), 0 for free sight.
+    """How near the first obstacle in each bearing is: exp(-distance / NEAR_M), 0 if there is none.
 
     The exponential keeps the measure in [0, 1] and lets what is too far to matter weigh
     nothing: at 30 m it is 0.05, where 1 / (1 + distance / 5 m) is still 0.14.
 
     Args:
         scene: The corridor; its walls are no obstacles here.
-        pose: x, y, z [m] and yaw [rad], as of `CorridorEnv.camera_pose`; sight is level, at z.
+        pose: x, y, z [m] and yaw [rad], as of `CorridorEnv.camera_pose`; rays are level, at height z.
         bearings_rad: (K,) to the right of straight ahead [rad].
 
     Returns:
-        float64 (K,) in [0, 1]; 1 from within an obstacle.
+        float64 (K,) in [0, 1]; 1 inside an obstacle.
 
     Raises:
         ValueError: A number of the pose or a bearing is not finite.
@@ -66,8 +66,8 @@ def _proximity(eye: tuple, headings: np.ndarray, sections: np.ndarray) -> np.nda
     near = np.zeros(len(headings))
     x, y = eye
     for k in range(len(headings)):
-        end = x + REACH_M * math.sin(headings[k]), y + REACH_M * math.cos(headings[k])
+        end = x + MAX_RANGE_M * math.sin(headings[k]), y + MAX_RANGE_M * math.cos(headings[k])
         contact = first_contact((x, y, end[0], end[1]), 0.0, math.inf, sections)
         if contact <= 1.0:
-            near[k] = math.exp(-contact * REACH_M / NEAR_M)
+            near[k] = math.exp(-contact * MAX_RANGE_M / NEAR_M)
     return near

@@ -1,12 +1,12 @@
-"""The world: obstacles, walls and ground as plain arrays, its mesh, its collisions.
+"""One corridor: obstacles, walls, ground and mesh as plain arrays, their light and their collisions.
 
 x points right, y forward along the lane, z up; metres throughout. Luminance is linear, in
 [0, 1], and Lambertian: albedo * (ambient + diffuse * max(0, normal . sun)). The ground is
 an infinite plane at z = 0; the walls are two upright planes at x = +-width_m / 2, both
 sides of which can be seen.
 
-A vehicle is a level disc at its flight's height. It touches what the plane at that height
-cuts from the bodies and from the surfaces of a mesh, and the walls at any height.
+A vehicle is a level disc at the height at which it flies. It touches what the plane at that
+height cuts from the bodies and from the surfaces of a mesh, and the walls at any height.
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from envs.scene import obstacles as bodies
 from envs.scene.collision import CELL_M, first_contact, ways_to_goal
 from envs.scene.layouts import (
     LAYOUTS,
@@ -31,41 +32,15 @@ from envs.scene.layouts import (
     with_overrides,
 )
 from envs.scene.mesh_file import is_mesh_path, read_mesh
-from envs.scene.obstacles import (
-    BOX,
-    CONE,
-    ELLIPSOID,
-    OBSTACLE,
-    POLE,
-    ROUNDING,
-    body_sections,
-    checked_mesh,
-    checked_obstacles,
-    mesh_sections,
-)
 from envs.scene.textures import Texture
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = [
-    "BOX",
-    "CONE",
-    "ELLIPSOID",
-    "LAYOUTS",
-    "OBSTACLE",
-    "POLE",
-    "Layout",
-    "MeshLayout",
-    "Scene",
-    "Texture",
-    "make_scene",
-]
-
 # The sun stands behind the start and to the right, so that the sides of a pole differ.
 SUN = (0.4, -0.5, math.sqrt(0.59))
-MAX_DRAWS = 20  # of a corridor, until one is passable
-HEIGHTS_KEPT = 8  # at which a scene remembers its sections
+MAX_DRAWS = 20  # of corridors, until one is passable
+MAX_HEIGHTS = 8  # for which a scene caches its sections
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,40 +83,36 @@ class Scene:
     mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def __post_init__(self) -> None:
-        """Keep read-only copies of the arrays; ValueError names the value that is refused."""
+        """Keep read-only copies of the arrays; ValueError names the wrong value and the rule."""
         _check_numbers(self)
-        depth = _depth(self.obstacle_texture)
-        object.__setattr__(self, "obstacles", checked_obstacles(self.obstacles, depth))
+        obstacles = bodies.checked_obstacles(self.obstacles, self.obstacle_texture.depth)
+        object.__setattr__(self, "obstacles", obstacles)
         if self.mesh is not None:
-            object.__setattr__(self, "mesh", checked_mesh(*self.mesh))
+            object.__setattr__(self, "mesh", bodies.checked_mesh(*self.mesh))
 
     @cached_property
     def kinds(self) -> frozenset[int]:
         """Kinds of obstacles that are there: POLE, CONE, ELLIPSOID, BOX."""
         return frozenset(np.unique(self.obstacles["kind"]).tolist())
 
-    @property
-    def is_still(self) -> bool:
-        """Whether nothing changes while the camera stands still."""
-        return not (self.ground_texture.moving or self.wall_texture.moving or self.obstacle_texture.moving)
-
     @cached_property
     def _sections(self) -> dict[float, np.ndarray]:
         return {}
 
     def sections(self, height_m: float = 2.0) -> np.ndarray:
-        """What a flight at `height_m` [m] can hit, walls aside.
+        """What a vehicle at `height_m` [m] can hit, walls aside; cached for a few heights.
 
         Returns:
             (M, 7) float64, read-only; see `envs.scene.obstacles`.
         """
         sections = self._sections.get(height_m)
         if sections is None:
-            sections = body_sections(self.obstacles, height_m)
+            found = [bodies.body_sections(self.obstacles, height_m)]
             if self.mesh is not None:
-                sections = np.concatenate([sections, mesh_sections(self.mesh[0], self.mesh[1], height_m)])
+                found.append(bodies.mesh_sections(self.mesh[0], self.mesh[1], height_m))
+            sections = np.concatenate(found)
             sections.flags.writeable = False
-            if len(self._sections) == HEIGHTS_KEPT:
+            if len(self._sections) == MAX_HEIGHTS:
                 self._sections.clear()
             self._sections[height_m] = sections
         return sections
@@ -160,8 +131,8 @@ class Scene:
         Args:
             a_m: Where the way begins, x and y [m].
             b_m: Where it ends.
-            radius_m: Of the disc [m].
-            height_m: At which it flies [m].
+            radius_m: Radius of the disc [m].
+            height_m: Height at which it flies [m].
 
         Returns:
             Fraction in [0, 1] of the segment, or inf if there is no contact.
@@ -182,7 +153,7 @@ class Scene:
         return self.first_contact(a_m, b_m, radius_m, height_m) <= 1.0
 
     def ways_to_goal(self, radius_m: float, height_m: float = 2.0) -> np.ndarray:
-        """From where the vehicle can reach the goal line, on a lattice of `envs.scene.collision.CELL_M`.
+        """From where the vehicle can reach the goal line, on a lattice of cells of `collision.CELL_M`.
 
         True is a proof for a vehicle whose steps are short against a cell; see
         `envs.scene.collision.ways_to_goal`.
@@ -243,8 +214,8 @@ def make_scene(
         name: A key of LAYOUTS, or the path of a mesh file that `trimesh` can read, whose
             surfaces stand in an otherwise empty lane.
         rng: Source of all that is random.
-        vehicle_radius_m: Of the vehicle that has to get through [m].
-        height_m: At which it flies [m].
+        vehicle_radius_m: Radius of the vehicle that has to get through [m].
+        height_m: Height at which it flies [m].
         **overrides: Values that replace fields of the layout, such as num_obstacles=60;
             those of a mesh file are the fields of `MeshLayout`.
 
@@ -259,17 +230,17 @@ def make_scene(
         )
     if name in LAYOUTS:
         layout = with_overrides(LAYOUTS[name], overrides)
-        scenes = (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
+        passable, scenes = layout.passable, (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
         remedy = "lower num_obstacles or the radii, raise min_gap_m, widen the lane"
     elif is_mesh_path(name):
-        layout = with_overrides(MeshLayout(), overrides)
-        scenes = (_mesh_corridor(name, layout) for _ in range(1))
+        lane = with_overrides(MeshLayout(), overrides)
+        passable, scenes = lane.passable, (_mesh_corridor(name, lane) for _ in range(1))
         remedy = "lower scale, widen the lane, fly at another height"
     else:
         known = ", ".join(sorted(LAYOUTS))
         raise ValueError(f"scene must be one of {known}, or the path of a mesh file, got {name!r}")
     for scene in scenes:
-        if not layout.passable or scene.passable(vehicle_radius_m, height_m):
+        if not passable or scene.passable(vehicle_radius_m, height_m):
             return scene
     raise ValueError(
         f"layout of scene {name!r} gave no corridor that a vehicle of radius {vehicle_radius_m} m can pass "
@@ -299,20 +270,17 @@ def _mesh_corridor(path: str, layout: MeshLayout) -> Scene:
 
 @functools.lru_cache(maxsize=2)
 def _read_mesh_corridor(path: str, stamp: tuple[int, int], layout: MeshLayout) -> Scene:
-    """The scene of a mesh file, read once: every episode flies the same; `stamp` tells a changed file."""
+    """The scene of a mesh file, read once for all episodes; `stamp` differs once the file has changed."""
     corners, normals, albedo = read_mesh(path)
-    bare = Scene(path, np.empty(0, OBSTACLE), width_m=layout.width_m, wall_height_m=layout.wall_height_m)
+    nothing = np.empty(0, bodies.OBSTACLE)
+    bare = Scene(path, nothing, width_m=layout.width_m, wall_height_m=layout.wall_height_m)
     luminance = bare.shade(albedo, normals[:, None, :]).ravel()
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return dataclasses.replace(bare, mesh=(layout.scale * corners.reshape(-1, 3), faces, luminance))
 
 
-def _depth(texture: Texture) -> float:
-    """By how much the pattern raises the albedo at most."""
-    return 0.0 if texture.plain else texture.contrast
-
-
 def _check_numbers(scene: Scene) -> None:
+    brightest = 1.0 + bodies.ROUNDING
     near, far = scene.walls_y_m
     left, right = scene.spawn_range_m
     sizes = (scene.length_m, scene.width_m, scene.wall_height_m)
@@ -328,6 +296,6 @@ def _check_numbers(scene: Scene) -> None:
         and max(scene.ambient + scene.diffuse, scene.sky_luminance) <= 1.0 + 1e-9,
         "sun must be a unit vector": len(scene.sun) == 3 and abs(math.hypot(*scene.sun) - 1.0) <= 1e-6,
         "ground_albedo and wall_albedo must be >= 0 and, times 1 + contrast of ground_texture and "
-        "wall_texture, <= 1": all(a >= 0.0 and a * (1.0 + _depth(t)) <= 1.0 + ROUNDING for a, t in surfaces),
+        "wall_texture, <= 1": all(a >= 0.0 and a * (1.0 + t.depth) <= brightest for a, t in surfaces),
     }
     refuse_unless(rules, f"scene {scene.name!r}", scene)

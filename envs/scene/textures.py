@@ -43,7 +43,7 @@ class Texture:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the values; ValueError names the one that is refused."""
+        """Check the values; ValueError names the wrong one and the rule."""
         if self.pattern not in PATTERNS:
             raise ValueError(f"texture pattern must be one of {PATTERNS}; got {self.pattern!r}.")
         if not 1e-3 <= self.period_m <= 1e4:
@@ -58,14 +58,14 @@ class Texture:
             raise ValueError(f"texture seed must be a whole number >= 0; got {self.seed!r}.")
 
     @property
-    def plain(self) -> bool:
-        """Whether the surface looks the same everywhere."""
-        return self.pattern == "plain" or self.contrast == 0.0
+    def depth(self) -> float:
+        """By which share of its mean the albedo changes at most."""
+        return 0.0 if self.pattern == "plain" else self.contrast
 
     @property
-    def moving(self) -> bool:
-        """Whether the surface changes with time."""
-        return not self.plain and self.velocity_mps != (0.0, 0.0)
+    def plain(self) -> bool:
+        """Whether the surface looks the same everywhere."""
+        return self.depth == 0.0
 
 
 def around(texture: Texture, radius_m: float) -> float:

@@ -74,5 +74,5 @@ def seconds(call: Callable[[], None]) -> float:
 
 if __name__ == "__main__":
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 3
-    figures = {variant: compare(variant, repeats=repeats) for variant in ("bytestream", "bytestream_xy")}
-    sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+    found = {variant: compare(variant, repeats=repeats) for variant in ("bytestream", "bytestream_xy")}
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")

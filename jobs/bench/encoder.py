@@ -29,7 +29,7 @@ PART = 50  # events whose rows are copied at once, to where the cache holds them
 
 
 def compare(coding: str, rounds: int = 15) -> dict[str, float]:
-    """Figures of one coding, at the paper's sizes."""
+    """Times of one coding, at the paper's sizes."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     evae = EventVAE(coding=coding).freeze()

@@ -1,4 +1,4 @@
-"""The event camera's time per frame against plain copying and against the paper's published design.
+"""The event camera's time per frame, compared with plain copying and with the paper's published design.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.events
 Expect: a table in about two minutes. All on one thread, medians of frames that take turns in
@@ -20,10 +20,9 @@ from collections.abc import Callable
 
 import numba
 import numpy as np
-from rich.table import Table
 
 from envs.events import EventCamera
-from jobs.run.progress import console
+from jobs.analysis.tables import show_table
 
 SIZES = ((64, 64), (346, 260), (640, 480), (1280, 720))
 SPEEDS = (("sparse", 0.1), ("dense", 1.0))  # pixels per frame
@@ -37,22 +36,20 @@ PUBLISHED_EVENT = np.dtype([("timestamp", "f8"), ("x", "u2"), ("y", "u2"), ("pol
 
 def main() -> None:
     """Measure and print the table."""
-    table = Table(title="Event camera, one thread, 5 ms per frame, threshold 0.2")
-    headings = ["pixels", "scene", "us/frame", "together", "events/pixel", "ns/pixel", "of copying"]
-    headings += ["published", "together"]
-    for heading in headings:
-        table.add_column(heading, justify="right")
+    head = ["pixels", "scene", "us/frame", "together", "events/pixel", "ns/pixel", "of copying"]
+    rows = []
     for width, height in SIZES:
         for name, speed in SPEEDS:
             frames = moving_gratings(width, height, speed)
-            events, seconds = measure(frames)
+            events, seconds = design_times(frames)
             pixels, ours, together = width * height, seconds["ours"], seconds["together"]
             times = (f"{1e6 * ours:,.1f}", f"{1e6 * together:,.1f}")
             row = (*times, f"{events / pixels:.4f}", f"{1e9 * ours / pixels:.2f}")
             ratios = [f"{ours / seconds['copying']:.1f}x"]
             ratios += [f"{seconds['published'] / one:.1f}x" for one in (ours, together)]
-            table.add_row(f"{width}x{height}", name, *row, *ratios)
-    console.print(table)
+            rows.append((f"{width}x{height}", name, *row, *ratios))
+    title = "Event camera, one thread, 5 ms per frame, threshold 0.2"
+    show_table(title, [*head, "published", "together"], rows, 2)
 
 
 def moving_gratings(width: int, height: int, speed: float) -> list[np.ndarray]:
@@ -74,7 +71,7 @@ def moving_gratings(width: int, height: int, speed: float) -> list[np.ndarray]:
     return frames
 
 
-def measure(frames: list[np.ndarray]) -> tuple[float, dict[str, float]]:
+def design_times(frames: list[np.ndarray]) -> tuple[float, dict[str, float]]:
     """Events per frame of the camera, and median seconds per frame of each of the designs."""
     height, width = frames[0].shape
     camera, published = EventCamera(width, height, contrast_threshold=THRESHOLD), Published(width, height)
@@ -112,7 +109,7 @@ class Published:
     """The design of the paper's published simulator, with the clock in microseconds."""
 
     def __init__(self, width: int, height: int) -> None:
-        """Make it for frames of (height, width)."""
+        """Make a camera for frames of (height, width)."""
         self._width = width
         self._last = np.zeros(width * height, np.float32)
         self._t_us = 0.0

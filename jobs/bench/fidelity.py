@@ -1,4 +1,4 @@
-"""How many renders and samples an event error takes: the measurements behind `envs.fidelity.plan`.
+"""How many renders and samples an event error takes: the measurements behind `envs.fidelity.plan_renders`.
 
 Run: python -m jobs.bench.fidelity [scene ...]
 Expect: about two minutes per scene on one core; poles and texture_change unless others are
@@ -10,35 +10,32 @@ what the plan achieves at tolerance 0.05.
 import dataclasses
 import sys
 
-from rich.table import Table
-
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
-from envs.event_error import REFERENCE_SAMPLES, measure
-from jobs.run.progress import console
+from envs.event_error import REFERENCE_SAMPLES, measure_event_error
+from jobs.analysis.tables import show_table
 
 RATES_HZ = (45.0, 100.0, 200.0, 400.0)
 THRESHOLDS = (0.05, 0.2, 0.5)
 RENDERS = (1, 2, 3, 4, 6, 8, 12, 16)
 SAMPLES = (1, 2, 3, 4)
-FLIGHTS, STEPS = 6, 12
+EPISODES, STEPS = 6, 12
 
 
 def main() -> None:
     """Measure and print one table per scene."""
+    head = [
+        *("Hz", "threshold"),
+        *(f"{count} renders" for count in RENDERS),
+        *(f"{count} samples" for count in SAMPLES),
+        *("plan", "its renders"),
+    ]
     for scene in sys.argv[1:] or ("poles", "texture_change"):
-        table = Table(title=f"Event error [%] in {scene}", title_justify="left")
-        heads = [
-            *(f"{k} renders" for k in RENDERS),
-            *(f"{n} samples" for n in SAMPLES),
-            "plan",
-            "its renders",
+        rows = [
+            (f"{hz:g}", f"{threshold:g}", *errors(scene, hz, threshold))
+            for hz in RATES_HZ
+            for threshold in THRESHOLDS
         ]
-        for head in ("Hz", "threshold", *heads):
-            table.add_column(head, justify="right")
-        for hz in RATES_HZ:
-            for threshold in THRESHOLDS:
-                table.add_row(f"{hz:g}", f"{threshold:g}", *errors(scene, hz, threshold))
-        console.print(table)
+        show_table(f"Event error [%] in {scene}", head, rows, 0)
 
 
 def errors(scene: str, hz: float, threshold: float) -> list[str]:
@@ -49,7 +46,10 @@ def errors(scene: str, hz: float, threshold: float) -> list[str]:
     tried = [FidelityConfig(max_step_m=step_m / renders, samples=exact) for renders in RENDERS]
     tried += [FidelityConfig(max_step_m=step_m / 32, samples=samples) for samples in SAMPLES]
     tried += [FidelityConfig()]
-    measured = [measure(dataclasses.replace(config, fidelity=fidelity), FLIGHTS, STEPS) for fidelity in tried]
+    measured = [
+        measure_event_error(dataclasses.replace(config, fidelity=fidelity), EPISODES, STEPS)
+        for fidelity in tried
+    ]
     return [f"{100 * accuracy.error:.1f}" for accuracy in measured] + [f"{measured[-1].renders:.0f}"]
 
 

@@ -1,4 +1,4 @@
-"""From the events of a control step to an action: how long a robot waits, by policy and window size.
+"""How long a robot waits from the events of a control step to an action, by policy and window size.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.latency
 Expect: a table in about a minute, one thread, wall time: the median and the 99th percentile of
@@ -16,18 +16,16 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import torch
-from rich.table import Table
 
-from envs.config import EnvConfig, sensor_settings
+from envs.config import EnvConfig
 from envs.events import EVENT
+from jobs.analysis.tables import show_table
 from jobs.bench.throughput import composed
-from jobs.run.progress import console
-from jobs.training.ppo import network_settings
-from jobs.training.pretrain import build_evae
+from jobs.training.ppo import policy_spec
+from models.encoder.evae import EventVAE
 from models.encoder.frozen import encoder_of
 from models.kinds import KINDS
 from models.policy import Policy
-from models.policy.features import FEATURES
 from models.policy.networks import build_networks
 from models.policy.onnx import export_onnx
 
@@ -39,28 +37,24 @@ WINDOW_US = 5000
 def main() -> None:
     """Measure and print the table."""
     torch.set_num_threads(1)
-    table = Table(title="Events to action in microseconds: p50 / p99 of Policy.act; p50 in onnxruntime")
-    table.add_column("policy")
-    for size in SIZES:
-        table.add_column(f"{size:,} events", justify="right")
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name, kind in KINDS.items():
-            if FEATURES[kind.feature].from_events is None:
+            if kind.observation == "luminance":
                 continue
             policy = random_policy(name)
             session = load(export_onnx(policy, Path(folder) / f"{name}.onnx"))
-            table.add_row(name, *(cell(policy, session, size) for size in SIZES))
-    console.print(table)
+            rows.append((name, *(latency_text(policy, session, size) for size in SIZES)))
+    title = "Events to action in microseconds: p50 / p99 of Policy.act; p50 in onnxruntime"
+    show_table(title, ["policy", *(f"{size:,} events" for size in SIZES)], rows)
 
 
 def random_policy(name: str) -> Policy:
     """A policy of the kind with its default sizes and random weights."""
     config = composed(f"model={name}")
-    networks = build_networks(network_settings(config))
-    encoder = None
-    if KINDS[name].encoder:
-        encoder = encoder_of(build_evae(config.model, sensor_settings(config.env)).freeze())
-    return Policy(networks.requires_grad_(False), network_settings(config), encoder)
+    spec = policy_spec(config)
+    encoder = encoder_of(EventVAE.of(spec.evae).freeze()) if spec.frozen else None
+    return Policy(build_networks(spec).requires_grad_(False), spec, encoder)
 
 
 def load(file: Path) -> Any:
@@ -70,8 +64,8 @@ def load(file: Path) -> Any:
     return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
 
 
-def cell(policy: Policy, session: Any, size: int) -> str:
-    """Both latencies for windows of `size` events."""
+def latency_text(policy: Policy, session: Any, size: int) -> str:
+    """Both latencies for windows of `size` events, as text."""
     events = random_events(size)
     rows = np.stack([events[field].astype(np.int64) for field in "txyp"], axis=1)
     inputs = {"events": rows, "window_us": np.array(WINDOW_US), "first": np.array(False)}

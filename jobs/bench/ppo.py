@@ -1,17 +1,15 @@
-"""Environment steps per second of whole PPO training, against stable-baselines3 on the same flights.
+"""Environment steps per second of whole PPO training, compared with stable-baselines3 in the same corridors.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo
 Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
 `jobs.training.ppo_learner`, "stable-baselines3" its PPO with the same networks, encoder, corridors and
-settings. All take turns in one process; an iteration flies 2,048 steps in 16 corridors and
-learns 10 epochs. Seconds are wall time, medians over the rounds: `ppo_fast` flies in processes
+settings. All take turns in one process; an iteration samples 2,048 steps in 16 corridors and
+learns 10 epochs. Seconds are wall time, medians over the rounds: `ppo_fast` samples in processes
 of its own, so the machine should be quiet. The second table is ours for every kind of policy.
 """
 
 import dataclasses
-import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,18 +19,18 @@ import gymnasium
 import numpy as np
 import torch
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
-from rich.table import Table
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
+from jobs.analysis.tables import show_table
 from jobs.bench.throughput import composed
+from jobs.bench.timing import interleaved
 from jobs.config.config import Config
-from jobs.config.schema import EVAE_SETTINGS
-from jobs.run.progress import console
 from jobs.run.ray_cluster import start_ray
-from jobs.training.ppo import build_ppo
+from jobs.training.ppo import build_ppo, policy_spec
+from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
 from models.encoder.weights import save_encoder
@@ -46,7 +44,7 @@ CONSTANT = "algo.lr_schedule=constant"
 
 
 class EncodedCorridors(VecEnv):
-    """Corridors as stable-baselines3 wants them: stacks of latents, each flight reset where it ends."""
+    """Corridors for stable-baselines3: stacks of latents, each episode followed by the next."""
 
     def __init__(self, num_envs: int, config: EnvConfig, table: EncoderTable, stack: int) -> None:
         """Make `num_envs` corridors that `table` encodes."""
@@ -56,7 +54,7 @@ class EncodedCorridors(VecEnv):
         super().__init__(num_envs, space, self.corridors[0].action_space)
 
     def reset(self) -> np.ndarray:
-        """Start all flights."""
+        """Start all episodes."""
         windows = [env.reset(seed=k << 32)[0] for k, env in enumerate(self.corridors)]
         self.stacks = np.zeros(self.shape, np.float32)
         self.stacks = self._push(np.stack(windows), np.ones(self.num_envs, bool))
@@ -67,11 +65,11 @@ class EncodedCorridors(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """Fly one step everywhere."""
+        """Simulate one step in every corridor."""
         results = [env.step(int(action)) for env, action in zip(self.corridors, self._actions, strict=True)]
         done = np.array([result[2] or result[3] for result in results])
         stacks = self._push(np.stack([result[0] for result in results]), np.zeros(self.num_envs, bool))
-        infos: list[dict[str, Any]] = [{} for _ in results]
+        infos: list[dict[str, object]] = [{} for _ in results]
         if done.any():
             windows = np.stack([results[k][0] for k in range(self.num_envs)])
             for k in np.flatnonzero(done):
@@ -85,10 +83,10 @@ class EncodedCorridors(VecEnv):
         return push_features(self.stacks, self.table.encode_windows(windows), first)
 
     def close(self) -> None:
-        """Close all."""
+        """Nothing to close."""
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """None is."""
+        """No corridor is wrapped."""
         return [False] * self.num_envs
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
@@ -109,38 +107,24 @@ def main() -> None:
     """Measure and print both tables."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        show("bytestream", seconds_of(against_others(Path(folder)), ROUNDS), "stable-baselines3, 32")
+        show("bytestream", interleaved(against_others(Path(folder)), ROUNDS), "stable-baselines3, 32")
         show(
-            "every policy, minibatches of 32", seconds_of(every_kind(Path(folder)), FEW_ROUNDS), "bytestream"
+            "every policy, minibatches of 32", interleaved(every_kind(Path(folder)), FEW_ROUNDS), "bytestream"
         )
 
 
 def show(title: str, seconds: dict[str, float], unit: str) -> None:
     """Print environment steps per second, and as multiples of one row."""
-    table = Table(title=f"PPO, {title}: iterations of {STEPS:,} steps that take turns, medians")
-    for head in ("training loop", "steps/s", f"of {unit}"):
-        table.add_column(head, justify="left" if head == "training loop" else "right")
-    for name, value in seconds.items():
-        table.add_row(name, f"{STEPS / value:,.0f}", f"{seconds[unit] / value:.2f}x")
-    console.print(table)
-
-
-def seconds_of(work: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Median wall time of each piece of work; the first round is not counted."""
-    taken: dict[str, list[float]] = {name: [] for name in work}
-    for turn in range(rounds + 1):
-        for name, piece in work.items():
-            start = time.perf_counter()
-            piece()
-            if turn:
-                taken[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in taken.items()}
+    rows = [
+        (name, f"{STEPS / value:,.0f}", f"{seconds[unit] / value:.2f}x") for name, value in seconds.items()
+    ]
+    title = f"PPO, {title}: iterations of {STEPS:,} steps that take turns, medians"
+    show_table(title, ("training loop", "steps/s", f"of {unit}"), rows)
 
 
 def against_others(folder: Path) -> dict[str, Callable[[], object]]:
     """One iteration on bytestream of our learner, RLlib's and stable-baselines3's."""
-    flown = composed().model
-    evae = EventVAE(flown.name, **{key: getattr(flown, key) for key in EVAE_SETTINGS}).freeze()
+    evae = EventVAE.of(evae_settings(composed())).freeze()
     path, table = encoder_file(evae, folder), EncoderTable.from_evae(evae)
     work: dict[str, Callable[[], object]] = {}
     for size in MINIBATCHES:
@@ -150,8 +134,8 @@ def against_others(folder: Path) -> dict[str, Callable[[], object]]:
         work[f"ours, {size}"] = ppo.build_algo().train
         theirs = ppo.copy(copy_frozen=False).learners(learner_class=PPOTorchLearner)
         work[f"RLlib's learner, {size}"] = theirs.build_algo().train
-        model = stable_baselines(config, table)
-        work[f"stable-baselines3, {size}"] = partial(model.learn, STEPS, reset_num_timesteps=False)
+        rival = stable_baselines(config, table)
+        work[f"stable-baselines3, {size}"] = partial(rival.learn, STEPS, reset_num_timesteps=False)
     fast = composed("algo=ppo_fast", CONSTANT)
     work["ours, algo=ppo_fast"] = build_ppo(fast, path).build_algo().train
     return work
@@ -164,9 +148,8 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
     rows["bytestream, fine-tuned"] = ["model=bytestream", "model.encoder=finetuned"]
     for name, words in rows.items():
         config = composed(*words, CONSTANT)
-        model = config.model
-        settings = {key: getattr(model, key) for key in EVAE_SETTINGS}
-        evae = EventVAE(model.name, **settings).freeze() if KINDS[model.name].encoder else None
+        needed = KINDS[config.model.name].encoder
+        evae = EventVAE.of(evae_settings(config)).freeze() if needed else None
         path = encoder_file(evae, folder) if evae else None
         work[name] = build_ppo(config, path).build_algo().train
     return work
@@ -175,15 +158,15 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
 def encoder_file(evae: EventVAE, folder: Path) -> Path:
     """The file of an encoder for the default sensor."""
     sensor = sensor_settings(EnvConfig())
-    path = folder / f"{evae.settings['variant']}.safetensors"
+    path = folder / f"{evae.settings.variant}.safetensors"
     save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
     return path
 
 
 def stable_baselines(config: Config, table: EncoderTable) -> PPO:
     """PPO of stable-baselines3 with an experiment's settings."""
-    algo, flown = config.algo, dataclasses.replace(config.env, split="train", observation="window")
-    corridors = EncodedCorridors(algo.num_envs_per_env_runner, flown, table, config.model.stack)
+    algo, env = config.algo, dataclasses.replace(config.env, split="train", observation="window")
+    corridors = EncodedCorridors(algo.num_envs_per_env_runner, env, table, config.model.stack)
     return PPO(
         "MlpPolicy",
         corridors,
@@ -197,7 +180,7 @@ def stable_baselines(config: Config, table: EncoderTable) -> PPO:
         vf_coef=algo.vf_loss_coeff,
         ent_coef=algo.entropy_coeff,
         max_grad_norm=algo.grad_clip,
-        policy_kwargs={"net_arch": list(config.model.hidden or ())},
+        policy_kwargs={"net_arch": policy_spec(config).hidden},
         device="cpu",
     )
 

@@ -14,17 +14,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from rich.table import Table
 
 from envs.corridor import CorridorEnv
 from envs.recordings import WRITERS, downscale_events, read_events, write_events
-from jobs.bench.throughput import interleaved
-from jobs.run.progress import console
+from jobs.analysis.tables import show_table
+from jobs.bench.timing import interleaved
 from jobs.run.provenance import REPOSITORY
 
 DATA = Path(os.environ.get("EVADE_DATA", REPOSITORY.parent / "shared" / "data"))
 SAMPLE = DATA / "expelliarmus_evt" / "evt3_sample.raw"
-FLIGHT_STEPS = 600
+SIMULATED_STEPS = 600
 
 
 def main() -> None:
@@ -43,21 +42,14 @@ def main() -> None:
             write_events(path, events, width, height, format)
         seconds = interleaved(work)
         sizes = {format: path.stat().st_size / len(events) for format, path in paths.items()}
-    table = Table(
-        title=f"{len(events):,} events of {source}, {width}x{height}; medians of interleaved rounds"
-    )
-    for heading in ("work", "Mev/s", "time / np.load", "bytes per event"):
-        table.add_column(heading, justify="left" if heading == "work" else "right")
     whole = seconds["np.load of npz"]
+    rows = []
     for name, taken in seconds.items():
         size = sizes.get(name.partition(" ")[2])
-        row = (
-            f"{len(events) / taken / 1e6:,.1f}",
-            f"{taken / whole:.2f}",
-            "" if size is None else f"{size:.2f}",
-        )
-        table.add_row(name, *row)
-    console.print(table)
+        speed = f"{len(events) / taken / 1e6:,.1f}", f"{taken / whole:.2f}"
+        rows.append((name, *speed, "" if size is None else f"{size:.2f}"))
+    title = f"{len(events):,} events of {source}, {width}x{height}; medians of interleaved rounds"
+    show_table(title, ("work", "Mev/s", "time / np.load", "bytes per event"), rows)
 
 
 def recording() -> tuple[np.ndarray, int, int, str]:
@@ -68,19 +60,18 @@ def recording() -> tuple[np.ndarray, int, int, str]:
     env = CorridorEnv()
     env.reset(seed=0)
     parts, clock_us = [], 0
-    for _ in range(FLIGHT_STEPS):
+    for _ in range(SIMULATED_STEPS):
         _, _, terminated, truncated, info = env.step(1)
         parts.append(env.events.copy())
         parts[-1]["t"] += clock_us
         if terminated or truncated:
             clock_us += info["t_us"]
             env.reset()
-    flown = np.concatenate(parts)
-    return flown, env.config.camera.width, env.config.camera.height, "a simulated flight"
+    return np.concatenate(parts), env.config.camera.width, env.config.camera.height, "a simulated flight"
 
 
 def load_npz(path: Path) -> list[np.ndarray]:
-    """What a reader without checks does."""
+    """Read the four arrays, without checks."""
     with np.load(path) as file:
         return [file[name] for name in ("t", "x", "y", "p")]
 

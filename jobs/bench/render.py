@@ -8,23 +8,24 @@ from the mean of 32 x 32 point samples per pixel, which at an upright edge is it
 up to 1 / 64 of a pixel.
 """
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
-from rich.table import Table
 
 from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer, sample_luminance
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture
 from envs.scene.obstacles import KINDS
-from jobs.run.progress import console
+from jobs.analysis.tables import show_table
+from jobs.bench.timing import interleaved
 
 ROUNDS = 9
-WAYS = np.linspace(0.0, 90.0, 30)
+PATH_M = np.linspace(0.0, 90.0, 30)
 POSES = ((0.3, 0.0, 2.0, 0.0), (-4.0, 30.0, 2.0, 0.2), (6.0, 55.0, 2.0, -0.5), (2.0, 70.0, 2.0, 0.05))
 SIZES = (64, 128, 256)
 
@@ -33,20 +34,19 @@ def main() -> None:
     """Measure and print both tables."""
     scenes = cases()
     times = frame_times(scenes)
-    table = Table(title=f"ms per frame, CPU time of one thread, medians of {ROUNDS} interleaved rounds")
-    for head in ("scene", *(f"{n}x{n}" for n in SIZES), "64x64, samples 2", "pyrender 64x64"):
-        table.add_column(head, justify="left" if head == "scene" else "right")
-    for name in scenes:
-        table.add_row(name, *(f"{value:.3f}" if value < math.inf else "none" for value in times[name]))
-    console.print(table)
-    table = Table(title="|difference| of luminance from 32 x 32 point samples, 64x64")
-    for head in ("scene", "samples", "mean", "p99.9", "largest"):
-        table.add_column(head, justify="left" if head == "scene" else "right")
+    title = f"ms per frame, CPU time of one thread, medians of {ROUNDS} interleaved rounds"
+    head = ("scene", *(f"{n}x{n}" for n in SIZES), "64x64, samples 2", "pyrender 64x64")
+    show_table(title, head, [
+        (name, *(f"{times[name, column]:.3f}" if (name, column) in times else "none" for column in head[1:]))
+        for name in scenes
+    ])  # fmt: skip
+    rows = []
     for name, scene in scenes.items():
         for samples, found in errors(scene).items():
-            figures = (found.mean(), np.quantile(found, 0.999), found.max())
-            table.add_row(name, str(samples), *(f"{value:.5f}" for value in figures))
-    console.print(table)
+            worst = (found.mean(), np.quantile(found, 0.999), found.max())
+            rows.append((name, str(samples), *(f"{value:.5f}" for value in worst)))
+    title = "|difference| of luminance from 32 x 32 point samples, 64x64"
+    show_table(title, ("scene", "samples", "mean", "p99.9", "largest"), rows)
 
 
 def cases() -> dict[str, Scene]:
@@ -97,37 +97,24 @@ def textured(scene: Scene, pattern: str) -> Scene:
     )
 
 
-def frame_times(scenes: dict[str, Scene]) -> dict[str, list[float]]:
-    """Milliseconds per frame, in the columns of the table; inf where there is no pyrender."""
-    stations: dict[tuple[str, int], Any] = {}
+def frame_times(scenes: Mapping[str, Scene]) -> dict[tuple[str, str], float]:
+    """Milliseconds per frame by scene and column of the table; without pyrender where EGL does not work."""
+    work: dict[tuple[str, str], Callable[[], object]] = {}
     for name, scene in scenes.items():
-        settings = [(size, 1) for size in SIZES] + [(64, 2)]
-        for column, (size, samples) in enumerate(settings):
-            stations[name, column] = RaycastRenderer(scene, size, size, samples=samples).render
-        stations[name, len(settings)] = pyrender_or_none(scene)
-    spent = {key: [one_round(render) for _ in range(2)][1:] for key, render in stations.items()}
-    for _ in range(ROUNDS - 1):
-        for key, render in stations.items():
-            spent[key].append(one_round(render))
-    return {name: [float(np.median(spent[name, column])) for column in range(5)] for name in scenes}
+        for size in SIZES:
+            work[name, f"{size}x{size}"] = partial(follow_path, RaycastRenderer(scene, size, size).render)
+        fine = RaycastRenderer(scene, 64, 64, samples=2)
+        work[name, "64x64, samples 2"] = partial(follow_path, fine.render)
+        with contextlib.suppress(RuntimeError, ValueError):
+            work[name, "pyrender 64x64"] = partial(follow_path, PyrenderRenderer(scene, 64, 64).render)
+    seconds = interleaved(work, ROUNDS, time.thread_time)
+    return {key: 1e3 * value / len(PATH_M) for key, value in seconds.items()}
 
 
-def pyrender_or_none(scene: Scene) -> Callable[..., Any] | None:
-    """The rival, where EGL works."""
-    try:
-        return PyrenderRenderer(scene, 64, 64).render
-    except (RuntimeError, ValueError):
-        return None
-
-
-def one_round(render: Callable[..., Any] | None) -> float:
-    """Milliseconds per frame of one flight."""
-    if render is None:
-        return math.inf
-    start = time.thread_time()
-    for y in WAYS:
-        render(0.3, float(y), 2.0)
-    return 1e3 * (time.thread_time() - start) / len(WAYS)
+def follow_path(render: Callable[..., object]) -> None:
+    """Render the frames along the path."""
+    for y_m in PATH_M:
+        render(0.3, float(y_m), 2.0)
 
 
 def errors(scene: Scene) -> dict[int, np.ndarray]:

@@ -1,10 +1,10 @@
 """How training and sweeps grow with cores: measured on simulated nodes of this machine, then a model.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.scaling [docs/images/scaling.png]
-Expect: five tables in about five minutes, and their figure if a file is named; the machine should be
-quiet. Nodes beyond this machine's cores share them, so that measured rates stop to grow there; the
-model says what they would be alone. Its inputs are the measured ones: seconds of a core for a step
-flown, seconds of the learner and bytes through the object store for a step learnt, seconds of a
+Expect: five tables in about five minutes, and their plot if a file is named; the machine should be
+quiet. Nodes beyond this machine's cores share them, so that measured rates stop growing there; the
+model predicts them for nodes of their own. Its inputs are measured: seconds of a core for a step
+simulated, seconds of the learner and bytes through the object store for a step learnt, seconds of a
 core for a condition, seconds of the driver for a trial.
 """
 
@@ -24,15 +24,14 @@ import ray
 from matplotlib.figure import Figure
 from ray import tune
 from ray.cluster_utils import Cluster
-from rich.table import Table
 
 from envs.config import EnvConfig
+from jobs.analysis.tables import show_table
 from jobs.bench.throughput import composed
 from jobs.config.config import HELD_OUT_SCENE
 from jobs.rollout.episodes import roll_out
 from jobs.rollout.executors import cached_agent
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.progress import console
 from jobs.run.ray_cluster import QUIET, WORKER_THREADS
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
@@ -40,7 +39,7 @@ from jobs.training.ppo import build_ppo
 STEPS = 2048  # of an iteration (appendix D.1.2)
 ROUNDS = 3
 TRIALS = 1000
-CELLS, CELL_FLIGHTS = 12, 7  # conditions flown to measure their rate; flights of one in the default sweep
+CONDITIONS, EPISODES = 12, 7  # evaluated to measure their rate; of one condition in the default sweep
 POLICY = "event_columns-s0"
 BANDWIDTH = 1e9  # of the network between nodes [bytes/s]: 10 Gbit/s
 CORES = (1, 2, 10, 100, 1000)
@@ -51,7 +50,7 @@ class Costs(NamedTuple):
     """What the model is made from.
 
     Attributes:
-        step_s: Of a core, for a step flown [s].
+        step_s: Of a core, for a simulated step [s].
         learn_s: Of the learner, for a step learnt; all runners wait [s].
         step_bytes: Through the object store, for a step.
         weight_bytes: To each runner, for an iteration.
@@ -76,8 +75,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for nodes, cores in ((1, 1), (1, 2), (2, 2)):
             with simulated(nodes, cores):
-                sweeps[nodes * cores] = CELLS / seconds_of(
-                    fly_condition, CELLS, Path(folder) / f"{nodes}{cores}"
+                sweeps[nodes * cores] = CONDITIONS / seconds_of(
+                    evaluate_condition, CONDITIONS, Path(folder) / f"{nodes}{cores}"
                 )
         for nodes in (1, 2):
             with simulated(nodes, cores=2):
@@ -92,7 +91,7 @@ def main() -> None:
     show_measured(rates, sweeps)
     show_model(costs)
     if sys.argv[1:]:
-        scaling_figure(costs, rates, sweeps).savefig(sys.argv[1], dpi=120)
+        plot_scaling(costs, rates, sweeps).savefig(sys.argv[1], dpi=120)
 
 
 def show_measured(rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]) -> None:
@@ -108,7 +107,7 @@ def show_model(costs: Costs) -> None:
     show("Costs", ("of", "is"), [(name, f"{value:.3g}") for name, value in costs._asdict().items()])
     show(
         "Training, the model",
-        ("cores", "env steps/s", "flying", "learning", "sending"),
+        ("cores", "env steps/s", "sampling", "learning", "sending"),
         [(cores, f"{STEPS / sum(parts):,.0f}", *(f"{part / sum(parts):.0%}" for part in parts))
          for cores in CORES for parts in [iteration_s(costs, cores)]],
     )  # fmt: skip
@@ -125,10 +124,8 @@ def conditions_per_s(costs: Costs, cores: int) -> float:
     return min(cores / costs.cell_s, 1 / costs.trial_s)
 
 
-def scaling_figure(
-    costs: Costs, rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]
-) -> Figure:
-    """Rates over cores: the model as a line, what was measured on this machine as points."""
+def plot_scaling(costs: Costs, rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]) -> Figure:
+    """Draw rates over cores: the model as a line, what was measured on this machine as points."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     cores = range(1, max(CORES) + 1)
@@ -138,7 +135,7 @@ def scaling_figure(
         own = {runners: rate for (n, runners), rate in rates.items() if n == nodes and runners}
         name = f"measured, {nodes} simulated node{'s' * (nodes > 1)}"
         left.plot(list(own), list(own.values()), "os"[nodes - 1], label=name)
-    left.set(xlabel="Cores that fly", ylabel="Environment steps per second", title="Training")
+    left.set(xlabel="Cores that sample", ylabel="Environment steps per second", title="Training")
     right.plot(cores, [3600 * conditions_per_s(costs, count) for count in cores], label="model")
     right.axhline(3600 / costs.trial_s, color="0.5", linestyle="--", label="the driver alone")
     right.plot(list(sweeps), [3600 * rate for rate in sweeps.values()], "o", label="measured on two cores")
@@ -151,9 +148,9 @@ def scaling_figure(
 
 
 def iteration_s(costs: Costs, cores: int) -> tuple[float, float, float]:
-    """Seconds of one PPO iteration that are spent flying, learning, and sending samples and weights.
+    """Seconds of one PPO iteration that are spent sampling, learning, and sending samples and weights.
 
-    A core flies for each runner; one process learns while they wait, and receives all samples.
+    Each runner samples on a core; one process learns while they wait, and receives all samples.
     """
     sent = STEPS * costs.step_bytes + cores * costs.weight_bytes
     return STEPS * costs.step_s / cores, STEPS * costs.learn_s, sent / BANDWIDTH
@@ -171,7 +168,7 @@ def bytes_sent(*words: str) -> tuple[float, float]:
 
 
 def training_rate(*words: str) -> tuple[float, float, float]:
-    """Environment steps per second of an iteration, and its seconds flying and learning per step."""
+    """Environment steps per second of an iteration, and its seconds sampling and learning per step."""
     algorithm = build_ppo(composed(*words)).build_algo()
     algorithm.train()  # compiles
     rates, shares = [], []
@@ -182,11 +179,11 @@ def training_rate(*words: str) -> tuple[float, float, float]:
         timers = result["timers"]
         shares.append((timers["env_runner_sampling_timer"] / STEPS, timers["learner_update_timer"] / STEPS))
     algorithm.stop()
-    flying, learning = (statistics.median(column) for column in zip(*shares, strict=True))
-    return statistics.median(rates), flying, learning
+    sampling, learning = (statistics.median(column) for column in zip(*shares, strict=True))
+    return statistics.median(rates), sampling, learning
 
 
-def seconds_of(trial: Callable[[dict[str, Any]], None], count: int, folder: Path) -> float:
+def seconds_of(trial: Callable[[dict[str, int]], None], count: int, folder: Path) -> float:
     """Wall time of so many trials, scheduled as a sweep's are, once a worker per core is there [s]."""
     os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = "3600"
     logging.getLogger("ray.tune").setLevel(
@@ -209,18 +206,17 @@ def seconds_of(trial: Callable[[dict[str, Any]], None], count: int, folder: Path
     return seconds
 
 
-def do_nothing(params: dict[str, Any]) -> None:
+def do_nothing(params: dict[str, int]) -> None:
     """A trial that costs its scheduling alone."""
     tune.report({"key": params["trial"]})
 
 
-def fly_condition(params: dict[str, Any]) -> None:
-    """A trial that flies what a policy flies under the default condition."""
-    first = CELL_FLIGHTS * params["trial"]
+def evaluate_condition(params: dict[str, int]) -> None:
+    """A trial that evaluates a policy under the default condition."""
+    first = params["trial"] * EPISODES
     agent = cached_agent(str(PRETRAINED / POLICY), "stochastic")
-    roll_out(
-        agent, EnvConfig(scene=HELD_OUT_SCENE, split="eval"), range(first, first + CELL_FLIGHTS), CELL_FLIGHTS
-    )
+    env = EnvConfig(scene=HELD_OUT_SCENE, split="eval")
+    roll_out(agent, env, range(first, first + EPISODES), EPISODES)
     tune.report({"key": params["trial"]})
 
 
@@ -242,14 +238,9 @@ def simulated(nodes: int, cores: int) -> Iterator[None]:
         cluster.shutdown()
 
 
-def show(title: str, heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
-    """Print a table."""
-    table = Table(title=title)
-    for head in heads:
-        table.add_column(head, justify="right")
-    for row in rows:
-        table.add_row(*(str(value) for value in row))
-    console.print(table)
+def show(title: str, heads: tuple[str, ...], rows: list[tuple[object, ...]]) -> None:
+    """Print a table of numbers."""
+    show_table(title, heads, [tuple(map(str, row)) for row in rows], 0)
 
 
 if __name__ == "__main__":

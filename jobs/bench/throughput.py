@@ -7,7 +7,6 @@ that the rows above them do; "of the loop" is their time as a share of the train
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 import yaml
-from rich.table import Table
 
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv, CorridorVectorEnv
@@ -24,14 +22,15 @@ from envs.events import EventCamera
 from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
+from jobs.analysis.tables import show_table
+from jobs.bench.timing import interleaved
 from jobs.config.config import Config, parse
-from jobs.config.schema import EVAE_SETTINGS
 from jobs.run.progress import console
+from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
 from models.encoder.weights import save_encoder
 
-ROUNDS = 5
 NUM_ENVS = 16
 CONFIG = EnvConfig()
 
@@ -40,24 +39,23 @@ def main() -> None:
     """Measure and print both tables."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    model = composed().model
-    evae = EventVAE(model.name, **{key: getattr(model, key) for key in EVAE_SETTINGS}).freeze()
+    evae = EventVAE.of(evae_settings(composed())).freeze()
     parts = [*frame_rows(), *step_rows(evae)]
     with TemporaryDirectory() as folder:
         loops = loop_rows(evae, Path(folder))
-    table = Table(title="One core, 64x64, scene poles, 200 Hz; medians of interleaved rounds")
-    for heading in ("station", "us", "per second", "of the loop"):
-        table.add_column(heading, justify="left" if heading == "station" else "right")
     whole = loops[0][1]
-    for name, seconds in [*parts, *loops]:
-        table.add_row(name, f"{1e6 * seconds:,.0f}", f"{1 / seconds:,.0f}", f"{seconds / whole:.1%}")
-    console.print(table)
+    rows = [
+        (name, f"{1e6 * seconds:,.0f}", f"{1 / seconds:,.0f}", f"{seconds / whole:.1%}")
+        for name, seconds in [*parts, *loops]
+    ]
+    title = "One core, 64x64, scene poles, 200 Hz; medians of interleaved rounds"
+    show_table(title, ("station", "us", "per second", "of the loop"), rows)
 
 
 def frame_rows() -> list[tuple[str, float]]:
     """Seconds per frame of each renderer, and per step of the event camera alone."""
     scene = make_scene("poles", np.random.default_rng(0))
-    ways = np.linspace(0.0, 90.0, 200)
+    path_m = np.linspace(0.0, 90.0, 200)
     raycast = RaycastRenderer(scene, 64, 64)
     frames = [raycast.render(0.0, 0.1 * step, 2.0).copy() for step in range(200)]
     camera = EventCamera(64, 64)
@@ -69,13 +67,13 @@ def frame_rows() -> list[tuple[str, float]]:
             camera.step(frame, next(clock_us))
 
     work: dict[str, Callable[[], object]] = {
-        "render: raycast": lambda: [raycast.render(0.0, y, 2.0) for y in ways],
+        "render: raycast": lambda: [raycast.render(0.0, y, 2.0) for y in path_m],
         "event camera": watch,
     }
     pyrender = _pyrender(scene)
     if pyrender is not None:
-        work["render: pyrender"] = lambda: [pyrender.render(0.0, y, 2.0) for y in ways]
-    return [(name, seconds / len(ways)) for name, seconds in interleaved(work).items()]
+        work["render: pyrender"] = lambda: [pyrender.render(0.0, y, 2.0) for y in path_m]
+    return [(name, seconds / len(path_m)) for name, seconds in interleaved(work).items()]
 
 
 def _pyrender(scene: Scene) -> PyrenderRenderer | None:
@@ -97,7 +95,7 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
     several = CorridorVectorEnv(NUM_ENVS, CONFIG)
     several.reset(seed=0)
 
-    def fly(env: CorridorEnv) -> None:
+    def step(env: CorridorEnv) -> None:
         env.reset(seed=0)
         over = False
         for _ in range(steps):
@@ -105,20 +103,20 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
             if over:
                 env.reset()
 
-    def fly_several(encode: bool) -> None:
+    def step_several(encode: bool) -> None:
         for _ in range(batches):
             windows = several.step(rng.integers(3, size=NUM_ENVS))[0]
             if encode:
                 table.encode_windows(windows)
 
     work: dict[str, Callable[[], object]] = {
-        "env step: raycast": lambda: fly(single),
-        f"env step: raycast, {NUM_ENVS} as a vector": lambda: fly_several(False),
-        f"env step: raycast, {NUM_ENVS} as a vector, encoded": lambda: fly_several(True),
+        "env step: raycast": lambda: step(single),
+        f"env step: raycast, {NUM_ENVS} as a vector": lambda: step_several(False),
+        f"env step: raycast, {NUM_ENVS} as a vector, encoded": lambda: step_several(True),
     }
     try:
         drawn.reset(seed=0)
-        work["env step: pyrender"] = lambda: fly(drawn)
+        work["env step: pyrender"] = lambda: step(drawn)
     except RuntimeError as error:
         console.print(str(error), markup=False)
     return [(name, seconds / steps) for name, seconds in interleaved(work).items()]
@@ -145,7 +143,7 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
     work: dict[str, Callable[[], object]] = {
         "training loop, the paper's minibatch of 32": algorithms[32].train,
         "training loop, minibatch of 256": algorithms[256].train,
-        "sampling: flights, networks, episodes": lambda: runner.sample(num_timesteps=size),
+        "sampling: simulation, networks, episodes": lambda: runner.sample(num_timesteps=size),
     }
     return [(name, seconds / size) for name, seconds in interleaved(work).items()]
 
@@ -156,19 +154,6 @@ def composed(*words: str) -> Config:
     command = [sys.executable, "-m", "platform.launch", "+exp=train", *algo, *words, "--cfg", "job"]
     said = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  own words, no shell
     return parse(yaml.safe_load(said.stdout))
-
-
-def interleaved(work: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Median seconds of each piece of work; the pieces take turns, so that a slow minute hits all."""
-    for piece in work.values():
-        piece()
-    taken: dict[str, list[float]] = {name: [] for name in work}
-    for _ in range(ROUNDS):
-        for name, piece in work.items():
-            start = time.perf_counter()
-            piece()
-            taken[name].append(time.perf_counter() - start)
-    return {name: float(np.median(seconds)) for name, seconds in taken.items()}
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pydantic_core import ErrorDetails
 
 from envs.config import STRICT, EnvConfig
 from jobs.config.conditions import axis_errors, condition_errors
-from jobs.config.env_keys import BESIDE_ENV, ENV_FIELDS, ENV_GROUPS, fields_of, flat_env, key_of
+from jobs.config.env_keys import BESIDE_ENV, ENV_GROUPS, ENV_KEYS, fields_of, flat_env, key_of
 from jobs.config.errors import SET_BY_JOBS, ConfigError, nearest, redacted
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
@@ -25,7 +25,6 @@ from jobs.config.schema import (
     ClusterConfig,
     CollectConfig,
     EvaluateConfig,
-    ModelConfig,
     Name,
     PretrainConfig,
     ProbeConfig,
@@ -36,7 +35,7 @@ from jobs.config.schema import (
     TradeSimulatorConfig,
     TrainConfig,
 )
-from models.kinds import KINDS, MIN_IMAGE
+from models.kinds import KINDS, Model, model_keys, read_model
 
 __all__ = ["HELD_OUT_SCENE", "Config", "ConfigError", "as_dict", "known_keys", "parse"]
 
@@ -62,7 +61,7 @@ class Config:
     resume: str | None
     runs_dir: Name
     env: EnvConfig
-    model: ModelConfig
+    model: Model
     algo: AlgoConfig
     collect: CollectConfig
     pretrain: PretrainConfig
@@ -96,6 +95,7 @@ def parse(values: Mapping[str, object]) -> Config:
     errors: list[str] = []
     parts: dict[str, object] = {"env": _env(values, errors)}
     parts |= {name: _section(section, values.get(name), name, errors) for name, section in SECTIONS.items()}
+    parts["model"] = _section(read_model, values.get("model"), "model", errors)
     top = {name: value for name, value in values.items() if name not in BESIDE_ENV}
     wrong = [name for name, part in parts.items() if part is None]
     config = _build(Config, {**top, **parts}, "", errors, skip=wrong)
@@ -123,10 +123,10 @@ def as_dict(config: Config) -> dict[str, object]:
 
 def known_keys() -> list[str]:
     """Every key that a configuration may have."""
-    keys = [*fields_of(Config), *BESIDE_ENV]
-    for name, section in (SECTIONS | ENV_GROUPS).items():
+    keys = [*fields_of(Config), *ENV_GROUPS, *ENV_KEYS]
+    for name, section in SECTIONS.items():
         keys += [f"{name}.{field}" for field in fields_of(section)]
-    return keys + [f"env.{name}" for name in ENV_FIELDS]
+    return keys + [f"model.{name}" for name in model_keys()]
 
 
 def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:
@@ -171,7 +171,9 @@ def _build(
 def _line(problem: ErrorDetails, key: str) -> str:
     """What pydantic found, as key, rule and value."""
     if problem["type"] == "unexpected_keyword_argument":
-        return f"{key}: no such key, got {problem['input']!r}{nearest(key, known_keys())}"
+        keys = known_keys()
+        hint = "; this kind of model has none" if key in keys else nearest(key, keys)
+        return f"{key}: no such key, got {problem['input']!r}{hint}"
     if problem["type"] in ("missing", "missing_argument", "value_error"):
         return f"{key}: {problem['msg'].removeprefix('Value error, ')}"
     return f"{key}: {problem['msg']}, got {problem['input']!r}"
@@ -207,10 +209,9 @@ def _size_errors(config: Config) -> Iterator[str]:
 
 def _image_errors(config: Config) -> Iterator[str]:
     """Sides of the sensor's image that are too small for the policy's network."""
-    if KINDS[config.model.name].network != "cnn" and config.model.name != "event_image_vae":
-        return
+    smallest = KINDS[config.model.name].min_side
     for name in ("width", "height"):
         side = getattr(config.env.camera, name)
-        if side < MIN_IMAGE:
-            rule = f"must be at least {MIN_IMAGE} for the network of {config.model.name}"
+        if side < smallest:
+            rule = f"must be at least {smallest} for the network of {config.model.name}"
             yield f"camera.{name}: {rule}, got {side}"

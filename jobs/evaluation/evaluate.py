@@ -31,7 +31,7 @@ from jobs.analysis.tables import (
 from jobs.analysis.video import Decode, open_film
 from jobs.config.config import HELD_OUT_SCENE, Config, as_dict
 from jobs.rollout.agents import BASELINES, StepInfo, make_agent
-from jobs.rollout.diagnostics import measure_event_error
+from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.episodes import Trajectory, TrajectoryRecorder, roll_out, write_episodes
 from jobs.rollout.executors import Executor
 from jobs.rollout.policies import EvaluatedPolicy, check_sensor, find_policy, read_policy
@@ -100,7 +100,7 @@ def evaluate(
     write_episodes(folder.evaluation / "episodes.csv", LABELS, episodes)
     publish(folder, tracker, summaries, trajectories(tasks))
     found = evaluation_metrics(summaries) | drift_by_label(results)
-    found |= measure_event_error(dataclasses.replace(config.env, scene=HELD_OUT_SCENE))
+    found |= report_event_error(dataclasses.replace(config.env, scene=HELD_OUT_SCENE))
     tracker.log(config.train.env_steps, found)
     if config.evaluate.video:
         task, file = tasks[0], folder.evaluation / "episode.mp4"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from envs.event_error import measure
+from envs.event_error import measure_event_error
 from jobs.rollout.agents import Agent, make_agent
 from jobs.rollout.diagnostics import DriftSampler
 from jobs.rollout.episodes import EPISODE, roll_out
@@ -104,7 +104,7 @@ def evaluate_part(part: Part) -> PartResult:
         raise ValueError(f"episodes must be finite, got NaN or infinity in {', '.join(bad)}")
     accuracy = None
     if part.measures_accuracy:
-        found = measure(task.env)
+        found = measure_event_error(task.env)
         accuracy = SimulationAccuracy(found.error, found.renders)
     return PartResult(episodes, drift.metrics(), accuracy)
 

@@ -13,7 +13,7 @@ from jobs.config.env_keys import ENV_KEYS, env_with
 from jobs.rollout.agents import BASELINES
 from jobs.run.folder import Run, latest_policies, named_policy
 from jobs.run.provenance import REPOSITORY
-from models.kinds import kind_of
+from models.kinds import find_kind
 from models.policy.policy import MANIFEST
 
 PRETRAINED = REPOSITORY / "models" / "pretrained"
@@ -60,7 +60,7 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     if missing:
         raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")
     group = str(manifest.get("exp", manifest["name"]))
-    identity, observation = settings_hash(manifest), kind_of(manifest).observation
+    identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
     return EvaluatedPolicy(agent, group, int(manifest["seed"]), identity, manifest["sensor"], observation)
 
 

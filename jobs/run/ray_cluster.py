@@ -6,6 +6,7 @@ import os
 import secrets
 import stat
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ QUIET = {
     "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }
-STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a machine that is busy
+MAX_STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a busy machine
 
 
 class ClusterError(RuntimeError):
@@ -87,10 +88,10 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
 
 
-def _start_local(settings: dict[str, Any]) -> None:
+def _start_local(settings: Mapping[str, object]) -> None:
     import ray
 
-    for _ in range(STARTS):
+    for _ in range(MAX_STARTS):
         try:
             ray.init(address="local", include_dashboard=False, **settings)
             return
@@ -98,7 +99,9 @@ def _start_local(settings: dict[str, Any]) -> None:
             if "timed out during startup" not in str(error):
                 raise
             ray.shutdown()
-    raise ClusterError(f"Ray did not start in {STARTS} times 30 s: the machine is too busy; try again later")
+    raise ClusterError(
+        f"Ray did not start in {MAX_STARTS} times 30 s: the machine is too busy; try again later"
+    )
 
 
 def fit(tuner: Any) -> Any:

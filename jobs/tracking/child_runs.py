@@ -1,8 +1,8 @@
-"""Finished runs below another in MLflow: a sweep's conditions and groups, a trade's settings."""
+"""Child runs in MLflow: finished runs of a sweep's conditions and groups, and of a trade's settings."""
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from envs.config import settings_hash
 from jobs.tracking.store import check_metrics, flatten
@@ -12,19 +12,19 @@ MAX_CHILDREN = 10_000  # of one run
 
 
 class ChildRun(NamedTuple):
-    """A finished run below another, with all that it holds."""
+    """A finished run below another, with its whole content."""
 
     name: str
-    params: Mapping[str, Any]
+    params: Mapping[str, object]
     tags: Mapping[str, str]
     metrics: Mapping[str, float]
     curves: Mapping[str, Mapping[int, float]] = {}  # metric -> its value at each step
 
 
 def write_child_runs(parent: Tracker, kind: str, children: Sequence[ChildRun]) -> None:
-    """Write finished runs below `parent`: three calls each, and none for one that is there unchanged.
+    """Write finished runs below `parent`: three calls each, and none for one that exists unchanged.
 
-    One whose content has changed takes the place of the run of the same name.
+    A run whose content has changed replaces the run of the same name.
     """
     from mlflow.entities import Metric, Param, RunTag
 
@@ -52,7 +52,7 @@ def write_child_runs(parent: Tracker, kind: str, children: Sequence[ChildRun]) -
 
 
 def _points(child: ChildRun) -> list[tuple[str, int, float]]:
-    """Name, step and value of everything that a child measured; what is no curve is at step 0."""
+    """Name, step and value of every metric of a child run; those that are not curves are at step 0."""
     curves = {name: {0: value} for name, value in child.metrics.items()} | dict(child.curves)
     check_metrics({name: sum(points.values()) for name, points in curves.items()})
     return [(name, step, value) for name, points in curves.items() for step, value in points.items()]

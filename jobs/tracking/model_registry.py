@@ -14,38 +14,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envs.config import settings_hash
+from jobs.run.files import read_json
 from jobs.run.provenance import REPOSITORY
 from jobs.tracking.tracker import Tracker
-from models.kinds import kind_of
+from models.kinds import find_kind
 from models.policy.policy import MANIFEST
 
 if TYPE_CHECKING:
     from mlflow.models import ModelSignature
 
 PREFIX = "evade-"
-NEEDED = (
-    "mlflow",
-    "numba",
-    "numpy",
-    "pandas",
-    "safetensors",
-    "torch",
-)  # by `jobs.tracking.served_policy` and `models`
+# Packages that `jobs.tracking.served_policy` and `models` import.
+NEEDED = ("mlflow", "numba", "numpy", "pandas", "safetensors", "torch")
 ABOUT = """\
-Policies of `{group}`, a version for each training; its tags name seed, length, commit and figures.
+Policies of `{group}`, a version for each training; its tags name seed, length, commit and metrics.
 
     model = mlflow.pyfunc.load_model("models:/{name}/1")
-    actions = model.predict(what_a_flight_has_seen)["action"]
+    actions = model.predict(observations_of_an_episode)["action"]
 
 Loading runs the code that lies beside the weights, as of any MLflow model; the weights alone are in
 the artifacts of the model, `artifacts/policy`, for `models.policy.load_policy`.
 """
-
-
 INTERFACE = (
-    "What one flight has seen, from its start: events t [us], x, y, p (-1 or +1), or pictures of luminance. "
-    "Out come, for its start and after each control step, the likeliest action (0 forward, 1 left, 2 right) "
-    "and the logits of all."
+    "The observations of one episode, from its start: events t [us], x, y, p (-1 or +1), or pictures of "
+    "luminance. Out come, for its start and after each control step, the likeliest action (0 forward, "
+    "1 left, 2 right) and the logits of all."
 )
 SHOWN = ("eval/success_rate", "eval/success_rate_low", "eval/success_rate_high", "eval/distance_m",
          "train/success_rate", "sim/event_error")  # fmt: skip
@@ -57,19 +50,19 @@ def register_training(tracker: Tracker, path: Path) -> str:
     Returns:
         As `register`.
     """
-    config = json.loads((path / "config.json").read_text())
+    config = read_json(path / "config.json")
     train, evaluated = (path / "stages" / f"{stage}.json" for stage in ("train", "evaluate"))
-    about = json.loads(train.read_text())
-    figures = about["figures"]
+    about = read_json(train)
+    metrics = about["figures"]
     if evaluated.is_file():
-        figures |= json.loads(evaluated.read_text())["figures"]["figures"]
+        metrics |= read_json(evaluated)["figures"]["figures"]
     tags = {name: config[name] for name in ("seed", "budget")} | {"run": path.name, "commit": about["commit"]}
     tags["env_steps"] = config["train"]["env_steps"]  # another length is no other model
-    tags |= {name: figures[name] for name in SHOWN if name in figures}
+    tags |= {name: metrics[name] for name in SHOWN if name in metrics}
     return register(tracker, path / "policy", config["exp"], tags)
 
 
-def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, Any]) -> str:
+def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, object]) -> str:
     """Register the policy of a training, once; a version that is there gets the new tags.
 
     Args:
@@ -145,7 +138,7 @@ def signature(manifest: Mapping[str, Any]) -> "ModelSignature":
     given = Schema(
         [ColSpec("long", "step"), ColSpec("long", "action"), *(ColSpec("float", name) for name in ACTIONS)]
     )
-    if kind_of(manifest).observation == "luminance":
+    if find_kind(manifest["name"]).observation == "luminance":
         shape = (-1, manifest["height"], manifest["width"])
         return ModelSignature(Schema([TensorSpec(np.dtype(np.float32), shape)]), given)
     window_us = round(1e6 / manifest["sensor"]["control_hz"])

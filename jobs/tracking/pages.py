@@ -1,8 +1,8 @@
-"""What a reader of MLflow's pages is told of the experiment and of each run, and the views that show them.
+"""The text on MLflow's pages of the experiment and of each run, and the views of its runs.
 
-Text and plain values; `jobs.tracking.tracker` writes them. Pages of MLflow hold pictures of their own size
-alone and fold a long text, so a run's page shows small pictures (`page/` among its artifacts) and
-begins with one line that says it all.
+These are texts and plain values; `jobs.tracking.tracker` writes them. MLflow shows pictures in their own
+size and folds long text, so a run's page shows small copies (`page/` among its artifacts) and begins
+with one line that sums it up.
 """
 
 import base64
@@ -11,7 +11,6 @@ import json
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from PIL import Image
 
@@ -24,11 +23,11 @@ MAX_CHARACTERS = 8000  # of a run's page; MLflow cuts what is longer, and does n
 PAGE_WIDTH = 860  # pixels of a picture beside MLflow's side panels on a screen of 1600
 PREVIEWS = "page"
 
-FIGURES = {  # metric: what it is, how it is written
+METRICS = {  # metric: what it is, how it is written
     "eval/success_rate": ("success in held-out corridors", "{:.0%}"),
     "eval/distance_m": ("distance without collision", "{:.1f} m"),
     "train/success_rate": ("success in training", "{:.0%}"),
-    "evae/explained_step": ("reconstruction explained by the latent", "{:.0%}"),
+    "evae/explained_loss_step": ("reconstruction explained by the latent", "{:.0%}"),
     "sweep/conditions": ("", "{:.0f} conditions"),
     "sweep/groups": ("", "{:.0f} groups of policies"),
     "sweep/episodes": ("", "{:.0f} episodes"),
@@ -50,13 +49,13 @@ READING = """
 |---|---|
 {kinds}
 
-A row of **Results** is a run folder: its page begins with its figures and holds the resolved settings
+A row of **Results** is a run folder: its page begins with its metrics and holds the resolved settings
 (Parameters), commit and host (Tags), and tables and films (Artifacts). Of a **sweep**, the page shows the
-figures with 95 % intervals; below it lie a run for each condition and group, named `axis=value group`, and a
+plots with 95 % intervals; below it lie a run for each condition and group, named `axis=value group`, and a
 run for each group, whose metrics `sweep/AXIS_success` are curves with the axis as their step. **Model
 registry**, on the left, has the trained policies: a model for each group, a version for each training.
 
-Success is the fraction of flights that reach the goal at 100 m, distance what is flown without a
+Success is the fraction of episodes that reach the goal at 100 m, distance the way without a
 collision. `sim/event_error` is how far the simulated events are from exact ones, `fidelity.tolerance`
 what was asked.
 """
@@ -74,7 +73,7 @@ def view_address(experiment_id: str, key: str) -> str:
     return f"#/experiments/{experiment_id}/runs?{WORKFLOW}&viewStateShareKey={key}{mode}"
 
 
-def table_view(search: str, columns: Sequence[str]) -> dict[str, Any]:
+def table_view(search: str, columns: Sequence[str]) -> dict[str, object]:
     """The state of a table of runs.
 
     Args:
@@ -85,7 +84,7 @@ def table_view(search: str, columns: Sequence[str]) -> dict[str, Any]:
     return {"searchFilter": search, **order, "selectedColumns": list(columns)}
 
 
-def chart_view(search: str, metrics: Sequence[str]) -> dict[str, Any]:
+def chart_view(search: str, metrics: Sequence[str]) -> dict[str, object]:
     """The state of a page of line charts, one for each metric; x is the metric's step."""
     section = {"uuid": "charts", "name": "Charts", "display": True, "isReordered": True}
     cards = [
@@ -105,14 +104,14 @@ def chart_view(search: str, metrics: Sequence[str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def usual_views() -> Iterator[tuple[str, str, dict[str, Any]]]:
+def usual_views() -> Iterator[tuple[str, str, dict[str, object]]]:
     """Key, name and state of the views that every store has."""
     for key, (name, search, columns) in COLUMNS.items():
         yield key, name, table_view(search, columns)
     yield "charts-learning", "Learning curves", chart_view("tags.kind = 'run'", CURVES)
 
 
-def packed_view(name: str, state: Mapping[str, Any], now_ms: int) -> str:
+def packed_view(name: str, state: Mapping[str, object], now_ms: int) -> str:
     """A view as MLflow stores it in a tag of the experiment."""
     packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
     return json.dumps({"name": name, "createdAt": now_ms, "updatedAt": now_ms, "state": packed})
@@ -166,7 +165,7 @@ class Page:
 
 
 def run_note(page: Page) -> str:
-    """The text at the top of a run's page: what it is, its figures, pictures and tables."""
+    """The text at the top of a run's page: what it is, its metrics, pictures and tables."""
     parts = [headline(page), links(page), *pictures(page), made(page)]
     used = sum(len(part) + 2 for part in parts)
     for path, text in page.tables.items():
@@ -179,20 +178,20 @@ def run_note(page: Page) -> str:
 
 
 def headline(page: Page) -> str:
-    """What the run is, and its main figures."""
+    """What the run is, and its main metrics."""
     job = JOBS.get(page.tags.get("job", ""))
     what = job.summary if job else "A run"
     named = ", ".join(page.params[name] for name in ("exp", "budget") if name in page.params)
-    figures = [_figure(page, name) for name in FIGURES if name in page.metrics]
+    metrics = [_metric_text(page, name) for name in METRICS if name in page.metrics]
     seed = page.params.get("seed", "-")
-    return f"**{what}** ({named}, seed {seed}): {', '.join(figures) or 'no figures yet'}."
+    return f"**{what}** ({named}, seed {seed}): {', '.join(metrics) or 'no metrics yet'}."
 
 
-def _figure(page: Page, name: str) -> str:
-    """A figure as text, with its interval if there is one."""
-    text, form = FIGURES[name]
-    bounds = [page.metrics.get(f"{name}_{end}") for end in ("low", "high")]
-    known = [form.format(bound) for bound in bounds if bound is not None]
+def _metric_text(page: Page, name: str) -> str:
+    """A metric as text, with its interval if there is one."""
+    text, form = METRICS[name]
+    ends = [page.metrics.get(f"{name}_{side}") for side in ("low", "high")]
+    known = [form.format(end) for end in ends if end is not None]
     value = f"{text} {form.format(page.metrics[name])}".strip()
     return value + (f" [{', '.join(known)}]" if len(known) == 2 else "")
 

@@ -1,4 +1,4 @@
-"""Results on their way to a tracking store that does not answer: kept in the run folder until it does."""
+"""Metrics that the tracking store has not taken yet: they wait in the run folder until it answers again."""
 
 import contextlib
 import json
@@ -7,25 +7,34 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from jobs.run.files import write_atomic
 
-REST_S = 30.0  # between two attempts, so that a store that is away does not hold up the work
-# How MLflow's calls meet a server that does not answer.
-PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "6"}  # 0, 4, 8, 16, 32 and 64 s apart
-QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
+RETRY_AFTER_S = 30.0  # so that a store that does not answer does not hold up the work
+# How often MLflow's calls try a server that does not answer.
+MANY_RETRIES = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "6"}  # 0, 4, 8, 16, 32 and 64 s apart
+NO_RETRIES = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
 
 
-class StoreAway(Exception):
-    """One call was not answered."""
+class StoreUnavailable(Exception):
+    """The store did not answer a call."""
+
+
+class LoggedStep(TypedDict):
+    """The metrics of one step, and the names of those that were not measured."""
+
+    step: int
+    time_ms: int
+    metrics: dict[str, float]
+    missing: list[str]
 
 
 @contextlib.contextmanager
-def calls(how: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables, which MLflow reads at each call, for a while."""
-    before = {name: os.environ.get(name) for name in how}
-    os.environ.update(how)
+def calling_with(retries: Mapping[str, str]) -> Iterator[None]:
+    """Set `MANY_RETRIES` or `NO_RETRIES` for a block: MLflow reads these variables at each call."""
+    before = {name: os.environ.get(name) for name in retries}
+    os.environ.update(retries)
     try:
         yield
     finally:
@@ -37,44 +46,44 @@ def calls(how: Mapping[str, str]) -> Iterator[None]:
 
 @dataclass
 class RetryQueue:
-    """What one MLflow run has still to be told, oldest first, as lines of JSON.
+    """The steps that one MLflow run still lacks, oldest first, as lines of JSON.
 
     Attributes:
-        file: Where it waits; there is none while nothing waits.
+        file: Where they wait; it exists only while some do.
     """
 
     file: Path
-    _next_s: float = field(default=0.0, repr=False)
+    _retry_at_s: float = field(default=0.0, repr=False)
 
-    def rows(self) -> list[dict[str, Any]]:
-        """What waits; half a line that a kill left is dropped."""
+    def rows(self) -> list[LoggedStep]:
+        """Read the steps that wait; half a line that a kill left is dropped."""
         text = self.file.read_text() if self.file.is_file() else ""
         return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
 
-    def deliver(self, new: Sequence[dict[str, Any]], send: Callable[[dict[str, Any]], None]) -> str | None:
-        """Send what waits and what is new, in order; keep what could not be sent.
+    def deliver(self, new: LoggedStep, send: Callable[[LoggedStep], None]) -> str | None:
+        """Send the steps that wait and the new one, in order; keep those that could not be sent.
 
         Args:
-            new: Rows to send after those that wait.
-            send: Sends one, or raises StoreAway; may be told the same row twice.
+            new: The step to send after those that wait.
+            send: Sends one, or raises StoreUnavailable; may get the same step twice.
 
         Returns:
-            Why rows wait from now on; None if none wait, or if they waited before.
+            Why steps wait from now on; None if none wait, or if some waited before.
         """
         waited = self.rows()
-        if waited and time.monotonic() < self._next_s:
-            self._keep([*waited, *new])
+        rows = [*waited, new]
+        if waited and time.monotonic() < self._retry_at_s:
+            self._keep(rows)
             return None
-        rows = [*waited, *new]
         for sent, row in enumerate(rows):
             try:
                 send(row)
-            except StoreAway as error:
+            except StoreUnavailable as error:
                 self._keep(rows[sent:])
-                self._next_s = time.monotonic() + REST_S
+                self._retry_at_s = time.monotonic() + RETRY_AFTER_S
                 return None if waited else str(error)
         self.file.unlink(missing_ok=True)
         return None
 
-    def _keep(self, rows: Sequence[dict[str, Any]]) -> None:
+    def _keep(self, rows: Sequence[LoggedStep]) -> None:
         write_atomic(self.file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))

@@ -1,7 +1,7 @@
-"""A registered policy as MLflow runs it: what a flight has seen in, the action of each control step out.
+"""A registered policy as MLflow runs it: the observations of one episode in, an action per control step out.
 
 MLflow keeps this script and the package `models` beside the policy's files and runs them where the
-model is loaded ("model from code"); nothing is pickled. A prediction is one flight from its start,
+model is loaded ("model from code"); nothing is pickled. A prediction is one episode from its start,
 so that the same input gives the same answer.
 """
 
@@ -27,36 +27,36 @@ class ServedPolicy(PythonModel):
 
     # Annotated as a table alone: any other annotation makes MLflow warn, or change the input.
     def predict(
-        self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None
+        self, context: Any, model_input: pd.DataFrame, params: dict[str, int] | None = None
     ) -> pd.DataFrame:
-        """The likeliest action of each control step of one flight, with the logits of all.
+        """The likeliest action of each control step of one episode, with the logits of all actions.
 
         Args:
             context: Of MLflow; unused.
-            model_input: Events as columns t [us since the flight's start], x, y [pixels], p (-1 or
+            model_input: Events as columns t [us since the episode's start], x, y [pixels], p (-1 or
                 +1), in time order; for a policy that sees luminance float32 (steps, H, W).
             params: `window_us`, the length of a control step [us].
 
         Returns:
-            A row per decision: `step` (0 at the flight's start, then one after each control step),
+            A row per decision: `step` (0 at the episode's start, then one after each control step),
             `action` and a logit for each of `ACTIONS`.
 
         Raises:
-            ValueError: Events before the flight's start, or not in time order.
+            ValueError: Events before the episode's start, or not in time order.
         """
-        policy = Policy(self.loaded.networks, self.loaded.manifest, self.loaded.encoder)
+        policy = Policy(self.loaded.networks, self.loaded.spec, self.loaded.encoder)
         if policy.observation == "luminance":
             logits = [policy.logits(picture[None])[0] for picture in np.asarray(model_input)]
         else:
             window_us = int((params or {})["window_us"])
             logits = [policy.event_logits(*step) for step in control_steps(model_input, window_us)]
         table = np.reshape(logits, (-1, len(ACTIONS)))
-        columns: dict[str, Any] = {"step": np.arange(len(table)), "action": table.argmax(axis=1)}
+        columns: dict[str, np.ndarray] = {"step": np.arange(len(table)), "action": table.argmax(axis=1)}
         return pd.DataFrame(columns | dict(zip(ACTIONS, table.T, strict=True)))
 
 
 def control_steps(events: pd.DataFrame, window_us: int) -> Iterator[tuple[dict[str, np.ndarray], int, int]]:
-    """What a flight's decisions are made from: nothing at its start, then the events of each control step.
+    """The inputs of an episode's decisions: nothing at its start, then the events of each control step.
 
     Yields:
         Fields by name, start and length [us] of each step, up to that of the newest event; it has
@@ -69,7 +69,7 @@ def control_steps(events: pd.DataFrame, window_us: int) -> Iterator[tuple[dict[s
     t = fields["t"]
     if len(t) and (t[0] <= 0 or np.any(np.diff(t) < 0)):
         raise ValueError(
-            f"t must begin above 0, at the flight's start, and never fall, got {t[:3]}...; sort by t"
+            f"t must begin above 0, at the episode's start, and never fall, got {t[:3]}...; sort by t"
         )
     ends_us = np.arange(0, t[-1] + window_us if len(t) else 1, window_us)
     first = 0

@@ -1,16 +1,15 @@
-"""Where the tracking store is, and what may be written to it; plain values, no tracker needed."""
+"""The address of the tracking store, and checks of what is written to it."""
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from jobs.config.config import Config, ConfigError
 from jobs.config.errors import HIDDEN, redacted
 from jobs.run.provenance import REPOSITORY
 
 SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep")
-MAX_METRICS = 40  # of one call; a page with hundreds of charts cannot be read, nor drawn
+MAX_METRICS = 40  # of one call; a page with hundreds of charts can be neither read nor drawn
 MAX_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
 LOCAL_PAGE = "http://127.0.0.1:5000"
 
@@ -39,17 +38,17 @@ def store_uri(config: Config) -> str:
 
 
 def page(uri: str) -> str:
-    """Where a browser finds a tracking store; it will ask for the password."""
+    """The address of a tracking store in a browser, which will ask for the password."""
     return redacted(uri).replace(f"{HIDDEN}@", "").rstrip("/") if uri.startswith("http") else LOCAL_PAGE
 
 
 def dashboard_command(uri: str) -> str:
-    """What a person types to serve a store to browsers of this machine only."""
+    """The command that serves a store to browsers of this machine only."""
     return "make mlflow" if uri == f"sqlite:///{REPOSITORY / 'mlflow.db'}" else server_command(uri)
 
 
 def server_command(uri: str) -> str:
-    """The server itself, whatever the store: variables and words."""
+    """The server's command for any store: variables and words."""
     lean = (
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true "
         "MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false"
@@ -72,7 +71,7 @@ def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
     return values
 
 
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten(values: Mapping[str, object], prefix: str = "") -> dict[str, str]:
     """Nested settings as `outer.inner` -> text; a text that MLflow would cut is refused."""
     flat: dict[str, str] = {}
     for key, value in values.items():

@@ -1,11 +1,11 @@
-"""What happened, written to MLflow; the only file that talks to it.
+"""Runs in MLflow: their parameters, metrics, tags, files and pages.
 
-One process creates the store (two at once break it), the driver alone writes, and it writes in
-batches: hundreds of single writes cost seconds, a batch a few hundredths of one.
+One process creates the store (two at once break it). Only the driver writes, in batches: hundreds of
+single writes take seconds, a batch a few hundredths of one.
 
-A store that does not answer holds up no training: curves wait in the run folder and are delivered
-when it is back. All else (tables, figures, the runs themselves) waits for it two minutes, then
-stops with what is computed in the run folder, from where the same command records it.
+A store that does not answer holds up no training: metrics wait in the run folder and are delivered
+when it answers again. All else (tables, plots, the runs themselves) waits for it two minutes, then
+the job stops; what it computed is in the run folder, and the same command records it from there.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from envs.config import settings_hash
@@ -44,7 +44,14 @@ from jobs.tracking.pages import (
     usual_views,
     view_address,
 )
-from jobs.tracking.retry_queue import PATIENT, QUICK, RetryQueue, StoreAway, calls
+from jobs.tracking.retry_queue import (
+    MANY_RETRIES,
+    NO_RETRIES,
+    LoggedStep,
+    RetryQueue,
+    StoreUnavailable,
+    calling_with,
+)
 from jobs.tracking.store import check_metrics, dashboard_command, flatten, page, store_uri
 
 if TYPE_CHECKING:
@@ -53,7 +60,7 @@ if TYPE_CHECKING:
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
 KNOWN_RUNS = "tracking.json"  # in a run folder
-AWAY = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # codes of MLflow's that another attempt may not meet
+UNAVAILABLE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # MLflow's codes after which a retry may help
 
 
 class TrackingError(RuntimeError):
@@ -85,19 +92,24 @@ class Tracker:
         values = check_metrics(metrics)
         missing = sorted(name for name, value in values.items() if math.isnan(value))
         measured = {name: value for name, value in values.items() if name not in missing}
-        row = {"step": step, "time_ms": int(time.time() * 1000), "metrics": measured, "missing": missing}
-        with calls(QUICK):
-            reason = self.retry_queue.deliver([row], self._send)
+        row: LoggedStep = {
+            "step": step,
+            "time_ms": int(time.time() * 1000),
+            "metrics": measured,
+            "missing": missing,
+        }
+        with calling_with(NO_RETRIES):
+            reason = self.retry_queue.deliver(row, self._send)
         if reason is not None:
             console.print(
                 f"{self.uri} does not answer, results wait in {self.retry_queue.file}: {reason}", markup=False
             )
 
-    def _send(self, row: Mapping[str, Any]) -> None:
-        """Write what `log` was told; the same row twice is the same points once, as their times are equal.
+    def _send(self, row: LoggedStep) -> None:
+        """Write the metrics of a step; writing the same row twice adds no points, as their times are equal.
 
         Raises:
-            StoreAway: The store does not answer.
+            StoreUnavailable: The store does not answer.
         """
         from mlflow.entities import Metric, RunTag
         from mlflow.exceptions import MlflowException
@@ -108,9 +120,9 @@ class Tracker:
         try:
             self.client.log_batch(self.run_id, metrics=metrics, tags=tags)
         except MlflowException as error:
-            if error.error_code not in AWAY:
+            if error.error_code not in UNAVAILABLE:
                 raise
-            raise StoreAway(_reason(error)) from error
+            raise StoreUnavailable(_reason(error)) from error
 
     def log_once(self, step: int, metrics: Mapping[str, float]) -> None:
         """Write only what the run does not hold yet: MLflow would draw a repeated point twice."""
@@ -121,7 +133,7 @@ class Tracker:
         }
         self.log(step, {name: value for name, value in metrics.items() if (name, step, value) not in held})
 
-    def params(self, values: Mapping[str, Any]) -> None:
+    def params(self, values: Mapping[str, object]) -> None:
         """Write settings that the run does not have yet, nested mappings as `outer.inner`."""
         from mlflow.entities import Param
 
@@ -130,21 +142,21 @@ class Tracker:
         for first in range(0, len(new), BATCH):
             self.client.log_batch(self.run_id, params=new[first : first + BATCH])
 
-    def tags(self, values: Mapping[str, Any]) -> None:
+    def tags(self, values: Mapping[str, object]) -> None:
         """Write tags; a tag that exists takes the new value."""
         from mlflow.entities import RunTag
 
         self.client.log_batch(self.run_id, tags=[RunTag(key, str(value)) for key, value in values.items()])
 
     def figure(self, name: str, figure: "Figure") -> None:
-        """Write a figure as a picture file called `name`."""
+        """Write a plot as a picture file called `name`."""
         self.client.log_figure(self.run_id, figure, name, save_kwargs={"dpi": 120})
 
     def text(self, name: str, text: str) -> None:
         """Write a text file called `name`."""
         self.client.log_text(self.run_id, text, name)
 
-    def table(self, name: str, columns: Mapping[str, Sequence[Any]]) -> None:
+    def table(self, name: str, columns: Mapping[str, Sequence[object]]) -> None:
         """Write a table as `name`.json; the values of its first column must be unique."""
         self.client.log_table(self.run_id, dict(columns), f"{name}.json")
 
@@ -157,7 +169,7 @@ class Tracker:
         run_id = _known_runs(path).get(_slot(self, "run"), self.run_id)
         return dataclasses.replace(self, run_id=run_id)
 
-    def save_view(self, key: str, name: str, state: Mapping[str, Any]) -> None:
+    def save_view(self, key: str, name: str, state: Mapping[str, object]) -> None:
         """Store a view of the experiment's runs under "Views", unless it is there unchanged.
 
         Args:
@@ -180,7 +192,7 @@ class Tracker:
             self.client.set_experiment_tag(self.experiment_id, NOTE, note)
 
     def write_page(self) -> None:
-        """Write the text at the top of the run's page anew, with small copies of all its pictures."""
+        """Rewrite the text at the top of the run's page, with small copies of all its pictures."""
         files = [path for path in self.files() if not path.startswith(f"{PREVIEWS}/")]
         with tempfile.TemporaryDirectory() as place:
             pictures = [path for path in files if path.endswith(".png")]
@@ -216,8 +228,8 @@ class Tracker:
 def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Tracker]:
     """Write to the MLflow run of a run folder: the one it had before, or a new one.
 
-    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C. Whoever writes
-    to it works in the run folder: no other process may.
+    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C. Meanwhile no other
+    process can work in the run folder.
 
     Args:
         config: Names the store and the experiment; its settings become parameters.
@@ -253,10 +265,10 @@ def _answering(uri: str, folder: Run) -> Iterator[None]:
     from mlflow.exceptions import MlflowException
 
     try:
-        with calls(PATIENT):
+        with calling_with(MANY_RETRIES):
             yield
-    except (MlflowException, StoreAway) as error:
-        if isinstance(error, MlflowException) and error.error_code not in AWAY:
+    except (MlflowException, StoreUnavailable) as error:
+        if isinstance(error, MlflowException) and error.error_code not in UNAVAILABLE:
             raise
         rest = f"what was computed is in {folder.path}, the same command records it"
         raise TrackingError(
@@ -271,7 +283,7 @@ def _reason(error: Exception) -> str:
 
 @contextlib.contextmanager
 def _ended(tracker: Tracker) -> Iterator[None]:
-    """End the run as what its block turned out to be; deliver what waits before it is finished."""
+    """Set the run's status at the end of a block; deliver the metrics that wait before it is finished."""
     from mlflow.exceptions import MlflowException
 
     try:
@@ -282,8 +294,8 @@ def _ended(tracker: Tracker) -> Iterator[None]:
         tracker.client.set_terminated(tracker.run_id, "FINISHED")
     except BaseException as error:
         status = "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
-        # A store that does not answer must not hide why the block ended.
-        with contextlib.suppress(MlflowException), calls(QUICK):
+        # An error of the store must not hide why the block ended.
+        with contextlib.suppress(MlflowException), calling_with(NO_RETRIES):
             tracker.client.set_terminated(tracker.run_id, status)
         raise
 
@@ -300,7 +312,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
             near.client.log_batch(run_id, tags=[])
             return replace(near, run_id=run_id)
         except MlflowException as error:  # the run was deleted: begin a new one
-            if error.error_code in AWAY:
+            if error.error_code in UNAVAILABLE:
                 raise
     run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
     write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})

@@ -21,7 +21,7 @@ from envs.kinematics import NUM_ACTIONS
 from envs.recordings import Recording, write_recording
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.agents import Agent, StepInfo, make_agent
-from jobs.rollout.diagnostics import measure_event_error
+from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.policies import check_sensor
 from jobs.run.folder import Run, finish, finished, locate_run, named_policy, open_run
 from jobs.run.progress import progress
@@ -72,7 +72,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_flights"] = recording.about["flights"]
     if config.collect.scenes:
-        figures |= measure_event_error(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
+        figures |= report_event_error(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
     tracker.log(0, figures)
     return finish(folder, "collect", figures)
 

@@ -18,14 +18,12 @@ from envs.config import Observation, sensor_differences, sensor_settings, settin
 from envs.corridor import CorridorVectorEnv
 from jobs.config.conditions import env_with
 from jobs.config.config import Config, ConfigError
-from jobs.config.schema import EVAE_SETTINGS
 from jobs.rollout.diagnostics import drift_metrics
 from jobs.training.env_runner import MAX_SAMPLE_S, PlainEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
 from models.encoder.evae import EventVAE
-from models.encoder.finetuned import evae_settings
-from models.encoder.weights import EncoderFileError, load_encoder
-from models.kinds import KINDS
+from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
+from models.kinds import KINDS, PolicySpec
 from models.policy.rllib_module import module_spec
 
 
@@ -71,7 +69,7 @@ LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cann
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 
 
-class FlightMetrics(RLlibCallback):
+class EpisodeMetrics(RLlibCallback):
     """What flights look like, read off the environments' infos; rewards are the true ones.
 
     An iteration ends two or three flights, so their figures are means over the last `EPISODES`. Flights
@@ -85,7 +83,7 @@ class FlightMetrics(RLlibCallback):
         self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
         self._unfinished: dict[str, float] = {}
         self._rounds = 0
-        self._encoder: tuple[EventVAE, dict[str, Any]] | None = None
+        self._encoder: tuple[EventVAE, EncoderManifest] | None = None
 
     def on_sample_end(
         self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
@@ -126,17 +124,17 @@ class FlightMetrics(RLlibCallback):
         None without an encoder, or where its file is no longer there: the frozen part that
         flies has no decoder.
         """
-        about = module.model_config["encoder_file"]
-        if about is None or not module.met:
+        file = module.model_config["encoder_file"]
+        if file is None or not module.met:
             return {}
         if self._encoder is None:
             try:
                 with torch.random.fork_rng(devices=[]):  # a model is made with random weights first
-                    self._encoder = load_encoder(about["path"])
+                    self._encoder = load_encoder(file.path)
             except EncoderFileError:
                 return {}
         evae, manifest = self._encoder
-        if manifest["sha256"] != about["digest"]:
+        if manifest["sha256"] != file.digest:
             return {}
         return drift_metrics(evae, module.met, manifest.get("figures", {}))
 
@@ -144,7 +142,7 @@ class FlightMetrics(RLlibCallback):
 def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:
     """The figures of a flight that has ended, from its last info."""
     return {
-        "flight_return": episode_return,
+        "episode_return": episode_return,
         "success_rate": float(info["success"]),
         "collision_rate": float(info["collision"]),
         "distance_m": float(info["distance_m"]),
@@ -165,12 +163,12 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
         ConfigError: If the encoder was made for another sensor, or for another model than the
             one to fine-tune.
     """
-    algo, settings = config.algo, network_settings(config)
+    algo = config.algo
     # It learns while the processes that fly, if any, wait: together they need a core for each of these.
     runners = algo.num_env_runners
     own_cpus = LITTLE if runners else 1
     register_env(ENV, make_corridors)
-    spec = module_spec(settings, config.seed, pretrained_encoder(config, encoder_path))
+    spec = module_spec(policy_spec(config), config.seed, pretrained_encoder(config, encoder_path))
     return (
         PPOConfig()
         .environment(ENV, env_config=corridor_settings(config), disable_env_checking=True)
@@ -207,7 +205,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             grad_clip_by="global_norm",
         )
         .rl_module(rl_module_spec=spec)
-        .callbacks(FlightMetrics)
+        .callbacks(EpisodeMetrics)
         .reporting(metrics_num_episodes_for_smoothing=EPISODES)
         .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
         .debugging(seed=config.seed, log_level="ERROR")
@@ -242,23 +240,14 @@ def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
     return CorridorVectorEnv(context["num_envs"], worlds)
 
 
-def network_settings(config: Config) -> dict[str, Any]:
+def policy_spec(config: Config) -> PolicySpec:
     """What the policy's networks are built from."""
-    model, camera = config.model, config.env.camera
-    return {
-        "name": model.name,
-        "width": camera.width,
-        "height": camera.height,
-        "encoder": model.encoder,
-        **{name: getattr(model, name) for name in EVAE_SETTINGS},
-        "stack": model.stack,
-        "hidden": model.hidden,
-        "num_actions": NUM_ACTIONS,
-    }
+    camera = config.env.camera
+    return PolicySpec(config.model, camera.width, camera.height, NUM_ACTIONS)
 
 
-def policy_settings(config: Config) -> dict[str, Any]:
-    """What a policy must be flown with, for its manifest."""
+def policy_about(config: Config) -> dict[str, object]:
+    """What a policy's manifest records of its environment and training, beside its `policy_spec`."""
     sensor = sensor_settings(config.env)
     return {
         "exp": config.exp,
@@ -267,12 +256,11 @@ def policy_settings(config: Config) -> dict[str, Any]:
         "sensor": sensor,
         "sensor_hash": settings_hash(sensor),
         "seed": config.seed,
-        **network_settings(config),
         "ppo": dataclasses.asdict(config.algo),
     }
 
 
-def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, dict[str, Any]] | None:
+def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, EncoderManifest] | None:
     """The encoder file with its manifest; None for a policy without one.
 
     Raises:
@@ -292,8 +280,7 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
         )
         remedy = "use its settings, or pretrain an encoder for these"
         raise ConfigError(f"encoder: was made for another sensor: {values}; {remedy}")
-    if config.model.encoder == "finetuned":
-        wanted = evae_settings(network_settings(config))
-        if wanted != about["model"]:
-            raise ConfigError(f"encoder: must be one of {wanted} to be fine-tuned, got {about['model']}")
+    spec = policy_spec(config)
+    if spec.finetuned and spec.evae != about["model"]:
+        raise ConfigError(f"encoder: must be one of {spec.evae} to be fine-tuned, got {about['model']}")
     return path, about

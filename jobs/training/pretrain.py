@@ -6,6 +6,7 @@ with its manifest, and `encoder/reconstructions.png`, in the run folder. A kille
 continues from its last checkpoint.
 """
 
+import dataclasses
 import hashlib
 import io
 from pathlib import Path
@@ -14,11 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
 from jobs.analysis.plots import plot_reconstructions
 from jobs.config.config import Config, ConfigError
-from jobs.config.schema import EVAE_SETTINGS, ModelConfig, PretrainConfig
+from jobs.config.schema import PretrainConfig
 from jobs.run.files import write_atomic
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console, progress
@@ -36,7 +36,7 @@ from models.encoder.evae import (
 )
 from models.encoder.event_batch import EventBatch, Grid, batch_windows
 from models.encoder.weights import EncoderFileError, load_encoder, save_encoder
-from models.kinds import KINDS
+from models.kinds import KINDS, EvaeSettings, PolicySpec
 
 Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
 
@@ -96,12 +96,11 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
     except EncoderFileError as error:
         rule = f"must be a run folder with an encoder, or an encoder file, got {named!r}"
         raise ConfigError(f"pretrain.encoder: {rule}: {error}") from error
-    with torch.device("meta"):  # its settings alone, without memory for weights
-        wanted = build_evae(config.model, sensor_settings(config.env)).settings
+    there, here = (dataclasses.asdict(part) for part in (evae.settings, evae_settings(config)))
     differ = [
-        f"{name}: {evae.settings[name]!r} there, {value!r} here"
-        for name, value in wanted.items()
-        if evae.settings[name] != value
+        f"{name}: {there[name]!r} there, {value!r} here"
+        for name, value in here.items()
+        if there[name] != value
     ]
     if differ:
         raise ConfigError(f"pretrain.encoder: must have the settings of the model, got {', '.join(differ)}")
@@ -128,24 +127,16 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
     settings = config.pretrain
     train = read_recording(data_file(folder, "train"))
     validation = read_recording(data_file(folder, "validation"))
-    torch.manual_seed(config.seed)
-    evae = build_evae(config.model, train.about["sensor"])
-    begin = initial_state(folder)
+    training = EvaeTraining.begin(evae_settings(config), train, settings, (config.seed, 2))
+    evae, begin = training.evae, initial_state(folder)
     if begin is not None:
         evae.load_state_dict(begin)
-    optimizer = torch.optim.Adam(
-        evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
-    )
-    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 2]))
     held_out = held_out_windows(validation, settings, evae.grid)
-    first = restore(folder.encoder, evae, optimizer, rng)
+    first = restore(folder.encoder, training)
     latest: dict[str, float] = {}
     with progress("Pretrain the event VAE", settings.iterations, "iterations", done=first) as advance:
         for iteration in range(first, settings.iterations):
-            evae.train()
-            batch = batch_windows(sample_windows(train, settings, settings.batch_windows, rng), evae.grid)
-            targets = event_targets(batch, evae.target)
-            losses = train_step(evae, optimizer, batch, targets, beta(settings, iteration), rng)
+            losses = training.step(iteration)
             last = iteration + 1 == settings.iterations
             if last or (iteration + 1) % settings.validate_every == 0:
                 before, latest = latest, held_out_figures(evae, held_out)
@@ -155,16 +146,55 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
                     iteration + 1, {f"evae/{name}": value for name, value in {**losses, **latest}.items()}
                 )
             if last or (iteration + 1) % settings.checkpoint_every == 0:
-                save_checkpoint(folder.encoder, evae, optimizer, rng, iteration + 1)
-            measured = f", held out {latest['explained_step']:.0%} explained" if latest else ""
+                save_checkpoint(folder.encoder, training, iteration + 1)
+            measured = f", held out {latest['explained_loss_step']:.0%} explained" if latest else ""
             advance(1, note=f"loss {losses['loss']:.4f}{measured}")
     return freeze(config, folder, tracker, evae, train.about, held_out)
 
 
-def build_evae(model: ModelConfig, sensor: dict[str, Any]) -> EventVAE:
-    """The untrained event VAE that a model configuration and a sensor ask for."""
-    settings = {name: getattr(model, name) for name in EVAE_SETTINGS}
-    return EventVAE(variant=model.name, width=sensor["width"], height=sensor["height"], **settings)
+@dataclasses.dataclass(frozen=True)
+class EvaeTraining:
+    """A training of an event VAE in progress; each step changes the model, the optimiser and the stream.
+
+    Attributes:
+        evae: The model.
+        optimizer: Over its parameters.
+        recording: What windows are sampled from.
+        settings: Of the training.
+        rng: Draws the windows and the noise of the latent.
+    """
+
+    evae: EventVAE
+    optimizer: torch.optim.Optimizer
+    recording: Recording
+    settings: PretrainConfig
+    rng: np.random.Generator
+
+    @classmethod
+    def begin(
+        cls, model: EvaeSettings, recording: Recording, settings: PretrainConfig, seed: tuple[int, int]
+    ) -> "EvaeTraining":
+        """A training from random weights; `seed` is that of the experiment and the number of its stream."""
+        torch.manual_seed(seed[0])
+        evae = EventVAE.of(model)
+        optimizer = torch.optim.Adam(
+            evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
+        )
+        return cls(evae, optimizer, recording, settings, np.random.default_rng(np.random.SeedSequence(seed)))
+
+    def step(self, iteration: int) -> dict[str, float]:
+        """One update on a batch of sampled windows; returns the losses that `train_step` does."""
+        evae, settings = self.evae.train(), self.settings
+        windows = sample_windows(self.recording, settings, settings.batch_windows, self.rng)
+        batch = batch_windows(windows, evae.grid)
+        targets = event_targets(batch, evae.target)
+        return train_step(evae, self.optimizer, batch, targets, beta(settings, iteration), self.rng)
+
+
+def evae_settings(config: Config) -> EvaeSettings:
+    """The settings of an experiment's event VAE."""
+    camera = config.env.camera
+    return PolicySpec(config.model, camera.width, camera.height).evae
 
 
 def beta(settings: PretrainConfig, iteration: int) -> float:
@@ -292,14 +322,12 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob(CHECKPOINTS), reverse=True)
 
 
-def save_checkpoint(
-    folder: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator, iteration: int
-) -> None:
-    """Write everything that a killed training needs to go on; its name holds its SHA-256."""
+def save_checkpoint(folder: Path, training: EvaeTraining, iteration: int) -> None:
+    """Write everything that a killed training needs to go on; the file's name holds its SHA-256."""
     state = {
-        "evae": evae.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "rng": rng.bit_generator.state,
+        "evae": training.evae.state_dict(),
+        "optimizer": training.optimizer.state_dict(),
+        "rng": training.rng.bit_generator.state,
         "torch_rng": torch.get_rng_state(),
         "iteration": iteration,
     }
@@ -311,8 +339,8 @@ def save_checkpoint(
         old.unlink()
 
 
-def restore(folder: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng: np.random.Generator) -> int:
-    """Load the newest checkpoint that is whole; return the number of iterations already done."""
+def restore(folder: Path, training: EvaeTraining) -> int:
+    """Load the newest undamaged checkpoint into a training; return how many iterations it has done."""
     for path in checkpoints(folder):
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != path.stem.rpartition("-")[2]:
@@ -320,9 +348,9 @@ def restore(folder: Path, evae: EventVAE, optimizer: torch.optim.Optimizer, rng:
             path.unlink()
             continue
         state = torch.load(io.BytesIO(content), weights_only=True)
-        evae.load_state_dict(state["evae"])
-        optimizer.load_state_dict(state["optimizer"])
-        rng.bit_generator.state = state["rng"]
+        training.evae.load_state_dict(state["evae"])
+        training.optimizer.load_state_dict(state["optimizer"])
+        training.rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch_rng"])
         return int(state["iteration"])
     return 0

@@ -30,18 +30,17 @@ from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage
 from jobs.tracking.tracker import open_tracker
-from jobs.training.env_runner import FlightError
-from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_settings
+from jobs.training.env_runner import RolloutError
+from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_about, policy_spec
 from jobs.training.pretrain import check_sources, prepare_encoder
-from models.encoder.weights import load_encoder
-from models.kinds import kind_of
+from models.encoder.weights import EncoderManifest, load_encoder
 from models.policy import save_policy
 
 OnResult = Callable[[int, Mapping[str, float]], None]
 
 # Name in the tracker -> where RLlib's result has it.
 METRICS = {
-    "train/episode_return": ("env_runners", "flight_return"),
+    "train/episode_return": ("env_runners", "episode_return"),
     "train/episodes": ("env_runners", "num_episodes_lifetime"),
     "train/success_rate": ("env_runners", "success_rate"),
     "train/collision_rate": ("env_runners", "collision_rate"),
@@ -169,7 +168,7 @@ def stopped(error: Exception | str) -> str:
 def last_line(error: Exception | str) -> str:
     """The line of a worker's error that names its cause."""
     lines = str(error).strip().splitlines()
-    raised = f"{FlightError.__module__}.{FlightError.__qualname__}: "  # as Ray writes it before the message
+    raised = f"{RolloutError.__module__}.{RolloutError.__qualname__}: "  # as Ray writes it before the message
     return lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
 
 
@@ -190,16 +189,16 @@ def export_policy(
         TrainingError: If the checkpoint's encoder is not the one in the file.
     """
     module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
-    settings = policy_settings(config)
-    evae, about = None, dict[str, Any]()
-    if encoder_path is not None and kind_of(settings).encoder:
-        evae, about = load_encoder(encoder_path)
+    spec = policy_spec(config)
+    evae, of_encoder = None, EncoderManifest()
+    if encoder_path is not None and spec.frozen:
+        evae, of_encoder = load_encoder(encoder_path)
     frozen = {} if evae is None else evae.state_dict()
     flown = {} if module.encoder is None else module.encoder.state_dict()
     if not all(torch.equal(value, frozen[name]) for name, value in flown.items()):
         raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
-    manifest = {**settings, "figures": figures}
-    save_policy(target, module.networks(), manifest, evae, about.get("figures"))
+    about = {**policy_about(config), "figures": figures}
+    save_policy(target, module.networks(), spec, about, evae, of_encoder.get("figures"))
 
 
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:

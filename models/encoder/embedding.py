@@ -13,12 +13,15 @@ A code is what is added to the features of an event before the maximum over even
 """
 
 import functools
+from typing import get_args
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
-CODINGS = ("additive", "eventnet", "none")
+from models.kinds import Coding
+
+CODINGS: tuple[str, ...] = get_args(Coding)
 
 
 def temporal_embedding(t: npt.ArrayLike, context: int) -> np.ndarray:

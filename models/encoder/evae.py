@@ -11,9 +11,9 @@ H W times more than the same number in front of a summed error: the appendix's s
 iterations. A weight near 1e-5 keeps it alive.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,16 +21,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.encoder.context import EventContextNetwork
-from models.encoder.embedding import CODINGS
 from models.encoder.event_batch import EventBatch, Grid
 from models.encoder.event_images import PictureContextNetwork, cell_counts, last_polarity, newest_time
+from models.kinds import EvaeSettings, checked
 
-VARIANTS = ("bytestream", "bytestream_xy", "event_image_vae")
-NORMS = ("batch", "none")
-TARGETS = ("signed", "occupancy", "aged", "counts")
 CELLS = 8  # each way, of the target "counts"
 COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events
-LIMITS = {"width": 4096, "height": 4096, "context": 8192, "latent": 256, "time_bins": 65536}
 LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
 ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)
 # A latent that the KL term had emptied held 0.03 nats and explained 0.000; living ones hold 10 and more.
@@ -72,11 +68,11 @@ class EventVAE(nn.Module):
         coding: str = "additive",
     ) -> None:
         super().__init__()
-        self.settings: dict[str, Any] = {
+        values = {
             "variant": variant, "width": width, "height": height, "context": context,
             "latent": latent, "norm": norm, "target": target, "time_bins": time_bins, "coding": coding,
         }  # fmt: skip
-        check_settings(self.settings)
+        self.settings = checked(EvaeSettings, values)
         self.grid = Grid(width, height, time_bins)
         self.target = target
         self.ecn: nn.Module = (
@@ -93,6 +89,11 @@ class EventVAE(nn.Module):
             nn.ReLU(),
             nn.Linear(1024, math.prod(target_shape(target, self.grid))),
         )
+
+    @classmethod
+    def of(cls, settings: EvaeSettings) -> "EventVAE":
+        """The untrained model of some settings."""
+        return cls(**dataclasses.asdict(settings))
 
     def forward(self, batch: EventBatch, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Reconstruct a batch of windows.
@@ -112,27 +113,6 @@ class EventVAE(nn.Module):
     def freeze(self) -> "EventVAE":
         """Eval mode, and no parameter or running statistic moves any more; returns self."""
         return self.eval().requires_grad_(False)
-
-
-def check_settings(settings: dict[str, Any]) -> None:
-    """Check the arguments of `EventVAE`.
-
-    Raises:
-        ValueError: Names the setting, the value and the rule.
-    """
-    choices = (("variant", VARIANTS), ("norm", NORMS), ("target", TARGETS), ("coding", CODINGS))
-    for name, allowed in choices:
-        if settings[name] not in allowed:
-            raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {settings[name]!r}")
-    for name, limit in LIMITS.items():
-        value = settings[name]
-        if type(value) is not int or not 1 <= value <= limit:
-            raise ValueError(f"{name} must be an integer in 1..{limit}, got {value!r}")
-    if settings["context"] % 2:
-        raise ValueError(f"context must be even (sines and cosines), got {settings['context']}")
-    if settings["variant"] != "bytestream" and settings["coding"] == "eventnet":
-        rule = f"must be additive or none for {settings['variant']}, which has no time"
-        raise ValueError(f"coding {rule}, got 'eventnet'")
 
 
 def target_shape(target: str, grid: Grid) -> tuple[int, ...]:
@@ -231,7 +211,7 @@ def train_step(
         RuntimeError: The gradient is not finite; no parameter has been changed.
     """
     parameter = evae.decoder[0].weight
-    noise = torch.from_numpy(rng.standard_normal((len(batch), evae.settings["latent"]))).to(parameter)
+    noise = torch.from_numpy(rng.standard_normal((len(batch), evae.settings.latent))).to(parameter)
     logits, mu, logvar = evae(batch, noise)
     reconstruction, kl = reconstruction_loss(logits, targets, evae.target), kl_divergence(mu, logvar).mean()
     loss = reconstruction + beta * kl
@@ -249,7 +229,7 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
 
     Returns:
         reconstruction (mean error of a pixel), mean_picture (the same error for the targets' own
-        mean picture), explained (1 - reconstruction / mean_picture: 0 for a model that has learnt
+        mean picture), explained_loss (1 - reconstruction / mean_picture: 0 for a model that has learnt
         nothing of the single window, 1 for a perfect one, and 0 where all targets are the same;
         of "aged" none reaches 1: the cross entropy keeps the entropy of times between 0 and 1),
         auc (`ranking_area` of "the target is not 0" by the picture's magnitude), kl (mean over
@@ -269,7 +249,7 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
     return {
         "reconstruction": reconstruction,
         "mean_picture": mean_picture,
-        "explained": 1.0 - reconstruction / mean_picture if mean_picture > 0 else 0.0,
+        "explained_loss": 1.0 - reconstruction / mean_picture if mean_picture > 0 else 0.0,
         "auc": ranking_area(reconstruct(logits, evae.target).abs().numpy(), targets.numpy() != 0),
         "kl": kl_divergence(mu, logvar).mean().item(),
         "active_units": active_units(mu),
@@ -311,7 +291,7 @@ def collapsed(figures: Mapping[str, float]) -> bool:
         figures: Of `validate`.
     """
     silent = figures["active_units"] == 0 or figures["kl"] < EMPTY_KL
-    return silent and figures["explained"] < EMPTY_EXPLAINED
+    return silent and figures["explained_loss"] < EMPTY_EXPLAINED
 
 
 def active_units(mu: Tensor) -> float:

@@ -4,7 +4,7 @@ x, y, p and the time bin take finitely many values (appendix C), so that an even
 integers. Training (`EventBatch`) and the frozen table read the same addresses.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,8 +14,7 @@ import numpy as np
 from models.encoder.embedding import time_bin
 
 MAX_WINDOW_US = 1 << 46
-EMPTY, ON, OFF = 0, 1, 2  # kinds of a row of events
-MAX_ROW = 1 << 15  # sides and time bins that a row of int16 holds
+ROW_EMPTY, ROW_ON, ROW_OFF = 0, 1, 2  # kinds of a row of `event_rows`
 
 
 class Grid(NamedTuple):
@@ -64,6 +63,11 @@ class EventBatch:
         return len(self.offsets) - 1
 
 
+def address_events(events: Any, start_us: int, window_us: int, grid: Grid) -> np.ndarray:
+    """As `index_events`, of events whose fields t, x, y, p have names."""
+    return index_events(tuple(events[name] for name in "txyp"), start_us, window_us, grid)
+
+
 def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, grid: Grid) -> np.ndarray:
     """Addresses of one window's events.
 
@@ -107,17 +111,13 @@ def _index(t, x, y, p, span, grid, address) -> int:  # type: ignore[no-untyped-d
     return -1
 
 
-def batch_windows(windows: list[tuple[Any, int, int]], grid: Grid) -> EventBatch:
-    """Batch windows given as (events, start_us, window_us); events have integer fields t, x, y, p.
+def batch_windows(windows: Iterable[tuple[Any, int, int]], grid: Grid) -> EventBatch:
+    """Batch windows given as (events, start_us, window_us); events as in `address_events`.
 
     Raises:
         ValueError: As `index_events`.
     """
-    parts = [
-        index_events(tuple(events[name] for name in "txyp"), start_us, window_us, grid)
-        for events, start_us, window_us in windows
-    ]
-    return _join(parts, grid)
+    return _join([address_events(*window, grid) for window in windows], grid)
 
 
 def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> EventBatch:
@@ -181,7 +181,7 @@ def event_rows(address: np.ndarray, size: int, width: int, height: int) -> np.nd
     rows = np.zeros((size, 4), np.int16)
     for n in range(address.shape[1]):
         code = address[0, n]
-        rows[n, 0] = ON if code >= width * height else OFF
+        rows[n, 0] = ROW_ON if code >= width * height else ROW_OFF
         rows[n, 1] = address[1, n]
         rows[n, 2], rows[n, 3] = code % width, code // width % height
     return rows
@@ -213,12 +213,12 @@ def _unroll(rows, grid, address, offsets) -> int:  # type: ignore[no-untyped-def
         for k in range(rows.shape[1]):
             kind, time = np.int64(rows[b, k, 0]), np.int64(rows[b, k, 1])
             x, y = np.int64(rows[b, k, 2]), np.int64(rows[b, k, 3])
-            if kind == EMPTY:
+            if kind == ROW_EMPTY:
                 continue
             inside = 0 <= x < width and 0 <= y < height and 0 <= time < time_bins
-            if not inside or (kind != ON and kind != OFF):
+            if not inside or (kind != ROW_ON and kind != ROW_OFF):
                 return b * rows.shape[1] + k
-            address[0, found] = ((kind == ON) * height + y) * width + x
+            address[0, found] = ((kind == ROW_ON) * height + y) * width + x
             address[1, found] = time
             found += 1
         offsets[b + 1] = found

@@ -1,9 +1,9 @@
-"""Event images through convolutions: the other half of an encoder that sees pictures, not events.
+"""Event images: how they are drawn from events, and an encoder of convolutions over them.
 
-The policy EIVAE of appendix D.1.2: a variational autoencoder over event images whose encoder
-is the convolutions of the policy EIP. Here each step's image has a latent of its own and the
-policy sees a stack of them, as of those of the bytestream; the paper encodes the stack of
-images. So the two differ in what the encoder sees, and in nothing else.
+The encoder is that of the policy `event_image_vae` (EIVAE in appendix D.1.2): a variational
+autoencoder whose encoder has the convolutions of `event_image`. Here each step's image has a latent
+of its own and the policy sees a stack of latents, as `bytestream` does; the paper encodes the stack
+of images. So these two policies differ only in what the encoder sees.
 """
 
 import math
@@ -58,9 +58,9 @@ class PictureContextNetwork(nn.Module):
 
 def last_polarity(batch: EventBatch) -> np.ndarray:
     """Polarity of each pixel's last event, -1, 0 or +1: float32 (B, H W), row-major."""
-    picture = np.zeros((len(batch), batch.grid.width * batch.grid.height), np.float32)
-    _draw(batch.code, batch.offsets, picture)
-    return picture
+    pictures = np.zeros((len(batch), batch.grid.width * batch.grid.height), np.float32)
+    _draw_windows(batch.code, batch.offsets, pictures)
+    return pictures
 
 
 def newest_time(batch: EventBatch) -> np.ndarray:
@@ -101,19 +101,24 @@ def event_pictures(batch: EventBatch) -> Tensor:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _draw(code, offsets, picture) -> None:  # type: ignore[no-untyped-def]
-    pixels = picture.shape[1]
-    for b in range(picture.shape[0]):
-        for n in range(offsets[b], offsets[b + 1]):
-            picture[b, code[n] % pixels] = 1.0 if code[n] >= pixels else -1.0
+def draw_last(code, picture, on, off) -> None:  # type: ignore[no-untyped-def]
+    """Set each pixel of `picture` (H W,) to `on` or `off` by its last event; others stay as they are."""
+    for n in range(len(code)):
+        picture[code[n] % len(picture)] = on if code[n] >= len(picture) else off
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _draw_windows(code, offsets, pictures) -> None:  # type: ignore[no-untyped-def]
+    for b in range(len(pictures)):
+        draw_last(code[offsets[b] : offsets[b + 1]], pictures[b], 1.0, -1.0)
 
 
 class PictureEncoder:
-    """The frozen half of such an autoencoder: windows to latents, as `models.table.EncoderTable`."""
+    """Its frozen encoder: windows to latents, with the methods of `models.encoder.table.EncoderTable`."""
 
     def __init__(self, evae: Any) -> None:
         """Take the parts of an `EventVAE` of variant "event_image_vae"."""
-        self.grid, self.latent_size = evae.grid, evae.settings["latent"]
+        self.grid, self.latent_size = evae.grid, evae.settings.latent
         self.layers = nn.Sequential(evae.ecn.layers, evae.encoder).eval()
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:

@@ -13,7 +13,7 @@ With EventNet's coding a context also holds the time bin of the event that each 
 of equal ones the newest; the phase of that bin follows when the latent is asked for.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -22,7 +22,7 @@ import torch
 
 from models.encoder.embedding import bin_centres, eventnet_phase, time_code
 from models.encoder.evae import EventVAE
-from models.encoder.event_batch import Grid, index_events, index_packed, thin
+from models.encoder.event_batch import Grid, address_events, index_packed, thin
 
 PRECISIONS = ("model", "int16", "int8")
 INT16_TOP, INT8_TOP = 32_767, 127
@@ -84,7 +84,7 @@ class EncoderTable:
         features, embedding, scale = _rounded(features, embedding, precision, dtype)
         first, _, last = exact.encoder
         hidden = _array(first.weight) * np.resize(scale, first.in_features), _array(first.bias)
-        head = [_array(part)[: evae.settings["latent"]] for part in (last.weight, last.bias)]
+        head = [_array(part)[: evae.settings.latent] for part in (last.weight, last.bias)]
         return cls(
             grid=grid,
             features=_read_only(features),
@@ -116,7 +116,7 @@ class EncoderTable:
             raise ValueError(
                 f"context must be {expected} (start from empty()), got {context.dtype} {context.shape}"
             )
-        address = index_events(tuple(events[name] for name in "txyp"), start_us, window_us, self.grid)
+        address = address_events(events, start_us, window_us, self.grid)
         result = context.copy()
         self._raise(address, result)
         return result
@@ -144,7 +144,7 @@ class EncoderTable:
         Raises:
             ValueError: As `models.encoder.event_batch.index_events`.
         """
-        address = index_events(tuple(events[name] for name in "txyp"), start_us, window_us, self.grid)
+        address = address_events(events, start_us, window_us, self.grid)
         return self._encode(address)
 
     def encode_windows(self, windows: np.ndarray) -> np.ndarray:
@@ -167,8 +167,8 @@ class EncoderTable:
 
 def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
     """The model in float64, with another resolution of time unless that is None."""
-    settings = evae.settings if time_bins is None else {**evae.settings, "time_bins": time_bins}
-    exact = EventVAE(**settings).double()
+    settings = evae.settings
+    exact = EventVAE.of(settings if time_bins is None else replace(settings, time_bins=time_bins)).double()
     exact.load_state_dict({**exact.state_dict(), **evae.state_dict()})  # a lean file's has no decoder
     return exact
 

@@ -2,23 +2,26 @@
 
 `NAME.safetensors` holds the state of an `EventVAE`; `NAME.json` holds its settings ("model"),
 the SHA-256 of the tensors' file and whatever the writer adds, such as sensor settings, their
-hash and figures. Everything is checked before use: size, digest, names, shapes, dtypes, finite
+hash and metrics. Everything is checked before use: size, digest, names, shapes, dtypes, finite
 values. No pickle is read or written.
 """
 
+import dataclasses
 import errno
 import hashlib
 import json
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import safetensors.torch
 import torch
 from torch import Tensor
 
-from models.encoder.evae import EventVAE, check_settings
+from models.encoder.evae import EventVAE
+from models.kinds import EvaeSettings, checked, renamed
 
 FORMAT = 1
 MAX_MANIFEST_BYTES = 1 << 20
@@ -26,22 +29,35 @@ MAX_HEADER_BYTES = 1 << 20
 DECODER = "decoder."  # of the names of its tensors
 LEAN = {torch.float32: torch.float16}  # what a tensor may be rounded to
 RESERVED = ("format", "model", "sha256")
-ADDED_SETTINGS = {"coding": "additive"}  # what a file means that was written before there was a choice
+ADDED_SETTINGS = {"coding": "additive"}  # meant by files that were written before there was a choice
+
+
+class EncoderManifest(TypedDict, total=False):
+    """What an encoder's manifest holds; the first three keys always."""
+
+    format: int
+    model: EvaeSettings
+    sha256: str
+    sensor: dict[str, object]
+    sensor_hash: str
+    figures: dict[str, float]
 
 
 class EncoderFileError(ValueError):
     """An encoder file that was refused; the message begins with its name."""
 
 
-def save_encoder(path: str | Path, evae: EventVAE, manifest: dict[str, Any], lean: bool = False) -> None:
+def save_encoder(
+    path: str | Path, evae: EventVAE, manifest: Mapping[str, object], lean: bool = False
+) -> None:
     """Write an encoder and its manifest; each file appears complete or not at all.
 
     Args:
         path: The tensors' file, ending in .safetensors; the manifest takes the same name and .json.
         evae: float32 model.
-        manifest: What else to record, as JSON values: sensor settings, hash, figures.
-        lean: Leave the decoder out and round the weights to float16: it flies, but draws no
-            pictures, in a fraction of the space.
+        manifest: What else to record, as JSON values: sensor settings, hash, metrics.
+        lean: Leave the decoder out and round the weights to float16: it encodes, but reconstructs
+            nothing, in a fraction of the space.
 
     Raises:
         EncoderFileError: A tensor is not finite or not float32, or the manifest holds a
@@ -55,7 +71,8 @@ def save_encoder(path: str | Path, evae: EventVAE, manifest: dict[str, Any], lea
     check_tensors(target, tensors, evae.settings)
     data = safetensors.torch.save(lean_tensors(tensors) if lean else tensors)
     digest = hashlib.sha256(data).hexdigest()
-    record = {**manifest, "format": FORMAT, "model": evae.settings, "sha256": digest}
+    model = dataclasses.asdict(evae.settings)
+    record = {**manifest, "format": FORMAT, "model": model, "sha256": digest}
     try:
         text = json.dumps(record, indent=2, sort_keys=True, allow_nan=False).encode()
     except (TypeError, ValueError) as error:
@@ -69,10 +86,10 @@ def save_encoder(path: str | Path, evae: EventVAE, manifest: dict[str, Any], lea
     write_atomic(target.with_suffix(".json"), text)
 
 
-def load_encoder(path: str | Path) -> tuple[EventVAE, dict[str, Any]]:
+def load_encoder(path: str | Path) -> tuple[EventVAE, EncoderManifest]:
     """Read an encoder: the frozen model (eval mode, no gradients) and its manifest.
 
-    Of a lean file the model's `decoder` is None.
+    A lean file has no decoder: the model's `decoder` is then None.
 
     Raises:
         EncoderFileError: A file is missing, too large, damaged or does not fit its manifest.
@@ -91,7 +108,7 @@ def load_encoder(path: str | Path) -> tuple[EventVAE, dict[str, Any]]:
     except Exception as error:
         raise EncoderFileError(f"{target}: not a safetensors file: {error}") from None
     check_tensors(target, tensors, settings)
-    evae = EventVAE(**settings)
+    evae = EventVAE.of(settings)
     if is_lean(tensors):
         evae.decoder = None
     evae.load_state_dict(tensors)
@@ -99,10 +116,10 @@ def load_encoder(path: str | Path) -> tuple[EventVAE, dict[str, Any]]:
 
 
 def lean_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of what flies, weights and biases in float16; running statistics stay as they are."""
-    flying = {name: tensor for name, tensor in tensors.items() if not name.startswith(DECODER)}
+    """The tensors without the decoder, weights and biases in float16; running statistics as they are."""
+    kept = {name: tensor for name, tensor in tensors.items() if not name.startswith(DECODER)}
     rounded = (".weight", ".bias")
-    return {name: tensor.half() if name.endswith(rounded) else tensor for name, tensor in flying.items()}
+    return {name: tensor.half() if name.endswith(rounded) else tensor for name, tensor in kept.items()}
 
 
 def is_lean(tensors: dict[str, Tensor]) -> bool:
@@ -110,7 +127,7 @@ def is_lean(tensors: dict[str, Tensor]) -> bool:
     return not any(name.startswith(DECODER) for name in tensors)
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path) -> EncoderManifest:
     """Read and check a manifest.
 
     Raises:
@@ -126,22 +143,22 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if manifest["format"] != FORMAT:
         raise EncoderFileError(f"{path}: format {manifest['format']!r}, this version reads {FORMAT}")
     try:
-        settings = manifest["model"] = {**ADDED_SETTINGS, **manifest["model"]}
-        check_settings(settings)
-        if set(settings) != set(EventVAE.__init__.__annotations__) - {"return"}:
-            raise ValueError(f"unknown settings among {sorted(settings)}")
-    except (KeyError, TypeError, ValueError) as error:
+        settings = {**ADDED_SETTINGS, **manifest["model"]}
+        if now := renamed(settings.get("variant")):
+            raise ValueError(f"variant {settings['variant']!r}{now}")
+        manifest["model"] = checked(EvaeSettings, settings)
+    except (TypeError, ValueError) as error:
         raise EncoderFileError(f"{path}: the model's settings are refused: {error}") from None
     return manifest
 
 
-def expected_tensors(settings: dict[str, Any]) -> dict[str, Tensor]:
+def expected_tensors(settings: EvaeSettings) -> dict[str, Tensor]:
     """State of a model with these settings: shapes and dtypes, without memory for values."""
     with torch.device("meta"):
-        return EventVAE(**settings).state_dict()
+        return EventVAE.of(settings).state_dict()
 
 
-def check_tensors(path: Path, tensors: dict[str, Tensor], settings: dict[str, Any]) -> None:
+def check_tensors(path: Path, tensors: dict[str, Tensor], settings: EvaeSettings) -> None:
     """Compare tensors with the model they belong to.
 
     Raises:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from models.encoder.event_batch import EMPTY, OFF, ON, EventBatch, Grid, batch_rows, distinct
+from models.encoder.event_batch import ROW_EMPTY, ROW_OFF, ROW_ON, EventBatch, Grid, batch_rows, distinct
 
 EVENTS = 256  # of a window that the network sees
 TIMES = 1024  # steps into which a window's time is rounded
@@ -60,7 +60,8 @@ class EventSet(nn.Module):
     def plain(self, stacks: Tensor) -> Tensor:
         """The same features, row by row: what the fused form is tested against, and what is exported."""
         kind, time, x, y = stacks.to(self.gate[0].weight)[..., None].unbind(-2)
-        on, there = (kind == ON).to(kind) - (kind == OFF).to(kind), (kind != EMPTY).to(kind)
+        on = (kind == ROW_ON).to(kind) - (kind == ROW_OFF).to(kind)
+        there = (kind != ROW_EMPTY).to(kind)
         inputs = torch.cat(_inputs(along(x, self.grid.width), along(y, self.grid.height), on), dim=-1)
         features = self.place(inputs) * self.gate(time / TIMES) * there
         pooled = features.amax(-2), features.sum(-2), there.sum(-2)

@@ -1,57 +1,70 @@
-"""What a policy keeps of one control step: an array of fixed size, made once from what it sees.
+"""The features of a policy: what it keeps of one control step, an array of fixed size.
 
-`FEATURES` says for each feature its type, its shape, and how it is made, from a batch of
-observations or from the events of one step. Settings are those of a policy's manifest: "width"
-and "height" of the sensor [pixels], "latent" and "time_bins" of the encoder. The encoder is an
-`EncoderTable`, or None where the feature needs none.
+Each `Feature` says its type and shape, and how it is computed from a batch of observations or from
+the events of one step. `models.kinds.KINDS` names the feature of each kind of policy.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
-from models.encoder.event_batch import Grid, event_rows, index_events, index_packed, thin
+from models.encoder.event_batch import Grid, address_events, event_rows, index_packed, thin
+from models.encoder.event_images import draw_last
 from models.encoder.finetuned import EVENTS as ENCODED_EVENTS
-from models.kinds import kind_of
+from models.encoder.frozen import Encoder
+from models.kinds import PolicySpec, resolve
 from models.policy.event_set import EVENTS, TIMES
 
-ON, OFF = 255, 125  # picture values of polarities (appendix D.1.2)
+PICTURE_ON, PICTURE_OFF = 255, 125  # values of a pixel in an event image (appendix D.1.2)
 GAMMA = 2.2
-Settings = Mapping[str, Any]
-Step = tuple[Any, int, int]
+
+
+class Step(NamedTuple):
+    """The events of one control step.
+
+    Attributes:
+        events: Integer arrays t, x, y, p by name, such as an EVENT array, in time order.
+        start_us: Start of the step on the clock of the events.
+        window_us: Its length.
+    """
+
+    events: Any
+    start_us: int
+    window_us: int
 
 
 class Feature(NamedTuple):
-    """How a feature is made.
+    """How a feature is computed.
 
     Attributes:
         dtype: Of its array.
-        shape: Settings -> its shape.
-        from_observations: (observations (B, ...), settings, encoder) -> features (B, ...) of that shape.
-        from_events: (step, settings, encoder) -> feature, of a step (events, start_us, window_us);
-            None: events do not say it.
+        shape: The policy -> its shape.
+        from_observations: (observations (B, ...), policy, encoder) -> features (B, ...) of that shape.
+        from_events: (step, policy, encoder) -> feature; None: it cannot be computed from events.
+
+    The encoder is that of a policy with a frozen one, else None.
     """
 
     dtype: type
-    shape: Callable[[Settings], tuple[int, ...]]
-    from_observations: Callable[[np.ndarray, Settings, Any], np.ndarray]
-    from_events: Callable[[Step, Settings, Any], np.ndarray] | None
+    shape: Callable[[PolicySpec], tuple[int, ...]]
+    from_observations: Callable[[np.ndarray, PolicySpec, Any], np.ndarray]
+    from_events: Callable[[Step, PolicySpec, Any], np.ndarray] | None
 
 
-def feature_of(settings: Settings) -> Feature:
-    """The feature of the policy that `settings` describe."""
-    return FEATURES[kind_of(settings).feature]
+def feature_of(spec: PolicySpec) -> Feature:
+    """The feature of a policy."""
+    feature: Feature = resolve(spec.kind.feature)
+    return feature
 
 
 def push_features(stacks: np.ndarray, features: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Append the newest feature to each stack; the first of a flight fills its whole stack.
+    """Append the newest feature to each stack; the first of an episode fills its whole stack.
 
     Args:
         stacks: (B, stack, ...), oldest feature first.
         features: (B, ...) of the same type.
-        first: bool (B,), True where the feature is the first of a flight.
+        first: bool (B,), True where the feature is the first of an episode.
 
     Returns:
         (B, stack, ...), a new array.
@@ -83,15 +96,15 @@ def event_picture(address: np.ndarray, width: int, height: int) -> np.ndarray:
     as in `column_counts`.
     """
     picture = np.zeros(width * height, np.uint8)
-    _draw(address[0], picture)
+    draw_last(address[0], picture, PICTURE_ON, PICTURE_OFF)
     return picture.reshape(height, width)
 
 
 def grey_picture(luminance: np.ndarray) -> np.ndarray:
     """Linear luminance as a camera stores it: gamma 2.2, 8 bits; uint8 of the same shape, 1 is white.
 
-    The paper's policy sees 8-bit RGB images (appendix D.1.2). This world is grey, so that
-    three equal channels would say no more than one. Brighter than white becomes white.
+    The paper's policy sees 8-bit RGB images (appendix D.1.2). This world is grey, so where
+    three equal channels would carry no more than one. Brighter than white becomes white.
 
     Raises:
         ValueError: The luminance is NaN or infinite.
@@ -101,53 +114,32 @@ def grey_picture(luminance: np.ndarray) -> np.ndarray:
     return np.rint(255.0 * np.clip(luminance, 0.0, 1.0) ** (1.0 / GAMMA)).astype(np.uint8)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _draw(code, picture) -> None:  # type: ignore[no-untyped-def]
-    for n in range(len(code)):
-        picture[code[n] % len(picture)] = ON if code[n] >= len(picture) else OFF
+def _grid(spec: PolicySpec, time_bins: int = 1) -> Grid:
+    return Grid(spec.width, spec.height, time_bins)
 
 
-def _grid(settings: Settings, time_bins: int = 1) -> Grid:
-    return Grid(settings["width"], settings["height"], time_bins)
+def _address(step: Step, grid: Grid) -> np.ndarray:
+    return address_events(*step, grid)
 
 
-def _address(step: Step, settings: Settings, time_bins: int = 1) -> np.ndarray:
-    events, start_us, window_us = step
-    fields = tuple(events[name] for name in "txyp")
-    return index_events(fields, start_us, window_us, _grid(settings, time_bins))
-
-
-def _picture_shape(settings: Settings) -> tuple[int, ...]:
-    return settings["height"], settings["width"]
-
-
-def _pictures(observations: np.ndarray, settings: Settings, dtype: type) -> np.ndarray:
-    """The observations, if they are pictures of this sensor."""
-    shape = _picture_shape(settings)
-    if observations.dtype != dtype or observations.shape[1:] != shape:
-        rule = f"must be {np.dtype(dtype)} (B, {shape[0]}, {shape[1]})"
-        raise ValueError(f"observations {rule}, got {observations.dtype} {observations.shape}")
-    return observations
-
-
-def _latents_of_windows(windows: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
+def _latents_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: Encoder) -> np.ndarray:
     return encoder.encode_windows(windows)
 
 
-def _latent_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
+def _latent_of_step(step: Step, spec: PolicySpec, encoder: Encoder) -> np.ndarray:
     return encoder.encode(*step)
 
 
-def _columns_of_windows(windows: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
-    grid = _grid(settings)
+def _columns_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
+    grid = _grid(spec)
     counts = np.empty((len(windows), 2 * grid.width), np.float32)
     for row, window in enumerate(windows):
         counts[row] = column_counts(index_packed(window, grid), grid.width, grid.height)
     return counts
 
 
-def _columns_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
-    return column_counts(_address(step, settings), settings["width"], settings["height"])
+def _columns_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return column_counts(_address(step, _grid(spec)), spec.width, spec.height)
 
 
 def _rows(address: np.ndarray, grid: Grid, most: int) -> np.ndarray:
@@ -161,46 +153,52 @@ def _rows_of_windows(windows: np.ndarray, grid: Grid, most: int) -> np.ndarray:
     return rows
 
 
-def _set_of_windows(windows: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
-    return _rows_of_windows(windows, _grid(settings, TIMES), EVENTS)
+def _set_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return _rows_of_windows(windows, _grid(spec, TIMES), EVENTS)
 
 
-def _set_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
-    return _rows(_address(step, settings, TIMES), _grid(settings, TIMES), EVENTS)
+def _set_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
+    grid = _grid(spec, TIMES)
+    return _rows(_address(step, grid), grid, EVENTS)
 
 
-def _encoded_of_windows(windows: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
-    return _rows_of_windows(windows, _grid(settings, settings["time_bins"]), ENCODED_EVENTS)
+def _encoded_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return _rows_of_windows(windows, _grid(spec, spec.evae.time_bins), ENCODED_EVENTS)
 
 
-def _encoded_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
-    time_bins = settings["time_bins"]
-    return _rows(_address(step, settings, time_bins), _grid(settings, time_bins), ENCODED_EVENTS)
+def _encoded_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
+    grid = _grid(spec, spec.evae.time_bins)
+    return _rows(_address(step, grid), grid, ENCODED_EVENTS)
 
 
-def _same_pictures(pictures: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
-    return _pictures(pictures, settings, np.uint8)
+def _picture_shape(spec: PolicySpec) -> tuple[int, ...]:
+    return spec.height, spec.width
 
 
-def _picture_of_step(step: Step, settings: Settings, encoder: Any) -> np.ndarray:
-    return event_picture(_address(step, settings), settings["width"], settings["height"])
+def _pictures(observations: np.ndarray, spec: PolicySpec, dtype: type) -> np.ndarray:
+    """The observations, if they are pictures of this sensor."""
+    shape = _picture_shape(spec)
+    if observations.dtype != dtype or observations.shape[1:] != shape:
+        rule = f"must be {np.dtype(dtype)} (B, {shape[0]}, {shape[1]})"
+        raise ValueError(f"observations {rule}, got {observations.dtype} {observations.shape}")
+    return observations
 
 
-def _grey_of_luminance(luminance: np.ndarray, settings: Settings, encoder: Any) -> np.ndarray:
-    return grey_picture(_pictures(luminance, settings, np.float32))
+def _same_pictures(pictures: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return _pictures(pictures, spec, np.uint8)
 
 
-FEATURES = {
-    "latent": Feature(
-        np.float32, lambda settings: (settings["latent"],), _latents_of_windows, _latent_of_step
-    ),
-    "columns": Feature(
-        np.float32, lambda settings: (2 * settings["width"],), _columns_of_windows, _columns_of_step
-    ),
-    "events": Feature(np.int16, lambda settings: (EVENTS, 4), _set_of_windows, _set_of_step),
-    "event_rows": Feature(
-        np.int16, lambda settings: (ENCODED_EVENTS, 4), _encoded_of_windows, _encoded_of_step
-    ),
-    "event_image": Feature(np.uint8, _picture_shape, _same_pictures, _picture_of_step),
-    "grey": Feature(np.uint8, _picture_shape, _grey_of_luminance, None),
-}
+def _picture_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return event_picture(_address(step, _grid(spec)), spec.width, spec.height)
+
+
+def _grey_of_luminance(luminance: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return grey_picture(_pictures(luminance, spec, np.float32))
+
+
+LATENT = Feature(np.float32, lambda spec: (spec.evae.latent,), _latents_of_windows, _latent_of_step)
+COLUMNS = Feature(np.float32, lambda spec: (2 * spec.width,), _columns_of_windows, _columns_of_step)
+EVENT_SET = Feature(np.int16, lambda spec: (EVENTS, 4), _set_of_windows, _set_of_step)
+EVENT_ROWS = Feature(np.int16, lambda spec: (ENCODED_EVENTS, 4), _encoded_of_windows, _encoded_of_step)
+EVENT_IMAGE = Feature(np.uint8, _picture_shape, _same_pictures, _picture_of_step)
+GREY = Feature(np.uint8, _picture_shape, _grey_of_luminance, None)

@@ -1,21 +1,20 @@
-"""What decides: networks from a stack of features to logits and a value, each as three parts.
+"""A policy's networks, from a stack of features to logits and a value, each as three parts.
 
     logits = pi(trunk(stack)),   value = vf(trunk(stack))
 
-`NETWORKS` says how each is put together; a part without weights costs nothing. Weights are
-those of a later `initialise`, or of a file.
+`models.kinds.KINDS` names the function that builds those of each kind of policy: it takes the shape of
+the stack and the policy, and returns the parts. Weights come from `initialise`, or from a file.
 """
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from models.encoder.finetuned import FinetunedEncoder
-from models.kinds import kind_of
+from models.kinds import PolicySpec, resolve
 from models.policy.event_set import OUTPUTS, EventSet
 from models.policy.features import feature_of
 
@@ -25,22 +24,15 @@ LAST_GAIN = {"pi": 0.01, "vf": 1.0}
 CNN_OUTPUTS = 512
 
 
-def build_networks(settings: Mapping[str, Any], seed: int = 0) -> nn.ModuleDict:
-    """The networks of a policy with its initial weights.
-
-    Args:
-        settings: As in a manifest: `name`, `stack`, `hidden` and `num_actions`, and what the
-            feature's shape follows from.
-        seed: Of the weights.
-    """
-    return initialise(assemble(settings), seed)
+def build_networks(spec: PolicySpec, seed: int = 0) -> nn.ModuleDict:
+    """The networks of a policy with the initial weights of a seed."""
+    return initialise(assemble(spec), seed)
 
 
-def assemble(settings: Mapping[str, Any]) -> nn.ModuleDict:
-    """The parts of a policy's networks (`PARTS`); their weights mean nothing yet."""
-    build = NETWORKS[kind_of(settings).network]
-    shape = (settings["stack"], *feature_of(settings).shape(settings))
-    return nn.ModuleDict(dict(zip(PARTS, build(shape, settings), strict=True)))
+def assemble(spec: PolicySpec) -> nn.ModuleDict:
+    """The parts of a policy's networks (`PARTS`), to be initialised or loaded."""
+    shape = (spec.model.stack, *feature_of(spec).shape(spec))
+    return nn.ModuleDict(dict(zip(PARTS, resolve(spec.kind.network)(shape, spec), strict=True)))
 
 
 def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
@@ -56,11 +48,10 @@ def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
     return networks
 
 
-def two_mlps(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
+def two_mlps(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
     """Two separate networks of dense tanh layers (appendix D.1.2; stable-baselines' MlpPolicy)."""
-    inputs, hidden = math.prod(shape), settings["hidden"]
-    pi, vf = mlp(inputs, hidden, settings["num_actions"]), mlp(inputs, hidden, 1)
-    return nn.Flatten(), pi, vf
+    inputs, hidden = math.prod(shape), spec.hidden
+    return nn.Flatten(), mlp(inputs, hidden, spec.num_actions), mlp(inputs, hidden, 1)
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
@@ -71,7 +62,7 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear([inputs, *hidden][-1], outputs))
 
 
-def nature_cnn(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
+def nature_cnn(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
     """Convolutions that policy and value share, over the stacked pictures as channels.
 
     The sizes are those of Mnih et al. (Nature 2015), as in stable-baselines' CnnPolicy, which
@@ -87,19 +78,19 @@ def nature_cnn(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Mo
         nn.Flatten(),
         *(nn.Linear(64 * height * width, CNN_OUTPUTS), nn.ReLU()),
     )
-    return trunk, nn.Linear(CNN_OUTPUTS, settings["num_actions"]), nn.Linear(CNN_OUTPUTS, 1)
+    return trunk, nn.Linear(CNN_OUTPUTS, spec.num_actions), nn.Linear(CNN_OUTPUTS, 1)
 
 
-def event_set(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
+def event_set(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
     """A network over sets of events that policy and value share (`models.policy.event_set`)."""
-    trunk = EventSet(shape[0], (settings["width"], settings["height"]))
-    return trunk, nn.Linear(OUTPUTS, settings["num_actions"]), nn.Linear(OUTPUTS, 1)
+    trunk = EventSet(shape[0], (spec.width, spec.height))
+    return trunk, nn.Linear(OUTPUTS, spec.num_actions), nn.Linear(OUTPUTS, 1)
 
 
-def finetuned_mlps(shape: Sequence[int], settings: Mapping[str, Any]) -> tuple[nn.Module, ...]:
-    """The networks of `two_mlps` behind an encoder that they share, and that learns on."""
-    _, pi, vf = two_mlps((shape[0], settings["latent"]), settings)
-    return FinetunedEncoder(settings), pi, vf
+def finetuned_mlps(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
+    """The networks of `two_mlps` behind an encoder that they share and that PPO trains on."""
+    _, pi, vf = two_mlps((shape[0], spec.evae.latent), spec)
+    return FinetunedEncoder(spec.evae), pi, vf
 
 
 class Bytes(nn.Module):
@@ -108,11 +99,3 @@ class Bytes(nn.Module):
     def forward(self, pictures: Tensor) -> Tensor:
         """Scale uint8 (...) to float32 (...)."""
         return pictures.float().div_(255.0)
-
-
-NETWORKS: dict[str, Callable[..., tuple[nn.Module, ...]]] = {
-    "mlp": two_mlps,
-    "cnn": nature_cnn,
-    "set": event_set,
-    "finetuned": finetuned_mlps,
-}

@@ -1,12 +1,12 @@
 """A policy as one ONNX file: events or a picture in, logits and the next stack of features out.
 
-For robots without Python. The graph holds the whole of it, with the preprocessing of training. It takes::
+For robots without Python. The graph is the whole policy, with the preprocessing of training. It takes::
 
     events       int64 (N, 4), t since the window's start [us], x, y [pixels], p (-1 or +1), in time order
     window_us    int64 (), length of the window [us]        (policies that see events)
     luminance    float32 (H, W), linear                     (policies that see luminance)
-    last_stack   (stack, ...), what the step before gave as next_stack; for a flight's first step anything
-    first        bool (), whether this is a flight's first step
+    last_stack   (stack, ...), next_stack of the step before; for an episode's first step anything
+    first        bool (), whether this is an episode's first step
 
 and gives::
 
@@ -18,19 +18,18 @@ and gives::
 """
 
 import importlib.util
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from models.encoder.event_batch import OFF as OFF_ROW
-from models.encoder.event_batch import ON as ON_ROW
+from models.encoder.event_batch import ROW_OFF, ROW_ON
 from models.encoder.event_images import OFF_SHARE, PictureEncoder
-from models.kinds import KINDS
+from models.kinds import KINDS, resolve
 from models.policy.event_set import EVENTS, TIMES, EventSet
-from models.policy.features import GAMMA, OFF, ON
+from models.policy.features import GAMMA, PICTURE_OFF, PICTURE_ON
 from models.policy.policy import Policy
 
 NEEDED = ("onnx", "onnxscript")
@@ -49,16 +48,19 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
 
     Raises:
         ModuleNotFoundError: The extra `onnx` is not installed.
+        ValueError: Policies of its kind have no ONNX form.
     """
+    if KINDS[policy.spec.model.name].onnx is None:
+        raise ValueError(f"{policy.spec.model.name} has no ONNX form; give its row in models.kinds one")
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise ModuleNotFoundError(f"ONNX export needs {', '.join(missing)}: pip install 'evade[onnx]'")
-    flying = FlyingPolicy(policy).eval()
-    seen, examples, dynamic = flying.examples()
-    stack = torch.zeros(flying.shape, dtype=flying.dtype)
+    graph = PolicyGraph(policy).eval()
+    seen, examples, dynamic = graph.examples()
+    stack = torch.zeros(graph.shape, dtype=graph.dtype)
     names = {"input_names": [*seen, "last_stack", "first"], "output_names": ["logits", "next_stack"]}
     program: Any = torch.onnx.export(
-        flying,
+        graph,
         (*examples, stack, torch.tensor(True)),
         dynamo=True,
         dynamic_shapes=((*dynamic, None, None),),  # of the one argument *inputs
@@ -69,23 +71,22 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
     return Path(path)
 
 
-class FlyingPolicy(nn.Module):
-    """One step of one flight of a policy, as a function of tensors."""
+class PolicyGraph(nn.Module):
+    """One step of one episode of a policy, as a function of tensors."""
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
-        manifest = policy.manifest
-        feature = policy._feature
-        self.shape = (manifest["stack"], *feature.shape(manifest))
-        kept = torch.from_numpy(policy._stacks).dtype
+        spec = policy.spec
+        self.shape = policy.stack_shape
+        kept = torch.from_numpy(np.empty(0, policy.feature.dtype)).dtype
         self.dtype = torch.int32 if kept == torch.int16 else kept  # of which onnxruntime knows more
-        self.size = manifest["height"], manifest["width"]
-        self.sees_events = feature.from_events is not None
+        self.size = spec.height, spec.width
+        self.sees_events = policy.feature.from_events is not None
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
         self.read = self.trunk.plain if isinstance(self.trunk, EventSet) else self.trunk
-        self.kind = KINDS[manifest["name"]].feature
+        self.feature = resolve(KINDS[spec.model.name].onnx or "")
         if isinstance(policy.encoder, PictureEncoder):
-            self.kind, self.layers, self.latent = "picture_latent", policy.encoder.layers, manifest["latent"]
+            self.layers, self.latent = policy.encoder.layers, policy.encoder.latent_size
         elif policy.encoder is not None:
             table = policy.encoder
             self.time_bins, self.turns = table.grid.time_bins, table.phase is not None
@@ -98,7 +99,7 @@ class FlyingPolicy(nn.Module):
             for name, array in arrays.items():
                 self.register_buffer(name, torch.from_numpy(array.copy()))
 
-    def examples(self) -> tuple[list[str], tuple[Tensor, ...], tuple[Any, ...]]:
+    def examples(self) -> tuple[list[str], tuple[Tensor, ...], tuple[object, ...]]:
         """Names, examples and free sizes of what the policy sees."""
         if self.sees_events:
             events = torch.tensor([[0, 0, 0, 1], [1, 0, 0, -1], [2, 0, 0, 1]])
@@ -109,13 +110,13 @@ class FlyingPolicy(nn.Module):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Logits and the next stack; inputs as the module's docstring lists them."""
         *seen, stack, first = inputs
-        feature = MAKERS[self.kind](self, *seen).to(self.dtype)
+        feature = self.feature(self, *seen).to(self.dtype)
         pushed = torch.cat([stack[1:], feature[None]])
         stack = torch.where(first, feature[None].expand(self.shape), pushed)
         return self.pi(self.read(stack[None]))[0], stack
 
 
-def _latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
     """Maximum over the events of table rows, then the encoder's dense layers (appendix C)."""
     there = torch.ones_like(events[:, :1], dtype=torch.bool)
     if policy.most_events is not None:
@@ -132,18 +133,18 @@ def _latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
     return policy.head_weight @ hidden + policy.head_bias
 
 
-def _picture_latent(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+def picture_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
     """Mean of the latent of the event image, with OFF as a share of ON."""
-    picture = _event_image(policy, events, window_us)
-    shares = torch.where(picture == ON, 1.0, torch.where(picture == OFF, OFF_SHARE, 0.0))
+    picture = event_image(policy, events, window_us)
+    shares = torch.where(picture == PICTURE_ON, 1.0, torch.where(picture == PICTURE_OFF, OFF_SHARE, 0.0))
     return policy.layers(shares[None, None])[0, : policy.latent]
 
 
-def _events(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+def event_set(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
     """Rows of events, as `models.encoder.event_batch.event_rows`."""
     events, there = _thinned(events, EVENTS)
     t, x, y, p = events.unbind(1)
-    rows = torch.stack([torch.where(p > 0, ON_ROW, OFF_ROW), _bins(t, window_us, TIMES), x, y], dim=1)
+    rows = torch.stack([torch.where(p > 0, ROW_ON, ROW_OFF), _bins(t, window_us, TIMES), x, y], dim=1)
     return torch.where(there, rows, 0)
 
 
@@ -163,7 +164,7 @@ def _bins(t: Tensor, window_us: Tensor, time_bins: int) -> Tensor:
     return torch.div(offset * time_bins, window_us, rounding_mode="floor").clamp(max=time_bins - 1)
 
 
-def _columns(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+def columns(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
     """log(1 + count) of ON, then of OFF events in each column."""
     _, x, _, p = events.unbind(1)
     width = policy.size[1]
@@ -172,31 +173,21 @@ def _columns(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
     return torch.log1p(counts)
 
 
-def _event_image(policy: FlyingPolicy, events: Tensor, window_us: Tensor) -> Tensor:
+def event_image(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
     """255 or 125 by each pixel's last event: the one with the highest number."""
     _, x, y, p = events.unbind(1)
     numbered = 2 * torch.ones_like(p).cumsum(0) + (p > 0)
     none = torch.zeros(policy.size[0] * policy.size[1], dtype=torch.int64)
     last = none.scatter_reduce(0, y * policy.size[1] + x, numbered, "amax")
-    return torch.where(last == 0, 0, torch.where(last % 2 == 1, ON, OFF)).reshape(policy.size)
+    return torch.where(last == 0, 0, torch.where(last % 2 == 1, PICTURE_ON, PICTURE_OFF)).reshape(policy.size)
 
 
-def _grey(policy: FlyingPolicy, luminance: Tensor) -> Tensor:
+def grey(policy: PolicyGraph, luminance: Tensor) -> Tensor:
     """Gamma-encoded 8-bit picture."""
     return torch.round(255.0 * luminance.clamp(0.0, 1.0) ** (1.0 / GAMMA))
 
 
-def _code(policy: FlyingPolicy, events: Tensor) -> Tensor:
+def _code(policy: PolicyGraph, events: Tensor) -> Tensor:
     """Row of each event in a table: ((p > 0) * height + y) * width + x."""
     _, x, y, p = events.unbind(1)
     return ((p > 0) * policy.size[0] + y) * policy.size[1] + x
-
-
-MAKERS: dict[str, Callable[..., Tensor]] = {
-    "latent": _latent,
-    "picture_latent": _picture_latent,
-    "events": _events,
-    "columns": _columns,
-    "event_image": _event_image,
-    "grey": _grey,
-}

@@ -1,9 +1,9 @@
-"""What flies: a stack of the last features, a network, the encoder if there is one; one folder.
+"""Policies and their folders: encoder, stack of the last features, networks.
 
 A policy folder turns observations, or events, into actions with the preprocessing of training,
 on a machine without Ray and without running anyone's code: safetensors files and their JSON
-manifests, each checked against its SHA-256 before use. An encoder that learnt on with its policy is
-in the networks' file, and flies from a table like a frozen one.
+manifests, each checked against its SHA-256 before use. A fine-tuned encoder is stored in the
+networks' file, and runs from a lookup table like a frozen one.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import safetensors.torch
@@ -19,81 +19,99 @@ import torch
 from torch import Tensor, nn
 
 from models.encoder.evae import EventVAE
-from models.encoder.event_images import PictureEncoder
-from models.encoder.finetuned import EVENTS, evae_settings
-from models.encoder.frozen import encoder_of, tabulate
-from models.encoder.table import EncoderTable
+from models.encoder.finetuned import EVENTS
+from models.encoder.frozen import Encoder, encoder_of, tabulate
 from models.encoder.weights import (
     EncoderFileError,
+    EncoderManifest,
     lean_tensors,
     load_encoder,
     read_limited,
     save_encoder,
     write_atomic,
 )
-from models.kinds import FINETUNED, KINDS, MIN_IMAGE, kind_of
-from models.policy.features import FEATURES, feature_of, push_features
+from models.kinds import PolicySpec, read_spec
+from models.policy.features import LATENT, Step, feature_of, push_features
 from models.policy.networks import assemble
 
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
 ENCODER_FILES = (ENCODER, "encoder.json")
-SIZES = ("stack", "num_actions", "width", "height")
-REQUIRED = ("sha256", "name", *SIZES, "latent", "hidden", "sensor", "sensor_hash")
+REQUIRED = ("sha256", "name", "sensor", "sensor_hash")
 FORMAT = 2
 MAX_BYTES = 1 << 28  # of one file, which is read whole
-MAX_SIZE = 1 << 16  # of a layer
 
 
 class PolicyFileError(ValueError):
     """A policy folder that was refused; the message names the file and the reason."""
 
 
+class PolicyManifest(TypedDict, total=False):
+    """What a policy's manifest holds beside the settings that `models.kinds.read_spec` reads."""
+
+    format: int
+    sha256: dict[str, str]
+    name: str
+    exp: str
+    run: str
+    seed: int
+    observation: str
+    window_capacity: int
+    sensor: dict[str, object]
+    sensor_hash: str
+    figures: dict[str, float]
+
+
 class Policy:
-    """Observations in, actions out; remembers the last features of each flight.
+    """Observations in, actions out; remembers the last features of each episode.
 
     Attributes:
-        manifest: Name, sensor settings and hash, network sizes, training settings and figures.
+        spec: What its networks were built from.
+        manifest: Sensor settings and hash, training settings and metrics; empty if it is from no folder.
+        encoder: Makes the latents that the networks read, frozen or fine-tuned; None without one.
         deterministic: True: the most likely action; False: one drawn from the distribution.
     """
 
     def __init__(
         self,
         networks: nn.ModuleDict,
-        manifest: Mapping[str, Any],
-        encoder: EncoderTable | PictureEncoder | None = None,
+        spec: PolicySpec,
+        encoder: Encoder | None = None,
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
+        manifest: PolicyManifest | None = None,
     ) -> None:
-        """Join the networks and the encoder, if any; a stochastic policy needs `rng`.
-
-        With an encoder the networks read its latents, however it was trained.
-        """
+        """Join the networks and the encoder, if any; a stochastic policy needs `rng`."""
         if not deterministic and rng is None:
             raise ValueError("rng must be given for a stochastic policy (deterministic=False), got None")
-        self.networks, self.manifest, self.encoder = networks, manifest, encoder
+        self.networks, self.spec, self.encoder = networks, spec, encoder
         self.deterministic, self.rng = deterministic, rng
-        self._feature = feature_of(manifest) if encoder is None else FEATURES["latent"]
+        self.manifest: PolicyManifest = {} if manifest is None else manifest
+        self.feature = feature_of(spec) if encoder is None else LATENT
         self.reset()
 
     @property
     def observation(self) -> str:
         """What the environment must show it: "window", "event_image" or "luminance"."""
-        return KINDS[self.manifest["name"]].observation
+        return self.spec.kind.observation
+
+    @property
+    def stack_shape(self) -> tuple[int, ...]:
+        """Shape of what the networks read for one episode: (stack, *feature), oldest first."""
+        return self.spec.model.stack, *self.feature.shape(self.spec)
 
     def reset(self, num_envs: int = 1) -> None:
-        """Forget everything: the next observations are the first of `num_envs` flights."""
-        shape = (num_envs, self.manifest["stack"], *self._feature.shape(self.manifest))
-        self._stacks = np.zeros(shape, self._feature.dtype)
+        """Forget everything: the next observations are the first of `num_envs` episodes."""
+        self._stacks: np.ndarray = np.zeros((num_envs, *self.stack_shape), self.feature.dtype)
         self._first = np.ones(num_envs, bool)
 
     def __call__(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
-        """Choose an action for each flight.
+        """Choose an action for each episode.
 
         Args:
-            observations: (B, ...), one per flight, of the kind that `observation` names:
+            observations: (B, ...), one per episode, of the kind that `observation` names:
                 windows int32 (B, capacity + 1, 4), event images uint8 (B, H, W) or luminance
                 float32 (B, H, W).
-            restarted: bool (B,), True where the observation is the first of a new flight
+            restarted: bool (B,), True where the observation is the first of a new episode
                 (with Gymnasium's NEXT_STEP autoreset: where the step before was terminated
                 or truncated); None: nowhere.
 
@@ -103,11 +121,11 @@ class Policy:
         return self._choose(self.logits(observations, restarted))
 
     def act(self, events: Any, start_us: int, window_us: int) -> int:
-        """Choose the action of one flight from the events of its control step; see `event_logits`."""
+        """Choose the action of one episode from the events of its control step; see `event_logits`."""
         return int(self._choose(self.event_logits(events, start_us, window_us)[None])[0])
 
     def event_logits(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Unnormalised log-probabilities float32 (actions,) of one flight's next step, from its events.
+        """Unnormalised log-probabilities float32 (actions,) of one episode's next step, from its events.
 
         Args:
             events: Integer arrays t, x, y, p by name, such as an EVENT array: the events of the
@@ -118,21 +136,21 @@ class Policy:
         Raises:
             ValueError: The policy does not see events.
         """
-        if self._feature.from_events is None:
-            rule = f"a policy that sees {self.observation}: call it with observations"
-            raise ValueError(f"events say nothing to {rule}")
-        feature = self._feature.from_events((events, start_us, window_us), self.manifest, self.encoder)
+        if self.feature.from_events is None:
+            rule = f"this policy takes {self.observation} images, not events"
+            raise ValueError(f"{rule}: call it with observations")
+        feature = self.feature.from_events(Step(events, start_us, window_us), self.spec, self.encoder)
         return self._logits(feature[None], None)[0]
 
     def logits(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
         """Unnormalised log-probabilities float32 (B, actions); arguments as in a call."""
-        features = self._feature.from_observations(observations, self.manifest, self.encoder)
+        features = self.feature.from_observations(observations, self.spec, self.encoder)
         return self._logits(features, restarted)
 
     def _logits(self, features: np.ndarray, restarted: np.ndarray | None) -> np.ndarray:
         if len(features) != len(self._stacks):
             raise ValueError(
-                f"observations must be one for each of {len(self._stacks)} flights, got {len(features)}: "
+                f"observations must be one for each of {len(self._stacks)} episodes, got {len(features)}: "
                 "call reset(num_envs) first"
             )
         first = self._first if restarted is None else self._first | restarted
@@ -156,23 +174,22 @@ class Policy:
 def save_policy(
     path: str | Path,
     networks: nn.ModuleDict,
-    manifest: Mapping[str, Any],
+    spec: PolicySpec,
+    about: Mapping[str, object],
     evae: EventVAE | None = None,
-    encoder_figures: Mapping[str, float] | None = None,
+    encoder_metrics: Mapping[str, float] | None = None,
     lean: bool = False,
 ) -> Path:
     """Write a policy folder that is sufficient alone; its manifest comes last, and seals it.
 
     Args:
         path: Folder, made if missing.
-        networks: Those of `models.policy.networks.assemble`; with the value, for those who train on.
-        manifest: At least `name`, `stack`, `num_actions`, `width`, `height`, `latent` and
-            `hidden` (or None), `sensor` and `sensor_hash`, for an encoder that learnt on also
-            `encoder` and `models.encoder.finetuned.SETTINGS`; anything else that JSON holds, such as
-            training figures.
+        networks: Those of `models.policy.networks.assemble`; with the value, for further training.
+        spec: What they were built from.
+        about: `sensor` and `sensor_hash`, and anything else that JSON holds, such as metrics.
         evae: The frozen event VAE, for a policy that has one.
-        encoder_figures: Its own held-out figures, for the encoder's manifest.
-        lean: Weights in float16 and no decoder, a fraction of the size: it flies, but draws nothing.
+        encoder_metrics: Its own held-out metrics, for the encoder's manifest.
+        lean: Weights in float16 and no decoder, a fraction of the size: it acts, but reconstructs nothing.
 
     Returns:
         The folder.
@@ -180,23 +197,24 @@ def save_policy(
     Raises:
         ValueError: An event VAE is missing or too many.
     """
-    needed = kind_of(manifest).encoder
-    if needed != (evae is not None):
-        raise ValueError(f"evae must be {'given' if needed else 'None'} for {manifest['name']}, got {evae!r}")
+    if spec.frozen != (evae is not None):
+        rule = f"evae must be {'given' if spec.frozen else 'None'} for {spec.model.name}"
+        raise ValueError(f"{rule}, got {evae!r}")
     folder = Path(path)
     folder.mkdir(parents=True, exist_ok=True)
     if evae is not None:
-        facts = {key: manifest[key] for key in ("sensor", "sensor_hash")}
-        save_encoder(folder / ENCODER, evae, {**facts, "figures": dict(encoder_figures or {})}, lean)
+        facts = {key: about[key] for key in ("sensor", "sensor_hash")}
+        save_encoder(folder / ENCODER, evae, {**facts, "figures": dict(encoder_metrics or {})}, lean)
     tensors = {name: value.detach().contiguous() for name, value in networks.state_dict().items()}
     write_atomic(folder / NETWORKS, safetensors.torch.save(lean_tensors(tensors) if lean else tensors))
-    sums = {name: _digest(folder / name) for name in _files(manifest)}
-    text = json.dumps({**manifest, "format": FORMAT, "sha256": sums}, indent=2, allow_nan=False)
+    sums = {name: _digest(folder / name) for name in _files(spec)}
+    manifest = {**about, **spec.manifest(), "format": FORMAT, "sha256": sums}
+    text = json.dumps(manifest, indent=2, allow_nan=False)
     write_atomic(folder / MANIFEST, text.encode())
     return folder
 
 
-def save_lean_policy(source: str | Path, path: str | Path, about: Mapping[str, Any]) -> Path:
+def save_lean_policy(source: str | Path, path: str | Path, about: Mapping[str, object]) -> Path:
     """Write the policy of a folder once more, lean, with `about` added to its manifest; return the new one.
 
     Raises:
@@ -204,10 +222,10 @@ def save_lean_policy(source: str | Path, path: str | Path, about: Mapping[str, A
     """
     folder = Path(source)
     load_policy(folder)  # checks every file
-    manifest = _read_manifest(folder / MANIFEST)
-    evae, own = load_encoder(folder / ENCODER) if kind_of(manifest).encoder else (None, {})
-    networks = _load_networks(folder / NETWORKS, manifest)
-    return save_policy(path, networks, {**manifest, **about}, evae, own.get("figures"), lean=True)
+    manifest, spec = _read_manifest(folder / MANIFEST)
+    evae, own = load_encoder(folder / ENCODER) if spec.frozen else (None, EncoderManifest())
+    networks = _load_networks(folder / NETWORKS, spec)
+    return save_policy(path, networks, spec, {**manifest, **about}, evae, own.get("figures"), lean=True)
 
 
 def load_policy(
@@ -219,83 +237,60 @@ def load_policy(
         PolicyFileError: If the folder is not a whole, unchanged policy of this format.
     """
     folder = Path(path)
-    manifest = _read_manifest(folder / MANIFEST)
+    manifest, spec = _read_manifest(folder / MANIFEST)
     for name, expected in manifest["sha256"].items():
         if _digest(folder / name) != expected:
             raise PolicyFileError(f"{folder / name}: SHA-256 must be {expected}: another or a damaged file")
-    kind = kind_of(manifest)
-    table = _load_encoder(folder, manifest) if kind.encoder else None
-    networks = _load_networks(folder / NETWORKS, manifest)
-    if kind.network == "finetuned":
-        table, networks["trunk"] = _tabulated(networks["trunk"], manifest), nn.Flatten()
-    return Policy(networks, manifest, table, deterministic, rng)
+    encoder = _load_encoder(folder, spec) if spec.frozen else None
+    networks = _load_networks(folder / NETWORKS, spec)
+    if spec.finetuned:
+        encoder, networks["trunk"] = _tabulated(networks["trunk"], spec), nn.Flatten()
+    return Policy(networks, spec, encoder, deterministic, rng, manifest)
 
 
-def _files(manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """The files that a policy's manifest vouches for."""
-    return (*(ENCODER_FILES if kind_of(manifest).encoder else ()), NETWORKS)
+def _files(spec: PolicySpec) -> tuple[str, ...]:
+    """The files of a policy beside its manifest, which holds their SHA-256."""
+    return (*(ENCODER_FILES if spec.frozen else ()), NETWORKS)
 
 
-def _read_manifest(file: Path) -> dict[str, Any]:
+def _read_manifest(file: Path) -> tuple[PolicyManifest, PolicySpec]:
     try:
-        manifest = json.loads(_read(file))
+        read = json.loads(_read(file))
     except (ValueError, RecursionError) as error:
         raise PolicyFileError(f"{file}: not a JSON file: {error}") from None
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        found = manifest.get("format") if isinstance(manifest, dict) else None
+    manifest: Any = read if isinstance(read, dict) else {}
+    if (found := manifest.get("format")) != FORMAT:
         raise PolicyFileError(f"{file}: format {found!r}, this version reads {FORMAT}; train it anew")
     missing = [key for key in REQUIRED if key not in manifest]
     if missing:
         raise PolicyFileError(f"{file}: the manifest lacks {missing}; export the policy again")
-    name = manifest["name"]
-    known = FINETUNED if manifest.get("encoder") == "finetuned" else KINDS
-    if not isinstance(name, str) or name not in known:
-        raise PolicyFileError(f"{file}: name must be one of {', '.join(known)}, got {name!r}")
-    if not isinstance(manifest["sha256"], dict) or set(manifest["sha256"]) != set(_files(manifest)):
-        wanted = ", ".join(_files(manifest))
+    try:
+        spec = read_spec(manifest)
+    except ValueError as error:
+        raise PolicyFileError(f"{file}: {error}") from None
+    if not isinstance(manifest["sha256"], dict) or set(manifest["sha256"]) != set(_files(spec)):
+        wanted = ", ".join(_files(spec))
         raise PolicyFileError(f"{file}: sha256 must name {wanted}, got {manifest['sha256']!r}")
-    _check_sizes(file, manifest)
-    return manifest
+    return manifest, spec
 
 
-def _check_sizes(file: Path, manifest: Mapping[str, Any]) -> None:
-    """Refuse sizes of which no network can be built."""
-    kind = KINDS[manifest["name"]]
-    used = [*SIZES, *(["latent"] if kind.encoder else [])]
-    hidden = manifest["hidden"] if kind.network == "mlp" else []
-    sizes = [manifest[name] for name in used] + (hidden if isinstance(hidden, list) else [None])
-    if not all(type(size) is int and 1 <= size <= MAX_SIZE for size in sizes):
-        raise PolicyFileError(f"{file}: {', '.join(used)} and hidden must be integers in 1..{MAX_SIZE}")
-    if kind_of(manifest).network == "finetuned":
-        try:
-            evae_settings(manifest)
-        except ValueError as error:
-            raise PolicyFileError(f"{file}: {error}") from None
-    if kind.network == "cnn" and min(manifest["width"], manifest["height"]) < MIN_IMAGE:
-        rule = f"must be at least {MIN_IMAGE} for {manifest['name']}"
-        raise PolicyFileError(f"{file}: width and height {rule}")
-
-
-def _load_encoder(folder: Path, manifest: Mapping[str, Any]) -> EncoderTable | PictureEncoder:
+def _load_encoder(folder: Path, spec: PolicySpec) -> Encoder:
     evae, _ = load_encoder(folder / ENCODER)
-    ours = {"variant": manifest["name"], **{key: manifest[key] for key in ("latent", "width", "height")}}
-    theirs = {key: evae.settings[key] for key in ours}
-    if ours != theirs:
-        raise PolicyFileError(f"{folder / ENCODER}: must be the encoder of {ours}, got one of {theirs}")
+    if evae.settings != spec.evae:
+        raise PolicyFileError(f"{folder / ENCODER}: must be that of {spec.evae}, got one of {evae.settings}")
     return encoder_of(evae)
 
 
-def _tabulated(trunk: nn.Module, manifest: Mapping[str, Any]) -> EncoderTable | PictureEncoder:
-    """The table of an encoder that learnt on; it sees windows thinned as in training."""
-    table: Any = tabulate(trunk, evae_settings(manifest))
+def _tabulated(trunk: nn.Module, spec: PolicySpec) -> Encoder:
+    """The lookup table of a fine-tuned encoder; it thins windows as in training."""
+    table: Any = tabulate(trunk, spec.evae)
     return dataclasses.replace(table, most_events=EVENTS)
 
 
-def _load_networks(file: Path, manifest: Mapping[str, Any]) -> nn.ModuleDict:
+def _load_networks(file: Path, spec: PolicySpec) -> nn.ModuleDict:
     """The networks of the file's tensors, which must fit one by one and be finite.
 
-    They are put together without memory for their weights: sizes that the file does not
-    bear out cost nothing.
+    They are built without memory for their weights, so that wrong sizes in a manifest cost nothing.
     """
     try:
         read = safetensors.torch.load(_read(file))
@@ -303,7 +298,7 @@ def _load_networks(file: Path, manifest: Mapping[str, Any]) -> nn.ModuleDict:
         raise PolicyFileError(f"{file}: not a safetensors file: {error}") from None
     tensors = {name: value.float() if value.dtype == torch.half else value for name, value in read.items()}
     with torch.device("meta"):
-        networks = assemble(manifest)
+        networks = assemble(spec)
     if _forms(tensors) != _forms(networks.state_dict()):
         raise PolicyFileError(f"{file}: not the networks of this policy: other tensors than it needs")
     bad = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
@@ -316,7 +311,7 @@ def _load_networks(file: Path, manifest: Mapping[str, Any]) -> nn.ModuleDict:
     return networks.requires_grad_(False)
 
 
-def _forms(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
+def _forms(tensors: Mapping[str, Tensor]) -> dict[str, tuple[object, ...]]:
     return {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()}
 
 

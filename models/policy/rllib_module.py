@@ -1,13 +1,12 @@
 """A policy inside RLlib: a module that owns the networks and the encoder.
 
-`features` makes what a policy keeps of a step (`models.policy.features`); the networks see stacks of the
+`features` computes the features of a step (`models.policy.features`); the networks read stacks of the
 last ones (`jobs.training.env_runner` keeps them). `models.policy.policy` is the same policy without Ray.
 """
 
 from collections import deque
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -19,10 +18,9 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor, nn
 
 from models.encoder.event_batch import cut_packed
-from models.encoder.event_images import PictureEncoder
-from models.encoder.frozen import read_encoder_part, tabulate
-from models.encoder.table import EncoderTable
-from models.kinds import kind_of
+from models.encoder.frozen import Encoder, read_encoder_part, tabulate
+from models.encoder.weights import EncoderManifest
+from models.kinds import EvaeSettings, PolicySpec
 from models.policy.features import feature_of
 from models.policy.networks import PARTS, build_networks
 
@@ -30,38 +28,52 @@ MET_WINDOWS = 128  # that a module remembers
 VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
 
 
-def stack_space(settings: Mapping[str, Any]) -> gym.spaces.Box:
-    """What the networks see: (stack, *feature), oldest feature first."""
-    feature = feature_of(settings)
+class EncoderFile(NamedTuple):
+    """The file of a pretrained encoder.
+
+    Attributes:
+        path: Of the tensors.
+        digest: Their SHA-256.
+        settings: Of the event VAE.
+    """
+
+    path: str
+    digest: str
+    settings: EvaeSettings
+
+
+def stack_space(spec: PolicySpec) -> gym.spaces.Box:
+    """What the networks read: (stack, *feature), oldest feature first."""
+    feature = feature_of(spec)
     whole = np.issubdtype(feature.dtype, np.integer)
     low, high = (np.iinfo(feature.dtype).min, np.iinfo(feature.dtype).max) if whole else (-np.inf, np.inf)
-    return gym.spaces.Box(low, high, (settings["stack"], *feature.shape(settings)), feature.dtype)
+    return gym.spaces.Box(low, high, (spec.model.stack, *feature.shape(spec)), feature.dtype)
 
 
 class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     """Frozen encoder, where the policy has one, and the networks.
 
     The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
-    checkpoint is sufficient alone. An encoder that learns on is the networks' trunk instead.
+    checkpoint is sufficient alone. A fine-tuned encoder is the networks' trunk instead.
     `model_config` holds what `module_spec` puts there.
 
     Attributes:
-        met: With a frozen encoder, the newest windows that it was shown, one of each vector step
-            and of each flight in turn, as `models.encoder.event_batch.cut_packed` cuts them.
+        met: With a frozen encoder, a sample of the newest windows that it was shown, one of each vector
+            step and of each episode in turn, as `models.encoder.event_batch.cut_packed` cuts them.
     """
 
     def setup(self) -> None:
         """Build the parts; called once by RLlib."""
-        settings: Any = self.model_config
-        about = settings["encoder_file"]
-        part = None if about is None else read_encoder_part(**about)
-        networks = build_networks(settings, settings["seed"])
-        if part is not None and not kind_of(settings).encoder:
+        self.spec: PolicySpec = self.model_config["spec"]
+        file: EncoderFile | None = self.model_config["encoder_file"]
+        part = None if file is None else read_encoder_part(*file)
+        networks = build_networks(self.spec, self.model_config["seed"])
+        if part is not None and self.spec.finetuned:
             networks["trunk"].load_state_dict(part.state_dict())
             part = None
         self.encoder = part
         self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
-        self._table: EncoderTable | PictureEncoder | None = None
+        self._table: Encoder | None = None
         self.met: deque[np.ndarray] = deque(maxlen=MET_WINDOWS)
         self._steps = 0
 
@@ -84,14 +96,13 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
     def features(self, observations: np.ndarray) -> np.ndarray:
         """Features (B, ...) of observations (B, ...)."""
-        settings: Any = self.model_config
         if self.encoder is not None:
-            self._table = self._table or tabulate(self.encoder, settings["encoder_file"]["settings"])
+            self._table = self._table or tabulate(self.encoder, self.model_config["encoder_file"].settings)
             self.met.append(cut_packed(observations[self._steps % len(observations)]))
             self._steps += 1
-        return feature_of(settings).from_observations(observations, settings, self._table)
+        return feature_of(self.spec).from_observations(observations, self.spec, self._table)
 
-    def set_state(self, state: dict[str, Any]) -> None:
+    def set_state(self, state: Any) -> None:
         """Load weights; the table is built anew only if they change the encoder."""
         if self.encoder is None:
             super().set_state(state)
@@ -101,19 +112,19 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         if not all(map(torch.equal, before, self.encoder.state_dict().values())):
             self._table = None
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the table, which is built from the encoder where it is needed, and the windows."""
+    def __getstate__(self) -> dict[str, object]:
+        """Everything but the windows and the table, which is built from the encoder where it is needed."""
         return {**self.__dict__, "_table": None, "met": deque(maxlen=MET_WINDOWS)}
 
-    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+    def _forward(self, batch: dict[str, Tensor], **kwargs: object) -> dict[str, Tensor]:
         return {Columns.ACTION_DIST_INPUTS: self.pi(self.trunk(batch[Columns.OBS]))}
 
-    def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+    def _forward_train(self, batch: dict[str, Tensor], **kwargs: object) -> dict[str, Tensor]:
         """The same, and what the trunk gives, so that the value's loss need not run it again."""
         embeddings = self.trunk(batch[Columns.OBS])
         return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), Columns.EMBEDDINGS: embeddings}
 
-    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Tensor:
+    def compute_values(self, batch: dict[str, Tensor], embeddings: Tensor | None = None) -> Tensor:
         """Values float32 (B,) of the batch's observations.
 
         Without the trunk's embeddings no gradient is kept: RLlib asks so for the targets, of
@@ -127,22 +138,22 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
 
 def module_spec(
-    settings: Mapping[str, Any], seed: int, encoder: tuple[str | Path, Mapping[str, Any]] | None = None
+    spec: PolicySpec, seed: int, encoder: tuple[str | Path, EncoderManifest] | None = None
 ) -> RLModuleSpec:
     """Specification of the module.
 
     Args:
-        settings: What `models.policy.networks.build_networks` reads.
+        spec: What the networks are built from.
         seed: Of the networks' initial weights.
         encoder: The pretrained encoder's file and its manifest; None for a policy without one.
     """
-    about = None
+    file = None
     if encoder is not None:
         path, manifest = encoder
-        about = {"path": str(path), "digest": manifest["sha256"], "settings": manifest["model"]}
+        file = EncoderFile(str(path), manifest["sha256"], manifest["model"])
     return RLModuleSpec(
         module_class=PolicyModule,
-        observation_space=stack_space(settings),
-        action_space=gym.spaces.Discrete(settings["num_actions"]),
-        model_config={**settings, "encoder_file": about, "seed": seed},
+        observation_space=stack_space(spec),
+        action_space=gym.spaces.Discrete(spec.num_actions),
+        model_config={"spec": spec, "encoder_file": file, "seed": seed},
     )

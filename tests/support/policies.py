@@ -1,5 +1,6 @@
 """Untrained policies and their folders for tests."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from models.encoder.evae import EventVAE
-from models.kinds import KINDS, kind_of
+from models.kinds import PolicySpec, model_keys, read_model
 from models.policy import save_policy
 from models.policy.networks import build_networks
 from models.policy.policy import MANIFEST
@@ -16,6 +17,7 @@ from models.policy.policy import MANIFEST
 HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
 SIDE = 40
 SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789ab"}
+ABOUT = {**SENSOR, "figures": {"return": 1.5}}
 FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
 
 
@@ -26,17 +28,15 @@ def kinds(names, quick=("bytestream", "rgb")):
 
 def save_untrained(path, env_config=HELD_OUT, name="bytestream"):
     """A policy folder with random weights; large ones, so that its actions differ."""
-    kind, sensor = KINDS[name], sensor_settings(env_config)
-    sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
-    parts = {"latent": 8 if kind.encoder else None, "hidden": [16] if kind.network == "mlp" else None}
+    sensor = sensor_settings(env_config)
+    spec = dataclasses.replace(make_spec(name, hidden=[16], time_bins=1024), width=64, height=64)
     about = {"sensor": sensor, "sensor_hash": settings_hash(sensor), "figures": {}}
-    networks = build_networks({"name": name, **sizes, **parts}, seed=3)
+    networks = build_networks(spec, seed=3)
     for value in networks["pi"].parameters():
         value.data *= 1000.0
     torch.manual_seed(0)
-    evae = EventVAE(context=64).freeze() if kind.encoder else None
-    manifest = {"name": name, **sizes, **parts, **about}
-    return save_policy(path, networks, manifest, evae, {"reconstruction_step": 0.5})
+    evae = EventVAE(context=64).freeze() if spec.frozen else None
+    return save_policy(path, networks, spec, about, evae, {"reconstruction_step": 0.5})
 
 
 def save_training(path, group, seed, env_config, name="event_columns"):
@@ -52,31 +52,26 @@ def make_evae(seed=0, variant="bytestream"):
     return EventVAE(variant, width=SIDE, height=SIDE, context=64, time_bins=32).freeze()
 
 
-def make_settings(name):
-    """Of a kind of policy, or of "finetuned": bytestream with an encoder that learnt on."""
+def make_spec(name, **changes):
+    """Of a kind of policy, or of "finetuned": bytestream with a fine-tuned encoder."""
     if name == "finetuned":
-        evae = make_evae().settings
-        own = {key: evae[key] for key in ("context", "norm", "target", "time_bins", "coding")}
-        return {**make_settings("bytestream"), **own, "encoder": "finetuned"}
-    kind = KINDS[name]
-    sizes = {"width": SIDE, "height": SIDE, "stack": 3, "num_actions": 3}
-    parts = {
-        "latent": 8 if kind.encoder else None,
-        "hidden": [64, 64] if kind.network == "mlp" else None,
-    }
-    return {"name": name, **sizes, **parts, **SENSOR, "figures": {"return": 1.5}}
+        return make_spec("bytestream", encoder="finetuned", **changes)
+    own = {"name": name, "stack": 3, "hidden": [64, 64], "context": 64, "latent": 8, "norm": "batch"}
+    own |= {"target": "signed", "time_bins": 32, "coding": "additive", "encoder": "frozen", **changes}
+    return PolicySpec(read_model(**{key: own[key] for key in model_keys(name)}), SIDE, SIDE, 3)
 
 
 def make_networks(name):
-    networks = build_networks(make_settings(name), seed=3)
+    networks = build_networks(make_spec(name), seed=3)
     *_, last = networks["pi"].modules()
     last.weight.data.mul_(100.0)  # so that actions differ
     return networks
 
 
 def save(path, name):
-    evae = make_evae(variant=name) if kind_of(make_settings(name)).encoder else None
-    return save_policy(path, make_networks(name), make_settings(name), evae)
+    spec = make_spec(name)
+    evae = make_evae(variant=name) if spec.frozen else None
+    return save_policy(path, make_networks(name), spec, ABOUT, evae)
 
 
 def make_windows(rng, count, capacity=40, side=16):

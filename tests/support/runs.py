@@ -8,7 +8,8 @@ from envs.config import sensor_settings, settings_hash
 from jobs.evaluation.sweep_plan import plan_sweep
 from jobs.rollout.policies import read_policy
 from jobs.tracking.tracker import open_store
-from jobs.training.pretrain import build_evae
+from jobs.training.pretrain import evae_settings
+from models.encoder.evae import EventVAE
 from models.encoder.weights import save_encoder
 
 
@@ -39,7 +40,7 @@ def tracked_sweeps(config, kind="condition", parent="sweep"):
 def write_encoder(folder, config):
     torch.manual_seed(0)
     sensor = sensor_settings(config.env)
-    evae = build_evae(config.model, sensor)
+    evae = EventVAE.of(evae_settings(config))
     for parameter in evae.ecn.parameters():  # random weights see little; make latents differ
         parameter.data.mul_(1.5)
     path = folder / "encoder.safetensors"

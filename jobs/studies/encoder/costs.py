@@ -67,9 +67,7 @@ def default_encodings(evae: EventVAE) -> list[Encoding]:
 
 def sized_encoding(evae: EventVAE) -> Encoding:
     """The table of a model of another context size."""
-    return Encoding(
-        "context", str(evae.settings["context"]), encode_whole(EncoderTable.from_evae(evae)), evae
-    )
+    return Encoding("context", str(evae.settings.context), encode_whole(EncoderTable.from_evae(evae)), evae)
 
 
 def encode_whole(table: EncoderTable) -> Encode:
@@ -101,7 +99,7 @@ def encode_by_network(evae: EventVAE) -> Encode:
     @torch.no_grad()
     def encode(window: Window) -> np.ndarray:
         context = evae.ecn.plain(batch_windows([window], evae.grid))
-        return evae.encoder(context)[0, : evae.settings["latent"]].numpy()
+        return evae.encoder(context)[0, : evae.settings.latent].numpy()
 
     return encode
 

@@ -43,6 +43,7 @@ from models.encoder.embedding import CODINGS
 from models.encoder.evae import EventVAE, event_targets, pictures, reconstruct
 from models.encoder.event_batch import EventBatch
 from models.encoder.weights import load_encoder
+from models.kinds import EncoderModel
 
 EVENT_ENCODERS = ("bytestream", "bytestream_xy")
 CONTEXTS = (128, 256, 512, 1024)
@@ -68,7 +69,7 @@ def run(config: Config) -> dict[str, float]:
         raise ConfigError(
             f"model: {model.name} has no encoder of single events; choose bytestream or bytestream_xy"
         )
-    if model.coding == "eventnet":
+    if isinstance(model, EncoderModel) and model.coding == "eventnet":
         raise ConfigError("model.coding: must be additive or none for this study, got 'eventnet'")
     check_sources(config)
     folder = open_run(config)
@@ -134,7 +135,7 @@ def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
     rows = {name: side_by_side(models, conditions[name]) for name in SHOWN}
     publish_plot(folder, tracker, "trade/coding_pictures", plot_pictures(rows, ("events", *CODINGS) * 2))
     return {
-        f"evae/explained_{coding}_{name.replace(' ', '_')}": mean
+        f"evae/explained_r2_{coding}_{name.replace(' ', '_')}": mean
         for coding, own in spreads.items()
         for name, (mean, _) in own.items()
     }
@@ -161,7 +162,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
         for scene, batch in scenes.items()
     }
     publish_plot(folder, tracker, "trade/scenes", plot_pictures(rows, ("events", "decoded") * PICTURES))
-    return {f"evae/explained_in_{scene.replace(' ', '_')}": share for scene, share in shares.items()}
+    return {f"evae/explained_r2_in_{scene.replace(' ', '_')}": share for scene, share in shares.items()}
 
 
 @torch.no_grad()

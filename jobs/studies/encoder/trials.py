@@ -1,12 +1,11 @@
 """Short trainings of the event VAE side by side, and the held-out windows they are compared on."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
@@ -15,17 +14,18 @@ from jobs.config.config import Config
 from jobs.run.folder import Run
 from jobs.run.progress import progress
 from jobs.training.collect import data_file
-from jobs.training.pretrain import Window, beta, build_evae, cut_window, sample_windows
-from models.encoder.evae import EventVAE, event_targets, train_step
+from jobs.training.pretrain import EvaeTraining, Window, cut_window, evae_settings, sample_windows
+from models.encoder.evae import EventVAE
 from models.encoder.event_batch import EventBatch, Grid, batch_windows
 from models.encoder.weights import load_encoder, save_encoder
+from models.kinds import EvaeSettings
 
 MAX_EVENTS, DENSE_EVENTS, SPARSE_EVENTS = 4096, 2000, 200
 OLDER_THAN = (0.5, 0.8, 0.9)
 NEWEST = 0.2
 
 
-def trained(config: Config, folder: Run, changes: dict[str, Any], seed: int) -> EventVAE:
+def trained(config: Config, folder: Run, changes: Mapping[str, Any], seed: int) -> EventVAE:
     """A frozen event VAE after a short training with some settings of the model changed.
 
     The same seed gives the same windows, whatever is changed. A training that was finished
@@ -33,18 +33,19 @@ def trained(config: Config, folder: Run, changes: dict[str, Any], seed: int) -> 
     """
     settings = trial_settings(config, changes)
     iterations = config.trade_encoder.iterations
-    name = f"{settings['variant']}-{settings['coding']}-{settings['context']}-s{seed}-{iterations}"
+    name = f"{settings.variant}-{settings.coding}-{settings.context}-s{seed}-{iterations}"
     file = folder.path / "trade" / "encoders" / f"{name}.safetensors"
     return kept(config, folder, file, settings, seed, iterations)
 
 
-def trial_settings(config: Config, changes: dict[str, Any]) -> dict[str, Any]:
+def trial_settings(config: Config, changes: Mapping[str, Any]) -> EvaeSettings:
     """The settings of the run's event VAE with some of them changed."""
-    return build_evae(config.model, sensor_settings(config.env)).settings | changes
+    changed: EvaeSettings = dataclasses.replace(evae_settings(config), **changes)
+    return changed
 
 
 def kept(
-    config: Config, folder: Run, file: Path, settings: dict[str, Any], seed: int, iterations: int
+    config: Config, folder: Run, file: Path, settings: EvaeSettings, seed: int, iterations: int
 ) -> EventVAE:
     """The frozen event VAE of a file, trained briefly on the run's recordings if it is not there yet."""
     if not file.with_suffix(".json").exists():
@@ -56,24 +57,14 @@ def kept(
 
 
 def train_short(
-    config: Config, train: Recording, settings: dict[str, Any], seed: int, iterations: int, title: str
+    config: Config, train: Recording, settings: EvaeSettings, seed: int, iterations: int, title: str
 ) -> EventVAE:
     """So many updates as `jobs.training.pretrain` makes them, without its checkpoints."""
-    pretrain = config.pretrain
-    torch.manual_seed(seed)
-    evae = EventVAE(**settings)
-    optimizer = torch.optim.Adam(
-        evae.parameters(), lr=pretrain.lr, weight_decay=pretrain.weight_decay, fused=True
-    )
-    rng = np.random.default_rng(np.random.SeedSequence([seed, 3]))
+    training = EvaeTraining.begin(settings, train, config.pretrain, (seed, 3))
     with progress(title, iterations, "iterations") as advance:
         for iteration in range(iterations):
-            windows = sample_windows(train, pretrain, pretrain.batch_windows, rng)
-            batch = batch_windows(windows, evae.grid)
-            targets = event_targets(batch, evae.target)
-            loss = train_step(evae, optimizer, batch, targets, beta(pretrain, iteration), rng)["loss"]
-            advance(1, note=f"loss {loss:.4f}")
-    return evae.freeze()
+            advance(1, note=f"loss {training.step(iteration)['loss']:.4f}")
+    return training.evae.freeze()
 
 
 def draw(

@@ -12,10 +12,10 @@ from envs.scene.range_scan import NEAR_M, proximity, sector_bearings
 from jobs.training.collect import HoldingAgent, steps_of
 from jobs.training.pretrain import Window
 from models.encoder.evae import EventVAE
-from models.encoder.event_batch import Grid, batch_windows
+from models.encoder.event_batch import Grid, address_events, batch_windows
 from models.encoder.event_images import cell_counts
 from models.encoder.frozen import encoder_of
-from models.policy.features import FEATURES
+from models.policy.features import column_counts
 
 SECTORS = 24  # of the field of view
 RAYS = 8  # in each sector: at 90 degrees no pole of 0.2 m is missed at 20 m
@@ -86,10 +86,8 @@ def nothing(probe_data: ProbeData) -> np.ndarray:
 
 def column_features(probe_data: ProbeData, grid: Grid) -> np.ndarray:
     """The features of the policy event_columns at each step, float32 (N, 2 width)."""
-    settings = {"width": grid.width, "height": grid.height}
-    make = FEATURES["columns"].from_events
-    assert make is not None  # noqa: S101  for the type checker
-    return np.stack([make(window, settings, None) for window in probe_data.windows])
+    addresses = (address_events(*window, grid) for window in probe_data.windows)
+    return np.stack([column_counts(address, grid.width, grid.height) for address in addresses])
 
 
 def cell_features(probe_data: ProbeData, grid: Grid, across: int) -> np.ndarray:

@@ -123,7 +123,7 @@ def find_encoder_policy(config: Config) -> tuple[EvaluatedPolicy, EventVAE]:
     file = Path(policy.agent) / ENCODER
     if not others and file.is_file():
         evae, _ = load_encoder(file)
-        if evae.settings["variant"] in EVENT_ENCODERS and evae.ecn.coding != "eventnet":
+        if evae.settings.variant in EVENT_ENCODERS and evae.ecn.coding != "eventnet":
             return policy, evae
     rule = f"must be one policy with a frozen encoder of {' or '.join(EVENT_ENCODERS)}, not EventNet's"
     raise ConfigError(f"trade.policy: {rule}, got {name!r}")

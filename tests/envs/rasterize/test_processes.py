@@ -43,9 +43,9 @@ def blocked(self, name, *args, **keywords):
     load(self, name, *args, **keywords)
 ctypes.CDLL.__init__ = blocked
 from envs.rasterize import PyrenderRenderer
-from envs.scene import make_scene
+from envs.scene import OBSTACLE, Scene
 try:
-    PyrenderRenderer(make_scene('poles', np.random.default_rng(0)), 8, 8)
+    PyrenderRenderer(Scene('empty', np.zeros(0, OBSTACLE)), 8, 8)
 except RuntimeError as error:
     print(error)
 """
@@ -81,9 +81,9 @@ import os
 os.environ['EGL_DEVICE_ID'] = '999'
 import numpy as np
 from envs.rasterize import PyrenderRenderer
-from envs.scene import make_scene
+from envs.scene import OBSTACLE, Scene
 try:
-    PyrenderRenderer(make_scene('poles', np.random.default_rng(0)), 8, 8)
+    PyrenderRenderer(Scene('empty', np.zeros(0, OBSTACLE)), 8, 8)
 except RuntimeError as error:
     print(error)
 """

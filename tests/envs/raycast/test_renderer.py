@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from envs.raycast import RaycastRenderer, sample_luminance
-from envs.scene import Scene, make_scene
-from envs.scene.scene import OBSTACLE
+from envs.scene import OBSTACLE, Scene, make_scene
 
 
 def poles(*rows: tuple[float, float, float, float]) -> np.ndarray:

@@ -52,7 +52,7 @@ sections = st.builds(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     rows=st.lists(sections, max_size=4),
     a=st.tuples(metres, metres),
@@ -266,7 +266,7 @@ def search(scene: Scene, radius: float, step: float, starts: np.ndarray) -> np.n
 
 def test_the_lattice_agrees_with_an_exact_search():
     starts, promises = np.array([-1.03, 0.0, 0.77]), []
-    for seed in range(16):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         kinds, radii = rng.choice([POLE, BOX, CONE, ELLIPSOID], 20), rng.uniform(0.2, 0.7, 20)
         places = rng.uniform((-3, 1), (3, 9), (20, 2))
@@ -275,7 +275,7 @@ def test_the_lattice_agrees_with_an_exact_search():
         leads = scene.ways_to_goal(0.2)
         cells = np.rint(starts / CELL_M)
         promised = leads[0, cells.astype(int) + (leads.shape[1] - 1) // 2]
-        # What is promised can be flown, and what can be flown with 1.5 cells to spare is promised.
+        # Each promised way exists, and each way with 1.5 cells to spare is promised.
         assert (search(scene, 0.2, 0.05, starts) >= promised).all()
         assert (promised >= search(scene, 0.2 + 1.5 * CELL_M, CELL_M, cells * CELL_M)).all()
         promises.append(promised.mean())

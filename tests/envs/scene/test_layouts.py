@@ -91,7 +91,7 @@ def test_only_texture_change_and_dynamic_are_not_plain():
     changed = LAYOUTS["texture_change"]
     textures = (changed.ground_texture, changed.wall_texture, changed.obstacle_texture)
     assert [texture.plain for texture in textures] == [False] * 3
-    assert LAYOUTS["dynamic"].obstacle_texture.moving
+    assert LAYOUTS["dynamic"].obstacle_texture.velocity_mps != (0.0, 0.0)
     assert LAYOUTS["dynamic"].shape != "pole"
 
 

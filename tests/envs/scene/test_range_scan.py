@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from envs.raycast.point_samples import BODY, trace_scene
-from envs.scene import Scene, make_scene
-from envs.scene.range_scan import NEAR_M, REACH_M, proximity, sector_bearings
-from envs.scene.scene import LAYOUTS, OBSTACLE, POLE
+from envs.scene import OBSTACLE, POLE, Scene, make_scene
+from envs.scene.range_scan import MAX_RANGE_M, NEAR_M, proximity, sector_bearings
 
 
 def pole(x, y, radius=0.5):
@@ -17,7 +16,7 @@ def marched(sections, eye, heading):
     """Distance to the first section by sphere tracing of its distance function [m], or inf."""
     x, y, ux, uy, hx, hy, r = sections.T
     travelled = 0.0
-    while travelled < REACH_M:
+    while travelled < MAX_RANGE_M:
         px, py = eye[0] + travelled * math.sin(heading), eye[1] + travelled * math.cos(heading)
         along, across = (px - x) * ux + (py - y) * uy, (py - y) * ux - (px - x) * uy
         gaps = np.hypot(np.maximum(abs(along) - hx, 0), np.maximum(abs(across) - hy, 0)) - r
@@ -31,7 +30,7 @@ def test_a_pole_ahead_is_as_near_as_its_surface():
     assert proximity(pole(0, 10), (0, 0, 2, 0), [0.0]) == pytest.approx([math.exp(-9.5 / NEAR_M)])
     assert proximity(pole(0, 10), (0, 0, 2, 0), [0.1, -0.1, math.pi]).tolist() == [0, 0, 0]
     assert proximity(pole(0, 10), (0, 10.2, 2, 0), [0.0, 1.0]).tolist() == [1, 1]
-    assert proximity(pole(0, REACH_M + 1), (0, 0, 2, 0), [0.0]).tolist() == [0]
+    assert proximity(pole(0, MAX_RANGE_M + 1), (0, 0, 2, 0), [0.0]).tolist() == [0]
     assert proximity(pole(0, 10), (0, 0, 7, 0), [0.0]).tolist() == [0]  # over its top
 
 
@@ -42,13 +41,13 @@ def test_bearings_are_to_the_right_and_yaw_turns_left():
     assert proximity(pole(5, 5), (0, 0, 2, 0.3), [math.pi / 4 + 0.3]) == pytest.approx(right[:1])
 
 
-@pytest.mark.parametrize("name", sorted(LAYOUTS))
+@pytest.mark.parametrize("name", ["poles", "cones", "gates", "shape_change"])  # each kind of body
 def test_it_agrees_with_marching_on_a_distance_function_and_with_rays_through_the_bodies(name):
     scene = make_scene(name, np.random.default_rng(1))
     rng, pixels, focal = np.random.default_rng(2), 101, 50.0
     bearings = np.arctan((np.arange(pixels) + 0.5 - 0.5 * pixels) / focal)
     hits = 0
-    for _ in range(12):
+    for _ in range(6):
         pose = (rng.uniform(-10, 10), rng.uniform(0, 90), 2.0, rng.uniform(-0.3, 0.3))
         near = proximity(scene, pose, bearings)
         if near.max() == 1.0:
@@ -59,7 +58,7 @@ def test_it_agrees_with_marching_on_a_distance_function_and_with_rays_through_th
         body = seen.surface[0] == BODY
         hits += body.sum()
         distance = np.where(body, seen.depth[0] / np.cos(bearings), np.inf)
-        distance[distance > REACH_M] = np.inf
+        distance[distance > MAX_RANGE_M] = np.inf
         np.testing.assert_allclose(near, np.exp(-distance / NEAR_M), atol=1e-12)
     assert hits > 50
 

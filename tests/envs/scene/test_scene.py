@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from envs.scene import BOX, CONE, ELLIPSOID, POLE, Scene, Texture, make_scene
-from envs.scene.scene import LAYOUTS, OBSTACLE, Layout
+from envs.scene import BOX, CONE, ELLIPSOID, LAYOUTS, OBSTACLE, POLE, Layout, Scene, Texture, make_scene
 
 
 def scene_of(*discs: tuple[float, float, float], **fields) -> Scene:
@@ -34,8 +33,8 @@ def test_every_scene_is_passable(name):
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_flying_straight_usually_fails(name):
     rng = np.random.default_rng(0)
-    scenes = [make_scene(name, rng) for _ in range(200)]
-    starts = rng.uniform(-10.0, 10.0, 200)
+    scenes = [make_scene(name, rng) for _ in range(100)]
+    starts = rng.uniform(-10.0, 10.0, 100)
     hits = [scene.collides((x, 0.0), (x, 100.0), 0.3) for scene, x in zip(scenes, starts, strict=True)]
     assert 0.7 < np.mean(hits) <= 1.0
 
@@ -95,22 +94,21 @@ def test_overrides_replace_values_of_the_layout():
     assert scene.obstacles["rx"].min() < scene.obstacles["rx"].max() <= 0.9
 
 
-def test_a_scene_says_what_is_in_it_and_whether_it_moves():
+def test_a_scene_says_what_kinds_are_in_it():
     rng = np.random.default_rng(0)
     kinds = {name: make_scene(name, rng).kinds for name in ("poles", "cones", "gates", "shape_change")}
     assert kinds == {"poles": {POLE}, "cones": {CONE}, "gates": {BOX}, "shape_change": {ELLIPSOID}}
     assert scene_of().kinds == set()
-    still = {name for name in LAYOUTS if make_scene(name, rng).is_still}
-    assert still == set(LAYOUTS) - {"dynamic"}
 
 
 def test_sections_are_remembered_for_a_few_heights_only():
     scene = scene_of((0.0, 10.0, 0.5))
-    assert scene.sections(2.0) is scene.sections(2.0)
+    first = scene.sections(2.0)
+    assert scene.sections(2.0) is first
     assert len(scene.sections(9.0)) == 0
     for height in np.linspace(0, 8, 100):
         assert scene.sections(float(height)).shape == (1, 7)
-    assert len(scene._sections) <= 8
+    assert scene.sections(2.0) is not first  # a hundred other heights have pushed it out
     with pytest.raises(ValueError, match="read-only"):
         scene.sections(2.0)[0] = 0.0
 

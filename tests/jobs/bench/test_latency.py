@@ -3,11 +3,10 @@ import pytest
 
 from jobs.bench.latency import load, random_events, random_policy
 from models.kinds import KINDS
-from models.policy.features import FEATURES
 from models.policy.onnx import export_onnx
 from tests.support.policies import kinds
 
-FROM_EVENTS = [name for name, kind in KINDS.items() if FEATURES[kind.feature].from_events is not None]
+FROM_EVENTS = [name for name, kind in KINDS.items() if kind.observation != "luminance"]
 
 
 @pytest.mark.parametrize("name", kinds(FROM_EVENTS, quick=("bytestream", "event_image")))

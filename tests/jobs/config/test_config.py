@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 import re
 from pathlib import Path
 
@@ -11,9 +12,8 @@ from envs.config import EnvConfig
 from jobs.config.config import ConfigError, as_dict, known_keys, parse
 from jobs.config.env_keys import flat_env
 from jobs.config.errors import SET_BY_JOBS
-from jobs.config.schema import EVAE_SETTINGS
 from jobs.run.folder import run_name
-from models.kinds import KINDS
+from models.kinds import KINDS, model_keys
 
 CONF = Path(__file__).resolve().parents[3] / "conf"
 
@@ -91,6 +91,22 @@ def test_every_value_says_its_unit_or_source_in_a_comment(file):
         assert [line for line in lines[1:] if ": " in line and "#" not in line and "name:" not in line] == []
 
 
+@pytest.mark.parametrize(
+    "file", sorted(path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help", "budget"))
+)
+def test_every_group_names_the_class_that_its_keys_are_fields_of(file):
+    text = file.read_text()
+    values = yaml.safe_load(text)
+    groups = {file.parent.name: values}
+    if file.parent == CONF:
+        groups = {key: group for key, group in values.items() if isinstance(group, dict) and key != "hydra"}
+    classes = re.findall(r"Fields: ([\w.]+)\.(\w+)", text)
+    assert len(classes) == len(groups)
+    for (module, name), group in zip(classes, groups.values(), strict=True):
+        fields = {field.name for field in dataclasses.fields(getattr(importlib.import_module(module), name))}
+        assert group.keys() - {"defaults"} <= fields
+
+
 def test_ppo_is_the_papers(composed):
     algo = parse(composed("+exp=bytestream", "budget=paper", "algo=ppo")).algo
     assert dataclasses.asdict(algo) == {
@@ -130,18 +146,22 @@ def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_i
 
 @pytest.mark.parametrize("name", sorted(KINDS))
 def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
-    values = composed("+exp=bytestream", f"model={name}")
-    kind = KINDS[name]
-    needed = {**dict.fromkeys((*EVAE_SETTINGS, "encoder"), kind.encoder), "hidden": kind.network == "mlp"}
-    usual = composed("+exp=bytestream")["model"]
-    for key, wanted in needed.items():
-        other, rule = (None, f"be given for {name}") if wanted else (usual[key], f"be null: {name} has no")
-        with pytest.raises(ConfigError, match=f"^model: {key} must {rule}.*got"):
-            parse(changed(values, f"model.{key}", other))
+    values, usual = composed("+exp=bytestream", f"model={name}"), composed("+exp=bytestream")["model"]
+    own = model_keys(name)
+    assert list(values["model"]) == own
+    for key in own:
+        if key != "name":
+            with pytest.raises(ConfigError, match=rf"^model\.{key}: .*got None"):
+                parse(changed(values, f"model.{key}", None))
+    for key in usual.keys() - {*own}:
+        with pytest.raises(
+            ConfigError, match=rf"^model\.{key}: no such key, got .*; this kind of model has none"
+        ):
+            parse(changed(values, f"model.{key}", usual[key]))
 
 
 @pytest.mark.parametrize("name", ["bytestream_xy", "event_image_vae"])
-def test_a_code_that_forgets_is_refused_where_there_is_no_time(composed, name):
+def test_eventnets_coding_is_an_error_where_there_is_no_time(composed, name):
     with pytest.raises(ConfigError, match=f"coding must be additive or none for {name}.*got 'eventnet'"):
         parse(composed("+exp=bytestream", f"model={name}", "model.coding=eventnet"))
     assert parse(composed("+exp=bytestream", "model.coding=eventnet")).model.coding == "eventnet"
@@ -228,9 +248,8 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("env.layout", {"num_obstacles": 2.5}, "num_obstacles must be a whole number"),
         ("env.layout", {"num_pole": 3}, "has no 'num_pole'"),
         ("env.layout", {"name": 3}, "has no 'name'"),
-        ("model.name", "snn", f"name must be one of {', '.join(KINDS)}, got 'snn'"),
-        ("model.latent", None, "latent must be given for bytestream, got None"),
-        ("model.hidden", None, "hidden must be given for bytestream, got None"),
+        ("model.name", "snn", f"must be one of {', '.join(KINDS)}, got 'snn'"),
+        ("model.name", "eip", "which is called event_image now"),
         (
             "train.conditions",
             [{"env.scene": "moon"}],
@@ -241,16 +260,16 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("model.coding", "phase", "'additive', 'eventnet' or 'none', got 'phase'"),
     ],
 )
-def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule):
-    with pytest.raises(ConfigError) as refusal:
+def test_a_configuration_error_names_the_key_the_rule_and_the_value(values, key, value, rule):
+    with pytest.raises(ConfigError) as error:
         parse(changed(values, key, value))
-    assert str(refusal.value).startswith(key.partition(".")[0])
-    assert rule in str(refusal.value)
-    assert len(str(refusal.value).splitlines()) == 1
+    assert str(error.value).startswith(key.partition(".")[0])
+    assert rule in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("exp", ["event_image", "event_image_vae", "rgb"])
-def test_a_picture_too_small_for_the_network_is_refused(composed, exp):
+def test_an_image_too_small_for_the_network_is_an_error(composed, exp):
     rule = f"camera.width: must be at least 36 for the network of {POLICIES[exp]}, got 35"
     with pytest.raises(ConfigError, match=f"^{re.escape(rule)}$"):
         parse(composed(f"+exp={exp}", "camera.width=35"))
@@ -258,10 +277,10 @@ def test_a_picture_too_small_for_the_network_is_refused(composed, exp):
     parse(composed("+exp=event_columns", "camera.width=35"))
 
 
-def test_all_refusals_come_at_once(values):
-    with pytest.raises(ConfigError) as refusal:
+def test_all_errors_come_at_once(values):
+    with pytest.raises(ConfigError) as error:
         parse(changed(changed(changed(values, "seed", -1), "algo.lr", -1.0), "env.control_hz", -1.0))
-    keys = [line.partition(":")[0] for line in str(refusal.value).splitlines()]
+    keys = [line.partition(":")[0] for line in str(error.value).splitlines()]
     assert sorted(keys) == ["algo.lr", "env.control_hz", "seed"]
 
 

@@ -77,7 +77,7 @@ def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_pa
     assert "bytestream (2), event_image (1), oracle (1)" in text
     assert "| sparsity | 0.5 | 5 | 1.6 | 5 |" in text
     assert text.index("(images/results_sparsity.png)") < text.index("## Success [%]")
-    assert "| `bytestream`: bears dead pixels | D.3 | `event_image` | holds |" in text
+    assert "| `bytestream`: tolerates dead pixels | D.3 | `event_image` | holds |" in text
     assert (
         "| `bytestream`: adapts to other control rates | abstract, D.3 | `event_image` | not tested |" in text
     )

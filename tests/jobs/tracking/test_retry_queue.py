@@ -1,7 +1,7 @@
 import pytest
 
 from jobs.tracking import retry_queue as retry_queue
-from jobs.tracking.retry_queue import RetryQueue, StoreAway, calls
+from jobs.tracking.retry_queue import RetryQueue, StoreUnavailable, calling_with
 
 
 class Store:
@@ -13,7 +13,7 @@ class Store:
     def send(self, row):
         self.asked += 1
         if self.away:
-            raise StoreAway("refused")
+            raise StoreUnavailable("refused")
         self.rows.append(row["step"])
 
 
@@ -28,18 +28,18 @@ def test_what_a_store_misses_is_delivered_once_and_in_order_when_it_is_back(tmp_
     store, box = Store(), RetryQueue(tmp_path / "waiting.jsonl")
 
     def log(step):
-        return box.deliver([{"step": step}], store.send)
+        return box.deliver({"step": step}, store.send)
 
     assert log(1) is None
     store.away = True
     assert [log(2), log(3)] == ["refused", None]  # said once
     assert store.asked == 2  # 3 was not tried: the store rests
-    clock[0] += retry_queue.REST_S
+    clock[0] += retry_queue.RETRY_AFTER_S
     assert log(4) is None
     store.away = False
     assert log(5) is None
     assert store.rows == [1]
-    clock[0] += retry_queue.REST_S
+    clock[0] += retry_queue.RETRY_AFTER_S
     assert log(6) is None
     assert store.rows == [1, 2, 3, 4, 5, 6]
     assert not box.file.exists()
@@ -48,11 +48,13 @@ def test_what_a_store_misses_is_delivered_once_and_in_order_when_it_is_back(tmp_
 def test_what_waits_outlives_the_process_and_half_a_line(tmp_path, clock):
     store, file = Store(), tmp_path / "waiting.jsonl"
     store.away = True
-    RetryQueue(file).deliver([{"step": 1}, {"step": 2}], store.send)
+    box = RetryQueue(file)
+    box.deliver({"step": 1}, store.send)
+    box.deliver({"step": 2}, store.send)
     with file.open("a") as lines:
         lines.write('{"st')
     store.away = False
-    RetryQueue(file).deliver([{"step": 3}], store.send)
+    RetryQueue(file).deliver({"step": 3}, store.send)
     assert store.rows == [1, 2, 3]
 
 
@@ -61,13 +63,13 @@ def test_another_error_than_absence_is_raised(tmp_path):
         raise ValueError("no such metric")
 
     with pytest.raises(ValueError, match="no such metric"):
-        RetryQueue(tmp_path / "waiting.jsonl").deliver([{"step": 1}], refuse)
+        RetryQueue(tmp_path / "waiting.jsonl").deliver({"step": 1}, refuse)
 
 
 def test_settings_of_calls_are_put_back(monkeypatch):
     monkeypatch.setenv("EVADE_A", "1")
     monkeypatch.delenv("EVADE_B", raising=False)
-    with calls({"EVADE_A": "2", "EVADE_B": "3"}):
+    with calling_with({"EVADE_A": "2", "EVADE_B": "3"}):
         assert (retry_queue.os.environ["EVADE_A"], retry_queue.os.environ["EVADE_B"]) == ("2", "3")
     assert retry_queue.os.environ["EVADE_A"] == "1"
     assert "EVADE_B" not in retry_queue.os.environ

@@ -169,7 +169,7 @@ def test_children_are_written_once_and_replaced_where_their_content_has_changed(
 
 
 def test_curves_wait_while_the_store_is_away_and_are_delivered_before_the_run_ends(folder, monkeypatch):
-    monkeypatch.setattr(retry_queue, "REST_S", 0.0)
+    monkeypatch.setattr(retry_queue, "RETRY_AFTER_S", 0.0)
     with open_tracker(folder.config, folder, key="away") as tracker:
         answer = tracker.client.log_batch
 
@@ -201,7 +201,7 @@ def test_the_same_row_twice_is_the_same_point_once(folder):
 def test_a_store_that_does_not_answer_stops_with_one_error_that_says_where_the_results_are(
     folder, monkeypatch
 ):
-    monkeypatch.setitem(tracking.PATIENT, "MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    monkeypatch.setitem(tracking.MANY_RETRIES, "MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
     nowhere = dataclasses.replace(folder.config.tracking, uri="http://127.0.0.1:9")
     config = dataclasses.replace(folder.config, tracking=nowhere)
     with (

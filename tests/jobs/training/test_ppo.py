@@ -10,7 +10,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 from envs.events import unpack_window
 from jobs.config.config import ConfigError
 from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.ppo import build_ppo, corridor_settings, make_corridors, network_settings, policy_settings
+from jobs.training.ppo import build_ppo, corridor_settings, make_corridors, policy_about, policy_spec
 from models.encoder.table import EncoderTable
 from models.encoder.weights import EncoderFileError, load_encoder
 from models.kinds import KINDS
@@ -18,7 +18,6 @@ from models.policy import load_policy, save_policy
 from models.policy.features import feature_of
 from tests.support.configs import SHORT, make_config
 from tests.support.policies import kinds
-from tests.support.runs import write_encoder
 
 FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "rgb", "finetuned")
 CNN_WEIGHTS = 32 * (3 * 64 + 1) + 64 * (32 * 16 + 1) + 64 * (64 * 9 + 1) + 512 * (1024 + 1)
@@ -32,11 +31,6 @@ WEIGHTS = {
     "event_image": CNN_WEIGHTS + 512 * 4 + 4,
     "rgb": CNN_WEIGHTS + 512 * 4 + 4,
 }
-
-
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory):
-    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
 
 
 def make_own(name, *overrides):
@@ -183,12 +177,12 @@ def test_a_training_asks_for_a_core_per_process_that_flies_or_one_in_all(encoder
 def test_the_networks_are_built_from_what_the_configuration_says():
     sizes = {"width": 64, "height": 64, "stack": 3, "num_actions": 3}
     bytestream, image = (
-        network_settings(make_config(f"model={name}")) for name in ("bytestream_xy", "event_image")
+        policy_spec(make_config(f"model={name}")).manifest() for name in ("bytestream_xy", "event_image")
     )
     evae = {"context": 256, "latent": 32, "norm": "batch", "target": "occupancy", "time_bins": 1024}
     evae |= {"coding": "none", "encoder": "frozen"}
     assert bytestream == {"name": "bytestream_xy", "hidden": [64, 64], **evae, **sizes}
-    assert image == {"name": "event_image", "hidden": None, **dict.fromkeys(evae), **sizes}
+    assert image == {"name": "event_image", **sizes}
 
 
 def test_the_corridors_flown_at_once_take_the_conditions_of_training_in_turn():
@@ -227,7 +221,7 @@ def test_the_learner_sees_the_features_of_what_was_shown(name, runner, ppo, enco
         cut += sum(not chunk.is_done for chunk in samples)
         batch = learner_batch(learner, samples, monkeypatch)
         stacks = recorder.stacks(name, encoder)
-        assert batch["obs"].numpy().dtype == feature_of(network_settings(make_own(name))).dtype
+        assert batch["obs"].numpy().dtype == feature_of(policy_spec(make_own(name))).dtype
         np.testing.assert_allclose(batch["obs"].numpy(), [stacks[key] for key in shown], rtol=1e-6)
     assert truncated >= 6
     assert cut >= 3
@@ -293,8 +287,9 @@ def test_the_exported_policy_gives_the_logits_of_the_path_through_rllib(name, ru
         for value in part.parameters():
             value.data.mul_(20.0)  # so that logits differ
     evae = load_encoder(encoder)[0] if is_frozen(name) else None
-    manifest = policy_settings(make_own(name, *SHORT))
-    policy = load_policy(save_policy(tmp_path, module.networks(), manifest, evae))
+    config = make_own(name, *SHORT)
+    folder = save_policy(tmp_path, module.networks(), policy_spec(config), policy_about(config), evae)
+    policy = load_policy(folder)
     assert policy.observation == runner.env.unwrapped.envs[0].config.observation
     recorder = Recorder(runner)
     samples = [chunk for _ in range(2) for chunk in runner.sample(num_timesteps=40)]

@@ -6,10 +6,11 @@ import torch
 
 from envs.config import EnvConfig
 from jobs.config.config import ConfigError
-from jobs.config.schema import EVAE_SETTINGS, ModelConfig, PretrainConfig
+from jobs.config.schema import PretrainConfig
 from jobs.run.folder import open_run
 from jobs.training.collect import record
 from jobs.training.pretrain import (
+    EvaeTraining,
     beta,
     check_sources,
     checkpoints,
@@ -22,9 +23,9 @@ from jobs.training.pretrain import (
     sample_windows,
     save_checkpoint,
 )
-from models.encoder.evae import EventVAE, event_targets, train_step
-from models.encoder.event_batch import batch_windows
+from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder, save_encoder
+from models.kinds import FixedModel
 from tests.support.configs import small_config
 
 SETTINGS = PretrainConfig(
@@ -87,24 +88,20 @@ def test_beta_follows_its_schedule():
     assert beta(appendix, 20_000) == pytest.approx(2e-3)
 
 
-def training(recording, iterations, checkpoint=None):
-    """An event VAE after some iterations, interrupted and continued at `checkpoint` if given."""
-    torch.manual_seed(0)
-    evae = EventVAE(context=64, latent=32, target="occupancy")
-    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3)
-    rng = np.random.default_rng(0)
-    first = 0 if checkpoint is None else restore(checkpoint, evae, optimizer, rng)
-    for _ in range(first, iterations):
-        batch = batch_windows(sample_windows(recording, SETTINGS, 8, rng), evae.grid)
-        train_step(evae, optimizer, batch, event_targets(batch, evae.target), 1e-5, rng)
-    return evae, optimizer, rng
+def trained(recording, iterations, checkpoint=None):
+    """A training after some iterations, interrupted and continued at `checkpoint` if given."""
+    model = EventVAE(context=64, latent=32, target="occupancy").settings
+    settings = dataclasses.replace(SETTINGS, batch_windows=8)
+    training = EvaeTraining.begin(model, recording, settings, (0, 0))
+    for iteration in range(0 if checkpoint is None else restore(checkpoint, training), iterations):
+        training.step(iteration)
+    return training
 
 
 def test_an_interrupted_training_ends_with_the_same_weights(recording, tmp_path):
-    whole = training(recording, 20)[0]
-    evae, optimizer, rng = training(recording, 12)
-    save_checkpoint(tmp_path, evae, optimizer, rng, 12)
-    continued = training(recording, 20, tmp_path)[0]
+    whole = trained(recording, 20).evae
+    save_checkpoint(tmp_path, trained(recording, 12), 12)
+    continued = trained(recording, 20, tmp_path).evae
     for name, value in whole.state_dict().items():
         assert torch.equal(value, continued.state_dict()[name]), name
 
@@ -113,12 +110,12 @@ def test_an_interrupted_training_ends_with_the_same_weights(recording, tmp_path)
     "harm", [lambda content: content[:-9], lambda content: content[:900] + b"!" + content[901:]]
 )
 def test_a_damaged_checkpoint_is_left_for_the_one_before_it(recording, tmp_path, capsys, harm):
-    evae, optimizer, rng = training(recording, 1)
+    training = trained(recording, 1)
     for iteration in (10, 20, 30):
-        save_checkpoint(tmp_path, evae, optimizer, rng, iteration)
+        save_checkpoint(tmp_path, training, iteration)
     newest, before = checkpoints(tmp_path)
     newest.write_bytes(harm(newest.read_bytes()))
-    assert restore(tmp_path, evae, optimizer, rng) == 20
+    assert restore(tmp_path, training) == 20
     assert capsys.readouterr().out == f"Checkpoint damaged, the one before it is taken: {newest}\n"
     assert checkpoints(tmp_path) == [before]
 
@@ -129,9 +126,9 @@ def test_training_explains_windows_of_flights_that_it_never_saw(recording):
     untrained = EventVAE(context=64, latent=32, target="occupancy")
     held_out = held_out_windows(unseen, SETTINGS, untrained.grid)
     before = held_out_figures(untrained, held_out)
-    after = held_out_figures(training(recording, 150)[0], held_out)
+    after = held_out_figures(trained(recording, 40).evae, held_out)
     assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]
-    assert after["explained_four_steps"] > before["explained_four_steps"]
+    assert after["explained_loss_four_steps"] > before["explained_loss_four_steps"]
 
 
 class Listener:
@@ -156,12 +153,12 @@ def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_pat
         config,
         model=dataclasses.replace(config.model, context=64),
         collect=dataclasses.replace(config.collect, num_steps=200, num_validation_steps=100),
-        pretrain=dataclasses.replace(config.pretrain, iterations=100, validate_every=50, beta=weight),
+        pretrain=dataclasses.replace(config.pretrain, iterations=40, validate_every=20, beta=weight),
     )
     folder, listener = open_run(config), Listener()
     file = prepare_encoder(config, folder, listener)
     figures = [figures for step, figures in listener.logged.items() if step > 0]
-    assert sorted(listener.logged) == [0, 50, 100]
+    assert sorted(listener.logged) == [0, 20, 40]
     assert figures[-1]["evae/collapsed"] == dead
     assert load_encoder(file)[1]["figures"]["collapsed"] == dead
     assert capsys.readouterr().out.count("posterior collapse") == dead  # once
@@ -207,9 +204,7 @@ def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anyt
 
 
 def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
-    model = ModelConfig(
-        name="event_image", stack=3, hidden=None, encoder=None, **dict.fromkeys(EVAE_SETTINGS)
-    )
+    model = FixedModel(name="event_image", stack=3)
     config = dataclasses.replace(small_config(tmp_path), model=model)
     with pytest.raises(
         ConfigError, match="model: event_image has no event VAE to pretrain; go on with job=train"

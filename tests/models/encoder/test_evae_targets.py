@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from models.encoder.evae import TARGETS, event_targets, pictures, reconstruct, target_shape
+from models.encoder.evae import event_targets, pictures, reconstruct, target_shape
 from models.encoder.event_batch import EventBatch, batch_windows
+from models.kinds import TARGETS
 from tests.support.encoders import bars, events, small
 
 

@@ -10,6 +10,7 @@ from models.encoder.event_batch import EventBatch, batch_packed
 from models.encoder.finetuned import EVENTS, FinetunedEncoder
 from models.encoder.frozen import encoder_part, tabulate
 from models.encoder.table import EncoderTable
+from models.kinds import EncoderModel, PolicySpec, model_keys
 from models.policy import load_policy, save_policy
 from models.policy.features import feature_of
 from models.policy.networks import build_networks
@@ -43,22 +44,26 @@ def make_evae(variant="bytestream", coding="additive", norm="batch"):
     return evae.freeze()
 
 
-def make_settings(evae):
-    own = {key: value for key, value in evae.settings.items() if key != "variant"}
-    sizes = {"stack": 3, "num_actions": 3, "hidden": [8], **SENSOR}
-    return {"name": evae.settings["variant"], "encoder": "finetuned", **own, **sizes}
+def make_spec(evae):
+    own = {
+        name: getattr(evae.settings, name)
+        for name in model_keys("bytestream")
+        if hasattr(evae.settings, name)
+    }
+    model = EncoderModel(name=evae.settings.variant, encoder="finetuned", stack=3, hidden=[8], **own)
+    return PolicySpec(model, SIDE, SIDE, 3)
 
 
 def make_trunk(evae):
-    trunk = FinetunedEncoder(make_settings(evae))
+    trunk = FinetunedEncoder(evae.settings)
     trunk.load_state_dict(encoder_part(copy.deepcopy(evae)).state_dict())
     return trunk
 
 
 def make_rows(windows, evae):
     """Stacks (B, 3, EVENTS, 4) of 3 B packed windows."""
-    settings = make_settings(evae)
-    rows = feature_of(settings).from_observations(windows, settings, None)
+    spec = make_spec(evae)
+    rows = feature_of(spec).from_observations(windows, spec, None)
     return torch.from_numpy(rows.reshape(-1, 3, *rows.shape[1:]))
 
 
@@ -115,13 +120,13 @@ def test_training_moves_no_running_statistic():
 
 def test_a_policy_sees_large_windows_thinned_as_in_training(tmp_path):
     evae = make_evae()
-    settings = make_settings(evae)
-    networks = build_networks(settings)
+    spec = make_spec(evae)
+    networks = build_networks(spec)
     networks["trunk"] = make_trunk(evae)
     networks["pi"][-1].weight.data.mul_(100.0)
     windows = make_windows(np.random.default_rng(4), 6, capacity=6000, side=SIDE)
     assert windows[:, 0, 0].max() > 2 * EVENTS
-    policy = load_policy(save_policy(tmp_path, networks, settings))
+    policy = load_policy(save_policy(tmp_path, networks, spec, SENSOR))
     policy.reset(2)
     for step in windows.reshape(2, 3, *windows.shape[1:]).swapaxes(0, 1):
         logits = policy.logits(step)
@@ -144,10 +149,10 @@ def test_the_table_of_an_encoder_that_learnt_on_is_that_of_its_event_vae():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"time_bins": 1 << 16}, "at most 32768 to be kept, got 65536"),
-        ({"coding": "phase"}, "coding must be"),
+        ({"time_bins": 1 << 16}, "time_bins must be at most 32768 .*got 65536"),
+        ({"coding": "phase"}, "coding"),
     ],
 )
 def test_an_encoder_that_cannot_be_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        FinetunedEncoder({**make_settings(make_evae()), **change})
+        dataclasses.replace(make_spec(make_evae()).model, **change)

@@ -7,14 +7,15 @@ from hypothesis import given, strategies
 from envs.config import CameraConfig, EnvConfig, Observation
 from envs.corridor import CorridorEnv
 from envs.events import EVENT, event_image, pack_window
-from models.kinds import FINETUNED, KINDS
+from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec, resolve
 from models.policy import Policy
-from models.policy.features import FEATURES, feature_of, grey_picture, push_features
-from models.policy.networks import NETWORKS, build_networks
+from models.policy.features import Feature, Step, feature_of, grey_picture, push_features
+from models.policy.networks import build_networks
 
 WIDTH, HEIGHT, WINDOW_US = 6, 4, 5000
-SIZES = {"width": WIDTH, "height": HEIGHT, "latent": None}
-COLUMNS, PICTURE = ({"name": name, **SIZES} for name in ("event_columns", "event_image"))
+SIZES = (WIDTH, HEIGHT, 3)
+COLUMNS = PolicySpec(DenseModel("event_columns", 3, [8]), *SIZES)
+PICTURE = PolicySpec(FixedModel("event_image", 3), *SIZES)
 
 
 def make_events(rng, count):
@@ -72,8 +73,8 @@ def test_the_events_of_a_step_give_what_their_window_and_their_image_give(seed, 
     events = make_events(np.random.default_rng(seed), count)
     later = events.copy()
     later["t"] += 70_000
-    for settings, expected in ((COLUMNS, columns(events)), (PICTURE, event_image(events, WIDTH, HEIGHT))):
-        made = feature_of(settings).from_events((later, 70_000, WINDOW_US), settings, None)
+    for spec, expected in ((COLUMNS, columns(events)), (PICTURE, event_image(events, WIDTH, HEIGHT))):
+        made = feature_of(spec).from_events(Step(later, 70_000, WINDOW_US), spec, None)
         np.testing.assert_array_equal(made, expected)
         assert made.dtype == expected.dtype
 
@@ -81,18 +82,18 @@ def test_the_events_of_a_step_give_what_their_window_and_their_image_give(seed, 
 def test_the_last_event_of_a_pixel_colours_it():
     events = np.zeros(3, EVENT)
     events["t"], events["x"], events["p"] = [1, 2, 3], [2, 2, 5], [1, -1, 1]
-    made = feature_of(PICTURE).from_events((events, 0, WINDOW_US), PICTURE, None)
+    made = feature_of(PICTURE).from_events(Step(events, 0, WINDOW_US), PICTURE, None)
     np.testing.assert_array_equal(made[0], [0, 0, 125, 0, 0, 255])
     assert not made[1:].any()
 
 
 @pytest.mark.parametrize(("name", "value"), [("x", WIDTH), ("y", HEIGHT), ("p", 0)])
-@pytest.mark.parametrize("settings", [COLUMNS, PICTURE], ids=["columns", "picture"])
-def test_an_event_that_the_sensor_cannot_make_is_refused(settings, name, value):
+@pytest.mark.parametrize("spec", [COLUMNS, PICTURE], ids=["columns", "picture"])
+def test_an_event_that_the_sensor_cannot_make_is_refused(spec, name, value):
     events = make_events(np.random.default_rng(1), 5)
     events[name][2] = value
     with pytest.raises(ValueError, match="event 2 has"):
-        feature_of(settings).from_events((events, 0, WINDOW_US), settings, None)
+        feature_of(spec).from_events(Step(events, 0, WINDOW_US), spec, None)
 
 
 def test_grey_is_what_a_display_decodes_to_the_luminance_again():
@@ -109,10 +110,10 @@ def test_grey_is_what_a_display_decodes_to_the_luminance_again():
 
 @pytest.mark.parametrize("name", ["event_image", "rgb"])
 def test_pictures_of_another_sensor_or_type_are_refused(name):
-    settings = {"name": name, **SIZES}
+    spec = PolicySpec(FixedModel(name, 3), *SIZES)
     for bad in (np.zeros((1, HEIGHT, WIDTH + 1), np.uint8), np.zeros((1, HEIGHT, WIDTH), np.int64)):
         with pytest.raises(ValueError, match=r"observations must be (uint8|float32) \(B, 4, 6\), got"):
-            feature_of(settings).from_observations(bad, settings, None)
+            feature_of(spec).from_observations(bad, spec, None)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.uint8, np.int16])
@@ -135,22 +136,22 @@ def test_the_first_feature_fills_the_stack_and_later_ones_push_out_the_oldest(dt
 @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if not kind.encoder])
 def test_each_kind_takes_what_the_environment_shows_it(name):
     env = CorridorEnv(EnvConfig(observation=KINDS[name].observation, camera=CameraConfig(40, 48)))
-    settings = {"name": name, "width": 40, "height": 48, "latent": None, "stack": 3, "num_actions": 3}
-    settings["hidden"] = [8] if KINDS[name].network == "mlp" else None
-    policy = Policy(build_networks(settings), settings)
+    hidden = {"hidden": [8]} if KINDS[name].settings is DenseModel else {}
+    spec = PolicySpec(KINDS[name].settings(name=name, stack=3, **hidden), 40, 48, 3)
+    policy = Policy(build_networks(spec), spec)
     observation, _ = env.reset(seed=0)
     for _ in range(3):
         action = policy(observation[None])
         observation, *_ = env.step(int(action[0]))
-    made = feature_of(settings).from_observations(observation[None], settings, None)
-    assert (made.dtype, made.shape[1:]) == (feature_of(settings).dtype, feature_of(settings).shape(settings))
+    made = feature_of(spec).from_observations(observation[None], spec, None)
+    assert (made.dtype, made.shape[1:]) == (feature_of(spec).dtype, feature_of(spec).shape(spec))
     assert made.any()
 
 
 def test_the_table_of_kinds_names_what_there_is():
-    rows = [*KINDS.values(), *FINETUNED.values()]
-    assert {kind.network for kind in rows} == set(NETWORKS)
-    assert {kind.feature for kind in rows} == set(FEATURES)
-    for kind in rows:
+    for kind in KINDS.values():
+        assert isinstance(resolve(kind.feature), Feature)
+        assert callable(resolve(kind.network))
+        assert kind.onnx is None or callable(resolve(kind.onnx))
         assert kind.observation in get_args(Observation)
         EnvConfig(observation=kind.observation)

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import gymnasium
@@ -6,20 +7,21 @@ import pytest
 import torch
 from torch import nn
 
-from models.kinds import MIN_IMAGE
+from models.kinds import MIN_IMAGE, EncoderModel, FixedModel, PolicySpec
 from models.policy.networks import PARTS, assemble, build_networks
 
-MLP = {"name": "bytestream", "latent": 8, "stack": 3, "hidden": [64, 64], "num_actions": 3}
-CNN = {"name": "event_image", "width": 64, "height": 64, "stack": 3, "hidden": None, "num_actions": 3}
+ENCODER = EncoderModel("bytestream", 64, 8, "batch", "signed", 32, "additive", "frozen", 3, [64, 64])
+MLP = PolicySpec(ENCODER, 64, 64, 3)
+CNN = PolicySpec(FixedModel("event_image", 3), 64, 64, 3)
 
 
 def layers(network):
     return [part for part in network.modules() if isinstance(part, nn.Linear | nn.Conv2d)]
 
 
-@pytest.mark.parametrize("settings", [MLP, CNN], ids=["mlp", "cnn"])
-def test_layers_are_orthogonal_with_the_gain_of_their_place(settings):
-    networks = build_networks(settings, seed=7)
+@pytest.mark.parametrize("spec", [MLP, CNN], ids=["mlp", "cnn"])
+def test_layers_are_orthogonal_with_the_gain_of_their_place(spec):
+    networks = build_networks(spec, seed=7)
     for name, last_gain in (("trunk", math.sqrt(2.0)), ("pi", 0.01), ("vf", 1.0)):
         for layer in layers(networks[name]):
             weight = layer.weight.detach().double().flatten(1)
@@ -29,9 +31,9 @@ def test_layers_are_orthogonal_with_the_gain_of_their_place(settings):
             assert not layer.bias.any()
 
 
-@pytest.mark.parametrize("settings", [MLP, CNN], ids=["mlp", "cnn"])
-def test_the_weights_follow_from_the_seed(settings):
-    first, again, other = (build_networks(settings, seed).state_dict() for seed in (7, 7, 8))
+@pytest.mark.parametrize("spec", [MLP, CNN], ids=["mlp", "cnn"])
+def test_the_weights_follow_from_the_seed(spec):
+    first, again, other = (build_networks(spec, seed).state_dict() for seed in (7, 7, 8))
     for name, value in first.items():
         assert torch.equal(value, again[name])
         assert torch.equal(value, other[name]) is name.endswith("bias")
@@ -74,7 +76,7 @@ def test_the_cnn_is_that_of_stable_baselines():
 
 
 def test_the_smallest_picture_is_the_smallest():
-    smallest = {**CNN, "width": MIN_IMAGE, "height": MIN_IMAGE}
+    smallest = dataclasses.replace(CNN, width=MIN_IMAGE, height=MIN_IMAGE)
     pictures = torch.zeros(1, 3, MIN_IMAGE, MIN_IMAGE, dtype=torch.uint8)
     assert build_networks(smallest)["trunk"](pictures).shape == (1, 512)
     with pytest.raises(RuntimeError):

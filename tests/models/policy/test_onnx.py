@@ -8,9 +8,10 @@ import torch
 from models.encoder.evae import EventVAE
 from models.policy import load_policy, save_policy
 from models.policy import onnx as export
+from models.policy.features import Step
 from models.policy.onnx import export_onnx
 from tests.support.encoders import EVENT
-from tests.support.policies import FLOWN, SIDE, kinds, make_networks, make_settings, save
+from tests.support.policies import ABOUT, FLOWN, SIDE, kinds, make_networks, make_spec, save
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
 EDGES = [(1, 0, 0, 1), (5000, SIDE - 1, SIDE - 1, -1), (4999, SIDE - 1, 0, 1), (5000, 0, SIDE - 1, -1)]
@@ -55,14 +56,14 @@ def folder(request, tmp_path_factory):
     evae = EventVAE(width=SIDE, height=SIDE, context=64, time_bins=32, **changes).freeze()
     for parameter in evae.ecn.layers.parameters():  # so that magnitudes outlive many ages
         parameter.data.mul_(3.0)
-    name = evae.settings["variant"]
-    return save_policy(path, make_networks(name), make_settings(name), evae)
+    name = evae.settings.variant
+    return save_policy(path, make_networks(name), make_spec(name, coding=evae.settings.coding), ABOUT, evae)
 
 
-def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_a_flight(folder, tmp_path):
+def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(folder, tmp_path):
     policy = load_policy(folder)
     file = export_onnx(policy, tmp_path / "policy.onnx")
-    feature = policy._feature
+    feature = policy.feature
     if feature.from_events is None:
         rng = np.random.default_rng(0)
         pictures = rng.uniform(-0.2, 1.4, (6, SIDE, SIDE)).astype(np.float32)
@@ -71,7 +72,7 @@ def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_a_flight(folde
     else:
         expected, shown = [], []
         for events in steps():
-            made = feature.from_events((events, 0, 5000), policy.manifest, policy.encoder)
+            made = feature.from_events(Step(events, 0, 5000), policy.spec, policy.encoder)
             expected.append(policy._logits(made[None], None)[0])
             rows = np.stack([events[name].astype(np.int64) for name in "txyp"], axis=1)
             shown.append({"events": rows, "window_us": np.array(5000)})

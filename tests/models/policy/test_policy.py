@@ -9,11 +9,10 @@ import torch
 from torch import nn
 
 from models.encoder.frozen import encoder_of
-from models.kinds import kind_of
 from models.policy import Policy, load_policy, save_policy
-from models.policy.features import feature_of
+from models.policy.features import Step, feature_of
 from models.policy.policy import ENCODER, MANIFEST
-from tests.support.policies import FLOWN, SIDE, make_evae, make_networks, make_settings, make_windows, save
+from tests.support.policies import ABOUT, FLOWN, SIDE, make_evae, make_networks, make_spec, make_windows, save
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 
@@ -35,7 +34,7 @@ def encoded(tmp_path):
 
 def make_observations(name, rng, count):
     """What an environment might show, (count, ...)."""
-    if kind_of(make_settings(name)).observation == "window":
+    if make_spec(name).kind.observation == "window":
         return make_windows(rng, count, side=SIDE)
     pictures = rng.choice([0, 0, 0, 125, 255], (count, SIDE, SIDE)).astype(np.uint8)
     return pictures if name == "event_image" else (pictures / 255).astype(np.float32)
@@ -52,11 +51,11 @@ def step_events(window, start_us):
 
 def expected_logits(name, flights):
     """Logits after the last of each flight's observations (B, T, ...), by a plain loop."""
-    settings, networks = make_settings(name), make_networks(name)
-    table = encoder_of(make_evae(variant=name)) if kind_of(settings).encoder else None
+    spec, networks = make_spec(name), make_networks(name)
+    table = encoder_of(make_evae(variant=name)) if spec.frozen else None
     stacks = []
     for observations in flights:
-        features = list(feature_of(settings).from_observations(observations, settings, table))
+        features = list(feature_of(spec).from_observations(observations, spec, table))
         stacks.append(np.stack((features[:1] * 2 + features)[-3:]))
     with torch.no_grad():
         return networks["pi"](networks["trunk"](torch.from_numpy(np.stack(stacks)))).numpy()
@@ -72,14 +71,14 @@ def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(nam
         np.testing.assert_allclose(logits, expected_logits(name, flights[:, :t]), rtol=1e-5, atol=1e-5)
     assert np.ptp(logits, axis=0).max() > 1e-2
     assert policy.manifest["figures"] == {"return": 1.5}
-    assert policy.observation == kind_of(make_settings(name)).observation
+    assert policy.observation == make_spec(name).kind.observation
 
 
 def test_the_same_policy_is_saved_as_the_same_bytes_and_each_file_has_its_sum(name, folder, tmp_path):
     again = save(tmp_path / "again", name)
     files = sorted(path.name for path in folder.iterdir())
     assert files == sorted(path.name for path in again.iterdir())
-    assert (ENCODER in files) is kind_of(make_settings(name)).encoder
+    assert (ENCODER in files) is make_spec(name).frozen
     for file in files:
         assert (folder / file).read_bytes() == (again / file).read_bytes()
     sums = json.loads((folder / MANIFEST).read_text())["sha256"]
@@ -108,14 +107,14 @@ def test_a_restarted_flight_forgets_and_its_neighbours_remember(name, folder):
 def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path, name):
     folder = save(tmp_path, name)
     windows = make_windows(np.random.default_rng(2), 30, side=SIDE)
-    settings = make_settings("event_image")
+    spec = make_spec("event_image")
     batch, single = load_policy(folder), load_policy(folder)
     chosen, acted = [], []
     for step, window in enumerate(windows):
         events = step_events(window, 5000 * step)
         shown = window
         if name == "event_image":
-            shown = feature_of(settings).from_events((events, 5000 * step, 5000), settings, None)
+            shown = feature_of(spec).from_events(Step(events, 5000 * step, 5000), spec, None)
         chosen.append(int(batch(shown[None])[0]))
         acted.append(single.act(events, 5000 * step, 5000))
     assert acted == chosen
@@ -123,7 +122,7 @@ def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path,
 
 
 def test_a_policy_that_sees_no_events_says_so(tmp_path):
-    with pytest.raises(ValueError, match="a policy that sees luminance: call it with observations"):
+    with pytest.raises(ValueError, match="luminance images, not events"):
         load_policy(save(tmp_path, "rgb")).act(np.empty(0, EVENT), 0, 5000)
 
 
@@ -142,26 +141,26 @@ def test_a_stochastic_policy_draws_actions_with_their_probabilities():
         def forward(self, stacks):
             return torch.log(torch.tensor([0.2, 0.5, 0.3])).repeat(len(stacks), 1) + 40.0
 
-    count, settings = 4000, make_settings("event_columns")
+    count, spec = 4000, make_spec("event_columns")
     networks = nn.ModuleDict({"trunk": nn.Identity(), "pi": Fixed()})
-    policy = Policy(networks, settings, deterministic=False, rng=np.random.default_rng(4))
+    policy = Policy(networks, spec, deterministic=False, rng=np.random.default_rng(4))
     policy.reset(count)
     actions = policy(np.repeat(make_windows(np.random.default_rng(5), 1), count, axis=0))
     shares = np.bincount(actions, minlength=3) / count
     np.testing.assert_allclose(shares, [0.2, 0.5, 0.3], atol=0.03)  # 4 standard errors
     with pytest.raises(ValueError, match="rng must be given"):
-        Policy(networks, settings, deterministic=False)
+        Policy(networks, spec, deterministic=False)
 
 
 def test_a_number_of_observations_other_than_that_of_the_flights_is_refused(name, folder):
-    with pytest.raises(ValueError, match=r"one for each of 1 flights, got 2: call reset\(num_envs\)"):
+    with pytest.raises(ValueError, match=r"one for each of 1 episodes, got 2: call reset\(num_envs\)"):
         load_policy(folder)(make_observations(name, np.random.default_rng(6), 2))
 
 
 def test_an_encoder_is_saved_if_and_only_if_the_policy_has_one(tmp_path):
     for name, evae, rule in (("bytestream", None, "given"), ("event_image", make_evae(), "None")):
         with pytest.raises(ValueError, match=f"evae must be {rule} for {name}"):
-            save_policy(tmp_path, make_networks(name), make_settings(name), evae)
+            save_policy(tmp_path, make_networks(name), make_spec(name), ABOUT, evae)
 
 
 @pytest.mark.system

@@ -6,7 +6,6 @@ import torch
 
 from jobs.bench.encoder import compare
 from jobs.config.config import ConfigError
-from jobs.config.schema import EVAE_SETTINGS, ModelConfig
 from jobs.run.folder import locate_run
 from jobs.studies.encoder import costs as encoder_costs
 from jobs.studies.encoder import trade as trade_encoder
@@ -26,6 +25,7 @@ from jobs.studies.encoder.trials import spread, squeezed
 from models.encoder.evae import EventVAE, event_targets, reconstruct
 from models.encoder.event_batch import EventBatch, batch_windows
 from models.encoder.table import EncoderTable
+from models.kinds import DenseModel
 from tests.support.configs import small_config
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
@@ -173,7 +173,9 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
     assert "default" in lines[0][-2]
     assert (folder / "coding.md").read_text().count("±") == 3 * 7
     assert metrics["perf/encode_step_us"] > 0
-    assert {f"evae/explained_{coding}_dense" for coding in ("additive", "eventnet", "none")} <= metrics.keys()
+    assert {
+        f"evae/explained_r2_{coding}_dense" for coding in ("additive", "eventnet", "none")
+    } <= metrics.keys()
 
     def refuse(*arguments):
         raise AssertionError("trained again")
@@ -194,8 +196,7 @@ def test_the_table_is_tens_of_times_faster_than_the_network_and_as_fast_as_memor
 
 
 def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(tmp_path):
-    nothing = dict.fromkeys(EVAE_SETTINGS)
-    model = ModelConfig(name="event_columns", stack=3, hidden=[64, 64], encoder=None, **nothing)
+    model = DenseModel(name="event_columns", stack=3, hidden=[64, 64])
     config = dataclasses.replace(small_config(tmp_path, job="trade_encoder"), model=model)
     with pytest.raises(ConfigError, match="event_columns has no encoder of single events"):
         trade_encoder.run(config)

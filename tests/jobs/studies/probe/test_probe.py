@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from jobs.config.config import ConfigError
-from jobs.config.schema import EVAE_SETTINGS, ModelConfig
 from jobs.run.folder import locate_run
 from jobs.studies.probe import probe
 from jobs.studies.probe.probe import (
@@ -18,6 +17,7 @@ from jobs.studies.probe.probe import (
     result_columns,
 )
 from jobs.studies.probe.readout import Scores
+from models.kinds import DenseModel
 from tests.support.configs import small_config
 
 
@@ -76,9 +76,7 @@ def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, 
 
 
 def test_a_policy_without_an_event_vae_is_refused_before_anything_is_written(tmp_path):
-    model = ModelConfig(
-        name="event_columns", stack=3, hidden=[64, 64], encoder=None, **dict.fromkeys(EVAE_SETTINGS)
-    )
+    model = DenseModel(name="event_columns", stack=3, hidden=[64, 64])
     config = dataclasses.replace(small_config(tmp_path, job="probe"), model=model)
     with pytest.raises(ConfigError, match="event_columns has no event VAE to probe"):
         probe.run(config)

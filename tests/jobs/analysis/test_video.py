@@ -1,0 +1,37 @@
+import av
+import numpy as np
+import pytest
+
+from envs.events import EVENT
+from jobs.analysis.video import coloured, last_polarity, open_film
+
+EVENTS = np.array([(1, 2, 0, -1), (2, 2, 0, 1), (3, 3, 1, -1)], EVENT)
+
+
+def show(film, steps):
+    for _ in range(steps):
+        film.step(np.ones((6, 7), np.float32), EVENTS, np.zeros((1, 4), np.int32), "caption")
+
+
+def test_a_film_has_a_frame_for_each_fiftieth_of_a_second_and_even_sizes(tmp_path):
+    with open_film(tmp_path / "a" / "film.mp4", 200.0, None) as film:
+        show(film, 12)
+    with av.open(str(tmp_path / "a" / "film.mp4")) as container:
+        frames = list(container.decode(video=0))
+    assert [frame.time for frame in frames] == pytest.approx([0.0, 0.04, 0.08])
+    assert (frames[0].width % 2, frames[0].height % 2) == (0, 0)
+
+
+def test_an_error_leaves_no_film(tmp_path):
+    with pytest.raises(AttributeError), open_film(tmp_path / "film.mp4", 50.0, None) as film:
+        film.step(None, EVENTS, None, "caption")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_last_event_of_a_pixel_gives_its_colour():
+    image = last_polarity(EVENTS, (6, 7))
+    assert (image[0, 2], image[1, 3], np.abs(image).sum()) == (1, -1, 2)
+    off, none, on = coloured(np.array([[-1.0, 0.0, 1.0]]))[0].astype(int)
+    assert off[0] > off[2]
+    assert on[2] > on[0]
+    assert none.max() < 50
