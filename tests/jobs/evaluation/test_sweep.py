@@ -26,6 +26,7 @@ def test_who_is_evaluated_and_whose_sensor_differs_is_said(tmp_path, capsys):
     ]
 
 
+@pytest.mark.slow  # two whole reports
 def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_rerun_adds_no_point(
     tmp_path,
 ):
