@@ -8,6 +8,7 @@ ValueError) that names the key, the value and the rule; an unknown key does too.
 import dataclasses
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, cast
 
 from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
@@ -30,6 +31,7 @@ def _number_or_truth(value: Any) -> float | bool:
 
 Value = Annotated[float | bool, PlainValidator(_number_or_truth)]
 
+Setting = float | int | str | None  # of the sensor
 Observation = Literal["window", "event_image", "luminance", "events", "none"]
 Split = Literal["train", "validation", "eval"]
 WITHOUT_EVENTS = ("luminance", "none")  # observations for which no event camera is simulated
@@ -60,7 +62,7 @@ class CameraConfig:
             threshold; fixed for each pixel, ON and OFF apart, at least a tenth of the
             nominal. Real sensors: about 0.03.
         threshold_seed: Which sensor of its kind: seed of the pixels' thresholds.
-        refractory_us: Dead time of a pixel after an event [us]; at its end the pixel takes
+        refractory_us: Refractory period of a pixel after an event [us]; at its end the pixel takes
             the level of that moment as its reference.
         encoding: What the luminance, white = 1, goes through before the response.
             "linear32": nothing. "linear8": clipped to [0, 1] and rounded to 8 bits.
@@ -84,7 +86,7 @@ class CameraConfig:
 
     @field_validator("refractory_us")
     @classmethod
-    def _dead_time_needs_memory(cls, value: int, info: ValidationInfo) -> int:
+    def _refractory_period_needs_memory(cls, value: int, info: ValidationInfo) -> int:
         if value > 0 and info.data.get("memory", "reference") != "reference":
             raise ValueError(f"needs memory 'reference' or must be 0, got {value}")
         return value
@@ -100,7 +102,7 @@ class CameraConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class FaultsConfig:
-    """What a real sensor does wrong. Which pixels are dead or hot is drawn once per episode.
+    """Faults of a real sensor. Which pixels are dead or hot is drawn once per episode.
 
     Attributes:
         sparsity: Fraction of pixels that are dead for the whole episode.
@@ -129,12 +131,12 @@ class FaultsConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class FidelityConfig:
-    """How exact the events have to be; `envs.fidelity.plan` chooses the cheapest way to that.
+    """How exact the events have to be; `envs.fidelity.plan_renders` chooses the cheapest rendering.
 
     Attributes:
         tolerance: Accepted share of events that differ from the converged ones in pixel,
             polarity or by more than 5 % of a control step in time, see `envs.event_error`.
-        max_step_m: Longest way flown between two renders [m]; None: chosen.
+        max_step_m: Longest way between two renders [m]; None: chosen.
         samples: Anti-aliasing of the renderer; None: chosen.
         cull_m: Obstacles farther than this are not drawn [m]; None: chosen.
     """
@@ -147,7 +149,7 @@ class FidelityConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class EnvConfig:
-    """A corridor flight: the world, the vehicle, the sensor and the observation.
+    """A corridor: the world, the vehicle, the sensor and the observation.
 
     Attributes:
         scene: Name of a layout in `envs.scene.layouts`, or the path of a mesh file.
@@ -183,10 +185,11 @@ class EnvConfig:
 
 
 def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
-    """The settings that a flight with an observation depends on: the others have their default values.
+    """The settings that an observation depends on; all others are set to their defaults.
 
-    Two simulations with equal ones give the same flights, step by step, to an agent that sees "luminance"
-    (whatever the event camera is) or "none" (whatever any camera is); to others each setting may matter.
+    Two simulations with equal ones give the same episodes, step by step, to an agent that observes
+    "luminance" (whatever the event camera is) or "none" (whatever any camera is); to other agents
+    every setting may matter.
     """
     if observation not in WITHOUT_EVENTS:
         return config
@@ -204,20 +207,20 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
     return seen
 
 
-def sensor_settings(config: EnvConfig) -> dict[str, Any]:
+def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
     """The settings that give an event its meaning: data, encoder and policy must share them."""
-    flight = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
-    return {**dataclasses.asdict(config.camera), **flight, **dataclasses.asdict(config.fidelity)}
+    motion = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
+    return {**dataclasses.asdict(config.camera), **motion, **dataclasses.asdict(config.fidelity)}
 
 
-def sensor_differences(theirs: dict[str, Any], config: EnvConfig) -> dict[str, tuple[Any, Any]]:
+def sensor_differences(theirs: Mapping[str, object], config: EnvConfig) -> dict[str, tuple[object, object]]:
     """Setting -> (their value, this simulation's value), for the sensor settings that differ."""
     ours = sensor_settings(config)
     pairs = {key: (theirs.get(key), ours.get(key)) for key in {**theirs, **ours}}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def settings_hash(settings: dict[str, Any]) -> str:
+def settings_hash(settings: Mapping[str, object]) -> str:
     """First 12 hexadecimal digits of the SHA-256 of `settings` as canonical JSON."""
     text = json.dumps(settings, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,7 +1,7 @@
-"""The corridor flight as a Gymnasium environment, single and vectorised (appendix D.1).
+"""The corridor as a Gymnasium environment, single and vectorised (appendix D.1).
 
 The vehicle moves at constant speed, one of three directions a step, while its camera keeps
-looking along +y. What ends a step early is decided along the flown segment: the vehicle
+looking along +y. What ends a step early is decided along the way of the step: the vehicle
 stops where it first touches an obstacle or a wall, or at the goal line, whichever comes
 first; both at the same place is a collision, and so is a start in contact.
 
@@ -10,8 +10,8 @@ of its own, made of (split, seed, episode): a corridor of one split never occurs
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
 
 import gymnasium
 import numpy as np
@@ -20,15 +20,41 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envs import kinematics as flight
+from envs import kinematics
 from envs.config import EnvConfig
 from envs.observations import observation_space, observe, picture
 from envs.scene import make_scene
 from envs.sensor import Sensor
 
 
+class Info(TypedDict):
+    """What `CorridorEnv` tells beside the observation.
+
+    Attributes:
+        episode_seed: Seed of the series of episodes.
+        episode: Number of the episode in its series.
+        x_m, y_m: Position of the vehicle [m].
+        distance_m: Progress along y since the start [m].
+        success, collision: What ended the episode; at most one of them.
+        num_events: Events of the last step, faults included.
+        dropped_events: Events of the last step lost to the camera's cap or the window's capacity.
+        t_us: Simulated time [us].
+    """
+
+    episode_seed: int | None
+    episode: int
+    x_m: float
+    y_m: float
+    distance_m: float
+    success: bool
+    collision: bool
+    num_events: int
+    dropped_events: int
+    t_us: int
+
+
 class CorridorEnv(gymnasium.Env):
-    """One flight from y = 0 to the goal line; `observation` is as `envs.observations` says.
+    """One episode from y = 0 to the goal line; `observation` is as `envs.observations` says.
 
     Actions: 0 forward, 1 left 45 degrees, 2 right 45 degrees. Reward (appendix D.1.1):
     metres of progress along y, +100 at the goal line, -100 at a collision; both terminate.
@@ -54,7 +80,7 @@ class CorridorEnv(gymnasium.Env):
         self.config = dataclasses.replace(config or EnvConfig(), **fields)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.config.control_hz}
-        self.action_space = spaces.Discrete(flight.NUM_ACTIONS)
+        self.action_space = spaces.Discrete(kinematics.NUM_ACTIONS)
         self.observation_space = observation_space(self.config)
         self._sensor = Sensor(self.config)
         self._seed: int | None = None
@@ -62,8 +88,8 @@ class CorridorEnv(gymnasium.Env):
         self._done = True
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Mapping[str, object] | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start an episode; its first render makes no events.
 
         Args:
@@ -76,24 +102,24 @@ class CorridorEnv(gymnasium.Env):
         """
         super().reset(seed=seed)
         if seed is None and self._seed is None:
-            seed = int(self.np_random.integers(flight.SEED_STRIDE))
-        self._episode = flight.choose_episode(0 if seed is not None else self._episode + 1, options or {})
+            seed = int(self.np_random.integers(kinematics.SEED_STRIDE))
+        self._episode = kinematics.choose_episode(0 if seed is not None else self._episode + 1, options or {})
         self._seed = self._seed if seed is None else int(seed)
         split = self.config.split
-        scene_rng, spawn_rng, faults_rng = flight.random_streams(split, self._seed or 0, self._episode)
+        scene_rng, spawn_rng, faults_rng = kinematics.random_streams(split, self._seed or 0, self._episode)
         config = self.config
         vehicle = config.vehicle_radius_m, config.camera_height_m
         self.scene = make_scene(config.scene, scene_rng, *vehicle, **config.layout)
         self._spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
-        self._moves = [0] * flight.NUM_ACTIONS
+        self._moves = [0] * kinematics.NUM_ACTIONS
         self._place = (self._spawn_x, 0.0)
         self._sensor.reset(self.scene, self._place, faults_rng)
         self._done = False
-        observation, lost = self._observe(0, flight.clock_us(1, self.config.control_hz))
+        observation, lost = self._observe(0, kinematics.clock_us(1, self.config.control_hz))
         return observation, self._info(lost)
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Fly one control step.
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """Simulate one control step.
 
         Raises:
             ResetNeeded: The episode is over, or has not begun.
@@ -103,12 +129,14 @@ class CorridorEnv(gymnasium.Env):
         if self._done:
             raise ResetNeeded("The episode is over or has not begun; call reset() before step().")
         if not self.action_space.contains(action):
-            raise ValueError(f"action must be an integer in [0, {flight.NUM_ACTIONS - 1}]; got {action!r}.")
+            raise ValueError(
+                f"action must be an integer in [0, {kinematics.NUM_ACTIONS - 1}]; got {action!r}."
+            )
         start_us = self._sensor.t_us
         self._done = True  # an error below leaves the episode unusable
         self._moves[int(action)] += 1
         try:
-            outcome = self._fly()
+            outcome = self._move()
             observation, lost = self._observe(start_us, self._sensor.t_us)
         except ValueError as error:
             where = f"episode {self._episode}, step {sum(self._moves)}, seed {self._seed}"
@@ -130,13 +158,13 @@ class CorridorEnv(gymnasium.Env):
         """Where the camera is: x, y, z [m] and yaw [rad]."""
         return (*self._place, self.config.camera_height_m, 0.0)
 
-    def _fly(self) -> flight.Outcome:
+    def _move(self) -> kinematics.Outcome:
         """Move and sense."""
         config, start = self.config, self._place
-        planned = flight.planned_position(self._spawn_x, self._moves, config)
+        planned = kinematics.planned_position(self._spawn_x, self._moves, config)
         vehicle = config.vehicle_radius_m, config.camera_height_m
-        outcome = flight.fly(self.scene, start, planned, *vehicle)
-        self._sensor.step(start, outcome, flight.clock_us(sum(self._moves), config.control_hz))
+        outcome = kinematics.advance(self.scene, start, planned, *vehicle)
+        self._sensor.step(start, outcome, kinematics.clock_us(sum(self._moves), config.control_hz))
         self._place = outcome.end
         return outcome
 
@@ -146,7 +174,7 @@ class CorridorEnv(gymnasium.Env):
         observation, excess = observe(self.config, self.events, self.luminance, start_us, end_us)
         return observation, self._sensor.dropped + excess
 
-    def _info(self, lost: int, outcome: flight.Outcome | None = None) -> dict[str, Any]:
+    def _info(self, lost: int, outcome: kinematics.Outcome | None = None) -> Info:
         return {
             "episode_seed": self._seed,
             "episode": self._episode,
@@ -162,7 +190,7 @@ class CorridorEnv(gymnasium.Env):
 
 
 class CorridorVectorEnv(VectorEnv):
-    """Several flights at once, each with the bytes that `CorridorEnv` gives for the same seed.
+    """Several episodes at once, each with the bytes that `CorridorEnv` gives for the same seed.
 
     An episode that is over is reset by the next step (AutoresetMode.NEXT_STEP), whose
     action is ignored and whose reward is 0. All returned arrays are fresh.
@@ -180,7 +208,7 @@ class CorridorVectorEnv(VectorEnv):
         """Make `num_envs` environments; the arguments not named here are those of `CorridorEnv`.
 
         Args:
-            num_envs: Flights at once.
+            num_envs: Environments.
             config: One for all, or several, which the environments take in turn.
             render_mode: See `CorridorEnv`.
             fields: To replace in every config.
@@ -205,8 +233,8 @@ class CorridorVectorEnv(VectorEnv):
         self._over = np.zeros(num_envs, bool)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | list[int | None] | None = None, options: Mapping[str, object] | None = None
+    ) -> tuple[Any, dict[str, np.ndarray]]:
         """Reset all environments.
 
         Args:
@@ -216,12 +244,14 @@ class CorridorVectorEnv(VectorEnv):
         Raises:
             ValueError: The number of seeds is not that of environments.
         """
-        seeds = flight.spread_seeds(seed, self.num_envs)
+        seeds = kinematics.spread_seeds(seed, self.num_envs)
         self._over[:] = False
         results = [env.reset(seed=s, options=options) for env, s in zip(self.envs, seeds, strict=True)]
         return self._batch([r[0] for r in results]), _stack_infos([r[1] for r in results])
 
-    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Step all environments, or reset those that were over.
 
         Raises:
@@ -257,9 +287,9 @@ class CorridorVectorEnv(VectorEnv):
         return np.stack(observations)
 
 
-def _stack_infos(infos: Any) -> dict[str, Any]:
+def _stack_infos(infos: Any) -> dict[str, np.ndarray]:
     """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
-    stacked: dict[str, Any] = {key: np.array([info[key] for info in infos]) for key in infos[0]}
+    stacked = {key: np.array([info[key] for info in infos]) for key in infos[0]}
     mask = np.ones(len(infos), bool)
     return stacked | {f"_{key}": mask for key in infos[0]}
 

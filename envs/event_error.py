@@ -1,4 +1,4 @@
-"""How far a simulation's events are from the converged ones: the error that fidelity is asked by."""
+"""Event error: the share of a simulation's events that differ from those of the converged simulation."""
 
 import dataclasses
 from typing import Literal, NamedTuple
@@ -8,7 +8,7 @@ import numpy as np
 
 from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig, FidelityConfig
 from envs.events import EVENT
-from envs.fidelity import plan
+from envs.fidelity import plan_renders
 from envs.kinematics import DIAGONAL, Outcome, Point, clock_us
 from envs.scene import Scene, make_scene
 from envs.sensor import Sensor
@@ -23,7 +23,7 @@ ENTROPY = 20_210_608  # the corridors measured in are those of no split
 
 
 class Accuracy(NamedTuple):
-    """What a simulation achieves.
+    """Event error, events and renders of a simulation.
 
     Attributes:
         error: Event error against the converged simulation.
@@ -36,7 +36,7 @@ class Accuracy(NamedTuple):
     renders: float
 
 
-def measure(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0) -> Accuracy:
+def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0) -> Accuracy:
     """Event error of a simulation on short flights, against the converged simulation of the same flights.
 
     Converged are: the renderer (the ray caster wherever it can draw the scene), its
@@ -57,7 +57,9 @@ def measure(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0)
     if config.observation in WITHOUT_EVENTS:
         rule = "observation must be one that has a camera for its error to be measured"
         raise ValueError(f"{rule}; got {config.observation!r}")
-    pairs = [_flight(config, steps, np.random.default_rng([ENTROPY, seed, i])) for i in range(flights)]
+    pairs = [
+        _measure_flight(config, steps, np.random.default_rng([ENTROPY, seed, i])) for i in range(flights)
+    ]
     tolerance_us = TIME_SHARE * 1e6 / config.control_hz
     weights = [events.size + converged.size for events, converged, _ in pairs]
     errors = [event_error(events, converged, tolerance_us) for events, converged, _ in pairs]
@@ -70,32 +72,34 @@ def measure(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0)
 
 
 def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
-    """The simulation of the same flight without any error of rendering, see `measure`."""
+    """The settings of the same simulation without any error of rendering, see `measure_event_error`."""
     renderer: Literal["raycast", "pyrender"] = "raycast" if scene.mesh is None else "pyrender"
     asked = dataclasses.replace(config, faults=FaultsConfig(), renderer=renderer)
     camera = dataclasses.replace(config.camera, memory="reference", encoding="linear32")
     usual = dataclasses.replace(asked, camera=camera, fidelity=FidelityConfig())
     fidelity = FidelityConfig(
-        max_step_m=plan(usual, scene).max_step_m / REFERENCE_RENDERS,
+        max_step_m=plan_renders(usual, scene).max_step_m / REFERENCE_RENDERS,
         samples=REFERENCE_SAMPLES[renderer],
         cull_m=NO_CULLING_M,
     )
     return dataclasses.replace(usual, fidelity=fidelity)
 
 
-def _flight(config: EnvConfig, steps: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int]:
+def _measure_flight(
+    config: EnvConfig, steps: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Events of one flight as `config` has it and converged, and the renders of the first."""
     scene = make_scene(config.scene, rng, config.vehicle_radius_m, config.camera_height_m, **config.layout)
     way = _free_way(config, scene, steps, rng)
     config = dataclasses.replace(config, faults=FaultsConfig())
-    events, renders = _fly(Sensor(config), config, scene, way)
+    events, renders = _events_along(Sensor(config), config, scene, way)
     exact = converged(config, scene)
-    flight = f"{exact!r} {way}"
-    if flight not in _CONVERGED:
+    key = f"{exact!r} {way}"
+    if key not in _CONVERGED:
         if len(_CONVERGED) == MAX_KEPT:
             _CONVERGED.clear()
-        _CONVERGED[flight] = _fly(Sensor(exact), config, scene, way)[0]
-    return events, _CONVERGED[flight], renders
+        _CONVERGED[key] = _events_along(Sensor(exact), config, scene, way)[0]
+    return events, _CONVERGED[key], renders
 
 
 def _free_way(config: EnvConfig, scene: Scene, steps: int, rng: np.random.Generator) -> list[Point]:
@@ -111,7 +115,9 @@ def _free_way(config: EnvConfig, scene: Scene, steps: int, rng: np.random.Genera
     return way
 
 
-def _fly(sensor: Sensor, config: EnvConfig, scene: Scene, way: list[Point]) -> tuple[np.ndarray, int]:
+def _events_along(
+    sensor: Sensor, config: EnvConfig, scene: Scene, way: list[Point]
+) -> tuple[np.ndarray, int]:
     """All events of a flight along `way`, and the number of renders."""
     sensor.reset(scene, way[0], np.random.default_rng(0))
     batches, renders = [np.empty(0, EVENT)], 0

@@ -1,4 +1,4 @@
-"""What a scene requires: which renderer, how many renders, how much anti-aliasing, from one tolerance.
+"""From one tolerance to the renderer, renders per control step and anti-aliasing that a scene needs.
 
 The tolerance is the accepted event error of `envs.event_error`. The rules below are fitted to
 that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
@@ -32,13 +32,13 @@ SAMPLES = {
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How one scene is simulated.
+class RenderPlan:
+    """How one scene is rendered.
 
     Attributes:
         renderer: "raycast" or "pyrender".
         samples: Its anti-aliasing.
-        max_step_m: Longest way flown between two renders [m]; infinite: one render a control step.
+        max_step_m: Longest way between two renders [m]; infinite: one render a control step.
         cull_m: Obstacles farther than this are not drawn [m]; infinite: all are.
     """
 
@@ -48,8 +48,8 @@ class Plan:
     cull_m: float
 
 
-def plan(config: EnvConfig, scene: Scene) -> Plan:
-    """The cheapest way to simulate `scene` within `config.fidelity.tolerance`; what is set there is kept.
+def plan_renders(config: EnvConfig, scene: Scene) -> RenderPlan:
+    """The cheapest way to render `scene` within `config.fidelity.tolerance`; what is set there is kept.
 
     The paper's two-frame cameras (memory "frame" and "legacy") see one frame a control step:
     more of them would change what they report, not make it more exact.
@@ -61,7 +61,7 @@ def plan(config: EnvConfig, scene: Scene) -> Plan:
     renderer = choose_renderer(config.renderer, scene)
     remembers = config.camera.memory == "reference"
     step_m = asked.max_step_m or _max_step_m(config, scene)
-    return Plan(
+    return RenderPlan(
         renderer=renderer,
         samples=asked.samples or _samples(renderer, scene, asked.tolerance),
         max_step_m=step_m if remembers else math.inf,
@@ -84,7 +84,7 @@ def choose_renderer(name: str, scene: Scene) -> str:
     return name
 
 
-def make_renderer(chosen: Plan, scene: Scene, width: int, height: int, fov_deg: float) -> Any:
+def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov_deg: float) -> Any:
     """The renderer of a plan. Raises RuntimeError if it is pyrender and OpenGL cannot run."""
     make: Any = RaycastRenderer
     if chosen.renderer == "pyrender":  # imported only where it is needed: it loads OpenGL

@@ -1,8 +1,8 @@
-"""Kinematics, clock, reward and random streams of a corridor flight, without its sensor (appendix D.1)."""
+"""Kinematics, clock, reward and random streams of a corridor episode (appendix D.1)."""
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,24 +19,24 @@ Point = tuple[float, float]
 
 
 class Outcome(NamedTuple):
-    """What one control step came to.
+    """Result of one control step.
 
     Attributes:
         end: Where the vehicle is after it, x and y [m].
-        flown: Fraction of the step that it flew.
+        share: Share of the step that it moved.
         reward: Metres of progress along y, with the bonus or the penalty.
         success, collision: What ended the episode; at most one of them.
     """
 
     end: Point
-    flown: float
+    share: float
     reward: float
     success: bool
     collision: bool
 
 
 def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Generator, ...]:
-    """Generators of an episode: for its scene, its spawn and its faults.
+    """Random generators of an episode: of its scene, its spawn and its faults.
 
     The split comes first in their entropy, so no seed makes a corridor of another split. The
     seed comes last: it may be longer than a word, and what followed it would run into its end.
@@ -45,7 +45,7 @@ def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Gener
     return tuple(np.random.default_rng(stream) for stream in streams)
 
 
-def choose_episode(following: int, options: dict[str, Any]) -> int:
+def choose_episode(following: int, options: Mapping[str, object]) -> int:
     """The episode that reset `options` ask for, or the `following` one.
 
     Raises:
@@ -61,7 +61,7 @@ def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[in
     """One seed for each of `count` environments.
 
     One number makes seed + i * 2**32 for environment i: workers with neighbouring seeds
-    then never fly the same corridors, as they would with seed + i.
+    then never get the same corridors, as they would with seed + i.
 
     Raises:
         ValueError: There are several seeds, but not `count`.
@@ -86,7 +86,7 @@ def planned_position(spawn_x_m: float, moves: list[int], config: EnvConfig) -> P
     One product of whole counts, so that no error adds up: 1000 steps of 0.1 m are 100 m.
 
     Args:
-        spawn_x_m: Where the flight began; y was 0 [m].
+        spawn_x_m: Where the episode began; y was 0 [m].
         moves: How often each action was taken.
         config: For speed and rate.
     """
@@ -95,8 +95,8 @@ def planned_position(spawn_x_m: float, moves: list[int], config: EnvConfig) -> P
     return spawn_x_m + x, (forward + (left + right) * DIAGONAL) * config.speed_mps / config.control_hz
 
 
-def fly(scene: Scene, start: Point, planned: Point, radius_m: float, height_m: float) -> Outcome:
-    """Fly from `start` towards `planned` until the first contact or the goal line (appendix D.1.1).
+def advance(scene: Scene, start: Point, planned: Point, radius_m: float, height_m: float) -> Outcome:
+    """Move from `start` towards `planned` until the first contact or the goal line (appendix D.1.1).
 
     Contact and goal at the same place is a collision; so is a start in contact. The vehicle
     is a level disc of `radius_m` that flies at `height_m`.
@@ -106,15 +106,15 @@ def fly(scene: Scene, start: Point, planned: Point, radius_m: float, height_m: f
     """
     contact = scene.first_contact(start, planned, radius_m, height_m)
     goal = (scene.length_m - start[1]) / (planned[1] - start[1])
-    flown = min(contact, goal, 1.0)
-    collision = contact <= flown
+    share = min(contact, goal, 1.0)
+    collision = contact <= share
     success = not collision and goal <= 1.0
     end = planned
-    if flown < 1.0:
-        end = (start[0] + flown * (planned[0] - start[0]), start[1] + flown * (planned[1] - start[1]))
+    if share < 1.0:
+        end = (start[0] + share * (planned[0] - start[0]), start[1] + share * (planned[1] - start[1]))
     if success:
         end = (end[0], scene.length_m)
     reward = end[1] - start[1] + GOAL_REWARD * success + COLLISION_REWARD * collision
     if not math.isfinite(reward):
         raise ValueError(f"the reward must be finite; got {reward} on the way from {start} to {planned}.")
-    return Outcome(end, flown, reward, success, collision)
+    return Outcome(end, share, reward, success, collision)

@@ -1,11 +1,12 @@
-"""What a policy, or a person, gets to see of a flight."""
+"""What a policy observes of a control step, and a picture of it for people."""
 
 import numpy as np
 from gymnasium import spaces
 
 from envs.config import EnvConfig
-from envs.events import EVENT, event_image, pack_window
-from envs.events.windows import OFF, ON
+from envs.events import EVENT, event_image
+from envs.events.photoreceptor import GAMMA
+from envs.events.windows import GREY_OFF, GREY_ON, fill_window
 
 ZOOM = 4
 
@@ -37,13 +38,13 @@ def observe(
 
     Args:
         config: Says which.
-        events: EVENT of (start_us, end_us].
+        events: EVENT of (start_us, end_us], valid and in time order.
         luminance: float32 (H, W), the last render.
         start_us: Start of the step [us].
         end_us: Its end [us].
     """
     if config.observation == "window":
-        window = pack_window(events, start_us, end_us - start_us, config.window_capacity)
+        window = fill_window(events, start_us, end_us - start_us, config.window_capacity)
         return window, int(window[0, 1])
     if config.observation == "event_image":
         return event_image(events, config.camera.width, config.camera.height), 0
@@ -55,7 +56,7 @@ def observe(
 
 
 def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
-    """Luminance beside the events, ON red and OFF blue, four times enlarged.
+    """Luminance (gamma 2.2) beside the events, ON red and OFF blue, four times enlarged.
 
     Args:
         events: EVENT in time order.
@@ -65,9 +66,9 @@ def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
         uint8 (4 H, 8 W, 3).
     """
     height, width = luminance.shape
-    grey = np.clip(255.0 * np.sqrt(luminance), 0, 255).astype(np.uint8)
+    grey = np.rint(255.0 * np.clip(luminance, 0.0, 1.0) ** (1.0 / GAMMA)).astype(np.uint8)
     polarity = event_image(events, width, height)
     image = np.repeat(np.concatenate((grey, np.zeros_like(polarity)), axis=1)[:, :, None], 3, axis=2)
-    image[:, width:][polarity == ON] = (255, 80, 40)
-    image[:, width:][polarity == OFF] = (40, 120, 255)
+    image[:, width:][polarity == GREY_ON] = (255, 80, 40)
+    image[:, width:][polarity == GREY_OFF] = (40, 120, 255)
     return image.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)

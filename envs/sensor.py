@@ -1,4 +1,4 @@
-"""The flying event camera: renders along the way, finds the events, applies the faults."""
+"""The vehicle's event camera: renders along the way, finds the events, applies the faults."""
 
 from typing import Any
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from envs.config import EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, apply_faults, draw_pixel_faults
-from envs.fidelity import Plan, make_renderer, plan, sub_renders
+from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
 from envs.scene import Scene
 
 FAULTLESS = FaultsConfig()
-TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
+MAX_PIXELS_TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
 
 
 class Sensor:
@@ -26,20 +26,20 @@ class Sensor:
         dropped: Events of the last step lost to the camera's cap.
         renders: Renders of the last step.
         t_us: The simulated clock [us].
-        plan: How the scene is simulated, `envs.fidelity.Plan`.
+        plan: How the scene is simulated, `envs.fidelity.RenderPlan`.
     """
 
     def __init__(self, config: EnvConfig) -> None:
         """Make the sensor that `config` describes."""
         self._config = config
         self._camera = EventCamera(config.camera)
-        self._together = max(1, TOGETHER // (config.camera.width * config.camera.height))
+        self._together = max(1, MAX_PIXELS_TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
-        self.plan: Plan
+        self.plan: RenderPlan
 
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
-        """Look at a new scene from `place` (x, y) [m] at `t_us`; `rng` draws the faults. No events."""
+        """Start in a new scene at `place` (x, y) [m], without events; `rng` draws the faults."""
         camera, self._rng = self._config.camera, rng
         if self._config.observation == "none":
             self.luminance = np.zeros((camera.height, camera.width), np.float32)
@@ -53,7 +53,7 @@ class Sensor:
             self._camera.reset(self.luminance, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
-        """Render the flown part of a control step in equal parts; set the events and the last render.
+        """Simulate one control step: render the part that the vehicle moved, and set the events.
 
         Parts are never shorter than the clock's microsecond. A vehicle stopped by contact
         or goal stands still for the rest of the step and sees nothing new. Where no event camera is
@@ -71,14 +71,14 @@ class Sensor:
             self.t_us = end_us
             return
         start_us = self.t_us
-        moving_us = round(outcome.flown * (end_us - start_us))
+        moving_us = round(outcome.share * (end_us - start_us))
         if self._pictures_alone:
             self.renders = int(moving_us > 0)
             if self.renders:
                 self.luminance = self._picture(outcome.end, start_us + moving_us)
             self.t_us = end_us
             return
-        way_m = outcome.flown * self._config.speed_mps / self._config.control_hz
+        way_m = outcome.share * self._config.speed_mps / self._config.control_hz
         self.renders = min(sub_renders(way_m, self.plan.max_step_m), moving_us) if moving_us else 0
         batches, self.dropped = [], 0
         for first in range(0, self.renders, self._together):
@@ -96,7 +96,7 @@ class Sensor:
         self.events = events
 
     def _picture(self, place: Point, t_us: int) -> np.ndarray:
-        """What is seen from a place (x, y) [m] at a time."""
+        """Luminance rendered from a place (x, y) [m] at a time, float32 (H, W)."""
         poses = self._poses(place, place, np.ones(1), np.array([t_us]))
         picture = self._renderer.render_way(poses)[0]
         if not (picture.min() >= 0.0 and picture.max() < np.inf):
@@ -120,8 +120,8 @@ class Sensor:
         return poses
 
     def _set_renderer(self, scene: Scene) -> None:
-        """Keep the renderer from episode to episode while scenes ask for the same."""
-        chosen, camera = plan(self._config, scene), self._config.camera
+        """Keep the renderer from episode to episode while its settings stay the same."""
+        chosen, camera = plan_renders(self._config, scene), self._config.camera
         same = self._renderer is not None
         same = same and (chosen.renderer, chosen.samples) == (self.plan.renderer, self.plan.samples)
         self.plan = chosen

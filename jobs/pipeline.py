@@ -8,8 +8,6 @@ VAE, such as +exp=event_columns, begins with its training. A stopped run continu
 was when the same command is given again.
 """
 
-from typing import Any
-
 from jobs.config.config import Config
 from jobs.evaluation.evaluate import evaluate
 from jobs.run.folder import open_run
@@ -20,15 +18,15 @@ from jobs.training.pretrain import check_sources, prepare_encoder
 from jobs.training.train import train
 
 
-def run(config: Config) -> dict[str, Any]:
-    """Every stage of a run that its policy needs and that is not done yet, then the table of its results."""
+def run(config: Config) -> dict[str, float]:
+    """Run every stage that the policy needs and that is not done yet, and return the evaluation's metrics."""
     check_sources(config)
     folder = open_run(config)
     config = folder.config
     console.print(f"Run folder: {folder.path}")
     with open_tracker(config, folder) as tracker:
         train(config, folder, prepare_encoder(config, folder, tracker), tracker.log)
-        figures = evaluate(config, folder, tracker)
+        metrics = evaluate(config, folder, tracker)
         console.print(f"Registered: {register_training(tracker, folder.path)}")
         console.print(tracker.dashboard())
-    return figures
+    return metrics

@@ -26,7 +26,7 @@ CONF = ROOT / "conf"
 
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
 OPEN_GROUPS = ("env.layout", "sweep.axes")  # take entries that conf/ does not have
-DONE, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 
 
 def main() -> int:
@@ -169,15 +169,15 @@ def report(error: Exception) -> int:
     from jobs.config.errors import redacted
 
     ours = raised_here(error)
-    refused = isinstance(error, ValueError) and ours
+    wrong_value = isinstance(error, ValueError) and ours
     full = getattr(error, "errno", None) == errno.ENOSPC
-    documented = refused or (isinstance(error, RuntimeError) and ours) or full
+    documented = wrong_value or (isinstance(error, RuntimeError) and ours) or full
     if os.environ.get("HYDRA_FULL_ERROR") == "1" or not documented:
         print(redacted("".join(traceback.format_exception(error))), end="", file=sys.stderr)
     message = redacted(str(error) if documented else f"{type(error).__name__}: {error}")
     message = "\n  ".join(["", *message.splitlines()]) if "\n" in message else f" {message}"
-    print(f"evade: {'refused' if refused else 'failed'}:{message}", file=sys.stderr)
-    return REFUSED if refused else FAILED
+    print(f"evade: {'refused' if wrong_value else 'failed'}:{message}", file=sys.stderr)
+    return WRONG_VALUE if wrong_value else FAILED
 
 
 def raised_here(error: Exception) -> bool:

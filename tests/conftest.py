@@ -51,15 +51,3 @@ def pytest_runtest_call(item):
 
 def _processor_s() -> float:
     return sum(os.times()[:4])
-
-
-@pytest.fixture
-def stub(monkeypatch):
-    """Cells are flown by `tests.support.stub_tuner.StubTuner`, whose lists say what was flown."""
-    from jobs.rollout import scheduler as flying
-    from tests.support.stub_tuner import StubTuner
-
-    StubTuner.flown, StubTuner.measured, StubTuner.broken, StubTuner.dying = [], [], {}, set()
-    monkeypatch.setattr(flying, "_tuner", StubTuner)
-    monkeypatch.setattr(flying, "start_ray", lambda *given: None)
-    return StubTuner

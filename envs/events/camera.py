@@ -35,10 +35,11 @@ from envs.events.photoreceptor import encode, encoding_tables, response_curve
 
 __all__ = ["EVENT", "EventCamera"]
 
+LUMINANCE = np.dtype(np.float32)
 T_LIMIT_US = 2**52  # exact in float64, 142 years
 # Every pixel of the largest sensor can fire once; 0.6 GB at the most while they are sorted.
 MAX_EVENTS_PER_FRAME = 2**24
-MIN_SHARE = 0.1  # of the nominal threshold, under mismatch
+MIN_THRESHOLD_SHARE = 0.1  # of the nominal threshold, under mismatch
 MIN_THRESHOLD = 1e-6
 
 
@@ -54,7 +55,7 @@ def pixel_thresholds(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
     if config.threshold_mismatch == 0.0:
         return nominal[0], nominal[1]
     draws = np.random.default_rng(config.threshold_seed).standard_normal((2, config.height * config.width))
-    share = np.maximum(1.0 + config.threshold_mismatch * draws, MIN_SHARE)
+    share = np.maximum(1.0 + config.threshold_mismatch * draws, MIN_THRESHOLD_SHARE)
     thresholds = np.maximum(nominal * share, MIN_THRESHOLD)
     return thresholds[0], thresholds[1]
 
@@ -86,25 +87,25 @@ class EventCamera:
         self.config = config
         self.dropped = 0
         self.t_us: int | None = None
-        legacy = config.memory == "legacy"
-        self._curve = response_curve(config.response, config.luminance_floor)
-        self._thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if legacy else 1)
-        forgets, carries = config.memory != "reference", config.excess == "carry"
-        self._rule = (config.refractory_us, config.max_events_per_pixel, carries, forgets, legacy)
-        self._tables = None if config.encoding == "linear32" else encoding_tables(config.encoding)
         self._shape = (config.height, config.width)
-        pixels = config.width * config.height
-        self._state = (
-            np.zeros(pixels, np.float32),  # last frame
-            np.zeros((2, pixels), np.float32),  # quiet from row 0 to row 1, both included
-            np.zeros((3, pixels)),  # first level, ON count, OFF count
-            np.zeros(pixels if config.refractory_us > 0 else 0, np.int64),  # end of the last dead time
+        self._tables = None if config.encoding == "linear32" else encoding_tables(config.encoding)
+        rule = crossings.Rule(
+            refractory_us=config.refractory_us,
+            max_events=config.max_events_per_pixel,
+            carries=config.excess == "carry",
+            forgets=config.memory != "reference",
+            legacy=config.memory == "legacy",
         )
-        words = np.zeros((pixels + 7) // 8, np.uint64)  # one flag a pixel, padded
-        self._scratch = (words, np.zeros(8 * words.size, np.int64))  # and the pixels to decide
+        curve = response_curve(config.response, config.luminance_floor)
+        thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if rule.legacy else 1)
+        self._model = tuple(rule), tuple(curve), thresholds
+        num_pixels = config.width * config.height
+        self._memory = crossings.memory_rows(num_pixels, config.refractory_us > 0)
+        num_words = (num_pixels + 7) // 8
+        self._scratch = np.zeros(num_words, np.uint64), np.zeros(8 * num_words, np.int64)
 
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
-        """Remember a first frame; it makes no events, and no pixel is in its dead time.
+        """Remember a first frame; it makes no events, and no pixel is in its refractory period.
 
         Args:
             luminance: float32 (H, W), linear, finite, >= 0; 1 is white.
@@ -116,8 +117,9 @@ class EventCamera:
         flat, t_us = self._checked(_stacked(luminance), 1), checked_time(t_us)
         bad = int(crossings.first_invalid(flat[0]))
         if bad >= 0:
-            raise self._refusal(flat, bad)
-        crossings.remember(self._encoded(flat)[0], self._curve, self._thresholds, self._state)
+            raise self._invalid(flat, bad)
+        seen = flat if self._tables is None else self._encoded(flat)
+        crossings.remember(seen[0], self._model, self._memory)
         self.t_us, self.dropped = t_us, 0
 
     def step(self, luminance: np.ndarray, t_us: int) -> np.ndarray:
@@ -154,44 +156,44 @@ class EventCamera:
         """
         if self.t_us is None:
             raise ValueError("EventCamera.step needs a first frame; call reset(luminance, t_us) before it.")
-        times, flat = [self.t_us], self._checked(frames, len(times_us))
-        for t_us in times_us:
-            times.append(checked_time(t_us))
-            if times[-1] <= times[-2]:
-                raise ValueError(f"t_us must increase from frame to frame; got {t_us} after {times[-2]}.")
+        flat, times = self._checked(frames, len(times_us)), np.empty(len(times_us) + 1, np.int64)
+        times[0] = last_us = self.t_us
+        for k, t_us in enumerate(times_us, 1):
+            times[k] = new_us = checked_time(t_us)
+            if new_us <= last_us:
+                raise ValueError(f"t_us must increase from frame to frame; got {t_us} after {last_us}.")
+            last_us = new_us
         bad, dropped, events = crossings.steps(
-            self._encoded(flat),
-            np.array(times),
-            (self.config.width, MAX_EVENTS_PER_FRAME),
-            self._rule,
-            self._curve,
-            self._thresholds,
-            self._state,
+            flat if self._tables is None else self._encoded(flat),
+            times,
+            self.config.width,
+            MAX_EVENTS_PER_FRAME,
+            self._model,
+            self._memory,
             self._scratch,
         )
         if bad >= 0:
-            raise self._refusal(flat, bad)
-        self.t_us, self.dropped = times[-1], dropped
+            raise self._invalid(flat, bad)
+        self.t_us, self.dropped = last_us, dropped
         return events
 
     def _encoded(self, flat: np.ndarray) -> np.ndarray:
-        """The frames (K, N) as the sensor's front end hands them on."""
-        if self._tables is None:
-            return flat
+        """The frames (K, N) as an 8-bit front end hands them on."""
+        assert self._tables is not None  # noqa: S101  for the type checker
         encoded = np.empty_like(flat)
         bad = int(encode(flat.ravel(), *self._tables, encoded.ravel()))
         if bad >= 0:
-            raise self._refusal(flat, bad)
+            raise self._invalid(flat, bad)
         return encoded
 
     def _checked(self, frames: np.ndarray, count: int) -> np.ndarray:
         """The frames as a contiguous (K, N) array."""
-        if getattr(frames, "dtype", None) != np.float32 or frames.shape != (count, *self._shape) or not count:
+        if getattr(frames, "dtype", None) != LUMINANCE or frames.shape != (count, *self._shape) or not count:
             dtype, shape = getattr(frames, "dtype", type(frames)), getattr(frames, "shape", ())[1:]
             raise ValueError(f"luminance must be float32 {self._shape}; got {dtype} of shape {shape}.")
         return frames.reshape(count, -1)
 
-    def _refusal(self, flat: np.ndarray, pixel: int) -> ValueError:
+    def _invalid(self, flat: np.ndarray, pixel: int) -> ValueError:
         """The error for a value that is not a luminance."""
         y, x = divmod(pixel % flat.shape[1], self.config.width)
         return ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {flat.flat[pixel]!s}.")

@@ -1,16 +1,39 @@
-"""From trains to events: the events of one pixel between two frames lie evenly in time.
+"""From trains to events: the events of one pixel between two frames lie evenly in time."""
 
-Event k = 0, 1, ... of a train comes `start + k * stride` microseconds after the last frame,
-rounded to a whole microsecond in [1, interval]. `trains` is float64 (2, N), start and stride;
-`crossings` int64 (N,), levels crossed, negative if downwards; `sent` int64 (N,), how many of
-them become events; `pixels` int64 (N,), flat indices in increasing order.
-"""
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 MIN_BITS, MAX_BITS = 6, 13  # of a sort's digit; 13 take a table of 64 KiB
+
+
+class Span(NamedTuple):
+    """Times of the last frame and of this one [us]."""
+
+    start_us: int
+    end_us: int
+
+
+class Trains(NamedTuple):
+    """Events of N pixels between two frames.
+
+    Event k = 0, 1, ... of a train comes `start + k * stride` microseconds after the last frame,
+    rounded to a whole microsecond in [1, interval].
+
+    Attributes:
+        pixels: Flat indices in increasing order, int64.
+        crossings: Levels crossed, negative if downwards, int64.
+        sent: How many of them become events, int64.
+        start, stride: Time of the first event, and from one to the next [us], float64.
+    """
+
+    pixels: np.ndarray
+    crossings: np.ndarray
+    sent: np.ndarray
+    start: np.ndarray
+    stride: np.ndarray
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -20,43 +43,44 @@ def moment(start, stride, k, interval):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def limit_events(trains, sent, interval, limit):
-    """Lower `sent` so that at most `limit` events remain: none after some microsecond; return how many.
+def limit_events(trains, span, limit):
+    """Lower `trains.sent` so that at most `limit` events remain, the earliest ones; return how many.
 
     If the first microsecond alone holds more, all trains keep the same number of events.
     """
-    total = sent.sum()
+    sent, total = trains.sent, trains.sent.sum()
     if total <= limit:
         return total
+    interval = span.end_us - span.start_us
     early, late = 0, interval
     while late - early > 1:
         middle = (early + late) // 2
-        if _until(trains, sent, middle, interval) > limit:
+        if _count_until(trains, middle, interval) > limit:
             late = middle
         else:
             early = middle
     share = limit // sent.size
     for j in range(sent.size):
-        sent[j] = _number(trains, sent, j, early, interval) if early > 0 else min(sent[j], share)
+        sent[j] = _train_until(trains, j, early, interval) if early > 0 else min(sent[j], share)
     return sent.sum()
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _until(trains, sent, t, interval):
+def _count_until(trains, t, interval):
     """Events up to and including time `t`."""
     total = 0
-    for j in range(sent.size):
-        total += _number(trains, sent, j, t, interval)
+    for j in range(trains.sent.size):
+        total += _train_until(trains, j, t, interval)
     return total
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _number(trains, sent, j, t, interval):
+def _train_until(trains, j, t, interval):
     """Events of train `j` up to and including time `t`."""
-    low, high = 0, sent[j]
+    low, high = 0, trains.sent[j]
     while low < high:
         middle = (low + high) // 2
-        if moment(trains[0, j], trains[1, j], middle, interval) <= t:
+        if moment(trains.start[j], trains.stride[j], middle, interval) <= t:
             low = middle + 1
         else:
             high = middle
@@ -64,29 +88,34 @@ def _number(trains, sent, j, t, interval):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def events_of(frame, pixels, crossings, sent, trains, total):
+def events_of(trains, span, width, total):
     """EVENT array of all trains, sorted by (t, y, x, order in the pixel). O(events) for any interval.
 
-    `frame` is (time of the last frame, time of this one, width). A radix sort by time is
-    stable, so that ties keep the raster order in which the trains come.
+    A radix sort by time is stable, so that ties keep the raster order in which the trains come.
+
+    Args:
+        trains: `Trains`, of which `total` events are sent.
+        span: `Span`.
+        width: Pixels of a row.
+        total: Sum of `trains.sent`.
     """
-    t0, t1, width = frame
     events = np.empty(total, EVENT)
     if total == 0:
         return events
-    times, places = _emitted(t1 - t0, width, pixels, crossings, sent, trains, total)
-    passes, bits = _digits(t1 - t0, total)
+    interval = span.end_us - span.start_us
+    times, places = _emitted(trains, interval, width, total)
+    passes, bits = _digits(interval, total)
     mask = (1 << bits) - 1
     for turn in range(passes - 1):
         times, places = _moved(times, places, turn * bits, mask)
     shift = (passes - 1) * bits
-    place_of = _starts(times, shift, mask, (t1 - t0) >> shift)
+    place_of = _starts(times, shift, mask, interval >> shift)
     for i in range(total):
         t, place = times[i], places[i]
         digit = (t >> shift) & mask
         event = events[place_of[digit]]
         place_of[digit] += 1
-        event.t = t0 + t
+        event.t = span.start_us + t
         event.x = (place >> 1) & 0xFFF
         event.y = place >> 13
         event.p = 2 * (place & 1) - 1
@@ -94,17 +123,17 @@ def events_of(frame, pixels, crossings, sent, trains, total):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _emitted(interval, width, pixels, crossings, sent, trains, total):
-    """Times [us after the last frame] and places (y << 13 | x << 1 | ON) of all events, by pixel."""
+def _emitted(trains, interval, width, total):
+    """Times [us after the last frame] and places (y << 13 | x << 1 | is ON) of all events, by pixel."""
     times, places = np.empty(total, np.int64), np.empty(total, np.uint32)
     event, y = 0, 0
-    for j in range(pixels.size):
-        while pixels[j] >= (y + 1) * width:
+    for j in range(trains.pixels.size):
+        pixel = trains.pixels[j]
+        while pixel >= (y + 1) * width:
             y += 1
-        place = np.uint32((y << 13) | ((pixels[j] - y * width) << 1) | (crossings[j] > 0))
-        start, stride = trains[0, j], trains[1, j]
-        for k in range(sent[j]):
-            times[event] = moment(start, stride, k, interval)
+        place = np.uint32((y << 13) | ((pixel - y * width) << 1) | (trains.crossings[j] > 0))
+        for k in range(trains.sent[j]):
+            times[event] = moment(trains.start[j], trains.stride[j], k, interval)
             places[event] = place
             event += 1
     return times, places

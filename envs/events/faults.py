@@ -1,6 +1,6 @@
-"""What a real sensor does wrong: dead and hot pixels, lost events, events without cause (appendix D.3).
+"""Faults of a real sensor: dead and hot pixels, lost events, events without cause (appendix D.3).
 
-`draw_pixel_faults` says once per episode which pixels are faulty, `apply_faults` treats the
+`draw_pixel_faults` draws the faulty pixels of an episode, `apply_faults` applies all faults to the
 events of one interval. A fault that is off costs nothing and draws nothing.
 """
 

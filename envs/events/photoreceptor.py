@@ -6,20 +6,36 @@ instructions, which no call of a library's `log` does.
 """
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
-LARGEST = float(np.finfo(np.float32).max)
-ONE = 0x3FF0000000000000  # the bits of 1.0
+MAX_LUMINANCE = float(np.finfo(np.float32).max)
 ROOT_HALF = 0x3FE6A09E667F3BCD  # the bits of sqrt(1/2)
 INVERSE_LN2 = 1.4426950408889634
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # sum: ln 2; k * HIGH is exact
 GAMMA = 2.2
 
 
-def response_curve(response: str, luminance_floor: float) -> tuple[float, float, float, float]:
-    """Numbers (shift, knee, gain, lowest) of a response curve, for `respond` and `light_of`.
+class Curve(NamedTuple):
+    """A response curve: log(max(L + shift, knee)), plus gain * (L - knee) below the knee.
+
+    Attributes:
+        shift: Added to the luminance L.
+        knee: Luminance below which the response is linear; 0: nowhere.
+        gain: Slope there.
+        lowest: Logarithm of the knee, -inf without one.
+    """
+
+    shift: float
+    knee: float
+    gain: float
+    lowest: float
+
+
+def response_curve(response: str, luminance_floor: float) -> Curve:
+    """The response curve of a camera's settings.
 
     With a = luminance_floor and L the luminance: "log" is log(L + a). "lin_log" is log(L)
     from a upwards and log(a) + (L - a) / a below it; value and slope are continuous at a.
@@ -29,19 +45,19 @@ def response_curve(response: str, luminance_floor: float) -> tuple[float, float,
         luminance_floor: a > 0, relative to white = 1.
     """
     if response == "log":
-        return luminance_floor, 0.0, 0.0, -math.inf
-    return 0.0, luminance_floor, 1.0 / luminance_floor, math.log(luminance_floor)
+        return Curve(luminance_floor, 0.0, 0.0, -math.inf)
+    return Curve(0.0, luminance_floor, 1.0 / luminance_floor, math.log(luminance_floor))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def natural_logarithm(values, exponents):
-    """Replace each of `values` (float64, normal, > 0) by its logarithm; `exponents` is scratch of its size.
+def natural_logarithm(values):
+    """Replace each of `values` (float64, normal, > 0) by its logarithm.
 
     x = 2^k (1 + f) with 1 + f in [sqrt(1/2), sqrt(2)); log(1 + f) is the odd series in
     s = f / (2 + f), as in Tang (1990) and fdlibm. Error below 1 ulp
     (tests/envs/events/test_extremes.py).
     """
-    bits = values.view(np.int64)
+    bits, exponents = values.view(np.int64), np.empty(values.size, np.int64)
     for i in range(values.size):
         k = (bits[i] - ROOT_HALF) >> 52
         exponents[i] = k
@@ -62,22 +78,21 @@ def natural_logarithm(values, exponents):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def respond(curve, luminance, levels, exponents):
+def respond(curve, luminance, levels):
     """Write into the first `levels` (float64) the responses to `luminance` (float32, finite, >= 0)."""
-    shift, knee, gain, _ = curve
     levels = levels[: luminance.size]
     for i in range(luminance.size):
-        levels[i] = max(luminance[i] + shift, knee)
-    natural_logarithm(levels, exponents)
-    if gain > 0.0:
+        levels[i] = max(luminance[i] + curve.shift, curve.knee)
+    natural_logarithm(levels)
+    if curve.gain > 0.0:
         for i in range(luminance.size):
-            levels[i] += min(luminance[i] - knee, 0.0) * gain
+            levels[i] += min(luminance[i] - curve.knee, 0.0) * curve.gain
 
 
 @numba.njit(cache=True, error_model="numpy")
-def exponential(values, exponents):
+def exponential(values):
     """Replace each of `values` (float64, between -700 and 700) by its exponential, relative error 1e-12."""
-    bits = values.view(np.int64)
+    bits, exponents = values.view(np.int64), np.empty(values.size, np.int64)
     for i in range(values.size):
         k = np.rint(values[i] * INVERSE_LN2)
         exponents[i] = np.int64(k)
@@ -98,16 +113,16 @@ def exponential(values, exponents):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def light_of(curve, levels, exponents):
+def light_of(curve, levels):
     """Replace responses (float64) by their luminances; below 0 where no luminance responds so low."""
-    shift, knee, _, lowest = curve
-    if knee == 0.0:
-        exponential(levels, exponents)
+    if curve.knee == 0.0:
+        exponential(levels)
         for i in range(levels.size):
-            levels[i] -= shift
+            levels[i] -= curve.shift
         return
     for i in range(levels.size):
-        levels[i] = np.exp(max(levels[i], lowest)) + min(levels[i] - lowest, 0.0) * knee
+        linear = min(levels[i] - curve.lowest, 0.0) * curve.knee
+        levels[i] = np.exp(max(levels[i], curve.lowest)) + linear
 
 
 def encoding_tables(encoding: str) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +142,7 @@ def encode(luminance, bounds, meanings, out):
     """Write the 8-bit version of `luminance` into `out`; index of the first invalid value, or -1."""
     for i in range(luminance.size):
         light = luminance[i]
-        if not 0.0 <= light <= LARGEST:
+        if not 0.0 <= light <= MAX_LUMINANCE:
             return i
         code = 0
         for half in (128, 64, 32, 16, 8, 4, 2, 1):

@@ -1,7 +1,9 @@
-"""Kernels of a pixel's dead time after an event: what it fires then, and where it looks on from.
+"""The refractory period of a pixel after an event: what it fires then, and where it looks on from.
 
-Names are those of `envs.events.crossings`. Input is taken as valid.
+Input is taken as valid. `memory` is a `Memory` of `envs.events.crossings`.
 """
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -13,48 +15,74 @@ from envs.events.emission import moment
 TOLERANCE = 2.0**-23
 
 
+class Pixel(NamedTuple):
+    """One pixel between two frames.
+
+    Attributes:
+        before, after: Responses at the last frame and at this one.
+        remembered: Remembered level.
+        on, off: Thresholds.
+        refractory_end_us: End of its last refractory period [us].
+    """
+
+    before: float
+    after: float
+    remembered: float
+    on: float
+    off: float
+    refractory_end_us: int
+
+
+class Motions(NamedTuple):
+    """Responses before and after of the pixels of trains, and the level remembered between, float64 (N,)."""
+
+    before: np.ndarray
+    after: np.ndarray
+    remembered: np.ndarray
+
+
 @numba.njit(cache=True, error_model="numpy")
-def train_with_dead_time(pixel, times, held, refractory_us):
+def train_after_refractory_period(pixel, span, refractory_us):
     """Signed crossings, start, stride, remembered level, and whether anything changed.
 
-    While the level moves one way at one pace, all events after the first are one dead time
-    and one threshold apart.
+    While the level moves one way at one pace, all events after the first are one refractory
+    period and one threshold apart.
     """
-    before, after, remembered, on, off = pixel
-    t0, t1 = times
-    ended, way = held >= t0, after - before
-    since = held - t0 if ended else 0
-    if ended:
-        remembered = before + way * (since / (t1 - t0))
-    sign, size = (1, on) if after > remembered else (-1, off)
-    if way == 0.0 or abs(after - remembered) + TOLERANCE < size:
+    interval = span.end_us - span.start_us
+    ended, way = pixel.refractory_end_us >= span.start_us, pixel.after - pixel.before
+    since = pixel.refractory_end_us - span.start_us if ended else 0
+    remembered = pixel.before + way * (since / interval) if ended else pixel.remembered
+    sign, size = (1, pixel.on) if pixel.after > remembered else (-1, pixel.off)
+    if way == 0.0 or abs(pixel.after - remembered) + TOLERANCE < size:
         return 0, 0.0, 0.0, remembered, ended
-    pace = (t1 - t0) / abs(way)
-    first = moment((sign * (remembered - before) + size) * pace, 0.0, 0, t1 - t0)
+    pace = interval / abs(way)
+    first = moment((sign * (remembered - pixel.before) + size) * pace, 0.0, 0, interval)
     gap = np.rint(size * pace)
-    left = (t1 - t0) + gap - (size - TOLERANCE) * pace - first
+    left = interval + gap - (size - TOLERANCE) * pace - first
     n = 1 + int(max(left / (refractory_us + gap), 0.0))
     return sign * n, float(first), refractory_us + gap, remembered, True
 
 
 @numba.njit(cache=True, error_model="numpy")
-def resume(pixels, crossings, trains, times, refractory_us, state):
-    """Start the dead time of each last event; compact the pixels that are out of it and return how many.
+def start_refractory_periods(trains, motions, span, refractory_us, memory):
+    """Start the period of each last event; compact the pixels that are out of it and return how many.
 
-    The others have no quiet band: they are decided in every frame, until their dead time ends.
+    The others have no quiet band: they are decided in every frame, until their period ends.
     """
-    band, level, held = state
-    t0, t1 = times
-    free = 0
-    for j in range(pixels.size):
-        i, n, remembered = pixels[j], abs(crossings[j]), trains[4, j]
+    interval, free = span.end_us - span.start_us, 0
+    for j in range(trains.pixels.size):
+        i, n, remembered = trains.pixels[j], abs(trains.crossings[j]), motions.remembered[j]
         if n > 0:
-            held[i] = t0 + moment(trains[0, j], trains[1, j], n - 1, t1 - t0) + refractory_us
-            if held[i] >= t1:
-                band[0, i], band[1, i] = 1.0, 0.0
+            end_us = (
+                span.start_us + moment(trains.start[j], trains.stride[j], n - 1, interval) + refractory_us
+            )
+            memory.refractory_end_us[i] = end_us
+            if end_us >= span.end_us:
+                memory.quiet_low[i], memory.quiet_high[i] = 1.0, 0.0
                 continue
-            remembered = trains[2, j] + (trains[3, j] - trains[2, j]) * ((held[i] - t0) / (t1 - t0))
-        level[0, i], level[1, i], level[2, i] = remembered, 0.0, 0.0
-        pixels[free] = i
+            way = motions.after[j] - motions.before[j]
+            remembered = motions.before[j] + way * ((end_us - span.start_us) / interval)
+        memory.first_level[i], memory.on_count[i], memory.off_count[i] = remembered, 0.0, 0.0
+        trains.pixels[free] = i
         free += 1
     return free

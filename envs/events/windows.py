@@ -5,8 +5,8 @@ import numpy as np
 
 from envs.events.camera import EVENT
 
-ON, OFF = 255, 125  # picture values of polarities (appendix D.1.2)
-MAX_US = 2**31 - 1
+GREY_ON, GREY_OFF = 255, 125  # of an event picture (appendix D.1.2)
+MAX_WINDOW_US = 2**31 - 1
 
 
 def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int) -> np.ndarray:
@@ -29,17 +29,23 @@ def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int
     """
     if events.dtype != EVENT or events.ndim != 1:
         raise ValueError(f"events must be a 1-D EVENT array; got {events.dtype}, {events.ndim}-D.")
-    if not 0 < window_us <= MAX_US or capacity < 1:
+    if not 0 < window_us <= MAX_WINDOW_US or capacity < 1:
         raise ValueError(
-            f"window_us must be in [1, {MAX_US}] and capacity >= 1; got {window_us} and {capacity}."
+            f"window_us must be in [1, {MAX_WINDOW_US}] and capacity >= 1; got {window_us} and {capacity}."
         )
-    window = np.zeros((capacity + 1, 4), np.int32)
-    bad = _pack(events, start_us, window_us, window)
+    bad = _first_out_of_place(events, start_us, window_us)
     if bad >= 0:
         raise ValueError(
             f"events must be sorted by t within ({start_us}, {start_us + window_us}] us with p in {{-1, 1}}; "
             f"event {bad} is {events[bad]}."
         )
+    return fill_window(events, start_us, window_us, capacity)
+
+
+def fill_window(events: np.ndarray, start_us: int, window_us: int, capacity: int) -> np.ndarray:
+    """As `pack_window`, for events that are known to be valid, such as those of `EventCamera`."""
+    window = np.zeros((capacity + 1, 4), np.int32)
+    _fill(events, start_us, window_us, window)
     return window
 
 
@@ -85,21 +91,26 @@ def event_image(events: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pack(events, start_us, window_us, window):
-    """Fill the window; return the first event that breaks a rule, or -1."""
+def _first_out_of_place(events, start_us, window_us):
+    """Index of the first event that is out of time or order or has no polarity, or -1."""
     last = start_us + 1
     for i in range(events.size):
         event = events[i]
         if not last <= event.t <= start_us + window_us or abs(event.p) != 1:
             return i
         last = event.t
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill(events, start_us, window_us, window):
+    """Write the newest events, and the numbers of row 0, into an empty window."""
     dropped = max(events.size - (window.shape[0] - 1), 0)
     window[0, 0], window[0, 1], window[0, 2] = events.size - dropped, dropped, window_us
     for i in range(dropped, events.size):
         event, row = events[i], i - dropped + 1
         window[row, 0], window[row, 1] = event.t - start_us, event.x
         window[row, 2], window[row, 3] = event.y, event.p
-    return -1
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -109,5 +120,5 @@ def _draw(events, image):
         event = events[i]
         if event.y >= image.shape[0] or event.x >= image.shape[1]:
             return i
-        image[event.y, event.x] = ON if event.p > 0 else OFF
+        image[event.y, event.x] = GREY_ON if event.p > 0 else GREY_OFF
     return -1

@@ -1,8 +1,8 @@
-"""What every event file reader gives, and the rules that every event file must keep.
+"""The result of every event file reader, and the rules that hold for every format.
 
-A reader checks sizes before it allocates, and hands its raw columns to `finish`, which
-applies the same rules to every format. A refusal is one ValueError that names the file,
-the rule and the remedy.
+A reader checks sizes before it allocates, and passes its raw columns to `finish`, which applies
+the same rules to every format. What breaks a rule raises one ValueError that names the file, the
+rule and the remedy.
 """
 
 import contextlib
@@ -236,7 +236,7 @@ def unwrap(counter: np.ndarray, bits: int) -> np.ndarray:
 
 
 def check_events(events: np.ndarray, width: int, height: int) -> None:
-    """Refuse what no event file may hold.
+    """Check events before they are written.
 
     Raises:
         ValueError: The dtype is not EVENT, the events are not sorted by t, a time is outside

@@ -1,15 +1,39 @@
 """Kernels that decode the words of Prophesee's encodings EVT 2.0, EVT 2.1 and EVT 3.0.
 
-Every kernel only counts if it is given no `events`; so it is called once with none, to learn
-the number, and once with room for all. It gives the number of
-events, the number of entries skipped because their time or row was not yet known, and the
-index of the first word of a reserved type, or -1.
+Call a decoder once with empty `events` to count, and once with room for all of them. It returns
+the number of events, the number of events skipped because their time or row was not yet known,
+and the index of the first word of a reserved type, or -1.
 """
+
+from enum import IntEnum
 
 import numba
 import numpy as np
 
-HIGH, LOW, TURNS, Y, X, P, ADVANCE = range(7)  # what an EVT 3.0 stream remembers
+FIRST_VENDOR_TYPE = 14  # words of this type and above are the vendor's own, in all encodings
+
+
+class Evt2(IntEnum):
+    """Types of EVT 2.0 and EVT 2.1 words (docs.prophesee.ai)."""
+
+    OFF = 0
+    ON = 1
+    TIME_HIGH = 8
+    TRIGGER = 10
+
+
+class Evt3(IntEnum):
+    """Types of EVT 3.0 words (docs.prophesee.ai)."""
+
+    ROW = 0
+    EVENT = 2
+    VECTOR_BASE = 3
+    VECTOR_12 = 4
+    VECTOR_8 = 5
+    TIME_LOW = 6
+    CONTINUED_4 = 7
+    TIME_HIGH = 8
+    TRIGGER = 10
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -58,18 +82,32 @@ def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tup
     for i in range(words.size):
         word = np.int64(words[i])
         kind = word >> 28
-        if kind <= 1:
+        if kind == Evt2.OFF or kind == Evt2.ON:
             mask = np.int64(masks[i]) if masks.size else np.int64(1)
             if base < 0:
                 skipped += _bits(mask)
             else:
                 t = base | (word >> 22 & 63)
                 n = _emit(events, n, mask, t, word >> 11 & 2047, word & 2047, 2 * kind - 1)
-        elif kind == 8:
+        elif kind == Evt2.TIME_HIGH:
             base = _time_base(word & 0xFFFFFFF, base)
-        elif kind != 10 and kind < 14:  # neither a trigger nor a vendor's word
+        elif kind != Evt2.TRIGGER and kind < FIRST_VENDOR_TYPE:
             return n, skipped, i
     return n, skipped, -1
+
+
+class Stream(IntEnum):
+    """Places in the memory of an EVT 3.0 stream."""
+
+    HIGH = 0  # upper and lower 12 bits of the clock
+    LOW = 1
+    TURNS = 2  # how often the 24-bit clock began again
+    Y = 3
+    X = 4
+    P = 5
+
+
+STREAM_SIZE = len(Stream)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -83,48 +121,47 @@ def decode_evt3(words: np.ndarray, events: np.ndarray) -> tuple[int, int, int]:
         events: EVENT array to fill.
     """
     n, skipped = 0, 0
-    state = np.zeros(7, np.int64)
-    state[HIGH], state[Y] = -1, -1
+    stream = np.zeros(STREAM_SIZE, np.int64)
+    stream[Stream.HIGH], stream[Stream.Y] = -1, -1
     for i in range(words.size):
-        mask = _evt3_word(np.int64(words[i]) >> 12, np.int64(words[i]) & 0xFFF, state)
-        if mask < 0:
+        kind, value = np.int64(words[i]) >> 12, np.int64(words[i]) & 0xFFF
+        mask, advance = 0, 0
+        if kind == Evt3.VECTOR_12:
+            mask, advance = int(value), 12
+        elif kind == Evt3.VECTOR_8:
+            mask, advance = int(value & 255), 8
+        elif kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE:
+            stream[Stream.X], stream[Stream.P] = value & 2047, 2 * (value >> 11) - 1
+            mask = 1 if kind == Evt3.EVENT else 0
+        elif not _take_row_or_time(kind, value, stream):
             return n, skipped, i
-        if mask and (state[HIGH] < 0 or state[Y] < 0 or state[P] == 0):
-            skipped += _bits(mask)
-        elif mask:
-            t = state[TURNS] << 24 | state[HIGH] << 12 | state[LOW]
-            n = _emit(events, n, mask, t, state[X], state[Y], state[P])
-        state[X] += state[ADVANCE]
+        if mask:
+            n, skipped = _emit_vector(events, n, skipped, mask, stream)
+        stream[Stream.X] += advance
     return n, skipped, -1
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _evt3_word(kind: int, value: int, state: np.ndarray) -> int:
-    """Take one word into the state; the mask of its events from x on, or -1 for a reserved type."""
-    state[ADVANCE] = 12 if kind == 4 else 8 if kind == 5 else 0
-    mask = 0
-    if kind == 2 or kind == 3:  # one event, or the first pixel of a vector
-        state[X], state[P] = value & 2047, 2 * (value >> 11) - 1
-        mask = 3 - kind
-    elif kind == 4 or kind == 5:
-        mask = value if kind == 4 else value & 255
-    elif kind == 0:
-        state[Y] = value & 2047
-    else:
-        mask = _evt3_clock(kind, value, state)
-    return mask
+def _emit_vector(events: np.ndarray, n: int, skipped: int, mask: int, stream: np.ndarray) -> tuple[int, int]:
+    """Events of a mask, or skipped ones where time, row or polarity are not yet known."""
+    if stream[Stream.HIGH] < 0 or stream[Stream.Y] < 0 or stream[Stream.P] == 0:
+        return n, skipped + _bits(mask)
+    t = stream[Stream.TURNS] << 24 | stream[Stream.HIGH] << 12 | stream[Stream.LOW]
+    return _emit(events, n, mask, t, stream[Stream.X], stream[Stream.Y], stream[Stream.P]), skipped
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _evt3_clock(kind: int, value: int, state: np.ndarray) -> int:
-    """Take a word that is no address: the clock, a trigger, or a vendor's word (0); others: -1."""
-    if kind == 6:
-        state[LOW] = value
-    elif kind == 8:
-        if value < state[HIGH] - 2048:  # the 24-bit clock began again
-            state[TURNS] += 1
-        if value != state[HIGH]:
-            state[HIGH], state[LOW] = value, 0
-    elif kind != 7 and kind != 10 and kind < 14:
-        return -1
-    return 0
+def _take_row_or_time(kind: int, value: int, stream: np.ndarray) -> bool:
+    """Take a word that makes no event into the stream's memory; False for a reserved type."""
+    if kind == Evt3.ROW:
+        stream[Stream.Y] = value & 2047
+    elif kind == Evt3.TIME_LOW:
+        stream[Stream.LOW] = value
+    elif kind == Evt3.TIME_HIGH:
+        if value < stream[Stream.HIGH] - 2048:  # the 24-bit clock began again
+            stream[Stream.TURNS] += 1
+        if value != stream[Stream.HIGH]:
+            stream[Stream.HIGH], stream[Stream.LOW] = value, 0
+    else:
+        return kind == Evt3.CONTINUED_4 or kind == Evt3.TRIGGER or kind >= FIRST_VENDOR_TYPE
+    return True

@@ -1,9 +1,4 @@
-"""Recordings of event cameras: read and write the files that the field uses.
-
-`read_events` takes a file of any known format, `write_events` makes one, `video_to_events`
-turns a video into events and `downscale_events` makes pixels larger. `Recording` is the
-simulator's own: events with the steps and settings that made them.
-"""
+"""The formats of event files that the field uses: which one a file has, and who reads and writes it."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,34 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from envs.recordings.aedat import MAGIC_2, MAGIC_4, read_aedat2, read_aedat4
-from envs.recordings.downscale import downscale_events
 from envs.recordings.event_file import MAX_BYTES, MAX_EVENTS, EventFile, Request, check_events, check_file
-from envs.recordings.hdf5 import (
-    Recording,
-    milliseconds_to_index,
-    read_hdf5,
-    read_recording,
-    write_hdf5,
-    write_recording,
-)
+from envs.recordings.hdf5 import read_hdf5, write_hdf5
 from envs.recordings.plain import US_PER, read_nmnist, read_npz, read_text, write_npz, write_text
 from envs.recordings.prophesee import read_dat, read_evt, write_prophesee
-from envs.recordings.video import VideoStep, video_steps, video_to_events
-
-__all__ = [
-    "FORMATS",
-    "EventFile",
-    "Recording",
-    "VideoStep",
-    "downscale_events",
-    "milliseconds_to_index",
-    "read_events",
-    "read_recording",
-    "video_steps",
-    "video_to_events",
-    "write_events",
-    "write_recording",
-]
 
 READERS: dict[str, Callable[[Request], EventFile]] = {
     "aedat2": read_aedat2,

@@ -1,7 +1,7 @@
 """HDF5 event files in the layout of the DSEC data set, and the recordings that add to it.
 
 `/events/{t,x,y,p}`, `/t_offset` and `/ms_to_idx` are what other tools read; `/index/*` and
-the attribute `about` are ours: where each control step and flight begins, and how the
+the attribute `about` are ours: where each control step and episode begins, and how the
 events were made. Polarity is 0 or 1 on disk, as in DSEC; files with -1 and 1 are read too.
 """
 
@@ -38,6 +38,8 @@ MAX_CHUNK_BYTES = 1 << 28
 # bitshuffle) crashed on damaged files, or (lz4, zstd) take the memory that the data declare.
 FILTERS = (1, 2, 3, 32000, 32001, 32026)
 BLOSC = (32001, 32026)
+# How data sets are compressed, and given a checksum, so that a flipped bit is noticed.
+PACKING = {**hdf5plugin.Blosc2(cname="zstd", clevel=3), "fletcher32": True}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +75,7 @@ def write_recording(path: Path, recording: Recording) -> None:
     with _written(path, events) as file:
         index = file.create_group("index")
         for name, values in recording.index.items():
-            index.create_dataset(name, data=values, **_packing())
+            index.create_dataset(name, data=values, **PACKING)
         file.attrs["about"] = json.dumps(recording.about, allow_nan=False)
 
 
@@ -142,15 +144,10 @@ def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
     with replaced(path) as part, h5py.File(part, "w") as file:
         columns = {"t": t_us, "x": events["x"], "y": events["y"], "p": (events["p"] > 0).astype(np.uint8)}
         for name, values in columns.items():
-            file.create_dataset(f"events/{name}", data=values, **_packing())
+            file.create_dataset(f"events/{name}", data=values, **PACKING)
         file["t_offset"] = np.int64(offset)
         file["ms_to_idx"] = milliseconds_to_index(t_us)
         yield file
-
-
-def _packing() -> dict[str, Any]:
-    """How data sets are compressed, and given a checksum, so that a flipped bit is noticed."""
-    return {**hdf5plugin.Blosc2(cname="zstd", clevel=3), "fletcher32": True}
 
 
 def _sensor(file: h5py.File) -> tuple[int | None, int | None]:

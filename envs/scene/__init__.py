@@ -1,9 +1,17 @@
-"""The world: obstacles, textures and layouts, collisions, and range scans."""
+"""The world: obstacles, textures and layouts, what the vehicle hits, and how far it sees.
+
+`Scene` and `make_scene` are imported when they are first used: they need numba, which takes long to
+load, and the launcher checks a scene's name without it.
+"""
+
+from typing import TYPE_CHECKING
 
 from envs.scene.layouts import LAYOUTS, Layout
 from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
-from envs.scene.scene import Scene, make_scene
 from envs.scene.textures import Texture
+
+if TYPE_CHECKING:
+    from envs.scene.scene import Scene, make_scene
 
 __all__ = [
     "BOX",
@@ -17,3 +25,12 @@ __all__ = [
     "Texture",
     "make_scene",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """`Scene` or `make_scene`, at their first use."""
+    if name not in ("Scene", "make_scene"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from envs.scene import scene
+
+    return getattr(scene, name)

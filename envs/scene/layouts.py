@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from envs.scene.collision import keep_apart
 from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
 from envs.scene.textures import Texture
 
@@ -202,6 +201,8 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
             "lower num_obstacles or min_gap_m, or widen the lane"
         )
     tries = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (TRIES_PER_OBSTACLE * count, 2))
+    from envs.scene.collision import keep_apart  # loads numba, which a check of names does without
+
     kept = keep_apart(tries, layout.min_gap_m, count)
     if len(kept) < count:
         raise ValueError(

@@ -130,7 +130,7 @@ def plot_trajectories(tracks: Sequence[Trajectory]) -> Figure:
         _draw_scene(panel, own[0].scene, own[0].height_m)
         for track in own:
             _draw_trajectory(panel, track)
-        ends = ", ".join(f"{track.agent} {track.way_m[-1, 1]:.0f} m" for track in own)
+        ends = ", ".join(f"{track.agent} {track.xy_m[-1, 1]:.0f} m" for track in own)
         panel.set_title(f"corridor {seed}: {ends}", loc="left", fontsize=8.5, color=INK)
         panel.tick_params(labelsize=8)
     figure.supxlabel("y, along the corridor [m]", fontsize=8)
@@ -165,7 +165,7 @@ def _outline(section: np.ndarray) -> Patch:
 def _draw_trajectory(panel: Axes, track: Trajectory) -> None:
     oracle = track.agent == "oracle"
     colour = GREEN if oracle else COLOURS[track.outcome]
-    x_m, y_m = track.way_m.T
+    x_m, y_m = track.xy_m.T
     panel.plot(y_m, x_m, color=colour, lw=1.2 if oracle else 2.0, ls="--" if oracle else "-", zorder=3)
     panel.plot(y_m[0], x_m[0], "o", color=colour, ms=4, zorder=4)
     if track.outcome == "collision":

@@ -164,9 +164,10 @@ def publish_table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     words: int = 1,
+    caption: str | None = None,
 ) -> None:
     """Print a table, and write it as Markdown, `name`.md, into the run folder and the tracker."""
-    show_table(title, head, rows, words)
+    show_table(title, head, rows, words, caption)
     text = markdown_table(head, rows, words)
     write_atomic(folder.path / f"{name}.md", text)
     tracker.text(f"{name}.md", text)

@@ -12,7 +12,7 @@ from av.video.stream import VideoStream
 from PIL import Image, ImageDraw, ImageFont
 
 from envs.events import event_image
-from envs.events.windows import OFF, ON
+from envs.events.windows import GREY_OFF, GREY_ON
 from jobs.analysis.plots import EVENT_COLOURS, INK
 from jobs.run.files import replaced
 from models.policy.features import grey_picture
@@ -77,7 +77,7 @@ def open_film(path: Path, control_hz: float, decode: Decode | None) -> Iterator[
 def last_polarity(events: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The last polarity of each pixel, -1, 0 or +1, (H, W); events in time order."""
     image = event_image(events, shape[1], shape[0])
-    return np.select([image == ON, image == OFF], [1, -1])
+    return np.select([image == GREY_ON, image == GREY_OFF], [1, -1])
 
 
 def coloured(picture: np.ndarray) -> np.ndarray:

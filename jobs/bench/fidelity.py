@@ -1,4 +1,4 @@
-"""How many renders and samples an event error needs: the measurements behind `envs.fidelity.plan`.
+"""How many renders and samples an event error takes: the measurements behind `envs.fidelity.plan_renders`.
 
 Run: python -m jobs.bench.fidelity [scene ...]
 Expect: about two minutes per scene on one core; poles and texture_change unless others are
@@ -11,7 +11,7 @@ import dataclasses
 import sys
 
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
-from envs.event_error import REFERENCE_SAMPLES, measure
+from envs.event_error import REFERENCE_SAMPLES, measure_event_error
 from jobs.analysis.tables import show_table
 
 RATES_HZ = (45.0, 100.0, 200.0, 400.0)
@@ -47,7 +47,8 @@ def errors(scene: str, hz: float, threshold: float) -> list[str]:
     tried += [FidelityConfig(max_step_m=step_m / 32, samples=samples) for samples in SAMPLES]
     tried += [FidelityConfig()]
     measured = [
-        measure(dataclasses.replace(config, fidelity=fidelity), EPISODES, STEPS) for fidelity in tried
+        measure_event_error(dataclasses.replace(config, fidelity=fidelity), EPISODES, STEPS)
+        for fidelity in tried
     ]
     return [f"{100 * accuracy.error:.1f}" for accuracy in measured] + [f"{measured[-1].renders:.0f}"]
 

@@ -29,9 +29,9 @@ from envs.config import EnvConfig
 from jobs.analysis.tables import show_table
 from jobs.bench.throughput import composed
 from jobs.config.config import HELD_OUT_SCENE
-from jobs.evaluation.sweep_plan import PRETRAINED
-from jobs.rollout.episodes import fly
-from jobs.rollout.scheduler import loaded
+from jobs.rollout.episodes import roll_out
+from jobs.rollout.executors import cached_agent
+from jobs.rollout.policies import PRETRAINED
 from jobs.run.ray_cluster import QUIET, WORKER_THREADS
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
@@ -213,9 +213,10 @@ def do_nothing(params: dict[str, int]) -> None:
 
 def evaluate_condition(params: dict[str, int]) -> None:
     """A trial that evaluates a policy under the default condition."""
-    first = EPISODES * params["trial"]
-    agent = loaded(str(PRETRAINED / POLICY), "stochastic")
-    fly(agent, EnvConfig(scene=HELD_OUT_SCENE, split="eval"), range(first, first + EPISODES), EPISODES)
+    first = params["trial"] * EPISODES
+    agent = cached_agent(str(PRETRAINED / POLICY), "stochastic")
+    env = EnvConfig(scene=HELD_OUT_SCENE, split="eval")
+    roll_out(agent, env, range(first, first + EPISODES), EPISODES)
     tune.report({"key": params["trial"]})
 
 

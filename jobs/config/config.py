@@ -16,7 +16,7 @@ from pydantic_core import ErrorDetails
 
 from envs.config import STRICT, EnvConfig
 from jobs.config.conditions import axis_errors, condition_errors
-from jobs.config.env_keys import BESIDE_ENV, ENV_FIELDS, ENV_GROUPS, fields_of, flat_env, key_of
+from jobs.config.env_keys import BESIDE_ENV, ENV_GROUPS, ENV_KEYS, fields_of, flat_env, key_of
 from jobs.config.errors import SET_BY_JOBS, ConfigError, nearest, redacted
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
@@ -123,11 +123,10 @@ def as_dict(config: Config) -> dict[str, object]:
 
 def known_keys() -> list[str]:
     """Every key that a configuration may have."""
-    keys = [*fields_of(Config), *BESIDE_ENV]
-    for name, section in (SECTIONS | ENV_GROUPS).items():
+    keys = [*fields_of(Config), *ENV_GROUPS, *ENV_KEYS]
+    for name, section in SECTIONS.items():
         keys += [f"{name}.{field}" for field in fields_of(section)]
-    keys += [f"model.{name}" for name in model_keys()]
-    return keys + [f"env.{name}" for name in ENV_FIELDS]
+    return keys + [f"model.{name}" for name in model_keys()]
 
 
 def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:

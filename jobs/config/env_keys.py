@@ -18,7 +18,7 @@ BESIDE_ENV = ("camera", "faults", "renderer", "fidelity")  # fields of EnvConfig
 
 
 def fields_of(section: "type[DataclassInstance]") -> dict[str, type]:
-    """Name -> type of each field of a dataclass of settings."""
+    """The fields of a dataclass of settings: name -> type."""
     return {part.name: typing.cast(type, part.type) for part in dataclasses.fields(section)}
 
 
@@ -46,7 +46,7 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
     fields: dict[str, typing.Any] = {}
     groups: dict[str, dict[str, object]] = {}
     for key, value in changes.items():
-        path = ENV_KEYS.get(key, (key,))
+        path = ENV_KEYS.get(key, (key,))  # an unknown key is for pydantic to reject
         if len(path) == 2:
             groups.setdefault(path[0], {})[path[1]] = value
         else:

@@ -2,7 +2,10 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from envs.config import EnvConfig
+from envs.scene.layouts import LAYOUTS
 
 
 def scene_errors(named: Sequence[tuple[str, str]], env: EnvConfig) -> list[str]:
@@ -15,17 +18,14 @@ def scene_errors(named: Sequence[tuple[str, str]], env: EnvConfig) -> list[str]:
         named: Pairs of the key that names a scene, and the scene; env.layout applies to each.
         env: Gives env.layout, and the vehicle that has to get through.
     """
-    # Imported here because numba takes long to load, which errors about other keys can do without.
-    import numpy as np
-
-    from envs.scene import LAYOUTS, make_scene
-
     vehicle = env.vehicle_radius_m, env.camera_height_m
     default = vehicle == (EnvConfig.vehicle_radius_m, EnvConfig.camera_height_m) and not env.layout
     errors: dict[str, str] = {}
     for key, scene in named:
         if default and scene in LAYOUTS:
             continue
+        from envs.scene import make_scene  # loads numba, which takes long
+
         try:
             make_scene(scene, np.random.default_rng(0), *vehicle, **env.layout)
         except ValueError as error:

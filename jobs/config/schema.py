@@ -1,4 +1,4 @@
-"""The settings of each part of an experiment: names, units and ranges; the values are in conf/."""
+"""The settings of each part of an experiment: names, types, ranges. Their values and units are in conf/."""
 
 from typing import Annotated, Literal
 
@@ -43,11 +43,13 @@ class AlgoConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class CollectConfig:
-    """Which flights and recordings fill the data set of the event VAE; each gets an equal share of the steps.
+    """What the data set of the event VAE is made of; scenes and recordings get equal shares of the steps.
 
     Attributes:
-        scenes: Layouts flown.
-        recordings: Event files of real cameras; each gives what it has, if that is less.
+        scenes: Layouts in which episodes are recorded.
+        recordings: Event files of real cameras; a short one contributes all that it has.
+        policy: Run or policy folder of a policy to record beside random actions.
+        policy_share: Share of the control steps that the policy takes.
     """
 
     scenes: list[Name]
@@ -77,11 +79,11 @@ class PretrainConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TrainConfig:
-    """How long the policy is trained, how often it is saved, and what it meets meanwhile.
+    """How long the policy is trained, how often it is saved, and under which conditions.
 
     Attributes:
         conditions: Settings of the simulation that are replaced together, as a sweep replaces
-            them; the corridors flown at once take them in turn. [{}] changes nothing.
+            them; the environments take them in turn. [{}] changes nothing.
     """
 
     env_steps: Count
@@ -91,7 +93,7 @@ class TrainConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class EvaluateConfig:
-    """On how many held-out corridors, and drawn by which renderers."""
+    """In how many held-out corridors a policy is evaluated, and with which renderers."""
 
     episodes: Count
     renderers: Annotated[list[Literal["raycast", "pyrender"]], Field(min_length=1)]
@@ -102,12 +104,12 @@ class EvaluateConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class SweepConfig:
-    """Which policies fly through which changes, `trials` corridors for each training.
+    """Which policies are evaluated under which conditions, in `trials` corridors for each training.
 
     Attributes:
-        scene: Where they fly unless an axis changes it.
-        policies: Each a group or a name in models/pretrained, "pretrained" (all there), "newest", a bound, or
-            a path.
+        scene: The layout, unless an axis changes it.
+        policies: Each a group or a name in models/pretrained, "pretrained" (all there), "newest", a baseline,
+            or a path.
         axes: Name -> setting -> values. The first setting names the points of the axis; others
             have as many values, or one that stays.
         reference: The group that paired differences are taken against.
@@ -122,13 +124,13 @@ class SweepConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TradeConfig:
-    """Which policy flies under every setting of simulator and encoder, and how often.
+    """Which policy is evaluated under every setting of simulator and encoder, and in how many corridors.
 
     Attributes:
         policy: A name in models/pretrained, "newest", or a path.
-        trials: Corridors flown under each setting,
-        pyrender_trials: and under those that pyrender draws.
-        replays: Flights on which costs and errors are measured.
+        trials: Corridors under each setting.
+        pyrender_trials: Corridors under the settings that pyrender draws.
+        replays: Episodes on which costs and errors are measured.
     """
 
     policy: Name
@@ -139,7 +141,13 @@ class TradeConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TradeSimulatorConfig:
-    """What the simulator's accuracy is measured on, and how often its cost."""
+    """Where the simulator's event error is measured, and how often its cost.
+
+    Attributes:
+        flights: Corridors in which errors are measured.
+        steps: Control steps in each of them, and in each round of timing.
+        rounds: Rounds of timing.
+    """
 
     scenes: Annotated[list[Name], Field(min_length=1)]
     control_hz: Annotated[list[Positive], Field(min_length=1)]
@@ -150,7 +158,7 @@ class TradeSimulatorConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TradeEncoderConfig:
-    """How long the encoders that are compared are trained, and on what they are measured."""
+    """How long the compared encoders are trained, and on how many windows they are measured."""
 
     iterations: Count
     seeds: Count
@@ -160,7 +168,7 @@ class TradeEncoderConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class ProbeConfig:
-    """On how many steps representations are probed, and which event VAEs are trained for that."""
+    """On how many steps representations are probed, and which event VAEs are trained for it."""
 
     num_steps: Count
     num_validation_steps: Count
@@ -173,11 +181,13 @@ class ProbeConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class ClusterConfig:
-    """Where Ray runs, and where its nodes leave what they write.
+    """Where Ray runs, and where its nodes store checkpoints and artifacts.
 
     Attributes:
+        address: Of a running cluster; None to start Ray on this machine.
+        num_cpus: How many cores jobs may use; None for all.
         storage: A folder that every node sees (NFS), or an address such as s3://bucket/evade;
-            None for the run folder, where there is but one machine.
+            None for the run folder, where there is only one machine.
     """
 
     name: Literal["local", "ray"]
@@ -187,7 +197,7 @@ class ClusterConfig:
 
     @pydantic.field_validator("storage")
     @classmethod
-    def _seen_from_everywhere(cls, storage: str | None) -> str | None:
+    def _every_node_sees_it(cls, storage: str | None) -> str | None:
         if storage is not None and not storage.startswith("/") and "://" not in storage:
             raise ValueError("must be an absolute folder, an address such as s3://bucket/evade, or null")
         return storage
@@ -195,7 +205,7 @@ class ClusterConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TrackingConfig:
-    """Where results are recorded."""
+    """Where results are recorded: the address of the MLflow store, and the experiment's name there."""
 
     uri: Name
     experiment: Name

@@ -1,4 +1,4 @@
-"""What the trainings of a group achieved under each condition of a sweep, as rows, tables and metrics."""
+"""Statistics of a sweep: what the trainings of a group achieved under each condition."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,32 +24,32 @@ from jobs.analysis.tables import (
 
 Condition = tuple[str, str]  # axis and value
 LABELS = ("Axis", "Value", "Group", "Training")
-Flights = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the same corridors
+TrainingEpisodes = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the same corridors
 
 
 @dataclass(frozen=True)
-class Row:
+class GroupResult:
     """One group under one condition.
 
     Attributes:
         condition: Axis and value.
         group: What was trained.
-        trainings: Training seeds that flew; a bound has None.
-        flights: Of all of them [-].
+        trainings: Training seeds that were evaluated; a baseline has None.
+        episodes: Of all of them [-].
         success: Fraction that reached the goal, two-stage interval.
-        wilson: The Wilson interval of the same, as if flights were independent.
+        wilson: The Wilson interval of the same, as if episodes were independent.
         distance_m: Mean forward distance without collision [m].
         middle_m: Interquartile mean of the distance [m].
         success_difference: To the reference group on the same corridors; None: there is none.
         distance_difference_m: The same of the distance [m].
         events_per_step: Mean events of a control step [-]; 0 for an agent that sees none.
-        dropped: Events that did not fit into a window or a pixel, all flights [-].
+        dropped: Events that did not fit into a window or a pixel, all episodes [-].
     """
 
     condition: Condition
     group: str
     trainings: tuple[int | None, ...]
-    flights: int
+    episodes: int
     success: Estimate
     wilson: Interval
     distance_m: Estimate
@@ -60,64 +60,74 @@ class Row:
     dropped: int
 
     @property
+    def name(self) -> str:
+        """Condition and group: "control_hz=45 bytestream"."""
+        return f"{'='.join(self.condition)} {self.group}"
+
+    @property
     def success_interval(self) -> Interval:
         """From the lower end of both intervals of success to the upper.
 
         Wilson's alone would not see that trainings differ, the bootstrap alone would give none
-        where all flights succeed or fail.
+        where all episodes succeed or fail.
         """
         low, high = self.success.interval or self.wilson
         return min(low, self.wilson[0]), max(high, self.wilson[1])
 
 
 def summarise_group(
-    condition: Condition, group: str, flown: Flights, reference: Flights | None = None
-) -> Row:
-    """The row of one group under one condition; a fixed generator draws the resamples.
+    condition: Condition,
+    group: str,
+    trainings: TrainingEpisodes,
+    reference: TrainingEpisodes | None = None,
+) -> GroupResult:
+    """The result of one group under one condition; a fixed generator draws the resamples.
 
     Args:
         condition: Axis and value.
         group: What was trained.
-        flown: EPISODE (n,) of each training, of the same corridors.
+        trainings: EPISODE (n,) of each training, of the same corridors.
         reference: The same of the group to compare with.
     """
-    success, distance = table_of(flown, "success"), table_of(flown, "distance_m")
+    success, distance = episode_values(trainings, "success"), episode_values(trainings, "distance_m")
     differences: list[Estimate | None] = [None, None]
     if reference:
         differences = [
-            paired_difference(ours, table_of(reference, name), np.random.default_rng(0))
+            paired_difference(ours, episode_values(reference, name), np.random.default_rng(0))
             for ours, name in ((success, "success"), (distance, "distance_m"))
         ]
-    return Row(
+    return GroupResult(
         condition=condition,
         group=group,
-        trainings=tuple(flown),
-        flights=success.size,
+        trainings=tuple(trainings),
+        episodes=success.size,
         success=two_stage_estimate(success, np.random.default_rng(0)),
         wilson=wilson_interval(int(success.sum()), success.size),
         distance_m=two_stage_estimate(distance, np.random.default_rng(0)),
         middle_m=two_stage_estimate(distance, np.random.default_rng(0), interquartile_mean),
         success_difference=differences[0],
         distance_difference_m=differences[1],
-        events_per_step=float(table_of(flown, "events_per_step").mean()),
-        dropped=int(table_of(flown, "dropped").sum()),
+        events_per_step=float(episode_values(trainings, "events_per_step").mean()),
+        dropped=int(episode_values(trainings, "dropped").sum()),
     )
 
 
-def table_of(flown: Flights, name: str) -> np.ndarray:
+def episode_values(trainings: TrainingEpisodes, name: str) -> np.ndarray:
     """One column of EPISODE as float64 (trainings, corridors).
 
     Raises:
-        ValueError: If two trainings did not fly the same corridors.
+        ValueError: If two trainings were evaluated in different corridors.
     """
-    trainings = list(flown.values())
-    if any(not np.array_equal(episodes["seed"], trainings[0]["seed"]) for episodes in trainings):
-        raise ValueError(f"trainings {list(flown)} must have flown the same corridors; fly what is missing")
-    return np.stack([episodes[name].astype(np.float64) for episodes in trainings])
+    every = list(trainings.values())
+    if any(not np.array_equal(episodes["seed"], every[0]["seed"]) for episodes in every):
+        raise ValueError(
+            f"trainings {list(trainings)} must have the same corridors; evaluate what is missing"
+        )
+    return np.stack([episodes[name].astype(np.float64) for episodes in every])
 
 
-def matrix(
-    rows: Sequence[Row],
+def success_table(
+    results: Sequence[GroupResult],
     conditions: Sequence[Condition],
     groups: Sequence[str],
     gaps: Mapping[tuple[str, str, str], str],
@@ -125,92 +135,88 @@ def matrix(
     """Conditions x groups, as headings and lines: success [%] with its interval.
 
     Args:
-        rows: What was flown.
+        results: What was evaluated.
         conditions: One line each.
         groups: One column each.
-        gaps: What stands in an empty place, by axis, value and group; nothing flown is "-".
+        gaps: Axis, value and group -> what stands in an empty place; by default "-".
     """
     found = dict(gaps)
-    found |= {(*row.condition, row.group): success_text(row) for row in rows}
+    found |= {(*result.condition, result.group): success_text(result) for result in results}
     lines = [(*place, *(found.get((*place, group), "-") for group in groups)) for place in conditions]
     return ("Axis", "Value", *groups), lines
 
 
-def details(rows: Sequence[Row], reference: str) -> str:
-    """Every row with all its estimates as a Markdown table."""
-    flown = ("Axis", "Value", "Group", "Trainings", "Flights", "Success [%]", "Distance [m]")
+def details_table(results: Sequence[GroupResult], reference: str) -> str:
+    """Every result with all its estimates as a Markdown table."""
+    own = ("Axis", "Value", "Group", "Trainings", "Episodes", "Success [%]", "Distance [m]")
     compared = ("Middle half [m]", f"Success - {reference}", f"Distance - {reference} [m]")
-    head = (*flown, *compared, "Events/step", "Dropped")
+    head = (*own, *compared, "Events/step", "Dropped")
     lines = [
         (
-            *row.condition,
-            row.group,
-            str(len(row.trainings)),
-            str(row.flights),
-            success_text(row),
-            estimate_text(row.distance_m),
-            estimate_text(row.middle_m),
-            estimate_text(row.success_difference, 100, "+.0f"),
-            estimate_text(row.distance_difference_m, 1, "+.1f"),
-            *events_texts(row.events_per_step, row.dropped),
+            *result.condition,
+            result.group,
+            str(len(result.trainings)),
+            str(result.episodes),
+            success_text(result),
+            estimate_text(result.distance_m),
+            estimate_text(result.middle_m),
+            estimate_text(result.success_difference, 100, "+.0f"),
+            estimate_text(result.distance_difference_m, 1, "+.1f"),
+            *events_texts(result.events_per_step, result.dropped),
         )
-        for row in rows
+        for result in results
     ]
     return markdown_table(head, lines, 3)
 
 
-def success_text(row: Row) -> str:
+def success_text(result: GroupResult) -> str:
     """The success rate [%] with its interval."""
-    return percent_text(Estimate(row.success.value, row.success_interval))
+    return percent_text(Estimate(result.success.value, result.success_interval))
 
 
-def columns(rows: Sequence[Row]) -> dict[str, list[str | float]]:
-    """The rows as columns for a tracker; the first, all labels joined, is unique."""
-    found: dict[str, list[str | float]] = {
-        "condition": [f"{name_of(row.condition)} {row.group}" for row in rows],
-        "axis": [row.condition[0] for row in rows],
-        "value": [row.condition[1] for row in rows],
-        "group": [row.group for row in rows],
-        "trainings": [len(row.trainings) for row in rows],
-        "flights": [row.flights for row in rows],
+def result_columns(results: Sequence[GroupResult]) -> dict[str, list[str | float]]:
+    """The results as columns of a tracker's table; the first, condition and group, is unique."""
+    metrics = [result_metrics(result) for result in results]
+    names = dict.fromkeys(name for values in metrics for name in values)
+    return {
+        "condition": [result.name for result in results],
+        "axis": [result.condition[0] for result in results],
+        "value": [result.condition[1] for result in results],
+        "group": [result.group for result in results],
+        "trainings": [len(result.trainings) for result in results],
+        "episodes": [result.episodes for result in results],
+        **{name: [values.get(name, float("nan")) for values in metrics] for name in names},
     }
-    figures = [metrics(row) for row in rows]
-    names = dict.fromkeys(name for values in figures for name in values)
-    return found | {name: [values.get(name, float("nan")) for values in figures] for name in names}
 
 
-def name_of(condition: Condition) -> str:
-    """A condition in one word: "control_hz=45"."""
-    return "=".join(condition)
-
-
-def metrics(row: Row) -> dict[str, float]:
-    """The figures of a row under the names that trackers and tables share; what is not known is left out."""
-    low, high = row.success_interval
-    figures = {
-        "eval/success_rate": row.success.value,
-        "eval/success_rate_low": low,
-        "eval/success_rate_high": high,
-        **estimate_metrics("eval/distance_m", row.distance_m),
-        **estimate_metrics("sweep/middle_half_m", row.middle_m),
-        **estimate_metrics("sweep/success_difference", row.success_difference),
-        **estimate_metrics("sweep/distance_difference_m", row.distance_difference_m),
+def result_metrics(result: GroupResult) -> dict[str, float]:
+    """Metrics under the names that trackers and tables share; what is not known is left out."""
+    success = Estimate(result.success.value, result.success_interval)
+    metrics = {
+        **estimate_metrics("eval/success_rate", success),
+        **estimate_metrics("eval/distance_m", result.distance_m),
+        **estimate_metrics("sweep/middle_half_m", result.middle_m),
+        **estimate_metrics("sweep/success_difference", result.success_difference),
+        **estimate_metrics("sweep/distance_difference_m", result.distance_difference_m),
     }
-    if row.events_per_step > 0.0:
-        figures |= {"sim/events_per_step": row.events_per_step, "sim/dropped_events": float(row.dropped)}
+    if result.events_per_step > 0.0:
+        metrics["sim/events_per_step"] = result.events_per_step
+        metrics["sim/dropped_events"] = float(result.dropped)
     try:
-        return {**figures, "sweep/value": float(row.condition[1])}  # the x axis of a chart over runs
+        return {**metrics, "sweep/value": float(result.condition[1])}  # the x axis of a chart over runs
     except ValueError:  # the value is a word
-        return figures
+        return metrics
 
 
-def axis_curves(axis: str, numbers: Mapping[str, float], rows: Sequence[Row]) -> dict[str, dict[int, float]]:
+def axis_curves(
+    axis: str, numbers: Mapping[str, float], results: Sequence[GroupResult]
+) -> dict[str, dict[int, float]]:
     """Success and distance of one group along an axis, as curves of a tracker, whose steps are integers.
 
     Args:
         axis: Its name.
         numbers: Value as text -> number, as `jobs.config.conditions.axis_numbers` gives them.
-        rows: Of this axis and one group.
+        results: Of this axis and one group.
 
     Returns:
         Metric -> step -> value. The step is the axis value, in per cent or per mille where it must
@@ -219,9 +225,9 @@ def axis_curves(axis: str, numbers: Mapping[str, float], rows: Sequence[Row]) ->
     for scale, unit in ((1, ""), (100, "_percent"), (1000, "_permille")):
         steps = {value: round(scale * number) for value, number in numbers.items()}
         if all(math.isclose(steps[value], scale * numbers[value]) for value in numbers):
-            points = {steps[row.condition[1]]: row for row in rows}
+            points = {steps[result.condition[1]]: result for result in results}
             return {
-                f"sweep/{axis}{unit}_success": {x: row.success.value for x, row in points.items()},
-                f"sweep/{axis}{unit}_distance_m": {x: row.distance_m.value for x, row in points.items()},
+                f"sweep/{axis}{unit}_success": {x: point.success.value for x, point in points.items()},
+                f"sweep/{axis}{unit}_distance_m": {x: point.distance_m.value for x, point in points.items()},
             }
     return {}

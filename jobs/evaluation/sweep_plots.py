@@ -1,7 +1,6 @@
-"""Figures of a sweep: every axis as lines or bars, and where along the corridor flights ended in contact."""
+"""Plots of a sweep: every axis as lines or bars, and where along the corridor episodes ended in contact."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,8 +9,8 @@ from matplotlib.figure import Figure
 from jobs.analysis.plots import INK, MUTED, panel_grid, style_of, tidy
 from jobs.analysis.statistics import Interval
 from jobs.config.conditions import axis_numbers, moving_settings
-from jobs.evaluation.group_stats import Row
-from jobs.rollout.agents import BOUNDS
+from jobs.evaluation.group_stats import GroupResult
+from jobs.rollout.agents import BASELINES
 
 SCALES = {
     "env.control_hz": ("Control rate [Hz]", "log"),
@@ -28,10 +27,12 @@ SCALES = {
 MAX_BANDS = 4  # of groups in one panel; more would cover each other, and become bars on points set apart
 DODGE = 0.012  # between such points, as a share of the axis
 MAX_ACROSS = 2  # panels of the collision map side by side
-Measure = Callable[[Row], tuple[float, Interval]]
+Quantity = Callable[[GroupResult], tuple[float, Interval]]
 
 
-def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Sequence[Row]) -> Figure:
+def axis_figure(
+    axis: str, points: Mapping[str, Mapping[str, object]], results: Sequence[GroupResult]
+) -> Figure:
     """Success and distance of all groups along one axis: lines over numbers, bars over words.
 
     Bars also where several settings change together: no single number says what a point is.
@@ -39,48 +40,50 @@ def axis_figure(axis: str, points: Mapping[str, Mapping[str, object]], rows: Seq
     Args:
         axis: Its name.
         points: Value as text -> settings that it changes; the first one names it.
-        rows: Of this axis.
+        results: Of this axis.
     """
     first = next(iter(next(iter(points.values()))))
     label, scale = SCALES.get(first, (first, "linear"))
     moving, words = moving_settings(points), axis_numbers(points) is None
-    groups = list(dict.fromkeys(row.group for row in rows))
+    groups = list(dict.fromkeys(result.group for result in results))
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     panels = figure.subplots(1, 2)
     ticks = [_tick(point, moving) for point in points.values()] if words else list(points)
-    for panel, measure in zip(panels, (_success_percent, _distance_m), strict=True):
+    for panel, quantity in zip(panels, (_success_percent, _distance_m), strict=True):
         if words:
-            _draw_bars(panel, list(points), groups, rows, measure)
+            _draw_bars(panel, list(points), groups, results, quantity)
             panel.set_xticks(range(len(points)), ticks, fontsize=8 if len(moving) < 2 else 7)
         else:
-            _draw_lines(panel, groups, rows, measure, scale)
+            _draw_lines(panel, groups, results, quantity, scale)
         panel.set_xlabel(label if len(moving) < 2 else f"{label}, and what changes with it")
         tidy(panel, "y")
         panel.set_axisbelow(True)
-    panels[0].set(ylim=(0, 103), ylabel="Flights that reached the goal [%]")
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set(ylim=(0, 103), ylabel="Episodes that reached the goal [%]")
     panels[1].set(ylim=(0, 103), ylabel="Mean distance without collision [m]")
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 5), frameon=False)
-    figure.supxlabel(_note(axis, points, moving, rows), x=0.995, ha="right", fontsize=7, color=MUTED)
+    figure.supxlabel(_footnote(axis, points, moving, results), x=0.995, ha="right", fontsize=7, color=MUTED)
     return figure
 
 
 def _draw_lines(
-    panel: Axes, groups: Sequence[str], rows: Sequence[Row], measure: Measure, scale: str
+    panel: Axes, groups: Sequence[str], results: Sequence[GroupResult], quantity: Quantity, scale: str
 ) -> None:
     """A line for each group with its intervals: a band, or bars where there are many groups."""
-    seen = [group for group in groups if group not in BOUNDS]
+    seen = [group for group in groups if group not in BASELINES]
     crowded = len(seen) > MAX_BANDS
     panel.set_xscale(scale)
-    ticks = sorted({float(row.condition[1]) for row in rows})
+    ticks = sorted({float(result.condition[1]) for result in results})
     for group in groups:
-        own = sorted((row for row in rows if row.group == group), key=lambda row: float(row.condition[1]))
+        own = [result for result in results if result.group == group]
+        own.sort(key=lambda result: float(result.condition[1]))
         colour, marker = style_of(group)
-        x = np.array([float(row.condition[1]) for row in own])
+        x = np.array([float(result.condition[1]) for result in own])
         if crowded and group in seen:
             x = _set_apart(x, ticks, scale, seen.index(group) - (len(seen) - 1) / 2)
-        y, low, high = np.array([(value, *interval) for value, interval in map(measure, own)]).T
-        dashes = "--" if group in BOUNDS else "-"
+        y, low, high = np.array([(value, *interval) for value, interval in map(quantity, own)]).T
+        dashes = "--" if group in BASELINES else "-"
         panel.plot(
             x, y, color=colour, marker=marker, ms=6, lw=1.8, ls=dashes, mec="white", mew=0.6, label=group
         )
@@ -101,39 +104,50 @@ def _set_apart(x: np.ndarray, ticks: Sequence[float], scale: str, places: float)
 
 
 def _draw_bars(
-    panel: Axes, values: Sequence[str], groups: Sequence[str], rows: Sequence[Row], measure: Measure
+    panel: Axes,
+    values: Sequence[str],
+    groups: Sequence[str],
+    results: Sequence[GroupResult],
+    quantity: Quantity,
 ) -> None:
     """Bars of all groups side by side at each value, with their intervals."""
     width = 0.84 / len(groups)
     for place, group in enumerate(groups):
-        own = [row for row in rows if row.group == group]
-        x = [values.index(row.condition[1]) + (place - (len(groups) - 1) / 2) * width for row in own]
-        y, low, high = np.array([(value, *interval) for value, interval in map(measure, own)]).T
+        own = [result for result in results if result.group == group]
+        offset = (place - (len(groups) - 1) / 2) * width
+        x = [values.index(result.condition[1]) + offset for result in own]
+        y, low, high = np.array([(value, *interval) for value, interval in map(quantity, own)]).T
         spread = np.abs(np.array([y - low, high - y]))
-        look: dict[str, Any] = {"ecolor": INK, "error_kw": {"lw": 0.9, "capsize": min(2.5, 14 * width)}}
-        panel.bar(x, y, 0.94 * width, color=style_of(group)[0], yerr=spread, label=group, **look)
+        caps = {"lw": 0.9, "capsize": min(2.5, 14 * width)}
+        panel.bar(
+            x, y, 0.94 * width, color=style_of(group)[0], yerr=spread, label=group, ecolor=INK, error_kw=caps
+        )
 
 
 def _tick(point: Mapping[str, object], moving: Sequence[str]) -> str:
     """What a point is; where several settings change, each on a line of its own, numbers with their names."""
     if len(moving) < 2:
         return str(next(iter(point.values()))).replace("_", "\n")
-    return "\n".join(_named(key.rpartition(".")[2], point[key]) for key in moving)
+    return "\n".join(_setting_text(key.rpartition(".")[2], point[key]) for key in moving)
 
 
-def _named(name: str, value: Any) -> str:
+def _setting_text(name: str, value: object) -> str:
     """A number behind its name; a word, which says itself what it is, alone and in short lines."""
     return f"{name} {value:g}" if isinstance(value, int | float) else str(value).replace("_", "\n")
 
 
-def _note(
-    axis: str, points: Mapping[str, Mapping[str, object]], moving: Sequence[str], rows: Sequence[Row]
+def _footnote(
+    axis: str,
+    points: Mapping[str, Mapping[str, object]],
+    moving: Sequence[str],
+    results: Sequence[GroupResult],
 ) -> str:
-    """What stays along the axis, and how much was flown."""
+    """What stays the same along the axis, and how much was evaluated."""
     point = next(iter(points.values()))
     held = [f"{key.rpartition('.')[2]} {value}" for key, value in point.items() if key not in moving]
-    flights, trainings = {row.flights for row in rows}, {len(row.trainings) for row in rows}
-    counts = f"{_range(flights)} flights of {_range(trainings)} trainings for each group"
+    episodes = {result.episodes for result in results}
+    trainings = {len(result.trainings) for result in results}
+    counts = f"{_range(episodes)} episodes of {_range(trainings)} trainings for each group"
     return "; ".join([axis, *held, counts, "95 % intervals"])
 
 
@@ -141,19 +155,20 @@ def _range(counts: set[int]) -> str:
     return " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
 
 
-def _success_percent(row: Row) -> tuple[float, Interval]:
-    low, high = row.success_interval
-    return 100 * row.success.value, (100 * low, 100 * high)
+def _success_percent(result: GroupResult) -> tuple[float, Interval]:
+    low, high = result.success_interval
+    return 100 * result.success.value, (100 * low, 100 * high)
 
 
-def _distance_m(row: Row) -> tuple[float, Interval]:
-    return row.distance_m.value, row.distance_m.interval or (row.distance_m.value,) * 2
+def _distance_m(result: GroupResult) -> tuple[float, Interval]:
+    distance = result.distance_m
+    return distance.value, distance.interval or (distance.value, distance.value)
 
 
 def collision_figure(
     ends: Mapping[str, tuple[np.ndarray, np.ndarray]], length_m: float, half_width_m: float
 ) -> Figure:
-    """Where flights of each group ended in contact, seen from above.
+    """Where episodes of each group ended in contact, seen from above.
 
     Args:
         ends: Group -> EPISODE without any change, and EPISODE under all changes in the same scene.
@@ -161,26 +176,33 @@ def collision_figure(
         half_width_m: Where the walls are [m].
     """
     figure, panels = panel_grid(len(ends), MAX_ACROSS, (6.6, 2.3), (0.0, 0.7), sharex=True, sharey=True)
-    for panel, (group, parts) in zip(panels, ends.items(), strict=True):
-        said = []
-        colour = style_of(group)[0]
-        looks: tuple[dict[str, Any], ...] = (
-            {"s": 26, "alpha": 0.95, "edgecolors": "white", "lw": 0.5},
-            {"s": 7, "alpha": 0.25, "lw": 0},
-        )
-        for episodes, look, name in zip(parts, looks, ("unchanged", "changed"), strict=True):
-            hit = episodes[episodes["collision"]]
-            order = 3 if name == "unchanged" else 2
-            panel.scatter(hit["distance_m"], hit["x_m"], color=colour, zorder=order, **look)
-            said.append(f"{name} {len(hit)} of {len(episodes)}")
+    for panel, (group, (unchanged, changed)) in zip(panels, ends.items(), strict=True):
+        _draw_contacts(panel, group, unchanged, changed)
         panel.hlines([-half_width_m, half_width_m], 0, length_m, color=INK, lw=1.5)
         panel.vlines(length_m, -half_width_m, half_width_m, color=MUTED, lw=1.2, ls=":")
         panel.set(xlim=(-2, length_m + 2), ylim=(half_width_m + 1.5, -half_width_m - 1.5))
-        panel.set_title(f"{group}: contacts {', '.join(said)}", loc="left", fontsize=9, color=INK)
-        panel.spines[:].set_visible(False)
-        panel.tick_params(labelsize=8)
     figure.supxlabel(
         "y, along the corridor [m]; large dots: nothing changed, small dots: all changes", fontsize=8
     )
     figure.supylabel("x, to the right [m]", fontsize=8)
     return figure
+
+
+def _draw_contacts(panel: Axes, group: str, unchanged: np.ndarray, changed: np.ndarray) -> None:
+    """The contacts of one group as dots, large where nothing was changed."""
+    colour, usual, others = style_of(group)[0], *(rows[rows["collision"]] for rows in (unchanged, changed))
+    panel.scatter(
+        usual["distance_m"],
+        usual["x_m"],
+        s=26,
+        alpha=0.95,
+        color=colour,
+        edgecolors="white",
+        lw=0.5,
+        zorder=3,
+    )
+    panel.scatter(others["distance_m"], others["x_m"], s=7, alpha=0.25, color=colour, lw=0, zorder=2)
+    counts = f"unchanged {len(usual)} of {len(unchanged)}, changed {len(others)} of {len(changed)}"
+    panel.set_title(f"{group}: contacts {counts}", loc="left", fontsize=9, color=INK)
+    panel.spines[:].set_visible(False)
+    panel.tick_params(labelsize=8)

@@ -6,12 +6,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jobs.analysis.statistics import Estimate, mean_difference, paired_difference
-from jobs.evaluation.group_stats import Condition, Flights, table_of
+from jobs.evaluation.group_stats import Condition, TrainingEpisodes, episode_values
 
 GAIN = {"success": 0.1, "distance_m": 5.0}  # the smallest gain that a claim has to mean
 Verdict = Literal["holds", "holds partly", "does not hold", "undecided", "not tested"]
 Measure = Literal["success", "distance_m"]
-Find = Callable[[Condition, str], Flights]  # episodes of a group under a condition; empty if there are none
+Find = Callable[[Condition, str], TrainingEpisodes]  # of a group under a condition; empty if there are none
 
 
 class Claim(NamedTuple):
@@ -104,7 +104,7 @@ def judge(claim: Claim, find: Find) -> Finding:
     both = {at: pair for at, pair in pairs.items() if all(pair)}
     if not both:
         return Finding("not tested", None, {})
-    ours, theirs = ([table_of(pair[side], claim.measure) for pair in both.values()] for side in (0, 1))
+    ours, theirs = ([episode_values(pair[side], claim.measure) for pair in both.values()] for side in (0, 1))
     single = [paired_difference(*pair, np.random.default_rng(0)) for pair in zip(ours, theirs, strict=True)]
     overall = paired_difference(_over_conditions(ours), _over_conditions(theirs), np.random.default_rng(0))
     return Finding(

@@ -19,8 +19,8 @@ import numpy as np
 from envs.config import settings_hash
 from jobs.analysis.plots import Curve, plot_learning_curves
 from jobs.config.config import Config, ConfigError
-from jobs.evaluation.sweep_plan import PRETRAINED
 from jobs.reporting.learning_curves import as_csv, read_curves
+from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json, write_atomic
 from jobs.run.folder import group_name, open_run
 from jobs.run.progress import console

@@ -8,7 +8,7 @@ docs/images/trade.png of the newest trade; with `resume` of what that run folder
 import csv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -16,11 +16,20 @@ from PIL import Image
 from jobs.analysis.statistics import two_stage_estimate
 from jobs.analysis.tables import estimate_text, markdown_table
 from jobs.config.config import Config, ConfigError
-from jobs.evaluation.group_stats import LABELS, Condition, details, matrix, summarise_group, table_of
-from jobs.evaluation.sweep_plan import NOMINAL, PRETRAINED
+from jobs.evaluation.group_stats import (
+    LABELS,
+    Condition,
+    details_table,
+    episode_values,
+    success_table,
+    summarise_group,
+)
+from jobs.evaluation.sweep_plan import NOMINAL
+from jobs.evaluation.sweep_report import Exactness, SweepFacts
 from jobs.reporting.learning_curves import mean_success, read_curves
 from jobs.reporting.paper_claims import CLAIMS, GAIN, LEARNT, Claim, Finding, judge, judge_learning
 from jobs.rollout.episodes import EPISODE
+from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json, write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
@@ -47,32 +56,6 @@ TITLES = {
 SweptEpisodes = dict[
     tuple[Condition, str], dict[int | None, np.ndarray]
 ]  # of each group under each condition
-
-
-class Exactness(TypedDict):
-    """How exact the events of a condition were: the error that was asked, and what was achieved."""
-
-    condition: tuple[str, str]
-    asked: float
-    event_error: float
-    renders_per_step: float
-
-
-class SweepFacts(TypedDict):
-    """What made a sweep, as its about.json says it; see `jobs.evaluation.sweep_report.about`."""
-
-    run: str
-    identity: str
-    command: str
-    flown_at: list[str]
-    date: str
-    scene: str
-    trials: int
-    reference: str
-    action: str
-    groups: dict[str, list[int | None]]
-    axes: dict[str, dict[str, object]]
-    exactness: list[Exactness]
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -134,8 +117,13 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
 
     Returns:
         The file.
+
+    Raises:
+        ConfigError: If an earlier version wrote the sweep.
     """
     about: SweepFacts = read_json(sweep / "about.json")
+    if "evaluated_at" not in about:
+        raise ConfigError(f"resume: {sweep} is a sweep of an earlier version; give its command again")
     plots = [name for name in (*about["axes"], "contacts") if (sweep / f"{name}.png").is_file()]
     (docs / "images").mkdir(parents=True, exist_ok=True)
     for name in plots:
@@ -145,7 +133,7 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
     text = render(
         TEMPLATE,
         about=about,
-        commits=", ".join(commit[:7] for commit in about["flown_at"]),
+        commits=", ".join(commit[:7] for commit in about["evaluated_at"]),
         groups=", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
         breaks=breaks_table(about, episodes),
         claims=claims_table(episodes, learning_success(pretrained)),
@@ -193,11 +181,11 @@ def breaks_table(about: SweepFacts, episodes: SweptEpisodes) -> str:
         own = episodes.get((nominal, group), {None: np.empty(0, EPISODE)})
         if None in own:  # a baseline, or not evaluated
             continue
-        before = table_of(own, "success")
+        before = episode_values(own, "success")
         lost = {}
         for (condition, other), trainings in episodes.items():
             if other == group and condition != nominal and trainings.keys() == own.keys():
-                change = table_of(trainings, "success") - before
+                change = episode_values(trainings, "success") - before
                 found = two_stage_estimate(change, np.random.default_rng(0))
                 if found.interval is not None and found.interval[1] < 0:
                     lost[condition] = found
@@ -257,8 +245,8 @@ def estimate_tables(about: SweepFacts, episodes: SweptEpisodes) -> tuple[str, st
         for group in groups
         if (at, group) in episodes
     ]
-    head, lines = matrix(rows, conditions, groups, {})
-    return markdown_table(head, lines, 2), details(rows, reference)
+    head, lines = success_table(rows, conditions, groups, {})
+    return markdown_table(head, lines, 2), details_table(rows, reference)
 
 
 def exactness_table(found: Sequence[Exactness]) -> str:

@@ -1,1 +1,1 @@
-"""Rolling out agents: episodes, evaluation tasks, and their scheduling on all cores."""
+"""Rolling out agents: policies, episodes, evaluation tasks, where they are stored and who computes them."""

@@ -1,13 +1,13 @@
-"""Who flies: the trained policy, and the bounds that say how hard the corridors are.
+"""Agents: the trained policy, and the baselines that say how hard the corridors are.
 
 `straight` and `random` see nothing; `oracle` knows where everything stands. A result means
 something between them.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict, cast
 
 import numpy as np
 
@@ -19,17 +19,29 @@ from envs.scene import Scene
 if TYPE_CHECKING:
     from models.policy import Policy
 
-BOUNDS = ("straight", "random", "oracle")
 # Of one step in x and y, in step lengths: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])
 LATTICE_M = 0.25
 CLEARANCE_SCALE_M = 0.4  # the price of a place falls by e with each such distance from contact
 BLOCKED = 1e3
-SIDE_PRICE = 0.01  # of a lattice step to the side: of two free ways, the straighter
+SIDE_PRICE = 0.01  # of a lattice step to the side: of two free paths, the straighter
+
+
+class StepInfo(TypedDict):
+    """What `CorridorEnv` tells beside an observation; metres, events and microseconds."""
+
+    x_m: float
+    y_m: float
+    distance_m: float
+    success: bool
+    collision: bool
+    num_events: int
+    dropped_events: int
+    t_us: int
 
 
 class Agent(Protocol):
-    """Chooses an action for each flight of a batch.
+    """Chooses an action for each episode of a batch.
 
     Attributes:
         observation: What its environments must show, as `envs.config.EnvConfig` names it.
@@ -40,29 +52,24 @@ class Agent(Protocol):
         """What it sees."""
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Begin one flight per environment, which has just been reset with its seed."""
+        """Begin one episode per environment, each just reset with its seed."""
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Actions (B,) for observations (B, ...) and the flights' infos."""
+    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+        """Actions (B,) for observations (B, ...) and the episodes' infos."""
 
 
-def make_agent(name: str, action: str = "deterministic", table: Mapping[str, Any] | None = None) -> Agent:
-    """A bound by its name, or the policy of a folder.
+def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[str, Any]] = ()) -> Agent:
+    """A baseline by its name, or the policy of a folder.
 
     Args:
         name: "straight", "random", "oracle", or the path of a policy folder.
         action: "deterministic" or "stochastic": how a policy chooses.
-        table: Settings of `EncoderTable.from_evae` for a policy whose frozen encoder reads single
-            events; None: those of the policy.
+        table: Names and values of settings of `EncoderTable.from_evae`, for a policy whose frozen
+            encoder reads single events; empty: those of the policy.
     """
-    bounds: dict[str, Callable[[], Agent]] = {
-        "straight": StraightAgent,
-        "random": RandomAgent,
-        "oracle": OracleAgent,
-    }
-    if name in bounds:
-        return bounds[name]()
-    # Here, because the bounds need no network.
+    if name in BASELINES:
+        return BASELINES[name]()
+    # Imported here, because the baselines need no network.
     from models.encoder.table import EncoderTable
     from models.encoder.weights import load_encoder
     from models.policy import load_policy
@@ -70,33 +77,33 @@ def make_agent(name: str, action: str = "deterministic", table: Mapping[str, Any
 
     policy = load_policy(Path(name))
     if table:
-        policy.encoder = EncoderTable.from_evae(load_encoder(Path(name) / ENCODER)[0], **table)
+        policy.encoder = EncoderTable.from_evae(load_encoder(Path(name) / ENCODER)[0], **dict(table))
     return PolicyAgent(policy, action == "stochastic")
 
 
 class StraightAgent:
-    """Always ahead."""
+    """Always flies straight ahead."""
 
     observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Nothing to remember."""
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
         """Zeros (B,)."""
         return np.zeros(len(infos), np.int64)
 
 
 class RandomAgent:
-    """Any action with the same probability at each step, drawn from the flight's own stream."""
+    """Takes each action with the same probability, drawn from the episode's own stream."""
 
     observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """One stream per flight, so that no flight depends on its neighbours."""
-        self._streams = flight_streams(seeds)
+        """Open one stream per episode, so that no episode depends on its neighbours."""
+        self._streams = episode_streams(seeds)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
         """Actions (B,)."""
         return np.array([stream.integers(NUM_ACTIONS) for stream in self._streams])
 
@@ -105,17 +112,17 @@ class PolicyAgent:
     """A trained policy; it sees its observation alone."""
 
     def __init__(self, policy: "Policy", stochastic: bool = False) -> None:
-        """Fly a loaded policy, choosing its likeliest action or drawing one as in training."""
+        """Take the policy's likeliest action, or draw one from its distribution as in training."""
         self.policy, self.stochastic = policy, stochastic
         self.observation = cast(Observation, policy.observation)
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Forget the flights before."""
+        """Forget the episodes before."""
         self.policy.reset(len(envs))
-        self._streams = flight_streams(seeds)
+        self._streams = episode_streams(seeds)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Actions (B,); draws come from each flight's own stream."""
+    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+        """Actions (B,); draws come from each episode's own stream."""
         logits = self.policy.logits(observations).astype(np.float64)
         if not self.stochastic:
             return logits.argmax(axis=1)
@@ -129,39 +136,39 @@ class OracleAgent:
     observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Plan one way per flight."""
+        """Plan one path per episode."""
         self._plans = []
         for env in envs:
             step_m = env.config.speed_mps / env.config.control_hz
             vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
-            plan = plan_way(env.scene, env.camera_pose()[0], *vehicle)
+            plan = plan_path(env.scene, env.camera_pose()[0], *vehicle)
             self._plans.append((plan, MOVES * step_m))
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """For each flight the action that ends closest to its plan."""
-        flights = zip(self._plans, infos, strict=True)
-        return np.array([follow(*plan, info["x_m"], info["y_m"]) for plan, info in flights])
+    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+        """For each episode the action that ends closest to its plan."""
+        pairs = zip(self._plans, infos, strict=True)
+        return np.array([follow(*plan, info["x_m"], info["y_m"]) for plan, info in pairs])
 
 
-def flight_streams(seeds: Sequence[int]) -> list[np.random.Generator]:
-    """One random stream per flight; it depends on the flight's seed alone."""
+def episode_streams(seeds: Sequence[int]) -> list[np.random.Generator]:
+    """One random stream per episode; it depends on the episode's seed alone."""
     return [np.random.default_rng(np.random.SeedSequence([int(seed), 0x9110])) for seed in seeds]
 
 
-def follow(way_x_m: np.ndarray, moves_m: np.ndarray, x_m: float, y_m: float) -> int:
-    """The move (of shape (3, 2), x and y [m]) after which x is closest to the way's."""
-    places = np.interp(y_m + moves_m[:, 1], np.arange(len(way_x_m)) * LATTICE_M, way_x_m)
+def follow(path_x_m: np.ndarray, moves_m: np.ndarray, x_m: float, y_m: float) -> int:
+    """The action whose move (moves_m: (3, 2), x and y [m]) ends closest in x to the path."""
+    places = np.interp(y_m + moves_m[:, 1], np.arange(len(path_x_m)) * LATTICE_M, path_x_m)
     return int(np.abs(x_m + moves_m[:, 0] - places).argmin())
 
 
-def plan_way(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 2.0) -> np.ndarray:
-    """The cheapest way to the goal line on a lattice of the three directions (dynamic programming).
+def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 2.0) -> np.ndarray:
+    """The cheapest path to the goal line on a lattice of the three directions (dynamic programming).
 
     Args:
         scene: The true geometry.
-        start_x_m: Where the flight starts, y = 0 [m].
+        start_x_m: Where the episode starts, y = 0 [m].
         radius_m: Of the vehicle [m].
-        height_m: At which it flies [m].
+        height_m: Of the vehicle [m].
 
     Returns:
         x [m] at y = 0, LATTICE_M, 2 LATTICE_M, ... up to the goal line, float64.
@@ -172,14 +179,14 @@ def plan_way(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 
     rest = price[-1]
     for row in range(rows - 2, -1, -1):
         padded = np.pad(rest, 1, constant_values=np.inf)
-        ways = np.stack([padded[1:-1], padded[:-2] + SIDE_PRICE, padded[2:] + SIDE_PRICE])
-        choice = ways.argmin(axis=0)
+        options = np.stack([padded[1:-1], padded[:-2] + SIDE_PRICE, padded[2:] + SIDE_PRICE])
+        choice = options.argmin(axis=0)
         moves[row] = np.array([0, -1, 1])[choice]
-        rest = price[row] + ways.min(axis=0)
-    way = [start]
+        rest = price[row] + options.min(axis=0)
+    path = [start]
     for row in range(rows - 1):
-        way.append(way[-1] + moves[row, way[-1]])
-    return start_x_m + (np.array(way) - start) * LATTICE_M
+        path.append(path[-1] + moves[row, path[-1]])
+    return start_x_m + (np.array(path) - start) * LATTICE_M
 
 
 def lattice_prices(
@@ -205,3 +212,10 @@ def lattice_prices(
         clearance[rows] = np.minimum(clearance[rows], gap)
     price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
     return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price), left
+
+
+BASELINES: dict[str, type[StraightAgent | RandomAgent | OracleAgent]] = {
+    "straight": StraightAgent,
+    "random": RandomAgent,
+    "oracle": OracleAgent,
+}

@@ -16,7 +16,7 @@ import numpy as np
 
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
-from envs.event_error import Accuracy, measure
+from envs.event_error import Accuracy, measure_event_error
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import env_with
 from jobs.config.config import Config
@@ -80,7 +80,7 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
     with progress(f"Trade in {scene}", len(named), "settings") as advance:
         accuracies = []
         for knob, _, simulation in named:
-            accuracies.append(measure(simulation, trade.flights, trade.steps))
+            accuracies.append(measure_event_error(simulation, trade.flights, trade.steps))
             advance(1, note=knob)
     costs = step_costs_us([simulation for *_, simulation in named], trade.steps, trade.rounds)
     rows = [
@@ -112,7 +112,9 @@ def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
             steps = max(1, round(trade.steps * hz / min(rates_hz) / 4))
             for memory in MEMORIES:
                 default = dataclasses.replace(config.env, control_hz=hz, split="validation")
-                accuracy = measure(env_with(default, {"camera.memory": memory}), trade.flights, steps)
+                accuracy = measure_event_error(
+                    env_with(default, {"camera.memory": memory}), trade.flights, steps
+                )
                 events_hz[memory].append(accuracy.events[0] * hz)
                 advance(1, note=memory)
     head = ["Memory", *(f"{hz:g} Hz" for hz in rates_hz)]

@@ -30,7 +30,7 @@ METRICS = {  # metric: what it is, how it is written
     "evae/explained_step": ("reconstruction explained by the latent", "{:.0%}"),
     "sweep/conditions": ("", "{:.0f} conditions"),
     "sweep/groups": ("", "{:.0f} groups of policies"),
-    "sweep/flights": ("", "{:.0f} episodes"),
+    "sweep/episodes": ("", "{:.0f} episodes"),
 }
 FIRST = ("eval/", "sweep/control_hz.", "sweep/contrast_threshold.", "sweep/sparsity.",
          "sweep/background_activity.", "sweep/", "train/")  # fmt: skip
@@ -40,7 +40,7 @@ COLUMNS = {  # view: name, filter, columns; the first column orders the runs
         "metrics.`sim/event_error`", "params.`exp`", "params.`seed`", "params.`train.env_steps`",
     )),
     "sweeps": ("Sweeps", "tags.kind = 'sweep'", (
-        "metrics.`sweep/conditions`", "metrics.`sweep/groups`", "metrics.`sweep/flights`", "tags.`groups`",
+        "metrics.`sweep/conditions`", "metrics.`sweep/groups`", "metrics.`sweep/episodes`", "tags.`groups`",
     )),
 }  # fmt: skip
 CURVES = ("train/success_rate", "train/distance_m")  # of trainings, over environment steps

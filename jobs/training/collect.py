@@ -10,7 +10,7 @@ Expect: about 3,000 control steps per second on one core; `data/train.h5` and
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,9 +20,9 @@ from envs.events import EVENT
 from envs.kinematics import NUM_ACTIONS
 from envs.recordings import Recording, write_recording
 from jobs.config.config import Config, ConfigError
-from jobs.rollout.accuracy import achieved
-from jobs.rollout.agents import Agent, make_agent
-from jobs.rollout.episodes import check_sensor
+from jobs.rollout.agents import Agent, StepInfo, make_agent
+from jobs.rollout.diagnostics import report_event_error
+from jobs.rollout.policies import check_sensor
 from jobs.run.folder import Run, finish, finished, locate_run, named_policy, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
@@ -72,7 +72,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_flights"] = recording.about["flights"]
     if config.collect.scenes:
-        figures |= achieved(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
+        figures |= report_event_error(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
     tracker.log(0, figures)
     return finish(folder, "collect", figures)
 
@@ -112,7 +112,7 @@ def check_policy(folder: Run) -> Path | None:
     if path is None:
         raise ConfigError(f"collect.policy: must be a run folder or a policy folder, got {named!r}")
     try:
-        check_sensor(load_policy(path).manifest, folder.config.env)
+        check_sensor(load_policy(path).manifest["sensor"], folder.config.env)
     except ValueError as error:
         raise ConfigError(f"collect.policy: {error}") from error
     return path
@@ -242,7 +242,7 @@ def steps_of(
     observation, info = started
     for _ in range(most_steps):
         shown = env.luminance if agent.observation == "luminance" else observation
-        action = int(agent(shown[None], [info])[0])
+        action = int(agent(shown[None], [cast(StepInfo, info)])[0])
         observation, _, terminated, truncated, info = env.step(action)
         yield int(info["t_us"])
         if terminated or truncated:

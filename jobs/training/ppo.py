@@ -18,7 +18,7 @@ from envs.config import Observation, sensor_differences, sensor_settings, settin
 from envs.corridor import CorridorVectorEnv
 from jobs.config.conditions import env_with
 from jobs.config.config import Config, ConfigError
-from jobs.rollout.drift import drift_figures
+from jobs.rollout.diagnostics import drift_metrics
 from jobs.training.env_runner import MAX_SAMPLE_S, PlainEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
 from models.encoder.evae import EventVAE
@@ -119,7 +119,7 @@ class FlightMetrics(RLlibCallback):
             self._flights.extend(flight for flight in self._begun.popleft().values() if flight)
 
     def _drift(self, module: Any) -> dict[str, float]:
-        """The `jobs.rollout.drift.drift_figures` of the windows that the module met.
+        """The `jobs.rollout.diagnostics.drift_metrics` of the windows that the module met.
 
         None without an encoder, or where its file is no longer there: the frozen part that
         flies has no decoder.
@@ -136,7 +136,7 @@ class FlightMetrics(RLlibCallback):
         evae, manifest = self._encoder
         if manifest["sha256"] != file.digest:
             return {}
-        return drift_figures(evae, module.met, manifest.get("figures", {}))
+        return drift_metrics(evae, module.met, manifest.get("figures", {}))
 
 
 def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:

@@ -24,7 +24,7 @@ from ray import tune
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.config.config import Config, ConfigError
-from jobs.rollout.drift import FIGURES
+from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
@@ -52,7 +52,7 @@ METRICS = {
     "train/gradient_norm": ("learners", "default_policy", "gradients_default_optimizer_global_norm"),
     "sim/events_per_step": ("env_runners", "events_per_step"),
     "sim/dropped_events": ("env_runners", "dropped_events"),
-    **{f"evae/{name}": ("env_runners", name) for name in FIGURES},
+    **{f"evae/{name}": ("env_runners", name) for name in DRIFT_METRICS},
     "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
     "perf/trial_restarts": ("trial_restarts",),
 }

@@ -74,15 +74,13 @@ def in_store(folder, uri, seed):
 
 
 def report(folder, uri, seed):
-    """A sweep whose flights are made up, and everything else is not."""
+    """A sweep whose episodes are made up, and everything else is not."""
     # Here, in a process of its own: Ray reads its token once, when it is imported, and another
     # test of this run names one later.
     from jobs.evaluation import sweep
-    from jobs.rollout import scheduler as flying
-    from tests.support.stub_tuner import StubTuner
+    from tests.support.fake_executor import FakeExecutor
 
-    flying._tuner, flying.start_ray = StubTuner, lambda *given: None
-    sweep.run(in_store(folder, uri, seed))
+    sweep.run(in_store(folder, uri, seed), FakeExecutor())
 
 
 def test_eight_sweeps_report_at_once_and_all_is_read_back(tmp_path, postgres):

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
 
-import jobs.rollout.accuracy
 from envs import event_error as accuracy
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
-from envs.event_error import converged, event_error, measure
+from envs.event_error import converged, event_error, measure_event_error
 from envs.events import EVENT
-from envs.fidelity import plan
+from envs.fidelity import plan_renders
 from envs.scene import make_scene
+from jobs.rollout import diagnostics
 
 TIMES = st.integers(0, 30)
 
@@ -83,7 +83,7 @@ def test_the_converged_simulation_has_no_error_and_more_renders_never_hurt_much(
     errors = []
     for share in (1, 2, 4, 8):
         asked = FidelityConfig(max_step_m=0.1 / share, samples=8)
-        errors.append(measure(EnvConfig(fidelity=asked), flights=3, steps=8).error)
+        errors.append(measure_event_error(EnvConfig(fidelity=asked), flights=3, steps=8).error)
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > 8 * errors[3]
     assert errors[3] < 0.03
@@ -92,11 +92,11 @@ def test_the_converged_simulation_has_no_error_and_more_renders_never_hurt_much(
 @pytest.mark.parametrize("scene_name", ["poles", "texture_change"])
 def test_the_converged_simulation_renders_six_times_as_often_and_no_setting_spoils_it(scene_name):
     scene = make_scene(scene_name, np.random.default_rng(0))
-    usual = plan(EnvConfig(), scene)
+    usual = plan_renders(EnvConfig(), scene)
     camera = CameraConfig(memory="legacy", encoding="gamma8", contrast_threshold=0.2)
     spoilt = EnvConfig(camera=camera, fidelity=FidelityConfig(0.5), renderer="pyrender")
     exact = converged(spoilt, scene)
-    chosen = plan(exact, scene)
+    chosen = plan_renders(exact, scene)
     assert (exact.camera, chosen.renderer) == (CameraConfig(), "raycast")
     assert chosen.max_step_m == pytest.approx(usual.max_step_m / 6)
     assert chosen.samples > usual.samples
@@ -106,8 +106,8 @@ def test_the_converged_simulation_renders_six_times_as_often_and_no_setting_spoi
 def test_a_flight_weighs_as_much_as_its_events(monkeypatch):
     one, many = events([(1, 0, 0, 1)]), events([(t, 0, 0, 1) for t in range(8)])
     flights = iter([(one, one, 1), (many, many[:0], 2)])
-    monkeypatch.setattr(accuracy, "_flight", lambda *_: next(flights))
-    found = measure(EnvConfig(), flights=2, steps=1)
+    monkeypatch.setattr(accuracy, "_measure_flight", lambda *_: next(flights))
+    found = measure_event_error(EnvConfig(), flights=2, steps=1)
     assert found.error == pytest.approx(8 / 10)  # of ten events of both streams two have a partner
     assert found.events == (4.5, 0.5)
     assert found.renders == 1.5
@@ -115,22 +115,22 @@ def test_a_flight_weighs_as_much_as_its_events(monkeypatch):
 
 def test_two_measurements_agree_and_other_corridors_differ():
     config = EnvConfig(fidelity=FidelityConfig(tolerance=0.2))
-    first, again, other = (measure(config, flights=2, steps=4, seed=seed) for seed in (0, 0, 1))
+    first, again, other = (measure_event_error(config, flights=2, steps=4, seed=seed) for seed in (0, 0, 1))
     assert first == again
     assert first != other
 
 
 def test_a_camera_that_forgets_is_told_from_one_that_remembers():
-    frame = measure(EnvConfig(camera=CameraConfig(memory="frame")), flights=2, steps=6)
+    frame = measure_event_error(EnvConfig(camera=CameraConfig(memory="frame")), flights=2, steps=6)
     assert frame.renders == 1.0
     assert frame.error > 0.3
     assert frame.events[0] < 0.8 * frame.events[1]
 
 
-@pytest.mark.parametrize("scene", ["poles", "texture_change"])
+@pytest.mark.parametrize(("scene", "flights", "steps"), [("poles", 4, 8), ("texture_change", 2, 3)])
 @pytest.mark.parametrize("hz", [45.0, 400.0])
-def test_the_error_achieved_is_within_the_tolerance_asked(scene, hz):
-    accuracy = measure(EnvConfig(scene=scene, control_hz=hz), flights=4, steps=8)
+def test_the_error_achieved_is_within_the_tolerance_asked(scene, flights, steps, hz):
+    accuracy = measure_event_error(EnvConfig(scene=scene, control_hz=hz), flights, steps)
     assert accuracy.events[1] > 10
     assert accuracy.error <= EnvConfig().fidelity.tolerance
 
@@ -138,7 +138,10 @@ def test_the_error_achieved_is_within_the_tolerance_asked(scene, hz):
 def test_culling_by_tolerance_adds_little_to_the_error_in_a_long_lane():
     lane = EnvConfig(layout={"last_y_m": 300.0, "num_obstacles": 120}, fidelity=FidelityConfig(0.2))
     whole = dataclasses.replace(lane, fidelity=FidelityConfig(0.2, cull_m=1e5))
-    culled, exact = measure(lane, flights=4, steps=8), measure(whole, flights=4, steps=8)
+    culled, exact = (
+        measure_event_error(lane, flights=4, steps=8),
+        measure_event_error(whole, flights=4, steps=8),
+    )
     assert exact.error < culled.error <= exact.error + 0.1 * 0.2
 
 
@@ -155,7 +158,9 @@ def test_the_error_achieved_is_within_the_tolerance_asked_everywhere(scene):
             for tolerance in (0.02, 0.05, 0.2):
                 config = EnvConfig(scene=scene, control_hz=hz, fidelity=FidelityConfig(tolerance))
                 camera = dataclasses.replace(config.camera, contrast_threshold=threshold)
-                accuracy = measure(dataclasses.replace(config, camera=camera), flights=6, steps=12)
+                accuracy = measure_event_error(
+                    dataclasses.replace(config, camera=camera), flights=6, steps=12
+                )
                 if accuracy.error > tolerance:
                     short.append((hz, threshold, tolerance, round(accuracy.error, 4)))
     assert short == []
@@ -164,9 +169,9 @@ def test_the_error_achieved_is_within_the_tolerance_asked_everywhere(scene):
 @pytest.mark.parametrize(("error", "says"), [(0.02, False), (0.2, True)])
 def test_a_job_says_what_it_achieves_and_whether_that_is_less_than_asked(monkeypatch, capsys, error, says):
     monkeypatch.setattr(
-        jobs.rollout.accuracy, "measure", lambda config: accuracy.Accuracy(error, (9.0, 10.0), 3.0)
+        diagnostics, "measure_event_error", lambda config: accuracy.Accuracy(error, (9.0, 10.0), 3.0)
     )
-    found = jobs.rollout.accuracy.achieved(EnvConfig())
+    found = diagnostics.report_event_error(EnvConfig())
     assert found == {"sim/event_error": error, "sim/renders_per_step": 3.0}
     text = " ".join(capsys.readouterr().out.split())
     assert f"{error:.1%} (asked: at most 5.0%)" in text
@@ -176,4 +181,4 @@ def test_a_job_says_what_it_achieves_and_whether_that_is_less_than_asked(monkeyp
 @pytest.mark.parametrize("observation", ["luminance", "none"])
 def test_a_simulation_without_a_camera_is_not_said_to_be_exact(observation):
     with pytest.raises(ValueError, match=f"observation must be one that has a camera.*got '{observation}'"):
-        measure(EnvConfig(observation=observation))
+        measure_event_error(EnvConfig(observation=observation))

@@ -7,7 +7,7 @@ import pytest
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from envs.corridor import CorridorEnv
-from envs.events.windows import MAX_US
+from envs.events.windows import MAX_WINDOW_US
 from envs.kinematics import Outcome, clock_us
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene
 from envs.sensor import Sensor
@@ -23,7 +23,7 @@ def check_step(env, action=0):
     assert math.isfinite(reward)
     assert not (terminated and truncated)
     assert 0 <= count <= env.config.window_capacity
-    assert 0 < window_us <= MAX_US
+    assert 0 < window_us <= MAX_WINDOW_US
     assert info["dropped_events"] >= dropped >= 0
     times = env.events["t"]
     assert (np.diff(times) >= 0).all()

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
-from envs.fidelity import choose_renderer, make_renderer, plan, sub_renders
+from envs.fidelity import choose_renderer, make_renderer, plan_renders, sub_renders
 from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
 
@@ -23,7 +23,7 @@ MESH = dataclasses.replace(SCENE, mesh=TRIANGLE)
 
 
 def renders(config, scene=SCENE):
-    return sub_renders(config.speed_mps / config.control_hz, plan(config, scene).max_step_m)
+    return sub_renders(config.speed_mps / config.control_hz, plan_renders(config, scene).max_step_m)
 
 
 def test_auto_takes_the_ray_caster_for_what_it_can_draw_and_pyrender_for_the_rest():
@@ -38,7 +38,9 @@ def test_auto_takes_the_ray_caster_for_what_it_can_draw_and_pyrender_for_the_res
 
 
 def test_a_plan_makes_its_renderer():
-    drawn = make_renderer(plan(EnvConfig(fidelity=FidelityConfig(samples=3)), SCENE), SCENE, 8, 6, 90.0)
+    drawn = make_renderer(
+        plan_renders(EnvConfig(fidelity=FidelityConfig(samples=3)), SCENE), SCENE, 8, 6, 90.0
+    )
     assert isinstance(drawn, RaycastRenderer)
     assert drawn.samples == 3
     assert drawn.render(0.0, 0.0, 2.0).shape == (6, 8)
@@ -53,7 +55,7 @@ def test_a_scene_without_a_mesh_never_loads_opengl():
 
 def test_a_stricter_tolerance_never_takes_less():
     tolerances = [1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 1e-3]
-    plans = [plan(EnvConfig(fidelity=FidelityConfig(tolerance)), SCENE) for tolerance in tolerances]
+    plans = [plan_renders(EnvConfig(fidelity=FidelityConfig(tolerance)), SCENE) for tolerance in tolerances]
     ways, samples = [p.max_step_m for p in plans], [p.samples for p in plans]
     assert ways == sorted(ways, reverse=True)
     assert samples == sorted(samples)
@@ -66,22 +68,25 @@ def test_longer_steps_smaller_pixels_and_textures_take_more_renders():
     sharp = CameraConfig(width=256, height=256)
     assert renders(EnvConfig(camera=sharp)) > renders(EnvConfig())
     textured = make_scene("texture_change", np.random.default_rng(0))
-    assert plan(EnvConfig(), textured).max_step_m < plan(EnvConfig(), SCENE).max_step_m
+    assert plan_renders(EnvConfig(), textured).max_step_m < plan_renders(EnvConfig(), SCENE).max_step_m
 
 
 def test_a_short_lane_is_drawn_whole_and_a_long_one_as_far_as_the_tolerance_asks():
     lane = make_scene("poles", np.random.default_rng(0), last_y_m=400.0, num_obstacles=150)
-    assert plan(EnvConfig(), SCENE).cull_m == math.inf
-    assert plan(EnvConfig(), dataclasses.replace(SCENE, obstacles=SCENE.obstacles[:0])).cull_m == math.inf
-    usual = plan(EnvConfig(), lane).cull_m
+    assert plan_renders(EnvConfig(), SCENE).cull_m == math.inf
+    assert (
+        plan_renders(EnvConfig(), dataclasses.replace(SCENE, obstacles=SCENE.obstacles[:0])).cull_m
+        == math.inf
+    )
+    usual = plan_renders(EnvConfig(), lane).cull_m
     assert 100.0 < usual < 200.0
-    assert plan(EnvConfig(fidelity=FidelityConfig(0.2)), lane).cull_m == pytest.approx(0.5 * usual)
-    assert plan(EnvConfig(fidelity=FidelityConfig(0.2)), SCENE).cull_m == pytest.approx(0.5 * usual)
+    assert plan_renders(EnvConfig(fidelity=FidelityConfig(0.2)), lane).cull_m == pytest.approx(0.5 * usual)
+    assert plan_renders(EnvConfig(fidelity=FidelityConfig(0.2)), SCENE).cull_m == pytest.approx(0.5 * usual)
 
 
 def test_round_bodies_and_patterns_take_more_samples_and_both_together_the_most():
     def samples(name, **fields):
-        return plan(EnvConfig(**fields), make_scene(name, np.random.default_rng(0))).samples
+        return plan_renders(EnvConfig(**fields), make_scene(name, np.random.default_rng(0))).samples
 
     plain, gates, patterns, cones, ellipsoids, both = (
         samples(name) for name in ("poles", "gates", "texture_change", "cones", "shape_change", "dynamic")
@@ -95,7 +100,7 @@ def test_round_bodies_and_patterns_take_more_samples_and_both_together_the_most(
 
 def test_what_is_set_is_kept():
     asked = FidelityConfig(tolerance=0.5, max_step_m=0.013, samples=5, cull_m=31.0)
-    chosen = plan(EnvConfig(fidelity=asked), SCENE)
+    chosen = plan_renders(EnvConfig(fidelity=asked), SCENE)
     assert (chosen.max_step_m, chosen.samples, chosen.cull_m) == (0.013, 5, 31.0)
 
 
@@ -128,7 +133,9 @@ def test_a_step_that_cannot_be_is_refused(step_m, max_step_m):
 
 
 def test_obstacles_beyond_the_culling_distance_cost_nothing_and_are_not_seen():
-    near = make_renderer(plan(EnvConfig(fidelity=FidelityConfig(cull_m=20.0)), SCENE), SCENE, 64, 64, 90.0)
+    near = make_renderer(
+        plan_renders(EnvConfig(fidelity=FidelityConfig(cull_m=20.0)), SCENE), SCENE, 64, 64, 90.0
+    )
     kept = SCENE.obstacles[np.hypot(SCENE.obstacles["x"], SCENE.obstacles["y"]) - 0.5 <= 20.0]
     only = RaycastRenderer(Scene("near", kept), 64, 64, samples=near.samples)
     assert 0 < len(kept) < len(SCENE.obstacles)

@@ -31,9 +31,9 @@ def one_by_one(config, scene, sensor, start, outcome, end_us):
     height = config.camera_height_m
     camera = EventCamera(config.camera)
     camera.reset(renderer.render(*start, height), 0)
-    way = outcome.flown * config.speed_mps / config.control_hz
+    way = outcome.share * config.speed_mps / config.control_hz
     count = max(1, math.ceil(way / plan.max_step_m - 1e-9))
-    moving_us, events = round(outcome.flown * end_us), []
+    moving_us, events = round(outcome.share * end_us), []
     for k in range(1, count + 1):
         x, y = (a + (b - a) * k / count for a, b in zip(start, outcome.end, strict=True))
         t_us = moving_us * k // count
@@ -42,11 +42,11 @@ def one_by_one(config, scene, sensor, start, outcome, end_us):
 
 
 @pytest.mark.parametrize("together", [1, 3 * 16 * 12, 2**22])
-@pytest.mark.parametrize("flown", [1.0, 0.37])
-def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, flown):
-    monkeypatch.setattr(sensing, "TOGETHER", together)
+@pytest.mark.parametrize("share", [1.0, 0.37])
+def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, share):
+    monkeypatch.setattr(sensing, "MAX_PIXELS_TOGETHER", together)
     config, scene, sensor = look()
-    outcome = Outcome((1.0 + 0.05 * flown, 5.0 + 0.08 * flown), flown, 0.0, False, flown < 1.0)
+    outcome = Outcome((1.0 + 0.05 * share, 5.0 + 0.08 * share), share, 0.0, False, share < 1.0)
     count, events = one_by_one(config, scene, sensor, (1.0, 5.0), outcome, 5000)
     sensor.step((1.0, 5.0), outcome, 5000)
     assert sensor.renders == count > 1
@@ -54,13 +54,13 @@ def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, flown):
     assert events.size > 40
     assert sensor.t_us == 5000
     expected = RaycastRenderer(scene, 16, 12, samples=sensor.plan.samples, cull_m=sensor.plan.cull_m).render(
-        *outcome.end, config.camera_height_m, 0.0, round(5000 * flown) * 1e-6
+        *outcome.end, config.camera_height_m, 0.0, round(5000 * share) * 1e-6
     )
     assert np.array_equal(sensor.luminance, expected)
 
 
 def test_events_lost_to_the_cap_are_counted_over_all_renders_of_a_step(monkeypatch):
-    monkeypatch.setattr(sensing, "TOGETHER", 16 * 12)
+    monkeypatch.setattr(sensing, "MAX_PIXELS_TOGETHER", 16 * 12)
     capped = CameraConfig(width=16, height=12, contrast_threshold=0.002, max_events_per_pixel=1)
     _, _, free = look(camera=CameraConfig(width=16, height=12, contrast_threshold=0.002))
     _, _, sensor = look(camera=capped)

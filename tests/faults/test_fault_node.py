@@ -8,6 +8,13 @@ from tests.support.clusters import SMALL, on
 from tests.support.faults import FINE, SWEEP, TRAIN, check_complete, launch, outcome
 
 pytestmark = pytest.mark.faults
+SLOW = """
+import time
+whole = roll_out
+def roll_out(*given):
+    time.sleep(2.0)
+    return whole(*given)
+"""
 
 
 def test_a_training_whose_machine_is_lost_goes_on_elsewhere_from_its_checkpoint(tmp_path, cluster):
@@ -25,15 +32,12 @@ def test_a_training_whose_machine_is_lost_goes_on_elsewhere_from_its_checkpoint(
     outcome("node lost, training", "goes on elsewhere (restarts in results: 1)", "steps since a checkpoint")
 
 
-def test_a_sweep_that_loses_a_machine_flies_every_cell_once(tmp_path, cluster):
+def test_a_sweep_that_loses_a_machine_evaluates_every_task_once(tmp_path, cluster):
     nodes = [cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"]) for _ in "ab"]
     axis = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}"
     words = (*SWEEP, "~sweep.axes", axis, "sweep.policies=[straight,oracle]")
-    slow = (
-        "whole = flown\ndef flown(cell, measured):\n    time.sleep(2.0)\n    return whole(cell, measured)\n"
-    )
     # Workers of a cluster are no children of the launcher: their machine hands them its environment.
-    job = launch(tmp_path, *words, *on(cluster), after={"jobs.rollout.scheduler": slow})
+    job = launch(tmp_path, *words, *on(cluster), after={"jobs.rollout.executors": SLOW})
     job.wait(lambda: len(job.kept()) >= 1)
     cluster.remove_node(nodes[0], allow_graceful=False)
     assert job.end() == 0, job.said
@@ -42,6 +46,4 @@ def test_a_sweep_that_loses_a_machine_flies_every_cell_once(tmp_path, cluster):
     assert len(rows) == len(set(rows)) == (4 + 1) * 2 * 2
     assert sum(len(rows) for rows in job.kept().values()) == 4 * 2 * 2
     assert (job.run / "stages" / "sweep.json").is_file()
-    outcome(
-        "node lost, sweep", "its cell is flown again elsewhere; each flight counts once", "flights in the air"
-    )
+    outcome("node lost, sweep", "its task is evaluated again elsewhere", "episodes under way")

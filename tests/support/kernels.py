@@ -7,17 +7,20 @@ import numpy as np
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
-from envs.event_error import measure
+from envs.event_error import measure_event_error
 from envs.events import EVENT
+from envs.raycast.renderer import sample_luminance
 from envs.recordings import read_events, write_events
+from envs.scene import make_scene
+from jobs.bench.latency import random_policy
 from models.encoder.evae import EventVAE
-from models.encoder.table import EncoderTable
+from models.encoder.event_batch import batch_windows
 
 CAMERA = {"width": 16, "height": 16}
 
 
 def main() -> None:
-    """Move through a few corridors, encode what is seen, and write and read a recording."""
+    """Move through a few corridors, ask policies what to do, and write and read a recording."""
     noisy = FaultsConfig(sparsity=0.1, background_activity=0.1, shot_noise_hz=10.0, leak_hz=1.0)
     worlds = (
         EnvConfig(camera=CameraConfig(**CAMERA), faults=noisy),
@@ -29,10 +32,14 @@ def main() -> None:
         env = CorridorEnv(config)
         env.reset(seed=0)
         env.step(1)
-    measure(EnvConfig(camera=CameraConfig(**CAMERA)), flights=1, steps=1)
+    measure_event_error(EnvConfig(camera=CameraConfig(**CAMERA)), flights=1, steps=1)
     events = np.zeros(100, EVENT)
     events["t"], events["p"] = np.arange(100), 1
-    EncoderTable.from_evae(EventVAE(context=64).freeze()).encode(events, 0, 5000)
+    sample_luminance(make_scene("poles", np.random.default_rng(0)), (0.0, 0.0, 2.0, 0.0), 8, 8)
+    for name in ("bytestream", "event_image", "event_set"):
+        random_policy(name).event_logits(events, 0, 5000)
+    evae = EventVAE(context=64)
+    evae.ecn(batch_windows([(events, 0, 5000)] * 2, evae.grid)).sum().backward()
     with tempfile.TemporaryDirectory() as folder:
         for name in ("evt2", "evt3"):
             write_events(Path(folder) / name, events, 16, 16, name)

@@ -5,7 +5,8 @@ import dataclasses
 import torch
 
 from envs.config import sensor_settings, settings_hash
-from jobs.evaluation.sweep_plan import plan, read_entry
+from jobs.evaluation.sweep_plan import plan_sweep
+from jobs.rollout.policies import read_policy
 from jobs.tracking.tracker import open_store
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
@@ -13,7 +14,7 @@ from models.encoder.weights import save_encoder
 
 
 def planned(config, *agents):
-    return plan(config, [read_entry(agent) for agent in agents])
+    return plan_sweep(config, [read_policy(agent) for agent in agents])
 
 
 def in_store(config, tmp_path):

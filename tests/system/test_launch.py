@@ -30,6 +30,22 @@ def test_answers_come_without_importing_anything_heavy(words):
     assert len(imported) < 600
 
 
+def test_a_job_begins_before_anything_heavy_is_imported():
+    code = """
+import sys, types, jobs
+from jobs.config.registry import JOBS, Job
+sys.modules["stub"] = types.SimpleNamespace(run=lambda config: print(*sys.modules))
+JOBS["train"] = Job("stub", "")
+sys.argv = ["evade", "+exp=train"]
+sys.exit(jobs.main())
+"""
+    result = shell(sys.executable, "-c", code)
+    assert result.returncode == 0
+    said, imported = result.stdout.splitlines()
+    assert said.startswith("If this is stopped")
+    assert set(imported.split()).isdisjoint(HEAVY)
+
+
 def test_help_names_every_job_experiment_and_budget(launch, launcher):
     status, out, err = launch("--help")
     assert (status, err) == (0, "")

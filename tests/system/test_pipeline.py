@@ -14,7 +14,8 @@ from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from models.policy import load_policy
 
-pytestmark = pytest.mark.system
+# One run serves most tests of this file, so one worker takes them all.
+pytestmark = [pytest.mark.system, pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(900)]
 ROOT = Path(__file__).resolve().parents[2]
 SECTIONS = ("evae/", "train/", "eval/", "sim/", "perf/")
 
@@ -23,9 +24,7 @@ def launch(folder: Path, *words: str) -> str:
     """What the launcher prints; it must end well."""
     command = [sys.executable, "-m", "platform.launch", *words, "budget=smoke", f"runs_dir={folder / 'runs'}"]
     environment = {**os.environ, "PYTHONPATH": ""}
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280, check=False
-    )
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

@@ -23,10 +23,12 @@ from envs.event_error import converged
 from jobs.analysis.statistics import paired_rate_difference
 from jobs.analysis.tables import publish_plot, publish_table, summarise
 from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError
-from jobs.evaluation.sweep_plan import find_agents, read_entry, with_sensor
 from jobs.rollout.agents import PolicyAgent, make_agent
-from jobs.rollout.scheduler import fly_cells
-from jobs.rollout.tasks import Cell, Entry, make_cell
+from jobs.rollout.executors import Executor
+from jobs.rollout.policies import EvaluatedPolicy, find_policies, with_sensor
+from jobs.rollout.scheduler import default_executor, evaluate_tasks
+from jobs.rollout.store import EpisodeStore
+from jobs.rollout.tasks import EvaluationTask, make_task
 from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import console, progress
@@ -71,75 +73,81 @@ TOGETHER: dict[str, tuple[Setting, Setting]] = {
 }
 
 
-def run(config: Config) -> dict[str, float]:
+def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     """Evaluate and measure every setting, and say what to choose; return the default's metrics.
+
+    Args:
+        config: The experiment.
+        executor: Computes the missing episodes; None: on all cores.
 
     Raises:
         ConfigError: The policy has no frozen encoder of single events.
         RuntimeError: The default or the most exact setting could not be evaluated.
     """
-    entry, evae = find_policy(config)
+    policy, evae = find_encoder_policy(config)
     folder = open_run(config)
     config = folder.config
-    every = plan(config, entry, evae)
-    identity = settings_hash({"cells": [[cell.key, len(cell.seeds)] for cell in every]})
+    every = plan(config, policy, evae)
+    place = folder.path / "trade"
+    store, executor = EpisodeStore(place), executor or default_executor(config.cluster, place)
+    identity = settings_hash({"cells": [[task.key, len(task.seeds)] for task in every]})
     with open_tracker(config, folder, key=f"trade {identity[:8]}") as tracker:
-        tracker.tags({"kind": "trade", "policy": entry.group})
-        episodes, failed = fly_cells(config, folder.path / "trade", every, "Trade", measuring=False)
-        for cell in (every[0], every[-1]):
-            if cell.key in failed:
-                raise RuntimeError(
-                    f"{cell.label[0]}: not evaluated: {failed[cell.key]}; the same command tries again"
-                )
-        able = [cell for cell in every if cell.key in episodes]
+        tracker.tags({"kind": "trade", "policy": policy.group})
+        results, failed = evaluate_tasks(every, store, executor, "Trade", measure_accuracy=False)
+        for task in (every[0], every[-1]):
+            if task.key in failed:
+                what, reason = task.condition[0], failed[task.key]
+                raise RuntimeError(f"{what}: not evaluated: {reason}; the same command tries again")
+        able = [task for task in every if task.key in results]
         measured = replay_all(config, able, evae)
-        default = episodes[every[0].key]
+        default = results[every[0].key].episodes
         rows = [
-            traded_setting(cell, own, episodes[cell.key], default)
-            for cell, own in zip(able, measured, strict=True)
+            traded_setting(task, own, results[task.key].episodes, default)
+            for task, own in zip(able, measured, strict=True)
         ]
-        reasons = {" ".join(cell.label): failed[cell.key] for cell in every if cell.key in failed}
-        write_trade(folder, tracker, rows, facts_of(config, folder, entry, every[0].env, reasons))
+        reasons = {" ".join(task.condition): failed[task.key] for task in every if task.key in failed}
+        write_trade(folder, tracker, rows, facts_of(config, folder, policy, every[0].env, reasons))
         tracker.log(0, trade_metrics(rows[0]))
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "trade", trade_metrics(rows[0]))
 
 
-def find_policy(config: Config) -> tuple[Entry, EventVAE]:
+def find_encoder_policy(config: Config) -> tuple[EvaluatedPolicy, EventVAE]:
     """The policy that is evaluated, and its encoder.
 
     Raises:
         ConfigError: If `trade.policy` names none, several, or one that has no such encoder.
     """
     name = config.trade.policy
-    agents = find_agents("trade.policy", name, config, locate_run(config))
-    file = Path(agents[0]) / ENCODER
-    if len(agents) == 1 and file.is_file():
+    policy, *others = find_policies("trade.policy", name, config, locate_run(config))
+    file = Path(policy.agent) / ENCODER
+    if not others and file.is_file():
         evae, _ = load_encoder(file)
         if evae.settings.variant in EVENT_ENCODERS and evae.ecn.coding != "eventnet":
-            return read_entry(agents[0]), evae
+            return policy, evae
     rule = f"must be one policy with a frozen encoder of {' or '.join(EVENT_ENCODERS)}, not EventNet's"
     raise ConfigError(f"trade.policy: {rule}, got {name!r}")
 
 
-def plan(config: Config, entry: Entry, evae: EventVAE) -> list[Cell]:
+def plan(config: Config, policy: EvaluatedPolicy, evae: EventVAE) -> list[EvaluationTask]:
     """The settings as cells, the default first and the most exact last; none twice.
 
     Raises:
         ConfigError: If the policy's own sensor and a setting exclude each other.
     """
-    own = with_sensor(dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval"), entry.sensor)
+    own = with_sensor(dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval"), policy.sensor)
     timed = evae.ecn.coding != "none"
-    found: dict[str, Cell] = {}
+    found: dict[str, EvaluationTask] = {}
     for knob, text, simulation, table in changes(timed):
         try:
             env = changed(own, simulation)
         except pydantic.ValidationError as error:
             reason = error.errors()[0]["msg"]
             raise ConfigError(f"trade.policy: {simulation} with its own sensor: {reason}") from None
-        found.setdefault((cell := _cell(config, entry, (knob, text), env, table)).key, cell)
+        task = _task(config, policy, (knob, text), env, table)
+        found.setdefault(task.key, task)
     table = {"time_bins": TIME_BINS[-1]} if timed else {}
-    return [*found.values(), _cell(config, entry, (EXACT, ""), exact_env(own), table)]
+    return [*found.values(), _task(config, policy, (EXACT, ""), exact_env(own), table)]
 
 
 def changes(timed: bool) -> list[tuple[str, str, Setting, Setting]]:
@@ -170,32 +178,34 @@ def exact_env(env: EnvConfig) -> EnvConfig:
     return converged(env, corridor.scene)
 
 
-def _cell(config: Config, entry: Entry, label: tuple[str, str], env: EnvConfig, table: Setting) -> Cell:
+def _task(
+    config: Config, policy: EvaluatedPolicy, condition: tuple[str, str], env: EnvConfig, table: Setting
+) -> EvaluationTask:
     trade = config.trade
     trials = min(trade.trials, trade.pyrender_trials) if env.renderer == "pyrender" else trade.trials
-    return make_cell(label, entry, config.evaluate.action, env, trials, table)
+    return make_task(condition, policy, config.evaluate.action, env, trials, tuple(table.items()))
 
 
-def replay_all(config: Config, every: Sequence[Cell], evae: EventVAE) -> list[Measured]:
-    """Measure cost and errors of each cell's setting on recorded episodes."""
+def replay_all(config: Config, every: Sequence[EvaluationTask], evae: EventVAE) -> list[Measured]:
+    """Measure cost and errors of each task's setting on recorded episodes."""
     torch.set_num_threads(1)
-    agents = [make_agent(cell.entry.agent, cell.action, dict(cell.table)) for cell in every]
-    settings = [(cell.env, cast(PolicyAgent, agent)) for cell, agent in zip(every, agents, strict=True)]
+    agents = [make_agent(task.policy.agent, task.action, task.table) for task in every]
+    settings = [(task.env, cast(PolicyAgent, agent)) for task, agent in zip(every, agents, strict=True)]
     seeds = range(config.trade.replays)
     with progress("Replay", len(seeds) * len(settings), "episodes") as advance:
         return measure_settings(settings, evae, seeds, advance)
 
 
 def traded_setting(
-    cell: Cell, measured: Measured, episodes: np.ndarray, default: np.ndarray
+    task: EvaluationTask, measured: Measured, episodes: np.ndarray, default: np.ndarray
 ) -> TradedSetting:
-    """The row of a cell, compared with the default's episodes in the same corridors."""
+    """The row of a task, compared with the default's episodes in the same corridors."""
     difference = paired_rate_difference(episodes["success"], default["success"][: len(episodes)])
-    return TradedSetting(*cell.label, measured, summarise(cell.label, episodes), difference)
+    return TradedSetting(*task.condition, measured, summarise(task.condition, episodes), difference)
 
 
 def facts_of(
-    config: Config, folder: Run, entry: Entry, env: EnvConfig, failed: Mapping[str, str]
+    config: Config, folder: Run, policy: EvaluatedPolicy, env: EnvConfig, failed: Mapping[str, str]
 ) -> TradeFacts:
     """What made the numbers."""
     return {
@@ -203,7 +213,7 @@ def facts_of(
         "command": command(),
         "date": today(),
         **provenance(),
-        "policy": f"{entry.group}-s{entry.training}",
+        "policy": f"{policy.group}-s{policy.training}",
         "scene": env.scene,
         "action": config.evaluate.action,
         "trials": config.trade.trials,

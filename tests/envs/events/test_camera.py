@@ -119,8 +119,8 @@ def test_identical_frames_make_no_events_even_at_the_smallest_threshold():
 def test_a_still_pixel_never_fires_whatever_rounding_did_to_its_memory():
     camera = one_pixel()
     camera.reset(frame(2.0), 0)
-    camera._state[2][0] -= 0.2
-    camera._state[1][:] = 0.0
+    lights, levels, _ = camera._memory
+    lights[1:], levels[0] = 0.0, levels[0] - 0.2
     assert camera.step(frame(2.0), 1000).size == 0
 
 

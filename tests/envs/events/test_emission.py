@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from envs.events import EventCamera
 from envs.events import camera as module
-from envs.events.emission import events_of
+from envs.events.emission import Span, Trains, events_of
 
 
 def texture(t_s, shape=(12, 16)):
@@ -24,11 +24,11 @@ def test_trains_become_events_in_total_order(rows, interval, width):
     counts, starts, strides = (np.array(column) for column in zip(*rows, strict=True))
     counts = counts.astype(np.int64)
     sent, pixels = np.abs(counts), np.arange(len(rows))
-    trains = np.stack((starts, strides)).astype(np.float64)
-    events = events_of((7, 7 + interval, width), pixels, counts, sent, trains, int(sent.sum()))
+    trains = Trains(pixels, counts, sent, starts.astype(np.float64), strides.astype(np.float64))
+    events = events_of(trains, Span(7, 7 + interval), width, int(sent.sum()))
     which = np.repeat(pixels, sent)
     order = np.concatenate([np.arange(n) for n in sent])
-    t = 7 + np.clip(np.rint(trains[0][which] + order * trains[1][which]), 1, interval).astype(np.int64)
+    t = 7 + np.clip(np.rint(trains.start[which] + order * trains.stride[which]), 1, interval).astype(np.int64)
     by_time = np.argsort(t, kind="stable")
     assert events["t"].tolist() == t[by_time].tolist()
     assert (events["y"].astype(int) * width + events["x"]).tolist() == which[by_time].tolist()

@@ -11,9 +11,9 @@ from hypothesis.extra.numpy import arrays
 from envs.config import FaultsConfig
 from envs.events import EventCamera, apply_faults, draw_pixel_faults
 from envs.events.camera import MAX_EVENTS_PER_FRAME
-from envs.events.photoreceptor import LARGEST
+from envs.events.photoreceptor import MAX_LUMINANCE
 
-ANY_LIGHT = st.floats(0, LARGEST, width=32, allow_subnormal=True)
+ANY_LIGHT = st.floats(0, MAX_LUMINANCE, width=32, allow_subnormal=True)
 MEMORIES = ("reference", "frame", "legacy")
 
 
@@ -72,7 +72,7 @@ def test_3_a_step_of_exactly_k_thresholds_is_k_events_without_drift(threshold):
         pytest.param(1e-45, 1e-38, 0.2, 0, id="8: subnormal"),
         pytest.param(0, 1e-45, 1e-6, 0, id="8: the smallest light"),
         pytest.param(1e38, 3e38, 0.2, 5, id="9: near the largest float32"),
-        pytest.param(0, LARGEST, 0.2, 478, id="9: all of float32"),
+        pytest.param(0, MAX_LUMINANCE, 0.2, 478, id="9: all of float32"),
         pytest.param(0.5, 0.9, 10, 0, id="11: the largest threshold"),
         pytest.param(0, 1e38, 10, 9, id="11: which still fires"),
     ],
@@ -150,7 +150,7 @@ def test_13_a_late_clock_loses_no_microsecond(t0, fields):
 
 
 @pytest.mark.parametrize("rate_hz", [45, 1000, 100_000])
-def test_14_a_dead_time_longer_than_the_interval_allows_one_event(rate_hz):
+def test_14_a_refractory_period_longer_than_the_interval_allows_one_event(rate_hz):
     camera = EventCamera(4, 4, refractory_us=50_000)
     camera.reset(frame(0.1, (4, 4)), 0)
     times = [round(k * 1e6 / rate_hz) for k in range(1, max(6, min(rate_hz // 10, 300)))]

@@ -1,4 +1,4 @@
-"""What the camera's options do: memory, response, thresholds, dead time, excess, encoding."""
+"""What the camera's options do: memory, response, thresholds, refractory period, excess, encoding."""
 
 import hashlib
 import itertools
@@ -158,7 +158,7 @@ def walk(seed, size=60, scale=0.6):
     return np.exp(np.cumsum(np.random.default_rng(seed).normal(0, scale, size))).astype(np.float32)
 
 
-def simulate_dead_time(values, dt_us, refractory_us, on, off):
+def simulate_refractory_period(values, dt_us, refractory_us, on, off):
     """One pixel, event by event: fire, wait, take the level of that moment as reference."""
     logs = [math.log(float(v) + 1e-9) for v in values]
     remembered, held, events = logs[0], None, []
@@ -182,35 +182,37 @@ def simulate_dead_time(values, dt_us, refractory_us, on, off):
 
 @pytest.mark.parametrize("refractory_us", [1, 30, 700, 1000, 2500, 20_000])
 @pytest.mark.parametrize(("on", "off"), [(0.2, 0.2), (0.02, 0.3)])
-def test_a_dead_time_runs_as_an_event_by_event_simulation_has_it(refractory_us, on, off):
+def test_a_refractory_period_runs_as_an_event_by_event_simulation_has_it(refractory_us, on, off):
     for seed in range(4):
         values = walk(seed)
         fields = {"contrast_threshold": on, "contrast_threshold_off": off, "refractory_us": refractory_us}
         events = play(values, **fields)
-        truth = simulate_dead_time(values, 1000, refractory_us, on, off)
+        truth = simulate_refractory_period(values, 1000, refractory_us, on, off)
         assert list(zip(events["t"].tolist(), events["p"].tolist(), strict=True)) == truth
         assert len(truth) > (2 if refractory_us > 10_000 else 15)
 
 
 @settings(max_examples=60, deadline=None)
 @given(arrays(np.float32, 8, elements=LUMINANCES), st.integers(1, 3000), st.sampled_from([1e-3, 0.2]))
-def test_a_pixel_fires_at_most_once_per_dead_time_at_any_frame_rate(values, refractory_us, threshold):
+def test_a_pixel_fires_at_most_once_per_refractory_period_at_any_frame_rate(values, refractory_us, threshold):
     for dt_us in (1, 100, 5000):
         events = play(values, dt_us, refractory_us=refractory_us, contrast_threshold=threshold)
         assert (np.diff(events["t"]) >= refractory_us).all()
         assert ((events["t"] >= 1) & (events["t"] <= 7 * dt_us)).all()
 
 
-def test_after_a_dead_time_a_pixel_starts_anew_from_the_light_of_that_moment():
+def test_after_a_refractory_period_a_pixel_starts_anew_from_the_light_of_that_moment():
     rise = np.exp(np.linspace(0.0, 1.0, 11))  # 1e-4 in log per microsecond
     assert play(rise, refractory_us=500)["t"].tolist() == [2000, 4500, 7000, 9500]
     assert play(np.exp([0.0, 1.0]), 10_000, refractory_us=500)["t"].tolist() == [2000, 4500, 7000, 9500]
     assert play(rise, refractory_us=9000)["t"].tolist() == [2000]
     still = np.concatenate((rise, np.full(30, rise[-1])))
-    assert len(play(still, refractory_us=9000)) == 1, "what passed in the dead time is not made up for"
+    assert len(play(still, refractory_us=9000)) == 1, (
+        "what passed in the refractory period is not made up for"
+    )
 
 
-def test_a_dead_time_outlasts_frames_and_ends_with_a_reset():
+def test_a_refractory_period_outlasts_frames_and_ends_with_a_reset():
     camera = EventCamera(1, 1, refractory_us=10_000)
     camera.reset(frame(0.1), 0)
     assert len(camera.step(frame(0.5), 1000)) == 1
@@ -219,7 +221,7 @@ def test_a_dead_time_outlasts_frames_and_ends_with_a_reset():
     assert len(camera.step(frame(0.5), 6000)) == 1
 
 
-def test_a_frame_refused_in_a_dead_time_changes_nothing():
+def test_a_frame_refused_in_a_refractory_period_changes_nothing():
     cameras = [EventCamera(2, 1, refractory_us=3000) for _ in range(2)]
     good = [np.float32([[0.1, 0.2]]), np.float32([[0.5, 0.1]]), np.float32([[0.1, 0.9]])]
     for camera in cameras:

@@ -8,7 +8,7 @@ import pytest
 
 from envs.events import EVENT
 from envs.recordings import Recording, read_events, read_recording, write_events, write_recording
-from envs.recordings.formats import milliseconds_to_index
+from envs.recordings.hdf5 import milliseconds_to_index
 
 
 @pytest.fixture

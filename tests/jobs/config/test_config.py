@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 import re
 from pathlib import Path
 
@@ -90,6 +91,22 @@ def test_every_value_says_its_unit_or_source_in_a_comment(file):
         assert [line for line in lines[1:] if ": " in line and "#" not in line and "name:" not in line] == []
 
 
+@pytest.mark.parametrize(
+    "file", sorted(path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help", "budget"))
+)
+def test_every_group_names_the_class_that_its_keys_are_fields_of(file):
+    text = file.read_text()
+    values = yaml.safe_load(text)
+    groups = {file.parent.name: values}
+    if file.parent == CONF:
+        groups = {key: group for key, group in values.items() if isinstance(group, dict) and key != "hydra"}
+    classes = re.findall(r"Fields: ([\w.]+)\.(\w+)", text)
+    assert len(classes) == len(groups)
+    for (module, name), group in zip(classes, groups.values(), strict=True):
+        fields = {field.name for field in dataclasses.fields(getattr(importlib.import_module(module), name))}
+        assert group.keys() - {"defaults"} <= fields
+
+
 def test_ppo_is_the_papers(composed):
     algo = parse(composed("+exp=bytestream", "budget=paper", "algo=ppo")).algo
     assert dataclasses.asdict(algo) == {
@@ -144,7 +161,7 @@ def test_a_kind_has_the_settings_of_its_parts_and_no_others(composed, name):
 
 
 @pytest.mark.parametrize("name", ["bytestream_xy", "event_image_vae"])
-def test_a_code_that_forgets_is_refused_where_there_is_no_time(composed, name):
+def test_eventnets_coding_is_an_error_where_there_is_no_time(composed, name):
     with pytest.raises(ConfigError, match=f"coding must be additive or none for {name}.*got 'eventnet'"):
         parse(composed("+exp=bytestream", f"model={name}", "model.coding=eventnet"))
     assert parse(composed("+exp=bytestream", "model.coding=eventnet")).model.coding == "eventnet"
@@ -243,16 +260,16 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("model.coding", "phase", "'additive', 'eventnet' or 'none', got 'phase'"),
     ],
 )
-def test_a_refusal_names_the_key_the_rule_and_the_value(values, key, value, rule):
-    with pytest.raises(ConfigError) as refusal:
+def test_a_configuration_error_names_the_key_the_rule_and_the_value(values, key, value, rule):
+    with pytest.raises(ConfigError) as error:
         parse(changed(values, key, value))
-    assert str(refusal.value).startswith(key.partition(".")[0])
-    assert rule in str(refusal.value)
-    assert len(str(refusal.value).splitlines()) == 1
+    assert str(error.value).startswith(key.partition(".")[0])
+    assert rule in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("exp", ["event_image", "event_image_vae", "rgb"])
-def test_a_picture_too_small_for_the_network_is_refused(composed, exp):
+def test_an_image_too_small_for_the_network_is_an_error(composed, exp):
     rule = f"camera.width: must be at least 36 for the network of {POLICIES[exp]}, got 35"
     with pytest.raises(ConfigError, match=f"^{re.escape(rule)}$"):
         parse(composed(f"+exp={exp}", "camera.width=35"))
@@ -260,10 +277,10 @@ def test_a_picture_too_small_for_the_network_is_refused(composed, exp):
     parse(composed("+exp=event_columns", "camera.width=35"))
 
 
-def test_all_refusals_come_at_once(values):
-    with pytest.raises(ConfigError) as refusal:
+def test_all_errors_come_at_once(values):
+    with pytest.raises(ConfigError) as error:
         parse(changed(changed(changed(values, "seed", -1), "algo.lr", -1.0), "env.control_hz", -1.0))
-    keys = [line.partition(":")[0] for line in str(refusal.value).splitlines()]
+    keys = [line.partition(":")[0] for line in str(error.value).splitlines()]
     assert sorted(keys) == ["algo.lr", "env.control_hz", "seed"]
 
 

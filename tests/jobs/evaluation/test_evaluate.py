@@ -4,45 +4,45 @@ import dataclasses
 import numpy as np
 import pytest
 
-from envs.config import CameraConfig, sensor_settings
+from envs.config import CameraConfig
 from envs.corridor import CorridorEnv
 from envs.sensor import Sensor
 from jobs.analysis.tables import summarise
 from jobs.analysis.video import frame
 from jobs.config.config import ConfigError
-from jobs.evaluation import evaluate as evaluating
 from jobs.evaluation.evaluate import (
     announce,
-    cell_of,
     evaluate,
-    film_seed,
-    find_policy,
-    fly_tasks,
-    tasks,
-    tracked_figures,
+    evaluate_all,
+    evaluation_metrics,
+    label_of,
+    plan_evaluation,
+    seed_to_film,
 )
 from jobs.evaluation.evaluate import run as run_evaluation
 from jobs.rollout.agents import PolicyAgent, make_agent
-from jobs.rollout.drift import FIGURES
-from jobs.rollout.episodes import EPISODE, Ways, check_sensor, fly
-from jobs.rollout.scheduler import KeepEpisodes
-from jobs.rollout.tasks import read_episodes
+from jobs.rollout.diagnostics import DRIFT_METRICS
+from jobs.rollout.episodes import EPISODE, TrajectoryRecorder, roll_out
+from jobs.rollout.executors import evaluate_part, run_serially
+from jobs.rollout.policies import check_sensor, find_policy, own_sensor_differences, read_policy
+from jobs.rollout.store import EpisodeStore
 from jobs.run.files import write_json
 from jobs.run.folder import finished, open_run
 from jobs.tracking.tracker import open_tracker
 from models.kinds import KINDS
 from models.policy import load_policy
 from tests.support.configs import small_config
-from tests.support.policies import HELD_OUT, save_untrained
+from tests.support.fake_executor import FakeExecutor
+from tests.support.policies import HELD_OUT, save_training, save_untrained
 
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    return save_untrained(tmp_path_factory.mktemp("flown") / "policy")
+    return save_untrained(tmp_path_factory.mktemp("given") / "policy")
 
 
 @pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_image", "rgb"])
-def test_a_policy_of_each_kind_flies_the_same_corridors_by_what_it_sees(tmp_path, name):
+def test_a_policy_of_each_kind_is_evaluated_in_the_same_corridors_by_what_it_sees(tmp_path, name):
     short = dataclasses.replace(HELD_OUT, time_limit_s=0.15)
     corridors, shapes = {}, {}
 
@@ -51,34 +51,38 @@ def test_a_policy_of_each_kind_flies_the_same_corridors_by_what_it_sees(tmp_path
         shapes.setdefault(env.config.observation, set()).add(observation.shape)
 
     for agent in ("straight", str(save_untrained(tmp_path, name=name))):
-        fly(make_agent(agent), short, [3, 4], watch=watch)
+        roll_out(make_agent(agent), short, [3, 4], watch=watch)
     assert [len(seen) for seen in corridors.values()] == [1, 1]
     shape = (4097, 4) if KINDS[name].observation == "window" else (64, 64)
     assert shapes == {"none": {(0,)}, KINDS[name].observation: {shape}}
 
 
 @pytest.mark.parametrize("action", ["deterministic", "stochastic"])
-def test_an_episode_does_not_depend_on_how_many_fly_beside_it(policy, action):
-    flown = [fly(make_agent(str(policy), action), HELD_OUT, range(5), num_envs) for num_envs in (1, 2, 5)]
-    np.testing.assert_array_equal(flown[0], flown[1])
-    np.testing.assert_array_equal(flown[0], flown[2])
+def test_an_episode_does_not_depend_on_how_many_run_beside_it(policy, action):
+    short = dataclasses.replace(HELD_OUT, time_limit_s=2.5)
+    episodes = [
+        roll_out(make_agent(str(policy), action), short, range(5), num_envs) for num_envs in (1, 2, 5)
+    ]
+    assert len(set(episodes[0]["steps"])) > 1
+    np.testing.assert_array_equal(episodes[0], episodes[1])
+    np.testing.assert_array_equal(episodes[0], episodes[2])
 
 
 def test_episodes_stand_in_the_order_of_their_seeds_and_depend_on_nothing_else():
-    some = fly(make_agent("straight"), HELD_OUT, [7, 3])
+    some = roll_out(make_agent("straight"), HELD_OUT, [7, 3])
     np.testing.assert_array_equal(some["seed"], [7, 3])
-    np.testing.assert_array_equal(some[::-1], fly(make_agent("straight"), HELD_OUT, [3, 7], num_envs=1))
+    np.testing.assert_array_equal(some[::-1], roll_out(make_agent("straight"), HELD_OUT, [3, 7], num_envs=1))
 
 
-def test_random_flights_differ_from_each_other_and_repeat():
-    first, again = (fly(make_agent("random"), HELD_OUT, range(3)) for _ in range(2))
+def test_random_episodes_differ_from_each_other_and_repeat():
+    first, again = (roll_out(make_agent("random"), HELD_OUT, range(3)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(first["distance_m"])) == 3
 
 
 def test_the_oracle_comes_through_where_flying_straight_does_not():
-    oracle = fly(make_agent("oracle"), HELD_OUT, range(20), num_envs=20)
-    straight = fly(make_agent("straight"), HELD_OUT, range(20), num_envs=20)
+    oracle = roll_out(make_agent("oracle"), HELD_OUT, range(20), num_envs=20)
+    straight = roll_out(make_agent("straight"), HELD_OUT, range(20), num_envs=20)
     assert oracle["success"].mean() >= 0.9
     assert straight["success"].mean() <= 0.3
     assert straight["collision"].sum() + straight["success"].sum() == 20
@@ -86,37 +90,37 @@ def test_the_oracle_comes_through_where_flying_straight_does_not():
 
 def test_the_oracle_also_comes_through_at_the_slowest_control():
     slow = dataclasses.replace(HELD_OUT, control_hz=45.0)
-    assert fly(make_agent("oracle"), slow, range(10), num_envs=10)["success"].mean() >= 0.9
+    assert roll_out(make_agent("oracle"), slow, range(10), num_envs=10)["success"].mean() >= 0.9
 
 
 def test_an_episode_ends_as_success_collision_or_truncation_and_counts_its_way():
     short = dataclasses.replace(HELD_OUT, time_limit_s=0.5)
-    flown = fly(make_agent("straight"), short, range(4))
-    assert flown["truncated"].all()
-    assert not (flown["success"] | flown["collision"]).any()
-    np.testing.assert_array_equal(flown["steps"], 100)
-    np.testing.assert_allclose(flown["distance_m"], 10.0)
-    np.testing.assert_allclose(flown["return"], 10.0)
+    episodes = roll_out(make_agent("straight"), short, range(4))
+    assert episodes["truncated"].all()
+    assert not (episodes["success"] | episodes["collision"]).any()
+    np.testing.assert_array_equal(episodes["steps"], 100)
+    np.testing.assert_allclose(episodes["distance_m"], 10.0)
+    np.testing.assert_allclose(episodes["return"], 10.0)
 
 
 @pytest.mark.parametrize(("scene", "limit_s"), [("poles_eval", 10.0), ("dynamic", 0.1)])
 @pytest.mark.parametrize("name", ["straight", "random", "oracle"])
-def test_a_agent_that_looks_at_nothing_flies_the_same_bits_without_a_render(
+def test_an_agent_that_looks_at_nothing_gives_the_same_bits_without_a_render(
     name, scene, limit_s, monkeypatch
 ):
     config, seeds = dataclasses.replace(HELD_OUT, scene=scene, time_limit_s=limit_s), range(2)
     looking = make_agent(name)
     looking.observation = "window"
-    rendered = fly(looking, config, seeds)
+    rendered = roll_out(looking, config, seeds)
     monkeypatch.delattr(Sensor, "_set_renderer")
-    blind = fly(make_agent(name), config, seeds)
+    blind = roll_out(make_agent(name), config, seeds)
     for field in ("seed", "success", "collision", "truncated", "distance_m", "return", "steps"):
         assert blind[field].tobytes() == rendered[field].tobytes(), field
     assert (rendered["events_per_step"] > 1).all()
     assert not blind["events_per_step"].any()
 
 
-def test_conditions_fly_the_same_corridors():
+def test_conditions_have_the_same_corridors():
     noisy = dataclasses.replace(HELD_OUT, control_hz=100.0, camera=CameraConfig(contrast_threshold=0.05))
     scenes = []
     for config in (HELD_OUT, noisy):
@@ -127,13 +131,15 @@ def test_conditions_fly_the_same_corridors():
     assert scenes[0][1] == scenes[1][1]
 
 
-def test_another_sensor_than_the_policys_is_refused_with_both_values():
-    manifest = {"sensor": sensor_settings(HELD_OUT)}
+def test_another_sensor_than_the_policys_is_refused_with_both_values(tmp_path):
+    policy = read_policy(save_training(tmp_path / "policy", "a", 0, HELD_OUT))
     other = dataclasses.replace(HELD_OUT, camera=CameraConfig(contrast_threshold=0.05))
-    assert check_sensor(manifest, HELD_OUT) == {}
+    check_sensor(policy.sensor, HELD_OUT)
     with pytest.raises(ValueError, match=r"contrast_threshold = 0\.05 instead of 0\.2"):
-        check_sensor(manifest, other)
-    assert check_sensor(manifest, other, allow_mismatch=True) == {"contrast_threshold": (0.2, 0.05)}
+        check_sensor(policy.sensor, other)
+    assert own_sensor_differences(policy, HELD_OUT) == {}
+    assert own_sensor_differences(policy, other) == {"contrast_threshold": (0.2, 0.05)}
+    assert own_sensor_differences(read_policy("oracle"), other) == {}
 
 
 def test_without_a_policy_the_message_says_how_to_get_one(tmp_path):
@@ -157,64 +163,67 @@ def test_the_newest_policy_of_another_model_is_not_taken_but_named(tmp_path):
 
 def test_a_runs_own_policy_comes_before_a_newer_one(tmp_path, capsys):
     config = small_config(tmp_path)
-    run = open_run(config)
-    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {"name": "bytestream"})
-    assert find_policy(config, run) == tmp_path / "runs" / "other" / "policy"
+    run, other = open_run(config), tmp_path / "runs" / "other" / "policy"
+    save_training(other, "a", 0, HELD_OUT, "bytestream")
+    assert find_policy(config, run).agent == str(other)
     announce(config, run, find_policy(config, run))
     assert "other/policy, the newest of bytestream in" in capsys.readouterr().out
-    write_json(run.policy / "policy.json", {"name": "bytestream"})
-    write_json(tmp_path / "runs" / "other" / "policy" / "policy.json", {"name": "bytestream"})
+    save_training(run.policy, "a", 0, HELD_OUT, "bytestream")
+    save_training(other, "a", 0, HELD_OUT, "bytestream")
     announce(config, run, find_policy(config, run))
     assert "policy, this run's own" in capsys.readouterr().out
-    assert find_policy(config, run) == run.policy
+    assert find_policy(config, run).agent == str(run.policy)
 
 
-def test_ways_end_where_the_episode_did():
-    ways = Ways([1])
-    flown = fly(make_agent("straight"), HELD_OUT, range(2), watch=ways.add)
-    (track,) = ways.tracks("straight", flown)
-    assert track.seed == 1
-    assert track.way_m[-1, 1] == flown["distance_m"][1]
-    assert track.outcome == ("collision" if flown["collision"][1] else "goal")
+def test_a_trajectory_ends_where_the_episode_did():
+    recorder = TrajectoryRecorder([1])
+    episodes = roll_out(make_agent("straight"), HELD_OUT, range(2), watch=recorder.add)
+    (trajectory,) = recorder.trajectories("straight", episodes)
+    assert trajectory.seed == 1
+    assert trajectory.xy_m[-1, 1] == episodes["distance_m"][1]
+    assert trajectory.outcome == ("collision" if episodes["collision"][1] else "goal")
 
 
-def test_the_film_shows_a_success_if_there_is_one_else_the_longest_flight():
-    flown = np.zeros(3, EPISODE)
-    flown["seed"], flown["distance_m"] = [4, 5, 6], [30.0, 60.0, 20.0]
-    assert film_seed(flown) == 5
-    flown["success"][2] = True
-    assert film_seed(flown) == 6
+def test_the_video_shows_a_success_if_there_is_one_else_the_longest_episode():
+    episodes = np.zeros(3, EPISODE)
+    episodes["seed"], episodes["distance_m"] = [4, 5, 6], [30.0, 60.0, 20.0]
+    assert seed_to_film(episodes) == 5
+    episodes["success"][2] = True
+    assert seed_to_film(episodes) == 6
 
 
-def test_the_tracked_figures_name_agent_scene_and_renderer(tmp_path):
-    plan = tasks(small_config(tmp_path))
-    rows = [summarise(task.label, fly(make_agent("straight"), HELD_OUT, [0, 1])) for task in plan[:1]] * len(
-        plan
-    )
-    rows = [dataclasses.replace(row, label=task.label) for row, task in zip(rows, plan, strict=True)]
-    figures = tracked_figures(rows)
+def test_the_metrics_name_agent_scene_and_renderer(tmp_path):
+    labels = [
+        label_of(task) for task in plan_evaluation(small_config(tmp_path), read_policy(trained(tmp_path)))
+    ]
+    row = summarise(labels[0], roll_out(make_agent("straight"), HELD_OUT, [0, 1]))
+    metrics = evaluation_metrics([dataclasses.replace(row, label=label) for label in labels])
     assert {
         "eval/success_rate",
         "eval/success_rate_poles",
         "eval/success_rate_pyrender",
         "eval/success_rate_oracle",
         "eval/distance_m_straight",
-    } <= set(figures)
-    assert len(figures) <= 40
+    } <= set(metrics)
+    assert len(metrics) <= 40
 
 
-@pytest.mark.system
-@pytest.mark.parametrize("name", ["bytestream", pytest.param("rgb", marks=pytest.mark.slow)])
-def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, name):
+def trained(tmp_path, name="bytestream"):
+    """The folder of a policy that says it was trained."""
+    return save_training(tmp_path / name, name, 0, small_config(tmp_path).env, name)
+
+
+@pytest.mark.parametrize("name", ["bytestream", "rgb"])
+def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)
     env = dataclasses.replace(config.env, time_limit_s=0.6)
     config = dataclasses.replace(config, evaluate=settings, env=env)
     run = open_run(config)
-    save_untrained(run.policy, config.env, name)
+    save_training(run.policy, name, 0, config.env, name)
     with open_tracker(config, run) as tracker:
-        figures = evaluate(config, run, tracker)
-        assert evaluate(config, run, tracker) == figures
+        figures = evaluate(config, run, tracker, run_serially)
+        assert evaluate(config, run, tracker, run_serially) == figures
     with (run.evaluation / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 5 * 2  # scenes, agents, corridors
@@ -224,7 +233,7 @@ def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, nam
     assert (run.evaluation / "episode.mp4").stat().st_size > 5_000
     assert not list(run.evaluation.glob(".*"))
     measured = {key for key in figures if key.startswith("evae/")}
-    plain = {f"evae/{part}" for part in FIGURES}
+    plain = {f"evae/{part}" for part in DRIFT_METRICS}
     others = {f"evae/drift_{row}" for row in ("deterministic", "poles", "deterministic_poles")}
     assert measured == (plain | others if KINDS[name].encoder else set())
     assert len(figures) <= 40
@@ -233,12 +242,12 @@ def test_an_evaluation_leaves_episodes_table_ways_film_and_figures(tmp_path, nam
     )
     with open_tracker(config, run) as tracker:
         more = dataclasses.replace(config, evaluate=dataclasses.replace(settings, episodes=3, video=False))
-        evaluate(more, run, tracker)
+        evaluate(more, run, tracker, run_serially)
     with (run.evaluation / "episodes.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 2 * 5 * 3
 
 
-def test_a_policy_flies_as_its_own_networks_say(policy):
+def test_a_policy_acts_as_its_own_networks_say(policy):
     agent = PolicyAgent(load_policy(policy))
     env = CorridorEnv(HELD_OUT)
     window, info = env.reset(seed=0)
@@ -250,68 +259,53 @@ def test_a_policy_flies_as_its_own_networks_say(policy):
         window, _, _, _, info = env.step(int(action[0]))
 
 
-def cells_for(config, path, identity="p"):
-    return {task: cell_of(task, config, path, (identity, "window")) for task in tasks(config)}
-
-
-def test_more_episodes_fly_only_the_new_corridors_and_another_policy_flies_all_but_the_bounds(tmp_path, stub):
+def test_more_episodes_evaluate_only_the_new_corridors_and_another_policy_all_but_the_baselines(tmp_path):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"])
     config = dataclasses.replace(config, evaluate=settings)
     more = dataclasses.replace(config, evaluate=dataclasses.replace(settings, episodes=3))
-    run, path = open_run(config), save_untrained(tmp_path / "policy")
-    flown = fly_tasks(cells_for(config, path), config, run)
-    assert list(flown) == tasks(config)
-    assert len(stub.flown) == len(set(stub.flown)) == 10 * 2
-    stub.flown.clear()
-    fly_tasks(cells_for(more, path), more, run)
-    assert {seed for _, seed in stub.flown} == {2}
-    stub.flown.clear()
-    fly_tasks(cells_for(more, path, "another"), more, run)
-    assert len(stub.flown) == 4 * 3  # two choices of action in two scenes
+    store, executor, policy = EpisodeStore(tmp_path), FakeExecutor(), read_policy(trained(tmp_path))
+    tasks = plan_evaluation(config, policy)
+    assert list(evaluate_all(tasks, store, executor)) == [label_of(task) for task in tasks]
+    assert len(executor.evaluated) == len(set(executor.evaluated)) == 10 * 2
+    executor.evaluated.clear()
+    evaluate_all(plan_evaluation(more, policy), store, executor)
+    assert {seed for _, seed in executor.evaluated} == {2}
+    executor.evaluated.clear()
+    evaluate_all(plan_evaluation(more, dataclasses.replace(policy, identity="another")), store, executor)
+    assert len(executor.evaluated) == 4 * 3  # two choices of action in two scenes
 
 
-def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_stops_with_the_reason(
-    tmp_path, stub
-):
-    config = small_config(tmp_path)
-    run, path = open_run(config), save_untrained(tmp_path / "policy")
-    stub.broken = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
-    flown = fly_tasks(cells_for(config, path), config, run)
-    assert {task.renderer for task in tasks(config)} - {task.renderer for task in flown} == {"pyrender"}
-    stub.broken = {("poles", "raycast"): "ValueError: no"}
-    config = dataclasses.replace(config, runs_dir=str(tmp_path / "others"))
-    with pytest.raises(RuntimeError, match=r"poles raycast: not flown: ValueError: no; the same command"):
-        fly_tasks(cells_for(config, path), config, open_run(config))
+def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_stops_with_the_reason(tmp_path):
+    executor, tasks = FakeExecutor(), plan_evaluation(small_config(tmp_path), read_policy(trained(tmp_path)))
+    executor.broken = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
+    results = evaluate_all(tasks, EpisodeStore(tmp_path), executor)
+    assert {label_of(task) for task in tasks} - set(results) == {
+        ("policy stochastic", "poles_eval", "pyrender")
+    }
+    executor.broken = {("poles", "raycast"): "ValueError: no"}
+    with pytest.raises(RuntimeError, match=r"poles raycast: .*ValueError: no"):
+        evaluate_all(tasks, EpisodeStore(tmp_path / "others"), executor)
 
 
-def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path, monkeypatch):
+def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)
-    env = dataclasses.replace(config.env, time_limit_s=0.05)
-    config = dataclasses.replace(config, evaluate=settings, env=env)
-    run, asked = open_run(config), []
-    save_untrained(run.policy, config.env, "event_columns")
-
-    def flown_here(config, place, cells, *given, **named):
-        asked.append(len(cells))
-        able = [cell for cell in cells if len(asked) > 1 or cell.env.renderer == "raycast"]
-        keep = KeepEpisodes(place / "episodes")
-        for cell in able:
-            rows = fly(make_agent("straight"), cell.env, cell.seeds).tolist()
-            result = {"key": cell.key, "label": [], "simulation": "s", "accuracy": None, "encoder": {}}
-            keep.on_trial_result(1, [], None, result | {"episodes": rows})
-        kept = {cell.key: read_episodes(cell, place / "episodes") for cell in able}
-        return kept, {cell.key: "no" for cell in cells if cell.key not in kept}
-
-    monkeypatch.setattr(evaluating, "fly_cells", flown_here)
+    config = dataclasses.replace(
+        config, evaluate=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)
+    )
+    run, executor = open_run(config), FakeExecutor(evaluate_part)
+    save_training(run.policy, "a", 0, config.env, "event_columns")
+    drawn = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
     with open_tracker(config, run) as tracker:
-        for _ in range(3):
-            evaluate(config, run, tracker)
-    assert asked == [11, 11]
-    marker = finished(run, "evaluate")
-    assert marker["missing"] == []
-    assert len(marker["flown_at"]) == 1
+        for broken, evaluated, missing in ((drawn, 10, 1), ({}, 11, 0), (drawn, 11, 0)):
+            executor.broken = broken
+            evaluate(config, run, tracker, executor)
+            assert (len(executor.evaluated), len(finished(run, "evaluate")["missing"])) == (
+                evaluated,
+                missing,
+            )
+    assert len(finished(run, "evaluate")["evaluated_at"]) == 1
 
 
 def test_a_caption_has_room_under_a_single_panel():

@@ -5,15 +5,16 @@ from pathlib import Path
 import pytest
 
 from jobs.evaluation.sweep import announce, run
-from jobs.rollout.drift import FIGURES
+from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.folder import open_run
 from models.policy.policy import NETWORKS
 from tests.support.configs import sweep_config
+from tests.support.fake_executor import FakeExecutor
 from tests.support.policies import save_training
 from tests.support.runs import in_store, planned, tracked_sweeps
 
 
-def test_who_flies_and_whose_sensor_differs_is_said(tmp_path, capsys):
+def test_who_is_evaluated_and_whose_sensor_differs_is_said(tmp_path, capsys):
     config = sweep_config(tmp_path)
     same = save_training(tmp_path / "same", "a", 0, config.env)
     slow = save_training(tmp_path / "slow", "a", 1, dataclasses.replace(config.env, control_hz=100.0))
@@ -21,16 +22,16 @@ def test_who_flies_and_whose_sensor_differs_is_said(tmp_path, capsys):
     assert capsys.readouterr().out.splitlines() == [
         "Group: a (training seeds 0, 1)",
         "Group: oracle",
-        f"Flown with its own sensor: {slow}: control_hz = 100.0 instead of 200.0",
+        f"Evaluated with its own sensor: {slow}: control_hz = 100.0 instead of 200.0",
     ]
 
 
 def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_rerun_adds_no_point(
-    tmp_path, stub
+    tmp_path,
 ):
     config = in_store(sweep_config(tmp_path, policies=["straight", "oracle"], reference="straight"), tmp_path)
     for _ in range(2):
-        figures = run(config)
+        figures = run(config, FakeExecutor())
     assert len(figures) == 5 * 2
     place = open_run(config).path / "sweep"
     names = (
@@ -59,7 +60,7 @@ def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_reru
     assert child.data.metrics["sweep/success_difference"] == 0.0
     assert [point.value for point in client.get_metric_history(parent, "sweep/conditions")] == [5.0]
     assert client.get_run(parent).data.metrics["sim/event_error_max"] == 0.01
-    assert client.get_run(parent).data.metrics["sweep/flights"] == 8  # of each bound two rates
+    assert client.get_run(parent).data.metrics["sweep/episodes"] == 8  # of each baseline two rates
     (groups,) = tracked_sweeps(config, "group")[1].values()
     assert set(groups) == {"straight", "oracle"}
     curve = client.get_metric_history(groups["oracle"].info.run_id, "sweep/sparsity_percent_distance_m")
@@ -71,15 +72,16 @@ def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_reru
     assert len(json.loads(Path(table).read_text())["data"]) == len(figures)
 
 
-def test_a_failed_cell_stands_in_the_table_and_its_child_comes_when_it_is_flown(tmp_path, stub):
+def test_a_failed_task_stands_in_the_table_and_its_child_comes_when_it_is_evaluated(tmp_path):
     config = in_store(sweep_config(tmp_path), tmp_path)
-    stub.broken = {("rate", "100"): "ValueError: no"}
-    run(config)
+    executor = FakeExecutor()
+    executor.broken = {("rate", "100"): "ValueError: no"}
+    run(config, executor)
     table = open_run(config).path / "sweep" / "table.md"
     assert "| rate | 100 | failed |" in table.read_text()
     assert "| rate | 100 | straight |  | ValueError: no |" in table.read_text()
-    stub.broken = {}
-    run(config)
+    executor.broken = {}
+    run(config, executor)
     assert "failed" not in table.read_text()
     _, sweeps = tracked_sweeps(config)
     ((_, children),) = sweeps.items()
@@ -87,13 +89,13 @@ def test_a_failed_cell_stands_in_the_table_and_its_child_comes_when_it_is_flown(
 
 
 def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differs_from_training(
-    tmp_path, stub
+    tmp_path,
 ):
     config = in_store(sweep_config(tmp_path), tmp_path)
     agent = save_training(tmp_path / "policy", "a", 0, dataclasses.replace(config.env, control_hz=100.0))
     for policies, trials in (([agent], 2), ([agent, "straight"], 2), ([agent], 3)):
         settings = dataclasses.replace(config.sweep, policies=policies, trials=trials)
-        run(dataclasses.replace(config, sweep=settings))
+        run(dataclasses.replace(config, sweep=settings), FakeExecutor())
     _, sweeps = tracked_sweeps(config)
     assert sorted(len(children) for children in sweeps.values()) == [5, 5, 10]
     for children in sweeps.values():
@@ -103,7 +105,7 @@ def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differ
 
 
 @pytest.mark.slow
-def test_cells_flown_as_tune_trials_come_back_with_their_episodes_and_one_that_raises_stops_no_other(
+def test_tasks_evaluated_as_tune_trials_come_back_with_their_episodes_and_one_that_raises_stops_no_other(
     tmp_path,
 ):
     config = sweep_config(tmp_path)
@@ -119,11 +121,11 @@ def test_cells_flown_as_tune_trials_come_back_with_their_episodes_and_one_that_r
     assert "| event_image | 1 | PolicyFileError: " in (place / "table.md").read_text()
     kept = sorted((place / "episodes").glob("*.json"))
     before = [path.read_text() for path in kept]
-    cells = [json.loads(text) for text in before]
-    assert {frozenset(cell["encoder"]) for cell in cells if "bytestream" in cell["label"]} == {
-        frozenset(FIGURES)
+    tasks = [json.loads(text) for text in before]
+    assert {frozenset(task["encoder"]) for task in tasks if "bytestream" in task["label"]} == {
+        frozenset(DRIFT_METRICS)
     }
-    assert not any(cell["encoder"] for cell in cells if "event_columns" in cell["label"])
+    assert not any(task["encoder"] for task in tasks if "event_columns" in task["label"])
     assert len(kept) == 3 * 2
     assert run(config) == figures
     assert [path.read_text() for path in kept] == before

@@ -5,7 +5,8 @@ import pytest
 
 from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from jobs.config.config import ConfigError
-from jobs.evaluation.sweep_plan import NOMINAL, find_entries, plan, read_entry, text, with_sensor
+from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep, value_text
+from jobs.rollout.policies import find_sweep_policies, read_policy, with_sensor
 from jobs.run.folder import open_run
 from models.policy.policy import MANIFEST
 from tests.support.configs import AXES, sweep_config
@@ -21,11 +22,11 @@ OTHER_CAMERA = {
 
 
 def at(sweep, axis, value):
-    (cell,) = [cell for cell in sweep.cells if cell.label == (axis, value)]
-    return cell
+    (task,) = [task for task in sweep.tasks if task.condition == (axis, value)]
+    return task
 
 
-def test_axes_change_their_settings_alone_and_share_the_unchanged_cell(tmp_path):
+def test_axes_change_their_settings_alone_and_share_the_unchanged_task(tmp_path):
     config = sweep_config(tmp_path)
     sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env))
     assert sweep.conditions == [
@@ -36,30 +37,30 @@ def test_axes_change_their_settings_alone_and_share_the_unchanged_cell(tmp_path)
     sparse = dataclasses.replace(usual.env.faults, sparsity=0.5)
     assert at(sweep, "sparsity", "0.5").env == dataclasses.replace(usual.env, faults=sparse)
     assert at(sweep, "rate", "100").env == dataclasses.replace(usual.env, control_hz=100.0)
-    assert len({cell.key for cell in sweep.cells}) == 3
-    assert all(cell.env.split == "eval" and cell.seeds == (0, 1) for cell in sweep.cells)
+    assert len({task.key for task in sweep.tasks}) == 3
+    assert all(task.env.split == "eval" and task.seeds == (0, 1) for task in sweep.tasks)
 
 
 def test_faults_change_no_accuracy_and_anything_else_does(tmp_path):
     sweep = planned(sweep_config(tmp_path), "straight", "oracle")
     usual, sparse, slow = (
-        {cell.simulation for cell in sweep.cells if cell.label == label}
+        {task.simulation for task in sweep.tasks if task.condition == label}
         for label in ((NOMINAL, "poles_eval"), ("sparsity", "0.5"), ("rate", "100"))
     )
     assert usual == sparse != slow
     assert len(usual) == 1
 
 
-def test_another_policy_is_another_cell(tmp_path):
+def test_another_policy_is_another_task(tmp_path):
     config = sweep_config(tmp_path)
     one = save_training(tmp_path / "one", "a", 0, config.env)
-    keys = {planned(config, name).cells[0].key for name in ("straight", "oracle", one)}
+    keys = {planned(config, name).tasks[0].key for name in ("straight", "oracle", one)}
     manifest = json.loads((tmp_path / "one" / MANIFEST).read_text())
     (tmp_path / "one" / MANIFEST).write_text(json.dumps({**manifest, "sha256": {}}))
-    assert len(keys | {planned(config, one).cells[0].key}) == 4
+    assert len(keys | {planned(config, one).tasks[0].key}) == 4
 
 
-def test_what_a_agent_does_not_see_makes_no_cell_of_its_own(tmp_path):
+def test_what_an_agent_does_not_see_makes_no_task_of_its_own(tmp_path):
     axes = {
         **AXES,
         "threshold": {"camera.contrast_threshold": [0.2, 0.4]},
@@ -69,7 +70,7 @@ def test_what_a_agent_does_not_see_makes_no_cell_of_its_own(tmp_path):
     agents = [save_training(tmp_path / name, name, 0, config.env, name) for name in ("rgb", "event_image")]
     sweep = planned(config, "straight", *agents)
     keys = {
-        group: {cell.label: cell.key for cell in sweep.cells if cell.entry.group == group}
+        group: {task.condition: task.key for task in sweep.tasks if task.policy.group == group}
         for group in sweep.groups
     }
     assert {group: len(set(found.values())) for group, found in keys.items()} == {
@@ -78,21 +79,21 @@ def test_what_a_agent_does_not_see_makes_no_cell_of_its_own(tmp_path):
         "event_image": 6,
     }
     assert keys["rgb"]["exactness", "8"] != keys["rgb"][NOMINAL, "poles_eval"]
-    errors = {cell.simulation for cell in sweep.cells if cell.label == ("threshold", "0.4")}
+    errors = {task.simulation for task in sweep.tasks if task.condition == ("threshold", "0.4")}
     assert len(errors) == 1, "the condition is the same for all"
 
 
-def test_a_policy_flies_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
+def test_a_policy_keeps_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
     config = sweep_config(tmp_path)
     trained = dataclasses.replace(config.env, control_hz=100.0, camera=CameraConfig(memory="frame"))
     agent = save_training(tmp_path / "policy", "a", 0, trained)
     sweep = planned(config, agent, "straight")
-    assert sweep.differ == {agent: {"control_hz": (100.0, 200.0), "memory": ("frame", "reference")}}
+    assert sweep.differences == {agent: {"control_hz": (100.0, 200.0), "memory": ("frame", "reference")}}
     own = sensor_settings(trained)
-    flown = {cell.label: sensor_settings(cell.env) for cell in sweep.cells if cell.entry.agent == agent}
-    assert flown[NOMINAL, "poles_eval"] == flown["sparsity", "0.5"] == flown["rate", "100"] == own
-    assert flown["rate", "200"] == {**own, "control_hz": 200.0}
-    ours = [cell.env for cell in sweep.cells if cell.entry.agent == "straight"]
+    used = {task.condition: sensor_settings(task.env) for task in sweep.tasks if task.policy.agent == agent}
+    assert used[NOMINAL, "poles_eval"] == used["sparsity", "0.5"] == used["rate", "100"] == own
+    assert used["rate", "200"] == {**own, "control_hz": 200.0}
+    ours = [task.env for task in sweep.tasks if task.policy.agent == "straight"]
     assert {env.camera.memory for env in ours} == {"reference"}
 
 
@@ -126,14 +127,14 @@ def test_policies_of_one_group_stand_together_by_their_training_seed(tmp_path):
     for place, group, seed in (("x", "b", 1), ("y", "a", 0), ("z", "b", 0)):
         save_training(tmp_path / "pretrained" / place, group, seed, env)
     named = sweep_config(tmp_path, policies=["pretrained", "oracle", "pretrained"])
-    entries = find_entries(named, folder, tmp_path / "pretrained")
-    assert [(entry.group, entry.training) for entry in entries] == [
+    policies = find_sweep_policies(named, folder, tmp_path / "pretrained")
+    assert [(policy.group, policy.training) for policy in policies] == [
         ("b", 0),
         ("b", 1),
         ("a", 0),
         ("oracle", None),
     ]
-    assert plan(named, entries).groups == {"b": [0, 1], "a": [0], "oracle": [None]}
+    assert plan_sweep(named, policies).groups == {"b": [0, 1], "a": [0], "oracle": [None]}
 
 
 def test_a_policy_without_an_experiment_is_of_the_group_of_its_kind(tmp_path):
@@ -141,7 +142,7 @@ def test_a_policy_without_an_experiment_is_of_the_group_of_its_kind(tmp_path):
     manifest = json.loads((tmp_path / "policy" / MANIFEST).read_text())
     del manifest["exp"]
     (tmp_path / "policy" / MANIFEST).write_text(json.dumps(manifest))
-    assert read_entry(agent).group == "event_columns"
+    assert read_policy(agent).group == "event_columns"
 
 
 def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_path):
@@ -149,23 +150,27 @@ def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_pat
     folder = open_run(config)
     path = save_training(tmp_path / "runs" / "trained" / "policy", "a", 0, config.env, "bytestream")
     for name in ("newest", path, path.removesuffix("/policy")):
-        (entry,) = find_entries(sweep_config(tmp_path, policies=[name]), folder)
-        assert entry.agent == path
+        (policy,) = find_sweep_policies(sweep_config(tmp_path, policies=[name]), folder)
+        assert policy.agent == path
 
 
 def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
     config = sweep_config(tmp_path, policies=["one"])
     path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env)
-    (entry,) = find_entries(config, open_run(config), tmp_path / "pretrained")
-    assert entry.agent == path
+    (policy,) = find_sweep_policies(config, open_run(config), tmp_path / "pretrained")
+    assert policy.agent == path
 
 
 def test_a_group_of_the_pretrained_folder_is_all_its_trainings_and_no_other_group(tmp_path):
     config = sweep_config(tmp_path, policies=["a", "straight"])
     for place, group, seed in (("a-s1", "a", 1), ("a-set-s0", "a-set", 0), ("a-s0", "a", 0)):
         save_training(tmp_path / "pretrained" / place, group, seed, config.env)
-    entries = find_entries(config, open_run(config), tmp_path / "pretrained")
-    assert [(entry.group, entry.training) for entry in entries] == [("a", 0), ("a", 1), ("straight", None)]
+    policies = find_sweep_policies(config, open_run(config), tmp_path / "pretrained")
+    assert [(policy.group, policy.training) for policy in policies] == [
+        ("a", 0),
+        ("a", 1),
+        ("straight", None),
+    ]
 
 
 def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
@@ -173,7 +178,7 @@ def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
 
     def refusal(*names):
         with pytest.raises(ConfigError) as refused:
-            find_entries(sweep_config(tmp_path, policies=names), folder, tmp_path / "none")
+            find_sweep_policies(sweep_config(tmp_path, policies=names), folder, tmp_path / "none")
         return str(refused.value)
 
     assert refusal("pretrained").startswith("sweep.policies: 'pretrained' means the policies in ")
@@ -194,4 +199,4 @@ def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
     [(45, "45"), (0.05, "0.05"), (0.12345678, "0.12345678"), ("frame", "frame"), (None, "null")],
 )
 def test_a_value_is_told_from_every_other_by_its_label(value, label):
-    assert text(value) == label
+    assert value_text(value) == label

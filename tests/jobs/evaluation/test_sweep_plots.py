@@ -5,9 +5,10 @@ import yaml
 from jobs.analysis.plots import BASELINE_STYLES, GROUP_STYLES, style_of
 from jobs.config.conditions import axis_points
 from jobs.evaluation.group_stats import summarise_group
-from jobs.evaluation.sweep_plan import PRETRAINED, text
+from jobs.evaluation.sweep_plan import value_text
 from jobs.evaluation.sweep_plots import axis_figure, collision_figure
 from jobs.rollout.episodes import EPISODE
+from jobs.rollout.policies import PRETRAINED
 from jobs.run.provenance import REPOSITORY
 from models.policy.policy import MANIFEST
 from tests.support.episodes import flights
@@ -31,14 +32,15 @@ def test_numbers_are_lines_and_each_group_has_its_own_with_a_band():
     assert panel.get_legend_handles_labels()[1] == ["bytestream", "event_image"]
     assert len(panel.collections) == 2
     assert (
-        "scene poles; 40 flights of 2 trainings" in figure.texts[-1].get_text() + figure._supxlabel.get_text()
+        "scene poles; 40 episodes of 2 trainings"
+        in figure.texts[-1].get_text() + figure._supxlabel.get_text()
     )
 
 
 @pytest.mark.parametrize(
     ("key", "values"), [("env.control_hz", (45, 200, 400)), ("faults.sparsity", (0, 0.5, 1))]
 )
-def test_many_groups_get_bars_beside_each_other_in_order_and_none_for_bounds(key, values):
+def test_many_groups_get_bars_beside_each_other_in_order_and_none_for_baselines(key, values):
     points = {f"{value:g}": {key: float(value)} for value in values}
     groups = ("a", "b", "c", "d", "e", "straight")
     panel = axis_figure("rate", points, rows_of("rate", points, groups)).axes[0]
@@ -74,12 +76,12 @@ def test_words_and_settings_that_change_together_are_bars(points, ticks):
 def test_every_axis_of_the_default_sweep_can_be_drawn():
     axes = yaml.safe_load((REPOSITORY / "conf" / "sweep" / "robustness.yaml").read_text())["axes"]
     for axis, settings in axes.items():
-        points = {text(next(iter(point.values()))): point for point in axis_points(settings)}
+        points = {value_text(next(iter(point.values()))): point for point in axis_points(settings)}
         panel = axis_figure(axis, points, rows_of(axis, points, ("a", "b"))).axes[0]
         assert len(panel.get_xticklabels()) == len(points), axis
 
 
-def test_a_condition_that_was_not_flown_leaves_a_gap():
+def test_a_condition_that_was_not_evaluated_leaves_a_gap():
     points = {name: {"env.scene": name} for name in ("poles", "dynamic")}
     rows = rows_of("world", points, ("a", "b"))[:-1]
     assert len(axis_figure("world", points, rows).axes[0].patches) == 3
@@ -93,10 +95,10 @@ def test_every_experiment_has_a_colour_and_marker_of_its_own():
 
 
 def test_the_map_shows_contacts_alone():
-    flown = np.zeros(4, EPISODE)
-    flown["collision"] = [True, True, False, True]
-    flown["distance_m"], flown["x_m"] = [10.0, 20.0, 100.0, 30.0], [1.0, -2.0, 0.0, 3.0]
-    panel = collision_figure({"bytestream": (flown, flown[:1])}, 100.0, 25.0).axes[0]
+    episodes = np.zeros(4, EPISODE)
+    episodes["collision"] = [True, True, False, True]
+    episodes["distance_m"], episodes["x_m"] = [10.0, 20.0, 100.0, 30.0], [1.0, -2.0, 0.0, 3.0]
+    panel = collision_figure({"bytestream": (episodes, episodes[:1])}, 100.0, 25.0).axes[0]
     usual, changed = (np.asarray(dots.get_offsets()) for dots in panel.collections[:2])
     np.testing.assert_array_equal(usual, [[10.0, 1.0], [20.0, -2.0], [30.0, 3.0]])
     assert len(changed) == 1

@@ -1,7 +1,7 @@
 import numpy as np
 
-from jobs.evaluation.sweep_plan import plan, read_entry
 from jobs.evaluation.sweep_report import (
+    SweepResults,
     about,
     contacts,
     exactness,
@@ -10,9 +10,8 @@ from jobs.evaluation.sweep_report import (
     typical_crashes,
 )
 from jobs.rollout.episodes import EPISODE
-from jobs.rollout.scheduler import flown
-from jobs.rollout.tasks import accuracy_file
-from jobs.run.files import write_json
+from jobs.rollout.executors import Part, evaluate_part
+from jobs.rollout.store import EpisodeStore, PartResult, SimulationAccuracy, TaskResult
 from jobs.run.folder import open_run
 from tests.support.configs import sweep_config
 from tests.support.episodes import flights
@@ -20,11 +19,18 @@ from tests.support.policies import save_training
 from tests.support.runs import planned
 
 
+def results_of(sweep, episodes, folder):
+    """What was found of a sweep whose tasks have these episodes, by key."""
+    results = {key: TaskResult(rows, {}, ("c0ffee",), 0) for key, rows in episodes.items()}
+    return SweepResults(sweep, EpisodeStore(folder), results, {})
+
+
 def test_groups_are_compared_with_the_reference_under_the_same_condition(tmp_path):
     sweep = planned(sweep_config(tmp_path), "straight", "oracle", "random")
     won = {"straight": 5, "oracle": 20, "random": 0}
-    episodes = {cell.key: flights(won[cell.entry.group]) for cell in sweep.cells}
-    rows = summarise_sweep(sweep, episodes, "straight")
+    episodes = {task.key: flights(won[task.policy.group]) for task in sweep.tasks}
+    found = results_of(sweep, episodes, tmp_path)
+    rows = summarise_sweep(found, "straight")
     assert [(row.condition, row.group) for row in rows[:4]] == [
         (("nominal", "poles_eval"), "straight"),
         (("nominal", "poles_eval"), "oracle"),
@@ -36,20 +42,23 @@ def test_groups_are_compared_with_the_reference_under_the_same_condition(tmp_pat
         0.75,
         -0.25,
     ]
-    assert all(row.success_difference is None for row in summarise_sweep(sweep, episodes, "nobody"))
+    assert all(row.success_difference is None for row in summarise_sweep(found, "nobody"))
 
 
-def test_a_group_of_which_nothing_was_flown_has_no_row(tmp_path):
+def test_a_group_of_which_nothing_was_evaluated_has_no_result(tmp_path):
     sweep = planned(sweep_config(tmp_path), "straight", "oracle")
-    episodes = {cell.key: flights(3) for cell in sweep.cells if cell.entry.group == "straight"}
-    assert {row.group for row in summarise_sweep(sweep, episodes, "oracle")} == {"straight"}
+    episodes = {task.key: flights(3) for task in sweep.tasks if task.policy.group == "straight"}
+    assert {row.group for row in summarise_sweep(results_of(sweep, episodes, tmp_path), "oracle")} == {
+        "straight"
+    }
 
 
 def test_contacts_of_the_sweeps_scene_are_told_by_what_was_changed_and_counted_once(tmp_path):
     axes = {"sparsity": {"faults.sparsity": [0.0, 0.5]}, "world": {"env.scene": ["poles_eval", "poles"]}}
     config = sweep_config(tmp_path, axes=axes)
     sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env))
-    usual, changed = contacts(sweep, "a", {cell.key: flights(3) for cell in sweep.cells})
+    found = results_of(sweep, {task.key: flights(3) for task in sweep.tasks}, tmp_path)
+    usual, changed = contacts(found, "a")
     assert (len(usual), len(changed)) == (20, 20)
 
 
@@ -67,17 +76,17 @@ def test_crashes_of_each_groups_first_training_are_filmed_once(tmp_path):
         save_training(tmp_path / f"{group}{seed}", group, seed, config.env)
         for group, seed in (("a", 0), ("a", 1), ("b", 4))
     ]
-    sweep = plan(config, [read_entry(agent) for agent in (*agents, "straight")])
-    usual = [cell for cell in sweep.cells if cell.label[0] == "nominal"]
-    rows = np.array([tuple(row) for row in flown(usual[0], False)["episodes"]], EPISODE)
+    sweep = planned(config, *agents, "straight")
+    usual = [task for task in sweep.tasks if task.condition[0] == "nominal"]
+    rows = evaluate_part(Part(usual[0])).episodes
     rows["collision"] = [True, False]
-    episodes = {cell.key: rows for cell in usual}
-    paths = film_crashes(tmp_path / "sweep", sweep, episodes)
+    found = results_of(sweep, {task.key: rows for task in usual}, tmp_path)
+    paths = film_crashes(tmp_path / "sweep", found)
     assert [path.name for path in paths] == [
-        f"{cell.entry.group}-{cell.key[:8]}-corridor0.mp4" for cell in (usual[0], usual[2])
+        f"{task.policy.group}-{task.key[:8]}-corridor0.mp4" for task in (usual[0], usual[2])
     ]
     before = [path.stat().st_mtime_ns for path in paths]
-    film_crashes(tmp_path / "sweep", sweep, episodes)
+    film_crashes(tmp_path / "sweep", found)
     assert [path.stat().st_mtime_ns for path in paths] == before
 
 
@@ -86,18 +95,21 @@ def test_what_made_a_sweep_is_told_without_a_place_of_this_machine(tmp_path, mon
     words = ["x", "+exp=robustness", named, f"runs_dir={tmp_path}", "tracking.uri=sqlite:///a.db"]
     monkeypatch.setattr("sys.argv", words)
     config = sweep_config(tmp_path)
-    found = about(config, open_run(config), planned(config, "straight"), ["c0ffee"])
+    sweep = planned(config, "straight")
+    found = about(config, open_run(config), results_of(sweep, {sweep.tasks[0].key: flights(1)}, tmp_path))
+    assert found["evaluated_at"] == ["c0ffee"]
     assert found["command"] == "python -m platform.launch +exp=robustness 'sweep.policies=[mine,oracle]'"
     assert str(tmp_path) not in str(found)
 
 
 def test_how_exact_a_condition_was_is_told_once_it_was_measured(tmp_path):
     sweep = planned(sweep_config(tmp_path), "straight", "oracle")
-    assert exactness(tmp_path, sweep) == []
-    cell = next(cell for cell in sweep.cells if cell.label[0] != "nominal")
+    found = results_of(sweep, {}, tmp_path)
+    assert exactness(found) == []
+    task = next(task for task in sweep.tasks if task.condition[0] != "nominal")
+    found.store.add(task, PartResult(flights(1, trials=1), {}, SimulationAccuracy(0.01, 5.0)), "c0ffee")
+    told = exactness(found)
     values = {"event_error": 0.01, "renders_per_step": 5.0}
-    write_json(accuracy_file(tmp_path, cell.simulation), values)
-    found = exactness(tmp_path, sweep)
-    assert {"condition": list(cell.label), "asked": 0.05, **values} in found
-    told = [one.simulation == cell.simulation for one in sweep.cells if one.entry == cell.entry]
-    assert len(found) == sum(told)
+    assert {"condition": task.condition, "asked": 0.05, **values} in told
+    same = [one.simulation == task.simulation for one in sweep.tasks if one.policy == task.policy]
+    assert len(told) == sum(same)

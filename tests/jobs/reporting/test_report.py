@@ -24,7 +24,7 @@ ABOUT = {
     "identity": "abc",
     "command": "python -m platform.launch +exp=robustness",
     "commit": "c0ffee",
-    "flown_at": ["c0ffee"],
+    "evaluated_at": ["c0ffee"],
     "date": "2026-01-02",
     "scene": "poles_eval",
     "trials": 20,

@@ -185,7 +185,7 @@ def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_
     assert "uthenticat" in wrong
 
 
-@pytest.mark.parametrize("failures", [0, 1, joining.STARTS])
+@pytest.mark.parametrize("failures", [0, 1, joining.MAX_STARTS])
 def test_a_busy_machine_gets_more_than_one_chance_to_start_ray(monkeypatch, failures):
     calls = []
 
@@ -196,7 +196,7 @@ def test_a_busy_machine_gets_more_than_one_chance_to_start_ray(monkeypatch, fail
 
     monkeypatch.setattr(ray, "init", init)
     monkeypatch.setattr(ray, "shutdown", lambda: calls.append("shutdown"))
-    if failures < joining.STARTS:
+    if failures < joining.MAX_STARTS:
         joining._start_local({"num_cpus": 1})
         assert calls == [{"address": "local", "include_dashboard": False, "num_cpus": 1}] + (
             ["shutdown", calls[0]] * failures

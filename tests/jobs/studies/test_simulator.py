@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envs.config import EnvConfig
-from envs.event_error import Accuracy, measure
+from envs.event_error import Accuracy, measure_event_error
 from jobs.run.folder import locate_run
 from jobs.studies import simulator as trade_simulator
 from jobs.studies.front_plots import pareto
@@ -69,6 +69,6 @@ def test_the_job_leaves_tables_and_figures_and_a_second_run_replaces_them(tmp_pa
     assert [row[1].strip() for row in rows] == ["default", "renders", "renders", "encoding"]
     assert [int(row[6]) for row in rows[1:3]] == [1, 3]
     assert 0.0 < metrics["sim/event_error_poles"] < 1.0
-    exact = measure(dataclasses.replace(config.env, split="validation"), 1, 1)
+    exact = measure_event_error(dataclasses.replace(config.env, split="validation"), 1, 1)
     assert metrics["sim/events_per_second_reference_200_hz"] == pytest.approx(200.0 * exact.events[0])
     assert metrics["sim/events_per_second_reference_200_hz"] > metrics["sim/events_per_second_legacy_200_hz"]

@@ -8,8 +8,8 @@ import pytest
 from docs.browser import CHROMIUM, Browser, served
 from jobs import pipeline
 from jobs.evaluation.sweep import run as run_sweep
-from jobs.rollout import scheduler as flying
 from jobs.rollout.episodes import EPISODE
+from jobs.rollout.store import PartResult, SimulationAccuracy
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.provenance import REPOSITORY
 from jobs.tracking.pages import (
@@ -27,6 +27,7 @@ from jobs.tracking.pages import (
 from jobs.tracking.store import dashboard_command, server_command
 from jobs.tracking.tracker import open_store
 from tests.support.configs import sweep_config
+from tests.support.fake_executor import FakeExecutor
 from tests.support.policies import save_training
 
 PAGE = Page(
@@ -82,21 +83,13 @@ def test_pictures_of_a_page_are_narrowed_and_never_enlarged(tmp_path, given, kep
     assert preview((tmp_path / "large.png").read_bytes()).size == kept
 
 
-class CrashingTuner:
-    """Tune without flights: the policy hits something everywhere, a bound nowhere."""
-
-    def __init__(self, folder, missing, measured, keep):
-        self.missing, self.keep = missing, keep
-
-    def fit(self):
-        for cell in self.missing:
-            rows = np.zeros(len(cell.seeds), EPISODE)
-            rows["seed"], rows["distance_m"] = cell.seeds, 50.0
-            rows["collision"] = cell.entry.training is not None
-            rows["success"] = ~rows["collision"]
-            result = {"key": cell.key, "label": list(cell.label), "simulation": cell.simulation}
-            result |= {"accuracy": {"event_error": 0.01, "renders_per_step": 3.0}, "encoder": {}}
-            self.keep.on_trial_result(1, [], None, {**result, "episodes": rows.tolist()})
+def crashed(part):
+    """The policy hits something everywhere, a baseline nowhere."""
+    episodes = np.zeros(len(part.task.seeds), EPISODE)
+    episodes["seed"], episodes["distance_m"] = part.task.seeds, 50.0
+    episodes["collision"] = part.task.policy.training is not None
+    episodes["success"] = ~episodes["collision"]
+    return PartResult(episodes, {}, SimulationAccuracy(0.01, 3.0))
 
 
 def evaluated_training(config) -> Run:
@@ -119,10 +112,7 @@ def store(tmp_path_factory):
     config = sweep_config(place, policies=["straight"], reference="straight", axes=axes)
     folder = evaluated_training(config)
     settings = dataclasses.replace(config.sweep, policies=[str(folder.policy), "straight"])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flying, "_tuner", CrashingTuner)
-        patch.setattr(flying, "start_ray", lambda *given: None)
-        run_sweep(dataclasses.replace(config, sweep=settings))
+    run_sweep(dataclasses.replace(config, sweep=settings), FakeExecutor(crashed))
     uri = f"sqlite:///{place / 'mlflow.db'}"
     client, experiment = open_store(uri, config.tracking.experiment)
     (training,) = client.search_runs([experiment], "tags.kind = 'run'")

@@ -12,7 +12,7 @@ from jobs.run.folder import finish, locate_run, open_run
 from jobs.training import collect
 from jobs.training.collect import FLIGHT_GAP_US, check_policy, record
 from tests.support.configs import small_config
-from tests.support.policies import save_untrained
+from tests.support.policies import kinds, save_untrained
 
 
 def flights(**fields):
@@ -78,7 +78,7 @@ def test_a_resumed_job_works_with_the_stored_settings(tmp_path):
     assert read_recording(stored.data / "train.h5").about["seed"] == stored.config.seed
 
 
-@pytest.fixture(scope="module", params=["bytestream", "event_image", "rgb"])
+@pytest.fixture(scope="module", params=kinds(["bytestream", "event_image", "rgb"]))
 def policy(request, tmp_path_factory):
     return save_untrained(tmp_path_factory.mktemp("flown") / "policy", name=request.param)
 

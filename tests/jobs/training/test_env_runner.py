@@ -10,7 +10,7 @@ import torch
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
-from jobs.rollout.drift import FIGURES, drift_figures
+from jobs.rollout.diagnostics import DRIFT_METRICS, drift_metrics
 from jobs.training.env_runner import FlightError, PlainEnvRunner
 from jobs.training.ppo import build_ppo
 from models.encoder.weights import load_encoder
@@ -159,11 +159,6 @@ def test_any_other_error_ends_the_process_as_rllib_has_it():
         runner.apply(lambda runner: runner.no_such_method())
 
 
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory):
-    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
-
-
 @pytest.fixture
 def encoded_runner(encoder):
     runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), encoder), worker_index=0)
@@ -223,18 +218,18 @@ def drift_of(runner, rounds=1):
         metrics = {
             name: getattr(value, "peek", lambda: math.nan)() for name, value in runner.get_metrics().items()
         }
-        told = {name: metrics[name] for name in FIGURES if not math.isnan(metrics.get(name, math.nan))}
+        told = {name: metrics[name] for name in DRIFT_METRICS if not math.isnan(metrics.get(name, math.nan))}
     return told, samples
 
 
 def test_drift_is_measured_every_tenth_round_on_what_the_policy_met(encoded_runner, encoder):
     first, _ = drift_of(encoded_runner)
     evae, about = load_encoder(encoder)
-    expected = drift_figures(evae, encoded_runner.module.met, {"reconstruction_step": 0.5})
+    expected = drift_metrics(evae, encoded_runner.module.met, {"reconstruction_step": 0.5})
     assert first == pytest.approx(expected | {"drift": expected["policy_reconstruction"] / 0.5})
     assert about["figures"] == {"reconstruction_step": 0.5}
     assert drift_of(encoded_runner)[0] == drift_of(encoded_runner, 8)[0] == {}
-    assert set(drift_of(encoded_runner)[0]) == set(FIGURES)
+    assert set(drift_of(encoded_runner)[0]) == set(DRIFT_METRICS)
 
 
 def test_without_its_file_an_encoder_is_flown_but_not_measured_and_nothing_else_changes(

@@ -18,7 +18,6 @@ from models.policy import load_policy, save_policy
 from models.policy.features import feature_of
 from tests.support.configs import SHORT, make_config
 from tests.support.policies import kinds
-from tests.support.runs import write_encoder
 
 FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "rgb", "finetuned")
 CNN_WEIGHTS = 32 * (3 * 64 + 1) + 64 * (32 * 16 + 1) + 64 * (64 * 9 + 1) + 512 * (1024 + 1)
@@ -32,11 +31,6 @@ WEIGHTS = {
     "event_image": CNN_WEIGHTS + 512 * 4 + 4,
     "rgb": CNN_WEIGHTS + 512 * 4 + 4,
 }
-
-
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory):
-    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
 
 
 def make_own(name, *overrides):

@@ -126,7 +126,7 @@ def test_training_explains_windows_of_flights_that_it_never_saw(recording):
     untrained = EventVAE(context=64, latent=32, target="occupancy")
     held_out = held_out_windows(unseen, SETTINGS, untrained.grid)
     before = held_out_figures(untrained, held_out)
-    after = held_out_figures(trained(recording, 150).evae, held_out)
+    after = held_out_figures(trained(recording, 40).evae, held_out)
     assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]
     assert after["explained_four_steps"] > before["explained_four_steps"]
 
@@ -153,12 +153,12 @@ def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_pat
         config,
         model=dataclasses.replace(config.model, context=64),
         collect=dataclasses.replace(config.collect, num_steps=200, num_validation_steps=100),
-        pretrain=dataclasses.replace(config.pretrain, iterations=100, validate_every=50, beta=weight),
+        pretrain=dataclasses.replace(config.pretrain, iterations=40, validate_every=20, beta=weight),
     )
     folder, listener = open_run(config), Listener()
     file = prepare_encoder(config, folder, listener)
     figures = [figures for step, figures in listener.logged.items() if step > 0]
-    assert sorted(listener.logged) == [0, 50, 100]
+    assert sorted(listener.logged) == [0, 20, 40]
     assert figures[-1]["evae/collapsed"] == dead
     assert load_encoder(file)[1]["figures"]["collapsed"] == dead
     assert capsys.readouterr().out.count("posterior collapse") == dead  # once

@@ -19,14 +19,8 @@ from jobs.training.ppo import FlightMetrics
 from jobs.training.train import TrainingError, read_metrics, reported_so_far
 from models.policy import load_policy
 from tests.support.configs import TINY, make_config
-from tests.support.runs import write_encoder
 
 ROOT = Path(__file__).resolve().parents[3]
-
-
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory):
-    return write_encoder(tmp_path_factory.mktemp("encoder"), make_config())
 
 
 def result(**learner):

@@ -1,0 +1,174 @@
+"""Policies by name: the folder that a name stands for, what it says, and its sensor in training."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from envs.config import EnvConfig, sensor_differences, settings_hash
+from jobs.config.config import Config, ConfigError
+from jobs.config.env_keys import ENV_KEYS, env_with
+from jobs.rollout.agents import BASELINES
+from jobs.run.folder import Run, latest_policies, named_policy
+from jobs.run.provenance import REPOSITORY
+from models.kinds import find_kind
+from models.policy.policy import MANIFEST
+
+PRETRAINED = REPOSITORY / "models" / "pretrained"
+SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
+Differences = dict[str, tuple[object, object]]  # sensor setting -> (the policy's value, the environment's)
+
+
+@dataclass(frozen=True)
+class EvaluatedPolicy:
+    """A policy or a baseline that is evaluated.
+
+    Attributes:
+        agent: Path of a policy folder, or a baseline's name.
+        group: What was trained; policies of one group differ in their training seed alone.
+        training: The training seed; None for a baseline.
+        identity: Hash of its manifest, which holds the SHA-256 sums of its files.
+        sensor: Sensor settings that it was trained with; none for a baseline.
+        observation: What it sees, as `envs.config.EnvConfig` names it.
+    """
+
+    agent: str
+    group: str
+    training: int | None
+    identity: str
+    sensor: Mapping[str, Any]
+    observation: str
+
+    @property
+    def name(self) -> str:
+        """Group and training: "bytestream s0"."""
+        return self.group if self.training is None else f"{self.group} s{self.training}"
+
+
+def read_policy(agent: str) -> EvaluatedPolicy:
+    """What a policy folder says about itself; a baseline has only its name.
+
+    Raises:
+        ConfigError: If the folder's manifest lacks what tells one training from another.
+    """
+    if agent in BASELINES:
+        return EvaluatedPolicy(agent, agent, None, agent, {}, "none")
+    manifest = json.loads((Path(agent) / MANIFEST).read_text())
+    missing = [name for name in ("name", "seed", "sensor") if name not in manifest]
+    if missing:
+        raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")
+    group = str(manifest.get("exp", manifest["name"]))
+    identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
+    return EvaluatedPolicy(agent, group, int(manifest["seed"]), identity, manifest["sensor"], observation)
+
+
+def find_policy(config: Config, run: Run) -> EvaluatedPolicy:
+    """The policy of a run folder, or else the newest one of its model.
+
+    Raises:
+        ConfigError: If there is none; the message names the models that have one.
+    """
+    if (run.policy / MANIFEST).is_file():
+        return read_policy(str(run.policy))
+    name, newest = run.config.model.name, latest_policies(config.runs_dir)
+    if name not in newest:
+        where = f"no trained policy of {name} in {str(Path(config.runs_dir).resolve())!r}"
+        others = f" (there is one of {', '.join(sorted(newest))}: take model=)" if newest else ""
+        train = "run python -m platform.launch +exp=bytestream"
+        raise ConfigError(f"{where}{others}: {train} model={name}")
+    return read_policy(str(newest[name]))
+
+
+def find_policies(
+    key: str, name: str, config: Config, run: Run, pretrained: Path = PRETRAINED
+) -> list[EvaluatedPolicy]:
+    """The policies and baselines that a name stands for.
+
+    A group of published policies, such as bytestream, stands for all its trainings: bytestream-s0, -s1, ..
+
+    Args:
+        key: Where the configuration has the name, for messages.
+        name: "pretrained", "newest", a baseline, a folder, or a name in `pretrained`.
+        config: The experiment.
+        run: Its run folder.
+        pretrained: The folder of the published policies.
+
+    Raises:
+        ConfigError: If there is no such policy.
+    """
+    published = sorted(path.parent for path in pretrained.glob(f"*/{MANIFEST}"))
+    if name == "pretrained":
+        if not published:
+            raise ConfigError(
+                f"{key}: 'pretrained' means the policies in {str(pretrained)!r}, which holds none; "
+                f"train one (python -m platform.launch +exp=bytestream) and name it: {key}=[newest]"
+            )
+        return [read_policy(str(path)) for path in published]
+    if name == "newest":
+        return [find_policy(config, run)]
+    if name in BASELINES:
+        return [read_policy(name)]
+    path = named_policy(name) or named_policy(str(pretrained / name))
+    if path is not None:
+        return [read_policy(str(path))]
+    trainings = [path for path in published if re.fullmatch(re.escape(name) + r"-s\d+", path.name)]
+    if not trainings:
+        places = "a name or a group in models/pretrained, a policy folder or a run folder"
+        raise ConfigError(
+            f"{key}: must be 'pretrained', 'newest', one of {tuple(BASELINES)}, {places}, got {name!r}"
+        )
+    return [read_policy(str(path)) for path in trainings]
+
+
+def find_sweep_policies(
+    config: Config, run: Run, pretrained: Path = PRETRAINED
+) -> tuple[EvaluatedPolicy, ...]:
+    """The policies that `sweep.policies` names, each once, groups together in the order of the names.
+
+    Raises:
+        ConfigError: If there is no such policy, or two have the same group and training seed.
+    """
+    named = [
+        policy
+        for name in config.sweep.policies
+        for policy in find_policies("sweep.policies", name, config, run, pretrained)
+    ]
+    policies = list({policy.identity: policy for policy in named}.values())
+    first: dict[str, EvaluatedPolicy] = {}
+    for policy in policies:
+        other = first.setdefault(policy.name, policy)
+        if other is not policy:
+            raise ConfigError(
+                f"sweep.policies: two policies are {policy.group} with training seed {policy.training}, got "
+                f"{other.agent!r} and {policy.agent!r}; leave one out, or train one with another seed"
+            )
+    order = list(dict.fromkeys(policy.group for policy in policies))
+    return tuple(sorted(policies, key=lambda policy: (order.index(policy.group), policy.training or 0)))
+
+
+def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
+    """The simulation with the sensor settings of a manifest, named as `sensor_settings` names them.
+
+    Raises:
+        pydantic.ValidationError: If a setting is unknown or its value is out of range.
+    """
+    return env_with(env, {SENSOR_KEYS.get(name, name): value for name, value in sensor.items()})
+
+
+def own_sensor_differences(policy: EvaluatedPolicy, env: EnvConfig) -> Differences:
+    """Where the sensor that a policy was trained with is not the environment's; nothing for a baseline."""
+    return sensor_differences(dict(policy.sensor), env) if policy.sensor else {}
+
+
+def check_sensor(sensor: Mapping[str, Any], env: EnvConfig) -> None:
+    """Check that the environment has the sensor that a policy was trained with.
+
+    Raises:
+        ValueError: If they differ; both values are named.
+    """
+    differ = sensor_differences(dict(sensor), env)
+    if differ:
+        got = "; ".join(f"{key} = {ours!r} instead of {theirs!r}" for key, (theirs, ours) in differ.items())
+        raise ValueError(f"the sensor must be the policy's, got {got}; the sweep job evaluates such changes")

@@ -1,0 +1,136 @@
+"""Where the episodes of evaluation tasks are kept, so that a stopped job continues from them."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jobs.rollout.episodes import EPISODE
+from jobs.rollout.tasks import EvaluationTask
+from jobs.run.files import RunError, read_json, write_json
+from jobs.run.progress import console
+
+
+@dataclass(frozen=True)
+class SimulationAccuracy:
+    """How exact a simulation is: its event error [-], and the renders per control step that it takes."""
+
+    event_error: float
+    renders_per_step: float
+
+
+@dataclass(frozen=True)
+class PartResult:
+    """What came of a part of a task.
+
+    Attributes:
+        episodes: EPISODE of its seeds.
+        drift: `drift_metrics` of the policy's encoder; empty without one.
+        accuracy: Of its simulation, if it was measured.
+    """
+
+    episodes: np.ndarray
+    drift: dict[str, float]
+    accuracy: SimulationAccuracy | None = None
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """What is stored of a task.
+
+    Attributes:
+        episodes: EPISODE, by seed.
+        drift: `drift_metrics` of the policy's encoder in the part with the lowest seeds.
+        commits: Of the code that evaluated it, sorted.
+        restarts: How many processes ended before they had evaluated a part of it.
+    """
+
+    episodes: np.ndarray
+    drift: dict[str, float]
+    commits: tuple[str, ...]
+    restarts: int
+
+
+class EpisodeStore:
+    """A folder with a JSON file for each task, and one for the accuracy of each simulation.
+
+    A damaged file is put aside, and its task is evaluated again.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Keep them in `folder`, which is made when the first is added."""
+        self.folder = folder
+
+    def missing(self, task: EvaluationTask) -> EvaluationTask:
+        """The task with only those seeds whose episodes are not stored."""
+        stored = self._read(task.key)
+        seeds = set() if stored is None else set(stored.episodes["seed"].tolist())
+        return dataclasses.replace(task, seeds=tuple(seed for seed in task.seeds if seed not in seeds))
+
+    def add(self, part: EvaluationTask, result: PartResult, commit: str, restarts: int = 0) -> None:
+        """Store the result of a part beside the episodes that its task has already.
+
+        Args:
+            part: What was evaluated.
+            result: What came of it.
+            commit: Of the code that evaluated it.
+            restarts: How many processes ended since the last part of this task was stored.
+        """
+        before, new = self._read(part.key), result.episodes
+        merged = TaskResult(new, result.drift, (commit,), restarts)
+        if before is not None and before.episodes.size:
+            others = before.episodes[~np.isin(before.episodes["seed"], new["seed"])]
+            merged = TaskResult(
+                np.sort(np.concatenate([others, new]), order="seed"),
+                before.drift if before.episodes["seed"].min() < new["seed"][0] else result.drift,
+                tuple(sorted({*before.commits, commit})),
+                before.restarts + restarts,
+            )
+        values = {
+            "label": [*part.condition, *part.policy.name.split()],
+            "commits": merged.commits,
+            "encoder": merged.drift,
+            "restarts": merged.restarts,
+            "episodes": merged.episodes.tolist(),
+        }
+        write_json(self._file(part.key), values)
+        if result.accuracy is not None:
+            write_json(self._accuracy_file(part), dataclasses.asdict(result.accuracy))
+
+    def result(self, task: EvaluationTask) -> TaskResult:
+        """What is stored of a task, with the episodes of its seeds in their order.
+
+        Raises:
+            KeyError: If episodes are missing.
+        """
+        stored = self._read(task.key)
+        if stored is None:
+            raise KeyError(f"no episodes are stored of {task.name} ({self._file(task.key)})")
+        places = {int(seed): place for place, seed in enumerate(stored.episodes["seed"])}
+        return dataclasses.replace(stored, episodes=stored.episodes[[places[seed] for seed in task.seeds]])
+
+    def accuracy(self, task: EvaluationTask) -> SimulationAccuracy | None:
+        """How exact a task's simulation is; None if that was not measured."""
+        file = self._accuracy_file(task)
+        return SimulationAccuracy(**read_json(file)) if file.is_file() else None
+
+    def _file(self, key: str) -> Path:
+        return self.folder / "episodes" / f"{key}.json"
+
+    def _accuracy_file(self, task: EvaluationTask) -> Path:
+        return self.folder / "accuracy" / f"{task.simulation}.json"
+
+    def _read(self, key: str) -> TaskResult | None:
+        """All that is stored under a key; None if there is nothing, or if it is damaged."""
+        file = self._file(key)
+        if not file.is_file():
+            return None
+        try:
+            values = read_json(file)
+            episodes = np.array([tuple(row) for row in values["episodes"]], EPISODE)
+            return TaskResult(episodes, values["encoder"], tuple(values["commits"]), values["restarts"])
+        except (RunError, KeyError, TypeError, ValueError):
+            file.replace(file.with_suffix(".damaged"))
+            console.print(f"Damaged and put aside, evaluated again: {file}", markup=False)
+            return None
