@@ -4,7 +4,7 @@ A frozen event VAE was pretrained on other episodes than the policy's own. `drif
 reconstruction error of a pixel over windows of one control step that the policy met, divided by the
 same error over the held-out windows of one control step of the encoder's own recording: 1 where the
 policy meets what the encoder knows, 1.2 where a pixel's error is a fifth larger. A picture with more
-events has a larger error too; `policy_explained` and `policy_auc` say whether it is told from
+events has a larger error too; `policy_explained_loss` and `policy_auc` say whether it is told from
 others as well as before.
 """
 
@@ -25,7 +25,7 @@ from models.encoder.event_batch import batch_packed, cut_packed
 from models.encoder.weights import load_encoder
 from models.policy.policy import ENCODER
 
-DRIFT_METRICS = ("policy_reconstruction", "policy_kl", "policy_explained", "policy_auc", "drift")
+DRIFT_METRICS = ("policy_reconstruction", "policy_kl", "policy_explained_loss", "policy_auc", "drift")
 MAX_WINDOWS = 512
 
 
@@ -101,13 +101,13 @@ def drift_metrics(
         held_out: The encoder's own metrics, of its manifest.
 
     Returns:
-        `policy_reconstruction`, `policy_kl`, `policy_explained` and `policy_auc` as
+        `policy_reconstruction`, `policy_kl`, `policy_explained_loss` and `policy_auc` as
         `models.encoder.evae.validate` defines them, and `drift` where the encoder's own error of one
         control step is known.
     """
     batch = batch_packed(windows, evae.grid)
     values = validate(evae, batch, event_targets(batch, evae.target))
-    metrics = {f"policy_{name}": values[name] for name in ("reconstruction", "kl", "explained", "auc")}
+    metrics = {f"policy_{name}": values[name] for name in ("reconstruction", "kl", "explained_loss", "auc")}
     own = held_out.get("reconstruction_step", 0.0)
     return metrics | ({"drift": values["reconstruction"] / own} if own > 0 else {})
 

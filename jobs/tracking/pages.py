@@ -27,7 +27,7 @@ METRICS = {  # metric: what it is, how it is written
     "eval/success_rate": ("success in held-out corridors", "{:.0%}"),
     "eval/distance_m": ("distance without collision", "{:.1f} m"),
     "train/success_rate": ("success in training", "{:.0%}"),
-    "evae/explained_step": ("reconstruction explained by the latent", "{:.0%}"),
+    "evae/explained_loss_step": ("reconstruction explained by the latent", "{:.0%}"),
     "sweep/conditions": ("", "{:.0f} conditions"),
     "sweep/groups": ("", "{:.0f} groups of policies"),
     "sweep/episodes": ("", "{:.0f} episodes"),

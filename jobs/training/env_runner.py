@@ -1,14 +1,14 @@
-"""RLlib's environment runner with all flights of a process in one loop over arrays.
+"""RLlib's environment runner with all episodes of a process in one loop over arrays.
 
 RLlib appends each number of each step to the object of its episode and sends every step through
-two pipelines of connectors, which takes longer than to simulate it. Here the steps of all
-corridors are kept as arrays, and the episodes are cut out of them at the end: the same flights
-as RLlib's own runner with connectors that stack features (`test_env_runner.py` compares the
+two pipelines of connectors, which takes longer than simulating it. Here the steps of all
+corridors are kept as arrays, and the episodes are cut out of them at the end: the same episodes
+as from RLlib's own runner with connectors that stack features (`test_env_runner.py` compares the
 bytes).
 
-What a policy keeps of a step (`models.policy.features`) is made exactly once, when it is shown, and the
-stack of the last ones takes the observation's place: PPO's epochs and its bootstrap values see
-stacks, and a raw window never leaves the process that flew.
+The features of a step (`models.policy.features`) are computed exactly once, and the stack of the
+last ones replaces the observation: PPO's epochs and its bootstrap values read stacks, and a raw
+window never leaves the env runner.
 """
 
 import uuid
@@ -24,13 +24,14 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from jobs.run.watchdog import ending_after
+from jobs.training.rllib_internals import ENV_RUNNER, require
 from models.policy.features import push_features
 
-MAX_SAMPLE_S = 900.0  # a process that flies compiles for a minute first, on a busy machine for several
+MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
 
 
 class Step(NamedTuple):
-    """One step of all N flights, each an array (N, ...).
+    """One step of all N episodes, each an array (N, ...).
 
     Attributes:
         stacks: What the policy saw before it.
@@ -38,10 +39,10 @@ class Step(NamedTuple):
         logits: What it drew them from, float32 (N, actions).
         logp: Logarithm of the probability of each action, float32.
         rewards: True ones, float64.
-        terminated: Whether the flight ended by contact or goal.
-        truncated: Whether the flight ended by its time limit.
+        terminated: Whether the episode ended by contact or goal.
+        truncated: Whether the episode ended by its time limit.
         infos: The environments', each value an array.
-        over: Where the environment was reset instead of flown.
+        over: Where the environment was reset instead of stepped.
     """
 
     stacks: np.ndarray
@@ -55,8 +56,8 @@ class Step(NamedTuple):
     over: np.ndarray
 
 
-class FlightError(RuntimeError):
-    """What the simulation or the policy raised in a process that flies."""
+class RolloutError(RuntimeError):
+    """An error of the simulation or the policy in an env runner."""
 
 
 def one_line(error: Exception) -> str:
@@ -65,7 +66,7 @@ def one_line(error: Exception) -> str:
 
 
 class Raised:
-    """A sample that could not be flown, on its way to the process that learns, where it raises."""
+    """Stands for the samples of an env runner that failed; re-raises its error in the learner process."""
 
     def __init__(self, reason: str) -> None:
         """Remember why."""
@@ -73,14 +74,14 @@ class Raised:
 
     def __getitem__(self, index: int) -> Any:
         """Raise it."""
-        raise FlightError(self.reason)
+        raise RolloutError(self.reason)
 
 
 class PlainEnvRunner(SingleAgentEnvRunner):
-    """Flies the corridors of one process, whose module makes the features, without connectors.
+    """Rolls out the episodes of one process, without connectors; its module computes the features.
 
-    RLlib starts a process anew that has ended or hangs, and that is right. It would also do so
-    where the code raised, hide the reason in a log, and meet the same again: that is told instead.
+    RLlib restarts an env runner that died or hangs, which is right. It would also restart one whose
+    code raised, hide the reason in a log, and fail the same way again: such an error is passed on.
     """
 
     _needs_initial_reset: bool
@@ -89,12 +90,13 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     def __init__(self, **settings: Any) -> None:
         """Build the environments and the policy.
 
-        In a process of its own what that raises is kept for whoever asks for anything: RLlib would go on
-        without the process, and fail for lack of it.
+        In a process of its own an error is kept and raised by the next call: RLlib would otherwise go
+        on without the env runner, and fail for lack of it.
         """
         self._refused = ""
         try:
             super().__init__(**settings)
+            require(self, ENV_RUNNER)
         except Exception as error:
             if not settings.get("worker_index"):
                 raise
@@ -109,33 +111,33 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         """As RLlib's, which asks this first.
 
         Raises:
-            FlightError: The process could not be built.
+            RolloutError: The process could not be built.
         """
         if self._refused:
-            raise FlightError(self._refused)
+            raise RolloutError(self._refused)
         return super().get_spaces()
 
     def sample(self, **asked: Any) -> list[SingleAgentEpisode]:
-        """Fly as asked, in less than `MAX_SAMPLE_S`.
+        """Roll out as asked, in less than `MAX_SAMPLE_S`.
 
         Raises:
-            FlightError: With the type and text of whatever was raised.
+            RolloutError: With the type and text of whatever was raised.
         """
         if self._refused:
-            raise FlightError(self._refused)
+            raise RolloutError(self._refused)
         try:
             with ending_after(MAX_SAMPLE_S):
                 return super().sample(**asked)
         except Exception as error:
-            raise FlightError(one_line(error)) from error
+            raise RolloutError(one_line(error)) from error
 
     def apply(self, func: Callable[..., Any], *values: Any, **named: Any) -> Any:
-        """As RLlib's, which ends the process where `func` raises; but a flight's error is handed on."""
+        """As RLlib's, which ends the process where `func` raises; but a rollout's error is passed on."""
 
         def handed_on(runner: Any, *values: Any, **named: Any) -> Any:
             try:
                 return func(runner, *values, **named)
-            except FlightError as error:
+            except RolloutError as error:
                 return Raised(str(error))
 
         return super().apply(handed_on, *values, **named)
@@ -149,34 +151,34 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         random_actions: bool = False,
         force_reset: bool = False,
     ) -> list[SingleAgentEpisode]:
-        """Fly at least `num_timesteps` steps, all corridors in lock-step.
+        """Roll out at least `num_timesteps` steps, all episodes in lock-step.
 
         Returns:
-            The flights that ended, in the order in which they did, then the pieces of those
+            The episodes that ended, in the order in which they did, then the pieces of those
             that go on; observations are stacks of features.
 
         Raises:
             ValueError: Something else was asked than steps of the policy's drawn actions.
         """
         if num_timesteps is None or random_actions or not explore:
-            raise ValueError("PlainEnvRunner flies num_timesteps of drawn actions and nothing else")
+            raise ValueError("PlainEnvRunner rolls out num_timesteps of drawn actions and nothing else")
         if force_reset or self._needs_initial_reset:
-            self._take_off()
+            self._reset_all()
         steps: list[Step] = []
-        flown = 0
-        while flown < num_timesteps:
+        taken = 0
+        while taken < num_timesteps:
             steps.append(self._step())
-            flown += int((~steps[-1].over).sum())
+            taken += int((~steps[-1].over).sum())
         done, going_on = self._cut(steps)
         self._done_episodes_for_metrics.extend(done)
         for piece in going_on:
             self._ongoing_episodes_for_metrics[piece.id_].append(piece)
-        self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=flown)
-        self._increase_sampled_metrics(flown, len(done))
+        self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=taken)
+        self._increase_sampled_metrics(taken, len(done))
         return done + going_on
 
-    def _take_off(self) -> None:
-        """Start every flight anew; those that were in the air are forgotten."""
+    def _reset_all(self) -> None:
+        """Start every episode anew; unfinished ones are dropped."""
         seed = self._seed if self._needs_initial_reset else None
         observations, infos = self.env.unwrapped.reset(seed=seed)
         features = self.module.features(observations)
@@ -184,13 +186,13 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         first = np.ones(len(features), bool)
         self._stacks = push_features(np.empty(shape, features.dtype), features, first)
         self._infos, self._over = infos, ~first
-        self._flights = [(uuid.uuid4().hex, 0) for _ in features]  # name, steps so far
+        self._episodes = [(uuid.uuid4().hex, 0) for _ in features]  # name, steps so far
         self._ongoing_episodes_for_metrics = defaultdict(list)
         self._needs_initial_reset = False
 
     @torch.no_grad()
     def _step(self) -> Step:
-        """Decide and fly one step everywhere; flights that are over start anew instead."""
+        """One step of every episode; those that are over start anew instead."""
         stacks, over = self._stacks, self._over
         logits = self.module._forward({Columns.OBS: torch.from_numpy(stacks)})[Columns.ACTION_DIST_INPUTS]
         chances = torch.softmax(logits, dim=-1)
@@ -203,7 +205,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return Step(stacks, actions, logits, logp, rewards, terminated, truncated, infos, over)
 
     def _cut(self, steps: list[Step]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
-        """The flights that ended in these steps, and the pieces of those that go on."""
+        """The episodes that ended in these steps, and the pieces of those that go on."""
         over = np.stack([step.over for step in steps])
         ended = np.stack([step.terminated | step.truncated for step in steps])
         stacks = np.stack([*(step.stacks for step in steps), self._stacks])
@@ -218,8 +220,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         for row in range(over.shape[1]):
             first = 0
             for last in [*np.flatnonzero(ended[:, row]), len(steps)]:
-                if over[first : first + 1, row].any():  # reset here: the flight begins after it
-                    self._flights[row] = uuid.uuid4().hex, 0
+                if over[first : first + 1, row].any():  # reset here: the episode begins after it
+                    self._episodes[row] = uuid.uuid4().hex, 0
                     first += 1
                 end = min(last + 1, len(steps))
                 if end > first:
@@ -242,9 +244,9 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     def _episode(
         self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: list[dict[str, Any]]
     ) -> SingleAgentEpisode:
-        """A piece of the flight in a row, which is that much longer then."""
-        name, begun = self._flights[row]
-        self._flights[row] = name, begun + len(columns["actions"])
+        """The next piece of the episode in a row."""
+        name, begun = self._episodes[row]
+        self._episodes[row] = name, begun + len(columns["actions"])
         return SingleAgentEpisode(
             name,
             observations=InfiniteLookbackBuffer(stacks),

@@ -69,7 +69,7 @@ LITTLE = 0.1  # of a core, for a process that waits most of the time; RLlib cann
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 
 
-class FlightMetrics(RLlibCallback):
+class EpisodeMetrics(RLlibCallback):
     """What flights look like, read off the environments' infos; rewards are the true ones.
 
     An iteration ends two or three flights, so their figures are means over the last `EPISODES`. Flights
@@ -142,7 +142,7 @@ class FlightMetrics(RLlibCallback):
 def outcome(info: Mapping[str, Any], episode_return: float) -> dict[str, float]:
     """The figures of a flight that has ended, from its last info."""
     return {
-        "flight_return": episode_return,
+        "episode_return": episode_return,
         "success_rate": float(info["success"]),
         "collision_rate": float(info["collision"]),
         "distance_m": float(info["distance_m"]),
@@ -205,7 +205,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             grad_clip_by="global_norm",
         )
         .rl_module(rl_module_spec=spec)
-        .callbacks(FlightMetrics)
+        .callbacks(EpisodeMetrics)
         .reporting(metrics_num_episodes_for_smoothing=EPISODES)
         .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
         .debugging(seed=config.seed, log_level="ERROR")

@@ -4,7 +4,7 @@ The value targets, the loss, its gradient and the optimiser are RLlib's (`test_p
 compares them, and the weights after an update). Around each minibatch of 32 steps RLlib slices,
 dispatches, times and logs, which takes longer than the gradient of two small networks; here that
 is done once per iteration, and no pipeline of connectors makes the batch. RLlib appends a row to
-each flight to bootstrap its value: it masks that row in the loss, but counts it in minibatches
+each episode to bootstrap its value: it masks that row in the loss, but counts it in minibatches
 and in the mean and deviation of the advantages. Here it is in neither.
 """
 
@@ -26,6 +26,8 @@ from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
+from jobs.training.rllib_internals import LEARNER, require
+
 READ = (
     Columns.OBS,
     Columns.ACTIONS,
@@ -44,7 +46,7 @@ REWARD_SCALE = (
 def advantages(
     values: np.ndarray, rewards: np.ndarray, terminated: bool, gamma: float, lambda_: float
 ) -> np.ndarray:
-    """Generalised advantage estimates of a piece of a flight (Schulman et al. 2016), float64 (T,).
+    """Generalised advantage estimates of a piece of an episode (Schulman et al. 2016), float64 (T,).
 
     Args:
         values: Of its T + 1 observations, (T + 1,).
@@ -61,6 +63,11 @@ def advantages(
 
 class PlainPPOLearner(PPOTorchLearner):
     """PPO for one module with discrete actions, without the divergence penalty, on one device."""
+
+    def build(self) -> None:
+        """As RLlib's."""
+        super().build()
+        require(self, LEARNER)
 
     def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
         """Adam with all its steps in one call."""
@@ -85,12 +92,12 @@ class PlainPPOLearner(PPOTorchLearner):
         """All epochs over the steps of one iteration, shuffled in each.
 
         Args:
-            training_data: Flights, as RLlib hands them over; or else
-            episodes: the flights themselves.
+            training_data: Episodes, as RLlib hands them over; or else
+            episodes: the episodes themselves.
             timesteps: Counters that schedules follow.
             num_epochs: Passes over the steps.
             minibatch_size: Steps per gradient; None: all.
-            kwargs: RLlib's other wishes, which concern other kinds of data.
+            kwargs: RLlib's other arguments, for other kinds of data.
 
         Returns:
             Metrics, as RLlib's learner returns them; losses are means over the last epoch.
@@ -117,12 +124,12 @@ class PlainPPOLearner(PPOTorchLearner):
         return self.metrics.reduce()
 
     def _threads(self) -> int:
-        """Those of the processes that fly, which wait meanwhile; one for networks too small to share."""
+        """As many as there are env runners, which wait meanwhile; one for networks too small to share."""
         large = any(True for _ in self.module[DEFAULT_MODULE_ID].unwrapped().trunk.parameters())
         return max(1, min(self.config.num_env_runners, os.cpu_count() or 1)) if large else 1
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
-        """The steps of all flights, one after the other, with what the loss compares them to."""
+        """The steps of all episodes, one after the other, with the targets of the loss."""
         config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
         scale = config.learner_config_dict.get(REWARD_SCALE, 1.0)
         shown = [np.asarray(episode.get_observations()) for episode in episodes]
@@ -131,22 +138,22 @@ class PlainPPOLearner(PPOTorchLearner):
         values = module.compute_values({Columns.OBS: torch.from_numpy(stacks)}).numpy()
         estimates = [
             advantages(
-                of_flight, scale * episode.get_rewards(), episode.is_terminated, config.gamma, config.lambda_
+                of_episode, scale * episode.get_rewards(), episode.is_terminated, config.gamma, config.lambda_
             )
-            for of_flight, episode in zip(np.split(values, ends[:-1]), episodes, strict=True)
+            for of_episode, episode in zip(np.split(values, ends[:-1]), episodes, strict=True)
         ]
-        flown = np.ones(len(stacks), bool)
-        flown[ends - 1] = False
+        taken = np.ones(len(stacks), bool)
+        taken[ends - 1] = False
         estimate = np.concatenate(estimates)
         standard = (estimate - estimate.mean()) / max(MIN_DEVIATION, estimate.std())
         columns = {
-            Columns.OBS: stacks[flown],
+            Columns.OBS: stacks[taken],
             Columns.ACTIONS: np.concatenate([episode.get_actions() for episode in episodes]),
             Columns.ACTION_LOGP: np.concatenate(
                 [episode.get_extra_model_outputs(Columns.ACTION_LOGP) for episode in episodes]
             ),
             Postprocessing.ADVANTAGES: standard.astype(np.float32),
-            Postprocessing.VALUE_TARGETS: (estimate + values[flown]).astype(np.float32),
+            Postprocessing.VALUE_TARGETS: (estimate + values[taken]).astype(np.float32),
         }
         return {name: torch.from_numpy(column) for name, column in columns.items()}
 

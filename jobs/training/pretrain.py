@@ -147,7 +147,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, Any]:
                 )
             if last or (iteration + 1) % settings.checkpoint_every == 0:
                 save_checkpoint(folder.encoder, training, iteration + 1)
-            measured = f", held out {latest['explained_step']:.0%} explained" if latest else ""
+            measured = f", held out {latest['explained_loss_step']:.0%} explained" if latest else ""
             advance(1, note=f"loss {losses['loss']:.4f}{measured}")
     return freeze(config, folder, tracker, evae, train.about, held_out)
 

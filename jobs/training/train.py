@@ -30,7 +30,7 @@ from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage
 from jobs.tracking.tracker import open_tracker
-from jobs.training.env_runner import FlightError
+from jobs.training.env_runner import RolloutError
 from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_about, policy_spec
 from jobs.training.pretrain import check_sources, prepare_encoder
 from models.encoder.weights import EncoderManifest, load_encoder
@@ -40,7 +40,7 @@ OnResult = Callable[[int, Mapping[str, float]], None]
 
 # Name in the tracker -> where RLlib's result has it.
 METRICS = {
-    "train/episode_return": ("env_runners", "flight_return"),
+    "train/episode_return": ("env_runners", "episode_return"),
     "train/episodes": ("env_runners", "num_episodes_lifetime"),
     "train/success_rate": ("env_runners", "success_rate"),
     "train/collision_rate": ("env_runners", "collision_rate"),
@@ -168,7 +168,7 @@ def stopped(error: Exception | str) -> str:
 def last_line(error: Exception | str) -> str:
     """The line of a worker's error that names its cause."""
     lines = str(error).strip().splitlines()
-    raised = f"{FlightError.__module__}.{FlightError.__qualname__}: "  # as Ray writes it before the message
+    raised = f"{RolloutError.__module__}.{RolloutError.__qualname__}: "  # as Ray writes it before the message
     return lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
 
 

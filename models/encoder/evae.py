@@ -229,7 +229,7 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
 
     Returns:
         reconstruction (mean error of a pixel), mean_picture (the same error for the targets' own
-        mean picture), explained (1 - reconstruction / mean_picture: 0 for a model that has learnt
+        mean picture), explained_loss (1 - reconstruction / mean_picture: 0 for a model that has learnt
         nothing of the single window, 1 for a perfect one, and 0 where all targets are the same;
         of "aged" none reaches 1: the cross entropy keeps the entropy of times between 0 and 1),
         auc (`ranking_area` of "the target is not 0" by the picture's magnitude), kl (mean over
@@ -249,7 +249,7 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
     return {
         "reconstruction": reconstruction,
         "mean_picture": mean_picture,
-        "explained": 1.0 - reconstruction / mean_picture if mean_picture > 0 else 0.0,
+        "explained_loss": 1.0 - reconstruction / mean_picture if mean_picture > 0 else 0.0,
         "auc": ranking_area(reconstruct(logits, evae.target).abs().numpy(), targets.numpy() != 0),
         "kl": kl_divergence(mu, logvar).mean().item(),
         "active_units": active_units(mu),
@@ -291,7 +291,7 @@ def collapsed(figures: Mapping[str, float]) -> bool:
         figures: Of `validate`.
     """
     silent = figures["active_units"] == 0 or figures["kl"] < EMPTY_KL
-    return silent and figures["explained"] < EMPTY_EXPLAINED
+    return silent and figures["explained_loss"] < EMPTY_EXPLAINED
 
 
 def active_units(mu: Tensor) -> float:

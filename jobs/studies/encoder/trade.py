@@ -135,7 +135,7 @@ def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
     rows = {name: side_by_side(models, conditions[name]) for name in SHOWN}
     publish_plot(folder, tracker, "trade/coding_pictures", plot_pictures(rows, ("events", *CODINGS) * 2))
     return {
-        f"evae/explained_{coding}_{name.replace(' ', '_')}": mean
+        f"evae/explained_r2_{coding}_{name.replace(' ', '_')}": mean
         for coding, own in spreads.items()
         for name, (mean, _) in own.items()
     }
@@ -162,7 +162,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
         for scene, batch in scenes.items()
     }
     publish_plot(folder, tracker, "trade/scenes", plot_pictures(rows, ("events", "decoded") * PICTURES))
-    return {f"evae/explained_in_{scene.replace(' ', '_')}": share for scene, share in shares.items()}
+    return {f"evae/explained_r2_in_{scene.replace(' ', '_')}": share for scene, share in shares.items()}
 
 
 @torch.no_grad()

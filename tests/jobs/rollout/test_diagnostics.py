@@ -45,7 +45,7 @@ def test_drift_metrics_are_those_of_the_windows_and_drift_is_the_ratio_to_the_en
 def test_windows_without_events_have_metrics_too(evae):
     metrics = drift_metrics(evae, [window(0)[:1]] * 2, {"reconstruction_step": 0.2})
     assert np.isfinite(list(metrics.values())).all()
-    assert (metrics["policy_auc"], metrics["policy_explained"]) == (0.5, 0.0)
+    assert (metrics["policy_auc"], metrics["policy_explained_loss"]) == (0.5, 0.0)
 
 
 @pytest.mark.parametrize("episodes", [1, 2, 3, 7, 8, 9, 10])

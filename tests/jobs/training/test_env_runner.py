@@ -11,7 +11,7 @@ from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 from jobs.rollout.diagnostics import DRIFT_METRICS, drift_metrics
-from jobs.training.env_runner import FlightError, PlainEnvRunner
+from jobs.training.env_runner import PlainEnvRunner, RolloutError
 from jobs.training.ppo import build_ppo
 from models.encoder.weights import load_encoder
 from models.kinds import KINDS
@@ -129,7 +129,7 @@ def test_a_reset_forgets_the_flights_in_the_air(tmp_path):
 )
 def test_what_it_cannot_fly_is_refused(asked, tmp_path):
     ours, theirs = make_runners("event_columns", tmp_path)
-    with pytest.raises(FlightError, match=r"ValueError: .*drawn actions and nothing else"):
+    with pytest.raises(RolloutError, match=r"ValueError: .*drawn actions and nothing else"):
         ours.sample(**asked)
     for runner in (ours, theirs):
         runner.stop()
@@ -142,13 +142,13 @@ class Broken(PlainEnvRunner):
         self.error = ValueError("episode 3, step 7, seed 0: the reward must be finite; got nan")
 
     def sample(self, **asked):
-        raise FlightError(f"ValueError: {self.error}")
+        raise RolloutError(f"ValueError: {self.error}")
 
 
 def test_what_a_flight_raises_is_raised_again_where_its_sample_is_used():
     sent = Broken().apply(lambda runner: (runner.sample(), runner.get_metrics()))
     received = pickle.loads(pickle.dumps(sent))
-    with pytest.raises(FlightError, match="step 7, seed 0: the reward must be finite; got nan"):
+    with pytest.raises(RolloutError, match="step 7, seed 0: the reward must be finite; got nan"):
         received[0]
 
 
@@ -186,10 +186,10 @@ def test_returns_are_reported_unscaled(encoded_runner):
     assert len(done) == len(begun)
     metrics = encoded_runner.get_metrics()
     metrics = {name: getattr(value, "peek", lambda value=value: value)() for name, value in metrics.items()}
-    assert metrics["flight_return"] == pytest.approx(np.sum(returns) / len(begun))
+    assert metrics["episode_return"] == pytest.approx(np.sum(returns) / len(begun))
     distances = [chunk.get_infos(-1)["distance_m"] for chunk in done]
     assert metrics["distance_m"] == pytest.approx(np.mean(distances))
-    assert metrics["flight_return"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
+    assert metrics["episode_return"] == pytest.approx(metrics["distance_m"])  # no bonus: truncated
     assert metrics["success_rate"] == metrics["collision_rate"] == 0.0
     assert metrics["dropped_events"] == 0.0
     assert metrics["events_per_step"] > 0.0

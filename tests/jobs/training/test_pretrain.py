@@ -128,7 +128,7 @@ def test_training_explains_windows_of_flights_that_it_never_saw(recording):
     before = held_out_figures(untrained, held_out)
     after = held_out_figures(trained(recording, 40).evae, held_out)
     assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]
-    assert after["explained_four_steps"] > before["explained_four_steps"]
+    assert after["explained_loss_four_steps"] > before["explained_loss_four_steps"]
 
 
 class Listener:

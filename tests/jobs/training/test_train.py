@@ -15,7 +15,7 @@ from ray.exceptions import ActorDiedError, RayTaskError
 
 from jobs.run.folder import open_run
 from jobs.training import train as training
-from jobs.training.ppo import FlightMetrics
+from jobs.training.ppo import EpisodeMetrics
 from jobs.training.train import TrainingError, read_metrics, reported_so_far
 from models.policy import load_policy
 from tests.support.configs import TINY, make_config
@@ -35,7 +35,7 @@ def result(**learner):
         "num_env_steps_sampled_lifetime": 4096,
         "env_runners": {
             "num_env_steps_sampled": 2048,
-            "flight_return": 12.5,
+            "episode_return": 12.5,
             "num_episodes_lifetime": 3,
         },
         "learners": {"default_policy": losses | learner},
@@ -110,7 +110,7 @@ def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_pa
     for errors in (
         (raised,),
         (lost, raised),
-        (raised.replace("ValueError", "jobs.training.env_runner.FlightError: KeyError"),),
+        (raised.replace("ValueError", "jobs.training.env_runner.RolloutError: KeyError"),),
     ):
         with pytest.raises(
             TrainingError, match=r"^training stopped: \w+Error: no; the same command continues"
@@ -223,11 +223,11 @@ class Logger(dict):
 @pytest.fixture
 def fly_round():
     """Hands one round of sampling to the metrics; what they say then."""
-    metrics, logger = FlightMetrics(), Logger()
+    metrics, logger = EpisodeMetrics(), Logger()
 
     def fly(*samples):
         metrics.on_sample_end(metrics_logger=logger, samples=list(samples))
-        return logger.get("flight_return"), logger.get("success_rate")
+        return logger.get("episode_return"), logger.get("success_rate")
 
     return fly
 

@@ -281,7 +281,7 @@ def test_windows_that_are_all_the_same_leave_nothing_to_explain():
     evae = small(target="occupancy").eval()
     empty = batch_windows([(events(), 0, 5)] * 3, evae.grid)
     figures = validate(evae, empty, event_targets(empty, "occupancy"))
-    assert (figures["explained"], figures["auc"]) == (0.0, 0.5)
+    assert (figures["explained_loss"], figures["auc"]) == (0.0, 0.5)
     assert np.isfinite(list(figures.values())).all()
 
 
@@ -297,9 +297,9 @@ def test_an_enormous_kl_weight_collapses_the_latent_and_a_small_one_does_not(bet
 
 
 def test_a_collapse_needs_a_silent_latent_and_pictures_that_explain_nothing():
-    alive = {"kl": 12.0, "active_units": 8.0, "explained": 0.2}
+    alive = {"kl": 12.0, "active_units": 8.0, "explained_loss": 0.2}
     assert not collapsed(alive)
-    assert not collapsed({**alive, "explained": -0.1})  # young
+    assert not collapsed({**alive, "explained_loss": -0.1})  # young
     assert not collapsed({**alive, "active_units": 0.0})  # on a small scale
-    assert collapsed({**alive, "active_units": 0.0, "explained": 0.0})
-    assert collapsed({**alive, "kl": 0.03, "explained": 0.0})
+    assert collapsed({**alive, "active_units": 0.0, "explained_loss": 0.0})
+    assert collapsed({**alive, "kl": 0.03, "explained_loss": 0.0})

@@ -173,7 +173,9 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
     assert "default" in lines[0][-2]
     assert (folder / "coding.md").read_text().count("±") == 3 * 7
     assert metrics["perf/encode_step_us"] > 0
-    assert {f"evae/explained_{coding}_dense" for coding in ("additive", "eventnet", "none")} <= metrics.keys()
+    assert {
+        f"evae/explained_r2_{coding}_dense" for coding in ("additive", "eventnet", "none")
+    } <= metrics.keys()
 
     def refuse(*arguments):
         raise AssertionError("trained again")

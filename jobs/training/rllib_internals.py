@@ -1,0 +1,40 @@
+"""The private names of RLlib that this package relies on; another version may lack any of them.
+
+`jobs.training.env_runner` and `jobs.training.ppo_learner` replace RLlib's loops over single steps and
+minibatches, for which RLlib has no public interface. A test compares these lists with what the two use.
+"""
+
+from collections.abc import Sequence
+
+import ray
+
+TESTED_RAY = "2.60.0"
+# Of a SingleAgentEnvRunner.
+ENV_RUNNER = (
+    "_done_episodes_for_metrics",
+    "_increase_sampled_metrics",
+    "_log_env_steps",
+    "_metrics_num_env_steps_sampled",
+    "_needs_initial_reset",
+    "_ongoing_episodes_for_metrics",
+    "_sample",
+    "_seed",
+)
+# Of a PPOTorchLearner.
+LEARNER = ("_log_steps_trained_metrics", "_module", "_weights_seq_no")
+# Of a TorchRLModule.
+MODULE = ("_forward", "_forward_train")
+
+
+def require(part: object, names: Sequence[str]) -> None:
+    """Check that a part of RLlib has the names that are relied on.
+
+    Raises:
+        RuntimeError: One is missing; the message says which version of Ray was tested.
+    """
+    missing = [name for name in names if not hasattr(part, name)]
+    if missing:
+        raise RuntimeError(
+            f"Ray {ray.__version__}: RLlib's {type(part).__name__} lacks {', '.join(missing)}; "
+            f"tested with Ray {TESTED_RAY}: pip install 'ray[rllib,tune]=={TESTED_RAY}'"
+        )

@@ -1,0 +1,88 @@
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from models.kinds import KINDS, DenseModel, Kind, PolicySpec, read_model
+from models.policy import load_policy, save_policy
+from models.policy.networks import build_networks
+from models.policy.onnx import export_onnx
+
+MODULE = '''
+"""The number of events in each half of the image, and a linear network: a kind of its own."""
+
+import numpy as np
+from torch import nn
+
+from models.policy.features import Feature
+
+
+def halves(events, width):
+    return np.array([(events["x"] < width // 2).sum(), (events["x"] >= width // 2).sum()], np.float32)
+
+
+def of_windows(windows, spec, encoder):
+    rows = [window[1 : window[0, 0] + 1] for window in windows]
+    return np.stack([halves({"x": row[:, 1]}, spec.width) for row in rows])
+
+
+def of_step(step, spec, encoder):
+    return halves(step.events, spec.width)
+
+
+HALVES = Feature(np.float32, lambda spec: (2,), of_windows, of_step)
+
+
+def linear(shape, spec):
+    inputs = shape[0] * shape[1]
+    return nn.Flatten(), nn.Linear(inputs, spec.num_actions), nn.Linear(inputs, 1)
+'''
+
+
+@pytest.fixture
+def spec(tmp_path, monkeypatch):
+    """A policy of a kind that is added here: a row, a module, and the settings of a configuration file."""
+    (tmp_path / "halves_kind.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(
+        KINDS, "halves", Kind("window", "halves_kind:HALVES", "halves_kind:linear", DenseModel)
+    )
+    yield PolicySpec(read_model(name="halves", stack=2, hidden=[4]), 40, 30, 3)
+    sys.modules.pop("halves_kind", None)
+
+
+def test_a_kind_is_added_by_a_row_and_a_module_and_is_built_saved_loaded_and_acts(spec, tmp_path):
+    networks = build_networks(spec, seed=1)
+    networks["pi"].weight.data.copy_(torch.eye(3, 4).roll(2, 1))  # towards the half with more events
+    about = {"sensor": {"width": 40, "height": 30}, "sensor_hash": "0123456789ab"}
+    policy = load_policy(save_policy(tmp_path / "policy", networks, spec, about))
+    assert (policy.spec, policy.observation) == (spec, "window")
+    rng, stack, actions = np.random.default_rng(0), None, set()
+    for step in range(20):
+        x = rng.integers(0, 40, int(rng.integers(1, 50)))
+        events = {"t": np.arange(len(x)), "x": x, "y": np.zeros_like(x), "p": np.ones_like(x)}
+        feature = np.array([(x < 20).sum(), (x >= 20).sum()], np.float32)
+        stack = np.stack([stack[1], feature]) if step else np.stack([feature, feature])
+        with torch.no_grad():
+            expected = networks["pi"](torch.from_numpy(stack.reshape(1, -1))).numpy()[0]
+        actions.add(action := policy.act(events, 0, 5000))
+        assert action == expected.argmax()
+    assert len(actions) > 1
+
+
+def test_a_kind_without_an_onnx_form_says_so(spec, tmp_path):
+    policy = load_policy(
+        save_policy(tmp_path / "policy", build_networks(spec), spec, {"sensor": {}, "sensor_hash": ""})
+    )
+    pytest.importorskip("onnx")
+    with pytest.raises(ValueError, match="halves has no ONNX form"):
+        export_onnx(policy, tmp_path / "policy.onnx")
+
+
+def test_every_kind_has_a_configuration_file_of_its_settings():
+    conf = Path(__file__).resolve().parents[3] / "conf" / "model"
+    for name in KINDS:
+        assert read_model(**yaml.safe_load((conf / f"{name}.yaml").read_text())).name == name
