@@ -114,6 +114,7 @@ def test_trainings_that_learn_nothing_are_not_published(tmp_path):
         publishing.run(small_config(tmp_path, job="ship", exp="ship"))
 
 
+@pytest.mark.system  # it fills a store, which takes seconds
 def test_the_job_writes_policies_curves_and_their_plot(tmp_path, monkeypatch):
     monkeypatch.setattr(publishing, "PRETRAINED", publishing.REPOSITORY / tmp_path / "pretrained")
     monkeypatch.setattr(publishing, "REPOSITORY", tmp_path)
