@@ -61,36 +61,21 @@ OF_BOTH: tuple[tuple[str, str, Measure, dict[str, tuple[str, ...]]], ...] = (
     ("generalises to other shapes", "D.3", "success", {"world": ("shape_change",)}),
     ("gains much over event images with moving textures", "F.1", "distance_m", {"world": ("dynamic",)}),
 )
-
-
-def _of_both(ours: str) -> list[Claim]:
-    """The claims of one of the two."""
-    return [
-        Claim(
-            text,
-            source,
-            ours,
-            "event_image",
-            measure,
-            tuple((at, value) for at in axes for value in axes[at]),
-        )
-        for text, source, measure, axes in OF_BOTH
-    ]
-
-
+BYTESTREAMS = ("bytestream", "bytestream_xy")
 FASTER = "learns faster"
 VAE = "beats a policy on an autoencoder over event images, which could not reach acceptable performance"
-BEST = "is best with moving textures, without polarity"
+BEST = "without polarity is best among moving textures"
 CLAIMS = (
-    *_of_both("bytestream"),
-    *_of_both("bytestream_xy"),
+    *(
+        Claim(text, source, ours, "event_image", measure, tuple((at, one) for at in axes for one in axes[at]))
+        for ours in BYTESTREAMS
+        for text, source, measure, axes in OF_BOTH
+    ),
     Claim(BEST, "F.1", "bytestream_xy", "bytestream", "distance_m", (("world", "dynamic"),)),
     Claim(VAE, "D.1.2", "event_image", "event_image_vae", "success", (("world", "poles_eval"),)),
 )
 # Tested on learning curves, and on no condition of a sweep.
-LEARNT = tuple(
-    Claim(FASTER, "abstract", ours, "event_image", "success", ()) for ours in ("bytestream", "bytestream_xy")
-)
+LEARNT = tuple(Claim(FASTER, "abstract", ours, "event_image", "success", ()) for ours in BYTESTREAMS)
 
 
 def judge(claim: Claim, find: Find) -> Finding:

@@ -1,7 +1,7 @@
 """Checkpoints of a training that are known to be whole: sealed when written, checked before use.
 
-A disk that lost power or was full, and a copy that was cut off, leave files that look right. A
-checkpoint that is not what was written is replaced by the newest one that is.
+A power failure, a full disk or an interrupted copy leaves files that look right. A checkpoint that
+differs from what was written is replaced by the newest one that does not.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ def seal(checkpoint: Path) -> None:
 def damage(checkpoint: Path) -> str | None:
     """What is wrong with a checkpoint, in a few words; None if it is what was written.
 
-    One without a seal was cut off by a kill before it got one: it may be whole, but nothing says so.
+    A checkpoint has no seal if the process was killed before it wrote one: it may be whole or not.
     """
     if not checkpoint.is_dir():
         return "missing"
@@ -38,9 +38,9 @@ def damage(checkpoint: Path) -> str | None:
 
 
 def mend(checkpoint: Path) -> str | None:
-    """Put the newest whole checkpoint beside a damaged one into its place; what was done, None if nothing.
+    """Replace a damaged checkpoint by the newest whole one beside it; return what was done, None if nothing.
 
-    One without a seal, which may be whole, is taken only where none has one.
+    One without a seal, which may be whole, is taken only if none has a seal.
 
     Args:
         checkpoint: The one that a training would continue from, `checkpoint_<number>`.

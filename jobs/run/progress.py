@@ -15,7 +15,7 @@ console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isat
 
 @contextlib.contextmanager
 def progress(title: str, total: int, unit: str, done: int = 0) -> Iterator[Callable[..., None]]:
-    """Show how far a job is, how fast, and how long it will still take.
+    """Show how far a job is, its speed, and the time that is left.
 
     Args:
         title: What is being done.
@@ -24,8 +24,8 @@ def progress(title: str, total: int, unit: str, done: int = 0) -> Iterator[Calla
         done: How many were done by an earlier run that this one continues.
 
     Yields:
-        `advance(count, note="")`: tell that `count` more units are done; the note (such as
-        the current loss) stands behind them.
+        `advance(count, note="")`: report that `count` more units are done; the note (such as
+        the current loss) is shown behind them.
     """
     if console.is_terminal:
         columns = (
@@ -52,7 +52,7 @@ def _advance_bar(bar: Progress, task: TaskID, count: int, note: str) -> None:
 
 
 class _PlainLines:
-    """The same for a log file: one line every few seconds, and one at the end."""
+    """Progress for a log file: one line every few seconds, and one at the end."""
 
     def __init__(self, title: str, total: int, unit: str, done: int) -> None:
         self.title, self.total, self.unit = title, total, unit
@@ -81,7 +81,7 @@ class _PlainLines:
 
 
 def clock(seconds: float) -> str:
-    """A duration as a person writes it: 45 s, 3 min 20 s, 2 h 05 min."""
+    """A duration as text: 45 s, 3 min 20 s, 2 h 05 min."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

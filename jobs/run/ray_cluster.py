@@ -43,19 +43,18 @@ class ClusterError(RuntimeError):
 
 
 def start_ray(cluster: ClusterConfig, folder: Path) -> None:
-    """Start Ray on this machine, or join the cluster named; do nothing if that is done.
+    """Start Ray on this machine, or join the configured cluster; do nothing if Ray is running already.
 
     A local Ray asks every client for a token, which lies in a file that its owner alone can
-    read; the home folder is not touched. Workers run one thread each: two threads beside
-    other busy processes are slower than one.
+    read; the home folder is not touched. Workers run one thread each, see `jobs.run.threads`.
 
     Args:
         cluster: Where Ray runs.
         folder: Where the token of a local Ray is kept.
 
     Raises:
-        ConfigError: If the cluster cannot be joined, others can read the token, or nothing is
-            said of the token of a cluster that is joined.
+        ConfigError: If the cluster cannot be joined, others can read the token, or RAY_AUTH_MODE
+            does not say whether the cluster asks for one.
         ClusterError: If this machine is too busy to start one.
     """
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
@@ -105,7 +104,7 @@ def _start_local(settings: Mapping[str, object]) -> None:
 
 
 def fit(tuner: Any) -> Any:
-    """Run a Tuner; what its callbacks raise comes out as it is, and not as the text of a traceback."""
+    """Run a Tuner; raise an error of its callbacks itself, not the text of its traceback."""
     from ray.tune import TuneError
 
     try:
@@ -115,7 +114,7 @@ def fit(tuner: Any) -> Any:
 
 
 def storage(cluster: ClusterConfig, folder: Path) -> str:
-    """Where the nodes of a cluster leave what belongs into a folder of a run: a path or an address.
+    """Where the nodes of a cluster store the files of a folder of a run: a path or an address.
 
     Args:
         cluster: Names the storage, if it is not the run folder itself.
@@ -127,7 +126,7 @@ def storage(cluster: ClusterConfig, folder: Path) -> str:
 
 
 def holds(place: str, start: str) -> bool:
-    """Whether a path or an address holds a file whose name begins so."""
+    """Whether a path or an address holds a file whose name begins with `start`."""
     import pyarrow.fs
 
     system, root = pyarrow.fs.FileSystem.from_uri(place)
@@ -136,7 +135,7 @@ def holds(place: str, start: str) -> bool:
 
 
 def check_mode(cluster: ClusterConfig) -> None:
-    """Refuse a Ray that would ask nobody for a token, unless a cluster is said to be one.
+    """Reject a Ray without authentication, unless the user says that a cluster has none.
 
     Raises:
         ConfigError: RAY_AUTH_MODE turns a local Ray's token off, or is not given for another.
@@ -186,7 +185,7 @@ def make_token(file: Path) -> None:
 
 
 def check_private(file: Path) -> None:
-    """Refuse a token that anyone but this user could read.
+    """Reject a token that anyone but this user could read.
 
     Raises:
         ConfigError: If there is no such file, it is another user's, or its mode lets others in.

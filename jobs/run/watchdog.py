@@ -1,4 +1,4 @@
-"""An end for what hangs: a process that takes too long is ended, so that another can try again."""
+"""A time limit for work that may hang: the process is ended, so that another can try again."""
 
 import contextlib
 import faulthandler
@@ -9,8 +9,8 @@ from collections.abc import Iterator
 def ending_after(seconds: float) -> Iterator[None]:
     """End this process, with a traceback in its log, if the block takes longer.
 
-    A kernel that hangs holds the interpreter, and no exception gets through to it: the
-    watching thread is none of Python's. One block at a time, and not from within another.
+    A kernel that hangs holds the interpreter, so that no exception reaches it: the thread that watches
+    is not one of Python's. One block at a time; blocks cannot be nested.
     """
     faulthandler.dump_traceback_later(seconds, exit=True)
     try:

@@ -1,1 +1,1 @@
-"""What MLflow is told: runs, pages, child runs and registered models. Only this package imports it."""
+"""Records in MLflow: runs, pages, child runs and registered models. Only this package imports it."""

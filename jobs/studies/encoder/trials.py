@@ -59,7 +59,7 @@ def kept(
 def train_short(
     config: Config, train: Recording, settings: EvaeSettings, seed: int, iterations: int, title: str
 ) -> EventVAE:
-    """So many updates as `jobs.training.pretrain` makes them, without its checkpoints."""
+    """Train for some iterations as `jobs.training.pretrain` does, without its checkpoints."""
     training = EvaeTraining.begin(settings, train, config.pretrain, (seed, 3))
     with progress(title, iterations, "iterations") as advance:
         for iteration in range(iterations):
@@ -72,7 +72,7 @@ def draw(
 ) -> list[Window]:
     """`count` fixed windows: "mixed" lengths, or "count", those of `most_events` events.
 
-    At the end of a flight a window by count holds fewer; of four times as many the fullest are kept.
+    At the end of an episode a window by count holds fewer; of four times as many the fullest are kept.
     """
     settings = dataclasses.replace(config.pretrain, windows=windows, window_events=most_events)
     rng = np.random.default_rng(1)

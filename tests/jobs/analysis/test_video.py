@@ -23,7 +23,7 @@ def test_a_film_has_a_frame_for_each_fiftieth_of_a_second_and_even_sizes(tmp_pat
 
 
 def test_an_error_leaves_no_film(tmp_path):
-    with pytest.raises(AttributeError), open_film(tmp_path / "film.mp4", 50.0, None) as film:
+    with pytest.raises(TypeError), open_film(tmp_path / "film.mp4", 50.0, None) as film:
         film.step(None, EVENTS, None, "caption")
     assert not list(tmp_path.iterdir())
 

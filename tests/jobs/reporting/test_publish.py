@@ -12,7 +12,7 @@ from jobs.reporting.learning_curves import as_csv, read_curves
 from jobs.reporting.publish import learning_curve, newest_trainings, publish
 from models.policy import load_policy
 from tests.support.configs import small_config
-from tests.support.policies import save_untrained
+from tests.support.policies import HELD_OUT, save_training
 
 
 def finish_training(tmp_path, name, exp="bytestream", seed=0, env_steps=500_000, iterations=120, **changes):
@@ -20,7 +20,7 @@ def finish_training(tmp_path, name, exp="bytestream", seed=0, env_steps=500_000,
     folder = tmp_path / "runs" / name
     values = as_dict(small_config(tmp_path, exp=exp, seed=seed, **changes))
     values["train"]["env_steps"] = env_steps
-    save_untrained(folder / "policy")
+    save_training(folder / "policy", exp, seed, HELD_OUT, "bytestream")
     (folder / "train").mkdir()
     (folder / "stages").mkdir()
     (folder / "config.json").write_text(json.dumps(values))
@@ -114,6 +114,7 @@ def test_trainings_that_learn_nothing_are_not_published(tmp_path):
         publishing.run(small_config(tmp_path, job="ship", exp="ship"))
 
 
+@pytest.mark.system  # it fills a store, which takes seconds
 def test_the_job_writes_policies_curves_and_their_plot(tmp_path, monkeypatch):
     monkeypatch.setattr(publishing, "PRETRAINED", publishing.REPOSITORY / tmp_path / "pretrained")
     monkeypatch.setattr(publishing, "REPOSITORY", tmp_path)

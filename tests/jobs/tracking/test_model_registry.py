@@ -51,7 +51,8 @@ def load(tracker, name):
     return mlflow.pyfunc.load_model(f"models:/{name}")
 
 
-@pytest.mark.parametrize("kind", SEEN)
+# The kernels that travel with the encoder of single events compile anew, for most of a minute.
+@pytest.mark.parametrize("kind", [pytest.param("bytestream", marks=pytest.mark.system), *SEEN[1:]])
 def test_a_registered_policy_gives_the_logits_and_actions_of_the_policy_itself(store, kind):
     tracker, folders = store
     model = load(tracker, register(tracker, folders[kind], kind, TAGS))
