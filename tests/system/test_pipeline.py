@@ -170,7 +170,9 @@ def test_the_policy_folder_alone_flies(flown, tmp_path):
 
 def test_the_same_command_again_repeats_nothing(flown):
     def written():
-        return {path: path.stat().st_mtime_ns for path in (flown[1] / "stages").iterdir()}
+        stages = (flown[1] / "stages").glob("*.json")
+        # An evaluation without OpenGL tries its missing rows again.
+        return {path: path.stat().st_mtime_ns for path in stages if path.stem != "evaluate"}
 
     before = written()
     printed = launch(flown[0], "+exp=bytestream", *SMALLER)

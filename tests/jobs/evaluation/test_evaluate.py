@@ -213,7 +213,8 @@ def trained(tmp_path, name="bytestream"):
     return save_training(tmp_path / name, name, 0, small_config(tmp_path).env, name)
 
 
-@pytest.mark.parametrize("name", ["bytestream", "rgb"])
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["bytestream", pytest.param("rgb", marks=pytest.mark.slow)])
 def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_path, name):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"], video=True)

@@ -117,6 +117,7 @@ def test_the_job_leaves_table_figure_and_page_and_a_second_run_evaluates_only_wh
     assert children["most exact"].data.tags["verdict"] in ("as good", "undecided", "worse")
 
 
+@pytest.mark.system
 def test_without_the_default_there_is_nothing_to_compare(tmp_path, policy, executor):
     executor.broken = {"default": "RuntimeError: no OpenGL"}
     with pytest.raises(RuntimeError, match=r"^default: .*RuntimeError: no OpenGL"):
