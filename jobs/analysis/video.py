@@ -1,14 +1,12 @@
 """Films of episodes: what the camera sees, its events, and what the latents hold of them."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import av
+import imageio_ffmpeg
 import numpy as np
-from av.container import OutputContainer
-from av.video.stream import VideoStream
 from PIL import Image, ImageDraw, ImageFont
 
 from envs.events import event_image
@@ -19,7 +17,7 @@ from models.policy.features import grey_picture
 
 ZOOM, GAP, BAR = 5, 12, 40
 FILM_FPS, FRAMES_PER_FLIGHT_S = 25, 50
-QUALITY = {"crf": "15"}  # of libx264: lower is better and larger, 23 is its default
+QUALITY = 7  # 0 to 10, best
 
 Decode = Callable[[np.ndarray], np.ndarray]
 
@@ -28,10 +26,10 @@ Decode = Callable[[np.ndarray], np.ndarray]
 class Film:
     """An MP4 file of one episode that is being written, see `open_film`."""
 
-    container: OutputContainer
-    stream: VideoStream
+    part: Path
     control_hz: float
     decode: Decode | None
+    _writer: Generator[None, np.ndarray | None, None] | None = None
     _recent: list[np.ndarray | None] = field(default_factory=list)
 
     def step(
@@ -51,9 +49,14 @@ class Film:
             panels.append(("decoded from the latents", coloured(self.decode(window))))
         slower = self.control_hz / stride / FILM_FPS
         picture = frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption)
-        if not self.stream.codec_context.is_open:
-            self.stream.height, self.stream.width = picture.shape[:2]
-        self.container.mux(self.stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+        if self._writer is None:
+            self._writer = _start_writer(self.part, picture)
+        self._writer.send(picture)
+
+    def close(self) -> None:
+        """End the file."""
+        if self._writer is not None:
+            self._writer.close()
 
 
 @contextlib.contextmanager
@@ -68,10 +71,20 @@ def open_film(path: Path, control_hz: float, decode: Decode | None) -> Iterator[
         control_hz: Control steps per second of flight [Hz].
         decode: Event window -> picture in [-1, 1], float (H, W), of a third panel; None: there is none.
     """
-    with replaced(path) as part, av.open(str(part), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", FILM_FPS, options=QUALITY)
-        yield Film(container, stream, control_hz, decode)
-        container.mux(stream.encode())
+    with replaced(path) as part, contextlib.closing(Film(part, control_hz, decode)) as film:
+        yield film
+
+
+def _start_writer(part: Path, picture: np.ndarray) -> Generator[None, np.ndarray | None, None]:
+    """Start the ffmpeg program that imageio-ffmpeg brings, for frames of the size of `picture`."""
+    size = (picture.shape[1], picture.shape[0])
+    look = {"codec": "libx264", "quality": QUALITY, "macro_block_size": 2}
+    mp4 = ["-f", "mp4"]  # the name of a file that is not whole yet does not say so
+    writer = imageio_ffmpeg.write_frames(
+        str(part), size, fps=FILM_FPS, ffmpeg_log_level="error", output_params=mp4, **look
+    )
+    writer.send(None)
+    return writer
 
 
 def last_polarity(events: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
