@@ -1,14 +1,15 @@
-"""Fly through training corridors, at random and by a policy if one is named; record every event.
+"""Record the events of episodes in training corridors, with random actions and by a policy if one is named.
 
-Recordings of real cameras (`collect.recordings`) are data beside the flights, or instead of them.
+Recordings of real cameras (`collect.recordings`) are data beside the episodes, or instead of them.
 
 Run: python -m platform.launch +exp=collect
 Expect: about 3,000 control steps per second on one core; `data/train.h5` and
-`data/validation.h5` in the run folder, each of whole flights that no other file shares.
+`data/validation.h5` in the run folder, each of whole episodes that no other file shares.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
@@ -26,12 +27,12 @@ from jobs.rollout.policies import check_sensor
 from jobs.run.folder import Run, finish, finished, locate_run, named_policy, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
-from jobs.training.real_recordings import Recorded, no_flights, read_recorded, with_recorded
+from jobs.training.real_recordings import Recorded, no_episodes, read_recorded, with_recorded
 from models.policy import load_policy
 
-FLIGHT_GAP_US = 1_000_000
+EPISODE_GAP_US = 1_000_000
 MEAN_HOLD_M = 2.0
-POLICY_EPISODES = 10**6  # number of a policy's first flight: corridors that no random flight came to
+POLICY_EPISODES = 10**6  # number of a policy's first episode: corridors that no random one came to
 
 
 def run(config: Config) -> dict[str, float]:
@@ -53,24 +54,24 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
         "validation": config.collect.num_validation_steps,
     }
     figures: dict[str, float] = {}
-    with progress("Collect flights", sum(sizes.values()), "steps") as advance:
+    with progress("Collect", sum(sizes.values()), "steps") as advance:
         for split, num_steps in sizes.items():
             scenes = config.collect.scenes
             parts = np.array_split(np.arange(num_steps), len(scenes) + len(recorded))
             shares = [len(part) for part in parts]
-            flights = [
+            own = [
                 (dataclasses.replace(config.env, scene=scene, split=split, observation="events"), share)
                 for scene, share in zip(scenes, shares, strict=False)
             ]
-            recording = no_flights(config.env)
-            if flights:
-                recording = record(flights, config.seed, advance, policy, config.collect.policy_share)
+            recording = no_episodes(config.env)
+            if own:
+                recording = record(own, config.seed, advance, policy, config.collect.policy_share)
             if recorded:
                 taken = [part[split] for part in recorded]
                 recording = with_recorded(recording, list(zip(taken, shares[len(scenes) :], strict=True)))
             write_recording(data_file(folder, split), recording)
             figures[f"collect/{split}_events"] = len(recording.events)
-            figures[f"collect/{split}_flights"] = recording.about["flights"]
+            figures[f"collect/{split}_episodes"] = recording.about["flights"]
     if config.collect.scenes:
         figures |= report_event_error(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
     tracker.log(0, figures)
@@ -100,7 +101,7 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
 
 
 def check_policy(folder: Run) -> Path | None:
-    """The folder of the policy that a run still has to collect flights of; None if there is none.
+    """The folder of the policy that a run still has to record episodes of; None if there is none.
 
     Raises:
         ConfigError: `collect.policy` names none, or one for another sensor.
@@ -119,92 +120,115 @@ def check_policy(folder: Run) -> Path | None:
 
 
 def record(
-    flights: Sequence[tuple[EnvConfig, int]],
+    shares: Sequence[tuple[EnvConfig, int]],
     seed: int,
     advance: Callable[[int], None],
     policy: Path | None = None,
     policy_share: float = 0.5,
 ) -> Recording:
-    """Roll out each environment for a number of control steps; join all flights on one clock.
+    """Roll out each environment for a number of control steps; join all episodes on one clock.
 
     Args:
-        flights: Environment and number of control steps [-], one pair per scene.
+        shares: Environment and number of control steps [-], one pair per scene.
         seed: Seed of corridors and actions.
-        advance: Told the number of steps after each flight.
-        policy: Folder of a policy that acts in a share of the steps, in whole flights of its own,
-            drawing its actions as in training; None: all are random.
+        advance: Told the number of steps after each episode.
+        policy: Folder of a policy that acts in a share of the steps, in whole episodes of its own,
+            sampling its actions as in training; None: all are random.
         policy_share: That share, 0..1.
 
     Returns:
-        Events of all flights, `FLIGHT_GAP_US` apart. `index` holds `step_t_us`, `step_end_us`
-        and `step_flight` (start and end [us] and flight number of each step).
+        Events of all episodes, `EPISODE_GAP_US` apart. `index` holds `step_t_us`, `step_end_us`
+        and `step_flight` (start and end [us] and episode number of each step).
     """
-    parts: list[np.ndarray] = []
-    steps: list[tuple[int, int, int]] = []
-    clock_us, flight = 0, 0
-    for config, num_steps, by_policy in stints(flights, policy, policy_share):
-        actions, draws = (np.random.SeedSequence([seed, len(parts), stream]) for stream in (1, 2))
+    tape = _Tape()
+    for config, num_steps, by_policy in stints(shares, policy, policy_share):
+        actions, draws = (np.random.SeedSequence([seed, len(tape.events), stream]) for stream in (1, 2))
         agent = make_agent(str(by_policy), "stochastic") if by_policy else HoldingAgent(actions)
-        flight_seeds = np.random.default_rng(draws)
-        blind = agent.observation in WITHOUT_EVENTS  # its flights are recorded with events all the same
-        env = CorridorEnv(config, observation="events" if blind else agent.observation)
-        started = env.reset(seed=seed, options={"episode": POLICY_EPISODES if by_policy else 0})
-        taken = 0
-        while taken < num_steps:
-            agent.reset([env], [int(flight_seeds.integers(2**63))])
-            flight_events, ends_us = fly_once(env, agent, started, num_steps - taken)
-            for events in flight_events:
-                shifted = events.copy()
-                shifted["t"] += clock_us
-                parts.append(shifted)
-            steps += [
-                (clock_us + start, clock_us + end, flight)
-                for start, end in zip([0, *ends_us], ends_us, strict=False)
-            ]
-            taken += len(ends_us)
-            flight += 1
-            clock_us += ends_us[-1] + FLIGHT_GAP_US
-            advance(len(ends_us))
-            started = env.reset()
-        env.close()
-    start, end, number = np.array(steps, dtype=np.int64).T
-    settings = sensor_settings(flights[0][0])
+        _record_stint(tape, config, num_steps, agent, np.random.default_rng(draws), seed, advance)
+    start, end, number = np.array(tape.steps, dtype=np.int64).T
+    settings = sensor_settings(shares[0][0])
     about = {
         "sensor": settings,
         "sensor_hash": settings_hash(settings),
-        "scenes": [config.scene for config, _ in flights],
-        "faults": [dataclasses.asdict(config.faults) for config, _ in flights],
+        "scenes": [config.scene for config, _ in shares],
+        "faults": [dataclasses.asdict(config.faults) for config, _ in shares],
         "seed": seed,
-        "flights": flight,
+        "flights": tape.episodes,
         "policy": None if policy is None else str(policy),
         "policy_share": 0.0 if policy is None else policy_share,
     }
     index = {"step_t_us": start, "step_end_us": end, "step_flight": number}
-    return Recording(np.concatenate([np.empty(0, EVENT), *parts]), index, about)
+    return Recording(np.concatenate([np.empty(0, EVENT), *tape.events]), index, about)
+
+
+@dataclass
+class _Tape:
+    """Episodes one after the other on one clock: events of each step; start, end and episode of each step."""
+
+    events: list[np.ndarray] = field(default_factory=list)
+    steps: list[tuple[int, int, int]] = field(default_factory=list)
+    clock_us: int = 0
+    episodes: int = 0
+
+    def add(self, events: Sequence[np.ndarray], ends_us: Sequence[int]) -> None:
+        """Append an episode: the events of each step, and when it ended [us since the episode's start]."""
+        for of_step in events:
+            shifted = of_step.copy()
+            shifted["t"] += self.clock_us
+            self.events.append(shifted)
+        for start, end in zip([0, *ends_us], ends_us, strict=False):
+            self.steps.append((self.clock_us + start, self.clock_us + end, self.episodes))
+        self.episodes += 1
+        self.clock_us += ends_us[-1] + EPISODE_GAP_US
+
+
+def _record_stint(
+    tape: _Tape,
+    config: EnvConfig,
+    num_steps: int,
+    agent: Agent,
+    agent_seeds: np.random.Generator,
+    seed: int,
+    advance: Callable[[int], None],
+) -> None:
+    """Add episodes of one agent in one scene to the tape, `num_steps` control steps of them."""
+    blind = agent.observation in WITHOUT_EVENTS  # its episodes are recorded with events all the same
+    env = CorridorEnv(config, observation="events" if blind else agent.observation)
+    first = 0 if isinstance(agent, HoldingAgent) else POLICY_EPISODES
+    started = env.reset(seed=seed, options={"episode": first})
+    taken = 0
+    while taken < num_steps:
+        agent.reset([env], [int(agent_seeds.integers(2**63))])
+        events, ends_us = run_episode(env, agent, started, num_steps - taken)
+        tape.add(events, ends_us)
+        taken += len(ends_us)
+        advance(len(ends_us))
+        started = env.reset()
+    env.close()
 
 
 def stints(
-    flights: Sequence[tuple[EnvConfig, int]], policy: Path | None, policy_share: float
+    shares: Sequence[tuple[EnvConfig, int]], policy: Path | None, policy_share: float
 ) -> list[tuple[EnvConfig, int, Path | None]]:
     """Each agent's share of each scene: environment, control steps, and the policy or None for random."""
     parts = []
-    for config, num_steps in flights:
+    for config, num_steps in shares:
         of_policy = 0 if policy is None else round(policy_share * num_steps)
         parts += [(config, num_steps - of_policy, None), (config, of_policy, policy)]
     return [part for part in parts if part[1] > 0]
 
 
 class HoldingAgent:
-    """Any action with the same probability, held for 2 m on average; for one flight at once."""
+    """Any action with the same probability, held for 2 m on average; for one episode at a time."""
 
     observation: Observation = "events"
 
     def __init__(self, seed: np.random.SeedSequence) -> None:
-        """Draw the actions of all flights from one stream."""
+        """Draw the actions of all episodes from one stream."""
         self._rng = np.random.default_rng(seed)
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Draw the first action; the stream goes on from flight to flight."""
+        """Draw the first action; the stream continues from episode to episode."""
         config = envs[0].config
         self._hold_steps = max(1.0, MEAN_HOLD_M * config.control_hz / config.speed_mps)
         self._action = self._rng.integers(NUM_ACTIONS)
@@ -216,13 +240,13 @@ class HoldingAgent:
         return np.array([self._action])
 
 
-def fly_once(
+def run_episode(
     env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, object]], most_steps: int
 ) -> tuple[list[np.ndarray], list[int]]:
-    """One flight of an environment and an agent that were just reset; `started` is what the reset gave.
+    """One episode of an environment and an agent that were just reset; `started` is what the reset gave.
 
     Returns:
-        The events of each step, and the time at which each step ended [us since take-off].
+        The events of each step, and the time at which each step ended [us since the start].
     """
     events, ends_us = [], []
     for end_us in steps_of(env, agent, started, most_steps):
@@ -234,10 +258,10 @@ def fly_once(
 def steps_of(
     env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, object]], most_steps: int
 ) -> Iterator[int]:
-    """The steps of such a flight, to look at the environment after each one.
+    """The steps of such an episode, to look at the environment after each one.
 
     Yields:
-        The time at which the step ended [us since take-off].
+        The time at which the step ended [us since the start].
     """
     observation, info = started
     for _ in range(most_steps):

@@ -152,9 +152,6 @@ def outcome(info: Mapping[str, float], episode_return: float) -> dict[str, float
 def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConfig:
     """The algorithm of an experiment; every default of RLlib that differs from the paper's is set.
 
-    `vf_clip_param` is infinite because RLlib clips the squared error, which with rewards of
-    +-100 would leave the value network without a gradient.
-
     Args:
         config: The experiment.
         encoder_path: The pretrained encoder's file, for a policy that has one.
@@ -170,7 +167,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
     register_env(ENV, make_corridors)
     spec = module_spec(policy_spec(config), config.seed, pretrained_encoder(config, encoder_path))
     return (
-        PPOConfig()
+        _optimiser(PPOConfig(), config)
         .environment(ENV, env_config=corridor_settings(config), disable_env_checking=True)
         .framework("torch")
         .env_runners(
@@ -187,28 +184,37 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             num_cpus_per_learner=own_cpus,
             learner_class=PlainPPOLearner,
         )
-        .training(
-            learner_config_dict={REWARD_SCALE: algo.reward_scale},
-            lr=learning_rate(config),
-            gamma=algo.gamma,
-            lambda_=algo.lambda_,
-            clip_param=algo.clip_param,
-            num_epochs=algo.num_epochs,
-            minibatch_size=algo.minibatch_size,
-            train_batch_size_per_learner=algo.train_batch_size_per_learner,
-            vf_loss_coeff=algo.vf_loss_coeff,
-            vf_clip_param=math.inf,
-            use_kl_loss=False,
-            kl_coeff=0.0,
-            entropy_coeff=algo.entropy_coeff,
-            grad_clip=algo.grad_clip,
-            grad_clip_by="global_norm",
-        )
         .rl_module(rl_module_spec=spec)
         .callbacks(EpisodeMetrics)
         .reporting(metrics_num_episodes_for_smoothing=EPISODES)
         .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
         .debugging(seed=config.seed, log_level="ERROR")
+    )
+
+
+def _optimiser(ppo: PPOConfig, config: Config) -> PPOConfig:
+    """PPO's loss, batches and step sizes.
+
+    `vf_clip_param` is infinite because RLlib clips the squared error, which with rewards of
+    +-100 would leave the value network without a gradient.
+    """
+    algo = config.algo
+    return ppo.training(
+        learner_config_dict={REWARD_SCALE: algo.reward_scale},
+        lr=learning_rate(config),
+        gamma=algo.gamma,
+        lambda_=algo.lambda_,
+        clip_param=algo.clip_param,
+        num_epochs=algo.num_epochs,
+        minibatch_size=algo.minibatch_size,
+        train_batch_size_per_learner=algo.train_batch_size_per_learner,
+        vf_loss_coeff=algo.vf_loss_coeff,
+        vf_clip_param=math.inf,
+        use_kl_loss=False,
+        kl_coeff=0.0,
+        entropy_coeff=algo.entropy_coeff,
+        grad_clip=algo.grad_clip,
+        grad_clip_by="global_norm",
     )
 
 

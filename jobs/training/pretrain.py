@@ -1,4 +1,4 @@
-"""Train the event VAE on collected flights and freeze its encoder (appendix B).
+"""Train the event VAE on recorded episodes and freeze its encoder (appendix B).
 
 Run: python -m platform.launch +exp=pretrain
 Expect: about 0.1 s per iteration of 50 windows on one core; `encoder/encoder.safetensors`
@@ -207,7 +207,7 @@ def beta(settings: PretrainConfig, iteration: int) -> float:
 def sample_windows(
     recording: Recording, settings: PretrainConfig, count: int, rng: np.random.Generator
 ) -> list[Window]:
-    """Draw event windows that never cross from one flight into the next.
+    """Draw event windows that never cross from one episode into the next.
 
     "count" windows hold `window_events` events from a random index on (appendix B.2). "mixed"
     windows last between half a control step and eight, so that the encoder knows the short,
@@ -221,26 +221,26 @@ def sample_windows(
 
 
 def _window_by_time(recording: Recording, most_events: int, rng: np.random.Generator) -> Window:
-    start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    start, end, episode = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
     step = int(rng.integers(len(start)))
     period_us = int(end[step] - start[step])
     ratio = np.exp(rng.uniform(np.log(MIN_STEPS), np.log(MAX_STEPS)))
     window_us = max(1, round(period_us * ratio))
-    last = int(np.searchsorted(flight, flight[step], side="right")) - 1
+    last = int(np.searchsorted(episode, episode[step], side="right")) - 1
     start_us = int(start[step]) + int(rng.integers(period_us))
     start_us = min(start_us, int(end[last]) - window_us)
-    first = int(np.searchsorted(flight, flight[step]))
+    first = int(np.searchsorted(episode, episode[step]))
     start_us = max(start_us, int(start[first]))
     return cut_window(recording, start_us, window_us, most_events)
 
 
 def _window_by_count(recording: Recording, num_events: int, rng: np.random.Generator) -> Window:
-    t_us, start, flight = recording.t_us, recording.index["step_t_us"], recording.index["step_flight"]
+    t_us, start, episode = recording.t_us, recording.index["step_t_us"], recording.index["step_flight"]
     first = int(rng.integers(len(t_us)))
     step = int(np.searchsorted(start, t_us[first], side="left")) - 1
-    last_step = int(np.searchsorted(flight, flight[step], side="right")) - 1
-    flight_end = int(np.searchsorted(t_us, recording.index["step_end_us"][last_step], side="right"))
-    stop = min(first + num_events, flight_end)
+    last_step = int(np.searchsorted(episode, episode[step], side="right")) - 1
+    episode_end = int(np.searchsorted(t_us, recording.index["step_end_us"][last_step], side="right"))
+    stop = min(first + num_events, episode_end)
     start_us = int(t_us[first]) - 1
     return recording.events[first:stop], start_us, int(t_us[stop - 1]) - start_us
 
@@ -252,7 +252,7 @@ def cut_window(recording: Recording, start_us: int, window_us: int, most_events:
 
 
 def held_out_windows(recording: Recording, settings: PretrainConfig, grid: Grid) -> dict[str, EventBatch]:
-    """Fixed windows of unseen flights: one control step long, and four."""
+    """Fixed windows of unseen episodes: one control step long, and four."""
     rng = np.random.default_rng(0)
     start, end = recording.index["step_t_us"], recording.index["step_end_us"]
     windows: dict[str, EventBatch] = {}

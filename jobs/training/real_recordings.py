@@ -96,9 +96,9 @@ def _part(name: str, events: np.ndarray, begin_us: int, span: tuple[int, int], e
 
 
 def with_recorded(recording: Recording, parts: Sequence[tuple[Recorded, int]]) -> Recording:
-    """A recording of flights with parts of others behind it, each of at most a number of control steps."""
+    """A recording of episodes with parts of others behind it, each of at most a number of control steps."""
     clock = int(recording.index["step_end_us"][-1]) + GAP_US if len(recording.index["step_end_us"]) else 0
-    flight = int(recording.about["flights"])
+    episode = int(recording.about["flights"])
     events, index, names = [recording.events], [np.stack(list(recording.index.values()))], []
     for part, most_steps in parts:
         ends = part.ends_us[:most_steps]
@@ -108,15 +108,15 @@ def with_recorded(recording: Recording, parts: Sequence[tuple[Recorded, int]]) -
         shown["t"] += clock
         events.append(shown)
         starts = np.concatenate([[0], ends[:-1]])
-        index.append(np.stack([clock + starts, clock + ends, np.full(len(ends), flight)]))
+        index.append(np.stack([clock + starts, clock + ends, np.full(len(ends), episode)]))
         names.append(part.name)
-        clock, flight = clock + int(ends[-1]) + GAP_US, flight + 1
+        clock, episode = clock + int(ends[-1]) + GAP_US, episode + 1
     joined = dict(zip(recording.index, np.concatenate(index, axis=1), strict=True))
-    about = recording.about | {"flights": flight, "recordings": names}
+    about = recording.about | {"flights": episode, "recordings": names}
     return Recording(np.concatenate(events), joined, about)
 
 
-def no_flights(env: EnvConfig) -> Recording:
+def no_episodes(env: EnvConfig) -> Recording:
     """The recording of nothing, for real recordings alone."""
     settings = sensor_settings(env)
     none = np.empty(0, np.int64)

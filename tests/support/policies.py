@@ -18,7 +18,7 @@ HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
 SIDE = 40
 SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789ab"}
 ABOUT = {**SENSOR, "figures": {"return": 1.5}}
-FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
+TRAINED = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
 
 
 def kinds(names, quick=("bytestream", "rgb")):

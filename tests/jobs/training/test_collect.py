@@ -10,7 +10,7 @@ from jobs.config.config import ConfigError
 from jobs.rollout.agents import PolicyAgent
 from jobs.run.folder import finish, locate_run, open_run
 from jobs.training import collect
-from jobs.training.collect import FLIGHT_GAP_US, check_policy, record
+from jobs.training.collect import EPISODE_GAP_US, check_policy, record
 from tests.support.configs import small_config
 from tests.support.policies import kinds, save_untrained
 
@@ -36,7 +36,7 @@ def test_another_seed_flies_other_corridors(monkeypatch):
         seen.append(env.scene.obstacles.tobytes())
         return [env.events], [5000]
 
-    monkeypatch.setattr(collect, "fly_once", look)
+    monkeypatch.setattr(collect, "run_episode", look)
     for seed in (0, 1):
         record([(EnvConfig(observation="events"), 3)], seed, lambda count: None)
     assert len(set(seen)) == len(seen) == 6
@@ -48,7 +48,7 @@ def test_every_event_lies_in_a_step_and_no_step_spans_two_flights(recording):
     assert np.all(end > start)
     same = flight[1:] == flight[:-1]
     assert np.all(start[1:][same] == end[:-1][same])
-    assert np.all(start[1:][~same] == end[:-1][~same] + FLIGHT_GAP_US)
+    assert np.all(start[1:][~same] == end[:-1][~same] + EPISODE_GAP_US)
     step = np.searchsorted(start, recording.t_us, side="left") - 1
     assert np.all(recording.t_us <= end[step])
 
@@ -90,15 +90,15 @@ def test_a_policy_flies_its_share_of_the_steps_in_corridors_of_its_own(policy, m
     def fly(env, agent, started, most_steps):
         nonlocal of_policy
         of_policy = isinstance(agent, PolicyAgent)
-        return fly_once(env, agent, started, most_steps)
+        return run_episode(env, agent, started, most_steps)
 
     def count(env, action):
         flown[of_policy] += 1
         corridors[of_policy].add(env.scene.obstacles.tobytes())
         return step(env, action)
 
-    fly_once = collect.fly_once
-    monkeypatch.setattr(collect, "fly_once", fly)
+    run_episode = collect.run_episode
+    monkeypatch.setattr(collect, "run_episode", fly)
     monkeypatch.setattr(CorridorEnv, "step", count)
     mixed = record(flights(), 0, lambda count: None, policy, 1 / 3)
     assert flown == {True: 300, False: 600}

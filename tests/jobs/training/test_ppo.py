@@ -19,7 +19,7 @@ from models.policy.features import feature_of
 from tests.support.configs import SHORT, make_config
 from tests.support.policies import kinds
 
-FLOWN = ("bytestream", "event_columns", "event_set", "event_image", "rgb", "finetuned")
+TRAINED = ("bytestream", "event_columns", "event_set", "event_image", "rgb", "finetuned")
 CNN_WEIGHTS = 32 * (3 * 64 + 1) + 64 * (32 * 16 + 1) + 64 * (64 * 9 + 1) + 512 * (1024 + 1)
 HEADS = 2 * (96 * 64 + 64 + 64 * 64 + 64) + 64 * 4 + 4
 CONTEXT_WEIGHTS = 3 * 64 + 64 * 128 + 128 * 256 + 2 * (64 + 128 + 256)
@@ -48,7 +48,7 @@ def is_frozen(name):
     return name == "bytestream"
 
 
-@pytest.fixture(scope="module", params=kinds(FLOWN))
+@pytest.fixture(scope="module", params=kinds(TRAINED))
 def name(request):
     return request.param
 

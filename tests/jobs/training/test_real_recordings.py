@@ -12,7 +12,7 @@ from jobs.config.config import ConfigError
 from jobs.run.folder import open_run
 from jobs.training import collect
 from jobs.training.pretrain import _window_by_count, _window_by_time
-from jobs.training.real_recordings import GAP_US, cropped, no_flights, read_recorded, with_recorded
+from jobs.training.real_recordings import GAP_US, cropped, no_episodes, read_recorded, with_recorded
 from tests.support.configs import small_config
 
 SLIDER = Path(os.environ.get("EVADE_DATA", "../shared/data")) / "rpg_slider_depth" / "events_chunk.txt"
@@ -84,7 +84,7 @@ def test_parts_follow_a_recording_as_flights_of_its_own(tmp_path):
 def test_windows_are_drawn_from_recordings_alone(tmp_path):
     write_events(tmp_path / "bar.npz", bright_bar(2.0), 128, 100)
     part = read_recorded(tmp_path / "bar.npz", ENV, 0.5)["train"]
-    recording, rng = with_recorded(no_flights(ENV), [(part, 100)]), np.random.default_rng(0)
+    recording, rng = with_recorded(no_episodes(ENV), [(part, 100)]), np.random.default_rng(0)
     for draw in (_window_by_count, _window_by_time):
         for _ in range(20):
             events, start_us, window_us = draw(recording, 500, rng)

@@ -11,7 +11,7 @@ from models.policy import onnx as export
 from models.policy.features import Step
 from models.policy.onnx import export_onnx
 from tests.support.encoders import EVENT
-from tests.support.policies import ABOUT, FLOWN, SIDE, kinds, make_networks, make_spec, save
+from tests.support.policies import ABOUT, SIDE, TRAINED, kinds, make_networks, make_spec, save
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
 EDGES = [(1, 0, 0, 1), (5000, SIDE - 1, SIDE - 1, -1), (4999, SIDE - 1, 0, 1), (5000, 0, SIDE - 1, -1)]
@@ -46,7 +46,7 @@ def fly_exported(file, shown, shape, dtype):
     return np.array(logits)
 
 
-@pytest.fixture(scope="module", params=kinds([*FLOWN, "bytestream_xy", "eventnet"]))
+@pytest.fixture(scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet"]))
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
     if name not in ("bytestream_xy", "eventnet"):

@@ -12,12 +12,21 @@ from models.encoder.frozen import encoder_of
 from models.policy import Policy, load_policy, save_policy
 from models.policy.features import Step, feature_of
 from models.policy.policy import ENCODER, MANIFEST
-from tests.support.policies import ABOUT, FLOWN, SIDE, make_evae, make_networks, make_spec, make_windows, save
+from tests.support.policies import (
+    ABOUT,
+    SIDE,
+    TRAINED,
+    make_evae,
+    make_networks,
+    make_spec,
+    make_windows,
+    save,
+)
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 
 
-@pytest.fixture(scope="module", params=FLOWN)
+@pytest.fixture(scope="module", params=TRAINED)
 def name(request):
     return request.param
 
