@@ -96,7 +96,7 @@ def test_a_video_is_recorded(tmp_path):
     assert [path.stat().st_size > 0 for path in tmp_path.glob("*.mp4")] == [True]
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # windows are no pictures
+@pytest.mark.filterwarnings("ignore::UserWarning")  # a window is neither an image nor a vector
 def test_stable_baselines3_accepts_it():
     check_env(make())
     monitored = Monitor(make())
@@ -108,7 +108,6 @@ def test_stable_baselines3_accepts_it():
     assert evaluate_policy(policy, monitored, 2, return_episode_rewards=True)[1] == [STEPS, STEPS]
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.system)])
 def test_stable_baselines3_trains(kind):
     envs = make_vec_env(NAME, 2, seed=0, env_kwargs=WORLD, vec_env_cls=kind)
