@@ -30,9 +30,11 @@ from envs.sensor import Sensor
 class Info(TypedDict):
     """What `CorridorEnv` tells beside the observation.
 
+    Gymnasium and stable-baselines3 add keys of their own, such as "episode", which none here may have.
+
     Attributes:
         episode_seed: Seed of the series of episodes.
-        episode: Number of the episode in its series.
+        episode_number: Number of the episode in its series, from 0.
         x_m, y_m: Position of the vehicle [m].
         distance_m: Progress along y since the start [m].
         success, collision: What ended the episode; at most one of them.
@@ -42,7 +44,7 @@ class Info(TypedDict):
     """
 
     episode_seed: int | None
-    episode: int
+    episode_number: int
     x_m: float
     y_m: float
     distance_m: float
@@ -95,7 +97,7 @@ class CorridorEnv(gymnasium.Env):
         Args:
             seed: Starts a series of episodes, of which this is number 0. Without it, the
                 next episode of the series starts.
-            options: {"episode": number} starts that episode of the series.
+            options: {"episode_number": number} starts that episode of the series.
 
         Raises:
             ValueError: An unknown option, or an episode that is no integer >= 0.
@@ -177,7 +179,7 @@ class CorridorEnv(gymnasium.Env):
     def _info(self, lost: int, outcome: kinematics.Outcome | None = None) -> Info:
         return {
             "episode_seed": self._seed,
-            "episode": self._episode,
+            "episode_number": self._episode,
             "x_m": self._place[0],
             "y_m": self._place[1],
             "distance_m": self._place[1],

@@ -51,9 +51,9 @@ def choose_episode(following: int, options: Mapping[str, object]) -> int:
     Raises:
         ValueError: An unknown option, or an episode that is no integer >= 0.
     """
-    episode = options.get("episode", following)
-    if options.keys() - {"episode"} or not isinstance(episode, int | np.integer) or episode < 0:
-        raise ValueError(f'options may hold {{"episode": integer >= 0}} alone; got {options}.')
+    episode = options.get("episode_number", following)
+    if options.keys() - {"episode_number"} or not isinstance(episode, int | np.integer) or episode < 0:
+        raise ValueError(f'options may hold {{"episode_number": integer >= 0}} alone; got {options}.')
     return int(episode)
 
 

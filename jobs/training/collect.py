@@ -195,7 +195,7 @@ def _record_stint(
     blind = agent.observation in WITHOUT_EVENTS  # its episodes are recorded with events all the same
     env = CorridorEnv(config, observation="events" if blind else agent.observation)
     first = 0 if isinstance(agent, HoldingAgent) else POLICY_EPISODES
-    started = env.reset(seed=seed, options={"episode": first})
+    started = env.reset(seed=seed, options={"episode_number": first})
     taken = 0
     while taken < num_steps:
         agent.reset([env], [int(agent_seeds.integers(2**63))])

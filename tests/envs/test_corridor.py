@@ -202,7 +202,7 @@ def test_the_same_seed_gives_the_same_bytes(faults):
 def test_splits_never_share_a_corridor_and_options_pick_an_episode():
     def poles(split, seed, episode):
         env = CorridorEnv(camera=SMALL, split=split)
-        env.reset(seed=seed, options={"episode": episode})
+        env.reset(seed=seed, options={"episode_number": episode})
         return env.scene.obstacles.tobytes(), env.camera_pose()
 
     cases = [(s, seed, e) for s in ("train", "validation", "eval") for seed in (0, 1, 2) for e in (0, 1, 2)]
@@ -211,6 +211,20 @@ def test_splits_never_share_a_corridor_and_options_pick_an_episode():
     env.reset(seed=1)
     env.reset()
     assert (env.scene.obstacles.tobytes(), env.camera_pose()) == poles("train", 1, 1)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_info_of_an_episode_says_how_to_start_it_again(count):
+    many = CorridorVectorEnv(count, camera=SMALL, faults=FAULTY, time_limit_s=0.01)
+    infos = many.reset(seed=3)[1]
+    for _ in range(7):  # two steps and a reset each
+        observations, *_, infos = many.step(np.zeros(count, int))
+    again = CorridorEnv(camera=SMALL, faults=FAULTY)
+    for row in range(count):
+        number = infos["episode_number"][row]
+        again.reset(seed=int(infos["episode_seed"][row]), options={"episode_number": number})
+        assert number == 2
+        assert again.step(0)[0].tobytes() == observations[row].tobytes()
 
 
 def test_faults_leave_the_corridor_and_the_spawn_alone():
@@ -279,7 +293,7 @@ def test_settings_that_make_no_sense_are_refused(name, value):
         CorridorEnv(**{name: value}).reset(seed=0)
 
 
-@pytest.mark.parametrize("options", [{"episode": -1}, {"episode": 1.5}, {"seed": 1}])
+@pytest.mark.parametrize("options", [{"episode_number": -1}, {"episode_number": 1.5}, {"seed": 1}])
 def test_unknown_options_are_refused(options):
     with pytest.raises(ValueError, match="options"):
         CorridorEnv(camera=SMALL).reset(seed=0, options=options)

@@ -29,7 +29,7 @@ def test_the_vector_form_gives_the_bytes_of_single_environments():
             assert (rewards[i], terminated[i], truncated[i]) == ends
             assert {key: infos[key][i] for key in info} == info
             over[i] = ends[1] or ends[2]
-    assert infos["episode"].tolist() == [2, 2, 2]
+    assert infos["episode_number"].tolist() == [2, 2, 2]
     assert len(expected) == 3
 
 

@@ -105,7 +105,7 @@ class Recorder:
     def keep(self, results):
         observations, infos = results[0], results[-1]
         for row, observation in enumerate(observations):
-            flight = infos["episode_seed"][row], infos["episode"][row]
+            flight = infos["episode_seed"][row], infos["episode_number"][row]
             self.flights.setdefault(flight, []).append(observation.copy())
         return results
 
@@ -122,7 +122,10 @@ class Recorder:
 def keys(chunk, control_hz=200.0):
     """(seed, episode, step) of a chunk's observations."""
     infos = chunk.get_infos()
-    return [(info["episode_seed"], info["episode"], round(info["t_us"] * control_hz / 1e6)) for info in infos]
+    return [
+        (info["episode_seed"], info["episode_number"], round(info["t_us"] * control_hz / 1e6))
+        for info in infos
+    ]
 
 
 def learner_batch(learner, samples, monkeypatch, **updates):

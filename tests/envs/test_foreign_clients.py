@@ -1,0 +1,153 @@
+"""Gymnasium's wrappers, stable-baselines3 and CleanRL's loop run the corridor as they come."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FrameStackObservation, RecordEpisodeStatistics, RecordVideo, RenderCollection
+from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from envs.config import CameraConfig
+from envs.corridor import CorridorEnv, CorridorVectorEnv, Info
+
+NAME = "envs.corridor:evade/Corridor-v0"
+STEPS = 10  # of an episode, which ends by its time limit
+WORLD = {
+    "camera": CameraConfig(width=16, height=16),
+    "window_capacity": 32,
+    "time_limit_s": STEPS / 200.0,
+}
+GYMNASIUM_KEYS = {"episode", "final_obs", "final_info", "final_observation"}
+SB3_KEYS = {"episode", "TimeLimit.truncated", "terminal_observation"}
+
+
+def make(**settings):
+    return gymnasium.make(NAME, **WORLD, **settings)
+
+
+def run_episode(env, seed=0):
+    """Reset and step forward to the end: the observations, the rewards, and the last info."""
+    observation, info = env.reset(seed=seed)
+    observations, rewards, over = [observation], [], False
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(0)
+        observations.append(observation)
+        rewards.append(reward)
+        over = terminated or truncated
+    return observations, rewards, info
+
+
+def statistics_of(info):
+    """Take the statistics out of an info; the rest must be what the corridor alone gives."""
+    statistics = info.pop("episode")
+    assert info == run_episode(CorridorEnv(**WORLD))[2]
+    return statistics
+
+
+@pytest.mark.parametrize("observation", ["window", "events"])
+def test_no_key_of_info_is_reserved(observation):
+    single = CorridorEnv(**WORLD, observation=observation)
+    vector = CorridorVectorEnv(2, **WORLD, observation=observation)
+    infos = [single.reset(seed=0)[1], vector.reset(seed=0)[1]]
+    for _ in range(STEPS):
+        infos += [single.step(0)[4], vector.step(np.array([0, 0]))[4]]
+    infos += [single.reset()[1], vector.step(np.array([0, 0]))[4]]
+    names = set(Info.__annotations__)
+    assert not names & (GYMNASIUM_KEYS | SB3_KEYS)
+    assert not any(name.startswith("_") for name in names)
+    assert all(set(info) == names for info in infos[::2])
+    assert all(set(info) == names | {f"_{name}" for name in names} for info in infos[1::2])
+
+
+def test_episode_statistics_are_recorded():
+    _, rewards, info = run_episode(RecordEpisodeStatistics(make()))
+    statistics = statistics_of(info)
+    assert statistics["r"] == sum(rewards)
+    assert statistics["l"] == STEPS
+
+
+def test_observations_are_stacked():
+    stacks, _, info = run_episode(RecordEpisodeStatistics(FrameStackObservation(make(), 4)))
+    alone = run_episode(CorridorEnv(**WORLD))[0]
+    assert statistics_of(info)["l"] == STEPS
+    for step, stack in enumerate(stacks):
+        assert stack.tolist() == [alone[max(0, step - back)].tolist() for back in (3, 2, 1, 0)]
+
+
+def test_frames_are_collected():
+    env = RecordEpisodeStatistics(RenderCollection(make(render_mode="rgb_array")))
+    assert statistics_of(run_episode(env)[2])["l"] == STEPS
+    frames = env.render()
+    assert len(frames) == STEPS + 1
+    assert {(frame.shape, frame.dtype.name) for frame in frames} == {((64, 128, 3), "uint8")}
+
+
+def test_a_video_is_recorded(tmp_path):
+    pytest.importorskip("moviepy", reason="gymnasium's RecordVideo writes with the package moviepy")
+    env = RecordVideo(RecordEpisodeStatistics(make(render_mode="rgb_array")), str(tmp_path), lambda n: True)
+    assert statistics_of(run_episode(env)[2])["l"] == STEPS
+    env.close()
+    assert [path.stat().st_size > 0 for path in tmp_path.glob("*.mp4")] == [True]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # a window is neither an image nor a vector
+def test_stable_baselines3_accepts_it():
+    check_env(make())
+    monitored = Monitor(make())
+    _, rewards, info = run_episode(monitored)
+    statistics = statistics_of(info)
+    assert statistics["r"] == pytest.approx(sum(rewards), abs=1e-6)
+    assert statistics["l"] == STEPS
+    policy = PPO("MlpPolicy", monitored, device="cpu")
+    assert evaluate_policy(policy, monitored, 2, return_episode_rewards=True)[1] == [STEPS, STEPS]
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.system)])
+def test_stable_baselines3_trains(kind):
+    envs = make_vec_env(NAME, 2, seed=0, env_kwargs=WORLD, vec_env_cls=kind)
+    policy = PPO("MlpPolicy", envs, n_steps=64, batch_size=32, n_epochs=2, device="cpu").learn(256)
+    envs.close()
+    assert policy.num_timesteps == 256
+    assert [ended["l"] for ended in policy.ep_info_buffer] == [STEPS] * (256 // STEPS // 2 * 2)
+
+
+@pytest.mark.parametrize(
+    "mode", ["vector_entry_point", "sync", pytest.param("async", marks=pytest.mark.system)]
+)
+def test_the_loop_of_cleanrl_reads_statistics_of_a_vector(mode):
+    envs = RecordVectorStatistics(gymnasium.make_vec(NAME, 2, vectorization_mode=mode, **WORLD))
+    envs.reset(seed=0)
+    totals, returns, lengths = np.zeros(2), [], []
+    for _ in range(2 * STEPS + 1):  # the step between two episodes resets
+        _, rewards, terminated, truncated, infos = envs.step(np.array([0, 1]))
+        totals += rewards
+        assert ("episode" in infos) == (terminated | truncated).any()
+        if "episode" in infos:
+            ended = infos["_episode"]
+            assert ended.tolist() == (terminated | truncated).tolist()
+            returns += infos["episode"]["r"][ended].tolist()
+            lengths += infos["episode"]["l"][ended].tolist()
+    envs.close()
+    assert lengths == [STEPS] * 4
+    assert sum(returns) == pytest.approx(totals.sum())
+
+
+@pytest.mark.parametrize("kind", [SyncVectorEnv, pytest.param(AsyncVectorEnv, marks=pytest.mark.system)])
+def test_the_loop_of_cleanrl_reads_the_last_info_of_each_episode(kind):
+    thunks = [lambda: RecordEpisodeStatistics(make())] * 2
+    envs = kind(thunks, autoreset_mode=AutoresetMode.SAME_STEP)
+    envs.reset(seed=0)
+    lengths = []
+    for _ in range(2 * STEPS):
+        infos = envs.step(np.array([0, 1]))[4]
+        if "final_info" in infos:
+            lengths += infos["final_info"]["episode"]["l"].tolist()
+            assert infos["final_info"]["t_us"].tolist() == [STEPS * 5000] * 2
+    envs.close()
+    assert lengths == [STEPS] * 4
