@@ -36,8 +36,8 @@ QUIET = {
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }
 # Of a path [bytes]: a socket's has room for 107 (103 on macOS), and Ray appends
-# "/session_2026-01-31_23-59-59_123456_4194304/sockets/plasma_store".
-MAX_RAY_FOLDER = 39
+# "/ray/session_2026-01-31_23-59-59_123456_4194304/sockets/plasma_store".
+MAX_RAY_FOLDER = 35
 MAX_STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a busy machine
 
 
@@ -80,9 +80,10 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         "configure_logging": True,
     }
     if cluster.name == "local":
+        os.environ["RAY_TMPDIR"] = str(ray_folder())  # of its workers, too
         # Two processes that started Ray within seconds of each other have waited for each other forever.
         with locked(private_folder() / "start-ray.lock"):
-            _start_local({"num_cpus": cluster.num_cpus, "_temp_dir": str(ray_folder()), **settings})
+            _start_local({"num_cpus": cluster.num_cpus, **settings})
         return
     try:
         ray.init(address=cluster.address or "auto", **settings)
@@ -126,7 +127,7 @@ def _on_loopback() -> Iterator[None]:
 
 
 def ray_folder() -> Path:
-    """Where a local Ray keeps its sockets, logs and staged files: a folder that no other user can enter.
+    """Where a local Ray keeps its sockets, logs, locks and staged files: no other user can enter it.
 
     Tune copies the state of an experiment through it and unpickles what it finds there. It lies in
     /tmp where the path of the temporary folder is too long for a socket.
@@ -134,10 +135,10 @@ def ray_folder() -> Path:
     Raises:
         RunError: The folder belongs to someone else, or others may enter it.
     """
-    folder = private_folder(os.environ.get("RAY_TMPDIR")) / "ray"
+    folder = private_folder()
     if len(os.fsencode(folder)) <= MAX_RAY_FOLDER:
         return folder
-    return private_folder("/tmp") / "ray"  # noqa: S108  entered by its owner alone
+    return private_folder("/tmp")  # noqa: S108  entered by its owner alone
 
 
 def logs_folder() -> Path:

@@ -231,7 +231,10 @@ from pathlib import Path
 from jobs.run.ray_cluster import logs_folder, start_ray
 from jobs.config.schema import ClusterConfig
 start_ray(ClusterConfig(name="local", address=None, num_cpus=1, storage=None), Path(sys.argv[1]))
+from ray.air._internal.filelock import TempFileLock
 from ray.train.constants import _get_ray_train_session_dir
+with TempFileLock("something"):
+    pass
 print(logs_folder(), _get_ray_train_session_dir(), sep="\\n")
 """
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as shared:
@@ -246,13 +249,11 @@ print(logs_folder(), _get_ray_train_session_dir(), sep="\\n")
 
 
 def test_rays_folder_leaves_room_for_the_names_of_sockets(tmp_path, monkeypatch):
-    monkeypatch.delenv("RAY_TMPDIR", raising=False)
     monkeypatch.setattr("tempfile.tempdir", "/tmp")
-    assert joining.ray_folder() == Path(f"/tmp/evade-{os.getuid()}/ray")
+    assert joining.ray_folder() == Path(f"/tmp/evade-{os.getuid()}")
     (long := tmp_path / ("x" * 50)).mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))
-    monkeypatch.setenv("RAY_TMPDIR", str(long))
-    assert joining.ray_folder() == Path(f"/tmp/evade-{os.getuid()}/ray")
+    assert joining.ray_folder() == Path(f"/tmp/evade-{os.getuid()}")
 
 
 @pytest.mark.parametrize("failures", [0, 1, joining.MAX_STARTS])
