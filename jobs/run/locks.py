@@ -39,14 +39,18 @@ def held_alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def private_folder() -> Path:
+def private_folder(place: str | None = None) -> Path:
     """A temporary folder of this user that no other user can read or fill with links; made if it is missing.
+
+    Args:
+        place: The folder that it lies in; the system's temporary folder if None.
 
     Raises:
         RunError: The folder belongs to someone else, or others may enter it.
     """
-    folder = Path(tempfile.gettempdir(), f"evade-{os.getuid()}")
-    folder.mkdir(mode=0o700, exist_ok=True)
+    folder = Path(place or tempfile.gettempdir(), f"evade-{os.getuid()}")
+    with contextlib.suppress(FileExistsError):  # whatever it is: a folder, or another user's link
+        folder.mkdir(mode=0o700)
     info = folder.lstat()
     if not stat.S_ISDIR(info.st_mode) or info.st_uid != os.getuid() or info.st_mode & 0o077:
         found = f"mode {stat.S_IMODE(info.st_mode):04o} of user {info.st_uid}"

@@ -1,4 +1,4 @@
-"""Start or join Ray: quietly, authenticated, one thread per worker."""
+"""Start or join Ray: quietly, authenticated, one thread per worker; a local one on loopback alone."""
 
 import contextlib
 import logging
@@ -6,7 +6,7 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,9 @@ QUIET = {
     "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }
+# Of a path [bytes]: a socket's has room for 107 (103 on macOS), and Ray appends
+# "/ray/session_2026-01-31_23-59-59_123456_4194304/sockets/plasma_store".
+MAX_RAY_FOLDER = 35
 MAX_STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a busy machine
 
 
@@ -45,8 +48,9 @@ class ClusterError(RuntimeError):
 def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     """Start Ray on this machine, or join the configured cluster; do nothing if Ray is running already.
 
-    A local Ray asks every client for a token, which lies in a file that its owner alone can
-    read; the home folder is not touched. Workers run one thread each, see `jobs.run.threads`.
+    A local Ray listens on the loopback address alone, keeps its sockets and logs in a private folder,
+    and asks every client for a token, which lies in a file that its owner alone can read; the home
+    folder is not touched. Workers run one thread each, see `jobs.run.threads`.
 
     Args:
         cluster: Where Ray runs.
@@ -76,6 +80,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         "configure_logging": True,
     }
     if cluster.name == "local":
+        os.environ["RAY_TMPDIR"] = str(ray_folder())  # of its workers, too
         # Two processes that started Ray within seconds of each other have waited for each other forever.
         with locked(private_folder() / "start-ray.lock"):
             _start_local({"num_cpus": cluster.num_cpus, **settings})
@@ -92,7 +97,8 @@ def _start_local(settings: Mapping[str, object]) -> None:
 
     for _ in range(MAX_STARTS):
         try:
-            ray.init(address="local", include_dashboard=False, **settings)
+            with _on_loopback():
+                ray.init(address="local", include_dashboard=False, **settings)
             return
         except Exception as error:  # Ray's own has no type of its own
             if "timed out during startup" not in str(error):
@@ -101,6 +107,45 @@ def _start_local(settings: Mapping[str, object]) -> None:
     raise ClusterError(
         f"Ray did not start in {MAX_STARTS} times 30 s: the machine is too busy; try again later"
     )
+
+
+@contextlib.contextmanager
+def _on_loopback() -> Iterator[None]:
+    """Let a Ray that starts take the loopback address for this machine's, and listen nowhere else.
+
+    That is what RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER=0 does; but Ray reads the variable when it is
+    imported, which may have been before. `_node_ip_address="127.0.0.1"` has no effect: Ray replaces it.
+    """
+    from ray._private import ray_constants
+
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+
+
+def ray_folder() -> Path:
+    """Where a local Ray keeps its sockets, logs, locks and staged files: no other user can enter it.
+
+    Tune copies the state of an experiment through it and unpickles what it finds there. It lies in
+    /tmp where the path of the temporary folder is too long for a socket.
+
+    Raises:
+        RunError: The folder belongs to someone else, or others may enter it.
+    """
+    folder = private_folder()
+    if len(os.fsencode(folder)) <= MAX_RAY_FOLDER:
+        return folder
+    return private_folder("/tmp")  # noqa: S108  entered by its owner alone
+
+
+def logs_folder() -> Path:
+    """The logs of the running Ray."""
+    from ray._private import worker
+
+    return Path(worker._global_node.get_logs_dir_path())
 
 
 def fit(tuner: Any) -> Any:

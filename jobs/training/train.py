@@ -28,7 +28,7 @@ from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
-from jobs.run.ray_cluster import fit, holds, start_ray, storage
+from jobs.run.ray_cluster import fit, holds, logs_folder, start_ray, storage
 from jobs.tracking.tracker import open_tracker
 from jobs.training.env_runner import RolloutError
 from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_about, policy_spec
@@ -287,9 +287,7 @@ def check_pause(seconds: float, result: Any, env_runners: int) -> None:
     restarts, alive = known.get("num_remote_worker_restarts", 0), known.get("num_healthy_workers", 1)
     if seconds > MAX_PAUSE_S or (alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)):
         ended = f"every env runner has died, some {MAX_RESTARTS + 1} times"
-        raise TrainingError(
-            f"no step was sampled for {seconds:.0f} s: {ended}; see /tmp/ray/session_latest/logs"
-        )
+        raise TrainingError(f"no step was sampled for {seconds:.0f} s: {ended}; see {logs_folder()}")
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:

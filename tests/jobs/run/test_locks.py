@@ -64,3 +64,24 @@ def test_locks_of_a_machine_lie_in_a_folder_that_nobody_else_can_enter(tmp_path,
     folder.chmod(0o755)
     with pytest.raises(RunError, match=r"its owner alone.* got mode 0755"):
         private_folder()
+
+
+@pytest.mark.parametrize("target", ["of-another", "file", "missing"])
+def test_a_link_in_place_of_the_private_folder_is_not_followed(tmp_path, monkeypatch, target):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "of-another").mkdir(mode=0o700)
+    (tmp_path / "file").write_text("content")
+    (tmp_path / f"evade-{os.getuid()}").symlink_to(tmp_path / target)
+    with pytest.raises(RunError, match="its owner alone"):
+        private_folder()
+    assert list((tmp_path / "of-another").iterdir()) == []
+    assert (tmp_path / "file").read_text() == "content"
+    assert not (tmp_path / "missing").exists()
+
+
+def test_a_link_in_place_of_a_lock_of_the_machine_is_not_followed(tmp_path):
+    (tmp_path / "precious").write_text("content")
+    (tmp_path / "start-ray.lock").symlink_to(tmp_path / "precious")
+    with pytest.raises(OSError, match="symbolic link"), locked(tmp_path / "start-ray.lock"):
+        pass
+    assert (tmp_path / "precious").read_text() == "content"

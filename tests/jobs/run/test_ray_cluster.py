@@ -2,8 +2,11 @@ import os
 import stat
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from ipaddress import ip_address
 from pathlib import Path
+from socket import SOCK_DGRAM
 from threading import Barrier
 
 import pydantic
@@ -163,6 +166,7 @@ print("joined")
 def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_token):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
     environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # of joining; Ray's own 20 take as many seconds
+    environment["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # else it asks another address than 127.0.0.1
 
     def join(**more: str) -> str:
         command = [sys.executable, "-c", CLIENT, address]
@@ -183,6 +187,73 @@ def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_
         assert head.wait(60) == 0
     assert "uthenticat" in without
     assert "uthenticat" in wrong
+
+
+def listening(pid: int) -> set[tuple[str, str, int]]:
+    """Program, address and port of each socket that a process or one of its descendants listens on."""
+    import psutil  # Ray's copy, found once Ray is imported
+
+    root = psutil.Process(pid)
+    return {
+        (process.name(), address.ip, address.port)
+        for process in [root, *root.children(recursive=True)]
+        for _, _, kind, address, _, status in process.net_connections("inet")
+        if status == psutil.CONN_LISTEN or kind == SOCK_DGRAM
+    }
+
+
+@pytest.mark.system
+def test_a_local_ray_listens_on_loopback_alone(tmp_path, no_token):
+    command = [sys.executable, "-c", HEAD, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, **pipes) as head:
+        address = head.stdout.readline().strip()
+        found = listening(head.pid)
+        head.stdin.close()
+        assert head.wait(60) == 0
+    assert address.startswith("127.0.0.1:")
+    programs = [name for name, _, _ in found]
+    assert {"gcs_server", "raylet"} <= set(programs), found
+    assert len(found) >= 6, found  # gcs_server, raylet (2), its agent, the driver, a worker
+    assert [entry for entry in found if not is_loopback(entry[1])] == []
+
+
+def is_loopback(address: str) -> bool:
+    found = ip_address(address)
+    return (getattr(found, "ipv4_mapped", None) or found).is_loopback
+
+
+@pytest.mark.system
+def test_a_local_ray_keeps_its_files_where_no_other_user_can_enter(tmp_path, no_token):
+    script = """
+import sys
+from pathlib import Path
+from jobs.run.ray_cluster import logs_folder, start_ray
+from jobs.config.schema import ClusterConfig
+start_ray(ClusterConfig(name="local", address=None, num_cpus=1, storage=None), Path(sys.argv[1]))
+from ray.air._internal.filelock import TempFileLock
+from ray.train.constants import _get_ray_train_session_dir
+with TempFileLock("something"):
+    pass
+print(logs_folder(), _get_ray_train_session_dir(), sep="\\n")
+"""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as shared:
+        Path(shared).chmod(0o1777)
+        command = [sys.executable, "-c", script, str(tmp_path)]
+        said = subprocess.check_output(command, cwd=ROOT, text=True, env=os.environ | {"TMPDIR": shared})
+        private = Path(shared, f"evade-{os.getuid()}")
+        assert all(Path(folder).is_relative_to(private / "ray") for folder in said.split())
+        assert (private / "ray" / "session_latest" / "logs" / "raylet.out").exists()
+        assert stat.S_IMODE(private.stat().st_mode) == 0o700
+        assert list(Path(shared).iterdir()) == [private]
+
+
+def test_rays_folder_leaves_room_for_the_names_of_sockets(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", "/tmp")
+    assert joining.ray_folder() == Path(f"/tmp/evade-{os.getuid()}")
+    (long := tmp_path / ("x" * 50)).mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(long))
+    assert joining.ray_folder() == Path(f"/tmp/evade-{os.getuid()}")
 
 
 @pytest.mark.parametrize("failures", [0, 1, joining.MAX_STARTS])

@@ -63,15 +63,19 @@ def test_a_loss_that_is_not_finite_stops_the_training(bad):
     ("runners", "alive", "restarts", "stops"),
     [(1, 0, 3, True), (2, 0, 6, True), (1, 0, 2, False), (2, 0, 5, False), (2, 1, 6, False)],
 )
-def test_a_training_stops_at_once_when_nothing_that_flies_is_started_again(runners, alive, restarts, stops):
+def test_a_training_stops_at_once_when_nothing_that_flies_is_started_again(
+    monkeypatch, runners, alive, restarts, stops
+):
+    monkeypatch.setattr(training, "logs_folder", lambda: "/the/logs")
     known = {"fault_tolerance": {"num_healthy_workers": alive, "num_remote_worker_restarts": restarts}}
-    with pytest.raises(TrainingError, match="every env runner") if stops else nullcontext():
+    with pytest.raises(TrainingError, match=r"every env runner.* see /the/logs") if stops else nullcontext():
         training.check_pause(1.0, known, runners)
 
 
 def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(training, "logs_folder", lambda: "/the/logs")
     folder, seen = open_run(make_config(f"runs_dir={tmp_path}")), []
     empty = {**result(), "env_runners": {}, "learners": {}}
     with training._listening(folder.config, folder, lambda step, metrics: seen.append(step)):
