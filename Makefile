@@ -69,10 +69,10 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine on
 	$(MLFLOW_ENV) $(BIN)/mlflow server --workers 1 --host 127.0.0.1 --port 5000 \
 	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
 
-test: setup ## the quick tests (4 minutes on two cores)
+test: setup ## the quick tests (3 minutes on two cores)
 	$(PYTEST) --dist worksteal $(ARGS)
 
-test-system: setup ## whole jobs, Ray, the launcher, and every kind of policy (8 minutes)
+test-system: setup ## whole jobs, Ray, the launcher, and every kind of policy (4 minutes)
 	$(PYTEST) -m "system and not slow" --dist loadgroup $(ARGS)
 
 test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
