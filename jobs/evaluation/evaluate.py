@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from envs.config import WITHOUT_EVENTS, EnvConfig
-from envs.corridor import CorridorEnv
+from envs.corridor import CorridorEnv, Info
 from jobs.analysis.plots import plot_trajectories
 from jobs.analysis.tables import (
     CAPTION,
@@ -30,7 +30,7 @@ from jobs.analysis.tables import (
 )
 from jobs.analysis.video import Decode, open_film
 from jobs.config.config import HELD_OUT_SCENE, Config, as_dict
-from jobs.rollout.agents import BASELINES, StepInfo, make_agent
+from jobs.rollout.agents import BASELINES, make_agent
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.episodes import Trajectory, TrajectoryRecorder, roll_out, write_episodes
 from jobs.rollout.executors import Executor
@@ -240,7 +240,7 @@ def film_episode(name: str, action: str, env_config: EnvConfig, seed: int, path:
     agent = make_agent(name, action)
     with open_film(path, env_config.control_hz, decode) as film:
 
-        def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: StepInfo) -> None:
+        def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: Info) -> None:
             caption = f"{env_config.scene} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
             ending = "   goal" if info["success"] else "   collision" if info["collision"] else ""
             events = None if agent.observation in WITHOUT_EVENTS else env.events

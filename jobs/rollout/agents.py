@@ -7,12 +7,12 @@ something between them.
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypedDict, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
 from envs.config import Observation
-from envs.corridor import CorridorEnv
+from envs.corridor import CorridorEnv, Info
 from envs.kinematics import DIAGONAL, NUM_ACTIONS
 from envs.scene import Scene
 
@@ -25,19 +25,6 @@ LATTICE_M = 0.25
 CLEARANCE_SCALE_M = 0.4  # the price of a place falls by e with each such distance from contact
 BLOCKED = 1e3
 SIDE_PRICE = 0.01  # of a lattice step to the side: of two free paths, the straighter
-
-
-class StepInfo(TypedDict):
-    """What `CorridorEnv` tells beside an observation; metres, events and microseconds."""
-
-    x_m: float
-    y_m: float
-    distance_m: float
-    success: bool
-    collision: bool
-    num_events: int
-    dropped_events: int
-    t_us: int
 
 
 class Agent(Protocol):
@@ -54,7 +41,7 @@ class Agent(Protocol):
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Begin one episode per environment, each just reset with its seed."""
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
         """Actions (B,) for observations (B, ...) and the episodes' infos."""
 
 
@@ -89,7 +76,7 @@ class StraightAgent:
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Nothing to remember."""
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
         """Zeros (B,)."""
         return np.zeros(len(infos), np.int64)
 
@@ -103,7 +90,7 @@ class RandomAgent:
         """Open one stream per episode, so that no episode depends on its neighbours."""
         self._streams = episode_streams(seeds)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
         """Actions (B,)."""
         return np.array([stream.integers(NUM_ACTIONS) for stream in self._streams])
 
@@ -121,7 +108,7 @@ class PolicyAgent:
         self.policy.reset(len(envs))
         self._streams = episode_streams(seeds)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
         """Actions (B,); draws come from each episode's own stream."""
         logits = self.policy.logits(observations).astype(np.float64)
         if not self.stochastic:
@@ -144,7 +131,7 @@ class OracleAgent:
             plan = plan_path(env.scene, env.camera_pose()[0], *vehicle)
             self._plans.append((plan, MOVES * step_m))
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[StepInfo]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
         """For each episode the action that ends closest to its plan."""
         pairs = zip(self._plans, infos, strict=True)
         return np.array([follow(*plan, info["x_m"], info["y_m"]) for plan, info in pairs])

@@ -7,14 +7,14 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from envs.config import EnvConfig
-from envs.corridor import CorridorEnv
+from envs.corridor import CorridorEnv, Info
 from envs.scene import Scene
-from jobs.rollout.agents import Agent, StepInfo
+from jobs.rollout.agents import Agent
 from jobs.run.files import write_atomic
 
 EPISODE = np.dtype(
@@ -32,7 +32,7 @@ EPISODE = np.dtype(
     ]
 )
 # Called after each step with the environment, the seed, the observation and the info.
-Watch = Callable[[CorridorEnv, int, np.ndarray, StepInfo], None]
+Watch = Callable[[CorridorEnv, int, np.ndarray, Info], None]
 
 
 def roll_out(
@@ -77,7 +77,7 @@ def _roll_out_batch(
     """One episode per environment, until the last one ends."""
     started = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
     observations = np.stack([observation for observation, _ in started])
-    infos = [cast(StepInfo, info) for _, info in started]
+    infos = [info for _, info in started]
     agent.reset(envs, seeds)
     totals = [np.zeros(4) for _ in envs]
     episodes = np.zeros(len(envs), EPISODE)
@@ -86,8 +86,7 @@ def _roll_out_batch(
     while running:
         actions = agent(observations, infos)
         for row in tuple(running):
-            observation, reward, terminated, truncated, step_info = envs[row].step(int(actions[row]))
-            info = cast(StepInfo, step_info)
+            observation, reward, terminated, truncated, info = envs[row].step(int(actions[row]))
             observations[row], infos[row] = observation, info
             totals[row] += reward, 1, info["num_events"], info["dropped_events"]
             if watch is not None:
@@ -99,7 +98,7 @@ def _roll_out_batch(
     return episodes
 
 
-def _record(episode: np.void, totals: np.ndarray, truncated: bool, info: StepInfo) -> None:
+def _record(episode: np.void, totals: np.ndarray, truncated: bool, info: Info) -> None:
     """Fill in an episode that has ended; `totals` are its return, steps, events and dropped events."""
     episode["success"], episode["collision"] = info["success"], info["collision"]
     episode["distance_m"], episode["x_m"] = info["distance_m"], info["x_m"]
@@ -155,7 +154,7 @@ class TrajectoryRecorder:
         self._scenes: dict[int, Scene] = {}
         self._height_m = 0.0
 
-    def add(self, env: CorridorEnv, seed: int, observation: np.ndarray, info: StepInfo) -> None:
+    def add(self, env: CorridorEnv, seed: int, observation: np.ndarray, info: Info) -> None:
         """Record the position of a step (`Watch`)."""
         if seed in self.seeds:
             self._points[seed].append((info["x_m"], info["y_m"]))

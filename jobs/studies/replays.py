@@ -6,7 +6,7 @@ places, so that every difference is due to the setting.
 
 import time
 from collections.abc import Callable, Generator, Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from envs.event_error import TIME_SHARE, event_error
 from envs.events import EVENT, unpack_window
-from jobs.rollout.agents import PolicyAgent, StepInfo
+from jobs.rollout.agents import PolicyAgent
 from jobs.studies.encoder.costs import exact_latents
 from models.encoder.evae import EventVAE
 from models.encoder.event_batch import cut_packed
@@ -154,7 +154,7 @@ def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray 
         while not over:
             windows.append(cut_packed(observation))
             start = time.process_time()
-            chosen.append(int(agent(observation[None], [cast(StepInfo, info)])[0]))
+            chosen.append(int(agent(observation[None], [info])[0]))
             action = chosen[-1] if actions is None else int(actions[len(chosen) - 1])
             observation, _, terminated, truncated, info = env.step(action)
             seconds += time.process_time() - start

@@ -8,20 +8,19 @@ Expect: about 3,000 control steps per second on one core; `data/train.h5` and
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
 from envs.config import WITHOUT_EVENTS, EnvConfig, Observation, Split, sensor_settings, settings_hash
-from envs.corridor import CorridorEnv
+from envs.corridor import CorridorEnv, Info
 from envs.events import EVENT
 from envs.kinematics import NUM_ACTIONS
 from envs.recordings import Recording, write_recording
 from jobs.config.config import Config, ConfigError
-from jobs.rollout.agents import Agent, StepInfo, make_agent
+from jobs.rollout.agents import Agent, make_agent
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.policies import check_sensor
 from jobs.run.folder import Run, finish, finished, locate_run, named_policy, open_run
@@ -233,7 +232,7 @@ class HoldingAgent:
         self._hold_steps = max(1.0, MEAN_HOLD_M * config.control_hz / config.speed_mps)
         self._action = self._rng.integers(NUM_ACTIONS)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Mapping[str, object]]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
         """The action, int (1,)."""
         if self._rng.random() < 1.0 / self._hold_steps:
             self._action = self._rng.integers(NUM_ACTIONS)
@@ -241,7 +240,7 @@ class HoldingAgent:
 
 
 def run_episode(
-    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, object]], most_steps: int
+    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int
 ) -> tuple[list[np.ndarray], list[int]]:
     """One episode of an environment and an agent that were just reset; `started` is what the reset gave.
 
@@ -256,7 +255,7 @@ def run_episode(
 
 
 def steps_of(
-    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Mapping[str, object]], most_steps: int
+    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int
 ) -> Iterator[int]:
     """The steps of such an episode, to look at the environment after each one.
 
@@ -266,7 +265,7 @@ def steps_of(
     observation, info = started
     for _ in range(most_steps):
         shown = env.luminance if agent.observation == "luminance" else observation
-        action = int(agent(shown[None], [cast(StepInfo, info)])[0])
+        action = int(agent(shown[None], [info])[0])
         observation, _, terminated, truncated, info = env.step(action)
         yield int(info["t_us"])
         if terminated or truncated:
