@@ -30,20 +30,23 @@ class Section(NamedTuple):
 
 
 @kernel
-def see_bodies(bodies: np.ndarray, frame: Record, limit: float, cull: float, seen: np.ndarray) -> int:
-    """Find the bodies that are in view.
+def see_bodies(
+    bodies: np.ndarray, frame: Record, low: float, high: float, cull: float, seen: np.ndarray
+) -> int:
+    """Find the bodies that are in view between two slopes.
 
     Args:
         bodies: (N,) BODY.
         frame: FRAME record.
-        limit: Largest slope that the image shows, to either side.
+        low: Slope of the left end of what is looked at.
+        high: Slope of its right end.
         cull: Bodies farther away are left out [m].
         seen: (N,) BODY, whose first elements become the bodies in view.
 
     Returns:
         How many are in view.
     """
-    slack = math.sqrt(1.0 + limit * limit)
+    slack_low, slack_high = math.sqrt(1.0 + low * low), math.sqrt(1.0 + high * high)
     count = 0
     for i in range(len(bodies)):
         body = bodies[i]
@@ -51,7 +54,9 @@ def see_bodies(bodies: np.ndarray, frame: Record, limit: float, cull: float, see
         reach = body.rx if body.kind != BOX else math.hypot(body.rx, body.ry)
         right = dx * frame.cos + dy * frame.sin
         forward = dy * frame.cos - dx * frame.sin
-        if forward + reach <= 0.0 or abs(right) > limit * forward + slack * reach:
+        if forward + reach <= 0.0:
+            continue
+        if right > high * forward + slack_high * reach or right < low * forward - slack_low * reach:
             continue
         seen[count] = body
         body = seen[count]
@@ -59,7 +64,7 @@ def see_bodies(bodies: np.ndarray, frame: Record, limit: float, cull: float, see
         if not _is_outside(body, frame.eye_z, cull):
             continue
         body.low, body.high = _box_silhouette(body, frame) if body.kind == BOX else _round_silhouette(body)
-        count += body.low < limit and body.high > -limit
+        count += body.low < high and body.high > low
     return count
 
 

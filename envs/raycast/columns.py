@@ -6,6 +6,7 @@ between edges. Input but poses is assumed valid.
 """
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -14,13 +15,63 @@ from envs.checks import LIMIT_M, LIMIT_S
 from envs.raycast.bodies import MIN_DEPTH, corner, depths, is_before, outline, see_bodies
 from envs.raycast.coverage import LAYERS, PADDING, cover_ground, ends, put, resolve
 from envs.raycast.patterns import texture_cell
-from envs.raycast.records import BODY, CUT, GAP, STRIP, Canvas, Ends, Record, inlined, kernel
+from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Canvas, Ends, Record, inlined, kernel
 from envs.raycast.surfaces import enter_gap, show_body, show_walls, wall_depth
 from envs.scene import BOX, CONE, ELLIPSOID
 
 MIN_STRIP = 1e-9  # [pixels] cuts nearer than this are one
 ARC_PARTS = 3  # strips of equal height at either end of an ellipsoid's outline
+GAPS = (701, 301, 132, 57, 23, 10, 4, 1)  # of the sort of cuts
 MAX_CUTS = 2 + 2 * max(2, ARC_PARTS)  # of one body: its ends, and corners or arcs
+
+
+class Part(NamedTuple):
+    """The columns of an image that are painted, in pixels.
+
+    Attributes:
+        half: Half of the image's width.
+        left: Where they begin.
+        right: Where they end.
+    """
+
+    half: float
+    left: float
+    right: float
+
+
+class Workspace(NamedTuple):
+    """Room for painting, made once for many images of the same scene and height.
+
+    Attributes:
+        seen: (N,) BODY, those in view.
+        order: (N,) int64, those in a strip.
+        cuts: CUT, where columns are cut.
+        gaps: GAP, what nothing nearer covers of a strip.
+        strips: (1,) STRIP.
+        frames: (1,) FRAME, of the pose that is painted.
+        accumulators: (LAYERS, height + PADDING) float64, zero between two columns.
+    """
+
+    seen: np.ndarray
+    order: np.ndarray
+    cuts: np.ndarray
+    gaps: np.ndarray
+    strips: np.ndarray
+    frames: np.ndarray
+    accumulators: np.ndarray
+
+
+def make_workspace(num_bodies: int, height: int) -> Workspace:
+    """Room for painting images of `height` rows of a scene of `num_bodies` bodies."""
+    return Workspace(
+        seen=np.empty(num_bodies, BODY),
+        order=np.empty(num_bodies, np.int64),
+        cuts=np.empty(MAX_CUTS * num_bodies + 5, CUT),
+        gaps=np.empty(max(height + PADDING, 2 * num_bodies + 32), GAP),
+        strips=np.zeros(1, STRIP),
+        frames=np.zeros(1, FRAME),
+        accumulators=np.zeros((LAYERS, height + PADDING)),
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -31,6 +82,7 @@ def render_way(
     poses: np.ndarray,
     images: np.ndarray,
     cull: float,
+    room: Workspace,
 ) -> int:
     """Fill images with the mean luminance over the area of each pixel.
 
@@ -41,50 +93,80 @@ def render_way(
         poses: (K, 5) float64 x, y, z [m], yaw [rad], time [s].
         images: (K, H, W) float32.
         cull: Bodies farther than this are not drawn [m].
+        room: A `Workspace` for N bodies and H rows.
 
     Returns:
         The index of the first pose that `envs.checks.check_pose` would refuse, or -1.
     """
-    # A record does not keep its array alive: these two must outlive all that is called here.
-    frames, strips = scene_frame.copy(), np.zeros(1, STRIP)
+    room.frames[0] = scene_frame[0]
     for k in range(len(poses)):
         x, y, z, yaw, time = poses[k]
         near = abs(x) <= LIMIT_M and abs(y) <= LIMIT_M and 0.0 <= z <= LIMIT_M
         if not (near and abs(yaw) < np.inf and abs(time) <= LIMIT_S):
             return k
-        _aim(frames[0], poses[k], images.shape[1])
-        _render(frames[0], strips[0], bodies, stacks, images[k], cull)
+        aim(room.frames[0], x, y, z, yaw, time)
+        paint_columns(bodies, stacks, images[k], 0, images.shape[2], cull, room)
     return -1
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _render(
-    frame: Record, strip: Record, bodies: np.ndarray, stacks: np.ndarray, image: np.ndarray, cull: float
+@kernel
+def paint_columns(
+    bodies: np.ndarray,
+    stacks: np.ndarray,
+    image: np.ndarray,
+    first: int,
+    last: int,
+    cull: float,
+    room: Workspace,
 ) -> None:
-    """Fill one image (H, W)."""
-    height, width = image.shape
-    seen, order = np.empty(len(bodies), BODY), np.empty(len(bodies), np.int64)
-    cuts = np.empty(MAX_CUTS * len(bodies) + 5, CUT)
-    count = see_bodies(bodies, frame, 0.5 * width / frame.focal, cull, seen)
-    size, total = _find_cuts(frame, seen[:count], width, cuts, order)
-    cuts = cuts[np.argsort(cuts[:size]["position"])]
-    gaps = np.empty(max(height + PADDING, 2 * count + 32), GAP)
-    canvas = Canvas(frame, strip, gaps, np.zeros((LAYERS, height + PADDING)), stacks)
-    _sweep(canvas, seen, order, total, cuts, image)
+    """Fill columns `first` .. `last` - 1 of an image (H, W), seen as `room.frames[0]` says.
+
+    A column has the same bytes whichever columns are painted with it.
+    """
+    frame, half = room.frames[0], 0.5 * image.shape[1]
+    low, high = (first - half) / frame.focal, (last - half) / frame.focal
+    count = see_bodies(bodies, frame, low, high, cull, room.seen)
+    size, total = _find_cuts(frame, room.seen[:count], Part(half, first, last), room.cuts, room.order)
+    _sort_cuts(room.cuts, size)
+    canvas = Canvas(frame, room.strips[0], room.gaps, room.accumulators, stacks)
+    _sweep(canvas, room.seen, room.order, total, room.cuts[:size], image, first, last)
+
+
+@kernel
+def _sort_cuts(cuts: np.ndarray, size: int) -> None:
+    """Sort the first cuts by position (Shell 1959, with gaps after Ciura 2001)."""
+    for gap in GAPS:
+        for i in range(gap, size):
+            position, body, begins = cuts[i].position, cuts[i].body, cuts[i].begins
+            j = i
+            while j >= gap and cuts[j - gap].position > position:
+                cuts[j] = cuts[j - gap]
+                j -= gap
+            cuts[j].position, cuts[j].body, cuts[j].begins = position, body, begins
 
 
 @kernel
 def _sweep(
-    canvas: Canvas, seen: np.ndarray, order: np.ndarray, total: int, cuts: np.ndarray, image: np.ndarray
+    canvas: Canvas,
+    seen: np.ndarray,
+    order: np.ndarray,
+    total: int,
+    cuts: np.ndarray,
+    image: np.ndarray,
+    first: int,
+    last: int,
 ) -> None:
     """Paint the strips between cuts from left to right, with the bodies that are there in each.
 
-    `order` holds the `total` bodies that have begun at the left edge.
+    `order` holds the `total` bodies that have begun at the left edge of column `first`.
     """
     frame, slopes = canvas.frame, canvas.strip.slopes
     half, samples, focal = 0.5 * image.shape[1], frame.samples, frame.focal
     known, passed = 0, 0
-    for cell in range(image.shape[1] * samples):
+    while passed < len(cuts) and cuts[passed].position <= first + MIN_STRIP:
+        known, total = _pass(order, known, total, cuts[passed])
+        passed += 1
+    for cell in range(first * samples, last * samples):
         left, edge = cell / samples, (cell + 1) / samples
         middle = (0.5 * (left + edge) - half) / focal
         while edge - left > MIN_STRIP:
@@ -101,65 +183,65 @@ def _sweep(
                 passed += 1
         texture_cell(canvas, middle)
         if (cell + 1) % samples == 0:
-            resolve(frame, canvas.accumulators, image, cell // samples)
+            resolve(frame, canvas.accumulators, image, cell // samples, first, last)
 
 
 @kernel
-def _aim(frame: Record, pose: np.ndarray, height: int) -> None:
+def aim(frame: Record, x: float, y: float, z: float, yaw: float, time: float) -> None:
     """Fill in what a pose adds to the frame."""
-    frame.eye_x, frame.eye_y, frame.eye_z, yaw, frame.time = pose
+    frame.eye_x, frame.eye_y, frame.eye_z, frame.time = x, y, z, time
     cos, sin = math.cos(yaw), math.sin(yaw)
-    frame.cos, frame.sin, frame.horizon = cos, sin, 0.5 * height
+    frame.cos, frame.sin = cos, sin
     frame.sun_right = frame.sun_x * cos + frame.sun_y * sin
     frame.sun_forward = frame.sun_y * cos - frame.sun_x * sin
 
 
 @inlined
-def _add_cut(cuts: np.ndarray, size: int, width: int, position: float, shown: bool) -> int:
-    """Note where a column is cut, if it is `shown` and in the image; the new number of cuts."""
+def _add_cut(cuts: np.ndarray, size: int, part: Part, position: float, shown: bool) -> int:
+    """Note where a column is cut, if it is `shown` and in the part; the new number of cuts."""
     cuts[size].position, cuts[size].body = position, -1
-    return size + (shown and 0.0 < position < width)
+    return size + (shown and part.left < position < part.right)
 
 
 @kernel
 def _find_cuts(
-    frame: Record, seen: np.ndarray, width: int, cuts: np.ndarray, order: np.ndarray
+    frame: Record, seen: np.ndarray, part: Part, cuts: np.ndarray, order: np.ndarray
 ) -> tuple[int, int]:
-    """Collect the cuts inside the image.
+    """Collect the cuts inside the part of the image that is painted.
 
     Returns:
-        The number of cuts, and that of bodies already begun at the left edge, in `order`.
+        The number of cuts, and that of bodies already begun at its left edge, in `order`.
     """
     size = total = 0
-    centre, focal = 0.5 * width, frame.focal
+    centre, focal = part.half, frame.focal
     for i in range(len(seen)):
         body = seen[i]
         low, high = centre + focal * body.low, centre + focal * body.high
-        if low <= 0.0:
+        if low <= part.left:
             order[total] = i
             total += 1
         else:
             cuts[size].position, cuts[size].body, cuts[size].begins = low, i, 1
             size += 1
         cuts[size].position, cuts[size].body, cuts[size].begins = high, i, 0
-        size += high < width
+        size += high < part.right
         if body.kind == CONE:
-            size = _cone_cuts(frame, body, width, cuts, size)
+            size = _cone_cuts(frame, body, part, cuts, size)
         if body.kind == ELLIPSOID:
-            size = _arc_cuts(frame, body, width, cuts, size)
+            size = _arc_cuts(frame, body, part, cuts, size)
         if body.kind == BOX:
-            size = _corner_cuts(frame, body, width, cuts, size)
+            size = _corner_cuts(frame, body, part, cuts, size)
     for k in range(4):
         dx = (frame.wall_half if k < 2 else -frame.wall_half) - frame.eye_x
         dy = (frame.wall_near if k % 2 else frame.wall_far) - frame.eye_y
         forward = dy * frame.cos - dx * frame.sin
         right = dx * frame.cos + dy * frame.sin
-        size = _add_cut(cuts, size, width, centre + focal * right / forward, forward > 0.0)
+        size = _add_cut(cuts, size, part, centre + focal * right / forward, forward > 0.0)
     return size, total
 
 
 @kernel
-def _cone_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: int) -> int:
+def _cone_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: int) -> int:
     """Add the axis of a cone, and where its straight outlines meet the edge of its base."""
     right, forward, radius = body.right, body.forward, body.rx
     square = right * right + forward * forward
@@ -172,12 +254,12 @@ def _cone_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: 
         back = abs(k) * cosine
         ahead = forward - back * forward + sine * right
         u = (right - back * right - sine * forward) / max(MIN_DEPTH, ahead)
-        size = _add_cut(cuts, size, width, 0.5 * width + frame.focal * u, ahead > 0.0 and rest > 0.0)
+        size = _add_cut(cuts, size, part, part.half + frame.focal * u, ahead > 0.0 and rest > 0.0)
     return size
 
 
 @kernel
-def _arc_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: int) -> int:
+def _arc_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: int) -> int:
     """Add cuts where an ellipsoid's outline bends most: in the outermost cell at its left and right end.
 
     The outline rises there as a square root does, and so cuts divide its height evenly.
@@ -187,12 +269,12 @@ def _arc_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: i
     for k in range(1, ARC_PARTS + 1):
         bend = reach * (k / ARC_PARTS) ** 2
         for u in (low + bend, high - bend):
-            size = _add_cut(cuts, size, width, 0.5 * width + frame.focal * u, True)
+            size = _add_cut(cuts, size, part, part.half + frame.focal * u, True)
     return size
 
 
 @kernel
-def _corner_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size: int) -> int:
+def _corner_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: int) -> int:
     """Add the corners of a box at which what it shows changes: the nearest; all, from above or below."""
     level = frame.eye_z > body.top or frame.eye_z < body.bottom
     nearest, least = 0, math.inf
@@ -203,7 +285,7 @@ def _corner_cuts(frame: Record, body: Record, width: int, cuts: np.ndarray, size
     for k in range(4):
         right, forward = corner(body, frame, k)
         shown = forward > 0.0 and (level or k == nearest)
-        size = _add_cut(cuts, size, width, 0.5 * width + frame.focal * right / forward, shown)
+        size = _add_cut(cuts, size, part, part.half + frame.focal * right / forward, shown)
     return size
 
 

@@ -104,9 +104,14 @@ def fill(
 
 
 @kernel
-def resolve(frame: Record, accumulators: np.ndarray, image: np.ndarray, column: int) -> None:
-    """Set the painted column aside; once there are `BLOCK`, or it is the last, write them into the image."""
-    rows, place = image.shape[0] + 2, column % BLOCK
+def resolve(
+    frame: Record, accumulators: np.ndarray, image: np.ndarray, column: int, first: int, last: int
+) -> None:
+    """Set the painted column aside; once there are `BLOCK`, or it is the last, write them into the image.
+
+    Columns `first` .. `last` - 1 are painted.
+    """
+    rows, place = image.shape[0] + 2, (column - first) % BLOCK
     steps, paint, waiting = (
         accumulators[Layer.STEPS],
         accumulators[Layer.PAINT],
@@ -120,9 +125,9 @@ def resolve(frame: Record, accumulators: np.ndarray, image: np.ndarray, column: 
     steps[-1] = 0.0
     if place == BLOCK - 1:
         _sum_block(frame.sky, waiting, image, column - place)
-    elif column == image.shape[1] - 1:
-        for first in range(column - place, column + 1):
-            _sum_column(frame.sky, waiting[first % BLOCK :: BLOCK], image, first)
+    elif column == last - 1:
+        for k in range(place + 1):
+            _sum_column(frame.sky, waiting[k::BLOCK], image, column - place + k)
 
 
 @kernel

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from envs.checks import check_image, check_pose
-from envs.raycast.columns import render_way
+from envs.raycast.columns import make_workspace, render_way
 from envs.raycast.point_samples import shade_hits, trace_scene
 from envs.raycast.records import BODY, FRAME
 from envs.scene import CONE, ELLIPSOID, Scene, Texture
@@ -46,12 +46,12 @@ def _make_bodies(scene: Scene) -> np.ndarray:
     return bodies
 
 
-def _make_frame(scene: Scene, focal: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
+def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """(1,) FRAME without what a pose determines, and float32 the filtered tiles of the scene's noise."""
     frame = np.zeros(1, FRAME)
     faces = np.array([(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)], np.float64)
     lit = scene.shade(np.ones(6), faces).tolist()
-    frame["focal"], frame["samples"] = focal, samples
+    frame["horizon"], frame["focal"], frame["samples"] = 0.5 * height, focal, samples
     frame["sky"], frame["floor"] = scene.sky_luminance, scene.shade(scene.ground_albedo, faces[0])
     frame["tallest"] = max([scene.wall_height_m, *(scene.obstacles["z"] + scene.obstacles["rz"]).tolist()])
     frame["wall_half"], frame["wall_top"] = 0.5 * scene.width_m, scene.wall_height_m
@@ -116,7 +116,9 @@ class RaycastRenderer:
         """Draw `scene` from now on. Raises ValueError if it holds what this renderer cannot draw."""
         _check_scene(scene)
         self._bodies = _make_bodies(scene)
-        self._frame, self._stacks = _make_frame(scene, focal_length(self.width, self.fov_deg), self.samples)
+        focal = focal_length(self.width, self.fov_deg)
+        self._frame, self._stacks = _make_frame(scene, self.height, focal, self.samples)
+        self._room = make_workspace(len(self._bodies), self.height)
 
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
@@ -153,7 +155,7 @@ class RaycastRenderer:
             ValueError: As `render`, for the first pose that is refused.
         """
         images = np.empty((len(poses), self.height, self.width), np.float32)
-        bad = render_way(self._bodies, self._stacks, self._frame, poses, images, self.cull_m)
+        bad = render_way(self._bodies, self._stacks, self._frame, poses, images, self.cull_m, self._room)
         if bad >= 0:
             x_m, y_m, z_m, yaw_rad, t_s = poses[bad].tolist()
             check_pose((x_m, y_m, z_m, yaw_rad), t_s)
