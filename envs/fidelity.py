@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from envs.config import EnvConfig
+from envs.events.ramps import can_look
 from envs.raycast import RaycastRenderer
 from envs.scene import CONE, ELLIPSOID, Scene
 
@@ -39,12 +40,15 @@ class RenderPlan:
         renderer: "raycast" or "pyrender".
         samples: Its anti-aliasing.
         max_step_m: Longest way between two renders [m]; infinite: one render a control step.
+        by_looks: Whether columns are looked at between the renders too, where something changes
+            in them (`envs.sensor.looks`).
         cull_m: Obstacles farther than this are not drawn [m]; infinite: all are.
     """
 
     renderer: str
     samples: int
     max_step_m: float
+    by_looks: bool
     cull_m: float
 
 
@@ -60,11 +64,13 @@ def plan_renders(config: EnvConfig, scene: Scene) -> RenderPlan:
     asked = config.fidelity
     renderer = choose_renderer(config.renderer, scene)
     remembers = config.camera.memory == "reference"
-    step_m = asked.max_step_m or _max_step_m(config, scene)
+    by_looks = renderer == "raycast" and can_look(config.camera)
+    step_m = asked.max_step_m or _max_step_m(config, scene, by_looks)
     return RenderPlan(
         renderer=renderer,
         samples=asked.samples or _samples(renderer, scene, asked.tolerance),
         max_step_m=step_m if remembers else math.inf,
+        by_looks=by_looks,
         cull_m=asked.cull_m or _cull_m(asked.tolerance, scene),
     )
 
@@ -106,22 +112,34 @@ def sub_renders(step_m: float, max_step_m: float) -> int:
     return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
 
 
-def _max_step_m(config: EnvConfig, scene: Scene) -> float:
+def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
     """Longest way between two renders [m], from a fit of the renders per control step.
 
-    Between renders, log luminance is taken as linear in time, so an event is late or early
-    within an interval; it may be so by 5 % of a control step. What a pixel sees changes
-    faster the farther a step leads and the smaller the pixel. Of a high threshold fewer
-    crossings are left, and those are the uncertain ones.
+    Between looks the light of a pixel is taken as linear in time, so an event is late or early
+    within an interval; it may be so by 5 % of a control step. What a pixel sees changes faster the
+    farther a step leads and the smaller the pixel. Of a high threshold fewer crossings are left,
+    and those are the uncertain ones.
     """
     focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     step_m = config.speed_mps / config.control_hz
-    renders = 3.19 + 1.8 * (step_m / 0.1)
-    renders *= 1.0 if _plain(scene) else RENDERS_TEXTURED
+    renders = _renders_by_looks(step_m, scene) if by_looks else _renders_alone(step_m, scene)
     renders *= max(1.0, focal / FOCAL_PIXELS) ** 0.5
     renders *= max(1.0, config.camera.contrast_threshold / 0.2) ** 0.4
     renders *= (0.05 / config.fidelity.tolerance) ** (0.65 if config.fidelity.tolerance < 0.05 else 0.5)
     return step_m / max(1.0, renders)
+
+
+def _renders_alone(step_m: float, scene: Scene) -> float:
+    """Renders of a control step at tolerance 0.05, if whole images are all that is looked at."""
+    return (3.19 + 1.8 * (step_m / 0.1)) * (1.0 if _plain(scene) else RENDERS_TEXTURED)
+
+
+def _renders_by_looks(step_m: float, scene: Scene) -> float:
+    """The same, beside looks at columns: those follow upright edges, but no level and no bent ones."""
+    share = step_m / 0.1
+    if scene.kinds & {CONE, ELLIPSOID} or (scene.obstacles["z"] > scene.obstacles["rz"] + 1e-9).any():
+        return 3.5 * share**0.5 * (1.0 if _plain(scene) else RENDERS_TEXTURED)
+    return 0.95 * share**1.1 if _plain(scene) else 1.3 * share**0.8
 
 
 def _cull_m(tolerance: float, scene: Scene) -> float:

@@ -30,15 +30,13 @@ import numpy as np
 
 from envs.config import CameraConfig
 from envs.events import crossings
-from envs.events.emission import EVENT
+from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME
 from envs.events.photoreceptor import encode, encoding_tables, response_curve
 
 __all__ = ["EVENT", "EventCamera"]
 
 LUMINANCE = np.dtype(np.float32)
 T_LIMIT_US = 2**52  # exact in float64, 142 years
-# Every pixel of the largest sensor can fire once; 0.6 GB at the most while they are sorted.
-MAX_EVENTS_PER_FRAME = 2**24
 MIN_THRESHOLD_SHARE = 0.1  # of the nominal threshold, under mismatch
 MIN_THRESHOLD = 1e-6
 
@@ -103,6 +101,11 @@ class EventCamera:
         self._memory = crossings.memory_rows(num_pixels, config.refractory_us > 0)
         num_words = (num_pixels + 7) // 8
         self._scratch = np.zeros(num_words, np.uint64), np.zeros(8 * num_words, np.int64)
+
+    @property
+    def state(self) -> tuple[Any, Any, Any]:
+        """Model, memory and scratch, as the kernels take them."""
+        return self._model, self._memory, self._scratch
 
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
         """Remember a first frame; it makes no events, and no pixel is in its refractory period.

@@ -129,7 +129,7 @@ def memory_rows(num_pixels: int, has_refractory_period: bool) -> tuple[np.ndarra
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _named(model, memory):
+def named(model, memory):
     """The model and the memory, with names."""
     rule, curve, limits = model
     lights, levels, ends = memory
@@ -156,7 +156,7 @@ def first_invalid(luminance):
 @numba.njit(cache=True, error_model="numpy")
 def remember(luminance, model, memory):
     """Start all memories from one frame, float32 (N,)."""
-    model, memory = _named(model, memory)
+    model, memory = named(model, memory)
     memory.previous[:] = luminance
     memory.on_count[:] = 0.0
     memory.off_count[:] = 0.0
@@ -171,11 +171,11 @@ def _remember_levels(luminance, model, memory):
         pixels = np.arange(first, min(first + BLOCK, luminance.size))
         levels = memory.first_level[first : first + pixels.size]
         respond(model.curve, luminance[first : first + pixels.size], levels)
-        _set_quiet_bands(pixels, levels, model, memory)
+        set_quiet_bands(pixels, levels, model, memory)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _set_quiet_bands(pixels, levels, model, memory):
+def set_quiet_bands(pixels, levels, model, memory):
     """Quiet bands of `pixels` that remember `levels`."""
     low, high, thresholds = np.empty(pixels.size), np.empty(pixels.size), model.thresholds
     for j in range(pixels.size):
@@ -211,7 +211,7 @@ def steps(frames, times_us, width, limit, model, memory, scratch):
         Index of the first invalid value in the flat frames, or -1; the number of events lost;
         EVENT array, sorted by (t, y, x, order in the pixel).
     """
-    model, memory = _named(model, memory)
+    model, memory = named(model, memory)
     bad = first_invalid(frames.ravel()) if len(frames) > 1 else -1
     if bad >= 0:
         return bad, 0, np.empty(0, EVENT)
@@ -236,7 +236,7 @@ def steps(frames, times_us, width, limit, model, memory, scratch):
 def _step(luminance, span, width, limit, model, memory, scratch):
     """One frame: (first invalid pixel or -1, events lost, events)."""
     flags, outside = scratch
-    found = _scan(luminance, memory, flags, outside)
+    found = scan(luminance, memory, flags, outside)
     counts, times = np.empty((2, found), np.int64), np.empty((2, found))
     responses = np.empty((3, found if model.rule.refractory_us > 0 else 0))
     motions = Motions(responses[0], responses[1], responses[2])
@@ -257,7 +257,7 @@ def _step(luminance, span, width, limit, model, memory, scratch):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _scan(luminance, memory, flags, outside):
+def scan(luminance, memory, flags, outside):
     """Write the pixels outside their quiet band, in raster order; return how many.
 
     The first loop has no branch, so that it compiles to wide instructions; the second looks
@@ -288,10 +288,10 @@ def _decide(luminance, span, model, memory, trains, motions):
     kept = 0
     for first in range(0, trains.crossings.size, BLOCK):
         pixels = trains.pixels[first : min(first + BLOCK, trains.crossings.size)]
-        bad = _respond_at(pixels, luminance, model.curve, table[Column.AFTER :], lights)
+        bad = respond_at(pixels, luminance, model.curve, table[Column.AFTER :], lights)
         if bad >= 0:
             return bad, 0
-        _respond_at(pixels, memory.previous, model.curve, table, lights)
+        respond_at(pixels, memory.previous, model.curve, table, lights)
         _recall(pixels, model, memory, table)
         if model.rule.refractory_us > 0:
             kept = _keep_refractory(pixels, span, model.rule, memory, table, trains, motions, kept)
@@ -302,7 +302,7 @@ def _decide(luminance, span, model, memory, trains, motions):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _respond_at(pixels, luminance, curve, levels, lights):
+def respond_at(pixels, luminance, curve, levels, lights):
     """Write the responses to the luminance of `pixels`; the first pixel with an invalid one, or -1."""
     for j in range(pixels.size):
         lights[j] = luminance[pixels[j]]
@@ -320,12 +320,12 @@ def _recall(pixels, model, memory, table):
         k = pixels[j] if thresholds.on.size > 1 else 0
         on, off = thresholds.on[k], thresholds.off[k]
         table[Column.ON + j], table[Column.OFF + j] = on, off
-        level = table[Column.BEFORE + j] if model.rule.forgets else _level(memory, pixels[j], on, off)
+        level = table[Column.BEFORE + j] if model.rule.forgets else level_of(memory, pixels[j], on, off)
         table[Column.REMEMBERED + j] = level
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _level(memory, i, on, off):
+def level_of(memory, i, on, off):
     """Remembered level; equal thresholds multiply the exact net count once."""
     if on == off:
         return memory.first_level[i] + (memory.on_count[i] - memory.off_count[i]) * on
@@ -408,5 +408,5 @@ def _advance(luminance, span, model, memory, trains, motions):
         block = pixels[first : min(first + BLOCK, pixels.size)]
         for j in range(block.size):
             k = block[j] if thresholds.on.size > 1 else 0
-            levels[j] = _level(memory, block[j], thresholds.on[k], thresholds.off[k])
-        _set_quiet_bands(block, levels, model, memory)
+            levels[j] = level_of(memory, block[j], thresholds.on[k], thresholds.off[k])
+        set_quiet_bands(block, levels, model, memory)

@@ -6,6 +6,8 @@ import numba
 import numpy as np
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+# Every pixel of the largest sensor can fire once; 0.6 GB at the most while they are sorted.
+MAX_EVENTS_PER_FRAME = 2**24
 MIN_BITS, MAX_BITS = 6, 13  # of a sort's digit; 13 take a table of 64 KiB
 
 
@@ -99,11 +101,24 @@ def events_of(trains, span, width, total):
         width: Pixels of a row.
         total: Sum of `trains.sent`.
     """
+    interval = span.end_us - span.start_us
+    times, places = _emitted(trains, interval, width, total)
+    return sorted_events(times, places, span)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def sorted_events(times, places, span):
+    """EVENT array in the order of time, ties as they are given.
+
+    Args:
+        times: int64 (N,), after the start of the span [us], at most its length.
+        places: uint32 (N,), y << 13 | x << 1 | is ON.
+        span: `Span`.
+    """
+    total, interval = times.size, span.end_us - span.start_us
     events = np.empty(total, EVENT)
     if total == 0:
         return events
-    interval = span.end_us - span.start_us
-    times, places = _emitted(trains, interval, width, total)
     passes, bits = _digits(interval, total)
     mask = (1 << bits) - 1
     for turn in range(passes - 1):

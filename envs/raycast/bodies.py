@@ -63,9 +63,26 @@ def see_bodies(
         body.dx, body.dy, body.right, body.forward, body.at = dx, dy, right, forward, math.inf
         if not _is_outside(body, frame.eye_z, cull):
             continue
-        body.low, body.high = _box_silhouette(body, frame) if body.kind == BOX else _round_silhouette(body)
+        body.low, body.high = _silhouette(body, frame)
         count += body.low < high and body.high > low
     return count
+
+
+@kernel
+def silhouette_of(body: Record, frame: Record) -> tuple[float, float]:
+    """Slopes of the left and right silhouette of one body, seen or not; +-inf as for a circle.
+
+    Notes in the body where it is as seen from the eye.
+    """
+    body.dx, body.dy = body.x - frame.eye_x, body.y - frame.eye_y
+    body.right = body.dx * frame.cos + body.dy * frame.sin
+    body.forward = body.dy * frame.cos - body.dx * frame.sin
+    return _silhouette(body, frame)
+
+
+@inlined
+def _silhouette(body: Record, frame: Record) -> tuple[float, float]:
+    return _box_silhouette(body, frame) if body.kind == BOX else _round_silhouette(body)
 
 
 @kernel

@@ -63,6 +63,7 @@ FRAME = _record(
 BODY = _record(
     [
         ("kind", "i8"),  # POLE, CONE, ELLIPSOID or BOX
+        ("number", "i8"),  # its place among the bodies of the scene
         *_floats("x", "y", "bottom", "top", "rx", "ry", "albedo"),
         ("turn", "f8"),  # metres of texture per radian around it
         # Once it is in view: its axis from the eye, in the world and as the camera sees it, and

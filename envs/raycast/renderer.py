@@ -40,6 +40,7 @@ def _make_bodies(scene: Scene) -> np.ndarray:
     bodies = np.zeros(len(o), BODY)
     for name in ("kind", "x", "y", "rx", "ry", "albedo"):
         bodies[name] = o[name]
+    bodies["number"] = np.arange(len(o))
     bodies["rx"][cut] *= (top / (top - bottom))[cut]
     bodies["bottom"], bodies["top"] = np.where(sunk, 0.0, bottom), top
     bodies["turn"] = [around(scene.obstacle_texture, radius) for radius in o["rx"].tolist()]
@@ -81,7 +82,14 @@ def focal_length(width: int, fov_deg: float) -> float:
 
 
 class RaycastRenderer:
-    """Renders one scene after the other; its only state is the scene and the shape of the image."""
+    """Renders one scene after the other; its only state is the scene and the shape of the image.
+
+    Attributes:
+        bodies: (N,) BODY, the obstacles, see `envs.raycast.records`.
+        frame: (1,) FRAME without what a pose determines.
+        stacks: Float32, the filtered tiles of the scene's noise.
+        room: `envs.raycast.columns.Workspace` of this scene.
+    """
 
     def __init__(
         self,
@@ -115,10 +123,10 @@ class RaycastRenderer:
     def set_scene(self, scene: Scene) -> None:
         """Draw `scene` from now on. Raises ValueError if it holds what this renderer cannot draw."""
         _check_scene(scene)
-        self._bodies = _make_bodies(scene)
+        self.bodies = _make_bodies(scene)
         focal = focal_length(self.width, self.fov_deg)
-        self._frame, self._stacks = _make_frame(scene, self.height, focal, self.samples)
-        self._room = make_workspace(len(self._bodies), self.height)
+        self.frame, self.stacks = _make_frame(scene, self.height, focal, self.samples)
+        self.room = make_workspace(len(self.bodies), self.height)
 
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
@@ -155,7 +163,7 @@ class RaycastRenderer:
             ValueError: As `render`, for the first pose that is refused.
         """
         images = np.empty((len(poses), self.height, self.width), np.float32)
-        bad = render_way(self._bodies, self._stacks, self._frame, poses, images, self.cull_m, self._room)
+        bad = render_way(self.bodies, self.stacks, self.frame, poses, images, self.cull_m, self.room)
         if bad >= 0:
             x_m, y_m, z_m, yaw_rad, t_s = poses[bad].tolist()
             check_pose((x_m, y_m, z_m, yaw_rad), t_s)

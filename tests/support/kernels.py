@@ -15,6 +15,7 @@ from envs.scene import make_scene
 from jobs.bench.latency import random_policy
 from models.encoder.evae import EventVAE
 from models.encoder.event_batch import batch_windows
+from tests.support.looks import HEIGHT, WIDTH, Looker
 
 CAMERA = {"width": 16, "height": 16}
 
@@ -32,6 +33,13 @@ def main() -> None:
         env = CorridorEnv(config)
         env.reset(seed=0)
         env.step(1)
+    for threshold_mismatch in (
+        0.0,
+        0.1,
+    ):  # kernels by themselves are compiled apart from those that call them
+        Looker(np.ones((HEIGHT, WIDTH), np.float32), threshold_mismatch=threshold_mismatch).look(
+            (np.zeros((HEIGHT, WIDTH), np.float32), 0, WIDTH, 1000)
+        )
     measure_event_error(EnvConfig(camera=CameraConfig(**CAMERA)), flights=1, steps=1)
     events = np.zeros(100, EVENT)
     events["t"], events["p"] = np.arange(100), 1

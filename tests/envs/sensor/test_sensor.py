@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 
-from envs import sensor as sensing
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from envs.corridor import CorridorEnv
 from envs.events import EVENT, EventCamera
@@ -11,8 +10,10 @@ from envs.kinematics import Outcome
 from envs.raycast import RaycastRenderer
 from envs.scene import make_scene
 from envs.sensor import Sensor
+from envs.sensor import sensor as sensing
 
 SMALL = CameraConfig(width=16, height=12, contrast_threshold=0.002)
+BY_FRAMES = CameraConfig(width=16, height=12, contrast_threshold=0.002, refractory_us=1)
 
 
 def look(seed=0, **fields):
@@ -45,7 +46,7 @@ def one_by_one(config, scene, sensor, start, outcome, end_us):
 @pytest.mark.parametrize("share", [1.0, 0.37])
 def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, share):
     monkeypatch.setattr(sensing, "MAX_PIXELS_TOGETHER", together)
-    config, scene, sensor = look()
+    config, scene, sensor = look(camera=BY_FRAMES)
     outcome = Outcome((1.0 + 0.05 * share, 5.0 + 0.08 * share), share, 0.0, False, share < 1.0)
     count, events = one_by_one(config, scene, sensor, (1.0, 5.0), outcome, 5000)
     sensor.step((1.0, 5.0), outcome, 5000)
@@ -59,8 +60,7 @@ def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, share):
     assert np.array_equal(sensor.luminance, expected)
 
 
-def test_events_lost_to_the_cap_are_counted_over_all_renders_of_a_step(monkeypatch):
-    monkeypatch.setattr(sensing, "MAX_PIXELS_TOGETHER", 16 * 12)
+def test_events_lost_to_the_cap_are_counted_over_all_renders_of_a_step():
     capped = CameraConfig(width=16, height=12, contrast_threshold=0.002, max_events_per_pixel=1)
     _, _, free = look(camera=CameraConfig(width=16, height=12, contrast_threshold=0.002))
     _, _, sensor = look(camera=capped)
@@ -89,7 +89,7 @@ def test_a_vehicle_that_cannot_move_sees_nothing_and_renders_nothing():
 
 
 def test_a_renderer_that_gives_no_luminance_is_named_and_stops_the_step(monkeypatch):
-    _, _, sensor = look()
+    _, _, sensor = look(camera=BY_FRAMES)
     monkeypatch.setattr(
         sensor._renderer, "render_way", lambda poses: np.full((len(poses), 12, 16), np.nan, "f4")
     )

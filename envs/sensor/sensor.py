@@ -4,11 +4,15 @@ from typing import Any
 
 import numpy as np
 
+from envs.checks import check_pose
 from envs.config import EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, apply_faults, draw_pixel_faults
+from envs.events.ramps import make_ramps
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
+from envs.raycast.silhouettes import Way, make_looks
 from envs.scene import Scene
+from envs.sensor.looks import BAD_POSE, sense_way
 
 FAULTLESS = FaultsConfig()
 MAX_PIXELS_TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
@@ -36,6 +40,9 @@ class Sensor:
         self._together = max(1, MAX_PIXELS_TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
+        self._looks = make_looks(config.camera.width)
+        self._ramps = make_ramps(3 * config.camera.width * config.camera.height)
+        self._seen_us = np.zeros(config.camera.width, np.int64)
         self.plan: RenderPlan
 
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
@@ -51,6 +58,7 @@ class Sensor:
         if not self._pictures_alone:
             self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
             self._camera.reset(self.luminance, t_us)
+            self._seen_us[:] = t_us
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
         """Simulate one control step: render the part that the vehicle moved, and set the events.
@@ -80,20 +88,49 @@ class Sensor:
             return
         way_m = outcome.share * self._config.speed_mps / self._config.control_hz
         self.renders = min(sub_renders(way_m, self.plan.max_step_m), moving_us) if moving_us else 0
-        batches, self.dropped = [], 0
-        for first in range(0, self.renders, self._together):
-            part = np.arange(first + 1, min(first + self._together, self.renders) + 1)
-            times = start_us + moving_us * part // self.renders
-            frames = self._renderer.render_way(self._poses(start, outcome.end, part / self.renders, times))
-            batches.append(self._camera.steps(frames, times.tolist()))
-            self.luminance, self.dropped = frames[-1], self.dropped + self._camera.dropped
+        if self.plan.by_looks:
+            events = self._look_along(start, outcome.end, moving_us)
+        else:
+            events = self._render_along(start, outcome.end, moving_us)
         self.t_us = end_us
-        events = batches[0] if len(batches) == 1 else np.concatenate((np.empty(0, EVENT), *batches))
         faults = self._config.faults
         if faults != FAULTLESS:
             span_us = start_us, end_us
             events = apply_faults(events, *span_us, self.luminance, faults, self._pixels, self._rng)
         self.events = events
+
+    def _look_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
+        """Events of a way, of which each column is looked at when something changes in it."""
+        if not moving_us:
+            self.dropped = 0
+            return np.empty(0, EVENT)
+        renderer = self._renderer
+        scene = renderer.bodies, renderer.stacks, renderer.frame, renderer.cull_m, renderer.room
+        way = Way(*start, *end, self._config.camera_height_m, self.t_us, moving_us)
+        image = self.luminance.copy()
+        camera = (*self._camera.state, self._seen_us)
+        bad, self.dropped, columns, events = sense_way(
+            scene, way, self.renders, image, camera, self._ramps, self._looks
+        )
+        if bad == BAD_POSE:
+            check_pose((*end, way.height, 0.0), (way.start_us + moving_us) * 1e-6)
+        if bad >= 0:
+            y, x = divmod(bad, image.shape[1])
+            raise ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {image[y, x]!s}.")
+        self.luminance, self.renders = image, columns / image.shape[1]
+        return events
+
+    def _render_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
+        """Events of a way from whole images."""
+        start_us = self.t_us
+        batches, self.dropped = [], 0
+        for first in range(0, self.renders, self._together):
+            part = np.arange(first + 1, min(first + self._together, self.renders) + 1)
+            times = start_us + moving_us * part // self.renders
+            frames = self._renderer.render_way(self._poses(start, end, part / self.renders, times))
+            batches.append(self._camera.steps(frames, times.tolist()))
+            self.luminance, self.dropped = frames[-1], self.dropped + self._camera.dropped
+        return batches[0] if len(batches) == 1 else np.concatenate((np.empty(0, EVENT), *batches))
 
     def _picture(self, place: Point, t_us: int) -> np.ndarray:
         """Luminance rendered from a place (x, y) [m] at a time, float32 (H, W)."""

@@ -1,0 +1,218 @@
+"""When the silhouettes of bodies cross the borders between columns of pixels, on a straight way.
+
+While a silhouette moves within one column, the light of the column's pixels changes almost
+linearly; when it passes into the next, one column stops changing and the other begins. So these
+are the moments at which a column has to be looked at.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.raycast.bodies import see_bodies, silhouette_of
+from envs.raycast.columns import Workspace, aim
+from envs.raycast.records import Record, inlined, kernel
+
+BESIDE = 2.0  # columns beside the image in which silhouettes are followed too
+CORRECTIONS = 2  # of the time of a crossing, which linear motion estimates first
+MOVING = 0.15  # columns; a silhouette that moves farther is looked at once more, half-way
+MIN_MOVE = 1e-9  # columns
+LOOKS_PER_COLUMN = 4  # at most, on average over the image; beyond it silhouettes cross unseen
+
+
+class Way(NamedTuple):
+    """A straight way at constant speed; the camera looks along +y.
+
+    Attributes:
+        start_x, start_y: Where it begins [m].
+        end_x, end_y: Where it ends [m].
+        height: Of the camera above the ground [m].
+        start_us: When it begins [us].
+        moving_us: How long it takes, >= 1 [us].
+    """
+
+    start_x: float
+    start_y: float
+    end_x: float
+    end_y: float
+    height: float
+    start_us: int
+    moving_us: int
+
+
+class Motion(NamedTuple):
+    """Of a silhouette within a part of a way.
+
+    Attributes:
+        start: Where it begins [columns].
+        speed: Its mean [columns/us].
+        begin_us, end_us: The part [us].
+    """
+
+    start: float
+    speed: float
+    begin_us: int
+    end_us: int
+
+
+class Looks(NamedTuple):
+    """At which times which columns are looked at.
+
+    Attributes:
+        t_us: Times, int64 [us].
+        first: First column of each look, int64.
+        last: The column after its last one, int64.
+        moving: Of each column of the image, whether a silhouette moves fast in it, bool.
+    """
+
+    t_us: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    moving: np.ndarray
+
+
+def make_looks(width: int) -> Looks:
+    """Room for the looks at images of `width` columns."""
+    size = LOOKS_PER_COLUMN * width
+    return Looks(
+        np.empty(size, np.int64),
+        np.empty(size, np.int64),
+        np.empty(size, np.int64),
+        np.empty(width, np.bool_),
+    )
+
+
+@kernel
+def aim_along(frame: Record, way: Way, t_us: float) -> None:
+    """Aim from where the camera is on its way at a time."""
+    part = (t_us - way.start_us) / way.moving_us
+    x = way.start_x + (way.end_x - way.start_x) * part
+    y = way.start_y + (way.end_y - way.start_y) * part
+    aim(frame, x, y, way.height, 0.0, t_us * 1e-6)
+
+
+@kernel
+def find_silhouettes(
+    bodies: np.ndarray, width: int, cull: float, room: Workspace, places: np.ndarray
+) -> None:
+    """Where the silhouettes of the bodies in view stand, seen as `room.frames[0]` says.
+
+    Args:
+        bodies: (N,) BODY.
+        width: Columns of the image.
+        cull: Bodies farther than this are not seen [m].
+        room: A `Workspace`.
+        places: (N, 2) float64, becomes the column of the left and the right silhouette of each
+            body [pixels], nan if it is not in view.
+    """
+    frame, half = room.frames[0], 0.5 * width
+    limit = (half + BESIDE) / frame.focal
+    places[:] = math.nan
+    for k in range(see_bodies(bodies, frame, -limit, limit, cull, room.seen)):
+        body = room.seen[k]
+        places[body.number, 0] = _near(half + frame.focal * body.low, width)
+        places[body.number, 1] = _near(half + frame.focal * body.high, width)
+
+
+@inlined
+def _near(place: float, width: int) -> float:
+    """A place, moved next to the image if it is far outside: beside a body it is infinite."""
+    return min(max(place, -BESIDE), width + BESIDE)
+
+
+@kernel
+def find_looks(
+    bodies: np.ndarray,
+    way: Way,
+    begin_us: int,
+    end_us: int,
+    before: np.ndarray,
+    after: np.ndarray,
+    width: int,
+    room: Workspace,
+    looks: Looks,
+) -> int:
+    """The looks that a part of a way takes before its end, sorted by time.
+
+    Args:
+        bodies: (N,) BODY.
+        way: The whole way.
+        begin_us: When the part begins [us].
+        end_us: When it ends [us].
+        before: (N, 2), `find_silhouettes` at its begin.
+        after: (N, 2), the same at its end.
+        width: Columns of the image.
+        room: A `Workspace`; its frame is changed.
+        looks: Filled with the looks; those beyond its room are left out.
+
+    Returns:
+        How many there are.
+    """
+    size = _half_way(before, after, begin_us, (begin_us + end_us) // 2, looks)
+    length_us = end_us - begin_us
+    for i in range(len(bodies)):
+        for side in range(2):
+            start, end = before[i, side], after[i, side]
+            low, high = min(start, end), max(start, end)
+            if not (high >= 0.0 and low <= width and high - low > MIN_MOVE):  # also where one is nan
+                continue
+            motion = Motion(start, (end - start) / length_us, begin_us, end_us)
+            for border in range(max(0, math.ceil(low)), min(width, math.floor(high)) + 1):
+                t_us = _crossing(bodies[i], side, border, 0.5 * width, motion, way, room)
+                if begin_us < t_us < end_us and size < len(looks.t_us):
+                    size = _add_look(looks, size, t_us, max(0, border - 1), min(width, border + 1))
+    return size
+
+
+@inlined
+def _half_way(before: np.ndarray, after: np.ndarray, begin_us: int, t_us: int, looks: Looks) -> int:
+    """Add looks half-way at the columns in which a silhouette moves fast; how many there are."""
+    moving, width = looks.moving, len(looks.moving)
+    moving[:] = False
+    for i in range(len(before)):
+        for side in range(2):
+            low, high = min(before[i, side], after[i, side]), max(before[i, side], after[i, side])
+            if high - low > MOVING and high >= 0.0 and low < width:
+                moving[int(max(0.0, low)) : int(high) + 1] = True
+    size = column = 0
+    while column < width and t_us > begin_us:
+        if moving[column]:
+            first = column
+            while column < width and moving[column]:
+                column += 1
+            looks.t_us[size], looks.first[size], looks.last[size] = t_us, first, column
+            size += 1
+        column += 1
+    return size
+
+
+@kernel
+def _crossing(
+    body: Record, side: int, border: int, half: float, motion: Motion, way: Way, room: Workspace
+) -> int:
+    """When a silhouette is at a border between columns [us]; its motion is linear at first sight."""
+    frame = room.frames[0]
+    room.seen[0] = body
+    t_us = motion.begin_us + (border - motion.start) / motion.speed
+    for _ in range(CORRECTIONS):
+        aim_along(frame, way, t_us)
+        low, high = silhouette_of(room.seen[0], frame)
+        beyond = half + frame.focal * (high if side else low) - border
+        t_us = min(max(t_us - beyond / motion.speed, float(motion.begin_us)), float(motion.end_us))
+    return round(t_us)
+
+
+@inlined
+def _add_look(looks: Looks, size: int, t_us: int, first: int, last: int) -> int:
+    """Add a look, sorted by time; the new number."""
+    j = size
+    while j > 0 and looks.t_us[j - 1] > t_us:
+        looks.t_us[j], looks.first[j], looks.last[j] = (
+            looks.t_us[j - 1],
+            looks.first[j - 1],
+            looks.last[j - 1],
+        )
+        j -= 1
+    looks.t_us[j], looks.first[j], looks.last[j] = t_us, first, last
+    return size + 1

@@ -1,0 +1,127 @@
+import numpy as np
+import pytest
+
+from envs.config import CameraConfig, EnvConfig, FidelityConfig
+from envs.event_error import event_error
+from envs.events import EventCamera
+from envs.kinematics import Outcome
+from envs.raycast import RaycastRenderer
+from envs.raycast.columns import aim, paint_columns
+from envs.scene import make_scene
+from envs.sensor import Sensor
+
+STEP_M, STEP_US = 0.1, 5000
+
+
+def flight(scene, steps, **fields):
+    """Events of a straight flight, renders a step, and the last picture."""
+    sensor = Sensor(EnvConfig(**fields))
+    sensor.reset(scene, (0.2, 10.0), np.random.default_rng(0))
+    events, renders = [], 0.0
+    for k in range(steps):
+        start, end = (0.2, 10.0 + k * STEP_M), (0.2, 10.0 + (k + 1) * STEP_M)
+        sensor.step(start, Outcome(end, 1.0, STEP_M, False, False), (k + 1) * STEP_US)
+        events.append(sensor.events)
+        renders += sensor.renders
+    return events, renders / steps, sensor.luminance
+
+
+def dense(scene, steps, renders, camera, samples=1):
+    """Events of the same flight from whole images alone."""
+    renderer = RaycastRenderer(scene, camera.width, camera.height, camera.fov_deg, samples)
+    times = np.arange(steps * renders + 1) * STEP_US // renders
+    poses = np.zeros((times.size, 5))
+    poses[:, 0], poses[:, 1], poses[:, 2] = 0.2, 10.0 + np.arange(times.size) * STEP_M / renders, 2.0
+    poses[:, 4] = times * 1e-6
+    frames = renderer.render_way(poses)
+    watching = EventCamera(camera)
+    watching.reset(frames[0], 0)
+    return watching.steps(frames[1:], times[1:].tolist())
+
+
+@pytest.mark.parametrize("name", ["poles", "shape_change", "cones", "gates", "texture_change", "dynamic"])
+@pytest.mark.parametrize("samples", [1, 3])
+def test_a_column_painted_alone_is_that_of_the_whole_image(name, samples):
+    rng = np.random.default_rng(samples)
+    renderer = RaycastRenderer(make_scene(name, rng), 40, 30, samples=samples)
+    for _ in range(20):
+        pose = *rng.uniform((-3.0, 0.0, 0.5), (3.0, 80.0, 6.0)), rng.uniform(-0.3, 0.3), rng.uniform(0, 2)
+        whole, part = renderer.render(*pose), np.full((30, 40), -1.0, np.float32)
+        first, last = np.sort(rng.choice(41, 2, replace=False))
+        renderer.room.frames[0] = renderer.frame[0]
+        aim(renderer.room.frames[0], *pose)
+        paint_columns(renderer.bodies, renderer.stacks, part, first, last, renderer.cull_m, renderer.room)
+        assert part[:, first:last].tobytes() == whole[:, first:last].tobytes()
+        assert (np.delete(part, np.s_[first:last], axis=1) == -1.0).all()
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.2, 0.5])
+def test_few_renders_with_looks_come_as_close_to_the_truth_as_many_without(threshold):
+    scene = make_scene("poles", np.random.default_rng(5))
+    camera = CameraConfig(contrast_threshold=threshold)
+    truth = dense(scene, 10, 40, camera)
+    events, renders, _ = flight(scene, 10, camera=camera, fidelity=FidelityConfig(max_step_m=STEP_M))
+    error = event_error(np.concatenate(events), truth, 0.05 * STEP_US)
+    without = event_error(dense(scene, 10, 1, camera), truth, 0.05 * STEP_US)
+    assert renders < 1.6
+    assert error < 0.06  # of one flight; the mean over flights is what is promised
+    assert without > 4 * error
+
+
+def test_more_parts_come_closer():
+    scene = make_scene("cones", np.random.default_rng(6))
+    truth = dense(scene, 6, 40, CameraConfig(), samples=4)
+    errors = [
+        event_error(
+            np.concatenate(
+                flight(scene, 6, fidelity=FidelityConfig(max_step_m=STEP_M / parts, samples=4))[0]
+            ),
+            truth,
+            0.05 * STEP_US,
+        )
+        for parts in (1, 2, 4, 8)
+    ]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[0] > 8 * errors[3]
+
+
+def test_events_of_a_step_are_sorted_and_within_it():
+    scene = make_scene("texture_change", np.random.default_rng(7))
+    for parts in (1, 3):
+        fidelity = FidelityConfig(max_step_m=STEP_M / parts)
+        for k, events in enumerate(flight(scene, 5, fidelity=fidelity)[0]):
+            assert events.size > 50
+            assert np.array_equal(
+                np.argsort(events, order=("t", "y", "x"), kind="stable"), np.arange(events.size)
+            )
+            assert k * STEP_US < events["t"][0] <= events["t"][-1] <= (k + 1) * STEP_US
+
+
+def test_the_picture_at_the_end_is_the_render_from_there():
+    scene = make_scene("poles", np.random.default_rng(8))
+    _, _, picture = flight(scene, 3)
+    expected = RaycastRenderer(scene, 64, 64).render(0.2, 10.0 + 3 * STEP_M, 2.0, 0.0, 3 * STEP_US * 1e-6)
+    assert picture.tobytes() == expected.tobytes()
+
+
+def test_a_still_world_makes_no_event_however_it_is_looked_at():
+    scene = make_scene("poles", np.random.default_rng(9))
+    sensor = Sensor(EnvConfig(camera=CameraConfig(contrast_threshold=1e-3)))
+    sensor.reset(scene, (0.2, 10.0), np.random.default_rng(0))
+    for k in range(3):
+        sensor.step((0.2, 10.0), Outcome((0.2, 10.0), 1.0, 0.0, False, False), (k + 1) * STEP_US)
+        assert sensor.events.size == 0
+
+
+@pytest.mark.parametrize("step_us", [1, 2, 7])
+def test_steps_of_a_few_microseconds(step_us):
+    scene = make_scene("poles_dense", np.random.default_rng(10))
+    sensor = Sensor(
+        EnvConfig(control_hz=1e6 / step_us, speed_mps=1e5, camera=CameraConfig(contrast_threshold=0.05))
+    )
+    sensor.reset(scene, (0.2, 10.0), np.random.default_rng(0))
+    for k in range(5):
+        start, end = (0.2, 10.0 + k), (0.2, 11.0 + k)
+        sensor.step(start, Outcome(end, 1.0, 1.0, False, False), (k + 1) * step_us)
+        assert sensor.events.size > 0
+        assert k * step_us < sensor.events["t"].min() <= sensor.events["t"].max() <= (k + 1) * step_us

@@ -1,0 +1,36 @@
+"""A camera that is looked through column by column, without a scene."""
+
+import numpy as np
+
+from envs.config import CameraConfig
+from envs.events import EventCamera
+from envs.events.crossings import named
+from envs.events.emission import Span
+from envs.events.ramps import events_of_ramps, look_at, make_ramps
+
+WIDTH, HEIGHT = 16, 12
+
+
+class Looker:
+    """A camera that is looked through column by column."""
+
+    def __init__(self, first, t_us=0, **fields):
+        self.config = CameraConfig(width=WIDTH, height=HEIGHT, **fields)
+        self.camera = EventCamera(self.config)
+        self.camera.reset(first, t_us)
+        self.seen_us = np.full(WIDTH, t_us, np.int64)
+        self.ramps = make_ramps(8 * WIDTH * HEIGHT)
+
+    def look(self, *looks):
+        """Events of looks (image, first column, column after the last, time [us]), and how many are lost."""
+        values, rows, scratch = self.camera.state
+        model, memory = named(values, rows)
+        start_us, kept, lost = int(self.seen_us.min()), 0, 0
+        for image, first, last, t_us in looks:
+            bad, kept, more = look_at(
+                image, first, last, t_us, model, memory, self.seen_us, scratch, self.ramps, kept
+            )
+            assert bad == -1
+            lost += more
+        span = Span(start_us, max(t_us for *_, t_us in looks))
+        return events_of_ramps(self.ramps, kept, span, WIDTH, model), lost
