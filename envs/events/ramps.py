@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from envs.config import CameraConfig
-from envs.events.crossings import BLOCK, level_of, respond_at, scan, set_quiet_bands
+from envs.events.crossings import BLOCK, Memory, Model, level_of, respond_at, scan, set_quiet_bands
 from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME, sorted_events
 from envs.events.photoreceptor import light_of
 from envs.events.refractory import TOLERANCE
@@ -46,6 +46,24 @@ class Ramps(NamedTuple):
     length_us: np.ndarray
 
 
+class Watch(NamedTuple):
+    """A camera that is looked through column by column.
+
+    Attributes:
+        model: `Model`.
+        memory: `Memory` of all pixels.
+        seen_us: int64 (W,), when each column was looked at last [us].
+        scratch: As `crossings.steps` takes it.
+        ramps: Room for the `Ramps` between two renders.
+    """
+
+    model: Model
+    memory: Memory
+    seen_us: np.ndarray
+    scratch: tuple
+    ramps: Ramps
+
+
 def make_ramps(size: int) -> Ramps:
     """Room for `size` ramps."""
     whole, real = np.empty((5, size), np.int64), np.empty((4, size))
@@ -60,7 +78,7 @@ def can_look(camera: CameraConfig) -> bool:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def look_at(image, first, last, t_us, model, memory, seen_us, scratch, ramps, kept):
+def look_at(image, first, last, t_us, watch, kept):
     """Look at columns `first` .. `last` - 1 of an image: keep the ramps of their pixels that fire.
 
     Args:
@@ -68,17 +86,14 @@ def look_at(image, first, last, t_us, model, memory, seen_us, scratch, ramps, ke
         first: The first column.
         last: The column after the last.
         t_us: The time [us], later than the last look at each of them.
-        model: `Model`.
-        memory: `Memory` of all pixels; changed.
-        seen_us: int64 (W,), when each column was looked at last [us]; changed.
-        scratch: As `crossings.steps` takes it.
-        ramps: `Ramps`, of which the first `kept` are in use; there is room for these pixels.
-        kept: See there.
+        watch: `Watch`, which remembers what is seen; its ramps have room for these pixels.
+        kept: How many of the ramps are in use.
 
     Returns:
         First invalid pixel or -1, ramps in use, and events lost.
     """
-    flat, (flags, outside) = image.ravel(), scratch
+    flat, (flags, outside) = image.ravel(), watch.scratch
+    model, memory, ramps = watch.model, watch.memory, watch.ramps
     whole = last - first == image.shape[1]
     found = (
         scan(flat, memory, flags, outside) if whole else _scan_columns(image, first, last, memory, outside)
@@ -91,7 +106,7 @@ def look_at(image, first, last, t_us, model, memory, seen_us, scratch, ramps, ke
         if bad >= 0:
             return bad, begun, 0
         respond_at(pixels, memory.previous, model.curve, responses[0], lights)
-        kept = _keep(pixels, responses, flat, t_us, image.shape[1], model, memory, seen_us, ramps, kept)
+        kept = _keep(pixels, responses, flat, t_us, watch, kept)
     for j in range(begun, kept):
         lost += abs(ramps.crossings[j]) - ramps.sent[j]
     _advance(ramps, begun, kept, model, memory)
@@ -99,7 +114,7 @@ def look_at(image, first, last, t_us, model, memory, seen_us, scratch, ramps, ke
         memory.previous[:] = flat
     else:
         _copy_columns(image, first, last, memory.previous)
-    seen_us[first:last] = t_us
+    watch.seen_us[first:last] = t_us
     return -1, kept, 0 if model.rule.carries else lost
 
 
@@ -127,9 +142,10 @@ def _copy_columns(image, first, last, previous):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _keep(pixels, responses, flat, t_us, width, model, memory, seen_us, ramps, kept):
+def _keep(pixels, responses, flat, t_us, watch, kept):
     """Append the ramps of the pixels that fire; return how many there are now."""
-    rule, thresholds = model.rule, model.thresholds
+    rule, thresholds = watch.model.rule, watch.model.thresholds
+    memory, seen_us, ramps = watch.memory, watch.seen_us, watch.ramps
     for j in range(pixels.size):
         i = pixels[j]
         k = i if thresholds.on.size > 1 else 0
@@ -140,7 +156,7 @@ def _keep(pixels, responses, flat, t_us, width, model, memory, seen_us, ramps, k
         count = np.int64((abs(change) + TOLERANCE) / abs(step))
         if count == 0 or not (rule.carries or way != 0.0):
             continue
-        length_us = t_us - seen_us[i % width]
+        length_us = t_us - seen_us[i % seen_us.size]
         light, sign = np.float64(memory.previous[i]), np.int64(1) if change > 0.0 else np.int64(-1)
         ramps.pixels[kept], ramps.crossings[kept] = i, sign * count
         ramps.sent[kept] = min(count, rule.max_events)
@@ -170,16 +186,15 @@ def _advance(ramps, begun, kept, model, memory):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def events_of_ramps(ramps, kept, span, width, model):
+def events_of_ramps(watch, kept, span):
     """EVENT array of the ramps, sorted by (t, y, x, order in the pixel).
 
     Args:
-        ramps: `Ramps`, those of a pixel in the order of time.
-        kept: How many of them are in use.
+        watch: `Watch`, whose ramps of a pixel are in the order of time.
+        kept: How many of the ramps are in use.
         span: `Span` in which they lie.
-        width: Pixels of a row.
-        model: `Model`.
     """
+    ramps, width = watch.ramps, watch.seen_us.size
     total = ramps.sent[:kept].sum()
     lights, times, places = np.empty(total), np.empty(total, np.int64), np.empty(total, np.uint32)
     event = 0
@@ -187,7 +202,7 @@ def events_of_ramps(ramps, kept, span, width, model):
         for k in range(ramps.sent[j]):
             lights[event] = ramps.level[j] + k * ramps.stride[j]
             event += 1
-    light_of(model.curve, lights)
+    light_of(watch.model.curve, lights)
     event = 0
     for j in range(kept):
         y = ramps.pixels[j] // width

@@ -41,19 +41,18 @@ class Way(NamedTuple):
     moving_us: int
 
 
-class Motion(NamedTuple):
-    """Of a silhouette within a part of a way.
+class Stretch(NamedTuple):
+    """A part of a way, from one render to the next.
 
     Attributes:
-        start: Where it begins [columns].
-        speed: Its mean [columns/us].
-        begin_us, end_us: The part [us].
+        begin_us, end_us: When it begins and ends [us].
+        before, after: (N, 2), `find_silhouettes` at its begin and at its end.
     """
 
-    start: float
-    speed: float
     begin_us: int
     end_us: int
+    before: np.ndarray
+    after: np.ndarray
 
 
 class Looks(NamedTuple):
@@ -122,53 +121,38 @@ def _near(place: float, width: int) -> float:
 
 
 @kernel
-def find_looks(
-    bodies: np.ndarray,
-    way: Way,
-    begin_us: int,
-    end_us: int,
-    before: np.ndarray,
-    after: np.ndarray,
-    width: int,
-    room: Workspace,
-    looks: Looks,
-) -> int:
-    """The looks that a part of a way takes before its end, sorted by time.
+def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, looks: Looks) -> int:
+    """The looks that a stretch of a way takes before its end, sorted by time.
 
     Args:
         bodies: (N,) BODY.
         way: The whole way.
-        begin_us: When the part begins [us].
-        end_us: When it ends [us].
-        before: (N, 2), `find_silhouettes` at its begin.
-        after: (N, 2), the same at its end.
-        width: Columns of the image.
+        stretch: The part of it.
         room: A `Workspace`; its frame is changed.
         looks: Filled with the looks; those beyond its room are left out.
 
     Returns:
         How many there are.
     """
-    size = _half_way(before, after, begin_us, (begin_us + end_us) // 2, looks)
-    length_us = end_us - begin_us
+    before, after, width = stretch.before, stretch.after, len(looks.moving)
+    size = _half_way(stretch, looks)
     for i in range(len(bodies)):
         for side in range(2):
-            start, end = before[i, side], after[i, side]
-            low, high = min(start, end), max(start, end)
+            low, high = min(before[i, side], after[i, side]), max(before[i, side], after[i, side])
             if not (high >= 0.0 and low <= width and high - low > MIN_MOVE):  # also where one is nan
                 continue
-            motion = Motion(start, (end - start) / length_us, begin_us, end_us)
             for border in range(max(0, math.ceil(low)), min(width, math.floor(high)) + 1):
-                t_us = _crossing(bodies[i], side, border, 0.5 * width, motion, way, room)
-                if begin_us < t_us < end_us and size < len(looks.t_us):
+                t_us = _crossing(bodies[i], side, border, width, way, stretch, room)
+                if stretch.begin_us < t_us < stretch.end_us and size < len(looks.t_us):
                     size = _add_look(looks, size, t_us, max(0, border - 1), min(width, border + 1))
     return size
 
 
 @inlined
-def _half_way(before: np.ndarray, after: np.ndarray, begin_us: int, t_us: int, looks: Looks) -> int:
+def _half_way(stretch: Stretch, looks: Looks) -> int:
     """Add looks half-way at the columns in which a silhouette moves fast; how many there are."""
-    moving, width = looks.moving, len(looks.moving)
+    before, after, moving, width = stretch.before, stretch.after, looks.moving, len(looks.moving)
+    t_us = (stretch.begin_us + stretch.end_us) // 2
     moving[:] = False
     for i in range(len(before)):
         for side in range(2):
@@ -176,7 +160,7 @@ def _half_way(before: np.ndarray, after: np.ndarray, begin_us: int, t_us: int, l
             if high - low > MOVING and high >= 0.0 and low < width:
                 moving[int(max(0.0, low)) : int(high) + 1] = True
     size = column = 0
-    while column < width and t_us > begin_us:
+    while column < width and t_us > stretch.begin_us:
         if moving[column]:
             first = column
             while column < width and moving[column]:
@@ -189,17 +173,18 @@ def _half_way(before: np.ndarray, after: np.ndarray, begin_us: int, t_us: int, l
 
 @kernel
 def _crossing(
-    body: Record, side: int, border: int, half: float, motion: Motion, way: Way, room: Workspace
+    body: Record, side: int, border: int, width: int, way: Way, stretch: Stretch, room: Workspace
 ) -> int:
     """When a silhouette is at a border between columns [us]; its motion is linear at first sight."""
-    frame = room.frames[0]
+    frame, start = room.frames[0], stretch.before[body.number, side]
     room.seen[0] = body
-    t_us = motion.begin_us + (border - motion.start) / motion.speed
+    per_us = (stretch.after[body.number, side] - start) / (stretch.end_us - stretch.begin_us)
+    t_us = stretch.begin_us + (border - start) / per_us
     for _ in range(CORRECTIONS):
         aim_along(frame, way, t_us)
         low, high = silhouette_of(room.seen[0], frame)
-        beyond = half + frame.focal * (high if side else low) - border
-        t_us = min(max(t_us - beyond / motion.speed, float(motion.begin_us)), float(motion.end_us))
+        beyond = 0.5 * width + frame.focal * (high if side else low) - border
+        t_us = min(max(t_us - beyond / per_us, float(stretch.begin_us)), float(stretch.end_us))
     return round(t_us)
 
 

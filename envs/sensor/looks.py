@@ -11,15 +11,15 @@ import numpy as np
 from envs.checks import LIMIT_M, LIMIT_S
 from envs.events.crossings import named
 from envs.events.emission import EVENT, Span
-from envs.events.ramps import events_of_ramps, look_at
+from envs.events.ramps import Watch, events_of_ramps, look_at
 from envs.raycast.columns import paint_columns
-from envs.raycast.silhouettes import aim_along, find_looks, find_silhouettes
+from envs.raycast.silhouettes import Stretch, aim_along, find_looks, find_silhouettes
 
 BAD_POSE = -2
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sense_way(scene, way, parts, image, camera, ramps, looks):
+def sense_way(scene, way, parts, image, camera, looks):
     """Events of a way, and the image at its end.
 
     Args:
@@ -28,17 +28,17 @@ def sense_way(scene, way, parts, image, camera, ramps, looks):
         way: `Way`.
         parts: In how many parts of equal time the way is cut.
         image: float32 (H, W), the last one; becomes that at the end.
-        camera: The model, memory and scratch of an `EventCamera`, and when each column was looked
-            at last.
-        ramps: Room for the `Ramps` of at least all pixels.
+        camera: The model, memory and scratch of an `EventCamera`, when each column was looked at
+            last [us], and room for `Ramps` of three times as many pixels.
         looks: Room for `Looks`.
 
     Returns:
         First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
     """
     bodies, stacks, scene_frame, cull, room = scene
-    values, rows, scratch, seen_us = camera
+    values, rows, scratch, seen_us, ramps = camera
     model, memory = named(values, rows)
+    watch = Watch(model, memory, seen_us, scratch, ramps)
     frame, width = room.frames[0], image.shape[1]
     room.frames[0] = scene_frame[0]
     if not _is_near(way):
@@ -52,7 +52,7 @@ def sense_way(scene, way, parts, image, camera, ramps, looks):
         before, after = after, before
         aim_along(frame, way, end_us)
         find_silhouettes(bodies, width, cull, room, after)
-        count = find_looks(bodies, way, begin_us, end_us, before, after, width, room, looks)
+        count = find_looks(bodies, way, Stretch(begin_us, end_us, before, after), room, looks)
         kept = 0
         for k in range(count + 1):
             t_us, first, last = end_us, 0, width
@@ -62,11 +62,11 @@ def sense_way(scene, way, parts, image, camera, ramps, looks):
                     continue
             aim_along(frame, way, t_us)
             paint_columns(bodies, stacks, image, first, last, cull, room)
-            bad, kept, more = look_at(image, first, last, t_us, model, memory, seen_us, scratch, ramps, kept)
+            bad, kept, more = look_at(image, first, last, t_us, watch, kept)
             if bad >= 0:
                 return bad, 0, 0, np.empty(0, EVENT)
             lost, columns = lost + more, columns + last - first
-        more_events = events_of_ramps(ramps, kept, Span(begin_us, end_us), width, model)
+        more_events = events_of_ramps(watch, kept, Span(begin_us, end_us))
         events = more_events if part == 1 else _joined(events, more_events)
         begin_us = end_us
     return -1, lost, columns, events

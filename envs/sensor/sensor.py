@@ -108,10 +108,8 @@ class Sensor:
         scene = renderer.bodies, renderer.stacks, renderer.frame, renderer.cull_m, renderer.room
         way = Way(*start, *end, self._config.camera_height_m, self.t_us, moving_us)
         image = self.luminance.copy()
-        camera = (*self._camera.state, self._seen_us)
-        bad, self.dropped, columns, events = sense_way(
-            scene, way, self.renders, image, camera, self._ramps, self._looks
-        )
+        camera = (*self._camera.state, self._seen_us, self._ramps)
+        bad, self.dropped, columns, events = sense_way(scene, way, self.renders, image, camera, self._looks)
         if bad == BAD_POSE:
             check_pose((*end, way.height, 0.0), (way.start_us + moving_us) * 1e-6)
         if bad >= 0:

@@ -6,7 +6,7 @@ from envs.config import CameraConfig
 from envs.events import EventCamera
 from envs.events.crossings import named
 from envs.events.emission import Span
-from envs.events.ramps import events_of_ramps, look_at, make_ramps
+from envs.events.ramps import Watch, events_of_ramps, look_at, make_ramps
 
 WIDTH, HEIGHT = 16, 12
 
@@ -19,18 +19,16 @@ class Looker:
         self.camera = EventCamera(self.config)
         self.camera.reset(first, t_us)
         self.seen_us = np.full(WIDTH, t_us, np.int64)
-        self.ramps = make_ramps(8 * WIDTH * HEIGHT)
+        values, rows, scratch = self.camera.state
+        model, memory = named(values, rows)
+        self.watch = Watch(model, memory, self.seen_us, scratch, make_ramps(8 * WIDTH * HEIGHT))
 
     def look(self, *looks):
         """Events of looks (image, first column, column after the last, time [us]), and how many are lost."""
-        values, rows, scratch = self.camera.state
-        model, memory = named(values, rows)
         start_us, kept, lost = int(self.seen_us.min()), 0, 0
         for image, first, last, t_us in looks:
-            bad, kept, more = look_at(
-                image, first, last, t_us, model, memory, self.seen_us, scratch, self.ramps, kept
-            )
+            bad, kept, more = look_at(image, first, last, t_us, self.watch, kept)
             assert bad == -1
             lost += more
         span = Span(start_us, max(t_us for *_, t_us in looks))
-        return events_of_ramps(self.ramps, kept, span, WIDTH, model), lost
+        return events_of_ramps(self.watch, kept, span), lost

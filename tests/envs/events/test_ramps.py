@@ -3,7 +3,6 @@ import pytest
 
 from envs.config import CameraConfig
 from envs.events import EVENT, EventCamera
-from envs.events.crossings import named
 from envs.events.ramps import can_look, look_at
 from tests.support.looks import HEIGHT, WIDTH, Looker
 
@@ -95,9 +94,7 @@ def test_a_value_that_is_no_luminance_is_named_and_changes_nothing():
     last[5, 7] = np.nan
     looker = Looker(first)
     before = [part.copy() for part in looker.camera.state[1]]
-    values, rows, scratch = looker.camera.state
-    model, memory = named(values, rows)
-    bad, kept, _ = look_at(last, 6, 9, 10, model, memory, looker.seen_us, scratch, looker.ramps, 0)
+    bad, kept, _ = look_at(last, 6, 9, 10, looker.watch, 0)
     assert (bad, kept) == (5 * WIDTH + 7, 0)
     assert all(np.array_equal(part, kept) for part, kept in zip(looker.camera.state[1], before, strict=True))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs.raycast import RaycastRenderer
-from envs.raycast.silhouettes import Way, aim_along, find_looks, find_silhouettes, make_looks
+from envs.raycast.silhouettes import Stretch, Way, aim_along, find_looks, find_silhouettes, make_looks
 from envs.scene import make_scene
 
 WIDTH = 64
@@ -33,7 +33,7 @@ def looks_of(scene):
         aim_along(room.frames[0], WAY, t_us)
         ends.append(np.empty((len(renderer.bodies), 2)))
         find_silhouettes(renderer.bodies, WIDTH, math.inf, room, ends[-1])
-    count = find_looks(renderer.bodies, WAY, *WHOLE, *ends, WIDTH, room, looks)
+    count = find_looks(renderer.bodies, WAY, Stretch(*WHOLE, *ends), room, looks)
     return looks.t_us[:count], looks.first[:count], looks.last[:count], ends
 
 
