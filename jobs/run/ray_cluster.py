@@ -13,6 +13,7 @@ from typing import Any
 from jobs.config.config import ConfigError
 from jobs.config.schema import ClusterConfig
 from jobs.run.locks import locked, private_folder
+from jobs.run.ray_sessions import forget_sessions
 from jobs.run.threads import ONE_THREAD
 
 # A learner of a large network takes more threads (`training.ppo_learner`); those that wait must sleep:
@@ -82,7 +83,8 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     if cluster.name == "local":
         os.environ["RAY_TMPDIR"] = str(ray_folder())  # of its workers, too
         # Two processes that started Ray within seconds of each other have waited for each other forever.
-        with locked(private_folder() / "start-ray.lock"):
+        with locked(ray_folder() / "start-ray.lock"):
+            forget_sessions(ray_folder())
             _start_local({"num_cpus": cluster.num_cpus, **settings})
         return
     try:
