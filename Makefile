@@ -26,7 +26,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster lint check bench docs lock clean
+.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -87,6 +87,9 @@ test-cluster: setup ## the same sweep on a Ray cluster, and eight at once into P
 	|| echo "warning: no PostgreSQL, so its test is skipped; apt-get install postgresql"
 	$(BIN)/python -c 'import psycopg' 2>/dev/null || $(BIN)/python -m pip install --quiet $(PSYCOPG)
 	$(BIN)/python -m pytest -m cluster -rs tests/cluster $(ARGS)
+
+test-soak: setup ## training, sweep and dashboard for an hour, with a fault every minute (ARGS="minutes=10 seed=1")
+	$(BIN)/python -m tests.soak.soak $(ARGS)
 
 lint: setup ## check style, format, types, and who imports whom
 	$(BIN)/ruff check .
