@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -233,11 +234,17 @@ def judged(fault: Fault, ends: list[End], seconds: float | None) -> tuple[str, b
     unclear = [end for end in own if end.traceback or not end.last_line.startswith("evade: ")]
     if unclear:
         end = unclear[0]
-        return f"stopped (status {end.status}) without a clear reason: {end.last_line[:160]}", False
+        return f"stopped (status {end.status}) without a clear reason: {short(end)}", False
     if own:
-        what = f"stopped: {own[0].last_line[:160]}; continued by its command"
+        what = f"stopped: {short(own[0])}; continued by its command"
         return what, fault.follows == EITHER
     return ("continued by its command" if ends else "went on"), True
+
+
+def short(end: End) -> str:
+    """The last line of a job that fits a cell of a table, without the time that Ray writes before it."""
+    line = re.sub(r"^\[\d{4}-[^]]*\] ", "", end.last_line)
+    return line.replace("|", "/")[:160]
 
 
 def say(event: Event) -> None:
