@@ -18,6 +18,7 @@ from typing import Protocol
 
 from tests.soak.dashboard import Dashboard
 from tests.soak.workload import Lane
+from tests.support.faults import command_line
 
 GOES_ON = "the jobs go on"
 COMMAND = "the printed command continues"
@@ -76,9 +77,9 @@ def down(soak: Soak, lane: Lane, number: signal.Signals = signal.SIGKILL) -> Ite
     """A driver ended by a signal, with all that it started; its command is given again after the block."""
     lane.held = True
     try:
-        left = lane.kill(number)
+        left = [command_line(pid)[:60].strip() for pid in lane.kill(number)]
         if left:
-            soak.findings.append(f"{len(left)} processes outlive the driver of the {lane.name}: {left}")
+            soak.findings.append(f"outlive the driver of the {lane.name} by a minute: {', '.join(left)}")
         yield
         if lane.job.process.returncode != 0:  # it may have been complete just then
             lane.note_end(lane.job.process.returncode, by_fault=True)

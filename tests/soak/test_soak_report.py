@@ -17,10 +17,10 @@ KILLED = End(status=-9, last_line="Sweep: 3/7", traceback=False, by_fault=True)
 
 def test_the_trend_is_that_within_processes_and_not_between_them():
     def life(begin_s, mb):
-        return [(begin_s + t, mb + 30 * t / 3600) for t in range(0, 600, 5)]
+        return [(begin_s + t, mb + 30 * t / 3600) for t in range(0, 1200, 5)]
 
-    assert slope_mb_per_hour([life(0, 100), life(600, 900)]) == pytest.approx(30)
-    loaded = [(t, mb + 100 * (t > 550)) for t, mb in life(0, 100)]
+    assert slope_mb_per_hour([life(0, 100), life(1200, 900)]) == pytest.approx(30)
+    loaded = [(t, mb + 100 * (t > 1100)) for t, mb in life(0, 100)]
     assert slope_mb_per_hour([loaded]) == pytest.approx(30)
     assert slope_mb_per_hour([life(0, 100)[:20]]) is None
 

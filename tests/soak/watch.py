@@ -32,8 +32,8 @@ from tests.soak.dashboard import Dashboard
 from tests.soak.processes import samples, shared_memory
 
 EVERY_S = 5.0
-YOUNG_S = 60.0  # a process that has just begun still imports and fills its caches
-OLD_S = 180.0  # shorter lives tell nothing about a trend
+YOUNG_S = 120.0  # a process that has just begun still imports and fills its caches
+OLD_S = 600.0  # shorter lives tell nothing about a trend: each stage loads what it needs
 FAR_S = 30.0  # between two samples that are compared
 COLOURS = {
     "driver": BLUE, "env runner": GREEN, "sweep worker": AMBER, "other of Ray": SLATE, "raylet": CYAN,
