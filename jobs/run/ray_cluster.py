@@ -219,6 +219,8 @@ def use_token(file: Path) -> None:
 
 def make_token(file: Path) -> None:
     """Write a new token to a file that nobody else can read; one that is there stays."""
+    if file.is_file() and not file.stat().st_size:  # a power failure cut it
+        file.unlink()
     if file.exists():
         return
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -14,6 +14,7 @@ import json
 import logging
 import math
 import os
+import sqlite3
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +26,7 @@ from urllib.parse import quote
 from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
 from jobs.config.errors import redacted
-from jobs.run.files import read_json, write_json
+from jobs.run.files import read_json, replaced, write_json
 from jobs.run.folder import Run
 from jobs.run.locks import held_alone, locked, private_folder
 from jobs.run.progress import console
@@ -60,6 +61,12 @@ if TYPE_CHECKING:
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
 KNOWN_RUNS = "tracking.json"  # in a run folder
+REMEDIES = {  # what SQLite says: what to do
+    "disk is full": "make room there; ",
+    "disk I/O error": "make room there; ",
+    "malformed": "the file is damaged: move it away for a new one; ",
+    "not a database": "the file is damaged: move it away for a new one; ",
+}
 UNAVAILABLE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # MLflow's codes after which a retry may help
 
 
@@ -261,24 +268,27 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
 
 @contextlib.contextmanager
 def _answering(uri: str, folder: Run) -> Iterator[None]:
-    """Stop with one clear error where the store does not answer."""
+    """Stop with one clear error where the store does not answer, is full or is damaged."""
     from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import DBAPIError
 
     try:
         with calling_with(MANY_RETRIES):
             yield
-    except (MlflowException, StoreUnavailable) as error:
-        if isinstance(error, MlflowException) and error.error_code not in UNAVAILABLE:
+    except (MlflowException, StoreUnavailable, DBAPIError) as error:
+        reason = _reason(error)
+        remedy = next((remedy for sign, remedy in REMEDIES.items() if sign in reason), "")
+        if isinstance(error, MlflowException) and error.error_code not in UNAVAILABLE and not remedy:
             raise
-        rest = f"what was computed is in {folder.path}, the same command records it"
-        raise TrackingError(
-            f"tracking.uri: {redacted(uri)} does not answer ({_reason(error)}); {rest}"
-        ) from error
+        rest = f"{remedy}what was computed is in {folder.path}, the same command records it"
+        raise TrackingError(f"tracking.uri: {redacted(uri)} does not answer ({reason}); {rest}") from error
 
 
 def _reason(error: Exception) -> str:
-    """The cause, as the last words of what MLflow says."""
-    return str(error).strip().splitlines()[0].rpartition("Caused by ")[2][:200]
+    """The cause, as the last words of what MLflow says, or as SQLite says it."""
+    lines = str(error).strip().splitlines()
+    cause = next((line for line in lines if line.startswith("(sqlite3.")), lines[0])
+    return cause.rpartition("Caused by ")[2][:200]
 
 
 @contextlib.contextmanager
@@ -342,15 +352,41 @@ def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["
     from mlflow import MlflowClient
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    name = quote(experiment, safe="")
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # tracebacks of what it raises
+    name, file = quote(experiment, safe=""), Path(uri.removeprefix("sqlite:///"))
     if uri.startswith("sqlite:///"):
-        file = Path(uri.removeprefix("sqlite:///"))
         lock, location = file.with_suffix(".lock"), (file.parent / "mlartifacts" / name).as_uri()
     else:
         lock, location = private_folder() / f"store-{settings_hash({'uri': uri})[:8]}.lock", None
     if storage is not None:
         location = f"{storage.rstrip('/')}/mlartifacts/{name}"
     with locked(lock):
+        if uri.startswith("sqlite:///"):
+            _create_or_check(file)
         client = MlflowClient(tracking_uri=uri)
         known = client.get_experiment_by_name(experiment)
         return client, known.experiment_id if known else client.create_experiment(experiment, location)
+
+
+def _create_or_check(file: Path) -> None:
+    """Make an SQLite store, whole or not at all: MLflow cannot go on with half of its tables.
+
+    Raises:
+        TrackingError: There is one, and it is damaged.
+    """
+    from mlflow import MlflowClient
+
+    if file.is_file() and file.stat().st_size:
+        try:
+            with contextlib.closing(sqlite3.connect(file)) as store:
+                ((said,), *_) = store.execute("PRAGMA quick_check(1)")
+        except sqlite3.OperationalError:  # locked by another process: no damage
+            return
+        except sqlite3.DatabaseError as error:
+            said = str(error)
+        if said != "ok":
+            remedy = "restore a copy, or move it away, and the same command records into a new one"
+            raise TrackingError(f"tracking.uri: {file}: damaged ({said.splitlines()[-1]}); {remedy}")
+        return
+    with replaced(file) as part:
+        MlflowClient(tracking_uri=f"sqlite:///{part}").search_experiments(max_results=1)

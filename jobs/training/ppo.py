@@ -20,6 +20,7 @@ from envs.kinematics import NUM_ACTIONS
 from jobs.config.conditions import env_with
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.diagnostics import drift_metrics
+from jobs.run.files import RunError
 from jobs.training.env_runner import MAX_SAMPLE_S, PlainEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
 from models.encoder.evae import EventVAE
@@ -271,6 +272,7 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
 
     Raises:
         ConfigError: It was made for another sensor, or for another model than the one to fine-tune.
+        RunError: It is damaged.
         ValueError: A policy that needs one got none, or the other way round.
     """
     name, needed = config.model.name, KINDS[config.model.name].encoder
@@ -278,7 +280,11 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
         raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")
     if path is None:
         return None
-    _, about = load_encoder(path)
+    try:
+        _, about = load_encoder(path)
+    except EncoderFileError as error:
+        marker = Path(path).parent.parent / "stages" / "pretrain.json"
+        raise RunError(f"{error}; delete {marker}, and the same command makes the encoder anew") from None
     differ = sensor_differences(about["sensor"], config.env)
     if differ:
         values = ", ".join(

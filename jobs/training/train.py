@@ -9,7 +9,6 @@ raise the same again.
 """
 
 import contextlib
-import json
 import math
 import re
 import time
@@ -26,6 +25,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
+from jobs.run.files import json_lines, naming, read_json_lines, whole_lines
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, logs_folder, start_ray, storage
@@ -245,7 +245,8 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
     file = folder.train / "results.jsonl"
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(whole_lines(file))
+    with file.open("ab") as content:
+        content.truncate(len(whole_lines(file)))  # a kill can leave half a line
     reported, last = reported_so_far(file)
     total, since_s = config.train.env_steps, time.monotonic()
     paused_s: float | None = None
@@ -264,8 +265,9 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             if env_steps <= reported:
                 return
             row = {name: value if math.isfinite(value) else None for name, value in last.items()}
-            lines.write(json.dumps({"env_steps": env_steps, **row}) + "\n")
-            lines.flush()
+            with naming(file):
+                lines.write(json_lines([{"env_steps": env_steps, **row}]))
+                lines.flush()
             on_result(env_steps, dict(last))
             advance(env_steps - reported, note=_note(last))
             reported = env_steps
@@ -291,18 +293,16 @@ def check_pause(seconds: float, result: Any, env_runners: int) -> None:
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
-    """Environment steps and metrics of the last whole line of a results file; 0 and none without one."""
-    lines = whole_lines(file).splitlines()
-    if not lines:
+    """Environment steps and metrics of the last whole line of a results file; 0 and none without one.
+
+    Raises:
+        RunError: A line is damaged.
+    """
+    rows = read_json_lines(file)
+    if not rows:
         return 0, {}
-    row = json.loads(lines[-1])
+    row = rows[-1]
     return int(row.pop("env_steps")), {name: math.nan if x is None else x for name, x in row.items()}
-
-
-def whole_lines(file: Path) -> bytes:
-    """A file's content up to its last line end: a kill can leave half a line behind it."""
-    text = file.read_bytes() if file.exists() else b""
-    return text[: text.rfind(b"\n") + 1]
 
 
 def read_metrics(result: Mapping[str, object], seconds: float) -> dict[str, float]:

@@ -12,7 +12,9 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -202,3 +204,41 @@ def check_complete(job):
     from models.policy import load_policy
 
     load_policy(job.run / "policy")
+
+
+def forked(folder: Path, *words: str, first: Callable[[], object] = lambda: None) -> tuple[int, str]:
+    """Run the launcher in a fork of this process, which has imported most of it: status, and what it says.
+
+    `first` is called in the fork before it. A status below 0 is the signal that ended it.
+    """
+    with tempfile.TemporaryFile("w+") as log:
+        pid = os.fork()
+        if pid == 0:
+            status = 70
+            try:
+                for number in (1, 2):
+                    os.dup2(log.fileno(), number)
+                sys.stdout = sys.stderr = os.fdopen(os.dup(log.fileno()), "w", buffering=1)
+                sys.argv = ["launch", *words, f"runs_dir={folder / 'runs'}"]
+                first()
+                from platform.launch import main
+
+                status = main()
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                os._exit(status)
+        _, status = os.waitpid(pid, 0)
+        log.seek(0)
+        return os.waitstatus_to_exitcode(status), log.read()
+
+
+def leave_room(disk: Path, room: int) -> Path:
+    """Fill a small disk so that `room` bytes are left; the file that does."""
+    filler = disk / "filler"
+    filler.unlink(missing_ok=True)
+    state = os.statvfs(disk)
+    with filler.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, max(1, state.f_bavail * state.f_frsize - room))
+    return filler
