@@ -24,12 +24,14 @@ from jobs.config.schema import ClusterConfig
 from jobs.rollout.agents import BASELINES
 from jobs.rollout.executors import Part, Recorder, attempt, evaluate_part
 from jobs.run.ray_cluster import fit, start_ray, storage
+from jobs.run.trial_errors import low_memory, newest_error
 from jobs.run.watchdog import ending_after
 
 MAX_FAILURES = 2
 # A step takes a thousandth of this, with pyrender a tenth; compiling takes a minute, and several
 # on a busy machine.
 MAX_STEP_S, MAX_START_S = 0.1, 900.0
+UNKNOWN_END = "killed, often for lack of memory, or crashed"  # Ray cannot tell which
 # Stored episodes are what a stopped job continues from. Tune's own picture of all trials, written
 # at each result, would cost more than the episodes.
 TUNE_SNAPSHOT_S = "3600"
@@ -108,20 +110,23 @@ class TrialCallback(tune.Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
         """Note that a part is tried again."""
-        self._lose(_part_of(trial), "tried again")
+        self._lose(trial, "tried again")
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
         """Note that a part is given up."""
-        self._lose(_part_of(trial), "given up")
+        self._lose(trial, "given up")
 
-    def _lose(self, part: Part, consequence: str) -> None:
+    def _lose(self, trial: Trial, consequence: str) -> None:
+        part = _part_of(trial)
         name, limit_s = part.task.part_id, time_limit_s(part)
         self._ends[name] += 1
         if time.monotonic() - self._started.get(name, math.inf) >= limit_s:
             self._late.add(name)
-        late = f" (it may take {limit_s:.0f} s)" if name in self._late else ""
+        cause = low_memory(newest_error(trial.error_file)) or UNKNOWN_END
+        if name in self._late:
+            cause = f"it may take {limit_s:.0f} s"
         if self._recorder is not None:
-            self._recorder.lose(part, f"its process ended{late} {self._ends[name]} times", consequence)
+            self._recorder.lose(part, f"its process ended ({cause}) {self._ends[name]} times", consequence)
 
 
 def _part_of(trial: Trial) -> Part:
