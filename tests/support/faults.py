@@ -176,10 +176,7 @@ def start(
     folder: Path, command: list[str], first: str = "", after: dict[str, str] | None = None, **variables: str
 ) -> Job:
     """The same from a whole command."""
-    hook = folder / "hook"
-    hook.mkdir(parents=True, exist_ok=True)
-    (hook / "sitecustomize.py").write_text(HOOK.format(after=after or {}, first=first))
-    path = os.pathsep.join([str(hook), str(ROOT)])
+    path = write_hook(folder, first, after)
     log = Path(variables.get("TMPDIR", folder)) / f"log-{time.monotonic_ns()}"  # not on a disk that fills up
     with log.open("w") as file:
         process = subprocess.Popen(
@@ -191,6 +188,14 @@ def start(
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
     return Job(process, log, folder / "runs")
+
+
+def write_hook(folder: Path, first: str = "", after: dict[str, str] | None = None) -> str:
+    """Write code for processes to run; the PYTHONPATH with which they run it."""
+    hook = folder / "hook"
+    hook.mkdir(parents=True, exist_ok=True)
+    (hook / "sitecustomize.py").write_text(HOOK.format(after=after or {}, first=first))
+    return os.pathsep.join([str(hook), str(ROOT)])
 
 
 def descendants(pid: int) -> Iterator[int]:
