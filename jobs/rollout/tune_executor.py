@@ -51,7 +51,16 @@ def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterCon
     start_ray(cluster, folder.parent)
     os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = TUNE_SNAPSHOT_S
     trial = tune.with_parameters(run_trial, files=policy_files(parts))
-    tuner = tune.Tuner(
+    callback = TrialCallback(recorder)
+    while parts:
+        fit(_tuner(trial, parts, cluster, folder, callback))
+        parts = callback.take_unfinished()
+
+
+def _tuner(
+    trial: Any, parts: Sequence[Part], cluster: ClusterConfig, folder: Path, callback: "TrialCallback"
+) -> tune.Tuner:
+    return tune.Tuner(
         tune.with_resources(trial, {"cpu": 1}),
         tune_config=tune.TuneConfig(reuse_actors=True),  # a new worker imports for seconds
         param_space={
@@ -61,11 +70,10 @@ def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterCon
             name="tune",
             storage_path=storage(cluster, folder),
             verbose=0,
-            callbacks=[TrialCallback(recorder)],
+            callbacks=[callback],
             failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
         ),
     )
-    fit(tuner)
 
 
 def time_limit_s(part: Part) -> float:
@@ -92,6 +100,12 @@ class TrialCallback(tune.Callback):
         self._started: dict[tuple[str, int], float] = {}
         self._ends: Counter[tuple[str, int]] = Counter()
         self._late: set[tuple[str, int]] = set()
+        self._unfinished: list[Part] = []
+
+    def take_unfinished(self) -> list[Part]:
+        """The parts that Tune gave up too early, which is what it does with a trial that has not begun."""
+        unfinished, self._unfinished = self._unfinished, []
+        return unfinished
 
     def __reduce__(self) -> tuple[type["TrialCallback"], tuple[None]]:
         """Tune pickles its callbacks; the recorder, whose progress bar cannot be pickled, stays behind."""
@@ -113,8 +127,13 @@ class TrialCallback(tune.Callback):
         self._lose(trial, "tried again")
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
-        """Note that a part is given up."""
-        self._lose(trial, "given up")
+        """Note that a part is given up, unless its process has ended too seldom for that."""
+        part = _part_of(trial)
+        if self._ends[part.task.part_id] < MAX_FAILURES:
+            self._unfinished.append(part)
+            self._lose(trial, "tried again")
+        else:
+            self._lose(trial, "given up")
 
     def _lose(self, trial: Trial, consequence: str) -> None:
         part = _part_of(trial)

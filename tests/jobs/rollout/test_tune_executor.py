@@ -9,7 +9,14 @@ import pytest
 from jobs.rollout import tune_executor
 from jobs.rollout.executors import Part, Recorder, evaluate_part
 from jobs.rollout.store import EpisodeStore
-from jobs.rollout.tune_executor import UNKNOWN_END, TrialCallback, policy_files, time_limit_s, with_files
+from jobs.rollout.tune_executor import (
+    MAX_FAILURES,
+    UNKNOWN_END,
+    TrialCallback,
+    policy_files,
+    time_limit_s,
+    with_files,
+)
 from tests.support.configs import sweep_config
 from tests.support.fake_executor import made_up
 from tests.support.policies import save_training
@@ -43,6 +50,7 @@ def test_a_part_whose_process_ends_is_counted_and_its_restarts_are_stored(tmp_pa
 def test_a_part_that_ends_after_its_limit_is_said_to_be_late(tmp_path, recorder, monkeypatch, capsys):
     monkeypatch.setattr(tune_executor, "MAX_START_S", 0.0)
     monkeypatch.setattr(tune_executor, "MAX_STEP_S", 0.0)
+    monkeypatch.setattr(tune_executor, "MAX_FAILURES", 0)
     part, callback = first_part(sweep_config(tmp_path)), TrialCallback(recorder)
     callback.on_trial_start(1, [], trial_of(part))
     callback.on_trial_error(1, [], trial_of(part))
@@ -68,6 +76,17 @@ def test_a_part_that_ray_ended_for_lack_of_memory_says_so(tmp_path, recorder):
     errors.write_text(begin.format(1) + low + begin.format(2) + "The actor died unexpectedly.\n")
     callback.on_trial_error(1, [], trial_of(part, str(errors)))
     assert recorder.reason(part) == f"its process ended ({UNKNOWN_END}) 2 times"
+
+
+def test_a_part_that_tune_gives_up_too_early_is_tried_again(tmp_path, recorder, capsys):
+    part, callback = first_part(sweep_config(tmp_path)), TrialCallback(recorder)
+    for _ in range(MAX_FAILURES):
+        callback.on_trial_error(1, [], trial_of(part))
+        assert callback.take_unfinished() == [part]
+        assert "tried again" in capsys.readouterr().out
+    callback.on_trial_error(1, [], trial_of(part))
+    assert callback.take_unfinished() == []
+    assert "given up" in capsys.readouterr().out
 
 
 def test_the_reason_that_a_part_gave_comes_before_the_end_of_its_process(tmp_path, recorder):
