@@ -16,7 +16,6 @@ import math
 import os
 import sqlite3
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from jobs.run.folder import Run
 from jobs.run.locks import held_alone, locked, private_folder
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
+from jobs.tracking.clock import now_ms
 from jobs.tracking.pages import (
     NOTE,
     PREVIEWS,
@@ -101,7 +101,7 @@ class Tracker:
         measured = {name: value for name, value in values.items() if name not in missing}
         row: LoggedStep = {
             "step": step,
-            "time_ms": int(time.time() * 1000),
+            "time_ms": now_ms(),
             "metrics": measured,
             "missing": missing,
         }
@@ -184,7 +184,7 @@ class Tracker:
             name: What the menu calls it.
             state: As `jobs.tracking.pages.table_view` or `chart_view` makes it.
         """
-        tag, view = f"{VIEW_TAG}.{key}", packed_view(name, state, int(time.time() * 1000))
+        tag, view = f"{VIEW_TAG}.{key}", packed_view(name, state, now_ms())
         old = json.loads(self.client.get_experiment(self.experiment_id).tags.get(tag, "{}"))
         if old.get("state") != json.loads(view)["state"]:
             self.client.set_experiment_tag(self.experiment_id, tag, view)
@@ -301,13 +301,19 @@ def _ended(tracker: Tracker) -> Iterator[None]:
         for row in tracker.retry_queue.rows():
             tracker._send(row)
         tracker.retry_queue.file.unlink(missing_ok=True)
-        tracker.client.set_terminated(tracker.run_id, "FINISHED")
+        _terminate(tracker, "FINISHED")
     except BaseException as error:
         status = "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
         # An error of the store must not hide why the block ended.
         with contextlib.suppress(MlflowException), calling_with(NO_RETRIES):
-            tracker.client.set_terminated(tracker.run_id, status)
+            _terminate(tracker, status)
         raise
+
+
+def _terminate(tracker: Tracker, status: str) -> None:
+    """Set a run's status and end; a run that is continued after the clock was set back ends when it began."""
+    start_ms = tracker.client.get_run(tracker.run_id).info.start_time
+    tracker.client.set_terminated(tracker.run_id, status, max(start_ms, now_ms()))
 
 
 def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
@@ -324,7 +330,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
         except MlflowException as error:  # the run was deleted: begin a new one
             if error.error_code in UNAVAILABLE:
                 raise
-    run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
+    run = near.client.create_run(near.experiment_id, now_ms(), tags=tags, run_name=name)
     write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})
     return dataclasses.replace(near, run_id=run.info.run_id)
 

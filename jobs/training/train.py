@@ -29,6 +29,7 @@ from jobs.run.files import json_lines, naming, read_json_lines, whole_lines
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, logs_folder, start_ray, storage
+from jobs.run.trial_errors import low_memory, newest_error
 from jobs.tracking.tracker import open_tracker
 from jobs.training.env_runner import RolloutError
 from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_about, policy_spec
@@ -64,7 +65,6 @@ MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
 LISTENER = "train"
-FAILURE = re.compile(r"^Failure # \d+ .*$", re.MULTILINE)  # begins each error that Tune writes about a trial
 RAISED = re.compile(r"^(?:\w+\.)*\w+(?:Error|Exception|Exit|Interrupt)\b.*$", re.MULTILINE)
 
 _LISTENERS: dict[str, Callable[[Mapping[str, object]], None]] = {}
@@ -106,16 +106,6 @@ class Relay(tune.Callback):
             raise TrainingError(stopped(error))
         reason = last_line(error) if error else "its process could not be started"
         console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
-
-
-def newest_error(file: str | None) -> str:
-    """The newest of the errors that Tune has written about a trial, as text; empty if there is none.
-
-    Tune keeps the error itself too, pickled, but where another user of the machine may write.
-    """
-    if file is None or not Path(file).is_file():
-        return ""
-    return FAILURE.split(Path(file).read_text())[-1].strip()
 
 
 def run(config: Config) -> dict[str, float]:
@@ -167,6 +157,9 @@ def stopped(error: Exception | str) -> str:
 
 def last_line(error: Exception | str) -> str:
     """The line of a worker's error that names its cause."""
+    ended = low_memory(str(error))
+    if ended is not None:
+        return f"its process was ended {ended}; stop other programs, or take a machine with more"
     lines = str(error).strip().splitlines()
     raised = f"{RolloutError.__module__}.{RolloutError.__qualname__}: "  # as Ray writes it before the message
     return lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
@@ -287,8 +280,11 @@ def check_pause(seconds: float, result: Any, env_runners: int) -> None:
     """
     known = result.get("fault_tolerance", {})
     restarts, alive = known.get("num_remote_worker_restarts", 0), known.get("num_healthy_workers", 1)
-    if seconds > MAX_PAUSE_S or (alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)):
-        ended = f"every env runner has died, some {MAX_RESTARTS + 1} times"
+    all_spent = alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)
+    if seconds > MAX_PAUSE_S or all_spent:
+        ended = "no env runner answers"
+        if all_spent:
+            ended = f"every env runner has died, some {MAX_RESTARTS + 1} times"
         raise TrainingError(f"no step was sampled for {seconds:.0f} s: {ended}; see {logs_folder()}")
 
 

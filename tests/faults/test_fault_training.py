@@ -38,14 +38,21 @@ def test_an_env_runner_that_is_killed_is_started_again_and_counted(tmp_path):
 
 
 def test_a_killed_driver_continues_by_the_printed_command(tmp_path):
-    job = launch(tmp_path, *TRAIN, *FINE)
+    # Long enough to be still at work when the other has started.
+    job = launch(tmp_path, *TRAIN, *FINE, "train.env_steps=6400")
+    job.wait(lambda: job.steps() >= 128)
+    refused = start(tmp_path, job.printed_command())
+    assert refused.end() == 1
+    assert f"{job.run}: process {job.process.pid} of " in refused.said
+    assert "works there; wait until it has ended" in refused.said
     job.wait(lambda: job.steps() >= 320)
-    job.kill()
+    job.kill_alone()
     before = job.rows()
-    again = start(tmp_path, job.printed_command())
+    again = start(tmp_path, job.printed_command())  # at once: what the other started may still be ending
     check_complete(again)
     assert again.rows()[: len(before)] == before
     outcome("driver killed, training", "the printed command continues; each step reported once", "0 results")
+    outcome("second driver, training", "refused while the first works, not after its SIGKILL", "nothing")
 
 
 def test_ctrl_c_stops_a_training_that_the_same_command_continues(tmp_path):
