@@ -296,3 +296,27 @@ def test_what_a_callback_raises_comes_out_of_tune_as_it_is():
 
     with pytest.raises(ClusterError, match="the reason"):
         joining.fit(Tuner())
+
+
+def refused_join(monkeypatch, error):
+    """What is said when Ray raises this as it joins."""
+
+    def init(**settings):
+        raise error
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ConfigError) as caught:
+        joining._join("h:6379", {})
+    return str(caught.value)
+
+
+def test_who_cannot_join_is_told_why_in_one_line(monkeypatch):
+    unreachable = ConnectionError("Failed to connect to Ray cluster at h:6379")
+    assert refused_join(monkeypatch, unreachable) == f"cluster.address: cannot join 'h:6379': {unreachable}"
+    unreachable.__cause__ = RuntimeError("Traceback ...\nRPC error: InvalidAuthToken: Authentication ...")
+    said = refused_join(monkeypatch, unreachable)
+    assert "it asks for another token" in said
+    assert "RAY_AUTH_TOKEN_PATH" in said
+    versions = "Version mismatch: The cluster was started with:\n    Ray: 2.59.0\n    Python: 3.11.7\n"
+    said = refused_join(monkeypatch, RuntimeError(versions))
+    assert said.endswith("with: Ray: 2.59.0 Python: 3.11.7; install the same packages on every machine")
