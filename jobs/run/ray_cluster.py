@@ -12,6 +12,7 @@ from typing import Any
 
 from jobs.config.config import ConfigError
 from jobs.config.schema import ClusterConfig
+from jobs.run.head_watch import watching_head
 from jobs.run.locks import locked, private_folder
 from jobs.run.same_code import check_machines
 from jobs.run.threads import ONE_THREAD
@@ -171,11 +172,16 @@ def logs_folder() -> Path:
 
 
 def fit(tuner: Any) -> Any:
-    """Run a Tuner; raise an error of its callbacks itself, not the text of its traceback."""
+    """Run a Tuner; raise an error of its callbacks itself, not the text of its traceback.
+
+    Raises:
+        HeadLostError: The head of the cluster does not answer any more.
+    """
     from ray.tune import TuneError
 
     try:
-        return tuner.fit()
+        with watching_head():
+            return tuner.fit()
     except TuneError as error:
         raise (error.__context__ or error) from None
 
