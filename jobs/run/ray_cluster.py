@@ -120,7 +120,7 @@ def _start_local(settings: Mapping[str, object]) -> None:
 
     for _ in range(MAX_STARTS):
         try:
-            with _on_loopback():
+            with on_loopback():
                 ray.init(address="local", include_dashboard=False, **settings)
             return
         except Exception as error:  # Ray's own has no type of its own
@@ -133,7 +133,7 @@ def _start_local(settings: Mapping[str, object]) -> None:
 
 
 @contextlib.contextmanager
-def _on_loopback() -> Iterator[None]:
+def on_loopback() -> Iterator[None]:
     """Let a Ray that starts take the loopback address for this machine's, and listen nowhere else.
 
     That is what RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER=0 does; but Ray reads the variable when it is
