@@ -1,5 +1,7 @@
 import json
+import os
 import shutil
+import signal
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from jobs.training.snapshots import FOLDER, generators, set_generators
 from jobs.training.train import METRICS, export_policy, read_metrics
 from models.kinds import KINDS
 from tests.support.configs import make_config
+from tests.support.faults import FINE, TRAIN, check_complete, launch, outcome, start
 from tests.support.runs import write_encoder
 
 pytestmark = pytest.mark.system
@@ -206,3 +209,28 @@ def test_generators_go_on():
     set_generators(kept)
     again = [(torch.rand(3).tolist(), np.random.normal(size=3).tolist()) for _ in "ab"]  # noqa: NPY002
     assert again == drawn
+
+
+@pytest.mark.faults
+def test_a_training_that_is_disturbed_ends_with_the_bytes_of_one_that_is_not(tmp_path):
+    words = *TRAIN, *FINE, "algo.num_env_runners=2", "train.checkpoint_every=3", "env.time_limit_s=0.2"
+    whole = launch(tmp_path / "whole", *words)
+    check_complete(whole)
+    job = launch(tmp_path / "disturbed", *words)
+    job.wait(lambda: job.steps() >= 128)
+    os.kill(job.workers("ray::PlainEnvRunner")[0], signal.SIGKILL)
+    before = job.steps()
+    job.wait(lambda: job.steps() > before + 64)
+    assert job.rows()[-1]["perf/env_runner_restarts"] == 1
+    job.kill()
+    again = start(tmp_path / "disturbed", job.printed_command())
+    check_complete(again)
+    assert "new episodes" not in again.said
+    told = [
+        [{name: row[name] for name in ("env_steps", *SAME)} for row in one.rows()] for one in (whole, again)
+    ]
+    assert told[0] == told[1]
+    policies = [sorted((one.run / "policy").glob("*.safetensors")) for one in (whole, again)]
+    assert [path.read_bytes() for path in policies[0]] == [path.read_bytes() for path in policies[1]]
+    assert policies[0]
+    outcome("env runner and driver killed", "the same bytes as undisturbed", "nothing")
