@@ -124,8 +124,9 @@ def test_the_first_part_of_a_longer_training_is_a_shorter_one(tmp_path):
     told = [rows(whole, 2), rows(whole, 2)]
     part = shorter()
     assert rows(part, 2) == told[0]
+    checkpoint = saved(part, tmp_path / "checkpoint")  # another training in this process seeds it anew
     extended = longer()
-    extended.load_checkpoint(str(saved(part, tmp_path / "checkpoint")))
+    extended.load_checkpoint(str(checkpoint))
     assert rows(extended, 2) == told[1]
     for algorithm in (whole, part, extended):
         algorithm.stop()
