@@ -28,11 +28,12 @@ from jobs.run.checkpoints import mend, seal
 from jobs.run.files import json_lines, naming, read_json_lines, whole_lines
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
-from jobs.run.ray_cluster import fit, holds, logs_folder, start_ray, storage
+from jobs.run.ray_cluster import fit, holds, start_ray, storage
 from jobs.run.trial_errors import low_memory, newest_error
 from jobs.tracking.tracker import open_tracker
+from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.env_runner import RolloutError
-from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_about, policy_spec
+from jobs.training.ppo import build_ppo, policy_about, policy_spec
 from jobs.training.pretrain import check_sources, prepare_encoder
 from models.encoder.weights import EncoderManifest, load_encoder
 from models.policy import save_policy
@@ -60,7 +61,6 @@ METRICS = {
 ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
 ENV_STEPS = "num_env_steps_sampled_lifetime"
 SAMPLED = ("env_runners", "num_env_steps_sampled")
-MAX_PAUSE_S = 600.0  # while all env runners restart: a busy machine takes minutes
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
@@ -88,7 +88,9 @@ class Relay(tune.Callback):
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
     ) -> None:
-        """Pass one result on, with the number of restarts before it."""
+        """Pass one result on, with the number of restarts before it, and show its notice."""
+        if NOTICE in result:
+            console.print(result[NOTICE], markup=False)
         _LISTENERS[self.name]({**result, "trial_restarts": trial.num_failures})
 
     def on_checkpoint(
@@ -242,17 +244,11 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
         content.truncate(len(whole_lines(file)))  # a kill can leave half a line
     reported, last = reported_so_far(file)
     total, since_s = config.train.env_steps, time.monotonic()
-    paused_s: float | None = None
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
         def listen(result: Mapping[str, object]) -> None:
-            nonlocal reported, since_s, paused_s
-            now_s = time.monotonic()
-            if not _lookup(result, SAMPLED) > 0:
-                paused_s = now_s if paused_s is None else paused_s
-                check_pause(now_s - paused_s, result, config.algo.num_env_runners)
-                return
-            paused_s, env_steps = None, int(_lookup(result, (ENV_STEPS,)))
+            nonlocal reported, since_s
+            now_s, env_steps = time.monotonic(), int(_lookup(result, (ENV_STEPS,)))
             last.update(read_metrics(result, now_s - since_s))
             since_s = now_s
             if env_steps <= reported:
@@ -270,22 +266,6 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             yield last
         finally:
             del _LISTENERS[LISTENER]
-
-
-def check_pause(seconds: float, result: Any, env_runners: int) -> None:
-    """Let a training wait for env runners that died, unless they do not come back.
-
-    Raises:
-        TrainingError: All have been started as often as they may be, or after `MAX_PAUSE_S`.
-    """
-    known = result.get("fault_tolerance", {})
-    restarts, alive = known.get("num_remote_worker_restarts", 0), known.get("num_healthy_workers", 1)
-    all_spent = alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)
-    if seconds > MAX_PAUSE_S or all_spent:
-        ended = "no env runner answers"
-        if all_spent:
-            ended = f"every env runner has died, some {MAX_RESTARTS + 1} times"
-        raise TrainingError(f"no step was sampled for {seconds:.0f} s: {ended}; see {logs_folder()}")
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:

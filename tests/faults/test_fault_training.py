@@ -31,9 +31,7 @@ def test_an_env_runner_that_is_killed_is_started_again_and_counted(tmp_path):
     ]
     assert restarts == 1
     repeated = [row["env_steps"] for row in job.rows() if row["env_steps"] > before]
-    outcome(
-        "env runner killed", "started again, training goes on (restarts in results: 1)", "its steps in flight"
-    )
+    outcome("env runner killed", "started again, goes on where it was (restarts in results: 1)", "nothing")
     assert repeated
 
 
@@ -165,7 +163,7 @@ def test_an_env_runner_that_hangs_is_ended_and_started_again(tmp_path):
     check_complete(job)
     assert (tmp_path / "hung").exists()
     assert job.rows()[-1]["perf/env_runner_restarts"] >= 1
-    outcome("env runner hangs", "ended after its limit (900 s), started again", "its steps in flight")
+    outcome("env runner hangs", "ended after its limit (900 s), goes on where it was", "nothing")
 
 
 def test_clock_jumps_change_no_result(tmp_path):

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -57,36 +56,6 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
 def test_a_loss_that_is_not_finite_stops_the_training(bad):
     with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
         read_metrics(result(vf_loss=bad), 2.0)
-
-
-@pytest.mark.parametrize(
-    ("runners", "alive", "restarts", "stops"),
-    [(1, 0, 3, True), (2, 0, 6, True), (1, 0, 2, False), (2, 0, 5, False), (2, 1, 6, False)],
-)
-def test_a_training_stops_at_once_when_nothing_that_flies_is_started_again(
-    monkeypatch, runners, alive, restarts, stops
-):
-    monkeypatch.setattr(training, "logs_folder", lambda: "/the/logs")
-    known = {"fault_tolerance": {"num_healthy_workers": alive, "num_remote_worker_restarts": restarts}}
-    with pytest.raises(TrainingError, match=r"every env runner.* see /the/logs") if stops else nullcontext():
-        training.check_pause(1.0, known, runners)
-
-
-def test_a_training_waits_for_processes_that_start_again_but_not_forever(tmp_path, monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(training, "logs_folder", lambda: "/the/logs")
-    folder, seen = open_run(make_config(f"runs_dir={tmp_path}")), []
-    empty = {**result(), "env_runners": {}, "learners": {}}
-    with training._listening(folder.config, folder, lambda step, metrics: seen.append(step)):
-        listen = training._LISTENERS[training.LISTENER]
-        for seconds in (100.0, 400.0, 400.0, 300.0, 300.0):
-            now[0] += seconds
-            listen(result() if seconds == 400.0 and not seen else empty)
-        now[0] += 1.0
-        with pytest.raises(TrainingError, match="no step was sampled for 601 s: no env runner answers"):
-            listen(empty)
-    assert seen == [4096]
 
 
 # What Ray's memory monitor writes, shortened.
