@@ -23,7 +23,7 @@ from ray.tune.experiment import Trial
 from jobs.config.schema import ClusterConfig
 from jobs.rollout.agents import BASELINES
 from jobs.rollout.executors import Part, Recorder, attempt, evaluate_part
-from jobs.run.ray_cluster import fit, start_ray, storage
+from jobs.run.ray_cluster import fit, session_folder, start_ray, storage
 from jobs.run.trial_errors import low_memory, newest_error
 from jobs.run.watchdog import ending_after
 
@@ -168,7 +168,8 @@ def with_files(part: Part, files: Files) -> Part:
         return part
     place = _unpacked.get(policy.identity)
     if place is None:
-        place = tempfile.mkdtemp(prefix="evade-policy-")
+        # A process that is killed leaves it behind: it goes with the logs then.
+        place = tempfile.mkdtemp(prefix="evade-policy-", dir=session_folder())
         atexit.register(shutil.rmtree, place, ignore_errors=True)
         for name, content in files[policy.agent].items():
             (Path(place) / name).write_bytes(content)

@@ -1,4 +1,4 @@
-"""Ends a job whose Ray has lost its head: Ray would leave without saying what to do, or wait."""
+"""Ends a job whose Ray has lost its head or its node: Ray would leave without saying what to do, or wait."""
 
 import contextlib
 import os
@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 # Ray waits 60 s for a head that is gone, and then ends the process in the middle of what it does.
 SILENCE_S = 40.0
 ASK_EVERY_S = 5.0
+ESSENTIAL = ("raylet", "gcs_server")
 LEAVE_S = 10.0  # to close what is open; what waits for Ray may wait forever
 
 
@@ -19,16 +20,20 @@ class HeadLostError(RuntimeError):
 
 
 @contextlib.contextmanager
-def watching_head(ask: Callable[[float], bool] | None = None) -> Iterator[None]:
-    """Stop the block, which runs in the main thread, if Ray's head is silent for `SILENCE_S`.
+def watching_head(
+    ask: Callable[[float], bool] | None = None, ended: Callable[[], str] | None = None
+) -> Iterator[None]:
+    """Stop the block, which runs in the main thread, if Ray's head is silent for `SILENCE_S`, or Ray ended.
 
     Args:
         ask: Whether the head answers within so many seconds; None for that of the running Ray.
+        ended: Which of Ray's processes that this one started has ended, "" if none; None for those of
+            the running Ray.
 
     Raises:
-        HeadLostError: The head was silent so long.
+        HeadLostError: The head was silent so long, or a process of Ray has ended.
     """
-    watch = _Watch(ask or head_answers)
+    watch = _Watch(ask or head_answers, ended or ended_process)
     threading.Thread(target=watch.run, name="head-watch", daemon=True).start()
     try:
         yield
@@ -36,7 +41,7 @@ def watching_head(ask: Callable[[float], bool] | None = None) -> Iterator[None]:
         if not watch.lost.is_set():
             raise
         watch.told.set()
-        raise HeadLostError(reason()) from None
+        raise HeadLostError(watch.reason) from None
     finally:
         watch.over.set()
 
@@ -52,39 +57,53 @@ def head_answers(seconds: float) -> bool:
     return True
 
 
-def reason() -> str:
-    """What to say of a head that is lost."""
-    return (
-        f"Ray's head has not answered for {SILENCE_S:.0f} s: its process, its machine or the network to it "
-        "is lost; once there is a cluster again, the same command continues"
-    )
+def ended_process() -> str:
+    """A process that the running Ray cannot do without, was started by this one, and has ended; "" if none."""
+    from ray._private import worker
+
+    node = worker._global_node
+    dead = [] if node is None else [name for name, _ in node.dead_processes()]
+    return next((name for name in ESSENTIAL if name in dead), "")
+
+
+CONTINUES = "the same command continues"
 
 
 class _Watch:
-    def __init__(self, ask: Callable[[float], bool]) -> None:
-        self.ask = ask
+    def __init__(self, ask: Callable[[float], bool], ended: Callable[[], str]) -> None:
+        self.ask, self.ended, self.reason = ask, ended, ""
         self.over, self.lost, self.told = threading.Event(), threading.Event(), threading.Event()
 
     def run(self) -> None:
         while not self.over.wait(ASK_EVERY_S):
-            if self._is_silent() and not self.over.is_set():
+            self.reason = self._lost()
+            if self.reason and not self.over.is_set():
                 self._stop()
                 return
 
-    def _is_silent(self) -> bool:
-        """Whether it does not answer, asked at least twice: everything may have been stopped for a while."""
+    def _lost(self) -> str:
+        """Why the job cannot go on, if it cannot.
+
+        A head is asked at least twice: everything may have been stopped for a while.
+        """
         began = time.monotonic()
         while time.monotonic() - began < SILENCE_S:
+            name = self.ended()
+            if name:
+                return f"Ray's process {name} has ended: it was killed, or crashed; {CONTINUES}"
             if self.ask(SILENCE_S / 2):
-                return False
+                return ""
             time.sleep(0.5)
-        return True
+        return (
+            f"Ray's head has not answered for {SILENCE_S:.0f} s: its process, its machine or the network to it "
+            f"is lost; once there is a cluster again, {CONTINUES}"
+        )
 
     def _stop(self) -> None:
         self.lost.set()
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
         time.sleep(LEAVE_S)
         if not self.told.is_set():
-            sys.stderr.write(f"evade: failed: {reason()}\n")
+            sys.stderr.write(f"evade: failed: {self.reason}\n")
             sys.stderr.flush()
         os._exit(1)

@@ -173,6 +173,13 @@ def logs_folder() -> Path:
     return Path(worker._global_node.get_logs_dir_path())
 
 
+def session_folder() -> Path | None:
+    """A folder of the running Ray, which goes when its logs do; None without Ray."""
+    from ray._private import worker
+
+    return None if worker._global_node is None else Path(worker._global_node.get_session_dir_path())
+
+
 def fit(tuner: Any) -> Any:
     """Run a Tuner; raise an error of its callbacks itself, not the text of its traceback.
 

@@ -13,6 +13,7 @@ from ray.exceptions import ActorDiedError
 from ray.rllib.env.env_runner_group import EnvRunnerGroup
 
 from jobs.run.ray_cluster import logs_folder
+from jobs.run.trial_errors import low_memory
 from jobs.training.env_runner import MAX_SAMPLE_S, Part, RolloutError
 from jobs.training.rllib_internals import GROUP, require
 from jobs.training.snapshots import Snapshot
@@ -130,6 +131,6 @@ class Rounds:
         """Raise an error if an env runner will not be started again."""
         for result in results:
             if not result.ok and isinstance(result.get(), ActorDiedError):
-                raise RolloutError(
-                    f"env runner {result.actor_id} has died {MAX_RESTARTS + 1} times; see {logs_folder()}"
-                )
+                ended = low_memory(str(result.get()))
+                ended = f"was ended {ended}" if ended else f"has died {MAX_RESTARTS + 1} times"
+                raise RolloutError(f"env runner {result.actor_id} {ended}; see {logs_folder()}")

@@ -18,7 +18,7 @@ from pathlib import Path
 from tests.soak.processes import living
 from tests.support.faults import Job, command_line, descendants, start
 
-POLICY_MUST_BE_EQUAL = False  # whether an interrupted training has to end with the same bytes
+POLICY_MUST_BE_EQUAL = True  # whether an interrupted training has to end with the same bytes
 KILLED_S = 60.0  # until nothing of a killed driver is left
 # Reads a jump of the clock from a file, at most once a second.
 CLOCK = """

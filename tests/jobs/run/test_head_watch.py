@@ -15,7 +15,7 @@ def ask(seconds):
     assert seconds == 0.5
     return answers.pop(0) if answers else {then}
 try:
-    with head_watch.watching_head(ask):
+    with head_watch.watching_head(ask, lambda: {ended!r}):
 {work}
     print("done")
 except head_watch.HeadLostError as error:
@@ -35,9 +35,9 @@ while True:
 pytestmark = pytest.mark.system
 
 
-def watched(work=FOREVER, answers=(), then=False, closing=0):
+def watched(work=FOREVER, answers=(), then=False, closing=0, ended=""):
     indented = "\n".join(f"        {line}" for line in work.strip().splitlines())
-    script = WATCHED.format(answers=list(answers), then=then, work=indented, closing=closing)
+    script = WATCHED.format(answers=list(answers), then=then, work=indented, closing=closing, ended=ended)
     command = [sys.executable, "-c", script]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=50)
 
@@ -67,6 +67,12 @@ def test_a_head_that_answers_or_answers_late_ends_nothing():
     for answers in ([], [False], [True, False, True, False]):
         ended = watched("time.sleep(3)", answers, then=True)
         assert (ended.stdout, ended.stderr, ended.returncode) == ("done\n", "", 0)
+
+
+def test_work_whose_ray_has_ended_ends_at_once_with_the_reason():
+    ended = watched(then=True, ended="raylet")
+    assert ended.stdout.startswith("told Ray's process raylet has ended: ")
+    assert ended.stdout.endswith("the same command continues\nclosed\n")
 
 
 def test_ctrl_c_stays_ctrl_c():
