@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 # Ray waits 60 s for a head that is gone, and then ends the process in the middle of what it does.
 SILENCE_S = 40.0
 ASK_EVERY_S = 5.0
+LOOK_EVERY_S = 0.2  # for processes that have ended: Ray ends this one within seconds then
 ESSENTIAL = ("raylet", "gcs_server")
 LEAVE_S = 10.0  # to close what is open; what waits for Ray may wait forever
 
@@ -58,7 +59,7 @@ def head_answers(seconds: float) -> bool:
 
 
 def ended_process() -> str:
-    """A process that the running Ray cannot do without, was started by this one, and has ended; "" if none."""
+    """A process of the running Ray that this one has started, that is essential, and has ended; or ""."""
     from ray._private import worker
 
     node = worker._global_node
@@ -75,11 +76,14 @@ class _Watch:
         self.over, self.lost, self.told = threading.Event(), threading.Event(), threading.Event()
 
     def run(self) -> None:
-        while not self.over.wait(ASK_EVERY_S):
-            self.reason = self._lost()
+        asked_s = time.monotonic()
+        while not self.over.wait(LOOK_EVERY_S):
+            due = time.monotonic() - asked_s > ASK_EVERY_S
+            self.reason = self._lost() if due or self.ended() else ""
             if self.reason and not self.over.is_set():
                 self._stop()
                 return
+            asked_s = time.monotonic() if due else asked_s
 
     def _lost(self) -> str:
         """Why the job cannot go on, if it cannot.
@@ -95,8 +99,8 @@ class _Watch:
                 return ""
             time.sleep(0.5)
         return (
-            f"Ray's head has not answered for {SILENCE_S:.0f} s: its process, its machine or the network to it "
-            f"is lost; once there is a cluster again, {CONTINUES}"
+            f"Ray's head has not answered for {SILENCE_S:.0f} s: its process, its machine or the network to "
+            f"it is lost; once there is a cluster again, {CONTINUES}"
         )
 
     def _stop(self) -> None:

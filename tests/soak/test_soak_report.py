@@ -4,12 +4,11 @@ import dataclasses
 
 import pytest
 
-from tests.soak import workload
 from tests.soak.injections import COMMAND, EITHER, GOES_ON, Fault
 from tests.soak.report import write_page
 from tests.soak.soak import judged
 from tests.soak.watch import slope_mb_per_hour
-from tests.soak.workload import End, Tables, without_policy
+from tests.soak.workload import End, Tables
 
 STOPPED = End(status=1, last_line="evade: failed: no room", traceback=False, by_fault=False)
 KILLED = End(status=-9, last_line="Sweep: 3/7", traceback=False, by_fault=True)
@@ -42,18 +41,11 @@ def test_what_follows_a_fault_is_judged(follows, ends, seconds, well):
     assert judged(Fault("", lambda soak: None, follows), ends, seconds)[1] is well
 
 
-def test_one_digit_makes_a_table_differ_and_a_policy_only_where_it_must_be_equal(monkeypatch):
+def test_one_digit_makes_a_table_differ_and_one_byte_a_policy():
     whole = Tables({"table.md": "0.1 "}, {"networks": "a"})
+    assert whole.differing(whole) == []
     assert whole.differing(Tables({"table.md": "0.2 "}, {"networks": "a"})) == ["table.md"]
-    other = Tables({"table.md": "0.1 "}, {"networks": "b"})
-    assert whole.differing(other) == []
-    monkeypatch.setattr(workload, "POLICY_MUST_BE_EQUAL", True)
-    assert whole.differing(other) == ["policy"]
-
-
-def test_the_rows_of_a_trained_policy_are_left_out_of_what_must_always_be_equal():
-    text = "| policy stochastic | 0.3 |\n| oracle | 1.0 |\n"
-    assert without_policy(text) == ["| oracle | 1.0 |"]
+    assert whole.differing(Tables({"table.md": "0.1 "}, {"networks": "b"})) == ["policy"]
 
 
 def test_the_report_goes_between_the_comments_of_a_page(tmp_path):

@@ -18,7 +18,6 @@ from pathlib import Path
 from tests.soak.processes import living
 from tests.support.faults import Job, command_line, descendants, start
 
-POLICY_MUST_BE_EQUAL = True  # whether an interrupted training has to end with the same bytes
 KILLED_S = 60.0  # until nothing of a killed driver is left
 # Reads a jump of the clock from a file, at most once a second.
 CLOCK = """
@@ -77,9 +76,8 @@ class Tables:
 
     def differing(self, other: "Tables") -> list[str]:
         """The names of the tables that differ."""
-        same = self.policy == other.policy or not POLICY_MUST_BE_EQUAL
         names = [name for name, text in self.evaluated.items() if other.evaluated.get(name) != text]
-        return names if same else [*names, "policy"]
+        return names if self.policy == other.policy else [*names, "policy"]
 
 
 def training_tables(run: Path) -> Tables:
@@ -90,13 +88,8 @@ def training_tables(run: Path) -> Tables:
         {name: x for name, x in row.items() if not name.startswith(("perf/", "checksum"))} for row in rows
     ]  # without what it took
     digest = hashlib.sha256((run / "policy" / "networks.safetensors").read_bytes()).hexdigest()
-    baselines = {name: "\n".join(sorted(without_policy(text))) for name, text in texts.items()}
-    return Tables(baselines, {**texts, "results": json.dumps(results), "networks": digest})
-
-
-def without_policy(text: str) -> list[str]:
-    """The lines that do not hang on the trained policy."""
-    return [line for line in text.splitlines() if "policy" not in line]
+    tables = {name: "\n".join(sorted(text.splitlines())) for name, text in texts.items()}
+    return Tables(tables, {"results": json.dumps(results), "networks": digest})
 
 
 def sweep_tables(run: Path) -> Tables:
