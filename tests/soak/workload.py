@@ -120,7 +120,7 @@ class End:
     """A job that ended without being complete: its status, and what it printed.
 
     Attributes:
-        last_line: The last one.
+        last_line: The job's last word, or the last line.
         traceback: Whether it printed one.
         by_fault: Whether the fault was to end it, by a signal.
     """
@@ -201,8 +201,10 @@ class Lane:
     def note_end(self, status: int, by_fault: bool = False) -> None:
         """Remember how a job ended."""
         lines = [line.strip() for line in self.job.said.splitlines() if line.strip()]
+        # Ray may print its own lines after the job's last word.
+        last = next((line for line in reversed(lines) if line.startswith("evade: ")), lines[-1] if lines else "")
         traced = "Traceback (most recent call last)" in self.job.said
-        self.ends.append(End(status, lines[-1] if lines else "", traced, by_fault))
+        self.ends.append(End(status, last, traced, by_fault))
 
     def new_ends(self) -> list[End]:
         """The ends since this was last asked."""
