@@ -202,7 +202,8 @@ class Lane:
         """Remember how a job ended."""
         lines = [line.strip() for line in self.job.said.splitlines() if line.strip()]
         # Ray may print its own lines after the job's last word.
-        last = next((line for line in reversed(lines) if line.startswith("evade: ")), lines[-1] if lines else "")
+        words = [line for line in lines if line.startswith("evade: ")] or lines
+        last = words[-1] if words else ""
         traced = "Traceback (most recent call last)" in self.job.said
         self.ends.append(End(status, last, traced, by_fault))
 
