@@ -26,7 +26,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster lint check bench docs lock clean
+.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -81,12 +81,15 @@ test-slow: setup ## what continuous integration leaves out for its length (an ho
 test-faults: setup ## inject faults into running jobs and print what was lost (15 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 2 --dist worksteal $(ARGS)
 
-test-cluster: setup ## the same sweep on a Ray cluster, and eight at once into PostgreSQL (20 minutes)
+test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (20 minutes)
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 \
 	|| { [ "$$(id -u)" = 0 ] && apt-get update && apt-get install --yes --no-install-recommends postgresql; } \
 	|| echo "warning: no PostgreSQL, so its test is skipped; apt-get install postgresql"
 	$(BIN)/python -c 'import psycopg' 2>/dev/null || $(BIN)/python -m pip install --quiet $(PSYCOPG)
 	$(BIN)/python -m pytest -m cluster -rs tests/cluster $(ARGS)
+
+test-soak: setup ## training, sweep and dashboard for an hour, with a fault every minute (ARGS="minutes=10 seed=1")
+	$(BIN)/python -m tests.soak.soak $(ARGS)
 
 lint: setup ## check style, format, types, and who imports whom
 	$(BIN)/ruff check .

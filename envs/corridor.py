@@ -273,6 +273,33 @@ class CorridorVectorEnv(VectorEnv):
         self._over = ends[0] | ends[1]
         return self._batch(observations), np.array(rewards), *ends, _stack_infos(infos)
 
+    def replay(
+        self, episodes: Sequence[tuple[int, int, Sequence[int]]]
+    ) -> tuple[Any, np.ndarray, dict[str, np.ndarray]]:
+        """Lead each environment to where its actions led before; what follows has the same bytes too.
+
+        Args:
+            episodes: Of each environment the seed, the number of its episode and the actions since its start.
+
+        Returns:
+            The last observations, whether each episode is over, and infos.
+
+        Raises:
+            ValueError: An episode ends before its last action: another simulation was given these.
+        """
+        results, self._over[:] = [], False
+        for row, (env, (seed, number, actions)) in enumerate(zip(self.envs, episodes, strict=True)):
+            observation, info = env.reset(seed=seed, options={"episode_number": number})
+            for step, action in enumerate(actions):
+                if self._over[row]:
+                    where = f"environment {row}, seed {seed}, episode {number}"
+                    raise ValueError(f"actions must not outlast the episode; {where} ended at step {step}.")
+                observation, _, terminated, truncated, info = env.step(int(action))
+                self._over[row] = terminated or truncated
+            results.append((observation, info))
+        observations, infos = zip(*results, strict=True)
+        return self._batch(observations), self._over.copy(), _stack_infos(infos)
+
     def render(self) -> Any:
         """One picture per environment, as `CorridorEnv.render`."""
         return tuple(env.render() for env in self.envs)

@@ -170,14 +170,23 @@ def report(error: Exception) -> int:
 
     ours = raised_here(error)
     wrong_value = isinstance(error, ValueError) and ours
-    full = getattr(error, "errno", None) == errno.ENOSPC
-    documented = wrong_value or (isinstance(error, RuntimeError) and ours) or full
+    full = full_disk(error)
+    documented = wrong_value or (isinstance(error, RuntimeError) and ours) or full is not None
     if os.environ.get("HYDRA_FULL_ERROR") == "1" or not documented:
         print(redacted("".join(traceback.format_exception(error))), end="", file=sys.stderr)
-    message = redacted(str(error) if documented else f"{type(error).__name__}: {error}")
+    message = redacted(full or (str(error) if documented else f"{type(error).__name__}: {error}"))
     message = "\n  ".join(["", *message.splitlines()]) if "\n" in message else f" {message}"
     print(f"evade: {'refused' if wrong_value else 'failed'}:{message}", file=sys.stderr)
     return WRONG_VALUE if wrong_value else FAILED
+
+
+def full_disk(error: Exception) -> str | None:
+    """What to say of an error that a full disk or a used-up quota caused; None if it is another error."""
+    if not isinstance(error, OSError) or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return None
+    where = error.filename2 or error.filename  # the second is what was copied to
+    file = f"{where}: " if where else ""
+    return f"{file}{os.strerror(error.errno)}; make room there, and the same command continues"
 
 
 def raised_here(error: Exception) -> bool:

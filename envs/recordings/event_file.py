@@ -285,6 +285,12 @@ def replaced(path: Path) -> Iterator[Path]:
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())  # the content before its name
         part.replace(path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # that of a write names no file
+            error.filename = str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)

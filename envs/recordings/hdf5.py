@@ -133,7 +133,10 @@ def milliseconds_to_index(t_us: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
-    """A new file that holds the events already and takes its name when all is written."""
+    """A new file that holds the events already and takes its name when all is written.
+
+    It is made in memory, where it takes its packed size: HDF5 crashes the process on a full disk.
+    """
     offset = int(events["t"][0]) if len(events) else 0
     t_us = events["t"] - offset
     if len(events) and t_us[-1] >= 1000 * MAX_INDEX:
@@ -141,13 +144,17 @@ def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
             f"{path}: the hdf5 layout has an index entry for each millisecond and this is {t_us[-1]} us; "
             f"write parts of at most {1000 * MAX_INDEX} us, or choose npz"
         )
-    with replaced(path) as part, h5py.File(part, "w") as file:
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
         columns = {"t": t_us, "x": events["x"], "y": events["y"], "p": (events["p"] > 0).astype(np.uint8)}
         for name, values in columns.items():
             file.create_dataset(f"events/{name}", data=values, **PACKING)
         file["t_offset"] = np.int64(offset)
         file["ms_to_idx"] = milliseconds_to_index(t_us)
         yield file
+        file.flush()
+        image = file.id.get_file_image()
+    with replaced(path) as part:
+        part.write_bytes(image)
 
 
 def _sensor(file: h5py.File) -> tuple[int | None, int | None]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from jobs.analysis.statistics import Estimate, bootstrap_interval, wilson_interval
-from jobs.run.files import write_atomic
+from jobs.run.files import replaced, write_atomic
 from jobs.run.folder import Run
 from jobs.run.progress import console
 
@@ -175,5 +176,11 @@ def publish_table(
 
 def publish_plot(folder: Run, tracker: "Tracker", name: str, plot: "Figure") -> None:
     """Write a plot as `name`.png into the run folder and the tracker."""
-    plot.savefig(folder.path / f"{name}.png", dpi=120)
+    save_plot(folder.path / f"{name}.png", plot)
     tracker.figure(f"{name}.png", plot)
+
+
+def save_plot(path: Path, plot: "Figure") -> None:
+    """Write a plot as a PNG file, whole or not at all."""
+    with replaced(path) as part:
+        plot.savefig(part, format="png", dpi=120)

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from envs.events import event_image
 from envs.events.windows import GREY_OFF, GREY_ON
 from jobs.analysis.plots import EVENT_COLOURS, INK
-from jobs.run.files import replaced
+from jobs.run.files import RunError, replaced
 from models.policy.features import grey_picture
 
 ZOOM, GAP, BAR = 5, 12, 40
@@ -31,6 +31,7 @@ class Film:
     decode: Decode | None
     _writer: Generator[None, np.ndarray | None, None] | None = None
     _recent: list[np.ndarray | None] = field(default_factory=list)
+    _frames: int = 0
 
     def step(
         self, luminance: np.ndarray, events: np.ndarray | None, window: np.ndarray, caption: str
@@ -51,12 +52,34 @@ class Film:
         picture = frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption)
         if self._writer is None:
             self._writer = _start_writer(self.part, picture)
-        self._writer.send(picture)
+        self._frames += 1
+        try:
+            self._writer.send(picture)
+        except OSError:  # ffmpeg has ended
+            raise self._failure("fewer") from None
 
     def close(self) -> None:
         """End the file."""
         if self._writer is not None:
             self._writer.close()
+
+    def check(self) -> None:
+        """Check that the file holds every frame, once it is closed: ffmpeg's errors are not passed on.
+
+        Raises:
+            RunError: It does not.
+        """
+        try:
+            held = imageio_ffmpeg.count_frames_and_secs(str(self.part))[0] if self._frames else 0
+        except RuntimeError:
+            held = 0
+        if held != self._frames:
+            raise self._failure(str(held))
+
+    def _failure(self, held: str) -> RunError:
+        """The error of a film that ffmpeg could not write."""
+        rule = f"a film there must hold {self._frames} frames, got {held}: ffmpeg could not write them"
+        return RunError(f"{self.part.parent}: {rule}; make room there, and give the same command again")
 
 
 @contextlib.contextmanager
@@ -71,8 +94,10 @@ def open_film(path: Path, control_hz: float, decode: Decode | None) -> Iterator[
         control_hz: Control steps per second of flight [Hz].
         decode: Event window -> picture in [-1, 1], float (H, W), of a third panel; None: there is none.
     """
-    with replaced(path) as part, contextlib.closing(Film(part, control_hz, decode)) as film:
-        yield film
+    with replaced(path) as part:
+        with contextlib.closing(Film(part, control_hz, decode)) as film:
+            yield film
+        film.check()
 
 
 def _start_writer(part: Path, picture: np.ndarray) -> Generator[None, np.ndarray | None, None]:

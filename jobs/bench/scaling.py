@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import ray
 from matplotlib.figure import Figure
 from ray import tune
+from ray._private.authentication.authentication_token_setup import enable_token_auth_by_default
 from ray.cluster_utils import Cluster
 
 from envs.config import EnvConfig
@@ -32,7 +33,7 @@ from jobs.config.config import HELD_OUT_SCENE
 from jobs.rollout.episodes import roll_out
 from jobs.rollout.executors import cached_agent
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.ray_cluster import QUIET, WORKER_THREADS
+from jobs.run.ray_cluster import QUIET, WORKER_THREADS, on_loopback, ray_folder, use_token
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
 
@@ -73,6 +74,7 @@ def main() -> None:
     rates: dict[tuple[int, int], float] = {}
     sweeps: dict[int, float] = {}
     with tempfile.TemporaryDirectory() as folder:
+        ask_for_token(Path(folder))
         for nodes, cores in ((1, 1), (1, 2), (2, 2)):
             with simulated(nodes, cores):
                 sweeps[nodes * cores] = CONDITIONS / seconds_of(
@@ -220,22 +222,33 @@ def evaluate_condition(params: dict[str, int]) -> None:
     tune.report({"key": params["trial"]})
 
 
+def ask_for_token(folder: Path) -> None:
+    """Let the clusters of this process ask everyone for a token, which is made in a folder of its own."""
+    os.environ.update({**QUIET, "RAY_TMPDIR": str(ray_folder())})
+    use_token(folder / "token")
+    enable_token_auth_by_default()  # Ray, imported above, has read the environment already
+
+
 @contextlib.contextmanager
 def simulated(nodes: int, cores: int) -> Iterator[None]:
-    """A Ray of so many nodes, all on this machine, each with so many cores by its own account."""
-    os.environ.update(QUIET)
-    cluster = Cluster(
-        initialize_head=True,
-        head_node_args={"num_cpus": cores, "object_store_memory": OBJECT_STORE, "include_dashboard": False},
-    )
-    try:
-        for _ in range(nodes - 1):
-            cluster.add_node(num_cpus=cores, object_store_memory=OBJECT_STORE)
-        ray.init(cluster.address, runtime_env={"env_vars": WORKER_THREADS}, log_to_driver=False)
-        yield
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
+    """A Ray of so many nodes, all on this machine's loopback, each with so many cores by its own account."""
+    with on_loopback():
+        cluster = Cluster(
+            initialize_head=True,
+            head_node_args={
+                "num_cpus": cores,
+                "object_store_memory": OBJECT_STORE,
+                "include_dashboard": False,
+            },
+        )
+        try:
+            for _ in range(nodes - 1):
+                cluster.add_node(num_cpus=cores, object_store_memory=OBJECT_STORE)
+            ray.init(cluster.address, runtime_env={"env_vars": WORKER_THREADS}, log_to_driver=False)
+            yield
+        finally:
+            ray.shutdown()
+            cluster.shutdown()
 
 
 def show(title: str, heads: tuple[str, ...], rows: list[tuple[object, ...]]) -> None:

@@ -4,13 +4,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 
 from envs.scene import make_scene
 from jobs.analysis.plots import style_of
-from jobs.analysis.tables import markdown_table, show_table
+from jobs.analysis.tables import markdown_table, save_plot, show_table
 from jobs.config.conditions import axis_numbers
 from jobs.config.config import Config
 from jobs.evaluation.evaluate import VIEW_COLUMNS, film_episode
@@ -33,6 +33,7 @@ from jobs.rollout.episodes import EPISODE, write_episodes
 from jobs.rollout.policies import own_sensor_differences
 from jobs.rollout.store import EpisodeStore, TaskResult
 from jobs.rollout.tasks import EvaluationTask
+from jobs.run.checkpoints import sha256
 from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run
 from jobs.run.progress import console
@@ -75,6 +76,7 @@ class SweepFacts(TypedDict):
     groups: dict[str, list[int | None]]
     axes: Axes
     exactness: list[Exactness]
+    episodes_sha256: NotRequired[str]  # older sweeps have none
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,8 @@ def report(config: Config, folder: Run, tracker: Tracker, found: SweepResults) -
     episodes = {(*task.condition, task.policy.group, training_text(task)): found.results[task.key].episodes
                 for task in sweep.tasks if task.key in found.results}  # fmt: skip
     write_episodes(place / "episodes.csv", LABELS, episodes)
-    write_json(place / "about.json", about(config, folder, found))
+    facts = about(config, folder, found)
+    write_json(place / "about.json", {**facts, "episodes_sha256": sha256(place / "episodes.csv")})
     write_tables(place, tracker, config.sweep.reference, found, groups)
     write_child_runs(tracker, "condition", [condition_run(found, result) for result in groups])
     track_groups(tracker, sweep, groups)
@@ -155,16 +158,15 @@ def write_plots(
 ) -> list[Path]:
     """One plot for each axis, and the map of contacts."""
     paths = []
-    place.mkdir(parents=True, exist_ok=True)
     for axis, points in found.sweep.axes.items():
         own = [result for result in groups if result.condition[0] == axis]
         if axis != NOMINAL and own:
             paths.append(place / f"{axis}.png")
-            axis_figure(axis, points, own).savefig(paths[-1], dpi=120)
+            save_plot(paths[-1], axis_figure(axis, points, own))
     scene = make_scene(config.sweep.scene, np.random.default_rng(0), **config.env.layout)
     ends = {group: contacts(found, group) for group in found.sweep.groups}
     paths.append(place / "contacts.png")
-    collision_figure(ends, scene.length_m, scene.width_m / 2).savefig(paths[-1], dpi=120)
+    save_plot(paths[-1], collision_figure(ends, scene.length_m, scene.width_m / 2))
     return paths
 
 

@@ -9,7 +9,6 @@ compared at have its thousands of steps behind their name: bytestream_1500k. Eac
 version in MLflow's model registry.
 """
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +17,11 @@ import numpy as np
 
 from envs.config import settings_hash
 from jobs.analysis.plots import Curve, plot_learning_curves
+from jobs.analysis.tables import save_plot
 from jobs.config.config import Config, ConfigError
 from jobs.reporting.learning_curves import as_csv, read_curves
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.files import read_json, write_atomic
+from jobs.run.files import read_json, read_json_lines, write_atomic
 from jobs.run.folder import group_name, open_run
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
@@ -70,7 +70,7 @@ def run(config: Config) -> dict[str, int]:
     curves = [published[key] for key in sorted(published)]
     write_atomic(PRETRAINED / "curves.csv", as_csv(curves))
     plot = plot_learning_curves(curves)
-    plot.savefig(PLOT, dpi=120)
+    save_plot(PLOT, plot)
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:
         tracker.figure("train/learning.png", plot)
@@ -111,8 +111,8 @@ def publish(training: Training, folder: Path) -> Path:
 
 def learning_curve(training: Training) -> Curve:
     """The success and distance of a training at about `MAX_POINTS` of its iterations."""
-    lines = (training.path / "train" / "results.jsonl").read_text().splitlines()
-    rows = [row for row in map(json.loads, lines) if row["train/success_rate"] is not None]
+    lines = read_json_lines(training.path / "train" / "results.jsonl")
+    rows = [row for row in lines if row["train/success_rate"] is not None]
     kept = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(int))
     names = ("env_steps", "train/success_rate", "train/distance_m")
     values = [[rows[place][name] for name in names] for place in kept]

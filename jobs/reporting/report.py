@@ -30,7 +30,8 @@ from jobs.reporting.learning_curves import mean_success, read_curves
 from jobs.reporting.paper_claims import CLAIMS, GAIN, LEARNT, Claim, Finding, judge, judge_learning
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.files import read_json, write_atomic
+from jobs.run.checkpoints import sha256
+from jobs.run.files import RunError, read_json, replaced, write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
@@ -120,6 +121,7 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
 
     Raises:
         ConfigError: If an earlier version wrote the sweep.
+        RunError: If a file of the sweep is damaged.
     """
     about: SweepFacts = read_json(sweep / "about.json")
     if "evaluated_at" not in about:
@@ -128,6 +130,8 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
     (docs / "images").mkdir(parents=True, exist_ok=True)
     for name in plots:
         copy_small(sweep / f"{name}.png", docs / "images" / f"results_{name}.png")
+    if about.get("episodes_sha256") not in (None, sha256(sweep / "episodes.csv")):
+        raise RunError(f"{sweep / 'episodes.csv'}: damaged; give the command of the sweep again")
     episodes = read_sweep_episodes(sweep / "episodes.csv")
     success, every = estimate_tables(about, episodes)
     text = render(
@@ -151,10 +155,14 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
 
 def copy_small(picture: Path, target: Path) -> None:
     """Copy a plot in `MAX_COLOURS` colours, at a third of the size: enough for lines and print."""
-    with Image.open(picture) as whole:
-        colours = Image.Quantize.MAXCOVERAGE
-        small = whole.convert("RGB").quantize(MAX_COLOURS, colours, dither=Image.Dither.NONE)
-    small.save(target, optimize=True)
+    try:
+        with Image.open(picture) as whole:
+            colours = Image.Quantize.MAXCOVERAGE
+            small = whole.convert("RGB").quantize(MAX_COLOURS, colours, dither=Image.Dither.NONE)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise RunError(f"{picture}: damaged ({error}); give the command that drew it again") from None
+    with replaced(target) as part:
+        small.save(part, "png", optimize=True)
 
 
 def read_sweep_episodes(file: Path) -> SweptEpisodes:

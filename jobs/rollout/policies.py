@@ -1,6 +1,5 @@
 """Policies by name: the folder that a name stands for, what it says, and its sensor in training."""
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from jobs.rollout.agents import BASELINES
 from jobs.run.folder import Run, latest_policies, named_policy
 from jobs.run.provenance import REPOSITORY
 from models.kinds import find_kind
-from models.policy.policy import MANIFEST
+from models.policy.policy import MANIFEST, PolicyFileError, read_policy_manifest
 
 PRETRAINED = REPOSITORY / "models" / "pretrained"
 SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
@@ -51,11 +50,14 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     """What a policy folder says about itself; a baseline has only its name.
 
     Raises:
-        ConfigError: If the folder's manifest lacks what tells one training from another.
+        ConfigError: If the folder's manifest is damaged, or lacks what tells one training from another.
     """
     if agent in BASELINES:
         return EvaluatedPolicy(agent, agent, None, agent, {}, "none")
-    manifest = json.loads((Path(agent) / MANIFEST).read_text())
+    try:
+        manifest = read_policy_manifest(Path(agent) / MANIFEST)
+    except PolicyFileError as error:
+        raise ConfigError(f"policy: {error}") from None
     missing = [name for name in ("name", "seed", "sensor") if name not in manifest]
     if missing:
         raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")

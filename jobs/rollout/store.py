@@ -1,8 +1,10 @@
 """Where the episodes of evaluation tasks are kept, so that a stopped job continues from them."""
 
 import dataclasses
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -10,6 +12,8 @@ from jobs.rollout.episodes import EPISODE
 from jobs.rollout.tasks import EvaluationTask
 from jobs.run.files import RunError, read_json, write_json
 from jobs.run.progress import console
+
+Stored = TypeVar("Stored")
 
 
 @dataclass(frozen=True)
@@ -111,9 +115,9 @@ class EpisodeStore:
         return dataclasses.replace(stored, episodes=stored.episodes[[places[seed] for seed in task.seeds]])
 
     def accuracy(self, task: EvaluationTask) -> SimulationAccuracy | None:
-        """How exact a task's simulation is; None if that was not measured."""
+        """How exact a task's simulation is; None if that was not measured, or is damaged."""
         file = self._accuracy_file(task)
-        return SimulationAccuracy(**read_json(file)) if file.is_file() else None
+        return self._undamaged(file, lambda values: SimulationAccuracy(**values))
 
     def _file(self, key: str) -> Path:
         return self.folder / "episodes" / f"{key}.json"
@@ -123,13 +127,19 @@ class EpisodeStore:
 
     def _read(self, key: str) -> TaskResult | None:
         """All that is stored under a key; None if there is nothing, or if it is damaged."""
-        file = self._file(key)
+
+        def parse(values: Mapping[str, Any]) -> TaskResult:
+            episodes = np.array([tuple(row) for row in values["episodes"]], EPISODE)
+            return TaskResult(episodes, values["encoder"], tuple(values["commits"]), values["restarts"])
+
+        return self._undamaged(self._file(key), parse)
+
+    def _undamaged(self, file: Path, parse: Callable[[Any], Stored]) -> Stored | None:
+        """What a file holds; None if there is none. A damaged one is put aside."""
         if not file.is_file():
             return None
         try:
-            values = read_json(file)
-            episodes = np.array([tuple(row) for row in values["episodes"]], EPISODE)
-            return TaskResult(episodes, values["encoder"], tuple(values["commits"]), values["restarts"])
+            return parse(read_json(file))
         except (RunError, KeyError, TypeError, ValueError):
             file.replace(file.with_suffix(".damaged"))
             console.print(f"Damaged and put aside, evaluated again: {file}", markup=False)

@@ -23,13 +23,15 @@ from ray.tune.experiment import Trial
 from jobs.config.schema import ClusterConfig
 from jobs.rollout.agents import BASELINES
 from jobs.rollout.executors import Part, Recorder, attempt, evaluate_part
-from jobs.run.ray_cluster import fit, start_ray, storage
+from jobs.run.ray_cluster import fit, session_folder, start_ray, storage
+from jobs.run.trial_errors import low_memory, newest_error
 from jobs.run.watchdog import ending_after
 
 MAX_FAILURES = 2
 # A step takes a thousandth of this, with pyrender a tenth; compiling takes a minute, and several
 # on a busy machine.
 MAX_STEP_S, MAX_START_S = 0.1, 900.0
+UNKNOWN_END = "killed, often for lack of memory, or crashed"  # Ray cannot tell which
 # Stored episodes are what a stopped job continues from. Tune's own picture of all trials, written
 # at each result, would cost more than the episodes.
 TUNE_SNAPSHOT_S = "3600"
@@ -49,7 +51,16 @@ def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterCon
     start_ray(cluster, folder.parent)
     os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = TUNE_SNAPSHOT_S
     trial = tune.with_parameters(run_trial, files=policy_files(parts))
-    tuner = tune.Tuner(
+    callback = TrialCallback(recorder)
+    while parts:
+        fit(_tuner(trial, parts, cluster, folder, callback))
+        parts = callback.take_unfinished()
+
+
+def _tuner(
+    trial: Any, parts: Sequence[Part], cluster: ClusterConfig, folder: Path, callback: "TrialCallback"
+) -> tune.Tuner:
+    return tune.Tuner(
         tune.with_resources(trial, {"cpu": 1}),
         tune_config=tune.TuneConfig(reuse_actors=True),  # a new worker imports for seconds
         param_space={
@@ -59,11 +70,10 @@ def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterCon
             name="tune",
             storage_path=storage(cluster, folder),
             verbose=0,
-            callbacks=[TrialCallback(recorder)],
+            callbacks=[callback],
             failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
         ),
     )
-    fit(tuner)
 
 
 def time_limit_s(part: Part) -> float:
@@ -90,6 +100,12 @@ class TrialCallback(tune.Callback):
         self._started: dict[tuple[str, int], float] = {}
         self._ends: Counter[tuple[str, int]] = Counter()
         self._late: set[tuple[str, int]] = set()
+        self._unfinished: list[Part] = []
+
+    def take_unfinished(self) -> list[Part]:
+        """The parts that Tune gave up too early, which is what it does with a trial that has not begun."""
+        unfinished, self._unfinished = self._unfinished, []
+        return unfinished
 
     def __reduce__(self) -> tuple[type["TrialCallback"], tuple[None]]:
         """Tune pickles its callbacks; the recorder, whose progress bar cannot be pickled, stays behind."""
@@ -108,20 +124,28 @@ class TrialCallback(tune.Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
         """Note that a part is tried again."""
-        self._lose(_part_of(trial), "tried again")
+        self._lose(trial, "tried again")
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
-        """Note that a part is given up."""
-        self._lose(_part_of(trial), "given up")
+        """Note that a part is given up, unless its process has ended too seldom for that."""
+        part = _part_of(trial)
+        if self._ends[part.task.part_id] < MAX_FAILURES:
+            self._unfinished.append(part)
+            self._lose(trial, "tried again")
+        else:
+            self._lose(trial, "given up")
 
-    def _lose(self, part: Part, consequence: str) -> None:
+    def _lose(self, trial: Trial, consequence: str) -> None:
+        part = _part_of(trial)
         name, limit_s = part.task.part_id, time_limit_s(part)
         self._ends[name] += 1
         if time.monotonic() - self._started.get(name, math.inf) >= limit_s:
             self._late.add(name)
-        late = f" (it may take {limit_s:.0f} s)" if name in self._late else ""
+        cause = low_memory(newest_error(trial.error_file)) or UNKNOWN_END
+        if name in self._late:
+            cause = f"it may take {limit_s:.0f} s"
         if self._recorder is not None:
-            self._recorder.lose(part, f"its process ended{late} {self._ends[name]} times", consequence)
+            self._recorder.lose(part, f"its process ended ({cause}) {self._ends[name]} times", consequence)
 
 
 def _part_of(trial: Trial) -> Part:
@@ -144,7 +168,8 @@ def with_files(part: Part, files: Files) -> Part:
         return part
     place = _unpacked.get(policy.identity)
     if place is None:
-        place = tempfile.mkdtemp(prefix="evade-policy-")
+        # A process that is killed leaves it behind: it goes with the logs then.
+        place = tempfile.mkdtemp(prefix="evade-policy-", dir=session_folder())
         atexit.register(shutil.rmtree, place, ignore_errors=True)
         for name, content in files[policy.agent].items():
             (Path(place) / name).write_bytes(content)

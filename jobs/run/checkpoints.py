@@ -70,11 +70,13 @@ def mend(checkpoint: Path) -> str | None:
     return f"Checkpoint damaged ({reason}), {good.name} takes its place: {checkpoint}"
 
 
+def sha256(file: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal digits."""
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def _digests(checkpoint: Path) -> dict[str, str]:
     """File -> SHA-256 of all but the seal."""
     files = (path for path in sorted(checkpoint.rglob("*")) if path.is_file())
-    return {
-        str(path.relative_to(checkpoint)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in files
-        if path != checkpoint / SEAL
-    }
+    return {str(path.relative_to(checkpoint)): sha256(path) for path in files if path != checkpoint / SEAL}

@@ -1,11 +1,19 @@
-"""Files that are written whole or not at all: text, bytes and JSON."""
+"""Files that are written whole or not at all: text, bytes, and JSON that carries its own checksum.
+
+A power failure, a full disk or an interrupted copy can change a file in a way that still reads as
+JSON, such as in one digit of a result: the checksum tells.
+"""
 
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from envs.config import settings_hash
+
+CHECKSUM = "checksum"  # of the other values of a JSON object; files of older versions have none
 
 
 class RunError(RuntimeError):
@@ -13,8 +21,12 @@ class RunError(RuntimeError):
 
 
 def write_json(path: Path, values: object) -> None:
-    """Write plain containers as JSON, whole or not at all; NaN and infinity are refused."""
-    write_atomic(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+    """Write plain containers as JSON, whole or not at all; NaN and infinity are refused.
+
+    An object gets a checksum, which `read_json` compares and takes out.
+    """
+    kept = with_checksum(values) if isinstance(values, Mapping) else values
+    write_atomic(path, json.dumps(kept, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:
@@ -24,30 +36,90 @@ def read_json(path: Path) -> Any:
         RunError: The file is damaged.
     """
     try:
-        return json.loads(path.read_text())
+        return without_checksum(json.loads(path.read_bytes()))
     except ValueError as error:
         remedy = "delete it, and the same command makes it anew"
         raise RunError(f"{path}: must be JSON, got a damaged file ({error}); {remedy}") from None
 
 
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader sees the old content or the new one, never a part.
+def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a JSON object as JSON holds them, and their checksum."""
+    text = json.dumps({name: value for name, value in values.items() if name != CHECKSUM}, allow_nan=False)
+    own = json.loads(text)
+    return {**own, CHECKSUM: settings_hash(own)}
 
-    This holds on the disk too: the content is stored before its name, and a full disk leaves the old file.
+
+def without_checksum(values: Any) -> Any:
+    """The values of a JSON object without their checksum; what has none is returned as it is.
+
+    Raises:
+        ValueError: They are not those that the checksum was made of.
     """
-    with replaced(path) as part, part.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
+    if not isinstance(values, dict) or CHECKSUM not in values:
+        return values
+    if values != with_checksum(values):
+        raise ValueError("other values than its checksum says")
+    return {name: value for name, value in values.items() if name != CHECKSUM}
+
+
+def json_lines(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows as lines of JSON, each with its checksum; NaN and infinity are refused."""
+    return "".join(json.dumps(with_checksum(row), allow_nan=False) + "\n" for row in rows)
+
+
+def read_json_lines(path: Path) -> list[Any]:
+    """The rows of a file of `json_lines`; none without a file. Half a line that a kill left is dropped.
+
+    Raises:
+        RunError: A line is damaged.
+    """
+    lines = whole_lines(path).splitlines()
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append(without_checksum(json.loads(line)))
+        except ValueError as error:
+            remedy = "delete the line, and the same command goes on without it"
+            raise RunError(f"{path}: line {number} is damaged ({error}); {remedy}") from None
+    return rows
+
+
+def whole_lines(path: Path) -> bytes:
+    """A file's content up to its last line end; nothing without a file."""
+    content = path.read_bytes() if path.is_file() else b""
+    return content[: content.rfind(b"\n") + 1]
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write a file so that a reader sees the old content or the new one, never a part."""
+    with replaced(path) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """Yield a path to write to; the file takes its final name when the block ends without an error."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Yield a path to write to; the file takes its final name when the block ends without an error.
+
+    This holds on the disk too: the content is stored before its name, and a full disk leaves the old file.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        yield part
-        part.replace(path)
+        with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield part
+            with part.open("rb") as file:
+                os.fsync(file.fileno())
+            part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an error of the operating system name the file: that of a write alone does not."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise

@@ -5,7 +5,6 @@ the same folder and continues there. Each finished stage leaves a marker with it
 """
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,8 @@ import yaml
 
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
-from jobs.run.files import read_json, write_atomic, write_json
+from jobs.run.files import RunError, read_json, write_atomic, write_json
+from jobs.run.progress import console
 from jobs.run.provenance import provenance
 from models.kinds import RENAMED, renamed
 
@@ -153,7 +153,13 @@ def latest_policies(runs_dir: str | Path) -> dict[str, Path]:
     """The policy folder of each kind that was finished last: name of the model -> folder."""
     manifests = Path(runs_dir).resolve().glob("*/policy/policy.json")
     ordered = sorted(manifests, key=lambda path: path.stat().st_mtime_ns)
-    return {json.loads(path.read_text()).get("name", ""): path.parent for path in ordered}
+    found = {}
+    for path in ordered:
+        try:
+            found[read_json(path).get("name", "")] = path.parent
+        except RunError:  # another run's: its own commands refuse it
+            console.print(f"Damaged, not considered: {path}", markup=False)
+    return found
 
 
 def named_policy(name: str) -> Path | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from jobs.run.files import RunError
+from jobs.run.files import RunError, naming
 
 
 @contextlib.contextmanager
@@ -32,10 +32,11 @@ def held_alone(folder: Path) -> Iterator[None]:
     try:
         lock = FileLock(file).acquire(blocking=False)
     except Timeout:
-        holder = file.read_text() or "another process"
+        holder = file.read_text(errors="replace") or "another process"
         raise RunError(f"{folder}: {holder} works there; wait until it has ended") from None
     with lock:
-        file.write_text(f"process {os.getpid()} of {os.uname().nodename}")
+        with naming(file):
+            file.write_text(f"process {os.getpid()} of {os.uname().nodename}")
         yield
 
 

@@ -12,7 +12,10 @@ from typing import Any
 
 from jobs.config.config import ConfigError
 from jobs.config.schema import ClusterConfig
+from jobs.run.head_watch import watching_head
 from jobs.run.locks import locked, private_folder
+from jobs.run.ray_sessions import forget_sessions
+from jobs.run.same_code import check_machines
 from jobs.run.threads import ONE_THREAD
 
 # A learner of a large network takes more threads (`training.ppo_learner`); those that wait must sleep:
@@ -57,8 +60,9 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         folder: Where the token of a local Ray is kept.
 
     Raises:
-        ConfigError: If the cluster cannot be joined, others can read the token, or RAY_AUTH_MODE
-            does not say whether the cluster asks for one.
+        ConfigError: If the cluster cannot be joined, one of its machines has other code than this
+            one, others can read the token, or RAY_AUTH_MODE does not say whether the cluster asks
+            for one.
         ClusterError: If this machine is too busy to start one.
     """
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
@@ -82,14 +86,35 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     if cluster.name == "local":
         os.environ["RAY_TMPDIR"] = str(ray_folder())  # of its workers, too
         # Two processes that started Ray within seconds of each other have waited for each other forever.
-        with locked(private_folder() / "start-ray.lock"):
+        with locked(ray_folder() / "start-ray.lock"):
+            forget_sessions(ray_folder())
             _start_local({"num_cpus": cluster.num_cpus, **settings})
         return
+    _join(cluster.address or "auto", settings)
+    check_machines()
+
+
+def _join(address: str, settings: Mapping[str, object]) -> None:
+    import ray
+
     try:
-        ray.init(address=cluster.address or "auto", **settings)
-    except (ConnectionError, ray.exceptions.RayError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise ConfigError(f"cluster.address: cannot join {cluster.address!r}: {reason}") from None
+        ray.init(address=address, **settings)
+    except (ConnectionError, RuntimeError, ray.exceptions.RayError) as error:
+        raise ConfigError(f"cluster.address: cannot join {address!r}: {why_not_joined(error)}") from None
+
+
+def why_not_joined(error: Exception) -> str:
+    """Why Ray could not join a cluster, in one line, with the remedy where it is known."""
+    text = f"{error}\n{error.__cause__ or ''}"
+    if "InvalidAuthToken" in text or "AuthenticationError" in text:
+        return (
+            "it asks for another token than this machine's; set RAY_AUTH_MODE=token, and "
+            "RAY_AUTH_TOKEN_PATH to the file with the cluster's token"
+        )
+    if "Version mismatch" in text:
+        found = " ".join(text[text.index("Version mismatch") :].split())
+        return f"{found.removesuffix(' None')}; install the same packages on every machine"
+    return text.strip().splitlines()[0]
 
 
 def _start_local(settings: Mapping[str, object]) -> None:
@@ -97,7 +122,7 @@ def _start_local(settings: Mapping[str, object]) -> None:
 
     for _ in range(MAX_STARTS):
         try:
-            with _on_loopback():
+            with on_loopback():
                 ray.init(address="local", include_dashboard=False, **settings)
             return
         except Exception as error:  # Ray's own has no type of its own
@@ -110,7 +135,7 @@ def _start_local(settings: Mapping[str, object]) -> None:
 
 
 @contextlib.contextmanager
-def _on_loopback() -> Iterator[None]:
+def on_loopback() -> Iterator[None]:
     """Let a Ray that starts take the loopback address for this machine's, and listen nowhere else.
 
     That is what RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER=0 does; but Ray reads the variable when it is
@@ -148,12 +173,24 @@ def logs_folder() -> Path:
     return Path(worker._global_node.get_logs_dir_path())
 
 
+def session_folder() -> Path | None:
+    """A folder of the running Ray, which goes when its logs do; None without Ray."""
+    from ray._private import worker
+
+    return None if worker._global_node is None else Path(worker._global_node.get_session_dir_path())
+
+
 def fit(tuner: Any) -> Any:
-    """Run a Tuner; raise an error of its callbacks itself, not the text of its traceback."""
+    """Run a Tuner; raise an error of its callbacks itself, not the text of its traceback.
+
+    Raises:
+        HeadLostError: The head of the cluster does not answer any more.
+    """
     from ray.tune import TuneError
 
     try:
-        return tuner.fit()
+        with watching_head():
+            return tuner.fit()
     except TuneError as error:
         raise (error.__context__ or error) from None
 
@@ -217,6 +254,8 @@ def use_token(file: Path) -> None:
 
 def make_token(file: Path) -> None:
     """Write a new token to a file that nobody else can read; one that is there stays."""
+    if file.is_file() and not file.stat().st_size:  # a power failure cut it
+        file.unlink()
     if file.exists():
         return
     file.parent.mkdir(parents=True, exist_ok=True)

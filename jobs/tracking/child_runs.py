@@ -1,10 +1,10 @@
 """Child runs in MLflow: finished runs of a sweep's conditions and groups, and of a trade's settings."""
 
-import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from envs.config import settings_hash
+from jobs.tracking.clock import now_ms
 from jobs.tracking.store import check_metrics, flatten
 from jobs.tracking.tracker import Tracker
 
@@ -40,15 +40,15 @@ def write_child_runs(parent: Tracker, kind: str, children: Sequence[ChildRun]) -
         if old is not None:
             client.delete_run(old.info.run_id)
         facts = {"kind": kind, "mlflow.parentRunId": parent.run_id}
-        run_id = client.create_run(parent.experiment_id, tags=facts, run_name=child.name).info.run_id
-        now_ms = int(time.time() * 1000)
+        now = now_ms()
+        run_id = client.create_run(parent.experiment_id, now, tags=facts, run_name=child.name).info.run_id
         client.log_batch(
             run_id,
-            metrics=[Metric(name, value, now_ms, step) for name, step, value in _points(child)],
+            metrics=[Metric(name, value, now, step) for name, step, value in _points(child)],
             params=[Param(key, value) for key, value in flatten(child.params).items()],
             tags=[RunTag(key, value) for key, value in {**child.tags, "content": content}.items()],
         )
-        client.set_terminated(run_id)
+        client.set_terminated(run_id, end_time=now_ms())
 
 
 def _points(child: ChildRun) -> list[tuple[str, int, float]]:

@@ -5,7 +5,6 @@ and the package `models`. Nothing is pickled, and nothing is installed to find o
 """
 
 import importlib.metadata
-import json
 import shutil
 import tempfile
 import warnings
@@ -18,7 +17,7 @@ from jobs.run.files import read_json
 from jobs.run.provenance import REPOSITORY
 from jobs.tracking.tracker import Tracker
 from models.kinds import find_kind
-from models.policy.policy import MANIFEST
+from models.policy.policy import MANIFEST, read_policy_manifest
 
 if TYPE_CHECKING:
     from mlflow.models import ModelSignature
@@ -75,7 +74,7 @@ def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, obje
         The version's name, "evade-bytestream/2".
     """
     client, name = tracker.client, PREFIX + group
-    manifest = json.loads((policy / MANIFEST).read_text())
+    manifest = read_policy_manifest(policy / MANIFEST)
     identity = settings_hash(manifest)
     if not client.search_registered_models(f"name = '{name}'"):
         client.create_registered_model(name, description=ABOUT.format(group=group, name=name))

@@ -1,7 +1,6 @@
 """Metrics that the tracking store has not taken yet: they wait in the run folder until it answers again."""
 
 import contextlib
-import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
 
-from jobs.run.files import write_atomic
+from jobs.run.files import json_lines, read_json_lines, write_atomic
 
 RETRY_AFTER_S = 30.0  # so that a store that does not answer does not hold up the work
 # How often MLflow's calls try a server that does not answer.
@@ -56,9 +55,12 @@ class RetryQueue:
     _retry_at_s: float = field(default=0.0, repr=False)
 
     def rows(self) -> list[LoggedStep]:
-        """Read the steps that wait; half a line that a kill left is dropped."""
-        text = self.file.read_text() if self.file.is_file() else ""
-        return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+        """Read the steps that wait; half a line that a kill left is dropped.
+
+        Raises:
+            RunError: A line is damaged.
+        """
+        return read_json_lines(self.file)
 
     def deliver(self, new: LoggedStep, send: Callable[[LoggedStep], None]) -> str | None:
         """Send the steps that wait and the new one, in order; keep those that could not be sent.
@@ -86,4 +88,4 @@ class RetryQueue:
         return None
 
     def _keep(self, rows: Sequence[LoggedStep]) -> None:
-        write_atomic(self.file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+        write_atomic(self.file, json_lines(rows))

@@ -14,8 +14,8 @@ import json
 import logging
 import math
 import os
+import sqlite3
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,11 +25,12 @@ from urllib.parse import quote
 from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
 from jobs.config.errors import redacted
-from jobs.run.files import read_json, write_json
+from jobs.run.files import read_json, replaced, write_json
 from jobs.run.folder import Run
 from jobs.run.locks import held_alone, locked, private_folder
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
+from jobs.tracking.clock import now_ms
 from jobs.tracking.pages import (
     NOTE,
     PREVIEWS,
@@ -60,6 +61,12 @@ if TYPE_CHECKING:
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
 KNOWN_RUNS = "tracking.json"  # in a run folder
+REMEDIES = {  # what SQLite says: what to do
+    "disk is full": "make room there; ",
+    "disk I/O error": "make room there; ",
+    "malformed": "the file is damaged: move it away for a new one; ",
+    "not a database": "the file is damaged: move it away for a new one; ",
+}
 UNAVAILABLE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # MLflow's codes after which a retry may help
 
 
@@ -94,7 +101,7 @@ class Tracker:
         measured = {name: value for name, value in values.items() if name not in missing}
         row: LoggedStep = {
             "step": step,
-            "time_ms": int(time.time() * 1000),
+            "time_ms": now_ms(),
             "metrics": measured,
             "missing": missing,
         }
@@ -177,7 +184,7 @@ class Tracker:
             name: What the menu calls it.
             state: As `jobs.tracking.pages.table_view` or `chart_view` makes it.
         """
-        tag, view = f"{VIEW_TAG}.{key}", packed_view(name, state, int(time.time() * 1000))
+        tag, view = f"{VIEW_TAG}.{key}", packed_view(name, state, now_ms())
         old = json.loads(self.client.get_experiment(self.experiment_id).tags.get(tag, "{}"))
         if old.get("state") != json.loads(view)["state"]:
             self.client.set_experiment_tag(self.experiment_id, tag, view)
@@ -261,24 +268,27 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
 
 @contextlib.contextmanager
 def _answering(uri: str, folder: Run) -> Iterator[None]:
-    """Stop with one clear error where the store does not answer."""
+    """Stop with one clear error where the store does not answer, is full or is damaged."""
     from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import DBAPIError
 
     try:
         with calling_with(MANY_RETRIES):
             yield
-    except (MlflowException, StoreUnavailable) as error:
-        if isinstance(error, MlflowException) and error.error_code not in UNAVAILABLE:
+    except (MlflowException, StoreUnavailable, DBAPIError) as error:
+        reason = _reason(error)
+        remedy = next((remedy for sign, remedy in REMEDIES.items() if sign in reason), "")
+        if isinstance(error, MlflowException) and error.error_code not in UNAVAILABLE and not remedy:
             raise
-        rest = f"what was computed is in {folder.path}, the same command records it"
-        raise TrackingError(
-            f"tracking.uri: {redacted(uri)} does not answer ({_reason(error)}); {rest}"
-        ) from error
+        rest = f"{remedy}what was computed is in {folder.path}, the same command records it"
+        raise TrackingError(f"tracking.uri: {redacted(uri)} does not answer ({reason}); {rest}") from error
 
 
 def _reason(error: Exception) -> str:
-    """The cause, as the last words of what MLflow says."""
-    return str(error).strip().splitlines()[0].rpartition("Caused by ")[2][:200]
+    """The cause, as the last words of what MLflow says, or as SQLite says it."""
+    lines = str(error).strip().splitlines()
+    cause = next((line for line in lines if line.startswith("(sqlite3.")), lines[0])
+    return cause.rpartition("Caused by ")[2][:200]
 
 
 @contextlib.contextmanager
@@ -291,13 +301,19 @@ def _ended(tracker: Tracker) -> Iterator[None]:
         for row in tracker.retry_queue.rows():
             tracker._send(row)
         tracker.retry_queue.file.unlink(missing_ok=True)
-        tracker.client.set_terminated(tracker.run_id, "FINISHED")
+        _terminate(tracker, "FINISHED")
     except BaseException as error:
         status = "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
         # An error of the store must not hide why the block ended.
         with contextlib.suppress(MlflowException), calling_with(NO_RETRIES):
-            tracker.client.set_terminated(tracker.run_id, status)
+            _terminate(tracker, status)
         raise
+
+
+def _terminate(tracker: Tracker, status: str) -> None:
+    """Set a run's status and end; a run that is continued after the clock was set back ends when it began."""
+    start_ms = tracker.client.get_run(tracker.run_id).info.start_time
+    tracker.client.set_terminated(tracker.run_id, status, max(start_ms, now_ms()))
 
 
 def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
@@ -314,7 +330,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
         except MlflowException as error:  # the run was deleted: begin a new one
             if error.error_code in UNAVAILABLE:
                 raise
-    run = near.client.create_run(near.experiment_id, tags=tags, run_name=name)
+    run = near.client.create_run(near.experiment_id, now_ms(), tags=tags, run_name=name)
     write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})
     return dataclasses.replace(near, run_id=run.info.run_id)
 
@@ -342,15 +358,41 @@ def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["
     from mlflow import MlflowClient
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    name = quote(experiment, safe="")
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # tracebacks of what it raises
+    name, file = quote(experiment, safe=""), Path(uri.removeprefix("sqlite:///"))
     if uri.startswith("sqlite:///"):
-        file = Path(uri.removeprefix("sqlite:///"))
         lock, location = file.with_suffix(".lock"), (file.parent / "mlartifacts" / name).as_uri()
     else:
         lock, location = private_folder() / f"store-{settings_hash({'uri': uri})[:8]}.lock", None
     if storage is not None:
         location = f"{storage.rstrip('/')}/mlartifacts/{name}"
     with locked(lock):
+        if uri.startswith("sqlite:///"):
+            _create_or_check(file)
         client = MlflowClient(tracking_uri=uri)
         known = client.get_experiment_by_name(experiment)
         return client, known.experiment_id if known else client.create_experiment(experiment, location)
+
+
+def _create_or_check(file: Path) -> None:
+    """Make an SQLite store, whole or not at all: MLflow cannot go on with half of its tables.
+
+    Raises:
+        TrackingError: There is one, and it is damaged.
+    """
+    from mlflow import MlflowClient
+
+    if file.is_file() and file.stat().st_size:
+        try:
+            with contextlib.closing(sqlite3.connect(file)) as store:
+                ((said,), *_) = store.execute("PRAGMA quick_check(1)")
+        except sqlite3.OperationalError:  # locked by another process: no damage
+            return
+        except sqlite3.DatabaseError as error:
+            said = str(error)
+        if said != "ok":
+            remedy = "restore a copy, or move it away, and the same command records into a new one"
+            raise TrackingError(f"tracking.uri: {file}: damaged ({said.splitlines()[-1]}); {remedy}")
+        return
+    with replaced(file) as part:
+        MlflowClient(tracking_uri=f"sqlite:///{part}").search_experiments(max_results=1)

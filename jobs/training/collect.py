@@ -23,6 +23,7 @@ from jobs.config.config import Config, ConfigError
 from jobs.rollout.agents import Agent, make_agent
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.policies import check_sensor
+from jobs.run.checkpoints import seal
 from jobs.run.folder import Run, finish, finished, locate_run, named_policy, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
@@ -71,6 +72,7 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
             write_recording(data_file(folder, split), recording)
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_episodes"] = recording.about["flights"]
+    seal(folder.data)
     if config.collect.scenes:
         figures |= report_event_error(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
     tracker.log(0, figures)

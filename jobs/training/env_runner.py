@@ -25,6 +25,7 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from jobs.run.watchdog import ending_after
 from jobs.training.rllib_internals import ENV_RUNNER, require
+from jobs.training.snapshots import Snapshot, generators, set_generators
 from models.policy.features import push_features
 
 MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
@@ -56,6 +57,24 @@ class Step(NamedTuple):
     over: np.ndarray
 
 
+class Part(NamedTuple):
+    """What one env runner contributes to a round of sampling.
+
+    Attributes:
+        runner: Which one, RLlib's `worker_index`.
+        began: Its rounds before this one, and the number of the weights that it sampled with.
+        episodes: As `PlainEnvRunner.sample` returns them.
+        metrics: As RLlib's `get_metrics` returns them.
+        after: Where it stands now.
+    """
+
+    runner: int
+    began: tuple[int, int]
+    episodes: list[SingleAgentEpisode]
+    metrics: Any
+    after: Snapshot
+
+
 class RolloutError(RuntimeError):
     """An error of the simulation or the policy in an env runner."""
 
@@ -84,6 +103,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     code raised, hide the reason in a log, and fail the same way again: such an error is passed on.
     """
 
+    _callbacks: list[Any]
     _needs_initial_reset: bool
     _ongoing_episodes_for_metrics: dict[str, list[SingleAgentEpisode]]
 
@@ -107,14 +127,18 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         if not self._refused:
             super().assert_healthy()
 
+    def _check_built(self) -> None:
+        """Raise the error of the construction, if there was one."""
+        if self._refused:
+            raise RolloutError(self._refused)
+
     def get_spaces(self) -> Any:
         """As RLlib's, which asks this first.
 
         Raises:
             RolloutError: The process could not be built.
         """
-        if self._refused:
-            raise RolloutError(self._refused)
+        self._check_built()
         return super().get_spaces()
 
     def sample(self, **asked: Any) -> list[SingleAgentEpisode]:
@@ -123,13 +147,88 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         Raises:
             RolloutError: With the type and text of whatever was raised.
         """
-        if self._refused:
-            raise RolloutError(self._refused)
+        self._check_built()
         try:
             with ending_after(MAX_SAMPLE_S):
                 return super().sample(**asked)
         except Exception as error:
             raise RolloutError(one_line(error)) from error
+
+    def take_part(self) -> Part:
+        """One round of sampling, with what it began from and where it led.
+
+        Raises:
+            RolloutError: With the type and text of whatever was raised.
+        """
+        self._check_built()
+        began = self._callbacks[0].rounds, self._weights_seq_no
+        return Part(self.worker_index, began, self.sample(), self.get_metrics(), self.snapshot())
+
+    def snapshot(self) -> Snapshot:
+        """All that the next rounds depend on but the weights; episodes as the actions that led there.
+
+        Raises:
+            RolloutError: The process could not be built.
+        """
+        self._check_built()
+        values = {"metrics": self._callbacks[0].state(), "steps": self.module.steps}
+        met = list(self.module.met)
+        arrays = {
+            **generators(),
+            "met": np.concatenate(met) if met else np.empty(0),
+            "met_rows": np.array([len(window) for window in met], np.int64),
+        }
+        if not self._needs_initial_reset:
+            values["names"] = [name for name, _ in self._episodes]
+            actions = [taken for _, taken in self._episodes]
+            arrays |= {
+                "stacks": self._stacks,
+                "actions": np.concatenate(actions),
+                "actions_taken": np.array([len(taken) for taken in actions], np.int64),
+                "episode_seed": self._infos["episode_seed"],
+                "episode_number": self._infos["episode_number"],
+            }
+        return Snapshot(values, arrays)
+
+    def resume(self, snapshot: Snapshot) -> str:
+        """Go on where another process stood; the weights come by `set_state`.
+
+        Returns:
+            Why the episodes begin anew instead, in a few words; empty if they go on.
+
+        Raises:
+            RolloutError: The process could not be built.
+        """
+        self._check_built()
+        arrays = snapshot.arrays
+        self._callbacks[0].set_state(snapshot.values["metrics"])
+        self._ongoing_episodes_for_metrics = defaultdict(list)
+        self._needs_initial_reset = "stacks" not in arrays
+        with ending_after(MAX_SAMPLE_S):
+            problem = "" if self._needs_initial_reset else self._replay(snapshot)
+        self._needs_initial_reset |= bool(problem)
+        met = np.split(arrays["met"], np.cumsum(arrays["met_rows"])[:-1]) if len(arrays["met_rows"]) else []
+        self.module.met.clear()
+        self.module.met.extend(met)
+        self.module.steps = snapshot.values["steps"]
+        set_generators(arrays)
+        return problem
+
+    def _replay(self, snapshot: Snapshot) -> str:
+        """Simulate the episodes under way up to where they were; return what differs, empty if nothing."""
+        arrays = snapshot.arrays
+        actions = np.split(arrays["actions"], np.cumsum(arrays["actions_taken"])[:-1])
+        series = arrays["episode_seed"].tolist(), arrays["episode_number"].tolist()
+        try:
+            told = self.env.unwrapped.replay(list(zip(*series, actions, strict=True)))
+        except ValueError as error:
+            return one_line(error)
+        observations, self._over, self._infos = told
+        self._stacks = arrays["stacks"]
+        if not np.array_equal(self.module.features(observations), self._stacks[:, -1]):
+            return "the simulation shows something else than before"
+        self._episodes = list(zip(snapshot.values["names"], actions, strict=True))
+        return ""
 
     def apply(self, func: Callable[..., Any], *values: Any, **named: Any) -> Any:
         """As RLlib's, which ends the process where `func` raises; but a rollout's error is passed on."""
@@ -186,7 +285,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         first = np.ones(len(features), bool)
         self._stacks = push_features(np.empty(shape, features.dtype), features, first)
         self._infos, self._over = infos, ~first
-        self._episodes = [(uuid.uuid4().hex, 0) for _ in features]  # name, steps so far
+        self._episodes = [_begun() for _ in features]
         self._ongoing_episodes_for_metrics = defaultdict(list)
         self._needs_initial_reset = False
 
@@ -221,7 +320,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             first = 0
             for last in [*np.flatnonzero(ended[:, row]), len(steps)]:
                 if over[first : first + 1, row].any():  # reset here: the episode begins after it
-                    self._episodes[row] = uuid.uuid4().hex, 0
+                    self._episodes[row] = _begun()
                     first += 1
                 end = min(last + 1, len(steps))
                 if end > first:
@@ -245,8 +344,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: list[dict[str, object]]
     ) -> SingleAgentEpisode:
         """The next piece of the episode in a row."""
-        name, begun = self._episodes[row]
-        self._episodes[row] = name, begun + len(columns["actions"])
+        name, before = self._episodes[row]
+        self._episodes[row] = name, np.concatenate([before, columns["actions"].astype(np.uint8)])
         return SingleAgentEpisode(
             name,
             observations=InfiniteLookbackBuffer(stacks),
@@ -259,9 +358,14 @@ class PlainEnvRunner(SingleAgentEnvRunner):
                 Columns.ACTION_DIST_INPUTS: InfiniteLookbackBuffer(columns["logits"]),
                 Columns.ACTION_LOGP: InfiniteLookbackBuffer(columns["logp"]),
             },
-            t_started=begun,
+            t_started=len(before),
             len_lookback_buffer=0,
         )
+
+
+def _begun() -> tuple[str, np.ndarray]:
+    """An episode that begins: its name, and the actions so far."""
+    return uuid.uuid4().hex, np.empty(0, np.uint8)
 
 
 def _of_row(infos: dict[str, np.ndarray], row: int) -> dict[str, object]:

@@ -9,7 +9,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from ray.rllib.algorithms.ppo import PPO as RLlibPPO
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
@@ -20,53 +19,19 @@ from envs.kinematics import NUM_ACTIONS
 from jobs.config.conditions import env_with
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.diagnostics import drift_metrics
-from jobs.training.env_runner import MAX_SAMPLE_S, PlainEnvRunner
+from jobs.run.files import RunError
+from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
+from jobs.training.rounds import MAX_RESTARTS, SAMPLE_TIMEOUT_S
 from models.encoder.evae import EventVAE
 from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
 from models.kinds import KINDS, PolicySpec
 from models.policy.rllib_module import module_spec
 
-
-class PPO(RLlibPPO):
-    """RLlib's PPO; an error of its construction is raised by the first iteration instead.
-
-    Ray ends an actor whose construction failed once everything it owns is released, and env runners
-    never are: the launcher would wait forever. Its name is RLlib's, because Tune continues a training
-    only under the name that it began with.
-    """
-
-    _refused: Exception | None = None
-
-    def setup(self, config: Any) -> None:
-        """Build it."""
-        try:
-            super().setup(config)
-        except Exception as error:
-            self._refused = error
-
-    def load_checkpoint(self, checkpoint: Any) -> None:
-        """Go on from a checkpoint; one that could not be built says so in its first iteration."""
-        if self._refused is None:
-            super().load_checkpoint(checkpoint)
-
-    def step(self) -> Any:
-        """One iteration."""
-        if self._refused is not None:
-            raise self._refused
-        return super().step()
-
-    def cleanup(self) -> None:
-        """Let go of what was built."""
-        if self._refused is None:
-            super().cleanup()
-
-
 ENV = "evade-corridors"
 EPISODES = 100  # that a rate is averaged over
 DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
 WAITING_CPUS = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
-MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 
 
 class EpisodeMetrics(RLlibCallback):
@@ -75,6 +40,9 @@ class EpisodeMetrics(RLlibCallback):
     An iteration ends two or three episodes, so metrics are means over the last `EPISODES`. Episodes
     count in the order in which they began, those of one round of sampling together: of those begun
     at once the short ones end first, and these are crashes.
+
+    Attributes:
+        rounds: Of sampling, so far.
     """
 
     def __init__(self) -> None:
@@ -82,17 +50,17 @@ class EpisodeMetrics(RLlibCallback):
         self._episodes: deque[dict[str, float]] = deque(maxlen=EPISODES)
         self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
         self._unfinished: dict[str, float] = {}
-        self._rounds = 0
+        self.rounds = 0
         self._encoder: tuple[EventVAE, EncoderManifest] | None = None
 
     def on_sample_end(
         self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
     ) -> None:
         """Count events and the outcome of each episode that ended; measure drift at times."""
-        if env_runner is not None and self._rounds % DRIFT_EVERY == 0:
+        if env_runner is not None and self.rounds % DRIFT_EVERY == 0:
             for name, value in self._drift(env_runner.module).items():
                 metrics_logger.log_value(name, value, window=1)
-        self._rounds += 1
+        self.rounds += 1
         infos = [info for chunk in samples for info in chunk.get_infos()[1:]]
         events, dropped = (
             np.array([info[key] for info in infos]) for key in ("num_events", "dropped_events")
@@ -117,6 +85,22 @@ class EpisodeMetrics(RLlibCallback):
             del self._unfinished[name], next(begun for begun in self._begun if name in begun)[name]
         while self._begun and None not in self._begun[0].values():
             self._episodes.extend(ended for ended in self._begun.popleft().values() if ended)
+
+    def state(self) -> dict[str, Any]:
+        """What the next metrics depend on, for JSON."""
+        return {
+            "rounds": self.rounds,
+            "episodes": list(self._episodes),
+            "begun": [dict(begun) for begun in self._begun],
+            "unfinished": dict(self._unfinished),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from a `state`."""
+        self.rounds = state["rounds"]
+        self._episodes = deque(state["episodes"], maxlen=EPISODES)
+        self._begun = deque(dict(begun) for begun in state["begun"])
+        self._unfinished = dict(state["unfinished"])
 
     def _drift(self, module: Any) -> dict[str, float]:
         """The `jobs.rollout.diagnostics.drift_metrics` of the windows that the module met.
@@ -174,7 +158,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             num_env_runners=runners,
             num_cpus_per_env_runner=1.0 - WAITING_CPUS / max(1, runners),
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
-            sample_timeout_s=MAX_SAMPLE_S + 60.0,  # a process that hangs ends itself before
+            sample_timeout_s=SAMPLE_TIMEOUT_S,
             gym_env_vectorize_mode="vector_entry_point",
             env_runner_cls=PlainEnvRunner,
         )
@@ -271,6 +255,7 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
 
     Raises:
         ConfigError: It was made for another sensor, or for another model than the one to fine-tune.
+        RunError: It is damaged.
         ValueError: A policy that needs one got none, or the other way round.
     """
     name, needed = config.model.name, KINDS[config.model.name].encoder
@@ -278,7 +263,11 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
         raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")
     if path is None:
         return None
-    _, about = load_encoder(path)
+    try:
+        _, about = load_encoder(path)
+    except EncoderFileError as error:
+        marker = Path(path).parent.parent / "stages" / "pretrain.json"
+        raise RunError(f"{error}; delete {marker}, and the same command makes the encoder anew") from None
     differ = sensor_differences(about["sensor"], config.env)
     if differ:
         values = ", ".join(

@@ -19,7 +19,8 @@ from envs.recordings import Recording, read_recording
 from jobs.analysis.plots import plot_reconstructions
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import PretrainConfig
-from jobs.run.files import write_atomic
+from jobs.run.checkpoints import UNSEALED, damage
+from jobs.run.files import RunError, write_atomic
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console, progress
 from jobs.tracking.tracker import Tracker, open_tracker
@@ -125,6 +126,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     if done is not None:
         return done
     settings = config.pretrain
+    check_data(folder)
     train = read_recording(data_file(folder, "train"))
     validation = read_recording(data_file(folder, "validation"))
     training = EvaeTraining.begin(evae_settings(config), train, settings, (config.seed, 2))
@@ -150,6 +152,20 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
             measured = f", held out {latest['explained_loss_step']:.0%} explained" if latest else ""
             advance(1, note=f"loss {losses['loss']:.4f}{measured}")
     return freeze(config, folder, tracker, evae, train.about, held_out)
+
+
+def check_data(folder: Run) -> None:
+    """Check that the recordings of a run are those that were collected.
+
+    Raises:
+        RunError: They are not.
+    """
+    reason = damage(folder.data)
+    if reason not in (None, UNSEALED):  # older versions did not seal them
+        marker = folder.path / "stages" / "collect.json"
+        raise RunError(
+            f"{folder.data}: damaged ({reason}); delete {marker}, and the same command collects anew"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """The private names of RLlib that this package relies on; another version may lack any of them.
 
 `jobs.training.env_runner` and `jobs.training.ppo_learner` replace RLlib's loops over single steps and
-minibatches, for which RLlib has no public interface. A test compares these lists with what the two use.
+minibatches, and `jobs.training.rounds` that over env runners, for which RLlib has no public interface. A
+test compares these lists with what they use.
 """
 
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ import ray
 TESTED_RAY = "2.60.0"
 # Of a SingleAgentEnvRunner.
 ENV_RUNNER = (
+    "_callbacks",
     "_done_episodes_for_metrics",
     "_increase_sampled_metrics",
     "_log_env_steps",
@@ -19,7 +21,10 @@ ENV_RUNNER = (
     "_ongoing_episodes_for_metrics",
     "_sample",
     "_seed",
+    "_weights_seq_no",
 )
+# Of an EnvRunnerGroup.
+GROUP = ("_worker_manager",)
 # Of a PPOTorchLearner.
 LEARNER = ("_log_steps_trained_metrics", "_module", "_weights_seq_no")
 # Of a TorchRLModule.

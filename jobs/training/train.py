@@ -9,7 +9,6 @@ raise the same again.
 """
 
 import contextlib
-import json
 import math
 import re
 import time
@@ -26,12 +25,15 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
+from jobs.run.files import json_lines, naming, read_json_lines, whole_lines
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
-from jobs.run.ray_cluster import fit, holds, logs_folder, start_ray, storage
+from jobs.run.ray_cluster import fit, holds, start_ray, storage
+from jobs.run.trial_errors import low_memory, newest_error
 from jobs.tracking.tracker import open_tracker
+from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.env_runner import RolloutError
-from jobs.training.ppo import MAX_RESTARTS, PPO, build_ppo, policy_about, policy_spec
+from jobs.training.ppo import build_ppo, policy_about, policy_spec
 from jobs.training.pretrain import check_sources, prepare_encoder
 from models.encoder.weights import EncoderManifest, load_encoder
 from models.policy import save_policy
@@ -59,12 +61,10 @@ METRICS = {
 ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
 ENV_STEPS = "num_env_steps_sampled_lifetime"
 SAMPLED = ("env_runners", "num_env_steps_sampled")
-MAX_PAUSE_S = 600.0  # while all env runners restart: a busy machine takes minutes
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
 LISTENER = "train"
-FAILURE = re.compile(r"^Failure # \d+ .*$", re.MULTILINE)  # begins each error that Tune writes about a trial
 RAISED = re.compile(r"^(?:\w+\.)*\w+(?:Error|Exception|Exit|Interrupt)\b.*$", re.MULTILINE)
 
 _LISTENERS: dict[str, Callable[[Mapping[str, object]], None]] = {}
@@ -88,7 +88,9 @@ class Relay(tune.Callback):
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
     ) -> None:
-        """Pass one result on, with the number of restarts before it."""
+        """Pass one result on, with the number of restarts before it, and show its notice."""
+        if NOTICE in result:
+            console.print(result[NOTICE], markup=False)
         _LISTENERS[self.name]({**result, "trial_restarts": trial.num_failures})
 
     def on_checkpoint(
@@ -106,16 +108,6 @@ class Relay(tune.Callback):
             raise TrainingError(stopped(error))
         reason = last_line(error) if error else "its process could not be started"
         console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
-
-
-def newest_error(file: str | None) -> str:
-    """The newest of the errors that Tune has written about a trial, as text; empty if there is none.
-
-    Tune keeps the error itself too, pickled, but where another user of the machine may write.
-    """
-    if file is None or not Path(file).is_file():
-        return ""
-    return FAILURE.split(Path(file).read_text())[-1].strip()
 
 
 def run(config: Config) -> dict[str, float]:
@@ -167,6 +159,9 @@ def stopped(error: Exception | str) -> str:
 
 def last_line(error: Exception | str) -> str:
     """The line of a worker's error that names its cause."""
+    ended = low_memory(str(error))
+    if ended is not None:
+        return f"its process was ended {ended}; stop other programs, or take a machine with more"
     lines = str(error).strip().splitlines()
     raised = f"{RolloutError.__module__}.{RolloutError.__qualname__}: "  # as Ray writes it before the message
     return lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
@@ -245,27 +240,23 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
     file = folder.train / "results.jsonl"
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(whole_lines(file))
+    with file.open("ab") as content:
+        content.truncate(len(whole_lines(file)))  # a kill can leave half a line
     reported, last = reported_so_far(file)
     total, since_s = config.train.env_steps, time.monotonic()
-    paused_s: float | None = None
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
         def listen(result: Mapping[str, object]) -> None:
-            nonlocal reported, since_s, paused_s
-            now_s = time.monotonic()
-            if not _lookup(result, SAMPLED) > 0:
-                paused_s = now_s if paused_s is None else paused_s
-                check_pause(now_s - paused_s, result, config.algo.num_env_runners)
-                return
-            paused_s, env_steps = None, int(_lookup(result, (ENV_STEPS,)))
+            nonlocal reported, since_s
+            now_s, env_steps = time.monotonic(), int(_lookup(result, (ENV_STEPS,)))
             last.update(read_metrics(result, now_s - since_s))
             since_s = now_s
             if env_steps <= reported:
                 return
             row = {name: value if math.isfinite(value) else None for name, value in last.items()}
-            lines.write(json.dumps({"env_steps": env_steps, **row}) + "\n")
-            lines.flush()
+            with naming(file):
+                lines.write(json_lines([{"env_steps": env_steps, **row}]))
+                lines.flush()
             on_result(env_steps, dict(last))
             advance(env_steps - reported, note=_note(last))
             reported = env_steps
@@ -277,32 +268,17 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             del _LISTENERS[LISTENER]
 
 
-def check_pause(seconds: float, result: Any, env_runners: int) -> None:
-    """Let a training wait for env runners that died, unless they do not come back.
+def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
+    """Environment steps and metrics of the last whole line of a results file; 0 and none without one.
 
     Raises:
-        TrainingError: All have been started as often as they may be, or after `MAX_PAUSE_S`.
+        RunError: A line is damaged.
     """
-    known = result.get("fault_tolerance", {})
-    restarts, alive = known.get("num_remote_worker_restarts", 0), known.get("num_healthy_workers", 1)
-    if seconds > MAX_PAUSE_S or (alive == 0 and restarts >= MAX_RESTARTS * max(1, env_runners)):
-        ended = f"every env runner has died, some {MAX_RESTARTS + 1} times"
-        raise TrainingError(f"no step was sampled for {seconds:.0f} s: {ended}; see {logs_folder()}")
-
-
-def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
-    """Environment steps and metrics of the last whole line of a results file; 0 and none without one."""
-    lines = whole_lines(file).splitlines()
-    if not lines:
+    rows = read_json_lines(file)
+    if not rows:
         return 0, {}
-    row = json.loads(lines[-1])
+    row = rows[-1]
     return int(row.pop("env_steps")), {name: math.nan if x is None else x for name, x in row.items()}
-
-
-def whole_lines(file: Path) -> bytes:
-    """A file's content up to its last line end: a kill can leave half a line behind it."""
-    text = file.read_bytes() if file.exists() else b""
-    return text[: text.rfind(b"\n") + 1]
 
 
 def read_metrics(result: Mapping[str, object], seconds: float) -> dict[str, float]:

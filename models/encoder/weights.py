@@ -14,7 +14,7 @@ import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import safetensors.torch
 import torch
@@ -29,6 +29,7 @@ MAX_HEADER_BYTES = 1 << 20
 DECODER = "decoder."  # of the names of its tensors
 LEAN = {torch.float32: torch.float16}  # what a tensor may be rounded to
 RESERVED = ("format", "model", "sha256")
+CHECKSUM = "checksum"  # of a manifest's other values; manifests of older versions have none
 ADDED_SETTINGS = {"coding": "additive"}  # meant by files that were written before there was a choice
 
 
@@ -45,6 +46,10 @@ class EncoderManifest(TypedDict, total=False):
 
 class EncoderFileError(ValueError):
     """An encoder file that was refused; the message begins with its name."""
+
+
+class DamagedManifestError(Exception):
+    """A manifest was changed after it was written."""
 
 
 def save_encoder(
@@ -74,7 +79,7 @@ def save_encoder(
     model = dataclasses.asdict(evae.settings)
     record = {**manifest, "format": FORMAT, "model": model, "sha256": digest}
     try:
-        text = json.dumps(record, indent=2, sort_keys=True, allow_nan=False).encode()
+        text = json.dumps(with_checksum(record), indent=2, sort_keys=True, allow_nan=False).encode()
     except (TypeError, ValueError) as error:
         raise EncoderFileError(f"{target}: the manifest must hold finite JSON values: {error}") from None
     if len(text) > MAX_MANIFEST_BYTES:
@@ -134,9 +139,11 @@ def read_manifest(path: Path) -> EncoderManifest:
         EncoderFileError: Not a JSON object with the keys and model settings of this format.
     """
     try:
-        manifest = json.loads(read_limited(path, MAX_MANIFEST_BYTES))
+        manifest = without_checksum(json.loads(read_limited(path, MAX_MANIFEST_BYTES)))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise EncoderFileError(f"{path}: not a JSON file: {error}") from None
+    except DamagedManifestError as error:
+        raise EncoderFileError(f"{path}: {error}") from None
     missing = [key for key in RESERVED if not isinstance(manifest, dict) or key not in manifest]
     if missing:
         raise EncoderFileError(f"{path}: the manifest lacks {missing}")
@@ -150,6 +157,27 @@ def read_manifest(path: Path) -> EncoderManifest:
     except (TypeError, ValueError) as error:
         raise EncoderFileError(f"{path}: the model's settings are refused: {error}") from None
     return manifest
+
+
+def with_checksum(manifest: Mapping[str, object]) -> dict[str, object]:
+    """A manifest, and the checksum of its values as JSON holds them."""
+    text = json.dumps(manifest, allow_nan=False)
+    canonical = json.dumps(json.loads(text), sort_keys=True, separators=(",", ":"))
+    return {**manifest, CHECKSUM: hashlib.sha256(canonical.encode()).hexdigest()[:12]}
+
+
+def without_checksum(manifest: Any) -> Any:
+    """A manifest without its checksum; one that has none as it is.
+
+    Raises:
+        DamagedManifestError: Its values are not those that the checksum was made of.
+    """
+    if not isinstance(manifest, dict) or CHECKSUM not in manifest:
+        return manifest
+    own = {name: value for name, value in manifest.items() if name != CHECKSUM}
+    if with_checksum(own) != manifest:
+        raise DamagedManifestError("damaged: other values than its checksum says; copy or make it again")
+    return own
 
 
 def expected_tensors(settings: EvaeSettings) -> dict[str, Tensor]:
@@ -224,5 +252,9 @@ def write_atomic(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # that of a write names no file
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)

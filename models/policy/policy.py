@@ -22,12 +22,15 @@ from models.encoder.evae import EventVAE
 from models.encoder.finetuned import EVENTS
 from models.encoder.frozen import Encoder, encoder_of, tabulate
 from models.encoder.weights import (
+    DamagedManifestError,
     EncoderFileError,
     EncoderManifest,
     lean_tensors,
     load_encoder,
     read_limited,
     save_encoder,
+    with_checksum,
+    without_checksum,
     write_atomic,
 )
 from models.kinds import PolicySpec, read_spec
@@ -38,6 +41,7 @@ MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.sa
 ENCODER_FILES = (ENCODER, "encoder.json")
 REQUIRED = ("sha256", "name", "sensor", "sensor_hash")
 FORMAT = 2
+REMEDY = "copy it again, or delete stages/train.json of its run folder and give the command again"
 MAX_BYTES = 1 << 28  # of one file, which is read whole
 
 
@@ -209,7 +213,7 @@ def save_policy(
     write_atomic(folder / NETWORKS, safetensors.torch.save(lean_tensors(tensors) if lean else tensors))
     sums = {name: _digest(folder / name) for name in _files(spec)}
     manifest = {**about, **spec.manifest(), "format": FORMAT, "sha256": sums}
-    text = json.dumps(manifest, indent=2, allow_nan=False)
+    text = json.dumps(with_checksum(manifest), indent=2, allow_nan=False)
     write_atomic(folder / MANIFEST, text.encode())
     return folder
 
@@ -242,7 +246,9 @@ def load_policy(
     manifest, spec = _read_manifest(folder / MANIFEST)
     for name, expected in manifest["sha256"].items():
         if _digest(folder / name) != expected:
-            raise PolicyFileError(f"{folder / name}: SHA-256 must be {expected}: another or a damaged file")
+            raise PolicyFileError(
+                f"{folder / name}: SHA-256 must be {expected}: another or a damaged file; {REMEDY}"
+            )
     encoder = _load_encoder(folder, spec) if spec.frozen else None
     networks = _load_networks(folder / NETWORKS, spec)
     if spec.finetuned:
@@ -255,12 +261,23 @@ def _files(spec: PolicySpec) -> tuple[str, ...]:
     return (*(ENCODER_FILES if spec.frozen else ()), NETWORKS)
 
 
-def _read_manifest(file: Path) -> tuple[PolicyManifest, PolicySpec]:
+def read_policy_manifest(file: Path) -> dict[str, Any]:
+    """The values of a policy's manifest as they were written; an empty one if they are no JSON object.
+
+    Raises:
+        PolicyFileError: It is damaged.
+    """
     try:
-        read = json.loads(_read(file))
+        read = without_checksum(json.loads(_read(file)))
     except (ValueError, RecursionError) as error:
-        raise PolicyFileError(f"{file}: not a JSON file: {error}") from None
-    manifest: Any = read if isinstance(read, dict) else {}
+        raise PolicyFileError(f"{file}: not a JSON file: {error}; {REMEDY}") from None
+    except DamagedManifestError as error:
+        raise PolicyFileError(f"{file}: {error}") from None
+    return read if isinstance(read, dict) else {}
+
+
+def _read_manifest(file: Path) -> tuple[PolicyManifest, PolicySpec]:
+    manifest: Any = read_policy_manifest(file)
     if (found := manifest.get("format")) != FORMAT:
         raise PolicyFileError(f"{file}: format {found!r}, this version reads {FORMAT}; train it anew")
     missing = [key for key in REQUIRED if key not in manifest]

@@ -60,6 +60,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     Attributes:
         met: With a frozen encoder, a sample of the newest windows that it was shown, one of each vector
             step and of each episode in turn, as `models.encoder.event_batch.cut_packed` cuts them.
+        steps: Vector steps so far, which say whose turn it is.
     """
 
     def setup(self) -> None:
@@ -75,7 +76,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
         self._table: Encoder | None = None
         self.met: deque[np.ndarray] = deque(maxlen=MET_WINDOWS)
-        self._steps = 0
+        self.steps = 0
 
     def get_non_inference_attributes(self) -> list[str]:
         """What an env runner does without."""
@@ -98,8 +99,8 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         """Features (B, ...) of observations (B, ...)."""
         if self.encoder is not None:
             self._table = self._table or tabulate(self.encoder, self.model_config["encoder_file"].settings)
-            self.met.append(cut_packed(observations[self._steps % len(observations)]))
-            self._steps += 1
+            self.met.append(cut_packed(observations[self.steps % len(observations)]))
+            self.steps += 1
         return feature_of(self.spec).from_observations(observations, self.spec, self._table)
 
     def set_state(self, state: Any) -> None:

@@ -93,3 +93,34 @@ def test_several_configs_are_flown_in_turn():
 def test_configs_that_show_different_things_are_refused():
     with pytest.raises(ValueError, match="one observation space"):
         CorridorVectorEnv(2, [EnvConfig(window_capacity=8), EnvConfig(window_capacity=9)])
+
+
+@pytest.mark.parametrize("memory", ["reference", "frame"])
+def test_a_replay_leads_to_where_the_actions_led_and_goes_on_with_the_same_bytes(memory):
+    config = EnvConfig(
+        camera=CameraConfig(width=16, height=16, memory=memory), faults=FAULTY, time_limit_s=0.1
+    )
+    first, second = (CorridorVectorEnv(3, [config, EnvConfig(camera=SMALL)]) for _ in range(2))
+    first.reset(seed=4)
+    actions = np.random.default_rng(0).integers(0, 3, (60, 3))
+    taken, over = [[], [], []], np.zeros(3, bool)
+    for row in actions[:20]:  # some are over now, and one has just been reset
+        for k in range(3):
+            taken[k] = [] if over[k] else [*taken[k], row[k]]
+        observations, _, terminated, truncated, infos = first.step(row)
+        over = terminated | truncated
+    series = infos["episode_seed"].tolist(), infos["episode_number"].tolist()
+    told = second.replay(list(zip(*series, taken, strict=True)))
+    assert told[0].tobytes() == observations.tobytes()
+    np.testing.assert_array_equal(told[1], over)
+    assert over.tolist() == [True, False, True]
+    np.testing.assert_equal(told[2], infos)
+    for row in actions[20:]:
+        for mine, other in zip(first.step(row), second.step(row), strict=True):
+            np.testing.assert_equal(mine, other)
+
+
+def test_actions_that_outlast_their_episode_are_refused():
+    env = CorridorVectorEnv(1, camera=SMALL, time_limit_s=0.02)
+    with pytest.raises(ValueError, match="environment 0, seed 3, episode 1 ended at step 4"):
+        env.replay([(3, 1, [0] * 5)])

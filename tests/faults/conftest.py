@@ -1,9 +1,13 @@
+import contextlib
+import os
 import subprocess
+import time
+from pathlib import Path
 
 import pytest
 
 from tests.support.clusters import cluster  # noqa: F401  a fixture
-from tests.support.faults import TABLE
+from tests.support.faults import DEADLINE_S, TABLE
 
 
 def pytest_collection_modifyitems(items):
@@ -43,3 +47,23 @@ def small_disk(tmp_path):
         pytest.skip("a full disk needs a small file system, and mounting one is not permitted")
     yield folder
     subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.fixture
+def small_memory():
+    """A group of processes that together may take 64 MiB more than they have; without the right to make one,
+    a path of nothing.
+    """
+    root = Path("/sys/fs/cgroup")
+    unified = (root / "cgroup.controllers").is_file()
+    group = root / ("" if unified else "memory") / f"evade-faults-{os.getpid()}"
+    with contextlib.suppress(OSError):
+        group.mkdir()
+        (group / ("memory.max" if unified else "memory.limit_in_bytes")).write_text(str(64 << 20))
+    yield group
+    deadline = time.monotonic() + DEADLINE_S
+    while group.is_dir():  # until the last of its processes has gone
+        assert time.monotonic() < deadline, (group / "cgroup.procs").read_text()
+        with contextlib.suppress(OSError):
+            group.rmdir()
+        time.sleep(0.1)

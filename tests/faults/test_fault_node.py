@@ -1,20 +1,21 @@
 """A machine of a cluster that is lost: the others go on with its work."""
 
-import csv
-
 import pytest
 
 from tests.support.clusters import SMALL, on
-from tests.support.faults import FINE, SWEEP, TRAIN, check_complete, launch, outcome
+from tests.support.faults import (
+    FINE,
+    SEEING,
+    TRAIN,
+    check_complete,
+    check_once,
+    launch,
+    noting,
+    outcome,
+    write_hook,
+)
 
 pytestmark = pytest.mark.faults
-SLOW = """
-import time
-whole = roll_out
-def roll_out(*given):
-    time.sleep(2.0)
-    return whole(*given)
-"""
 
 
 def test_a_training_whose_machine_is_lost_goes_on_elsewhere_from_its_checkpoint(tmp_path, cluster):
@@ -32,18 +33,13 @@ def test_a_training_whose_machine_is_lost_goes_on_elsewhere_from_its_checkpoint(
     outcome("node lost, training", "goes on elsewhere (restarts in results: 1)", "steps since a checkpoint")
 
 
-def test_a_sweep_that_loses_a_machine_evaluates_every_task_once(tmp_path, cluster):
-    nodes = [cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"]) for _ in "ab"]
-    axis = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}"
-    words = (*SWEEP, "~sweep.axes", axis, "sweep.policies=[straight,oracle]")
+def test_a_sweep_that_loses_a_machine_evaluates_every_task_once(tmp_path, cluster, monkeypatch):
     # Workers of a cluster are no children of the launcher: their machine hands them its environment.
-    job = launch(tmp_path, *words, *on(cluster), after={"jobs.rollout.executors": SLOW})
+    monkeypatch.setenv("PYTHONPATH", write_hook(tmp_path, after=noting(tmp_path)))
+    nodes = [cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"]) for _ in "ab"]
+    job = launch(tmp_path, *SEEING, *on(cluster), after=noting(tmp_path))
     job.wait(lambda: len(job.kept()) >= 1)
     cluster.remove_node(nodes[0], allow_graceful=False)
-    assert job.end() == 0, job.said
-    with (job.run / "sweep" / "episodes.csv").open() as file:
-        rows = [tuple(row.values()) for row in csv.DictReader(file)]
-    assert len(rows) == len(set(rows)) == (4 + 1) * 2 * 2
-    assert sum(len(rows) for rows in job.kept().values()) == 4 * 2 * 2
+    check_once(job, tmp_path, again_at_most=2)
     assert (job.run / "stages" / "sweep.json").is_file()
     outcome("node lost, sweep", "its task is evaluated again elsewhere", "episodes under way")

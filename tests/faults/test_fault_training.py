@@ -31,21 +31,26 @@ def test_an_env_runner_that_is_killed_is_started_again_and_counted(tmp_path):
     ]
     assert restarts == 1
     repeated = [row["env_steps"] for row in job.rows() if row["env_steps"] > before]
-    outcome(
-        "env runner killed", "started again, training goes on (restarts in results: 1)", "its steps in flight"
-    )
+    outcome("env runner killed", "started again, goes on where it was (restarts in results: 1)", "nothing")
     assert repeated
 
 
 def test_a_killed_driver_continues_by_the_printed_command(tmp_path):
-    job = launch(tmp_path, *TRAIN, *FINE)
+    # Long enough to be still at work when the other has started.
+    job = launch(tmp_path, *TRAIN, *FINE, "train.env_steps=6400")
+    job.wait(lambda: job.steps() >= 128)
+    refused = start(tmp_path, job.printed_command())
+    assert refused.end() == 1
+    assert f"{job.run}: process {job.process.pid} of " in refused.said
+    assert "works there; wait until it has ended" in refused.said
     job.wait(lambda: job.steps() >= 320)
-    job.kill()
+    job.kill_alone()
     before = job.rows()
-    again = start(tmp_path, job.printed_command())
+    again = start(tmp_path, job.printed_command())  # at once: what the other started may still be ending
     check_complete(again)
     assert again.rows()[: len(before)] == before
     outcome("driver killed, training", "the printed command continues; each step reported once", "0 results")
+    outcome("second driver, training", "refused while the first works, not after its SIGKILL", "nothing")
 
 
 def test_ctrl_c_stops_a_training_that_the_same_command_continues(tmp_path):
@@ -158,7 +163,7 @@ def test_an_env_runner_that_hangs_is_ended_and_started_again(tmp_path):
     check_complete(job)
     assert (tmp_path / "hung").exists()
     assert job.rows()[-1]["perf/env_runner_restarts"] >= 1
-    outcome("env runner hangs", "ended after its limit (900 s), started again", "its steps in flight")
+    outcome("env runner hangs", "ended after its limit (900 s), goes on where it was", "nothing")
 
 
 def test_clock_jumps_change_no_result(tmp_path):

@@ -1,9 +1,31 @@
-"""A Ray cluster on this machine for tests."""
+"""A Ray cluster on this machine for tests, and work for it."""
+
+from pathlib import Path
 
 import pytest
 
+from tests.support.faults import HOOK, SWEEP
+
 TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
 SMALL = {"object_store_memory": 100 * 2**20, "include_dashboard": False}
+# Twelve parts, of two episodes each.
+AXIS = "+sweep.axes.rate={env.control_hz:[40,50,80,100,160,200]}"
+RATES = (*SWEEP, "~sweep.axes", AXIS, "sweep.policies=[straight,oracle]")
+SLOW = """
+import time
+whole = roll_out
+def roll_out(*given):
+    time.sleep(4.0)
+    return whole(*given)
+"""
+
+
+def slow_workers(folder: Path) -> str:
+    """The PYTHONPATH of a node whose workers take their time for each part of a sweep."""
+    (folder / "slow").mkdir()
+    hook = HOOK.format(after={"jobs.rollout.executors": SLOW}, first="")
+    (folder / "slow" / "sitecustomize.py").write_text(hook)
+    return str(folder / "slow")
 
 
 @pytest.fixture

@@ -4,7 +4,10 @@ A fault is code in a `sitecustomize.py` on the path of the launcher, which every
 Ray inherits: it is run after the module that it names is imported, in whichever process.
 """
 
+import contextlib
+import csv
 import dataclasses
+import functools
 import json
 import os
 import re
@@ -12,9 +15,21 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+
+from jobs.config.config import parse
+from jobs.evaluation.sweep_plan import plan_sweep
+from jobs.rollout.executors import run_serially
+from jobs.rollout.policies import find_sweep_policies
+from jobs.rollout.scheduler import evaluate_tasks
+from jobs.rollout.store import EpisodeStore
+from jobs.run.folder import locate_run
+from tests.support.configs import compose
 
 ROOT = Path(__file__).resolve().parents[2]
 DEADLINE_S = 1200.0  # of one step of a test: a starved machine starts Ray in minutes
@@ -33,6 +48,15 @@ TRAIN = (
     "env.time_limit_s=0.035",
 )
 SWEEP = ("+exp=robustness", "budget=smoke", "env.time_limit_s=0.2", "sweep.reference=straight")
+# Both policies see events, so that each sparsity is a task of its own for each; with two episodes a
+# task they are more than a job evaluates without Ray.
+SEEING = (
+    *SWEEP,
+    "~sweep.axes",
+    "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}",
+    "sweep.policies=[bytestream-s0,event_set-s0]",
+)
+TASKS = 4 * 2  # the nominal condition is that of sparsity 0
 
 HOOK = """
 import importlib.abc, importlib.machinery, sys, threading
@@ -117,11 +141,15 @@ class Job:
         """Wait for its end; the exit status."""
         return self.process.wait(DEADLINE_S)
 
+    def kill_alone(self) -> None:
+        """End the launcher by SIGKILL; what it started may live on for some seconds."""
+        self.process.kill()
+        self.process.wait()
+
     def kill(self) -> None:
         """End the launcher by SIGKILL, and wait until all that it started has gone with it."""
         below = list(descendants(self.process.pid))
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait()
+        self.kill_alone()
         deadline = time.monotonic() + DEADLINE_S
         while any(Path(f"/proc/{pid}").exists() for pid in below):
             assert time.monotonic() < deadline, below
@@ -149,10 +177,7 @@ def start(
     folder: Path, command: list[str], first: str = "", after: dict[str, str] | None = None, **variables: str
 ) -> Job:
     """The same from a whole command."""
-    hook = folder / "hook"
-    hook.mkdir(parents=True, exist_ok=True)
-    (hook / "sitecustomize.py").write_text(HOOK.format(after=after or {}, first=first))
-    path = os.pathsep.join([str(hook), str(ROOT)])
+    path = write_hook(folder, first, after)
     log = Path(variables.get("TMPDIR", folder)) / f"log-{time.monotonic_ns()}"  # not on a disk that fills up
     with log.open("w") as file:
         process = subprocess.Popen(
@@ -164,6 +189,14 @@ def start(
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
     return Job(process, log, folder / "runs")
+
+
+def write_hook(folder: Path, first: str = "", after: dict[str, str] | None = None) -> str:
+    """Write code for processes to run; the PYTHONPATH with which they run it."""
+    hook = folder / "hook"
+    hook.mkdir(parents=True, exist_ok=True)
+    (hook / "sitecustomize.py").write_text(HOOK.format(after=after or {}, first=first))
+    return os.pathsep.join([str(hook), str(ROOT)])
 
 
 def descendants(pid: int) -> Iterator[int]:
@@ -182,12 +215,103 @@ def descendants(pid: int) -> Iterator[int]:
         below += parents.get(child, [])
 
 
+@contextlib.contextmanager
+def standing_still(pids: Iterable[int]) -> Iterator[list[int]]:
+    """Stop processes by SIGSTOP for the length of a block, and continue them."""
+    stopped = [pid for pid in pids if signalled(pid, signal.SIGSTOP)]
+    assert stopped
+    try:
+        yield stopped
+    finally:
+        for pid in stopped:
+            signalled(pid, signal.SIGCONT)
+
+
+def signalled(pid: int, number: int) -> bool:
+    """Whether a process was there to be sent a signal."""
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 def command_line(pid: int) -> str:
     """The command line of a process, which Ray's workers make their title; empty if it has gone."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
     except OSError:
         return ""
+
+
+# Writes down each episode that a process evaluates, and takes its time.
+NOTED = """
+import time
+whole = evaluate_part
+def evaluate_part(part):
+    result = whole(part)
+    with open({file!r}, "a") as notes:
+        for seed in part.task.seeds:
+            notes.write(f"{{part.task.key}} {{seed}}\\n")
+    time.sleep(1.0)
+    return result
+"""
+# Lets a process take memory until the kernel ends it, in a group whose memory is limited; where no
+# such group can be made, the process ends as the kernel would end it.
+OUTGROW = """
+import os, pathlib
+def outgrow():
+    group, held = pathlib.Path({group!r}), []
+    if not group.is_dir():
+        os.kill(os.getpid(), 9)
+    (group / "cgroup.procs").write_text(str(os.getpid()))
+    while True:
+        held.append(bytearray(1 << 24))
+"""
+
+
+def noting(folder: Path) -> dict[str, str]:
+    """Code that notes each evaluated episode in a file of a folder."""
+    return {"jobs.rollout.executors": NOTED.format(file=str(folder / "episodes"))}
+
+
+@functools.cache
+def expected_episodes() -> dict[str, list]:
+    """What a sweep of `SEEING` keeps: evaluated in this process, one task after the other."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = parse({**compose(*SEEING), "runs_dir": folder})
+        store = EpisodeStore(Path(folder) / "sweep")
+        tasks = plan_sweep(config, find_sweep_policies(config, locate_run(config))).tasks
+        evaluate_tasks(tasks, store, run_serially, measure_accuracy=False)
+        files = (Path(folder) / "sweep" / "episodes").iterdir()
+        return {path.stem: json.loads(path.read_text())["episodes"] for path in files}
+
+
+def check_once(job: Job, notes: Path, again_at_most: int) -> None:
+    """The sweep `SEEING` ended well: all episodes, each once, and hardly one evaluated twice.
+
+    Args:
+        job: The sweep that ended.
+        notes: The folder of `noting`.
+        again_at_most: How many episodes may have been evaluated again: those under way at the fault.
+    """
+    assert job.end() == 0, job.said
+    with (job.run / "sweep" / "episodes.csv").open() as file:
+        rows = [tuple(row.values()) for row in csv.DictReader(file)]
+    assert len(rows) == len(set(rows))
+    assert len(expected_episodes()) == TASKS
+    assert job.kept() == expected_episodes()
+    evaluated = Counter((notes / "episodes").read_text().splitlines())
+    assert len(evaluated) == TASKS * 2
+    assert sum(evaluated.values()) - len(evaluated) <= again_at_most
+
+
+def check_ended_by_kernel(group: Path, times: int) -> None:
+    """The kernel has ended so many processes of a group for lack of memory."""
+    counters = [group / name for name in ("memory.events", "memory.oom_control")]
+    for file in counters:
+        if file.is_file():
+            assert f"oom_kill {times}" in file.read_text().splitlines()
 
 
 FINE = ("train.env_steps=960", "train.checkpoint_every=1")
@@ -202,3 +326,41 @@ def check_complete(job):
     from models.policy import load_policy
 
     load_policy(job.run / "policy")
+
+
+def forked(folder: Path, *words: str, first: Callable[[], object] = lambda: None) -> tuple[int, str]:
+    """Run the launcher in a fork of this process, which has imported most of it: status, and what it says.
+
+    `first` is called in the fork before it. A status below 0 is the signal that ended it.
+    """
+    with tempfile.TemporaryFile("w+") as log:
+        pid = os.fork()
+        if pid == 0:
+            status = 70
+            try:
+                for number in (1, 2):
+                    os.dup2(log.fileno(), number)
+                sys.stdout = sys.stderr = os.fdopen(os.dup(log.fileno()), "w", buffering=1)
+                sys.argv = ["launch", *words, f"runs_dir={folder / 'runs'}"]
+                first()
+                from platform.launch import main
+
+                status = main()
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                os._exit(status)
+        _, status = os.waitpid(pid, 0)
+        log.seek(0)
+        return os.waitstatus_to_exitcode(status), log.read()
+
+
+def leave_room(disk: Path, room: int) -> Path:
+    """Fill a small disk so that `room` bytes are left; the file that does."""
+    filler = disk / "filler"
+    filler.unlink(missing_ok=True)
+    state = os.statvfs(disk)
+    with filler.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, max(1, state.f_bavail * state.f_frsize - room))
+    return filler

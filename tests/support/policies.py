@@ -9,10 +9,11 @@ import torch
 
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from models.encoder.evae import EventVAE
+from models.encoder.weights import with_checksum
 from models.kinds import PolicySpec, model_keys, read_model
 from models.policy import save_policy
 from models.policy.networks import build_networks
-from models.policy.policy import MANIFEST
+from models.policy.policy import MANIFEST, read_policy_manifest
 
 HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
 SIDE = 40
@@ -42,8 +43,8 @@ def save_untrained(path, env_config=HELD_OUT, name="bytestream"):
 def save_training(path, group, seed, env_config, name="event_columns"):
     """An untrained policy that says it is a training of `group`; returns the folder."""
     save_untrained(path, env_config, name)
-    manifest = json.loads((path / MANIFEST).read_text())
-    (path / MANIFEST).write_text(json.dumps({**manifest, "exp": group, "seed": seed}))
+    manifest = read_policy_manifest(path / MANIFEST)
+    (path / MANIFEST).write_text(json.dumps(with_checksum({**manifest, "exp": group, "seed": seed})))
     return str(path)
 
 

@@ -8,7 +8,7 @@ from jobs.config.config import ConfigError
 from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep, value_text
 from jobs.rollout.policies import find_sweep_policies, read_policy, with_sensor
 from jobs.run.folder import open_run
-from models.policy.policy import MANIFEST
+from models.policy.policy import MANIFEST, read_policy_manifest
 from tests.support.configs import AXES, sweep_config
 from tests.support.policies import save_training
 from tests.support.runs import planned
@@ -55,7 +55,7 @@ def test_another_policy_is_another_task(tmp_path):
     config = sweep_config(tmp_path)
     one = save_training(tmp_path / "one", "a", 0, config.env)
     keys = {planned(config, name).tasks[0].key for name in ("straight", "oracle", one)}
-    manifest = json.loads((tmp_path / "one" / MANIFEST).read_text())
+    manifest = read_policy_manifest(tmp_path / "one" / MANIFEST)
     (tmp_path / "one" / MANIFEST).write_text(json.dumps({**manifest, "sha256": {}}))
     assert len(keys | {planned(config, one).tasks[0].key}) == 4
 
@@ -139,7 +139,7 @@ def test_policies_of_one_group_stand_together_by_their_training_seed(tmp_path):
 
 def test_a_policy_without_an_experiment_is_of_the_group_of_its_kind(tmp_path):
     agent = save_training(tmp_path / "policy", "x", 5, EnvConfig())
-    manifest = json.loads((tmp_path / "policy" / MANIFEST).read_text())
+    manifest = read_policy_manifest(tmp_path / "policy" / MANIFEST)
     del manifest["exp"]
     (tmp_path / "policy" / MANIFEST).write_text(json.dumps(manifest))
     assert read_policy(agent).group == "event_columns"

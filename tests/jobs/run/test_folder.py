@@ -11,7 +11,7 @@ import pytest
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
-from jobs.run.files import RunError, write_json
+from jobs.run.files import RunError, read_json, write_json
 from jobs.run.folder import (
     NOT_IN_RUN_NAME,
     finish,
@@ -97,9 +97,7 @@ def test_the_stored_configuration_is_readable_as_yaml_and_json(config):
     import yaml
 
     run = open_run(config)
-    assert yaml.safe_load((run.path / "config.yaml").read_text()) == json.loads(
-        (run.path / "config.json").read_text()
-    )
+    assert yaml.safe_load((run.path / "config.yaml").read_text()) == read_json(run.path / "config.json")
 
 
 def test_a_damaged_marker_is_named_with_its_remedy(config):
@@ -157,9 +155,9 @@ def test_without_git_the_commit_is_unknown(monkeypatch):
 
 def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(config):
     run = open_run(config)
-    stored = json.loads((run.path / "config.json").read_text())
+    stored = read_json(run.path / "config.json")
     del stored["collect"]["recordings"], stored["train"]["conditions"]
-    (run.path / "config.json").write_text(json.dumps(stored))
+    write_json(run.path / "config.json", stored)
     assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
     settings = {name: value for name, value in stored.items() if name not in NOT_IN_RUN_NAME}
     assert run.path.name.endswith(settings_hash(settings)[:8])
@@ -171,9 +169,9 @@ def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(confi
 def test_a_run_folder_of_a_model_that_was_renamed_is_not_continued_and_says_its_new_name(config, old, new):
     assert new in KINDS
     run = open_run(config)
-    stored = json.loads((run.path / "config.json").read_text())
+    stored = read_json(run.path / "config.json")
     stored["model"]["name"] = old
-    (run.path / "config.json").write_text(json.dumps(stored))
+    write_json(run.path / "config.json", stored)
     with pytest.raises(ConfigError, match=rf"^resume: .* {old}, .* {new} now") as error:
         open_run(dataclasses.replace(config, resume=str(run.path)))
     assert len(str(error.value).splitlines()) == 1
@@ -182,9 +180,9 @@ def test_a_run_folder_of_a_model_that_was_renamed_is_not_continued_and_says_its_
 def test_a_run_folder_with_null_for_what_its_model_does_not_have_is_continued(config):
     values = {**as_dict(config), "model": {"name": "event_columns", "stack": 3, "hidden": [64, 64]}}
     run = open_run(parse(values))
-    stored = json.loads((run.path / "config.json").read_text())
+    stored = read_json(run.path / "config.json")
     stored["model"] |= {"context": None, "latent": None, "encoder": None}
-    (run.path / "config.json").write_text(json.dumps(stored))
+    write_json(run.path / "config.json", stored)
     again = open_run(dataclasses.replace(config, resume=str(run.path)))
     assert again.config.model == run.config.model
 
@@ -203,13 +201,13 @@ def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_k
 
 def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):
     run = open_run(config)
-    stored = json.loads((run.path / "config.json").read_text())
+    stored = read_json(run.path / "config.json")
     del stored["probe"]
     stored["sweep"] = {"axes": "of another version"}
-    (run.path / "config.json").write_text(json.dumps(stored))
+    write_json(run.path / "config.json", stored)
     again = open_run(dataclasses.replace(config, resume=str(run.path), seed=7))
     assert again.config == dataclasses.replace(config, resume=str(run.path))
     del stored["algo"]
-    (run.path / "config.json").write_text(json.dumps(stored))
+    write_json(run.path / "config.json", stored)
     with pytest.raises(ConfigError, match="algo: must be a group of settings"):
         open_run(dataclasses.replace(config, resume=str(run.path)))

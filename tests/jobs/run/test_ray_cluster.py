@@ -4,9 +4,7 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from ipaddress import ip_address
 from pathlib import Path
-from socket import SOCK_DGRAM
 from threading import Barrier
 
 import pydantic
@@ -26,6 +24,7 @@ from jobs.run.ray_cluster import (
     storage,
     use_token,
 )
+from tests.support.sockets import beyond_loopback, listening
 
 ROOT = Path(__file__).resolve().parents[3]
 LOCAL = ClusterConfig(name="local", address=None, num_cpus=1, storage=None)
@@ -189,19 +188,6 @@ def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_
     assert "uthenticat" in wrong
 
 
-def listening(pid: int) -> set[tuple[str, str, int]]:
-    """Program, address and port of each socket that a process or one of its descendants listens on."""
-    import psutil  # Ray's copy, found once Ray is imported
-
-    root = psutil.Process(pid)
-    return {
-        (process.name(), address.ip, address.port)
-        for process in [root, *root.children(recursive=True)]
-        for _, _, kind, address, _, status in process.net_connections("inet")
-        if status == psutil.CONN_LISTEN or kind == SOCK_DGRAM
-    }
-
-
 @pytest.mark.system
 def test_a_local_ray_listens_on_loopback_alone(tmp_path, no_token):
     command = [sys.executable, "-c", HEAD, str(tmp_path)]
@@ -215,12 +201,7 @@ def test_a_local_ray_listens_on_loopback_alone(tmp_path, no_token):
     programs = [name for name, _, _ in found]
     assert {"gcs_server", "raylet"} <= set(programs), found
     assert len(found) >= 6, found  # gcs_server, raylet (2), its agent, the driver, a worker
-    assert [entry for entry in found if not is_loopback(entry[1])] == []
-
-
-def is_loopback(address: str) -> bool:
-    found = ip_address(address)
-    return (getattr(found, "ipv4_mapped", None) or found).is_loopback
+    assert beyond_loopback(found) == []
 
 
 @pytest.mark.system
@@ -296,3 +277,27 @@ def test_what_a_callback_raises_comes_out_of_tune_as_it_is():
 
     with pytest.raises(ClusterError, match="the reason"):
         joining.fit(Tuner())
+
+
+def refused_join(monkeypatch, error):
+    """What is said when Ray raises this as it joins."""
+
+    def init(**settings):
+        raise error
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ConfigError) as caught:
+        joining._join("h:6379", {})
+    return str(caught.value)
+
+
+def test_who_cannot_join_is_told_why_in_one_line(monkeypatch):
+    unreachable = ConnectionError("Failed to connect to Ray cluster at h:6379")
+    assert refused_join(monkeypatch, unreachable) == f"cluster.address: cannot join 'h:6379': {unreachable}"
+    unreachable.__cause__ = RuntimeError("Traceback ...\nRPC error: InvalidAuthToken: Authentication ...")
+    said = refused_join(monkeypatch, unreachable)
+    assert "it asks for another token" in said
+    assert "RAY_AUTH_TOKEN_PATH" in said
+    versions = "Version mismatch: The cluster was started with:\n    Ray: 2.59.0\n    Python: 3.11.7\n"
+    said = refused_join(monkeypatch, RuntimeError(versions))
+    assert said.endswith("with: Ray: 2.59.0 Python: 3.11.7; install the same packages on every machine")

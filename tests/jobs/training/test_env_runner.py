@@ -87,6 +87,46 @@ def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
         runner.stop()
 
 
+@pytest.mark.parametrize("name", kinds(["bytestream", "event_columns", "event_set", "event_image", "rgb"]))
+def test_one_that_resumes_samples_as_the_one_that_went_on(name, tmp_path):
+    config = make_config(*SHORT, f"model={name}", "algo.train_batch_size_per_learner=32")
+    ppo = build_ppo(config, write_encoder(tmp_path, config) if KINDS[name].encoder else None)
+    first, second = (PlainEnvRunner(config=ppo, worker_index=0) for _ in range(2))
+    samples_of(first, (40, 17))
+    kept, number = first.snapshot(), first.module.steps
+    parts = [first.take_part() for _ in range(2)]
+    torch.manual_seed(9)
+    assert second.resume(kept) == ""
+    again = [second.take_part() for _ in range(2)]
+    assert second.module.steps == first.module.steps >= number
+    for mine, other in zip(parts, again, strict=True):
+        assert mine.began == other.began
+        for one, two in zip(mine.episodes, other.episodes, strict=True):
+            assert one.get_observations().tobytes() == two.get_observations().tobytes()
+            assert one.get_actions().tolist() == two.get_actions().tolist()
+            np.testing.assert_equal(one.get_infos(), two.get_infos())
+            assert (one.t_started, one.is_done) == (two.t_started, two.is_done)
+        names = {"episode_return", "distance_m", "events_per_step"}
+        assert {name: mine.metrics[name].peek() for name in names} == {
+            name: other.metrics[name].peek() for name in names
+        }
+    for runner in (first, second):
+        runner.stop()
+
+
+def test_one_that_resumes_before_its_first_round_begins_anew():
+    words = "model=event_columns", "algo.train_batch_size_per_learner=32"
+    runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT, *words)), worker_index=0)
+    kept = runner.snapshot()
+    first = runner.take_part()
+    assert runner.resume(kept) == ""
+    again = runner.take_part()
+    assert again.began == first.began == (0, 0)
+    for one, two in zip(first.episodes, again.episodes, strict=True):
+        assert one.get_observations().tobytes() == two.get_observations().tobytes()
+    runner.stop()
+
+
 def test_pieces_of_a_flight_share_its_name_and_follow_each_other(tmp_path):
     ours, theirs = make_runners("event_columns", tmp_path)
     theirs.stop()

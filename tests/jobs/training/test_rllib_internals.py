@@ -5,10 +5,11 @@ import pytest
 import ray
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.core.rl_module.torch import TorchRLModule
+from ray.rllib.env.env_runner_group import EnvRunnerGroup
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 from jobs.training import env_runner, ppo_learner
-from jobs.training.rllib_internals import ENV_RUNNER, LEARNER, MODULE, TESTED_RAY, require
+from jobs.training.rllib_internals import ENV_RUNNER, GROUP, LEARNER, MODULE, TESTED_RAY, require
 
 
 def defined(part, name):
@@ -19,7 +20,12 @@ def defined(part, name):
 
 @pytest.mark.parametrize(
     ("part", "names"),
-    [(SingleAgentEnvRunner, ENV_RUNNER), (PPOTorchLearner, LEARNER), (TorchRLModule, MODULE)],
+    [
+        (SingleAgentEnvRunner, ENV_RUNNER),
+        (EnvRunnerGroup, GROUP),
+        (PPOTorchLearner, LEARNER),
+        (TorchRLModule, MODULE),
+    ],
 )
 def test_every_private_name_that_is_relied_on_exists(part, names):
     assert [name for name in names if not defined(part, name)] == []

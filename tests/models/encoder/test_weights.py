@@ -9,7 +9,13 @@ import torch
 
 from models.encoder.evae import EventVAE, event_targets, train_step
 from models.encoder.event_batch import batch_windows
-from models.encoder.weights import MAX_MANIFEST_BYTES, EncoderFileError, load_encoder, save_encoder
+from models.encoder.weights import (
+    MAX_MANIFEST_BYTES,
+    EncoderFileError,
+    load_encoder,
+    save_encoder,
+    without_checksum,
+)
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 SETTINGS = {
@@ -43,7 +49,7 @@ def path(tmp_path):
 def rewrite(path, change):
     """Change a manifest in place."""
     file = path.with_suffix(".json")
-    manifest = json.loads(file.read_text())
+    manifest = without_checksum(json.loads(file.read_text()))
     change(manifest)
     file.write_text(json.dumps(manifest))
 

@@ -7,7 +7,7 @@ import torch
 from models.encoder.weights import save_encoder
 from models.policy import PolicyFileError, load_policy, save_policy
 from models.policy.networks import build_networks
-from models.policy.policy import ENCODER, MANIFEST, MAX_BYTES, NETWORKS
+from models.policy.policy import ENCODER, MANIFEST, MAX_BYTES, NETWORKS, read_policy_manifest
 from tests.support.policies import ABOUT, make_evae, make_spec, save
 
 
@@ -54,7 +54,7 @@ def cut_manifest(folder):
 
 def change_manifest(**values):
     def change(folder):
-        manifest = json.loads((folder / MANIFEST).read_text())
+        manifest = read_policy_manifest(folder / MANIFEST)
         (folder / MANIFEST).write_text(json.dumps({**manifest, **values}))
 
     return change
@@ -62,7 +62,7 @@ def change_manifest(**values):
 
 def forget(key):
     def change(folder):
-        manifest = json.loads((folder / MANIFEST).read_text())
+        manifest = read_policy_manifest(folder / MANIFEST)
         del manifest[key]
         (folder / MANIFEST).write_text(json.dumps(manifest))
 

@@ -1,0 +1,113 @@
+"""Ends a job whose Ray has lost its head or its node: Ray would leave without saying what to do, or wait."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+# Ray waits 60 s for a head that is gone, and then ends the process in the middle of what it does.
+SILENCE_S = 40.0
+ASK_EVERY_S = 5.0
+LOOK_EVERY_S = 0.2  # for processes that have ended: Ray ends this one within seconds then
+ESSENTIAL = ("raylet", "gcs_server")
+LEAVE_S = 10.0  # to close what is open; what waits for Ray may wait forever
+
+
+class HeadLostError(RuntimeError):
+    """The head of the cluster does not answer; the message says so in one line, and what to do."""
+
+
+@contextlib.contextmanager
+def watching_head(
+    ask: Callable[[float], bool] | None = None, ended: Callable[[], str] | None = None
+) -> Iterator[None]:
+    """Stop the block, which runs in the main thread, if Ray's head is silent for `SILENCE_S`, or Ray ended.
+
+    Args:
+        ask: Whether the head answers within so many seconds; None for that of the running Ray.
+        ended: Which of Ray's processes that this one started has ended, "" if none; None for those of
+            the running Ray.
+
+    Raises:
+        HeadLostError: The head was silent so long, or a process of Ray has ended.
+    """
+    watch = _Watch(ask or head_answers, ended or ended_process)
+    threading.Thread(target=watch.run, name="head-watch", daemon=True).start()
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not watch.lost.is_set():
+            raise
+        watch.told.set()
+        raise HeadLostError(watch.reason) from None
+    finally:
+        watch.over.set()
+
+
+def head_answers(seconds: float) -> bool:
+    """Whether the head of the running Ray answers in time; each request is repeated until then."""
+    from ray._private.worker import global_worker
+
+    try:
+        global_worker.gcs_client.internal_kv_exists(b"", None, timeout=seconds)
+    except Exception:  # of several types, and a client that is closed has none at all
+        return False
+    return True
+
+
+def ended_process() -> str:
+    """A process of the running Ray that this one has started, that is essential, and has ended; or ""."""
+    from ray._private import worker
+
+    node = worker._global_node
+    dead = [] if node is None else [name for name, _ in node.dead_processes()]
+    return next((name for name in ESSENTIAL if name in dead), "")
+
+
+CONTINUES = "the same command continues"
+
+
+class _Watch:
+    def __init__(self, ask: Callable[[float], bool], ended: Callable[[], str]) -> None:
+        self.ask, self.ended, self.reason = ask, ended, ""
+        self.over, self.lost, self.told = threading.Event(), threading.Event(), threading.Event()
+
+    def run(self) -> None:
+        asked_s = time.monotonic()
+        while not self.over.wait(LOOK_EVERY_S):
+            due = time.monotonic() - asked_s > ASK_EVERY_S
+            self.reason = self._lost() if due or self.ended() else ""
+            if self.reason and not self.over.is_set():
+                self._stop()
+                return
+            asked_s = time.monotonic() if due else asked_s
+
+    def _lost(self) -> str:
+        """Why the job cannot go on, if it cannot.
+
+        A head is asked at least twice: everything may have been stopped for a while.
+        """
+        began = time.monotonic()
+        while time.monotonic() - began < SILENCE_S:
+            name = self.ended()
+            if name:
+                return f"Ray's process {name} has ended: it was killed, or crashed; {CONTINUES}"
+            if self.ask(SILENCE_S / 2):
+                return ""
+            time.sleep(0.5)
+        return (
+            f"Ray's head has not answered for {SILENCE_S:.0f} s: its process, its machine or the network to "
+            f"it is lost; once there is a cluster again, {CONTINUES}"
+        )
+
+    def _stop(self) -> None:
+        self.lost.set()
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        time.sleep(LEAVE_S)
+        if not self.told.is_set():
+            sys.stderr.write(f"evade: failed: {self.reason}\n")
+            sys.stderr.flush()
+        os._exit(1)

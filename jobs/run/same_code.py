@@ -1,0 +1,83 @@
+"""Whether every machine of a cluster has the code and the packages that the driver has."""
+
+import hashlib
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+from jobs.config.config import ConfigError
+from jobs.run.provenance import REPOSITORY
+
+ROOMS = ("envs", "models", "jobs")
+PACKAGES = ("numba", "numpy", "torch")  # decide the digits; Ray compares itself and Python
+ANSWER_S = 600.0  # a busy machine starts a worker in minutes
+
+
+def fingerprint() -> dict[str, str]:
+    """What decides the results of this process: the code, as a SHA-256, and the versions of packages."""
+    digest = hashlib.sha256()
+    for room in ROOMS:
+        for file in sorted((REPOSITORY / room).rglob("*.py")):
+            digest.update(f"{file.relative_to(REPOSITORY)}\0".encode() + file.read_bytes() + b"\0")
+    return {"evade": digest.hexdigest()[:12], **{name: version(name) for name in PACKAGES}}
+
+
+def check_machines() -> None:
+    """Refuse a cluster, already joined, if a machine of it that computes has other code than this one.
+
+    A machine that joins later is not asked, and one that is lost meanwhile is left out.
+
+    Raises:
+        ConfigError: One has another version, or none.
+    """
+    here = fingerprint()
+    errors = differences(here, ask_machines())
+    if errors:
+        raise ConfigError("\n".join(f"cluster.address: {error}" for error in errors))
+
+
+def ask_machines() -> dict[str, dict[str, str] | str]:
+    """The address of each machine, and its fingerprint, or why it has none."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    task = ray.remote(num_cpus=0, max_retries=2)(fingerprint)
+    asked = {
+        node["NodeManagerAddress"]: task.options(
+            scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+        ).remote()
+        for node in ray.nodes()
+        if node["Alive"] and node["Resources"].get("CPU", 0) > 0
+    }
+    answers = {address: _answer(reference) for address, reference in asked.items()}
+    return {address: answer for address, answer in answers.items() if answer is not None}
+
+
+def _answer(reference: Any) -> dict[str, str] | str | None:
+    """What a machine answers, why it cannot, or None if it is lost."""
+    import ray
+
+    try:
+        answer: dict[str, str] = ray.get(reference, timeout=ANSWER_S)
+    except (ray.exceptions.RayTaskError, ray.exceptions.RaySystemError) as error:
+        return str(error).strip().splitlines()[-1].strip()
+    except ray.exceptions.GetTimeoutError:
+        return f"no answer in {ANSWER_S:.0f} s"
+    except ray.exceptions.RayError:
+        return None
+    return answer
+
+
+def differences(here: Mapping[str, str], answers: Mapping[str, Mapping[str, str] | str]) -> list[str]:
+    """One line for each machine that is not as this one, with the remedy."""
+    errors = []
+    for address, answer in answers.items():
+        if isinstance(answer, str):
+            errors.append(f"{address} cannot run this package ({answer}); install it there as it is here")
+            continue
+        other = [f"{name} {answer.get(name)} (here {mine})" for name, mine in here.items()
+                 if answer.get(name) != mine]  # fmt: skip
+        if other:
+            rule = "must have the code and packages of this machine"
+            errors.append(f"{address} {rule}, got {', '.join(other)}; install the same commit and lock file")
+    return errors

@@ -1,0 +1,29 @@
+"""What Tune writes about a trial whose process ended, and what to tell a person of it."""
+
+import re
+from pathlib import Path
+
+FAILURE = re.compile(r"^Failure # \d+ .*$", re.MULTILINE)  # begins each error that Tune writes about a trial
+LOW_MEMORY = re.compile(r"low on memory\. Memory on the node .*? was (\S+) used / (\S+) limit", re.DOTALL)
+
+
+def newest_error(file: str | None) -> str:
+    """The newest of the errors that Tune has written about a trial, as text; empty if there is none.
+
+    Tune keeps the error itself too, pickled, but where another user of the machine may write.
+    """
+    if file is None or not Path(file).is_file():
+        return ""
+    return FAILURE.split(Path(file).read_text())[-1].strip()
+
+
+def low_memory(error: str) -> str | None:
+    """Who ended a process and why, if an error says that Ray's memory monitor did it; else None.
+
+    The monitor ends processes before the kernel would: when more of the machine's memory is in use
+    than RAY_memory_usage_threshold says, 95 % by default.
+    """
+    found = LOW_MEMORY.search(error)
+    if found is None:
+        return None
+    return f"by Ray, for lack of memory: {found[1]} of {found[2]} in use"

@@ -1,0 +1,136 @@
+"""Rounds of sampling in which every env runner takes part exactly once, whatever becomes of its process.
+
+RLlib goes on without an env runner that was lost, and its replacement begins new episodes. Here the
+replacement is led to where the lost one began the round, and samples what that would have sampled: a training
+has the same bytes as one in which nothing was lost.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import ray
+from ray.exceptions import ActorDiedError
+from ray.rllib.env.env_runner_group import EnvRunnerGroup
+
+from jobs.run.ray_cluster import logs_folder
+from jobs.run.trial_errors import low_memory
+from jobs.training.env_runner import MAX_SAMPLE_S, Part, RolloutError
+from jobs.training.rllib_internals import GROUP, require
+from jobs.training.snapshots import Snapshot
+
+MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
+MAX_PAUSE_S = 600.0  # until an env runner has started again: a busy machine takes minutes
+SAMPLE_TIMEOUT_S = MAX_SAMPLE_S + 60.0  # a process that hangs ends itself before
+LOCAL = 0  # index of the env runner in this process
+
+
+class Rounds:
+    """Takes rounds with the env runners of a training; without processes of their own, with the local one.
+
+    Attributes:
+        snapshots: Where each env runner stood after the last round, or stands before the first.
+        problems: Why episodes had to begin anew, in a few words each.
+    """
+
+    def __init__(self, group: EnvRunnerGroup) -> None:
+        """Remember where the env runners begin.
+
+        Raises:
+            RolloutError: One has died for good, or does not answer.
+        """
+        require(group, GROUP)
+        self.problems: list[str] = []
+        self._group, self._manager = group, group._worker_manager
+        self._indices = sorted(self._manager.actor_ids())
+        if self._indices:
+            begin = self._until_answered(lambda runner: (runner.snapshot(),), self._indices)
+            self.snapshots: dict[int, Snapshot] = {index: begin[index][0] for index in self._indices}
+        else:
+            self.snapshots = {LOCAL: group.local_env_runner.snapshot()}
+
+    def take(self) -> list[Part]:
+        """One round: the parts of all env runners, by index.
+
+        Raises:
+            RolloutError: What an env runner raised; or one has died for good, or does not come back.
+        """
+        parts: dict[int, Part] = {}
+        while due := [index for index in self.snapshots if index not in parts]:
+            parts |= {part.runner: part for part in self._sampled(due) if self._fits(part)}
+            self.resume([index for index in due if index not in parts])
+        self.snapshots = {index: parts[index].after for index in self.snapshots}
+        return [parts[index] for index in self.snapshots]
+
+    def resume(self, indices: Sequence[int]) -> None:
+        """Lead env runners to where they stood after the last round, with the newest weights.
+
+        Raises:
+            RolloutError: One has died for good, or does not come back.
+        """
+        if not indices:
+            return
+        local = self._group.local_env_runner
+        if not self._indices:
+            said = [local.resume(self.snapshots[LOCAL])]
+        else:
+            weights = ray.put(local.get_state())
+            places = {index: ray.put(self.snapshots[index]) for index in indices}
+
+            def lead(runner: Any) -> tuple[str]:
+                runner.set_state(ray.get(weights))
+                return (runner.resume(ray.get(places[runner.worker_index])),)
+
+            said = [answer[0] for answer in self._until_answered(lead, indices).values()]
+        self.problems += filter(None, said)
+
+    def _sampled(self, due: list[int]) -> list[Part]:
+        """What the env runners sampled that are alive."""
+        if not self._indices:
+            return [self._group.local_env_runner.take_part()]
+        results = self._manager.foreach_actor(
+            lambda runner: runner.take_part(), remote_actor_ids=due, timeout_seconds=SAMPLE_TIMEOUT_S
+        )
+        self._check_alive(results)
+        return [Part(*result.get()) for result in results if result.ok]
+
+    def _fits(self, part: Part) -> bool:
+        """Whether an env runner sampled from where it stood, with the newest weights; else it has to again.
+
+        Ray may have started its process again before anyone asked, and RLlib leaves a message with
+        weights out if the one before it is still on its way.
+        """
+        rounds, weights = part.began
+        same = rounds == self.snapshots[part.runner].values["metrics"]["rounds"]
+        if not same:
+            self._manager.set_actor_state(part.runner, healthy=False)  # counts as a restart when it answers
+        return same and weights == self._group.local_env_runner._weights_seq_no
+
+    def _until_answered(
+        self, ask: Callable[[Any], tuple[Any, ...]], indices: Sequence[int]
+    ) -> dict[int, Any]:
+        """What env runners return, by index; those that are being started again are waited for."""
+        answers: dict[int, Any] = {}
+        while missing := [index for index in indices if index not in answers]:
+            results = self._manager.foreach_actor(
+                ask,
+                remote_actor_ids=missing,
+                healthy_only=False,
+                mark_healthy=True,
+                timeout_seconds=MAX_PAUSE_S,
+            )
+            self._check_alive(results)
+            silent = set(missing) - {result.actor_id for result in results}
+            if silent:
+                silence = f"has not started again for {MAX_PAUSE_S:.0f} s"
+                raise RolloutError(f"env runner {min(silent)} {silence}; see {logs_folder()}")
+            answers |= {result.actor_id: result.get() for result in results if result.ok}
+        return answers
+
+    @staticmethod
+    def _check_alive(results: Any) -> None:
+        """Raise an error if an env runner will not be started again."""
+        for result in results:
+            if not result.ok and isinstance(result.get(), ActorDiedError):
+                ended = low_memory(str(result.get()))
+                ended = f"was ended {ended}" if ended else f"has died {MAX_RESTARTS + 1} times"
+                raise RolloutError(f"env runner {result.actor_id} {ended}; see {logs_folder()}")

@@ -1,0 +1,82 @@
+"""What the future of a training depends on beside its weights and its optimiser, as plain values and arrays.
+
+The random generators of each of its processes; and of each env runner the episodes under way, the metrics of
+those that ended, and the windows that its module met. A checkpoint holds them as JSON and as arrays.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from jobs.run.files import RunError, read_json, write_json
+
+FOLDER = "snapshots"  # in a checkpoint
+LAYOUT = 1  # of a snapshot; another number is refused
+ABOUT = "layout.json"
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Where a process stands.
+
+    Attributes:
+        values: What JSON can hold.
+        arrays: The rest; its bytes are kept.
+    """
+
+    values: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+def generators() -> dict[str, np.ndarray]:
+    """The states of torch's and numpy's generators of this process."""
+    _, words, *rest = np.random.get_state()  # noqa: NPY002  the one that RLlib seeds
+    return {
+        "torch_generator": torch.get_rng_state().numpy(),
+        "numpy_generator": words,
+        "numpy_position": np.array(rest, np.float64),  # and the normal number that is kept for the next call
+    }
+
+
+def set_generators(arrays: dict[str, np.ndarray]) -> None:
+    """Continue the random numbers of `generators`."""
+    torch.set_rng_state(torch.from_numpy(arrays["torch_generator"]))
+    position, kept, normal = arrays["numpy_position"].tolist()
+    np.random.set_state(("MT19937", arrays["numpy_generator"], int(position), int(kept), normal))  # noqa: NPY002
+
+
+def write_snapshots(checkpoint: Path, snapshots: dict[str, Snapshot]) -> None:
+    """Add the snapshots of named processes to a checkpoint."""
+    folder = checkpoint / FOLDER
+    folder.mkdir()
+    for name, snapshot in snapshots.items():
+        # NaN is no JSON, but Python reads and writes it.
+        (folder / f"{name}.json").write_text(json.dumps(snapshot.values))
+        np.savez_compressed(folder / f"{name}.npz", **snapshot.arrays)  # type: ignore[arg-type]
+    write_json(folder / ABOUT, {"layout": LAYOUT, "processes": list(snapshots)})
+
+
+def read_snapshots(checkpoint: Path) -> dict[str, Snapshot] | None:
+    """The snapshots of a checkpoint; None if it has none, as those of earlier versions.
+
+    Raises:
+        RunError: They have another layout.
+    """
+    folder = checkpoint / FOLDER
+    if not folder.is_dir():
+        return None
+    about = read_json(folder / ABOUT)
+    if about.get("layout") != LAYOUT:
+        remedy = "continue with the version that wrote it, or delete the run's train/ to train anew"
+        raise RunError(f"{folder}: layout must be {LAYOUT}, got {about.get('layout')!r}; {remedy}")
+    return {name: _read(folder / name) for name in about["processes"]}
+
+
+def _read(path: Path) -> Snapshot:
+    """One snapshot, of the files that `path` names without their ending."""
+    with np.load(path.with_suffix(".npz"), allow_pickle=False) as arrays:
+        return Snapshot(json.loads(path.with_suffix(".json").read_text()), dict(arrays))

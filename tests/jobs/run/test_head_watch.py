@@ -1,0 +1,81 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+# In a process of its own, because the watch ends the process that it is in.
+WATCHED = """
+import time
+from jobs.run import head_watch
+head_watch.ASK_EVERY_S, head_watch.SILENCE_S, head_watch.LEAVE_S = 0.05, 1.0, 1.0
+answers = {answers}
+def ask(seconds):
+    assert seconds == 0.5
+    return answers.pop(0) if answers else {then}
+try:
+    with head_watch.watching_head(ask, lambda: {ended!r}):
+{work}
+    print("done")
+except head_watch.HeadLostError as error:
+    print("told", error, flush=True)
+    time.sleep({closing})
+    print("closed")
+"""
+FOREVER = "time.sleep(60)"
+DEAF = """
+while True:
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        pass
+"""
+
+pytestmark = pytest.mark.system
+
+
+def watched(work=FOREVER, answers=(), then=False, closing=0, ended=""):
+    indented = "\n".join(f"        {line}" for line in work.strip().splitlines())
+    script = WATCHED.format(answers=list(answers), then=then, work=indented, closing=closing, ended=ended)
+    command = [sys.executable, "-c", script]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=50)
+
+
+def test_work_whose_head_is_silent_ends_with_the_reason():
+    ended = watched()
+    assert ended.stdout.startswith("told Ray's head has not answered for 1 s: ")
+    assert ended.stdout.endswith("the same command continues\nclosed\n")
+    assert ended.stderr == ""
+    assert ended.returncode == 0
+
+
+def test_work_that_waits_forever_for_a_lost_head_is_ended_with_the_same_reason():
+    ended = watched(DEAF)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("evade: failed: Ray's head has not answered for 1 s: ")
+    assert ended.stderr.count("\n") == 1
+
+
+def test_what_closes_forever_after_a_lost_head_is_ended_without_a_second_reason():
+    ended = watched(closing=60)
+    assert (ended.returncode, ended.stderr) == (1, "")
+    assert "closed" not in ended.stdout
+
+
+def test_a_head_that_answers_or_answers_late_ends_nothing():
+    for answers in ([], [False], [True, False, True, False]):
+        ended = watched("time.sleep(3)", answers, then=True)
+        assert (ended.stdout, ended.stderr, ended.returncode) == ("done\n", "", 0)
+
+
+def test_work_whose_ray_has_ended_ends_at_once_with_the_reason():
+    ended = watched(then=True, ended="raylet")
+    assert ended.stdout.startswith("told Ray's process raylet has ended: ")
+    assert ended.stdout.endswith("the same command continues\nclosed\n")
+
+
+def test_ctrl_c_stays_ctrl_c():
+    ended = watched("raise KeyboardInterrupt", then=True)
+    assert "KeyboardInterrupt" in ended.stderr
+    assert "told" not in ended.stdout

@@ -1,0 +1,109 @@
+"""Nothing that a user starts can be reached from another machine: every socket is counted while it runs."""
+
+import os
+import shlex
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from tests.support.faults import FINE, SWEEP, TRAIN, launch
+from tests.support.sockets import beyond_loopback, listening
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
+ROOT = Path(__file__).resolve().parents[2]
+POLICY = ROOT / "models" / "pretrained" / "event_set-s0"
+# Twelve episodes, which is more than the driver evaluates itself.
+AXIS = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.1,0.2,0.3,0.4,0.5]}"
+
+
+def check(found):
+    """Ray and its workers are there, and all of them on loopback."""
+    programs = [name for name, _, _ in found]
+    assert {"gcs_server", "raylet"} <= set(programs), found
+    assert any(name.startswith("ray::") for name in programs), found
+    assert beyond_loopback(found) == []
+
+
+def test_a_sweep_listens_on_loopback_alone(tmp_path):
+    words = (*SWEEP, "~sweep.axes", AXIS, f"sweep.policies=[{POLICY}]")
+    job = launch(tmp_path, *words)
+    job.wait(job.kept)
+    found = listening(job.process.pid)
+    assert job.end() == 0, job.said
+    check(found)
+
+
+def test_a_training_listens_on_loopback_alone(tmp_path):
+    job = launch(tmp_path, *TRAIN, *FINE)
+    job.wait(job.steps)
+    found = listening(job.process.pid)
+    assert job.end() == 0, job.said
+    check(found)
+
+
+def test_the_dashboard_listens_on_loopback_alone(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # The last of an option counts: a port and a store of its own.
+    words = f"ARGS=--port {port} --backend-store-uri sqlite:///{tmp_path}/mlflow.db"
+    recipe = subprocess.check_output(["make", "--dry-run", "mlflow", words], cwd=ROOT, text=True)
+    command = shlex.split("MLFLOW_SERVER" + recipe.replace("\\\n", "").rpartition("\nMLFLOW_SERVER")[2])
+    with subprocess.Popen(["env", *command], cwd=ROOT, env=os.environ) as server:
+        try:
+            wait_for(f"http://127.0.0.1:{port}/health", server)
+            found = listening(server.pid)
+        finally:
+            server.terminate()
+    assert port in {entry[2] for entry in found}
+    assert beyond_loopback(found) == []
+
+
+# Serves until its standard input ends; the first line it prints is the address.
+SIMULATED = """
+import sys
+from pathlib import Path
+import ray
+from jobs.bench.scaling import ask_for_token, simulated
+ask_for_token(Path(sys.argv[1]))
+with simulated(nodes=2, cores=1):
+    print(ray.get_runtime_context().gcs_address, flush=True)
+    sys.stdin.read()
+"""
+STRANGER = "import sys; from ray._raylet import GcsClient; GcsClient(address=sys.argv[1])"
+
+
+def test_the_simulated_cluster_of_a_bench_listens_on_loopback_alone_and_asks_for_a_token(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    command = [sys.executable, "-c", SIMULATED, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as cluster:
+        address = cluster.stdout.readline().strip()
+        found = listening(cluster.pid)
+        stranger = subprocess.run(
+            [sys.executable, "-c", STRANGER, address],
+            env={**environment, "RAY_AUTH_MODE": "disabled"}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        cluster.stdin.close()
+        assert cluster.wait(120) == 0
+    assert {"gcs_server", "raylet"} <= {name for name, _, _ in found}, found
+    assert beyond_loopback(found) == []
+    assert "InvalidAuthToken" in stranger.stderr
+
+
+def wait_for(address: str, server: subprocess.Popen) -> None:
+    """Until a server answers."""
+    deadline = time.monotonic() + 300.0
+    while True:
+        assert server.poll() is None
+        try:
+            assert urllib.request.urlopen(address, timeout=60).status == 200
+            return
+        except OSError:
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
