@@ -50,7 +50,7 @@ def errors(scene: str, hz: float, threshold: float) -> list[str]:
         measure_event_error(dataclasses.replace(config, fidelity=fidelity), EPISODES, STEPS)
         for fidelity in tried
     ]
-    return [f"{100 * accuracy.error:.1f}" for accuracy in measured] + [f"{measured[-1].renders:.0f}"]
+    return [f"{100 * accuracy.error:.1f}" for accuracy in measured] + [f"{measured[-1].renders:.1f}"]
 
 
 if __name__ == "__main__":

@@ -264,7 +264,7 @@ def exactness_table(found: Sequence[Exactness]) -> str:
             *one["condition"],
             f"{100 * one['asked']:g}",
             f"{100 * one['event_error']:.1f}",
-            f"{one['renders_per_step']:.0f}",
+            f"{one['renders_per_step']:.1f}",
         )
         for one in found
     ]

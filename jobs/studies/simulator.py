@@ -167,7 +167,7 @@ def setting_cells(row: MeasuredSetting, on_front: bool) -> tuple[str, ...]:
     """A text for each of `HEADINGS`."""
     accuracy = row.accuracy
     numbers = (f"{row.cost_us:,.0f}", f"{100 * accuracy.error:.1f}", f"{accuracy.events[0]:.0f}")
-    return (row.knob, row.setting, *numbers, f"{accuracy.renders:.0f}", "*" if on_front else "")
+    return (row.knob, row.setting, *numbers, f"{accuracy.renders:.1f}", "*" if on_front else "")
 
 
 def setting_columns(rows: Sequence[MeasuredSetting]) -> dict[str, list[str | float]]:

@@ -1,0 +1,130 @@
+"""Speed and event error of a control step, of this checkout against another commit, in one interleaved run.
+
+Run: python -m jobs.bench.against [COMMIT], the one before HEAD unless another is named
+Expect: a table in about five minutes on one core. Two processes, one of each checkout, take turns
+at the same flights; a ratio is the median over the rounds of the other's time over this one's. The
+event error is that against the converged simulation of the same checkout, at tolerance 0.05.
+"""
+
+import inspect
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from jobs.analysis.tables import show_table
+
+ROUNDS = 15
+SCENES = ("poles", "poles_dense", "shape_change", "gates", "texture_change", "dynamic")
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def worker() -> None:
+    """Answer each line of the input, the name of a scene, by seconds a step and the event error, as JSON.
+
+    It runs by its source alone in another checkout, so that it takes nothing from this file.
+    """
+    import json
+    import sys
+    import time
+
+    import numpy as np
+
+    from envs.config import EnvConfig
+    from envs.corridor import CorridorEnv
+    from envs.event_error import measure_event_error
+
+    steps, known = 300, {}
+    for line in sys.stdin:
+        scene = line.strip()
+        if scene not in known:
+            known[scene] = (
+                CorridorEnv(EnvConfig(scene=scene)),
+                measure_event_error(EnvConfig(scene=scene)).error,
+            )
+        env, error = known[scene]
+        rng, seconds = np.random.default_rng(0), []
+        env.reset(seed=0)
+        for _ in range(steps):
+            action = int(rng.integers(3))
+            began = time.perf_counter()
+            over = any(env.step(action)[2:4])
+            seconds.append(time.perf_counter() - began)
+            if over:
+                env.reset()
+        print(json.dumps([float(np.median(seconds)), error]), flush=True)
+
+
+class Checkout:
+    """A process that flies with the code of one checkout."""
+
+    def __init__(self, folder: Path) -> None:
+        """Start it."""
+        code = f"{inspect.getsource(worker)}\nworker()"
+        environment = {**os.environ, "PYTHONPATH": str(folder)}
+        self._process = subprocess.Popen(  # noqa: S603  own code
+            [sys.executable, "-c", code],
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def fly(self, scene: str) -> tuple[float, float]:
+        """Median seconds of a step, and the event error."""
+        assert self._process.stdin is not None  # noqa: S101  for the type checker
+        assert self._process.stdout is not None  # noqa: S101
+        self._process.stdin.write(f"{scene}\n")
+        self._process.stdin.flush()
+        seconds, error = json.loads(self._process.stdout.readline())
+        return seconds, error
+
+    def end(self) -> None:
+        """Stop it."""
+        self._process.kill()
+        self._process.wait()
+
+
+@contextmanager
+def checked_out(commit: str) -> Iterator[Path]:
+    """A folder with the code of a commit of this repository."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "code"
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "--quiet", "--detach", str(place), commit], check=True)  # noqa: S603
+        try:
+            yield place
+        finally:
+            subprocess.run([*git, "remove", "--force", str(place)], check=True)  # noqa: S603
+
+
+def compared(scene: str, here: Checkout, there: Checkout) -> tuple[str, ...]:
+    """A row of the table; the first round, which compiles, does not count."""
+    pairs = [(here.fly(scene), there.fly(scene)) for _ in range(ROUNDS + 1)][1:]
+    ratios = [other[0] / own[0] for own, other in pairs]
+    micro = [f"{1e6 * statistics.median(pair[k][0] for pair in pairs):.0f}" for k in range(2)]
+    errors = [f"{side[1]:.3f}" for side in pairs[0]]
+    spread = f"{min(ratios):.2f} to {max(ratios):.2f}"
+    return scene, *micro, f"{statistics.median(ratios):.2f}", spread, *errors
+
+
+def main() -> None:
+    """Measure and print the table."""
+    commit = sys.argv[1] if len(sys.argv) > 1 else "HEAD^"
+    with checked_out(commit) as place:
+        here, there = Checkout(ROOT), Checkout(place)
+        rows = [compared(scene, here, there) for scene in SCENES]
+        here.end()
+        there.end()
+    head = ("scene", "us here", "us there", "there / here", "all rounds", "error here", "error there")
+    show_table(f"A control step, against {commit}", head, rows)
+
+
+if __name__ == "__main__":
+    main()
