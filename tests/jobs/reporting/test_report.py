@@ -75,7 +75,7 @@ def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_pa
         assert fact in text
     assert "\n\n\n" not in text
     assert "bytestream (2), event_image (1), oracle (1)" in text
-    assert "| sparsity | 0.5 | 5 | 1.6 | 5 |" in text
+    assert "| sparsity | 0.5 | 5 | 1.6 | 5.0 |" in text
     assert text.index("(images/results_sparsity.png)") < text.index("## Success [%]")
     assert "| `bytestream`: tolerates dead pixels | D.3 | `event_image` | holds |" in text
     assert (
