@@ -121,6 +121,16 @@ def _near(place: float, width: int) -> float:
 
 
 @kernel
+def fastest(before: np.ndarray, after: np.ndarray) -> float:
+    """How far the silhouette moves that moves most [columns], of bodies seen both times."""
+    farthest = 0.0
+    for i in range(len(before)):
+        for side in range(2):
+            farthest = max(farthest, abs(after[i, side] - before[i, side]))  # nan is not greater
+    return farthest
+
+
+@kernel
 def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, looks: Looks) -> int:
     """The looks that a stretch of a way takes before its end, sorted by time.
 
@@ -135,7 +145,9 @@ def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, 
         How many there are.
     """
     before, after, width = stretch.before, stretch.after, len(looks.moving)
-    size = _half_way(stretch, looks)
+    size, half_way_us = 0, (stretch.begin_us + stretch.end_us) // 2
+    if half_way_us > stretch.begin_us:
+        size = _look_at_moving(stretch, looks, half_way_us)
     for i in range(len(bodies)):
         for side in range(2):
             low, high = min(before[i, side], after[i, side]), max(before[i, side], after[i, side])
@@ -149,10 +161,9 @@ def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, 
 
 
 @inlined
-def _half_way(stretch: Stretch, looks: Looks) -> int:
-    """Add looks half-way at the columns in which a silhouette moves fast; how many there are."""
+def _look_at_moving(stretch: Stretch, looks: Looks, t_us: int) -> int:
+    """Begin with looks at the columns in which a silhouette moves far; how many there are."""
     before, after, moving, width = stretch.before, stretch.after, looks.moving, len(looks.moving)
-    t_us = (stretch.begin_us + stretch.end_us) // 2
     moving[:] = False
     for i in range(len(before)):
         for side in range(2):
@@ -160,7 +171,7 @@ def _half_way(stretch: Stretch, looks: Looks) -> int:
             if high - low > MOVING and high >= 0.0 and low < width:
                 moving[int(max(0.0, low)) : int(high) + 1] = True
     size = column = 0
-    while column < width and t_us > stretch.begin_us:
+    while column < width:
         if moving[column]:
             first = column
             while column < width and moving[column]:

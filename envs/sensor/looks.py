@@ -13,9 +13,10 @@ from envs.events.crossings import named
 from envs.events.emission import EVENT, Span
 from envs.events.ramps import Watch, events_of_ramps, look_at
 from envs.raycast.columns import paint_columns
-from envs.raycast.silhouettes import Stretch, aim_along, find_looks, find_silhouettes
+from envs.raycast.silhouettes import Stretch, aim_along, fastest, find_looks, find_silhouettes
 
 BAD_POSE = -2
+FAST = 0.7  # columns from one render to the next; a body that moves more is near, and all its edges move
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -26,7 +27,7 @@ def sense_way(scene, way, parts, image, camera, looks):
         scene: Bodies, filtered tiles, FRAME without a pose, distance beyond which bodies are not
             drawn [m], and `Workspace`.
         way: `Way`.
-        parts: In how many parts of equal time the way is cut.
+        parts: In how many parts of equal time the way is cut; twice as many where something is near.
         image: float32 (H, W), the last one; becomes that at the end.
         camera: The model, memory and scratch of an `EventCamera`, when each column was looked at
             last [us], and room for `Ramps` of three times as many pixels.
@@ -44,8 +45,12 @@ def sense_way(scene, way, parts, image, camera, looks):
     if not _is_near(way):
         return BAD_POSE, 0, 0, np.empty(0, EVENT)
     before, after = np.empty((len(bodies), 2)), np.empty((len(bodies), 2))
+    aim_along(frame, way, way.start_us + way.moving_us)
+    find_silhouettes(bodies, width, cull, room, before)
     aim_along(frame, way, way.start_us)
     find_silhouettes(bodies, width, cull, room, after)
+    if fastest(before, after) > FAST * parts:
+        parts *= 2
     events, lost, columns, begin_us = np.empty(0, EVENT), 0, 0, way.start_us
     for part in range(1, parts + 1):
         end_us = way.start_us + way.moving_us * part // parts

@@ -30,6 +30,7 @@ from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage
 from jobs.run.trial_errors import low_memory, newest_error
+from jobs.run.tune_state import keep_state, mend_state
 from jobs.tracking.tracker import open_tracker
 from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.env_runner import RolloutError
@@ -96,9 +97,10 @@ class Relay(tune.Callback):
     def on_checkpoint(
         self, iteration: int, trials: list[Any], trial: Any, checkpoint: tune.Checkpoint, **info: Any
     ) -> None:
-        """Seal one."""
+        """Seal one, and keep what Tune knows of the training."""
         if on_disk(checkpoint):
             seal(Path(checkpoint.path))
+            keep_state(Path(checkpoint.path).parents[1])
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Say that the training goes on, or stop it if its code raised."""
@@ -199,6 +201,9 @@ def export_policy(
 def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
     """The experiment in the run folder: continued if it is there, else new."""
     path = storage(config.cluster, folder.train)
+    said = mend_state(folder.train)
+    if said:
+        console.print(said, markup=False)
     # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
     if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
         stopped_at = restored(path, algorithm).get_results()[0].checkpoint

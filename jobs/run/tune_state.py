@@ -1,0 +1,43 @@
+"""What Tune knows of a training, kept whole: Tune overwrites its own file, and a full disk cuts it short."""
+
+import json
+from pathlib import Path
+
+from jobs.run.files import write_atomic
+
+STATES = "experiment_state-*.json"  # Tune's, one of each command; the newest counts
+KEPT = "kept_state.json"  # does not match, so that Tune does not read it
+
+
+def keep_state(experiment: Path) -> None:
+    """Copy the newest state of an experiment, if it is whole, to where it is never half-written."""
+    states = sorted(experiment.glob(STATES))
+    if states and _is_whole(states[-1]):
+        write_atomic(experiment / KEPT, states[-1].read_bytes())
+
+
+def mend_state(experiment: Path) -> str | None:
+    """Replace states that are cut short by the one that was kept; what was done, None if nothing.
+
+    Without one, the training begins anew, with the same results.
+    """
+    damaged = [path for path in sorted(experiment.glob(STATES)) if not _is_whole(path)]
+    if not damaged:
+        return None
+    kept = experiment / KEPT
+    if _is_whole(kept):
+        write_atomic(damaged[-1], kept.read_bytes())
+        done = "the one before takes its place"
+    else:
+        damaged[-1].unlink()
+        done = "the training goes on from an older state, or begins anew"
+    for path in damaged[:-1]:
+        path.unlink()
+    return f"State of the training damaged, {done}: {damaged[-1]}"
+
+
+def _is_whole(file: Path) -> bool:
+    try:
+        return isinstance(json.loads(file.read_bytes()), dict)
+    except (FileNotFoundError, ValueError):
+        return False
