@@ -63,7 +63,7 @@ def test_few_renders_with_looks_come_as_close_to_the_truth_as_many_without(thres
     events, renders, _ = flight(scene, 10, camera=camera, fidelity=FidelityConfig(max_step_m=STEP_M))
     error = event_error(np.concatenate(events), truth, 0.05 * STEP_US)
     without = event_error(dense(scene, 10, 1, camera), truth, 0.05 * STEP_US)
-    assert renders < 1.6
+    assert renders < 2.2
     assert error < 0.06  # of one flight; the mean over flights is what is promised
     assert without > 4 * error
 
