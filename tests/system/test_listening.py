@@ -52,7 +52,9 @@ def test_the_dashboard_listens_on_loopback_alone(tmp_path):
         port = free.getsockname()[1]
     # The last of an option counts: a port and a store of its own.
     words = f"ARGS=--port {port} --backend-store-uri sqlite:///{tmp_path}/mlflow.db"
-    recipe = subprocess.check_output(["make", "--dry-run", "mlflow", words], cwd=ROOT, text=True)
+    recipe = subprocess.check_output(
+        ["make", "--no-print-directory", "--dry-run", "mlflow", words], cwd=ROOT, text=True
+    )
     command = shlex.split("MLFLOW_SERVER" + recipe.replace("\\\n", "").rpartition("\nMLFLOW_SERVER")[2])
     with subprocess.Popen(["env", *command], cwd=ROOT, env=os.environ) as server:
         try:

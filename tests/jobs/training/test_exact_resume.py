@@ -9,7 +9,7 @@ import ray
 import torch
 from safetensors.numpy import load_file
 
-from jobs.run.files import RunError
+from jobs.run.files import RunError, read_json, write_json
 from jobs.run.ray_cluster import start_ray
 from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.ppo import build_ppo
@@ -161,7 +161,7 @@ def test_a_checkpoint_of_an_earlier_version_begins_new_episodes_and_says_so(chec
 
 def test_a_checkpoint_of_another_layout_is_refused_with_the_remedy(checkpoint):
     about = checkpoint[0] / FOLDER / "layout.json"
-    about.write_text(about.read_text().replace('"layout": 1', '"layout": 2'))
+    write_json(about, read_json(about) | {"layout": 2})
     with pytest.raises(
         RunError, match="layout must be 1, got 2; continue with the version that wrote it, or"
     ):
@@ -170,7 +170,8 @@ def test_a_checkpoint_of_another_layout_is_refused_with_the_remedy(checkpoint):
 
 def test_a_checkpoint_of_other_processes_is_refused(checkpoint):
     about = checkpoint[0] / FOLDER / "layout.json"
-    about.write_text(about.read_text().replace('"0"', '"learner"'))
+    values = json.loads(json.dumps(read_json(about)).replace('"0"', '"learner"'))
+    write_json(about, values)
     with pytest.raises(RunError, match=r"must be of the processes \['0', 'learner'\], got \['learner'\]"):
         next_result(*checkpoint)
 
