@@ -97,6 +97,18 @@ def test_a_damaged_checkpoint_is_left_for_the_one_before(tmp_path, how, harm):
     outcome(f"checkpoint {how}", "said aloud, the newest whole one is taken", "the steps since that one")
 
 
+def test_what_tune_knows_is_kept_whole(tmp_path):
+    job = launch(tmp_path, *TRAIN, *FINE)
+    job.wait(lambda: job.steps() >= 320 and len(checkpoints(job)) >= 3)
+    job.kill()
+    (state,) = job.run.glob("train/experiment_state-*.json")
+    state.write_bytes(state.read_bytes()[:-100])  # as a full disk does
+    again = start(tmp_path, job.printed_command())
+    check_complete(again)
+    assert "State of the training damaged, the one before takes its place" in again.said
+    outcome("Tune's state cut", "said aloud, the one that was kept is taken", "steps since a checkpoint")
+
+
 BUG = """
 whole_step = CorridorVectorEnv.step
 count = 0
