@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Protocol
 
 from tests.soak.dashboard import Dashboard
-from tests.soak.workload import Lane
+from tests.soak.workload import KILLED_S, Lane
 from tests.support.faults import command_line
 
 GOES_ON = "the jobs go on"
@@ -79,7 +79,8 @@ def down(soak: Soak, lane: Lane, number: signal.Signals = signal.SIGKILL) -> Ite
     try:
         left = [command_line(pid)[:60].strip() for pid in lane.kill(number)]
         if left:
-            soak.findings.append(f"outlive the driver of the {lane.name} by a minute: {', '.join(left)}")
+            what = f"outlive the driver of the {lane.name} by {KILLED_S:.0f} s"
+            soak.findings.append(f"{what}: {', '.join(left)}")
         yield
         if lane.job.process.returncode != 0:  # it may have been complete just then
             lane.note_end(lane.job.process.returncode, by_fault=True)

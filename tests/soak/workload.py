@@ -18,7 +18,7 @@ from pathlib import Path
 from tests.soak.processes import living
 from tests.support.faults import Job, command_line, descendants, start
 
-KILLED_S = 60.0  # until nothing of a killed driver is left
+KILLED_S = 150.0  # until nothing of a killed driver is left: Ray's agents look for their server for 60 s
 # Reads a jump of the clock from a file, at most once a second.
 CLOCK = """
 import time
