@@ -4,7 +4,6 @@
 something between them.
 """
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -15,16 +14,13 @@ from envs.config import Observation
 from envs.corridor import CorridorEnv, Info
 from envs.kinematics import DIAGONAL, NUM_ACTIONS
 from envs.scene import Scene
+from envs.scene.planning import LATTICE_M, SIDE_PRICE, cost_to_go
 
 if TYPE_CHECKING:
     from models.policy import Policy
 
 # Of one step in x and y, in step lengths: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])
-LATTICE_M = 0.25
-CLEARANCE_SCALE_M = 0.4  # the price of a place falls by e with each such distance from contact
-BLOCKED = 1e3
-SIDE_PRICE = 0.01  # of a lattice step to the side: of two free paths, the straighter
 
 
 class Agent(Protocol):
@@ -149,7 +145,7 @@ def follow(path_x_m: np.ndarray, moves_m: np.ndarray, x_m: float, y_m: float) ->
 
 
 def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 2.0) -> np.ndarray:
-    """The cheapest path to the goal line on a lattice of the three directions (dynamic programming).
+    """The cheapest path to the goal line on a lattice of the three directions (`envs.scene.planning`).
 
     Args:
         scene: The true geometry.
@@ -160,45 +156,14 @@ def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float =
     Returns:
         x [m] at y = 0, LATTICE_M, 2 LATTICE_M, ... up to the goal line, float64.
     """
-    price, start = lattice_prices(scene, start_x_m, radius_m, height_m)
-    rows, columns = price.shape
-    moves = np.zeros((rows, columns), np.int64)
-    rest = price[-1]
-    for row in range(rows - 2, -1, -1):
-        padded = np.pad(rest, 1, constant_values=np.inf)
-        options = np.stack([padded[1:-1], padded[:-2] + SIDE_PRICE, padded[2:] + SIDE_PRICE])
-        choice = options.argmin(axis=0)
-        moves[row] = np.array([0, -1, 1])[choice]
-        rest = price[row] + options.min(axis=0)
-    path = [start]
-    for row in range(rows - 1):
-        path.append(path[-1] + moves[row, path[-1]])
+    plan = cost_to_go(scene, radius_m, height_m, start_x_m)
+    start = round((start_x_m - plan.first_x_m) / LATTICE_M)
+    column, path = start, [start]
+    for ahead in plan.costs[1:]:
+        sides = ahead[column], ahead[column - 1] + SIDE_PRICE, ahead[column + 1] + SIDE_PRICE
+        column += (0, -1, 1)[int(np.argmin(sides))]
+        path.append(column)
     return start_x_m + (np.array(path) - start) * LATTICE_M
-
-
-def lattice_prices(
-    scene: Scene, start_x_m: float, radius_m: float, height_m: float
-) -> tuple[np.ndarray, int]:
-    """What it costs to be at each place of the lattice, (rows in y, columns in x), and the start's column.
-
-    A place in contact costs `BLOCKED`; others less, the farther they are from contact.
-    """
-    half = 0.5 * scene.width_m - radius_m
-    left, right = math.floor((start_x_m + half) / LATTICE_M), math.floor((half - start_x_m) / LATTICE_M)
-    x_m = start_x_m + np.arange(-left, right + 1) * LATTICE_M
-    y_m = np.arange(math.ceil(scene.length_m / LATTICE_M) + 1) * LATTICE_M
-    clearance = np.broadcast_to(half - np.abs(x_m), (len(y_m), len(x_m))).copy()
-    reach = 6 * CLEARANCE_SCALE_M  # beyond it an obstacle adds nothing to the price
-    for x, y, ux, uy, hx, hy, r in scene.sections(height_m):
-        size = r + radius_m
-        deep = abs(uy) * hx + abs(ux) * hy + size + reach
-        rows = slice(*np.searchsorted(y_m, [y - deep, y + deep]))
-        dx, dy = x_m[None, :] - x, y_m[rows, None] - y
-        along, across = np.abs(dx * ux + dy * uy) - hx, np.abs(dy * ux - dx * uy) - hy
-        gap = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)) - size
-        clearance[rows] = np.minimum(clearance[rows], gap)
-    price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
-    return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price), left
 
 
 BASELINES: dict[str, type[StraightAgent | RandomAgent | OracleAgent]] = {

@@ -12,6 +12,7 @@ from envs.events import EVENT
 from envs.raycast.renderer import sample_luminance
 from envs.recordings import read_events, write_events
 from envs.scene import make_scene
+from envs.scene.planning import cost_to_go
 from jobs.bench.latency import random_policy
 from models.encoder.evae import EventVAE
 from models.encoder.event_batch import batch_windows
@@ -43,7 +44,9 @@ def main() -> None:
     measure_event_error(EnvConfig(camera=CameraConfig(**CAMERA)), flights=1, steps=1)
     events = np.zeros(100, EVENT)
     events["t"], events["p"] = np.arange(100), 1
-    sample_luminance(make_scene("poles", np.random.default_rng(0)), (0.0, 0.0, 2.0, 0.0), 8, 8)
+    scene = make_scene("poles", np.random.default_rng(0))
+    sample_luminance(scene, (0.0, 0.0, 2.0, 0.0), 8, 8)
+    cost_to_go(scene, 0.3).of_actions(0.0, 0.0)
     for name in ("bytestream", "event_image", "event_set"):
         random_policy(name).event_logits(events, 0, 5000)
     evae = EventVAE(context=64)

@@ -1,0 +1,128 @@
+"""The cheapest way to the goal line from anywhere in a corridor, by dynamic programming on a lattice.
+
+A vehicle that knows the geometry moves on a lattice of `LATTICE_M` by steps ahead or 45 degrees to a side.
+Each place has a price, which falls with its clearance. Geometry is the scene's, which stands still
+while an episode lasts: bodies, gates as their posts, and of a mesh the surfaces that the vehicle's
+height cuts; textures that move move nothing.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from envs.scene.collision import MARGIN
+from envs.scene.scene import Scene
+
+LATTICE_M = 0.25
+CLEARANCE_SCALE_M = 0.4  # the price of a place falls by e with each such distance from contact
+BLOCKED = 1e3
+SIDE_PRICE = 0.01  # of a lattice step to the side: of two free paths, the straighter
+
+
+@dataclass(frozen=True)
+class CostToGo:
+    """What the cheapest way to the goal line costs, from each place of the lattice.
+
+    Attributes:
+        costs: (rows in y, columns in x), float64; row 0 is y = 0.
+        prices: Of being at each place, of the same shape.
+        first_x_m: Where column 0 is [m].
+    """
+
+    costs: np.ndarray
+    prices: np.ndarray
+    first_x_m: float
+
+    def of_actions(self, x_m: float, y_m: float) -> np.ndarray:
+        """What each action costs from anywhere: ahead, left, right; float64 (3,).
+
+        A lattice step in the action's direction, and from there the cheapest way, interpolated between
+        the four nearest places; outside the lattice, as at its edge.
+        """
+        return _of_actions(self.costs, (x_m - self.first_x_m) / LATTICE_M, y_m / LATTICE_M)
+
+
+def cost_to_go(scene: Scene, radius_m: float, height_m: float = 2.0, through_x_m: float = 0.0) -> CostToGo:
+    """Plan for a vehicle of `radius_m` at `height_m` [m]; a column of the lattice is at `through_x_m` [m].
+
+    Raises:
+        ValueError: The lane is too narrow for the vehicle.
+    """
+    if 0.5 * scene.width_m <= radius_m:
+        raise ValueError(f"a lane must be wider than the vehicle, got {scene.width_m} m and {radius_m} m")
+    prices, first_x_m = lattice_prices(scene, through_x_m, radius_m, height_m)
+    return CostToGo(_costs(prices), prices, first_x_m)
+
+
+def lattice_prices(
+    scene: Scene, through_x_m: float, radius_m: float, height_m: float
+) -> tuple[np.ndarray, float]:
+    """What it costs to be at each place of the lattice, (rows in y, columns in x), and column 0's x [m].
+
+    A place in contact costs `BLOCKED`; others less, the farther they are from contact. The outermost
+    columns are in contact with the walls, or farther away than the vehicle can come.
+    """
+    half = 0.5 * scene.width_m - radius_m
+    wide = min(half, max(map(abs, scene.spawn_range_m)) + scene.length_m)
+    left, right = (math.floor((wide + side * through_x_m) / LATTICE_M) + 1 for side in (1, -1))
+    x_m = through_x_m + np.arange(-left, right + 1) * LATTICE_M
+    y_m = np.arange(math.ceil(scene.length_m / LATTICE_M) + 1) * LATTICE_M
+    clearance = np.broadcast_to(half - np.abs(x_m), (len(y_m), len(x_m))).copy()
+    # Beyond six scales an obstacle adds nothing to the price.
+    _approach(clearance, scene.sections(height_m), x_m, y_m, radius_m, 6 * CLEARANCE_SCALE_M)
+    price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
+    return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price), float(x_m[0])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _approach(
+    clearance: np.ndarray, sections: np.ndarray, x_m: np.ndarray, y_m: np.ndarray, radius: float, reach: float
+) -> None:
+    """Lower the clearance of places, in rows up to `reach` from a section, to the distance from it."""
+    for k in range(len(sections)):
+        x, y, ux, uy, hx, hy, r = sections[k]
+        size = r + radius
+        deep = abs(uy) * hx + abs(ux) * hy + size + reach
+        for j in range(np.searchsorted(y_m, y - deep), np.searchsorted(y_m, y + deep)):
+            dy = y_m[j] - y
+            for i in range(len(x_m)):
+                dx = x_m[i] - x
+                along = max(abs(dx * ux + dy * uy) - hx, 0.0)
+                across = max(abs(dy * ux - dx * uy) - hy, 0.0)
+                most = clearance[j, i] + size
+                if most > 0.0 and along * along + across * across <= MARGIN * most * most:
+                    clearance[j, i] = min(clearance[j, i], math.hypot(along, across) - size)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _costs(prices: np.ndarray) -> np.ndarray:
+    """The cheapest sum of prices to the last row, `SIDE_PRICE` added for each step to a side."""
+    costs = prices.copy()
+    rows, columns = prices.shape
+    for j in range(rows - 2, -1, -1):
+        for i in range(columns):
+            best = costs[j + 1, i]
+            if i > 0:
+                best = min(best, costs[j + 1, i - 1] + SIDE_PRICE)
+            if i < columns - 1:
+                best = min(best, costs[j + 1, i + 1] + SIDE_PRICE)
+            costs[j, i] += best
+    return costs
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _of_actions(costs: np.ndarray, column: float, row: float) -> np.ndarray:
+    """`CostToGo.of_actions` of a place in lattice steps."""
+    last_row, last_column = costs.shape[0] - 1, costs.shape[1] - 1
+    y = min(max(row + 1.0, 0.0), float(last_row))
+    j = min(int(y), last_row - 1)
+    found = np.empty(3)
+    for action, side in enumerate((0.0, -1.0, 1.0)):
+        x = min(max(column + side, 0.0), float(last_column))
+        i = min(int(x), last_column - 1)
+        near = costs[j, i] + (x - i) * (costs[j, i + 1] - costs[j, i])
+        far = costs[j + 1, i] + (x - i) * (costs[j + 1, i + 1] - costs[j + 1, i])
+        found[action] = near + (y - j) * (far - near) + SIDE_PRICE * abs(side)
+    return found

@@ -1,0 +1,125 @@
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from envs.config import EnvConfig
+from envs.kinematics import advance, planned_position
+from envs.scene import make_scene
+from envs.scene.planning import BLOCKED, LATTICE_M, SIDE_PRICE, CostToGo, _costs, cost_to_go
+
+RADIUS_M, HEIGHT_M = 0.3, 2.0
+SCENES = ("poles_eval", "gates", "shape_change", "dynamic")
+
+
+def drawn(name, seed=0):
+    return make_scene(name, np.random.default_rng([seed, 77]), RADIUS_M, HEIGHT_M)
+
+
+@pytest.mark.parametrize("name", ["poles_eval", "gates"])
+def test_costs_obey_bellmans_equation_at_every_place(name):
+    plan = cost_to_go(drawn(name), RADIUS_M, HEIGHT_M)
+    rows, columns = plan.costs.shape
+    for row in range(rows - 1):
+        for column in range(1, columns - 1):
+            at = plan.first_x_m + column * LATTICE_M, row * LATTICE_M
+            best = plan.prices[row, column] + plan.of_actions(*at).min()
+            assert plan.costs[row, column] == pytest.approx(best, rel=1e-12)
+    np.testing.assert_array_equal(plan.costs[-1], plan.prices[-1])
+
+
+def test_costs_are_those_of_the_cheapest_of_all_ways():
+    prices = np.random.default_rng(3).uniform(size=(6, 5))
+
+    def cheapest(row, column):
+        if row == len(prices) - 1:
+            return prices[row, column]
+        ways = [
+            SIDE_PRICE * abs(side) + cheapest(row + 1, column + side)
+            for side in (-1, 0, 1)
+            if 0 <= column + side < 5
+        ]
+        return prices[row, column] + min(ways)
+
+    expected = [[cheapest(row, column) for column in range(5)] for row in range(6)]
+    np.testing.assert_allclose(_costs(prices), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_place_is_blocked_exactly_where_the_vehicle_is_in_contact_or_nearly(name):
+    scene = drawn(name)
+    plan = cost_to_go(scene, RADIUS_M, HEIGHT_M)
+    rng = np.random.default_rng(0)
+    for row, column in zip(rng.integers(0, 401, 400), rng.integers(0, plan.costs.shape[1], 400), strict=True):
+        x, y = plan.first_x_m + column * LATTICE_M, row * LATTICE_M
+        sizes = (RADIUS_M + 0.5 * LATTICE_M + nudge for nudge in (-1e-9, 1e-9))
+        reaches = [scene.collides((x, y), (x, y), size, HEIGHT_M) for size in sizes]
+        if reaches[0] == reaches[1]:
+            assert (plan.prices[row, column] == BLOCKED) == reaches[0]
+            assert plan.prices[row, column] <= 1.0 or reaches[0]
+
+
+def test_costs_between_places_are_bilinear_and_outside_those_of_the_edge():
+    plan = CostToGo(np.random.default_rng(0).uniform(size=(5, 7)), np.zeros((5, 7)), -1.0)
+
+    def cost(x, y):
+        return plan.of_actions(x, y - LATTICE_M)[0]
+
+    corners = [cost(x, y) for y in (0.5, 0.75) for x in (-0.5, -0.25)]
+    assert corners == [plan.costs[2, 2], plan.costs[2, 3], plan.costs[3, 2], plan.costs[3, 3]]
+    inside = cost(-0.5 + 0.3 * LATTICE_M, 0.5 + 0.8 * LATTICE_M)
+    assert inside == pytest.approx(np.dot([0.7 * 0.2, 0.3 * 0.2, 0.7 * 0.8, 0.3 * 0.8], corners))
+    assert cost(-9.0, 9.0) == plan.costs[4, 0]
+    ahead, left, right = plan.of_actions(-0.4, 0.3)
+    assert left == pytest.approx(plan.of_actions(-0.65, 0.3)[0] + SIDE_PRICE)
+    assert right == pytest.approx(plan.of_actions(-0.15, 0.3)[0] + SIDE_PRICE)
+    assert ahead == plan.of_actions(-0.4, 0.3)[0]
+
+
+def flown(scene, seed, random_share, plan=None):
+    """Whether the teacher's cheapest actions lead from a random start to the goal line."""
+    plan = plan or cost_to_go(scene, RADIUS_M, HEIGHT_M)
+    rng, config = np.random.default_rng(seed), EnvConfig()
+    spawn_x, moves = rng.uniform(*scene.spawn_range_m), [0, 0, 0]
+    place = (spawn_x, 0.0)
+    while True:
+        action = rng.integers(3) if rng.random() < random_share else plan.of_actions(*place).argmin()
+        moves[action] += 1
+        told = advance(scene, place, planned_position(spawn_x, moves, config), RADIUS_M, HEIGHT_M)
+        if told.success or told.collision:
+            return told.success
+        place = told.end
+
+
+@pytest.mark.parametrize(
+    ("name", "random_share", "least"),
+    [("poles_eval", 0.0, 40), ("poles_eval", 0.3, 40), ("gates", 0.3, 40), ("poles_dense", 0.0, 40)],
+)
+def test_the_cheapest_actions_come_through(name, random_share, least):
+    assert sum(flown(drawn(name, seed), seed, random_share) for seed in range(40)) >= least
+
+
+def test_a_mesh_blocks_where_its_surfaces_are(tmp_path):
+    box = trimesh.creation.box((8.0, 2.0, 6.0))
+    box.apply_translation((0.0, 30.0, 3.0))
+    box.export(tmp_path / "box.stl")
+    scene = make_scene(str(tmp_path / "box.stl"), np.random.default_rng(0))
+    plan = cost_to_go(scene, RADIUS_M, HEIGHT_M)
+    assert plan.of_actions(0.0, 28.6).min() > BLOCKED
+    assert all(flown(scene, seed, 0.3, plan) for seed in range(10))
+    left_of, right_of = plan.of_actions(-2.0, 25.75), plan.of_actions(2.0, 25.75)
+    assert left_of.argmin() == 1
+    assert right_of.argmin() == 2
+
+
+def test_a_lane_narrower_than_the_vehicle_is_refused():
+    with pytest.raises(ValueError, match=r"wider than the vehicle, got 30\.0 m and 15\.0 m"):
+        cost_to_go(drawn("poles"), 15.0)
+
+
+def test_no_place_is_planned_that_the_vehicle_cannot_come_to():
+    scene = make_scene("poles", np.random.default_rng(0), RADIUS_M, HEIGHT_M, width_m=10_000.0)
+    plan = cost_to_go(scene, RADIUS_M, HEIGHT_M)
+    assert plan.costs.shape[1] * LATTICE_M == pytest.approx(2 * (10.0 + scene.length_m), abs=1.0)
+    assert math.isfinite(plan.costs.max())
