@@ -1,14 +1,15 @@
 """The settings of each part of an experiment: names, types, ranges. Their values and units are in conf/."""
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import pydantic
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
 from jobs.config.conditions import Axis, AxisName, Condition
-from models.kinds import Latent, Stack, Target
+from models.kinds import Latent, Stack, Target, checked
 
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -16,8 +17,37 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 @dataclass(frozen=True, config=STRICT)
+class ImitationConfig:
+    """Imitation of a planner that knows the geometry (DAgger: Ross et al. 2011).
+
+    Attributes:
+        temperature: Labels are softmax(-cost / temperature); costs as in `envs.scene.planning`.
+        guided_batches: In the first batches the teacher acts too: in all steps of the first, then in half as
+            many in each; 0: never.
+        fit_steps: Gradient steps after each batch, on steps of all batches.
+        final_steps: Gradient steps after the last, with a step size that falls to 0.
+        keep_mb: Memory for the steps that are kept [MB]; beyond it, a random sample of all.
+    """
+
+    temperature: Positive
+    guided_batches: Annotated[int, Field(ge=0)]
+    fit_steps: Count
+    final_steps: Count
+    keep_mb: Positive
+
+
+def _imitation(values: object) -> object:
+    """The settings of a mapping, which pydantic would not take for a dataclass where it is strict."""
+    return checked(ImitationConfig, dict(values)) if isinstance(values, Mapping) else values
+
+
+@dataclass(frozen=True, config=STRICT)
 class AlgoConfig:
-    """PPO, each word as RLlib spells it (appendix D.1.2)."""
+    """PPO, each word as RLlib spells it (appendix D.1.2).
+
+    Attributes:
+        imitation: Learn from a teacher instead; of the others then only lr, sizes and grad_clip count.
+    """
 
     lr: Positive
     lr_schedule: Literal["constant", "linear"]
@@ -33,6 +63,7 @@ class AlgoConfig:
     reward_scale: Positive
     num_envs_per_env_runner: Count
     num_env_runners: Annotated[int, Field(ge=0, le=10_000)]
+    imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)]
 
     @pydantic.model_validator(mode="after")
     def _minibatch_fits(self) -> "AlgoConfig":

@@ -27,6 +27,7 @@ NOT_IN_RUN_NAME = (
 )  # fmt: skip
 # Settings that older run folders lack, each with the value that does what was done before it existed.
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
+    "algo": {"imitation": None},
     "collect": {"recordings": []},
     "train": {"conditions": [{}]},
 }
@@ -111,7 +112,11 @@ def reopen(path: Path, config: Config) -> Run:
         )
     # Older versions wrote null for the settings that a kind of model does not have.
     values["model"] = {name: value for name, value in values["model"].items() if value is not None}
-    values |= {section: {**added, **values[section]} for section, added in ADDED_SETTINGS.items()}
+    values |= {
+        section: {**added, **values[section]}
+        for section, added in ADDED_SETTINGS.items()
+        if section in values
+    }
     run = parse({**values, **here})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
 

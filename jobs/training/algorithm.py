@@ -48,7 +48,9 @@ class PPO(RLlibPPO):
         """Write what the future of the training depends on."""
         super().save_checkpoint(checkpoint_dir)
         runners = {str(index): snapshot for index, snapshot in self._rounds.snapshots.items()}
-        write_snapshots(Path(checkpoint_dir), {LEARNER: Snapshot({}, generators()), **runners})
+        (answer,) = self.learner_group.foreach_learner(lambda learner: learner.kept())
+        own = Snapshot({}, {**generators(), **answer.get()})
+        write_snapshots(Path(checkpoint_dir), {LEARNER: own, **runners})
 
     def load_checkpoint(self, checkpoint: Any) -> None:
         """Go on from a checkpoint; what could not be built or read is said by the first iteration."""
@@ -74,6 +76,7 @@ class PPO(RLlibPPO):
             raise RunError(f"a checkpoint must be of the processes {sorted(asked)}, got {sorted(found)}")
         self._rounds.snapshots = {index: found[str(index)] for index in self._rounds.snapshots}
         self._rounds.resume(list(self._rounds.snapshots))
+        self.learner_group.foreach_learner(lambda learner: learner.keep(found[LEARNER].arrays))
         set_generators(found[LEARNER].arrays)
 
     def restore_env_runners(self, env_runner_group: Any) -> list[int]:

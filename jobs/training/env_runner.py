@@ -36,9 +36,8 @@ class Step(NamedTuple):
 
     Attributes:
         stacks: What the policy saw before it.
-        actions: What it drew, int64.
-        logits: What it drew them from, float32 (N, actions).
-        logp: Logarithm of the probability of each action, float32.
+        actions: What was done, int64.
+        outputs: What is kept of the policy's decision, by RLlib's name.
         rewards: True ones, float64.
         terminated: Whether the episode ended by contact or goal.
         truncated: Whether the episode ended by its time limit.
@@ -48,8 +47,7 @@ class Step(NamedTuple):
 
     stacks: np.ndarray
     actions: np.ndarray
-    logits: np.ndarray
-    logp: np.ndarray
+    outputs: dict[str, np.ndarray]
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
@@ -289,19 +287,24 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self._ongoing_episodes_for_metrics = defaultdict(list)
         self._needs_initial_reset = False
 
-    @torch.no_grad()
     def _step(self) -> Step:
         """One step of every episode; those that are over start anew instead."""
         stacks, over = self._stacks, self._over
+        actions, outputs = self._decide(stacks)
+        observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
+        self._stacks = push_features(stacks, self.module.features(observations), over)
+        self._over = terminated | truncated
+        return Step(stacks, actions, outputs, rewards, terminated, truncated, infos, over)
+
+    @torch.no_grad()
+    def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Drawn actions (N,), and by name the logits (N, actions) and the actions' log-probabilities."""
         logits = self.module._forward({Columns.OBS: torch.from_numpy(stacks)})[Columns.ACTION_DIST_INPUTS]
         chances = torch.softmax(logits, dim=-1)
         actions = torch.multinomial(chances, 1, replacement=True)
         logp = torch.log_softmax(logits, dim=-1).gather(1, actions)
-        actions, logits, logp = actions[:, 0].numpy(), logits.numpy(), logp[:, 0].numpy()
-        observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
-        self._stacks = push_features(stacks, self.module.features(observations), over)
-        self._over = terminated | truncated
-        return Step(stacks, actions, logits, logp, rewards, terminated, truncated, infos, over)
+        outputs = {Columns.ACTION_DIST_INPUTS: logits.numpy(), Columns.ACTION_LOGP: logp[:, 0].numpy()}
+        return actions[:, 0].numpy(), outputs
 
     def _cut(self, steps: list[Step]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
         """The episodes that ended in these steps, and the pieces of those that go on."""
@@ -310,10 +313,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         stacks = np.stack([*(step.stacks for step in steps), self._stacks])
         infos = [self._infos, *(step.infos for step in steps)]
         self._infos = infos[-1]
-        columns = {
-            name: np.stack([getattr(step, name) for step in steps])
-            for name in ("actions", "logits", "logp", "rewards")
-        }
+        columns = {name: np.stack([getattr(step, name) for step in steps]) for name in ("actions", "rewards")}
+        columns |= {name: np.stack([step.outputs[name] for step in steps]) for name in steps[0].outputs}
         done: list[tuple[int, SingleAgentEpisode]] = []
         going_on = []
         for row in range(over.shape[1]):
@@ -351,13 +352,10 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             observations=InfiniteLookbackBuffer(stacks),
             observation_space=self.module.observation_space,
             infos=infos,
-            actions=InfiniteLookbackBuffer(columns["actions"]),
+            actions=InfiniteLookbackBuffer(columns.pop("actions")),
             action_space=self.module.action_space,
-            rewards=InfiniteLookbackBuffer(columns["rewards"]),
-            extra_model_outputs={
-                Columns.ACTION_DIST_INPUTS: InfiniteLookbackBuffer(columns["logits"]),
-                Columns.ACTION_LOGP: InfiniteLookbackBuffer(columns["logp"]),
-            },
+            rewards=InfiniteLookbackBuffer(columns.pop("rewards")),
+            extra_model_outputs={name: InfiniteLookbackBuffer(values) for name, values in columns.items()},
             t_started=len(before),
             len_lookback_buffer=0,
         )

@@ -21,6 +21,7 @@ from jobs.config.config import Config, ConfigError
 from jobs.rollout.diagnostics import drift_metrics
 from jobs.run.files import RunError
 from jobs.training.env_runner import PlainEnvRunner
+from jobs.training.imitation import IMITATION, ImitationLearner, TaughtEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
 from jobs.training.rounds import MAX_RESTARTS, SAMPLE_TIMEOUT_S
 from models.encoder.evae import EventVAE
@@ -105,7 +106,7 @@ class EpisodeMetrics(RLlibCallback):
     def _drift(self, module: Any) -> dict[str, float]:
         """The `jobs.rollout.diagnostics.drift_metrics` of the windows that the module met.
 
-        None without an encoder, or where its file is no longer there: the frozen part that
+        None without an encoder, or where its file is no longer there or lean: the frozen part that
         acts has no decoder.
         """
         file = module.model_config["encoder_file"]
@@ -118,7 +119,7 @@ class EpisodeMetrics(RLlibCallback):
             except EncoderFileError:
                 return {}
         evae, manifest = self._encoder
-        if manifest["sha256"] != file.digest:
+        if manifest["sha256"] != file.digest or evae.decoder is None:
             return {}
         return drift_metrics(evae, module.met, manifest.get("figures", {}))
 
@@ -160,13 +161,13 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
             sample_timeout_s=SAMPLE_TIMEOUT_S,
             gym_env_vectorize_mode="vector_entry_point",
-            env_runner_cls=PlainEnvRunner,
+            env_runner_cls=TaughtEnvRunner if algo.imitation else PlainEnvRunner,
         )
         .resources(num_cpus_for_main_process=own_cpus)
         .learners(
             num_learners=0,
             num_cpus_per_learner=own_cpus,
-            learner_class=PlainPPOLearner,
+            learner_class=ImitationLearner if algo.imitation else PlainPPOLearner,
         )
         .rl_module(rl_module_spec=spec)
         .callbacks(EpisodeMetrics)
@@ -184,7 +185,7 @@ def _optimiser(ppo: PPOConfig, config: Config) -> PPOConfig:
     """
     algo = config.algo
     return ppo.training(
-        learner_config_dict={REWARD_SCALE: algo.reward_scale},
+        learner_config_dict=learner_settings(config),
         lr=learning_rate(config),
         gamma=algo.gamma,
         lambda_=algo.lambda_,
@@ -202,9 +203,18 @@ def _optimiser(ppo: PPOConfig, config: Config) -> PPOConfig:
     )
 
 
+def learner_settings(config: Config) -> dict[str, object]:
+    """What the learner is told beside RLlib's own settings."""
+    settings: dict[str, object] = {REWARD_SCALE: config.algo.reward_scale}
+    if config.algo.imitation is not None:
+        own = dataclasses.asdict(config.algo.imitation)
+        settings[IMITATION] = {**own, "env_steps": config.train.env_steps}
+    return settings
+
+
 def learning_rate(config: Config) -> float | list[list[float]]:
     """Adam's step size: one number, or (environment step, value) pairs between which RLlib interpolates."""
-    if config.algo.lr_schedule == "constant":
+    if config.algo.lr_schedule == "constant" or config.algo.imitation is not None:
         return config.algo.lr
     return [[0, config.algo.lr], [config.train.env_steps, 0.0]]
 

@@ -114,14 +114,25 @@ class PlainPPOLearner(PPOTorchLearner):
         self._weights_seq_no += 1
         rows = self._rows(training_data.episodes)
         count = len(rows[Columns.ACTIONS])
-        for _ in range(num_epochs):
-            figures = self._epoch(rows, minibatch_size or count)
-        figures[LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY] = self._explained_variance(rows)
+        figures = self._improve(rows, num_epochs, minibatch_size or count)
         self.metrics.log_dict(figures, key=DEFAULT_MODULE_ID, window=1)
         steps = SampleBatch({Columns.ACTIONS: rows[Columns.ACTIONS]})
         self._log_steps_trained_metrics(MultiAgentBatch({DEFAULT_MODULE_ID: steps}, env_steps=count))
         self.after_gradient_based_update(timesteps=counters)
         return self.metrics.reduce()
+
+    def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Tensor]:
+        """All epochs over the rows; the figures of the last."""
+        for _ in range(num_epochs):
+            figures = self._epoch(rows, minibatch_size)
+        return figures | {LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY: self._explained_variance(rows)}
+
+    def kept(self) -> dict[str, np.ndarray]:
+        """What the next updates depend on beside RLlib's own state."""
+        return {}
+
+    def keep(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on with what an earlier process had `kept`, among other arrays."""
 
     def _threads(self) -> int:
         """As many as there are env runners, which wait meanwhile; one for networks too small to share."""

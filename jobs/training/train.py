@@ -34,6 +34,7 @@ from jobs.run.tune_state import keep_state, mend_state
 from jobs.tracking.tracker import open_tracker
 from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.env_runner import RolloutError
+from jobs.training.imitation import AGREEMENT_KEY
 from jobs.training.ppo import build_ppo, policy_about, policy_spec
 from jobs.training.pretrain import check_sources, prepare_encoder
 from models.encoder.weights import EncoderManifest, load_encoder
@@ -52,6 +53,7 @@ METRICS = {
     "train/value_loss": ("learners", "default_policy", "vf_loss"),
     "train/explained_variance": ("learners", "default_policy", "vf_explained_var"),
     "train/entropy": ("learners", "default_policy", "entropy"),
+    "train/agreement": ("learners", "default_policy", AGREEMENT_KEY),
     "train/gradient_norm": ("learners", "default_policy", "gradients_default_optimizer_global_norm"),
     "sim/events_per_step": ("env_runners", "events_per_step"),
     "sim/dropped_events": ("env_runners", "dropped_events"),
@@ -297,7 +299,9 @@ def read_metrics(result: Mapping[str, object], seconds: float) -> dict[str, floa
     metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
     steps = _lookup(result, SAMPLED)
     metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
-    bad = [f"{name} = {metrics[name]}" for name in ALWAYS_FINITE if not math.isfinite(metrics[name])]
+    learners: Any = result["learners"]
+    told = [name for name in ALWAYS_FINITE if METRICS[name][-1] in learners["default_policy"]]
+    bad = [f"{name} = {metrics[name]}" for name in told if not math.isfinite(metrics[name])]
     if bad:
         where = f"at environment step {result[ENV_STEPS]}"
         raise TrainingError(f"losses must be finite, got {', '.join(bad)} {where}")

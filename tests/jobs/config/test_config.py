@@ -16,6 +16,7 @@ from tests.support.configs import CONF, compose
 POLICIES = {
     "bytestream": "bytestream",
     "bytestream_finetuned": "bytestream",
+    "bytestream_imitation": "bytestream",
     "bytestream_paper": "bytestream",
     "bytestream_robust": "bytestream",
     "bytestream_xy": "bytestream_xy",
@@ -32,7 +33,9 @@ def options(group: str) -> list[str]:
 
 
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
-CHOICES = [f"{group}={option}" for group in GROUPS if group != "exp" for option in options(group)]
+CHOICES = [
+    f"{group}={option}" for group in GROUPS if group not in ("exp", "length") for option in options(group)
+]
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +80,15 @@ def test_no_key_is_given_without_being_checked_nor_checked_without_being_given(v
 def test_every_value_says_its_unit_or_source_in_a_comment(file):
     lines = file.read_text().splitlines()
     assert lines[0].startswith("#")
-    if file.parent != CONF and file.parent.name != "budget":
+    if file.parent != CONF and file.parent.name not in ("budget", "length"):
         assert [line for line in lines[1:] if ": " in line and "#" not in line and "name:" not in line] == []
 
 
 @pytest.mark.parametrize(
-    "file", sorted(path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help", "budget"))
+    "file",
+    sorted(
+        path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help", "budget", "length")
+    ),
 )
 def test_every_group_names_the_class_that_its_keys_are_fields_of(file):
     text = file.read_text()
@@ -114,7 +120,32 @@ def test_ppo_is_the_papers():
         "reward_scale": 1.0,
         "num_env_runners": 0,
         "num_envs_per_env_runner": 16,
+        "imitation": None,
     }
+
+
+@pytest.mark.parametrize("length", options("length"))
+def test_an_algorithm_trains_as_long_as_it_needs_in_each_budget(length):
+    budget, _, algo = length.partition("_")
+    told = compose("+exp=bytestream", f"budget={budget}", f"algo={algo}")
+    own = yaml.safe_load((CONF / "length" / f"{length}.yaml").read_text())
+    assert own["train"].items() <= told["train"].items()
+    assert parse(told).algo.imitation is not None
+    assert (
+        compose("+exp=bytestream", f"budget={budget}", f"algo={algo}", "train.env_steps=7")["train"][
+            "env_steps"
+        ]
+        == 7
+    )
+
+
+def test_wrong_settings_of_imitation_are_refused_by_name():
+    values = compose("+exp=bytestream", "algo=imitation")
+    values["algo"]["imitation"] |= {"temperature": 0.0, "fit_steps": 0.5}
+    with pytest.raises(
+        ConfigError, match=r"^algo\.imitation: temperature: .*got 0\.0; fit_steps: .*got 0\.5$"
+    ):
+        parse(values)
 
 
 def test_the_stages_of_an_experiment_share_its_run_folder():

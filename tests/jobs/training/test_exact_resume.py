@@ -29,6 +29,8 @@ SMALL = (
     "algo.train_batch_size_per_learner=96",
     "algo.num_epochs=2",
 )
+IMITATION = ("algo=imitation", "model=event_columns", "algo.imitation.fit_steps=5", "algo.minibatch_size=32")
+OWN = {"finetuned": ["model.encoder=finetuned"], "imitation": IMITATION}
 SAME = [name for name in METRICS if not name.startswith("perf/")]
 CONDITIONS = "train.conditions=[{},{faults.sparsity:0.5},{env.control_hz:100}]"
 
@@ -43,8 +45,7 @@ def a_ray(tmp_path_factory):
 
 def built(folder, name, *words):
     """The configuration of a small training, its encoder file, and a function that makes it."""
-    own = "model.encoder=finetuned" if name == "finetuned" else f"model={name}"
-    config = make_config(*SMALL, own, *words)
+    config = make_config(*OWN.get(name, [f"model={name}"]), *SMALL, *words)
     encoder = write_encoder(folder, config) if KINDS[config.model.name].encoder else None
     return config, encoder, lambda: PPO(config=build_ppo(config, encoder))
 
@@ -76,7 +77,8 @@ def assert_same(mine, other):
 
 
 @pytest.mark.parametrize(
-    ("name", "runners"), [*((name, 0) for name in TRAINED), ("finetuned", 1), ("bytestream", 2)]
+    ("name", "runners"),
+    [*((name, 0) for name in TRAINED), ("finetuned", 1), ("bytestream", 2), ("imitation", 2)],
 )
 def test_a_training_goes_on_from_its_checkpoint_with_the_same_bytes(name, runners, tmp_path):
     words = CONDITIONS, "algo.lr_schedule=linear", f"algo.num_env_runners={runners}"

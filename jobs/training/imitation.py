@@ -1,0 +1,169 @@
+"""Imitation of a planner that knows the geometry, in PPO's machinery (DAgger: Ross et al. 2011).
+
+The env runners roll out the student, in the first batches mixed with the teacher, and the teacher says
+of each step what each action would have cost: of those, too, to which the student strayed. All steps are
+kept; after each batch the networks learn to act as their labels say. The value network learns nothing.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.learner.learner import ENTROPY_KEY, POLICY_LOSS_KEY
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from envs.scene import Scene
+from envs.scene.planning import CostToGo, cost_to_go
+from jobs.training.env_runner import PlainEnvRunner
+from jobs.training.ppo_learner import PlainPPOLearner
+
+IMITATION = "imitation"  # of the learner's own settings: those of `ImitationConfig`, and env_steps
+COSTS = "costs"  # of a step: what each action costs more than the cheapest, float32 (actions,)
+AGREEMENT_KEY = (
+    "agreement"  # share of the newest steps in which the student's likeliest action is the cheapest
+)
+
+
+class TaughtEnvRunner(PlainEnvRunner):
+    """As `PlainEnvRunner`; the teacher labels every step, and acts in some."""
+
+    def __init__(self, **settings: Any) -> None:
+        self._plans: dict[int, tuple[Scene, CostToGo]] = {}  # of each environment's scene
+        super().__init__(**settings)
+
+    @property
+    def teacher_share(self) -> float:
+        """Of the steps of this round."""
+        done = self._callbacks[0].rounds
+        guided = self.config.learner_config_dict[IMITATION]["guided_batches"]
+        return 0.5**done if done < guided else 0.0
+
+    def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        actions, outputs = super()._decide(stacks)
+        costs = np.stack([self._costs(row) for row in range(len(stacks))])
+        if self.teacher_share > 0.0:
+            by_teacher = torch.rand(len(stacks)).numpy() < self.teacher_share
+            actions = np.where(by_teacher, costs.argmin(axis=1), actions)
+        return actions, {**outputs, COSTS: costs}
+
+    def _costs(self, row: int) -> np.ndarray:
+        """`COSTS` where an environment is now."""
+        env = self.env.unwrapped.envs[row]
+        scene, plan = self._plans.get(row, (None, None))
+        if plan is None or scene is not env.scene:
+            plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
+            self._plans[row] = env.scene, plan
+        costs = plan.of_actions(*env.camera_pose()[:2])
+        return (costs - costs.min()).astype(np.float32)
+
+
+class Lessons:
+    """Steps with their labels, of all batches; beyond a bound, a random sample of all."""
+
+    def __init__(self, most_bytes: float) -> None:
+        self.most_bytes, self.seen = most_bytes, 0
+        self.stacks, self.costs = np.empty(0), np.empty(0)
+
+    def __len__(self) -> int:
+        return min(self.seen, len(self.stacks))
+
+    def add(self, stacks: np.ndarray, costs: np.ndarray) -> None:
+        """Keep steps (N, ...) and costs (N, actions); each step seen is as likely kept as any other."""
+        if not self.seen:
+            most = max(1, int(self.most_bytes / (stacks[0].nbytes + costs[0].nbytes)))
+            self.stacks = np.empty(
+                (most, *stacks.shape[1:]), stacks.dtype
+            )  # pages that nobody wrote cost nothing
+            self.costs = np.empty((most, *costs.shape[1:]), costs.dtype)
+        numbers = self.seen + np.arange(len(stacks))
+        drawn = (torch.rand(len(stacks), dtype=torch.float64).numpy() * (numbers + 1)).astype(np.int64)
+        places = np.where(numbers < len(self.stacks), numbers, drawn)
+        kept = places < len(self.stacks)
+        self.stacks[places[kept]], self.costs[places[kept]] = stacks[kept], costs[kept]
+        self.seen += len(stacks)
+
+    def draw(self, count: int) -> dict[str, Tensor]:
+        """So many rows at random."""
+        rows = torch.randint(len(self), (count,))
+        columns = {Columns.OBS: self.stacks, COSTS: self.costs}
+        return {name: torch.from_numpy(column)[rows] for name, column in columns.items()}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it, for `load`."""
+        size = len(self)
+        return {"stacks": self.stacks[:size], "costs": self.costs[:size], "seen": np.array(self.seen)}
+
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on from `arrays`."""
+        self.seen = 0
+        if len(arrays["stacks"]):
+            self.add(arrays["stacks"], arrays["costs"])
+        self.seen = int(arrays["seen"])
+
+
+class ImitationLearner(PlainPPOLearner):
+    """Learns the teacher's labels by cross-entropy, from the steps of all batches."""
+
+    def build(self) -> None:
+        """As PPO's learner."""
+        super().build()
+        self._settings: dict[str, Any] = self.config.learner_config_dict[IMITATION]
+        self._lessons = Lessons(1e6 * self._settings["keep_mb"])
+
+    def update(self, *, timesteps: Mapping[str, int] | None = None, **asked: Any) -> Any:
+        """Learn from all steps so far, longer if there will be no more; arguments and result as PPO's."""
+        sampled = dict(timesteps or {}).get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
+        self._last = sampled >= self._settings["env_steps"]
+        return super().update(timesteps=timesteps, **asked)
+
+    def kept(self) -> dict[str, np.ndarray]:
+        """The lessons."""
+        return self._lessons.arrays()
+
+    def keep(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on with lessons."""
+        self._lessons.load(arrays)
+
+    def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
+        """The steps of all episodes, one after the other."""
+        columns = {
+            Columns.OBS: [np.asarray(episode.get_observations())[:-1] for episode in episodes],
+            Columns.ACTIONS: [episode.get_actions() for episode in episodes],
+            Columns.ACTION_DIST_INPUTS: [
+                episode.get_extra_model_outputs(Columns.ACTION_DIST_INPUTS) for episode in episodes
+            ],
+            COSTS: [episode.get_extra_model_outputs(COSTS) for episode in episodes],
+        }
+        return {name: torch.from_numpy(np.concatenate(parts)) for name, parts in columns.items()}
+
+    def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Tensor]:
+        """Gradient steps on random rows of all so far; the means of their figures."""
+        likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
+        self._lessons.add(rows[Columns.OBS].numpy(), costs.numpy())
+        count = self._settings["final_steps" if self._last else "fit_steps"]
+        groups = self.get_optimizer(DEFAULT_MODULE_ID).param_groups
+        figures = []
+        for step in range(count):
+            if self._last:
+                groups[0]["lr"] = self.config.lr * (1.0 - step / count)
+            figures.append(self._step(self._lessons.draw(minibatch_size)))
+        if self._last:
+            self._lessons = Lessons(0)  # which a checkpoint would hold otherwise
+        means = {name: torch.stack([one[name] for one in figures]).mean() for name in figures[0]}
+        return means | {AGREEMENT_KEY: (costs.gather(1, likeliest) == 0.0).float().mean()}
+
+    def _loss(self, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Cross-entropy of the labels, softmax(-cost / temperature); and the policy's entropy."""
+        module = self.module[DEFAULT_MODULE_ID].unwrapped()
+        logits = module._forward_train(rows)[Columns.ACTION_DIST_INPUTS]
+        labels = torch.softmax(-rows[COSTS] / self._settings["temperature"], dim=-1)
+        loss = cross_entropy(logits, labels)
+        logps = torch.log_softmax(logits.detach(), dim=-1)
+        figures = {POLICY_LOSS_KEY: loss.detach(), ENTROPY_KEY: -(logps.exp() * logps).sum(-1).mean()}
+        return loss, figures

@@ -1,0 +1,164 @@
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from envs.corridor import CorridorEnv
+from envs.scene.planning import cost_to_go
+from jobs.training.imitation import COSTS, ImitationLearner, Lessons, TaughtEnvRunner
+from jobs.training.ppo import build_ppo, corridor_settings
+from tests.support.configs import SHORT, make_config
+
+WORDS = (*SHORT, "algo=imitation", "model=event_columns", "algo.num_env_runners=0", "train.env_steps=1000")
+SETTINGS = ("algo.imitation.fit_steps=7", "algo.imitation.final_steps=20", "algo.minibatch_size=16")
+SAMPLED = "num_env_steps_sampled_lifetime"
+
+
+@pytest.fixture(scope="module")
+def config():
+    return make_config(*WORDS, *SETTINGS, "algo.imitation.guided_batches=2")
+
+
+@pytest.fixture(scope="module")
+def rolled_out(config):
+    """An env runner, and its rounds: of the teacher alone, half and half, and of the student alone."""
+    runner = TaughtEnvRunner(config=build_ppo(config), worker_index=0)
+    rounds = [(runner.teacher_share, runner.sample(num_timesteps=140)) for _ in range(4)]
+    yield runner, rounds
+    runner.stop()
+
+
+@pytest.fixture
+def learner(config, rolled_out):
+    return build_ppo(config).build_learner(env=rolled_out[0].env)
+
+
+def optimiser(learner):
+    return learner.get_optimizer("default_policy").param_groups[0]
+
+
+def test_a_step_carries_what_each_action_costs_where_it_began(config, rolled_out):
+    env = CorridorEnv(corridor_settings(config)["config"])
+    for _, episodes in rolled_out[1]:
+        for episode in episodes[:6]:
+            infos = episode.get_infos()
+            env.reset(
+                seed=int(infos[0]["episode_seed"]),
+                options={"episode_number": int(infos[0]["episode_number"])},
+            )
+            plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
+            costs = np.stack([plan.of_actions(info["x_m"], info["y_m"]) for info in infos[:-1]])
+            expected = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
+            np.testing.assert_array_equal(episode.get_extra_model_outputs(COSTS), expected)
+
+
+def test_the_teacher_acts_in_half_as_many_steps_of_each_batch_and_then_in_none(rolled_out):
+    shares = [share for share, _ in rolled_out[1]]
+    assert shares == [1.0, 0.5, 0.0, 0.0]
+    found = []
+    for _, episodes in rolled_out[1]:
+        costs = np.concatenate([episode.get_extra_model_outputs(COSTS) for episode in episodes])
+        actions = np.concatenate([episode.get_actions() for episode in episodes])
+        found.append(np.mean(actions == costs.argmin(axis=1)))
+    assert found[0] == 1.0
+    assert found[1] == pytest.approx(0.5 + 0.5 * found[2], abs=0.2)
+
+
+def test_the_loss_is_the_cross_entropy_of_the_labels(learner, rolled_out):
+    rows = learner._rows(rolled_out[1][2][1])
+    loss, figures = learner._loss(rows)
+    logits = learner.module["default_policy"].unwrapped()._forward(rows)["action_dist_inputs"].double()
+    weights = torch.exp(-rows[COSTS].double() / 0.003)
+    labels = weights / weights.sum(1, keepdim=True)
+    expected = -(labels * (logits - logits.exp().sum(1, keepdim=True).log())).sum(1).mean()
+    assert float(loss.detach()) == pytest.approx(float(expected), rel=1e-5)
+    assert 0.0 < float(figures["entropy"]) < math.log(3) + 1e-6
+    loss.backward()
+    gradients = {name: value.grad for name, value in learner.module["default_policy"].named_parameters()}
+    assert {name for name, value in gradients.items() if value is None} == {
+        n for n in gradients if n.startswith("vf.")
+    }
+
+
+def test_steps_of_all_batches_are_learnt_from_and_none_is_kept_after_the_last(
+    learner, rolled_out, monkeypatch
+):
+    drawn = []
+    step = learner._step
+
+    def watched(rows):
+        drawn.append((len(rows[COSTS]), float(optimiser(learner)["lr"])))
+        return step(rows)
+
+    monkeypatch.setattr(learner, "_step", watched)
+    episodes = [copy.deepcopy(episodes) for _, episodes in rolled_out[1]]
+    steps = [sum(map(len, batch)) for batch in episodes]
+    for k, batch in enumerate(episodes):
+        told = learner.update(episodes=batch, timesteps={SAMPLED: 999 if k < 3 else 1000}, minibatch_size=16)
+        assert len(learner._lessons) == (sum(steps[: k + 1]) if k < 3 else 0)
+    assert len(drawn) == 3 * 7 + 20
+    assert {size for size, _ in drawn} == {16}
+    rates = [rate for _, rate in drawn]
+    assert set(rates[:21]) == {1e-3}
+    np.testing.assert_allclose(rates[21:], 1e-3 * (1.0 - np.arange(20) / 20))
+    assert 0.0 <= float(told["default_policy"]["agreement"].peek()) <= 1.0
+
+
+def test_labels_are_learnt(learner, rolled_out):
+    _, episodes = rolled_out[1][0]
+    losses = []
+    for _ in range(30):
+        told = learner.update(episodes=copy.deepcopy(episodes), timesteps={SAMPLED: 1}, minibatch_size=64)
+        losses.append(float(told["default_policy"]["policy_loss"].peek()))
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def rows_of(first, count):
+    numbers = np.arange(first, first + count)
+    return np.repeat(numbers[:, None], 3, axis=1).astype(np.int16), np.stack([numbers] * 3, 1).astype(
+        np.float32
+    )
+
+
+def test_lessons_are_all_kept_up_to_a_bound_and_beyond_it_a_fair_sample():
+    lessons = Lessons(100 * (3 * 2 + 3 * 4))
+    torch.manual_seed(0)
+    for first in range(0, 80, 16):
+        lessons.add(*rows_of(first, 16))
+    np.testing.assert_array_equal(lessons.arrays()["costs"][:, 0], np.arange(80))
+    counts = np.zeros(400)
+    for _ in range(100):
+        lessons = Lessons(100 * (3 * 2 + 3 * 4))
+        for first in range(0, 400, 50):
+            lessons.add(*rows_of(first, 50))
+        kept = lessons.arrays()["costs"][:, 0].astype(int)
+        assert len(lessons) == len(set(kept)) == 100
+        counts[kept] += 1
+    assert abs(counts[:200].mean() / 25 - 1) < 0.05
+    assert counts.min() > 5
+    assert counts.max() < 50
+    drawn = lessons.draw(5)
+    assert all(torch.equal(drawn["obs"][:, k].float(), drawn[COSTS][:, k]) for k in range(3))
+
+
+@pytest.mark.parametrize("seen", [0, 60, 150])
+def test_lessons_go_on_from_their_arrays(seen):
+    lessons, again = Lessons(100 * (3 * 2 + 3 * 4)), Lessons(100 * (3 * 2 + 3 * 4))
+    if seen:
+        lessons.add(*rows_of(0, seen))
+    again.load(lessons.arrays())
+    for one in (lessons, again):
+        torch.manual_seed(5)
+        one.add(*rows_of(seen, 70))
+    assert lessons.seen == again.seen == seen + 70
+    for name, value in lessons.arrays().items():
+        np.testing.assert_array_equal(value, again.arrays()[name])
+
+
+def test_algo_imitation_names_both_parts(config):
+    ppo = build_ppo(config)
+    assert ppo.env_runner_cls is TaughtEnvRunner
+    assert ppo.learner_class is ImitationLearner
+    assert ppo.lr == 1e-3
