@@ -33,6 +33,7 @@ Latent = Annotated[int, Field(ge=1, le=256)]
 TimeBins = Annotated[int, Field(ge=1, le=65536)]
 Stack = Annotated[int, Field(ge=1, le=32)]
 Size = Annotated[int, Field(ge=1, le=65536)]
+TimesMs = Annotated[list[Annotated[float, Field(gt=0, le=1e6)]], Field(max_length=16)]
 
 MAX_ROW_TIME_BINS = 1 << 15  # of an encoder that PPO trains on: events are kept as rows of int16
 MIN_IMAGE = 36  # pixels, of the picture that leaves the third convolution of `nature_cnn` one pixel
@@ -77,6 +78,8 @@ class EncoderModel:
         encoder: What PPO does with the pretrained encoder.
         stack: Latest latents that the policy sees.
         hidden: Neurons of each dense layer.
+        memory_ms: If any, it sees the newest latent instead, and means of all that decay with these
+            time constants [ms] (`models.policy.memory`).
     """
 
     has_encoder: ClassVar[bool] = True
@@ -91,6 +94,7 @@ class EncoderModel:
     encoder: Literal["frozen", "finetuned"]
     stack: Stack
     hidden: list[Size]
+    memory_ms: TimesMs = dataclasses.field(default_factory=list)
 
     @pydantic.model_validator(mode="after")
     def _fits_its_kind(self) -> "EncoderModel":
@@ -100,6 +104,9 @@ class EncoderModel:
                 able = ", ".join(name for name, kind in KINDS.items() if kind.finetuning)
                 rule = f"must be frozen for {self.name}; {able} can be fine-tuned"
                 raise ValueError(f"encoder {rule}, got 'finetuned'")
+            if self.memory_ms:
+                rule = "must be [] for encoder=finetuned, whose latents change while it learns"
+                raise ValueError(f"memory_ms {rule}, got {self.memory_ms}")
             if self.time_bins > MAX_ROW_TIME_BINS:
                 rule = f"must be at most {MAX_ROW_TIME_BINS} for encoder=finetuned"
                 raise ValueError(f"time_bins {rule}, got {self.time_bins}")
@@ -113,13 +120,14 @@ class EncoderModel:
 
 @dataclass(frozen=True, config=STRICT)
 class DenseModel:
-    """A policy whose dense layers read a stack of features that are computed without an encoder."""
+    """A policy whose dense layers read features that are computed without an encoder; see `EncoderModel`."""
 
     has_encoder: ClassVar[bool] = False
 
     name: KindName
     stack: Stack
     hidden: list[Size]
+    memory_ms: TimesMs = dataclasses.field(default_factory=list)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -205,6 +213,8 @@ KINDS = {
         min_side=MIN_IMAGE,
     ),
 }
+# Settings that older files lack, each with the value that does what was done before it existed.
+ADDED_MODEL_SETTINGS: dict[str, object] = {"memory_ms": []}
 RENAMED = {
     "brp_full": "bytestream",
     "brp_xy": "bytestream_xy",
@@ -256,6 +266,16 @@ class PolicySpec:
         if not isinstance(self.model, EncoderModel):
             raise ValueError(f"{self.model.name} has no event VAE")
         return self.model.evae(self.width, self.height)
+
+    @property
+    def memory_ms(self) -> list[float]:
+        """Time constants of what it keeps of the past [ms]; none: it keeps a stack."""
+        return [] if isinstance(self.model, FixedModel) else self.model.memory_ms
+
+    @property
+    def depth(self) -> int:
+        """Features that it keeps of an episode, as `models.policy.memory` does."""
+        return 1 + len(self.memory_ms) if self.memory_ms else self.model.stack
 
     @property
     def hidden(self) -> list[int]:
@@ -314,6 +334,7 @@ def read_spec(values: Mapping[str, object]) -> PolicySpec:
     Raises:
         ValueError: A setting is missing, of another type or out of its range; the message names it.
     """
+    values = {**ADDED_MODEL_SETTINGS, **values}
     name, sizes = values.get("name"), ("width", "height", "num_actions")
     own = model_keys(name) if isinstance(name, str) and name in KINDS else ["name"]
     missing = [key for key in (*own, *sizes) if key not in values]

@@ -17,7 +17,7 @@ from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.run.files import RunError, read_json, write_atomic, write_json
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
-from models.kinds import RENAMED, renamed
+from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
 
 # Sections that do not change what is trained: where a run is computed and recorded, and what is
 # done with its policy afterwards.
@@ -27,6 +27,7 @@ NOT_IN_RUN_NAME = (
 )  # fmt: skip
 # Settings that older run folders lack, each with the value that does what was done before it existed.
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
+    "model": ADDED_MODEL_SETTINGS,
     "algo": {"imitation": None},
     "collect": {"recordings": []},
     "train": {"conditions": [{}]},
@@ -112,11 +113,10 @@ def reopen(path: Path, config: Config) -> Run:
         )
     # Older versions wrote null for the settings that a kind of model does not have.
     values["model"] = {name: value for name, value in values["model"].items() if value is not None}
-    values |= {
-        section: {**added, **values[section]}
-        for section, added in ADDED_SETTINGS.items()
-        if section in values
-    }
+    for section, added in ADDED_SETTINGS.items():
+        if section in values:
+            own = model_keys(model) if section == "model" else added
+            values[section] = {**{name: added[name] for name in added if name in own}, **values[section]}
     run = parse({**values, **here})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
 

@@ -26,7 +26,6 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from jobs.run.watchdog import ending_after
 from jobs.training.rllib_internals import ENV_RUNNER, require
 from jobs.training.snapshots import Snapshot, generators, set_generators
-from models.policy.features import push_features
 
 MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
 
@@ -278,12 +277,11 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         """Start every episode anew; unfinished ones are dropped."""
         seed = self._seed if self._needs_initial_reset else None
         observations, infos = self.env.unwrapped.reset(seed=seed)
-        features = self.module.features(observations)
-        shape = len(features), self.module.observation_space.shape[0], *features.shape[1:]
-        first = np.ones(len(features), bool)
-        self._stacks = push_features(np.empty(shape, features.dtype), features, first)
+        first, space = np.ones(self.env.num_envs, bool), self.module.observation_space
+        self._stacks = np.zeros((len(first), *space.shape), space.dtype)
+        self._stacks = self.module.remember(self._stacks, observations, first)
         self._infos, self._over = infos, ~first
-        self._episodes = [_begun() for _ in features]
+        self._episodes = [_begun() for _ in first]
         self._ongoing_episodes_for_metrics = defaultdict(list)
         self._needs_initial_reset = False
 
@@ -292,7 +290,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         stacks, over = self._stacks, self._over
         actions, outputs = self._decide(stacks)
         observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
-        self._stacks = push_features(stacks, self.module.features(observations), over)
+        self._stacks = self.module.remember(stacks, observations, over)
         self._over = terminated | truncated
         return Step(stacks, actions, outputs, rewards, terminated, truncated, infos, over)
 

@@ -31,7 +31,7 @@ def build_networks(spec: PolicySpec, seed: int = 0) -> nn.ModuleDict:
 
 def assemble(spec: PolicySpec) -> nn.ModuleDict:
     """The parts of a policy's networks (`PARTS`), to be initialised or loaded."""
-    shape = (spec.model.stack, *feature_of(spec).shape(spec))
+    shape = (spec.depth, *feature_of(spec).shape(spec))
     return nn.ModuleDict(dict(zip(PARTS, resolve(spec.kind.network)(shape, spec), strict=True)))
 
 

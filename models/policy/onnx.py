@@ -5,7 +5,7 @@ For robots without Python. The graph is the whole policy, with the preprocessing
     events       int64 (N, 4), t since the window's start [us], x, y [pixels], p (-1 or +1), in time order
     window_us    int64 (), length of the window [us]        (policies that see events)
     luminance    float32 (H, W), linear                     (policies that see luminance)
-    last_stack   (stack, ...), next_stack of the step before; for an episode's first step anything
+    last_stack   (depth, ...), next_stack of the step before; for an episode's first step anything
     first        bool (), whether this is an episode's first step
 
 and gives::
@@ -81,6 +81,7 @@ class PolicyGraph(nn.Module):
         kept = torch.from_numpy(np.empty(0, policy.feature.dtype)).dtype
         self.dtype = torch.int32 if kept == torch.int16 else kept  # of which onnxruntime knows more
         self.size = spec.height, spec.width
+        self.tau_us = torch.tensor([1e3 * time_ms for time_ms in spec.memory_ms])
         self.sees_events = policy.feature.from_events is not None
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
         self.read = self.trunk.plain if isinstance(self.trunk, EventSet) else self.trunk
@@ -111,9 +112,15 @@ class PolicyGraph(nn.Module):
         """Logits and the next stack; inputs as the module's docstring lists them."""
         *seen, stack, first = inputs
         feature = self.feature(self, *seen).to(self.dtype)
-        pushed = torch.cat([stack[1:], feature[None]])
+        newest = feature[None]
+        kept = newest + (stack[:-1] - newest) * self._rest(*seen) if len(self.tau_us) else stack[1:]
+        pushed = torch.cat([kept, newest])
         stack = torch.where(first, feature[None].expand(self.shape), pushed)
         return self.pi(self.read(stack[None]))[0], stack
+
+    def _rest(self, events: Tensor, window_us: Tensor) -> Tensor:
+        """Share (K, 1) of each mean that outlives the step (`models.policy.memory`)."""
+        return torch.exp(-window_us.float() / self.tau_us)[:, None]
 
 
 def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:

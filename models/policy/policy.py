@@ -34,7 +34,8 @@ from models.encoder.weights import (
     write_atomic,
 )
 from models.kinds import PolicySpec, read_spec
-from models.policy.features import LATENT, Step, feature_of, push_features
+from models.policy.features import LATENT, Step, feature_of
+from models.policy.memory import remember, windows_us
 from models.policy.networks import assemble
 
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
@@ -100,8 +101,8 @@ class Policy:
 
     @property
     def stack_shape(self) -> tuple[int, ...]:
-        """Shape of what the networks read for one episode: (stack, *feature), oldest first."""
-        return self.spec.model.stack, *self.feature.shape(self.spec)
+        """Shape of what the networks read for one episode: (depth, *feature), the newest last."""
+        return self.spec.depth, *self.feature.shape(self.spec)
 
     def reset(self, num_envs: int = 1) -> None:
         """Forget everything: the next observations are the first of `num_envs` episodes."""
@@ -144,21 +145,23 @@ class Policy:
             rule = f"this policy takes {self.observation} images, not events"
             raise ValueError(f"{rule}: call it with observations")
         feature = self.feature.from_events(Step(events, start_us, window_us), self.spec, self.encoder)
-        return self._logits(feature[None], None)[0]
+        return self._logits(feature[None], window_us, None)[0]
 
     def logits(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
         """Unnormalised log-probabilities float32 (B, actions); arguments as in a call."""
         features = self.feature.from_observations(observations, self.spec, self.encoder)
-        return self._logits(features, restarted)
+        return self._logits(features, windows_us(observations, self.spec), restarted)
 
-    def _logits(self, features: np.ndarray, restarted: np.ndarray | None) -> np.ndarray:
+    def _logits(
+        self, features: np.ndarray, window_us: np.ndarray | int, restarted: np.ndarray | None
+    ) -> np.ndarray:
         if len(features) != len(self._stacks):
             raise ValueError(
                 f"observations must be one for each of {len(self._stacks)} episodes, got {len(features)}: "
                 "call reset(num_envs) first"
             )
         first = self._first if restarted is None else self._first | restarted
-        self._stacks = push_features(self._stacks, features, first)
+        self._stacks = remember(self._stacks, features, first, self.spec, window_us)
         self._first = np.zeros(len(features), bool)
         with torch.inference_mode():
             logits = self.networks["pi"](self.networks["trunk"](torch.from_numpy(self._stacks))).numpy()

@@ -22,6 +22,7 @@ from models.encoder.frozen import Encoder, read_encoder_part, tabulate
 from models.encoder.weights import EncoderManifest
 from models.kinds import EvaeSettings, PolicySpec
 from models.policy.features import feature_of
+from models.policy.memory import remember, windows_us
 from models.policy.networks import PARTS, build_networks
 
 MET_WINDOWS = 128  # that a module remembers
@@ -43,11 +44,11 @@ class EncoderFile(NamedTuple):
 
 
 def stack_space(spec: PolicySpec) -> gym.spaces.Box:
-    """What the networks read: (stack, *feature), oldest feature first."""
+    """What the networks read: (depth, *feature), as `models.policy.memory` keeps it."""
     feature = feature_of(spec)
     whole = np.issubdtype(feature.dtype, np.integer)
     low, high = (np.iinfo(feature.dtype).min, np.iinfo(feature.dtype).max) if whole else (-np.inf, np.inf)
-    return gym.spaces.Box(low, high, (spec.model.stack, *feature.shape(spec)), feature.dtype)
+    return gym.spaces.Box(low, high, (spec.depth, *feature.shape(spec)), feature.dtype)
 
 
 class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
@@ -102,6 +103,11 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
             self.met.append(cut_packed(observations[self.steps % len(observations)]))
             self.steps += 1
         return feature_of(self.spec).from_observations(observations, self.spec, self._table)
+
+    def remember(self, kept: np.ndarray, observations: np.ndarray, first: np.ndarray) -> np.ndarray:
+        """What the networks read, with the features of the newest observations (`models.policy.memory`)."""
+        features = self.features(observations)
+        return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
 
     def set_state(self, state: Any) -> None:
         """Load weights; the table is built anew only if they change the encoder."""

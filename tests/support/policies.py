@@ -57,7 +57,15 @@ def make_spec(name, **changes):
     """Of a kind of policy, or of "finetuned": bytestream with a fine-tuned encoder."""
     if name == "finetuned":
         return make_spec("bytestream", encoder="finetuned", **changes)
-    own = {"name": name, "stack": 3, "hidden": [64, 64], "context": 64, "latent": 8, "norm": "batch"}
+    own = {
+        "name": name,
+        "stack": 3,
+        "memory_ms": [],
+        "hidden": [64, 64],
+        "context": 64,
+        "latent": 8,
+        "norm": "batch",
+    }
     own |= {"target": "signed", "time_bins": 32, "coding": "additive", "encoder": "frozen", **changes}
     return PolicySpec(read_model(**{key: own[key] for key in model_keys(name)}), SIDE, SIDE, 3)
 

@@ -9,6 +9,7 @@ from models.encoder.evae import EventVAE
 from models.policy import load_policy, save_policy
 from models.policy import onnx as export
 from models.policy.features import Step
+from models.policy.networks import build_networks
 from models.policy.onnx import export_onnx
 from tests.support.encoders import EVENT
 from tests.support.policies import ABOUT, SIDE, TRAINED, kinds, make_networks, make_spec, save
@@ -46,9 +47,12 @@ def fly_exported(file, shown, shape, dtype):
     return np.array(logits)
 
 
-@pytest.fixture(scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet"]))
+@pytest.fixture(scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet", "memory"]))
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
+    if name == "memory":
+        spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0])
+        return save_policy(path, build_networks(spec, seed=3), spec, ABOUT)
     if name not in ("bytestream_xy", "eventnet"):
         return save(path, name)
     torch.manual_seed(0)
@@ -73,7 +77,7 @@ def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(fol
         expected, shown = [], []
         for events in steps():
             made = feature.from_events(Step(events, 0, 5000), policy.spec, policy.encoder)
-            expected.append(policy._logits(made[None], None)[0])
+            expected.append(policy._logits(made[None], 5000, None)[0])
             rows = np.stack([events[name].astype(np.int64) for name in "txyp"], axis=1)
             shown.append({"events": rows, "window_us": np.array(5000)})
     dtype = policy._stacks.dtype if policy._stacks.dtype != np.int16 else np.int32

@@ -1,0 +1,43 @@
+"""What a policy keeps of the past: its last features, or means of them that decay with time.
+
+Kept features are an array (B, depth, ...), the newest last. A stack holds the last ones, whatever time lies
+between them. Decaying means, one for each time constant, say how long something has been so, whatever the
+rate of control: a feature holds until the next one, so that m <- f + (m - f) exp(-dt / tau).
+"""
+
+import numpy as np
+
+from models.kinds import PolicySpec
+from models.policy.features import push_features
+
+
+def remember(
+    kept: np.ndarray, features: np.ndarray, first: np.ndarray, spec: PolicySpec, window_us: np.ndarray | int
+) -> np.ndarray:
+    """Add the newest feature of each episode to what was kept; the first of an episode fills all of it.
+
+    Args:
+        kept: (B, depth, ...).
+        features: (B, ...) of the same type.
+        first: bool (B,), True where the feature is the first of an episode.
+        spec: The policy.
+        window_us: How long each feature took, (B,) or one for all [us]; a stack does not ask.
+
+    Returns:
+        (B, depth, ...), a new array.
+    """
+    if not spec.memory_ms:
+        return push_features(kept, features, first)
+    tau_us = np.float32(1e3) * np.array(spec.memory_ms, np.float32)
+    rest = np.exp(-np.asarray(window_us, np.float32).reshape(-1, 1) / tau_us)
+    rest = rest.reshape(*rest.shape, *(1 for _ in features.shape[1:]))
+    newest = features[:, None]
+    means = newest + (kept[:, :-1] - newest) * rest
+    return np.where(
+        first.reshape(-1, *(1 for _ in features.shape)), newest, np.concatenate([means, newest], 1)
+    )
+
+
+def windows_us(observations: np.ndarray, spec: PolicySpec) -> np.ndarray | int:
+    """How long the window of each observation is [us]; 0 for a policy that does not ask."""
+    return observations[:, 0, 2] if spec.memory_ms else 0

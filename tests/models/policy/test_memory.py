@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+
+from models.kinds import checked, read_model, read_spec
+from models.policy import load_policy, save_policy
+from models.policy.memory import remember
+from models.policy.networks import build_networks
+from tests.support.policies import ABOUT, SIDE, make_evae, make_spec, make_windows
+
+TAUS = [10.0, 30.0, 100.0]
+SPEC = make_spec("event_columns", memory_ms=TAUS)
+
+
+def kept_after(features, window_us):
+    """What is kept of one episode's features (T, n)."""
+    kept = np.zeros((1, SPEC.depth, features.shape[1]), np.float32)
+    for step, feature in enumerate(features):
+        kept = remember(kept, feature[None], np.array([step == 0]), SPEC, window_us[step : step + 1])
+    return kept[0]
+
+
+def test_means_are_those_of_the_whole_past():
+    rng = np.random.default_rng(0)
+    features, window_us = rng.normal(size=(30, 4)).astype("f4"), rng.integers(1000, 40_000, 30)
+    kept = kept_after(features, window_us)
+    np.testing.assert_array_equal(kept[-1], features[-1])
+    since_us = window_us.sum() - np.cumsum(window_us)  # since the end of each step
+    for mean, tau in zip(kept[:-1], TAUS, strict=True):
+        weights = np.exp(-since_us / (1e3 * tau)) - np.exp(-(since_us + window_us) / (1e3 * tau))
+        weights[0] = np.exp(-since_us[0] / (1e3 * tau))  # what was before the first is like the first
+        assert weights.sum() == pytest.approx(1.0)
+        np.testing.assert_allclose(mean, weights @ features, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("parts", [2, 7])
+def test_a_step_in_parts_is_remembered_as_the_whole(parts):
+    rng = np.random.default_rng(1)
+    features, window_us = rng.normal(size=(9, 3)).astype("f4"), rng.integers(5, 50, 9) * 7 * 200
+    whole = kept_after(features, window_us)
+    found = kept_after(np.repeat(features, parts, axis=0), np.repeat(window_us // parts, parts))
+    np.testing.assert_allclose(found, whole, rtol=1e-4, atol=1e-5)
+
+
+def test_an_episode_that_begins_forgets_and_its_neighbours_remember():
+    rng = np.random.default_rng(2)
+    kept, features = rng.normal(size=(3, 4, 5)).astype("f4"), rng.normal(size=(3, 5)).astype("f4")
+    before, first = kept.copy(), np.array([False, True, False])
+    after = remember(kept, features, first, SPEC, 5000)
+    np.testing.assert_array_equal(kept, before)
+    np.testing.assert_array_equal(after[1], np.stack([features[1]] * 4))
+    alone = remember(kept[2:], features[2:], first[2:], SPEC, np.array([5000]))
+    np.testing.assert_array_equal(after[2:], alone)
+    assert after.dtype == np.float32
+
+
+def test_a_policy_with_memory_keeps_it_in_its_folder_and_acts_by_it(tmp_path):
+    evae, spec = make_evae(), make_spec("bytestream", memory_ms=TAUS)
+    networks = build_networks(spec, seed=3)
+    networks["pi"][-1].weight.data.mul_(100.0)
+    policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT, evae))
+    assert policy.spec == spec
+    assert policy.stack_shape == (4, 8)
+    windows = make_windows(np.random.default_rng(0), 12, side=SIDE)
+    windows[6:, 0, 2] = 20_000
+    shown = np.array([policy.logits(window[None])[0] for window in windows])
+    policy.reset()
+    for window, expected in zip(windows, shown, strict=True):
+        count, _, window_us, _ = window[0]
+        t, x, y, p = window[1 : count + 1].T
+        np.testing.assert_array_equal(
+            policy.event_logits({"t": t, "x": x, "y": y, "p": p}, 0, window_us), expected
+        )
+    policy.reset()
+    windows[6:, 0, 2] = 5000
+    faster = np.array([policy.logits(window[None])[0] for window in windows])
+    np.testing.assert_array_equal(faster[:6], shown[:6])
+    assert np.abs(faster[6:] - shown[6:]).max() > 0.0
+
+
+def test_a_policy_from_before_has_a_stack():
+    values = make_spec("bytestream").manifest()
+    del values["memory_ms"]
+    assert read_spec(values) == make_spec("bytestream")
+    assert read_spec(values).depth == 3
+
+
+def test_latents_that_change_while_learning_have_no_memory_in_time():
+    values = make_spec("finetuned").manifest() | {"memory_ms": [10.0]}
+    with pytest.raises(ValueError, match=r"memory_ms must be \[\] for encoder=finetuned, .*got \[10\.0\]"):
+        read_spec(values)
+    with pytest.raises(ValueError, match=r"memory_ms\.0: .*greater than 0, got 0\.0"):
+        checked(read_model, {"name": "event_columns", "stack": 3, "hidden": [8], "memory_ms": [0.0]})
