@@ -9,7 +9,10 @@ from envs.corridor import CorridorEnv
 from envs.scene.planning import cost_to_go
 from jobs.training.imitation import COSTS, ImitationLearner, Lessons, TaughtEnvRunner
 from jobs.training.ppo import build_ppo, corridor_settings
+from models.kinds import KINDS
 from tests.support.configs import SHORT, make_config
+from tests.support.policies import TRAINED, kinds
+from tests.support.runs import write_encoder
 
 WORDS = (*SHORT, "algo=imitation", "model=event_columns", "algo.num_env_runners=0", "train.env_steps=1000")
 SETTINGS = ("algo.imitation.fit_steps=7", "algo.imitation.final_steps=20", "algo.minibatch_size=16")
@@ -162,3 +165,18 @@ def test_algo_imitation_names_both_parts(config):
     assert ppo.env_runner_cls is TaughtEnvRunner
     assert ppo.learner_class is ImitationLearner
     assert ppo.lr == 1e-3
+
+
+@pytest.mark.parametrize("name", kinds(TRAINED, quick=("bytestream",)))
+def test_every_kind_of_policy_can_be_taught(name, tmp_path):
+    own = "model.encoder=finetuned" if name == "finetuned" else f"model={name}"
+    few = "algo.imitation.fit_steps=2", "algo.minibatch_size=8"
+    config = make_config(*SHORT, "algo=imitation", "algo.num_env_runners=0", own, *few)
+    ppo = build_ppo(config, write_encoder(tmp_path, config) if KINDS[config.model.name].encoder else None)
+    runner = TaughtEnvRunner(config=ppo, worker_index=0)
+    learner = ppo.build_learner(env=runner.env)
+    before = [value.clone() for value in learner.module["default_policy"].pi.parameters()]
+    learner.update(episodes=runner.sample(num_timesteps=16), timesteps={SAMPLED: 16}, minibatch_size=8)
+    after = list(learner.module["default_policy"].pi.parameters())
+    assert all(not torch.equal(one, other) for one, other in zip(before, after, strict=True))
+    runner.stop()
