@@ -272,29 +272,33 @@ class CorridorVectorEnv(VectorEnv):
         self._take(actions, ~over)
         for row in np.flatnonzero(over):
             self.envs[row].begin(None, None)
-        rows = self._flights.rows
-        terminated, truncated = rows["success"] | rows["collision"], rows["truncated"].copy()
-        self._over = terminated | truncated
-        return self._observations(), rows["reward"].copy(), terminated, truncated, self.tell()
+        results = self._results()
+        self._over = results[2] | results[3]
+        return results
 
-    def step_some(self, actions: np.ndarray, active: np.ndarray) -> Any:
-        """Step the active environments, in one compiled call, and leave the others as they are.
+    def step_some(
+        self, actions: np.ndarray, active: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Step the active environments and leave the others as they are; as `step`, but nothing is reset.
 
         Args:
             actions: Integers (B,), those of the others are ignored.
-            active: bool (B,).
-
-        Returns:
-            Observations of all; an environment that was not stepped has no events.
+            active: bool (B,). What is returned of the others is their last step, without its events.
 
         Raises:
             ResetNeeded: The episode of an active one is over, or has not begun.
             ValueError: As `step`.
         """
         self._take(actions, active)
-        return self._observations()
+        return self._results()
+
+    def _results(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        rows = self._flights.rows
+        terminated, truncated = rows["success"] | rows["collision"], rows["truncated"].copy()
+        return self._observations(), rows["reward"].copy(), terminated, truncated, self.tell()
 
     def _take(self, actions: np.ndarray, active: np.ndarray) -> None:
+        """One control step of the active environments."""
         taken, rows = np.asarray(actions), self._flights.rows
         if taken.shape != (self.num_envs,):
             raise ValueError(f"actions must number {self.num_envs}; got {len(actions)}.")

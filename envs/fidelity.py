@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numba
-import numpy as np
 
 from envs.config import EnvConfig
 from envs.events.ramps import can_look
@@ -112,13 +111,14 @@ def sub_renders(step_m: float, max_step_m: float) -> int:
     """
     if not (0.0 <= step_m < math.inf and max_step_m > 0.0):
         raise ValueError(f"step_m must be finite and >= 0, max_step_m > 0; got {step_m}, {max_step_m}")
-    return int(parts_of(step_m, max_step_m))
+    parts: int = parts_of(step_m, max_step_m)
+    return parts
 
 
 @numba.njit(cache=True, error_model="numpy")
 def parts_of(step_m: float, max_step_m: float) -> int:
     """As `sub_renders`, of valid numbers."""
-    return max(1, np.int64(np.ceil(step_m / max_step_m * (1.0 - 1e-9))))
+    return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
 
 
 def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:

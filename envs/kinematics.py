@@ -92,7 +92,7 @@ def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[in
 @numba.njit(cache=True, error_model="numpy")
 def clock_us(step: int, control_hz: float) -> int:
     """Simulated time at the end of a control step [us], from the count: it does not drift."""
-    return np.int64(np.rint(step * 1e6 / control_hz))
+    return round(step * 1e6 / control_hz)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -21,10 +21,11 @@ def observation_space(config: EnvConfig) -> spaces.Space:
         "none": uint8 (0,).
     """
     shape = (config.camera.height, config.camera.width)
-    if config.observation == "window" and config.window_capacity is None:
-        return spaces.Sequence(spaces.Box(-1, np.iinfo(np.int32).max, (4,), np.int32), stack=True)
     if config.observation == "window":
-        return spaces.Box(-1, np.iinfo(np.int32).max, (config.window_capacity + 1, 4), np.int32)
+        capacity, most = config.window_capacity, np.iinfo(np.int32).max
+        if capacity is None:
+            return spaces.Sequence(spaces.Box(-1, most, (4,), np.int32), stack=True)
+        return spaces.Box(-1, most, (capacity + 1, 4), np.int32)
     if config.observation == "event_image":
         return spaces.Box(0, 255, shape, np.uint8)
     if config.observation == "luminance":

@@ -189,7 +189,7 @@ class Sensor:
 
 
 def check_sensed(bad: int, way: Way, image: np.ndarray) -> None:
-    """Raise ValueError for what `sense_way` found to be wrong, if anything, with the `image` that it painted."""
+    """Raise ValueError for what `sense_way` found to be wrong, if anything; `image` is what it painted."""
     if bad == BAD_POSE:
         check_pose((way.end_x, way.end_y, way.height, 0.0), (way.start_us + way.moving_us) * 1e-6)
     if bad >= 0:

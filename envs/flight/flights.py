@@ -1,43 +1,15 @@
-"""Vehicles on their way through corridors, and one control step of many of them in one compiled call.
-
-The call moves each vehicle, finds contact and goal, and simulates the camera of every sensor that
-sees by looks (`envs.sensor`). Other sensors, and faults, take their turn in Python afterwards.
-"""
+"""Vehicles side by side: where each is, and what its last step brought."""
 
 from typing import Any
 
-import numba
 import numpy as np
-from numba.typed import List
 
 from envs.config import EnvConfig
 from envs.events import EVENT
-from envs.fidelity import parts_of
-from envs.kinematics import Lane, Outcome, advance, clock_us, planned_position
-from envs.raycast.silhouettes import Way
+from envs.flight.step import BAD_REWARD, FLIGHT, GOOD, fly, line_up, put, way_of
+from envs.kinematics import Outcome, clock_us
 from envs.scene import Scene
-from envs.sensor import Sensor, check_sensed, sense_way
-
-GOOD, BAD_REWARD = -1, -10
-
-_FLOATS = (
-    *("spawn_x_m", "x_m", "y_m"),
-    *("speed_mps", "control_hz", "radius_m", "height_m", "half_width_m", "length_m"),
-    *("max_step_m", "limit_us"),  # way between two renders, and when the time is up
-    # The last step: where it began, the share of it that was flown, its reward, its renders.
-    *("start_x_m", "start_y_m", "share", "reward", "renders"),
-)
-_WHOLE = (
-    *("forward", "left", "right"),  # how often each action was taken
-    *("start_us", "t_us", "window_us"),  # when the last step began and ended; its length, or that of the first
-    *("num_events", "dropped"),  # events of it, and those that the camera lost in it
-    "problem",  # `GOOD`, `BAD_REWARD`, or what `sense_way` says
-)
-_FLAGS = ("by_looks", "success", "collision", "truncated", "over")
-FLIGHT = np.dtype(
-    [(name, "f8") for name in _FLOATS] + [(name, "i8") for name in _WHOLE] + [(name, "?") for name in _FLAGS],
-    align=True,
-)
+from envs.sensor import Sensor, check_sensed
 
 
 class FlightError(ValueError):
@@ -152,93 +124,3 @@ class Flights:
             check_sensed(int(flight["problem"]), way_of(flight), sensor.view().scratch.image)
         except ValueError as error:
             raise FlightError(row, str(error)) from error
-
-
-@numba.njit(cache=True, error_model="numpy")
-def line_up(corridor, count):
-    """A list with `count` times the same corridor: level sections of what stands there, and a `View`."""
-    corridors = List()
-    for _ in range(count):
-        corridors.append(corridor)
-    return corridors
-
-
-@numba.njit(cache=True, error_model="numpy")
-def put(corridors, row, corridor):
-    """Exchange one corridor of a list."""
-    corridors[row] = corridor
-
-
-@numba.njit(cache=True, error_model="numpy")
-def fly(rows, corridors, actions, active):
-    """One control step of all active vehicles.
-
-    Args:
-        rows: (B,) FLIGHT, changed in place.
-        corridors: A list of B, see `line_up`.
-        actions: int64 (B,).
-        active: bool (B,).
-
-    Returns:
-        EVENT of those that see by looks, vehicle after vehicle; int64 (B + 1,), where the events of each end.
-    """
-    found, ends = [np.empty(0, EVENT)], np.zeros(rows.size + 1, np.int64)
-    for row in range(rows.size):
-        ends[row + 1] = ends[row]
-        if active[row]:
-            sections, view = corridors[row]
-            _move(rows[row], actions[row], sections)
-            if rows[row].by_looks and rows[row].problem == GOOD:
-                events = _look(rows[row], view)
-                found.append(events)
-                ends[row + 1] += events.size
-            rows[row].over |= rows[row].problem != GOOD
-    together, size = np.empty(ends[-1], EVENT), 0
-    for events in found:
-        together[size : size + events.size] = events
-        size += events.size
-    return together, ends
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _move(flight, action, sections):
-    """Move a vehicle, and say what that brought."""
-    flight.forward += action == 0
-    flight.left += action == 1
-    flight.right += action == 2
-    moves, step_m = (flight.forward, flight.left, flight.right), (flight.speed_mps, flight.control_hz)
-    lane = Lane(flight.radius_m, flight.half_width_m, flight.length_m)
-    start = flight.x_m, flight.y_m
-    outcome = advance(lane, sections, start, planned_position(flight.spawn_x_m, moves, step_m))
-    flight.start_x_m, flight.start_y_m = start
-    flight.x_m, flight.y_m = outcome.end
-    flight.share, flight.reward = outcome.share, outcome.reward
-    flight.success, flight.collision = outcome.success, outcome.collision
-    flight.start_us, flight.t_us = flight.t_us, clock_us(sum(moves), flight.control_hz)
-    flight.window_us = flight.t_us - flight.start_us
-    flight.dropped, flight.renders = 0, 0.0
-    ended = outcome.success or outcome.collision
-    flight.truncated = not ended and flight.t_us >= flight.limit_us
-    flight.over = ended or flight.truncated
-    flight.problem = GOOD if np.isfinite(outcome.reward) else BAD_REWARD
-
-
-@numba.njit(cache=True, error_model="numpy")
-def way_of(flight):
-    """The `Way` of the last step, up to where the vehicle stopped."""
-    moving_us = np.int64(np.rint(flight.share * flight.window_us))
-    place = flight.start_x_m, flight.start_y_m, flight.x_m, flight.y_m
-    return Way(place[0], place[1], place[2], place[3], flight.height_m, flight.start_us, moving_us)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _look(flight, view):
-    """Events of the last step of a vehicle; it stands still, and sees nothing, once it has stopped."""
-    way = way_of(flight)
-    if way.moving_us == 0:
-        return np.empty(0, EVENT)
-    way_m = flight.share * flight.speed_mps / flight.control_hz
-    parts = min(parts_of(way_m, flight.max_step_m), way.moving_us)
-    flight.problem, flight.dropped, columns, events = sense_way(view, way, parts)
-    flight.renders = columns / view.seen_us.size
-    return events
