@@ -12,7 +12,8 @@ import numba
 import numpy as np
 
 from envs.checks import LIMIT_M, LIMIT_S
-from envs.events.crossings import named
+from envs.compiled import kernel
+from envs.events.crossings import Room, make_room, named
 from envs.events.emission import EVENT, Span
 from envs.events.ramps import Ramps, Watch, events_of_ramps, look_at, make_ramps
 from envs.raycast.columns import Workspace, make_workspace, paint_columns
@@ -39,6 +40,7 @@ class Scratch(NamedTuple):
         pixels: As `crossings.steps` takes its scratch.
         ramps: For three times as many pixels as the image has.
         looks: For the looks at it.
+        block: For a block of pixels.
     """
 
     room: Workspace
@@ -46,6 +48,7 @@ class Scratch(NamedTuple):
     pixels: tuple[np.ndarray, np.ndarray]
     ramps: Ramps
     looks: Looks
+    block: Room
 
 
 class View(NamedTuple):
@@ -87,6 +90,7 @@ def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
         pixels=(np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)),
         ramps=make_ramps(3 * size),
         looks=make_looks(width),
+        block=make_room(),
     )
 
 
@@ -103,9 +107,9 @@ def sense_way(view, way, parts):
         First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
     """
     bodies, stacks, cull, seen_us = view.bodies, view.stacks, view.cull_m, view.seen_us
-    room, image, pixels, ramps, looks = view.scratch
+    room, image, pixels, ramps, looks, block = view.scratch
     model, memory = named(view.model, view.memory)
-    watch = Watch(model, memory, seen_us, pixels, ramps)
+    watch = Watch(model, memory, seen_us, pixels, ramps, block)
     frame, width = room.frames[0], image.shape[1]
     room.frames[0] = view.frame[0]
     if not _is_near(way):
@@ -129,7 +133,7 @@ def sense_way(view, way, parts):
             t_us, first, last = end_us, 0, width
             if k < count:
                 t_us, first, last = looks.t_us[k], looks.first[k], looks.last[k]
-                if kept + 2 * image.size > ramps.pixels.size or seen_us[first:last].max() >= t_us:
+                if kept + 2 * image.size > ramps.pixels.size or _is_seen(seen_us, first, last, t_us):
                     continue
             aim_along(frame, way, t_us)
             paint_columns(bodies, stacks, image, first, last, cull, room)
@@ -143,7 +147,16 @@ def sense_way(view, way, parts):
     return -1, lost, columns, events
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
+def _is_seen(seen_us, first, last, t_us):
+    """Whether one of some columns was looked at as late as that, or later."""
+    latest = seen_us[first]
+    for column in range(first + 1, last):
+        latest = max(latest, seen_us[column])
+    return latest >= t_us
+
+
+@kernel
 def _is_near(way):
     """Whether `envs.checks.check_pose` would accept the end of a way."""
     near = abs(way.end_x) <= LIMIT_M and abs(way.end_y) <= LIMIT_M and 0.0 <= way.height <= LIMIT_M
