@@ -23,10 +23,10 @@ from gymnasium.vector.utils import batch_space
 from envs import kinematics
 from envs.config import EnvConfig
 from envs.events.windows import pack_windows
-from envs.flight import FlightError, Flights
 from envs.observations import observation_space, observe, picture
 from envs.scene import make_scene
 from envs.sensor import Sensor
+from envs.vehicles import StepError, Vehicles
 
 
 class Info(TypedDict):
@@ -87,11 +87,11 @@ class CorridorEnv(gymnasium.Env):
         self.observation_space = observation_space(self.config)
         self._sensor = Sensor(self.config)
         self.series: tuple[int | None, int] = None, 0
-        self._flights, self._row = Flights(1), 0
+        self._vehicles, self._row = Vehicles(1), 0
 
-    def join(self, flights: Flights, row: int) -> None:
-        """Fly beside others, as one row of `flights`, from the next reset on."""
-        self._flights, self._row = flights, row
+    def join(self, vehicles: Vehicles, row: int) -> None:
+        """Fly beside others, as one row of `vehicles`, from the next reset on."""
+        self._vehicles, self._row = vehicles, row
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, object] | None = None
@@ -123,7 +123,7 @@ class CorridorEnv(gymnasium.Env):
         self.scene = make_scene(config.scene, scene_rng, *vehicle, **config.layout)
         spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
         self._sensor.reset(self.scene, (spawn_x, 0.0), faults_rng)
-        self._flights.start(self._row, config, self.scene, self._sensor, spawn_x)
+        self._vehicles.start(self._row, config, self.scene, self._sensor, spawn_x)
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Simulate one control step.
@@ -134,19 +134,19 @@ class CorridorEnv(gymnasium.Env):
                 infinite, with the episode, step and seed named.
         """
         row = self._row
-        if self._flights.rows["over"][row]:
+        if self._vehicles.rows["over"][row]:
             raise ResetNeeded("The episode is over or has not begun; call reset() before step().")
         if not self.action_space.contains(action):
             raise ValueError(_bad_action(action))
-        active = np.zeros(len(self._flights.rows), bool)
+        active = np.zeros(len(self._vehicles.rows), bool)
         active[row] = True
         try:
-            self._flights.step(np.full(active.size, action, np.int64), active)
-        except FlightError as error:
+            self._vehicles.step(np.full(active.size, action, np.int64), active)
+        except StepError as error:
             raise ValueError(f"{self.name_step()}: {error}") from error
-        info, flight = self._info(), self._flights.rows[row]
+        info, vehicle = self._info(), self._vehicles.rows[row]
         terminated = info["success"] or info["collision"]
-        return self._observation(), float(flight["reward"]), terminated, bool(flight["truncated"]), info
+        return self._observation(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
 
     def render(self) -> Any:
         """Luminance beside the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
@@ -162,7 +162,7 @@ class CorridorEnv(gymnasium.Env):
 
         One of a vector environment has those of the vector's last step.
         """
-        return self._flights.events_of(self._row)
+        return self._vehicles.events_of(self._row)
 
     @property
     def luminance(self) -> np.ndarray:
@@ -171,25 +171,25 @@ class CorridorEnv(gymnasium.Env):
 
     def camera_pose(self) -> tuple[float, float, float, float]:
         """Where the camera is: x, y, z [m] and yaw [rad]."""
-        flight = self._flights.rows[self._row]
-        return float(flight["x_m"]), float(flight["y_m"]), self.config.camera_height_m, 0.0
+        vehicle = self._vehicles.rows[self._row]
+        return float(vehicle["x_m"]), float(vehicle["y_m"]), self.config.camera_height_m, 0.0
 
     def name_step(self) -> str:
         """Episode, step and seed, for an error."""
-        flight, (seed, number) = self._flights.rows[self._row], self.series
-        steps = flight["forward"] + flight["left"] + flight["right"]
+        vehicle, (seed, number) = self._vehicles.rows[self._row], self.series
+        steps = vehicle["forward"] + vehicle["left"] + vehicle["right"]
         return f"episode {number}, step {steps}, seed {seed}"
 
     def _observation(self) -> np.ndarray:
         """What is observed of the last step."""
         if self.config.observation != "window":
             return observe(self.config, self.events, self.luminance)
-        row, events = self._flights.rows[self._row : self._row + 1], self.events
+        row, events = self._vehicles.rows[self._row : self._row + 1], self.events
         ends = np.array([0, events.size])
         return pack_windows(events, ends, row["start_us"], row["window_us"], self.config.window_capacity)[0]
 
     def _info(self) -> Info:
-        told = _tell([self], self._flights.rows[self._row : self._row + 1])
+        told = _tell([self], self._vehicles.rows[self._row : self._row + 1])
         return cast(Info, {name: values.tolist()[0] for name, values in told.items()})
 
 
@@ -232,9 +232,9 @@ class CorridorVectorEnv(VectorEnv):
         self.metadata = {**self.metadata, "render_fps": self.envs[0].metadata["render_fps"]}
         self.single_observation_space = self.envs[0].observation_space
         self.single_action_space = self.envs[0].action_space
-        self._flights = Flights(num_envs)
+        self._vehicles = Vehicles(num_envs)
         for row, env in enumerate(self.envs):
-            env.join(self._flights, row)
+            env.join(self._vehicles, row)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._over = np.zeros(num_envs, bool)
@@ -255,7 +255,7 @@ class CorridorVectorEnv(VectorEnv):
         self._over[:] = False
         for env, own_seed in zip(self.envs, seeds, strict=True):
             env.begin(own_seed, options)
-        self._flights.forget_events()
+        self._vehicles.forget_events()
         return self._observations(), self.tell()
 
     def step(
@@ -293,13 +293,13 @@ class CorridorVectorEnv(VectorEnv):
         return self._results()
 
     def _results(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        rows = self._flights.rows
+        rows = self._vehicles.rows
         terminated, truncated = rows["success"] | rows["collision"], rows["truncated"].copy()
         return self._observations(), rows["reward"].copy(), terminated, truncated, self.tell()
 
     def _take(self, actions: np.ndarray, active: np.ndarray) -> None:
         """One control step of the active environments."""
-        taken, rows = np.asarray(actions), self._flights.rows
+        taken, rows = np.asarray(actions), self._vehicles.rows
         if taken.shape != (self.num_envs,):
             raise ValueError(f"actions must number {self.num_envs}; got {len(actions)}.")
         if (rows["over"] & active).any():
@@ -308,13 +308,13 @@ class CorridorVectorEnv(VectorEnv):
         if wrong.any():
             raise ValueError(_bad_action(taken[wrong.argmax()]))
         try:
-            self._flights.step(taken.astype(np.int64), active)
-        except FlightError as error:
+            self._vehicles.step(taken.astype(np.int64), active)
+        except StepError as error:
             raise ValueError(f"{self.envs[error.row].name_step()}: {error}") from error
 
     def tell(self) -> dict[str, np.ndarray]:
         """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
-        told, mask = _tell(self.envs, self._flights.rows), np.ones(self.num_envs, bool)
+        told, mask = _tell(self.envs, self._vehicles.rows), np.ones(self.num_envs, bool)
         return told | {f"_{name}": mask for name in told}
 
     def replay(
@@ -354,11 +354,11 @@ class CorridorVectorEnv(VectorEnv):
 
     def _observations(self) -> Any:
         """What all observe of the last step."""
-        config, flights = self.envs[0].config, self._flights
+        config, vehicles = self.envs[0].config, self._vehicles
         if config.observation != "window":
             return self._batch([observe(env.config, env.events, env.luminance) for env in self.envs])
-        clocks = flights.rows["start_us"], flights.rows["window_us"]
-        return pack_windows(flights.events, flights.ends, *clocks, config.window_capacity)
+        clocks = vehicles.rows["start_us"], vehicles.rows["window_us"]
+        return pack_windows(vehicles.events, vehicles.ends, *clocks, config.window_capacity)
 
     def _batch(self, observations: Any) -> Any:
         """Observations as one fresh array; those that differ in length stay a tuple."""
@@ -368,7 +368,7 @@ class CorridorVectorEnv(VectorEnv):
 
 
 def _tell(envs: Sequence[CorridorEnv], rows: np.ndarray) -> dict[str, np.ndarray]:
-    """`Info` of several environments, each value an array; `rows` are their FLIGHT."""
+    """`Info` of several environments, each value an array; `rows` are their VEHICLE."""
     config, lost = envs[0].config, rows["dropped"].copy()
     if config.observation == "window" and config.window_capacity is not None:
         lost += np.maximum(rows["num_events"] - config.window_capacity, 0)

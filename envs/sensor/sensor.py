@@ -25,7 +25,7 @@ class Sensor:
     Only what is observed is simulated: with observation "luminance" one render a step and no event
     camera, with "none" a clock alone.
 
-    A step that is seen by looks needs no more than `view`, so that `envs.flight` can take those of many
+    A step that is seen by looks needs no more than `view`, so that `envs.vehicles` can take those of many
     sensors together; such a sensor is not stepped by itself then, and its clock stands still.
 
     Attributes:

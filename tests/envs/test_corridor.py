@@ -40,7 +40,7 @@ def straight(env, seed=0, **options):
 
 
 def flight_bytes(env, seed, actions):
-    """All that a flight gives, as bytes; it starts again when it is over."""
+    """All that a vehicle gives, as bytes; it starts again when it is over."""
     observation, info = env.reset(seed=seed)
     seen = [observation.tobytes(), repr(info)]
     for action in actions:
@@ -101,7 +101,7 @@ def test_a_collision_returns_the_metres_to_the_contact_less_100():
             gaps = [math.dist((pole["x"], pole["y"]), here) - pole["rx"] for pole in env.scene.obstacles]
             assert min(gaps) == pytest.approx(0.3, abs=1e-6)
             return
-    pytest.fail("no flight met a pole")
+    pytest.fail("no vehicle met a pole")
 
 
 @pytest.mark.parametrize("action", [1, 2])
@@ -284,7 +284,7 @@ def test_a_bad_number_stops_the_flight_naming_episode_step_and_seed():
 def test_a_reward_that_is_not_finite_is_refused():
     env = CorridorEnv(camera=SMALL)
     env.reset(seed=3)
-    env._flights.rows["y_m"] = math.nan
+    env._vehicles.rows["y_m"] = math.nan
     with pytest.raises(ValueError, match=r"episode 0, step 1, seed 3: the reward must be finite; got nan"):
         env.step(0)
     with pytest.raises(ResetNeeded):

@@ -6,13 +6,13 @@ import numpy as np
 
 from envs.config import EnvConfig
 from envs.events import EVENT
-from envs.flight.step import BAD_REWARD, FLIGHT, GOOD, fly, line_up, put, way_of
 from envs.kinematics import Outcome, clock_us
 from envs.scene import Scene
 from envs.sensor import Sensor, check_sensed
+from envs.vehicles.step import BAD_REWARD, GOOD, VEHICLE, line_up, put, step_all, way_of
 
 
-class FlightError(ValueError):
+class StepError(ValueError):
     """A step that went wrong, and the row of the vehicle."""
 
     def __init__(self, row: int, reason: str) -> None:
@@ -21,18 +21,18 @@ class FlightError(ValueError):
         self.row = row
 
 
-class Flights:
+class Vehicles:
     """Vehicles side by side, each in a corridor of its own.
 
     Attributes:
-        rows: (B,) FLIGHT, where each is and what its last step brought.
+        rows: (B,) VEHICLE, where each is and what its last step brought.
         events: EVENT of the last step of all, vehicle after vehicle, faults included.
         ends: int64 (B + 1,), vehicle b has events ends[b] .. ends[b + 1] - 1.
     """
 
     def __init__(self, count: int) -> None:
         """Room for `count` vehicles, none of which has started."""
-        self.rows = np.zeros(count, FLIGHT)
+        self.rows = np.zeros(count, VEHICLE)
         self.rows["over"] = True
         self._sensors: list[Sensor | None] = [None] * count
         self._by_hand: set[int] = set()
@@ -41,15 +41,15 @@ class Flights:
 
     def start(self, row: int, config: EnvConfig, scene: Scene, sensor: Sensor, spawn_x_m: float) -> None:
         """Put a vehicle at the start of a scene that its sensor has been reset to."""
-        flight = self.rows[row : row + 1]
-        flight[:] = np.zeros(1, FLIGHT)
-        flight["spawn_x_m"] = flight["x_m"] = spawn_x_m
-        flight["speed_mps"], flight["control_hz"] = config.speed_mps, config.control_hz
-        flight["radius_m"], flight["height_m"] = config.vehicle_radius_m, config.camera_height_m
-        flight["half_width_m"], flight["length_m"] = 0.5 * scene.width_m, scene.length_m
-        flight["limit_us"], flight["by_looks"] = config.time_limit_s * 1e6, sensor.sees_by_looks
-        flight["max_step_m"] = sensor.plan.max_step_m if sensor.sees_by_looks else np.inf
-        flight["window_us"], flight["problem"] = clock_us(1, config.control_hz), GOOD
+        vehicle = self.rows[row : row + 1]
+        vehicle[:] = np.zeros(1, VEHICLE)
+        vehicle["spawn_x_m"] = vehicle["x_m"] = spawn_x_m
+        vehicle["speed_mps"], vehicle["control_hz"] = config.speed_mps, config.control_hz
+        vehicle["radius_m"], vehicle["height_m"] = config.vehicle_radius_m, config.camera_height_m
+        vehicle["half_width_m"], vehicle["length_m"] = 0.5 * scene.width_m, scene.length_m
+        vehicle["limit_us"], vehicle["by_looks"] = config.time_limit_s * 1e6, sensor.sees_by_looks
+        vehicle["max_step_m"] = sensor.plan.max_step_m if sensor.sees_by_looks else np.inf
+        vehicle["window_us"], vehicle["problem"] = clock_us(1, config.control_hz), GOOD
         self._sensors[row] = sensor
         corridor = scene.sections(config.camera_height_m), sensor.view()
         if self._corridors is None:
@@ -69,10 +69,10 @@ class Flights:
             active: bool (B,); others stay as they are, without events. At least one vehicle has started.
 
         Raises:
-            FlightError: A number became NaN or infinite; the vehicle's flight is over.
+            StepError: A number became NaN or infinite; the vehicle's episode is over.
         """
         rows = self.rows
-        self.events, self.ends = fly(rows, self._corridors, actions, active)
+        self.events, self.ends = step_all(rows, self._corridors, actions, active)
         wrong = rows["problem"] != GOOD
         if wrong.any():
             self._refuse(int((wrong & active).argmax()))
@@ -97,30 +97,30 @@ class Flights:
 
     def _sense(self, row: int, events: np.ndarray) -> np.ndarray:
         """Events of a step that the compiled call has not simulated to the end."""
-        flight, sensor = self.rows[row], self._sensors[row]
+        vehicle, sensor = self.rows[row], self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
-        start_us, t_us = int(flight["start_us"]), int(flight["t_us"])
+        start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
         try:
-            if flight["by_looks"]:
+            if vehicle["by_looks"]:
                 return sensor.spoil(events, start_us, t_us)
-            end = float(flight["x_m"]), float(flight["y_m"])
-            share, ends = float(flight["share"]), (bool(flight["success"]), bool(flight["collision"]))
-            outcome = Outcome(end, share, float(flight["reward"]), *ends)
-            sensor.step((float(flight["start_x_m"]), float(flight["start_y_m"])), outcome, t_us)
+            end = float(vehicle["x_m"]), float(vehicle["y_m"])
+            share, ends = float(vehicle["share"]), (bool(vehicle["success"]), bool(vehicle["collision"]))
+            outcome = Outcome(end, share, float(vehicle["reward"]), *ends)
+            sensor.step((float(vehicle["start_x_m"]), float(vehicle["start_y_m"])), outcome, t_us)
         except ValueError as error:
-            flight["over"] = True
-            raise FlightError(row, str(error)) from error
-        flight["dropped"], flight["renders"] = sensor.dropped, sensor.renders
+            vehicle["over"] = True
+            raise StepError(row, str(error)) from error
+        vehicle["dropped"], vehicle["renders"] = sensor.dropped, sensor.renders
         return sensor.events
 
     def _refuse(self, row: int) -> None:
         """Raise the error of a step that the compiled call has found."""
-        flight, sensor = self.rows[row].copy(), self._sensors[row]
+        vehicle, sensor = self.rows[row].copy(), self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
-        if flight["problem"] == BAD_REWARD:
-            way = f"from {flight['start_x_m']}, {flight['start_y_m']} to {flight['x_m']}, {flight['y_m']}"
-            raise FlightError(row, f"the reward must be finite; got {flight['reward']} on the way {way}.")
+        if vehicle["problem"] == BAD_REWARD:
+            way = f"from {vehicle['start_x_m']}, {vehicle['start_y_m']} to {vehicle['x_m']}, {vehicle['y_m']}"
+            raise StepError(row, f"the reward must be finite; got {vehicle['reward']} on the way {way}.")
         try:
-            check_sensed(int(flight["problem"]), way_of(flight), sensor.view().scratch.image)
+            check_sensed(int(vehicle["problem"]), way_of(vehicle), sensor.view().scratch.image)
         except ValueError as error:
-            raise FlightError(row, str(error)) from error
+            raise StepError(row, str(error)) from error

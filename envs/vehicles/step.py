@@ -20,7 +20,7 @@ _FLOATS = (
     *("spawn_x_m", "x_m", "y_m"),
     *("speed_mps", "control_hz", "radius_m", "height_m", "half_width_m", "length_m"),
     *("max_step_m", "limit_us"),  # way between two renders, and when the time is up
-    # The last step: where it began, the share of it that was flown, its reward, its renders.
+    # The last step: where it began, the share of it that it moved, its reward, its renders.
     *("start_x_m", "start_y_m", "share", "reward", "renders"),
 )
 _WHOLE = (
@@ -34,7 +34,7 @@ _WHOLE = (
     "problem",  # `GOOD`, `BAD_REWARD`, or what `sense_way` says
 )
 _FLAGS = ("by_looks", "success", "collision", "truncated", "over")
-FLIGHT = np.dtype(
+VEHICLE = np.dtype(
     [(name, "f8") for name in _FLOATS] + [(name, "i8") for name in _WHOLE] + [(name, "?") for name in _FLAGS],
     align=True,
 )
@@ -56,11 +56,11 @@ def put(corridors, row, corridor):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fly(rows, corridors, actions, active):
+def step_all(rows, corridors, actions, active):
     """One control step of all active vehicles.
 
     Args:
-        rows: (B,) FLIGHT, changed in place.
+        rows: (B,) VEHICLE, changed in place.
         corridors: A list of B, see `line_up`.
         actions: int64 (B,).
         active: bool (B,).
@@ -87,44 +87,44 @@ def fly(rows, corridors, actions, active):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _move(flight, action, sections):
+def _move(vehicle, action, sections):
     """Move a vehicle, and say what that brought."""
-    flight.forward += action == 0
-    flight.left += action == 1
-    flight.right += action == 2
-    moves, step_m = (flight.forward, flight.left, flight.right), (flight.speed_mps, flight.control_hz)
-    lane = Lane(flight.radius_m, flight.half_width_m, flight.length_m)
-    start = flight.x_m, flight.y_m
-    outcome = advance(lane, sections, start, planned_position(flight.spawn_x_m, moves, step_m))
-    flight.start_x_m, flight.start_y_m = start
-    flight.x_m, flight.y_m = outcome.end
-    flight.share, flight.reward = outcome.share, outcome.reward
-    flight.success, flight.collision = outcome.success, outcome.collision
-    flight.start_us, flight.t_us = flight.t_us, clock_us(sum(moves), flight.control_hz)
-    flight.window_us = flight.t_us - flight.start_us
-    flight.dropped, flight.renders = 0, 0.0
+    vehicle.forward += action == 0
+    vehicle.left += action == 1
+    vehicle.right += action == 2
+    moves, step_m = (vehicle.forward, vehicle.left, vehicle.right), (vehicle.speed_mps, vehicle.control_hz)
+    lane = Lane(vehicle.radius_m, vehicle.half_width_m, vehicle.length_m)
+    start = vehicle.x_m, vehicle.y_m
+    outcome = advance(lane, sections, start, planned_position(vehicle.spawn_x_m, moves, step_m))
+    vehicle.start_x_m, vehicle.start_y_m = start
+    vehicle.x_m, vehicle.y_m = outcome.end
+    vehicle.share, vehicle.reward = outcome.share, outcome.reward
+    vehicle.success, vehicle.collision = outcome.success, outcome.collision
+    vehicle.start_us, vehicle.t_us = vehicle.t_us, clock_us(sum(moves), vehicle.control_hz)
+    vehicle.window_us = vehicle.t_us - vehicle.start_us
+    vehicle.dropped, vehicle.renders = 0, 0.0
     ended = outcome.success or outcome.collision
-    flight.truncated = not ended and flight.t_us >= flight.limit_us
-    flight.over = ended or flight.truncated
-    flight.problem = GOOD if np.isfinite(outcome.reward) else BAD_REWARD
+    vehicle.truncated = not ended and vehicle.t_us >= vehicle.limit_us
+    vehicle.over = ended or vehicle.truncated
+    vehicle.problem = GOOD if np.isfinite(outcome.reward) else BAD_REWARD
 
 
 @numba.njit(cache=True, error_model="numpy")
-def way_of(flight):
+def way_of(vehicle):
     """The `Way` of the last step, up to where the vehicle stopped."""
-    moving_us = round(flight.share * flight.window_us)
-    place = flight.start_x_m, flight.start_y_m, flight.x_m, flight.y_m
-    return Way(place[0], place[1], place[2], place[3], flight.height_m, flight.start_us, moving_us)
+    moving_us = round(vehicle.share * vehicle.window_us)
+    place = vehicle.start_x_m, vehicle.start_y_m, vehicle.x_m, vehicle.y_m
+    return Way(place[0], place[1], place[2], place[3], vehicle.height_m, vehicle.start_us, moving_us)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _look(flight, view):
+def _look(vehicle, view):
     """Events of the last step of a vehicle; it stands still, and sees nothing, once it has stopped."""
-    way = way_of(flight)
+    way = way_of(vehicle)
     if way.moving_us == 0:
         return np.empty(0, EVENT)
-    way_m = flight.share * flight.speed_mps / flight.control_hz
-    parts = min(parts_of(way_m, flight.max_step_m), way.moving_us)
-    flight.problem, flight.dropped, columns, events = sense_way(view, way, parts)
-    flight.renders = columns / view.seen_us.size
+    way_m = vehicle.share * vehicle.speed_mps / vehicle.control_hz
+    parts = min(parts_of(way_m, vehicle.max_step_m), way.moving_us)
+    vehicle.problem, vehicle.dropped, columns, events = sense_way(view, way, parts)
+    vehicle.renders = columns / view.seen_us.size
     return events
