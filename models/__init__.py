@@ -61,7 +61,7 @@ def _digests(folder: Path) -> dict[str, str]:
 
 def _imports(folder: Path, text: str) -> set[Path]:
     """Files that the import statements of a text may mean, wherever they stand."""
-    modules = set()
+    modules: set[str] = set()
     for module, names in re.findall(IMPORT.format(folder.name), text):
         modules.update((module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))))
     places = {folder.parent.joinpath(*module.split(".")) for module in modules} - {folder}

@@ -8,6 +8,7 @@ something to compile, because that takes seconds.
 import hashlib
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,18 +51,18 @@ def fly() -> None:
     from envs.event_error import measure_event_error
     from envs.recordings import read_events, write_events
 
-    small = {"width": 16, "height": 16}
+    small = partial(CameraConfig, width=16, height=16)
     noisy = FaultsConfig(sparsity=0.1, background_activity=0.1, shot_noise_hz=10.0, leak_hz=1.0)
     for config in (
-        EnvConfig(camera=CameraConfig(**small), faults=noisy),
-        EnvConfig(camera=CameraConfig(**small, memory="frame"), observation="event_image", scene="gates"),
-        EnvConfig(camera=CameraConfig(**small, refractory_us=100), scene="texture_change"),
-        EnvConfig(camera=CameraConfig(**small), observation="luminance", scene="dynamic"),
+        EnvConfig(camera=small(), faults=noisy),
+        EnvConfig(camera=small(memory="frame"), observation="event_image", scene="gates"),
+        EnvConfig(camera=small(refractory_us=100), scene="texture_change"),
+        EnvConfig(camera=small(), observation="luminance", scene="dynamic"),
     ):
         env = CorridorEnv(config)
         env.reset(seed=0)
         env.step(1)
-    measure_event_error(EnvConfig(camera=CameraConfig(**small)), flights=1, steps=1)
+    measure_event_error(EnvConfig(camera=small()), flights=1, steps=1)
     with tempfile.TemporaryDirectory() as folder:
         for name in ("dat", "evt2", "evt3"):
             write_events(Path(folder) / name, some_events(), 16, 16, name)
