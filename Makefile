@@ -32,7 +32,8 @@ help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-17s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this package
+setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this package, and compile the kernels
+	@$(BIN)/python -m jobs.run.compile
 
 $(INSTALLED): requirements.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
