@@ -126,12 +126,15 @@ def medians(
 ) -> dict[str, float]:
     """Seconds of CPU time of one call; the short ones are called `CALLS` times in a row."""
     torch.set_num_threads(1)
-    repeated: dict[str, Callable[[], object]] = {
-        name: lambda call=call: [call() for _ in range(CALLS)] for name, call in short.items()
-    }
+    work = {name: repeated(call) for name, call in short.items()} | long
     with torch.inference_mode():
-        seconds = interleaved({**repeated, **long}, rounds, time.process_time)
+        seconds = interleaved(work, rounds, time.process_time)
     return {name: value / (CALLS if name in short else 1) for name, value in seconds.items()}
+
+
+def repeated(call: Callable[[], object]) -> Callable[[], object]:
+    """`CALLS` calls."""
+    return lambda: [call() for _ in range(CALLS)]
 
 
 def plain_torch(features: int) -> nn.Module:
@@ -151,7 +154,7 @@ def copy_rows(target: np.ndarray, parts: list[np.ndarray]) -> None:
 
 
 @numba.njit(error_model="numpy")
-def read_rows(features: np.ndarray, embedding: np.ndarray, code: np.ndarray, bins: np.ndarray) -> int:
+def read_rows(features: np.ndarray, embedding: np.ndarray, code: np.ndarray, bins: np.ndarray) -> np.int64:
     """Load every word of the rows of the events, and do next to nothing with it."""
     total = np.int64(0)
     for n in range(len(code)):
