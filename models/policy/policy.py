@@ -59,7 +59,7 @@ class PolicyManifest(TypedDict, total=False):
     run: str
     seed: int
     observation: str
-    window_capacity: int
+    window_capacity: int | None
     sensor: dict[str, object]
     sensor_hash: str
     figures: dict[str, float]
