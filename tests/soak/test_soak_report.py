@@ -8,7 +8,6 @@ from tests.soak.injections import COMMAND, EITHER, GOES_ON, Fault
 from tests.soak.report import write_page
 from tests.soak.soak import judged
 from tests.soak.watch import slope_mb_per_hour
-from tests.soak.watch import slope_mb_per_hour
 from tests.soak.workload import End, Tables
 
 STOPPED = End(status=1, last_line="evade: failed: no room", traceback=False, by_fault=False)
