@@ -77,6 +77,8 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
         return
     for name in ("ray", "ray.rllib", "ray.tune"):
         logging.getLogger(name).setLevel(logging.ERROR)
+    # It logs the traceback of a trial's error, which it also writes beside the trial and jobs report.
+    logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
         "runtime_env": {"env_vars": WORKER_THREADS},
         "log_to_driver": False,
