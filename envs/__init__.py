@@ -14,11 +14,11 @@ IMPORT = r"(?:from|import) +({}(?:\.\w+)*)(?: +import +(\([^)]*\)|[^\n]*))?"
 def _forget_stale_kernels() -> None:
     """Delete compiled kernels that are cut, or whose file or what it imports from this package has changed.
 
-    numba checks the file of a kernel alone, not the files of the kernels that it calls: after an
-    edit there, it would go on running the old machine code. It writes the name of a kernel before the
-    kernel: a full disk or a kill in between would leave the new name with the old machine code. And it
-    raises where a file is empty or ends too early. `envs` and `models` may not import each other, so
-    each has this function; a test runs both.
+    numba checks the file of a kernel alone, not the files of the kernels that it calls, nor of the types
+    of its arguments, which its annotations import: after an edit there, it would go on running the old
+    machine code. It writes the name of a kernel before the kernel: a full disk or a kill in between would
+    leave the new name with the old machine code. And it raises where a file is empty or ends too early.
+    `envs` and `models` may not import each other, so each has this function; a test runs both.
     """
     folder = Path(__file__).parent
     index = folder / "__pycache__" / "kernels.json"

@@ -6,9 +6,13 @@ something to compile, because that takes seconds.
 """
 
 import hashlib
+import os
+import subprocess
+import sys
 import tempfile
 import time
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -21,27 +25,41 @@ from jobs.run.provenance import REPOSITORY
 CACHE = REPOSITORY / "envs" / "__pycache__"
 
 
+def compile_kernels() -> None:
+    """Compile, in a process of its own, before several processes start that would each do it.
+
+    Nothing is done where the folder of the source cannot be written: numba then compiles elsewhere.
+    """
+    if not _is_current() and os.access(CACHE.parent, os.W_OK):
+        subprocess.run([sys.executable, "-m", "jobs.run.compile"], cwd=REPOSITORY, check=False)
+
+
 def main() -> None:
     """Compile what has changed since the last time, and say how long it took."""
     with locked(CACHE / "compile.lock", "Another process compiles the kernels; waiting for it ..."):
-        done, now = CACHE / "compiled", _digest()
-        if done.is_file() and done.read_text() == now:
+        if _is_current():
             return
+        now = _digest()
         console.print("Compiling the kernels (a minute at the first time) ...")
         start = time.perf_counter()
         fly()
         encode()
         console.print(f"Compiled the kernels in {time.perf_counter() - start:.0f} s.")
-        write_atomic(done, now)
+        write_atomic(CACHE / "compiled", now)
+
+
+def _is_current() -> bool:
+    """Whether nothing has changed since all was compiled."""
+    compiled = CACHE / "compiled"
+    return compiled.is_file() and compiled.read_text() == _digest()
 
 
 def _digest() -> str:
-    """A hash of all sources of kernels, and of what is compiled of them."""
-    files = [
-        Path(__file__),
-        *(path for room in ("envs", "models") for path in (REPOSITORY / room).rglob("*.py")),
-    ]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(files))).hexdigest()
+    """A hash of all sources of kernels, of what is compiled of them, by which numba and where to."""
+    files = sorted(path for room in ("envs", "models") for path in (REPOSITORY / room).rglob("*.py"))
+    whole = hashlib.sha256(b"".join(path.read_bytes() for path in (Path(__file__), *files)))
+    whole.update(f"{version('numba')} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
+    return whole.hexdigest()
 
 
 def fly() -> None:
