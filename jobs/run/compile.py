@@ -65,7 +65,7 @@ def _digest() -> str:
 def fly() -> None:
     """Move through a few corridors, and write and read a recording."""
     from envs.config import CameraConfig, EnvConfig, FaultsConfig
-    from envs.corridor import CorridorEnv
+    from envs.corridor import CorridorEnv, CorridorVectorEnv
     from envs.event_error import measure_event_error
     from envs.recordings import read_events, write_events
 
@@ -80,6 +80,9 @@ def fly() -> None:
         env = CorridorEnv(config)
         env.reset(seed=0)
         env.step(1)
+    several = CorridorVectorEnv(2, camera=small(), window_capacity=None)
+    several.reset(seed=0)
+    several.step(np.zeros(2, np.int64))
     measure_event_error(EnvConfig(camera=small()), flights=1, steps=1)
     with tempfile.TemporaryDirectory() as folder:
         for name in ("dat", "evt2", "evt3"):
