@@ -32,7 +32,8 @@ help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-17s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this package
+setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this package, and compile the kernels
+	@$(BIN)/python -m jobs.run.compile
 
 $(INSTALLED): requirements.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -78,10 +79,10 @@ test-system: setup ## whole jobs, Ray, the launcher, and every kind of policy (4
 test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
 	$(PYTEST) -m slow --dist loadgroup $(ARGS)
 
-test-faults: setup ## inject faults into running jobs and print what was lost (15 minutes)
+test-faults: setup ## inject faults into running jobs and print what was lost (18 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 2 --dist worksteal $(ARGS)
 
-test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (20 minutes)
+test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (10 minutes)
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 \
 	|| { [ "$$(id -u)" = 0 ] && apt-get update && apt-get install --yes --no-install-recommends postgresql; } \
 	|| echo "warning: no PostgreSQL, so its test is skipped; apt-get install postgresql"

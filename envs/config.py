@@ -163,7 +163,7 @@ class EnvConfig:
         observation: "window", "event_image", "events"; "luminance": one picture a step, and no
             event camera; or "none": nothing is rendered, for an agent that looks at nothing.
         window_capacity: Most events that one window holds; the oldest beyond it are
-            dropped and counted.
+            dropped and counted. None: a window is as long as its step has events.
         split: Which corridors: those of one split never occur in another, whatever the seed.
         renderer: "raycast", "pyrender", or "auto": the cheapest that can draw the scene.
     """
@@ -176,7 +176,7 @@ class EnvConfig:
     camera_height_m: Annotated[float, Field(ge=0, le=1000)] = 2.0
     time_limit_s: Positive = 10.0
     observation: Observation = "window"
-    window_capacity: Annotated[int, Field(ge=1, le=10_000_000)] = 4096
+    window_capacity: Annotated[int, Field(ge=1, le=10_000_000)] | None = 4096
     split: Split = "train"
     renderer: Literal["auto", "raycast", "pyrender"] = "auto"
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)

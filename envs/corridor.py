@@ -11,7 +11,7 @@ of its own, made of (split, seed, episode): a corridor of one split never occurs
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 import gymnasium
 import numpy as np
@@ -22,9 +22,11 @@ from gymnasium.vector.utils import batch_space
 
 from envs import kinematics
 from envs.config import EnvConfig
+from envs.events.windows import pack_windows
 from envs.observations import observation_space, observe, picture
 from envs.scene import make_scene
 from envs.sensor import Sensor
+from envs.vehicles import StepError, Vehicles
 
 
 class Info(TypedDict):
@@ -65,8 +67,7 @@ class CorridorEnv(gymnasium.Env):
     Attributes:
         config: The settings, `EnvConfig`.
         scene: The corridor of this episode.
-        events: EVENT array of the last step, faults included; empty with observation "luminance" or "none".
-        luminance: float32 (H, W), the last render; 0 with "none".
+        series: Seed of the series of episodes, and the number of this one in it.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012 - Gymnasium's name
@@ -85,9 +86,12 @@ class CorridorEnv(gymnasium.Env):
         self.action_space = spaces.Discrete(kinematics.NUM_ACTIONS)
         self.observation_space = observation_space(self.config)
         self._sensor = Sensor(self.config)
-        self._seed: int | None = None
-        self._episode = 0
-        self._done = True
+        self.series: tuple[int | None, int] = None, 0
+        self._vehicles, self._row = Vehicles(1), 0
+
+    def join(self, vehicles: Vehicles, row: int) -> None:
+        """Fly beside others, as one row of `vehicles`, from the next reset on."""
+        self._vehicles, self._row = vehicles, row
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, object] | None = None
@@ -102,23 +106,24 @@ class CorridorEnv(gymnasium.Env):
         Raises:
             ValueError: An unknown option, or an episode that is no integer >= 0.
         """
+        self.begin(seed, options)
+        return self._observation(), self._info()
+
+    def begin(self, seed: int | None, options: Mapping[str, object] | None) -> None:
+        """As `reset`, without a look at what is observed."""
         super().reset(seed=seed)
-        if seed is None and self._seed is None:
+        config, number = self.config, self.series[1]
+        if seed is None and self.series[0] is None:
             seed = int(self.np_random.integers(kinematics.SEED_STRIDE))
-        self._episode = kinematics.choose_episode(0 if seed is not None else self._episode + 1, options or {})
-        self._seed = self._seed if seed is None else int(seed)
-        split = self.config.split
-        scene_rng, spawn_rng, faults_rng = kinematics.random_streams(split, self._seed or 0, self._episode)
-        config = self.config
+        number = kinematics.choose_episode(0 if seed is not None else number + 1, options or {})
+        self.series = self.series[0] if seed is None else int(seed), number
+        streams = kinematics.random_streams(config.split, self.series[0] or 0, number)
+        scene_rng, spawn_rng, faults_rng = streams
         vehicle = config.vehicle_radius_m, config.camera_height_m
         self.scene = make_scene(config.scene, scene_rng, *vehicle, **config.layout)
-        self._spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
-        self._moves = [0] * kinematics.NUM_ACTIONS
-        self._place = (self._spawn_x, 0.0)
-        self._sensor.reset(self.scene, self._place, faults_rng)
-        self._done = False
-        observation, lost = self._observe(0, kinematics.clock_us(1, self.config.control_hz))
-        return observation, self._info(lost)
+        spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
+        self._sensor.reset(self.scene, (spawn_x, 0.0), faults_rng)
+        self._vehicles.start(self._row, config, self.scene, self._sensor, spawn_x)
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Simulate one control step.
@@ -128,25 +133,20 @@ class CorridorEnv(gymnasium.Env):
             ValueError: The action is not in the action space; or a number became NaN or
                 infinite, with the episode, step and seed named.
         """
-        if self._done:
+        row = self._row
+        if self._vehicles.rows["over"][row]:
             raise ResetNeeded("The episode is over or has not begun; call reset() before step().")
         if not self.action_space.contains(action):
-            raise ValueError(
-                f"action must be an integer in [0, {kinematics.NUM_ACTIONS - 1}]; got {action!r}."
-            )
-        start_us = self._sensor.t_us
-        self._done = True  # an error below leaves the episode unusable
-        self._moves[int(action)] += 1
+            raise ValueError(_bad_action(action))
+        active = np.zeros(len(self._vehicles.rows), bool)
+        active[row] = True
         try:
-            outcome = self._move()
-            observation, lost = self._observe(start_us, self._sensor.t_us)
-        except ValueError as error:
-            where = f"episode {self._episode}, step {sum(self._moves)}, seed {self._seed}"
-            raise ValueError(f"{where}: {error}") from error
-        terminated = outcome.success or outcome.collision
-        truncated = not terminated and self._sensor.t_us >= self.config.time_limit_s * 1e6
-        self._done = terminated or truncated
-        return observation, outcome.reward, terminated, truncated, self._info(lost, outcome)
+            self._vehicles.step(np.full(active.size, action, np.int64), active)
+        except StepError as error:
+            raise ValueError(f"{self.name_step()}: {error}") from error
+        info, vehicle = self._info(), self._vehicles.rows[row]
+        terminated = info["success"] or info["collision"]
+        return self._observation(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
 
     def render(self) -> Any:
         """Luminance beside the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
@@ -156,39 +156,41 @@ class CorridorEnv(gymnasium.Env):
         """Free the renderer."""
         self._sensor.close()
 
+    @property
+    def events(self) -> np.ndarray:
+        """EVENT array of the last step, faults included; empty with observation "luminance" or "none".
+
+        One of a vector environment has those of the vector's last step.
+        """
+        return self._vehicles.events_of(self._row)
+
+    @property
+    def luminance(self) -> np.ndarray:
+        """The last render, float32 (H, W), which the next step may change; 0 with observation "none"."""
+        return self._sensor.luminance
+
     def camera_pose(self) -> tuple[float, float, float, float]:
         """Where the camera is: x, y, z [m] and yaw [rad]."""
-        return (*self._place, self.config.camera_height_m, 0.0)
+        vehicle = self._vehicles.rows[self._row]
+        return float(vehicle["x_m"]), float(vehicle["y_m"]), self.config.camera_height_m, 0.0
 
-    def _move(self) -> kinematics.Outcome:
-        """Move and sense."""
-        config, start = self.config, self._place
-        planned = kinematics.planned_position(self._spawn_x, self._moves, config)
-        vehicle = config.vehicle_radius_m, config.camera_height_m
-        outcome = kinematics.advance(self.scene, start, planned, *vehicle)
-        self._sensor.step(start, outcome, kinematics.clock_us(sum(self._moves), config.control_hz))
-        self._place = outcome.end
-        return outcome
+    def name_step(self) -> str:
+        """Episode, step and seed, for an error."""
+        vehicle, (seed, number) = self._vehicles.rows[self._row], self.series
+        steps = vehicle["forward"] + vehicle["left"] + vehicle["right"]
+        return f"episode {number}, step {steps}, seed {seed}"
 
-    def _observe(self, start_us: int, end_us: int) -> tuple[np.ndarray, int]:
-        """Observation, and the events lost to the camera's cap or the window's capacity."""
-        self.events, self.luminance = self._sensor.events, self._sensor.luminance
-        observation, excess = observe(self.config, self.events, self.luminance, start_us, end_us)
-        return observation, self._sensor.dropped + excess
+    def _observation(self) -> np.ndarray:
+        """What is observed of the last step."""
+        if self.config.observation != "window":
+            return observe(self.config, self.events, self.luminance)
+        row, events = self._vehicles.rows[self._row : self._row + 1], self.events
+        ends = np.array([0, events.size])
+        return pack_windows(events, ends, row["start_us"], row["window_us"], self.config.window_capacity)[0]
 
-    def _info(self, lost: int, outcome: kinematics.Outcome | None = None) -> Info:
-        return {
-            "episode_seed": self._seed,
-            "episode_number": self._episode,
-            "x_m": self._place[0],
-            "y_m": self._place[1],
-            "distance_m": self._place[1],
-            "success": outcome is not None and outcome.success,
-            "collision": outcome is not None and outcome.collision,
-            "num_events": self.events.size,
-            "dropped_events": lost,
-            "t_us": self._sensor.t_us,
-        }
+    def _info(self) -> Info:
+        told = _tell([self], self._vehicles.rows[self._row : self._row + 1])
+        return cast(Info, {name: values.tolist()[0] for name, values in told.items()})
 
 
 class CorridorVectorEnv(VectorEnv):
@@ -230,6 +232,9 @@ class CorridorVectorEnv(VectorEnv):
         self.metadata = {**self.metadata, "render_fps": self.envs[0].metadata["render_fps"]}
         self.single_observation_space = self.envs[0].observation_space
         self.single_action_space = self.envs[0].action_space
+        self._vehicles = Vehicles(num_envs)
+        for row, env in enumerate(self.envs):
+            env.join(self._vehicles, row)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._over = np.zeros(num_envs, bool)
@@ -248,8 +253,10 @@ class CorridorVectorEnv(VectorEnv):
         """
         seeds = kinematics.spread_seeds(seed, self.num_envs)
         self._over[:] = False
-        results = [env.reset(seed=s, options=options) for env, s in zip(self.envs, seeds, strict=True)]
-        return self._batch([r[0] for r in results]), _stack_infos([r[1] for r in results])
+        for env, own_seed in zip(self.envs, seeds, strict=True):
+            env.begin(own_seed, options)
+        self._vehicles.forget_events()
+        return self._observations(), self.tell()
 
     def step(
         self, actions: np.ndarray
@@ -257,21 +264,58 @@ class CorridorVectorEnv(VectorEnv):
         """Step all environments, or reset those that were over.
 
         Raises:
-            ValueError: The number of actions is not that of environments, or one is refused.
+            ResetNeeded: No reset yet, or an environment failed in the step before.
+            ValueError: The number of actions is not that of environments, or one is refused; or as
+                `CorridorEnv.step`.
         """
-        if len(actions) != self.num_envs:
+        over = self._over
+        self._take(actions, ~over)
+        for row in np.flatnonzero(over):
+            self.envs[row].begin(None, None)
+        results = self._results()
+        self._over = results[2] | results[3]
+        return results
+
+    def step_some(
+        self, actions: np.ndarray, active: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Step the active environments and leave the others as they are; as `step`, but nothing is reset.
+
+        Args:
+            actions: Integers (B,), those of the others are ignored.
+            active: bool (B,). What is returned of the others is their last step, without its events.
+
+        Raises:
+            ResetNeeded: The episode of an active one is over, or has not begun.
+            ValueError: As `step`.
+        """
+        self._take(actions, active)
+        return self._results()
+
+    def _results(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        rows = self._vehicles.rows
+        terminated, truncated = rows["success"] | rows["collision"], rows["truncated"].copy()
+        return self._observations(), rows["reward"].copy(), terminated, truncated, self.tell()
+
+    def _take(self, actions: np.ndarray, active: np.ndarray) -> None:
+        """One control step of the active environments."""
+        taken, rows = np.asarray(actions), self._vehicles.rows
+        if taken.shape != (self.num_envs,):
             raise ValueError(f"actions must number {self.num_envs}; got {len(actions)}.")
-        results = []
-        for env, action, over in zip(self.envs, actions, self._over, strict=True):
-            if over:
-                observation, info = env.reset()
-                results.append((observation, 0.0, False, False, info))
-            else:
-                results.append(env.step(action))
-        observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
-        ends = np.array(terminated), np.array(truncated)
-        self._over = ends[0] | ends[1]
-        return self._batch(observations), np.array(rewards), *ends, _stack_infos(infos)
+        if (rows["over"] & active).any():
+            raise ResetNeeded("An episode is over or has not begun; call reset() before step().")
+        wrong = active & ((taken < 0) | (taken >= kinematics.NUM_ACTIONS) | (taken.dtype.kind not in "iu"))
+        if wrong.any():
+            raise ValueError(_bad_action(taken[wrong.argmax()]))
+        try:
+            self._vehicles.step(taken.astype(np.int64), active)
+        except StepError as error:
+            raise ValueError(f"{self.envs[error.row].name_step()}: {error}") from error
+
+    def tell(self) -> dict[str, np.ndarray]:
+        """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
+        told, mask = _tell(self.envs, self._vehicles.rows), np.ones(self.num_envs, bool)
+        return told | {f"_{name}": mask for name in told}
 
     def replay(
         self, episodes: Sequence[tuple[int, int, Sequence[int]]]
@@ -287,18 +331,17 @@ class CorridorVectorEnv(VectorEnv):
         Raises:
             ValueError: An episode ends before its last action: another simulation was given these.
         """
-        results, self._over[:] = [], False
+        observations, self._over = [], np.zeros(self.num_envs, bool)
         for row, (env, (seed, number, actions)) in enumerate(zip(self.envs, episodes, strict=True)):
-            observation, info = env.reset(seed=seed, options={"episode_number": number})
+            observation, _ = env.reset(seed=seed, options={"episode_number": number})
             for step, action in enumerate(actions):
                 if self._over[row]:
                     where = f"environment {row}, seed {seed}, episode {number}"
                     raise ValueError(f"actions must not outlast the episode; {where} ended at step {step}.")
-                observation, _, terminated, truncated, info = env.step(int(action))
+                observation, _, terminated, truncated, _ = env.step(int(action))
                 self._over[row] = terminated or truncated
-            results.append((observation, info))
-        observations, infos = zip(*results, strict=True)
-        return self._batch(observations), self._over.copy(), _stack_infos(infos)
+            observations.append(observation)
+        return self._batch(observations), self._over.copy(), self.tell()
 
     def render(self) -> Any:
         """One picture per environment, as `CorridorEnv.render`."""
@@ -309,18 +352,42 @@ class CorridorVectorEnv(VectorEnv):
         for env in self.envs:
             env.close()
 
+    def _observations(self) -> Any:
+        """What all observe of the last step."""
+        config, vehicles = self.envs[0].config, self._vehicles
+        if config.observation != "window":
+            return self._batch([observe(env.config, env.events, env.luminance) for env in self.envs])
+        clocks = vehicles.rows["start_us"], vehicles.rows["window_us"]
+        return pack_windows(vehicles.events, vehicles.ends, *clocks, config.window_capacity)
+
     def _batch(self, observations: Any) -> Any:
-        """Observations as one fresh array; event sequences differ in length and stay a tuple."""
+        """Observations as one fresh array; those that differ in length stay a tuple."""
         if isinstance(self.single_observation_space, spaces.Sequence):
             return tuple(observations)
         return np.stack(observations)
 
 
-def _stack_infos(infos: Any) -> dict[str, np.ndarray]:
-    """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
-    stacked = {key: np.array([info[key] for info in infos]) for key in infos[0]}
-    mask = np.ones(len(infos), bool)
-    return stacked | {f"_{key}": mask for key in infos[0]}
+def _tell(envs: Sequence[CorridorEnv], rows: np.ndarray) -> dict[str, np.ndarray]:
+    """`Info` of several environments, each value an array; `rows` are their VEHICLE."""
+    config, lost = envs[0].config, rows["dropped"].copy()
+    if config.observation == "window" and config.window_capacity is not None:
+        lost += np.maximum(rows["num_events"] - config.window_capacity, 0)
+    return {
+        "episode_seed": np.array([env.series[0] for env in envs]),
+        "episode_number": np.array([env.series[1] for env in envs]),
+        "x_m": rows["x_m"].copy(),
+        "y_m": rows["y_m"].copy(),
+        "distance_m": rows["y_m"].copy(),
+        "success": rows["success"].copy(),
+        "collision": rows["collision"].copy(),
+        "num_events": rows["num_events"].copy(),
+        "dropped_events": lost,
+        "t_us": rows["t_us"].copy(),
+    }
+
+
+def _bad_action(action: object) -> str:
+    return f"action must be an integer in [0, {kinematics.NUM_ACTIONS - 1}]; got {action!r}."
 
 
 # Gymnasium imports what stands before the colon: make("envs.corridor:evade/Corridor-v0").

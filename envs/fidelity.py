@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numba
+
 from envs.config import EnvConfig
 from envs.events.ramps import can_look
 from envs.raycast import RaycastRenderer
@@ -109,6 +111,13 @@ def sub_renders(step_m: float, max_step_m: float) -> int:
     """
     if not (0.0 <= step_m < math.inf and max_step_m > 0.0):
         raise ValueError(f"step_m must be finite and >= 0, max_step_m > 0; got {step_m}, {max_step_m}")
+    parts: int = parts_of(step_m, max_step_m)
+    return parts
+
+
+@numba.njit(cache=True, error_model="numpy")
+def parts_of(step_m: float, max_step_m: float) -> int:
+    """As `sub_renders`, of valid numbers."""
     return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
 
 

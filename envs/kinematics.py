@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
-from envs.config import EnvConfig
-from envs.scene import Scene
+from envs.scene.collision import first_contact
 
 SPLITS = ("train", "validation", "eval")
 NUM_ACTIONS = 3  # forward, left 45 degrees, right 45 degrees
@@ -16,6 +16,20 @@ GOAL_REWARD, COLLISION_REWARD = 100.0, -100.0
 SEED_STRIDE = 2**32
 
 Point = tuple[float, float]
+
+
+class Lane(NamedTuple):
+    """A vehicle and the lane in which it flies.
+
+    Attributes:
+        radius_m: Of the vehicle, a level disc [m].
+        half_width_m: The walls are at x = +-half_width_m [m].
+        length_m: The goal line is at y = length_m [m].
+    """
+
+    radius_m: float
+    half_width_m: float
+    length_m: float
 
 
 class Outcome(NamedTuple):
@@ -75,12 +89,14 @@ def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[in
     return list(seed)
 
 
+@numba.njit(cache=True, error_model="numpy")
 def clock_us(step: int, control_hz: float) -> int:
     """Simulated time at the end of a control step [us], from the count: it does not drift."""
     return round(step * 1e6 / control_hz)
 
 
-def planned_position(spawn_x_m: float, moves: list[int], config: EnvConfig) -> Point:
+@numba.njit(cache=True, error_model="numpy")
+def planned_position(spawn_x_m: float, moves: tuple[int, int, int], step_m: tuple[float, float]) -> Point:
     """Where all moves so far lead, x and y [m].
 
     One product of whole counts, so that no error adds up: 1000 steps of 0.1 m are 100 m.
@@ -88,24 +104,29 @@ def planned_position(spawn_x_m: float, moves: list[int], config: EnvConfig) -> P
     Args:
         spawn_x_m: Where the episode began; y was 0 [m].
         moves: How often each action was taken.
-        config: For speed and rate.
+        step_m: Speed [m/s] and control rate [Hz], whose quotient is the way of a step.
     """
     forward, left, right = moves
-    x = (right - left) * DIAGONAL * config.speed_mps / config.control_hz
-    return spawn_x_m + x, (forward + (left + right) * DIAGONAL) * config.speed_mps / config.control_hz
+    speed_mps, control_hz = step_m
+    x = (right - left) * DIAGONAL * speed_mps / control_hz
+    return spawn_x_m + x, (forward + (left + right) * DIAGONAL) * speed_mps / control_hz
 
 
-def advance(scene: Scene, start: Point, planned: Point, radius_m: float, height_m: float) -> Outcome:
+@numba.njit(cache=True, error_model="numpy")
+def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> Outcome:
     """Move from `start` towards `planned` until the first contact or the goal line (appendix D.1.1).
 
-    Contact and goal at the same place is a collision; so is a start in contact. The vehicle
-    is a level disc of `radius_m` that flies at `height_m`.
+    Contact and goal at the same place is a collision; so is a start in contact.
 
-    Raises:
-        ValueError: The reward is not finite.
+    Args:
+        lane: `Lane`.
+        sections: (M, 7), what stands in it, as `envs.scene.Scene.sections` gives it.
+        start: x and y [m].
+        planned: x and y [m], farther ahead.
     """
-    contact = scene.first_contact(start, planned, radius_m, height_m)
-    goal = (scene.length_m - start[1]) / (planned[1] - start[1])
+    segment = start[0], start[1], planned[0], planned[1]
+    contact = first_contact(segment, lane.radius_m, lane.half_width_m, sections)
+    goal = (lane.length_m - start[1]) / (planned[1] - start[1])
     share = min(contact, goal, 1.0)
     collision = contact <= share
     success = not collision and goal <= 1.0
@@ -113,8 +134,6 @@ def advance(scene: Scene, start: Point, planned: Point, radius_m: float, height_
     if share < 1.0:
         end = (start[0] + share * (planned[0] - start[0]), start[1] + share * (planned[1] - start[1]))
     if success:
-        end = (end[0], scene.length_m)
+        end = (end[0], lane.length_m)
     reward = end[1] - start[1] + GOAL_REWARD * success + COLLISION_REWARD * collision
-    if not math.isfinite(reward):
-        raise ValueError(f"the reward must be finite; got {reward} on the way from {start} to {planned}.")
     return Outcome(end, share, reward, success, collision)

@@ -6,7 +6,7 @@ from gymnasium import spaces
 from envs.config import EnvConfig
 from envs.events import EVENT, event_image
 from envs.events.photoreceptor import GAMMA
-from envs.events.windows import GREY_OFF, GREY_ON, fill_window
+from envs.events.windows import GREY_OFF, GREY_ON
 
 ZOOM = 4
 
@@ -15,13 +15,17 @@ def observation_space(config: EnvConfig) -> spaces.Space:
     """The space of what `config.observation` names.
 
     Returns:
-        "window": int32 (capacity + 1, 4), see `envs.events.pack_window`; "event_image":
+        "window": int32 (capacity + 1, 4), see `envs.events.pack_window`, or (N + 1, 4) of all N
+        events where the capacity is None; "event_image":
         uint8 (H, W); "luminance": float32 (H, W); "events": rows [t [us], x, y, p], int64;
         "none": uint8 (0,).
     """
     shape = (config.camera.height, config.camera.width)
     if config.observation == "window":
-        return spaces.Box(-1, np.iinfo(np.int32).max, (config.window_capacity + 1, 4), np.int32)
+        capacity, most = config.window_capacity, np.iinfo(np.int32).max
+        if capacity is None:
+            return spaces.Sequence(spaces.Box(-1, most, (4,), np.int32), stack=True)
+        return spaces.Box(-1, most, (capacity + 1, 4), np.int32)
     if config.observation == "event_image":
         return spaces.Box(0, 255, shape, np.uint8)
     if config.observation == "luminance":
@@ -31,28 +35,21 @@ def observation_space(config: EnvConfig) -> spaces.Space:
     return spaces.Sequence(spaces.Box(-1, 2**53, (4,), np.int64), stack=True)
 
 
-def observe(
-    config: EnvConfig, events: np.ndarray, luminance: np.ndarray, start_us: int, end_us: int
-) -> tuple[np.ndarray, int]:
-    """The observation of one control step, as a fresh array, and how many events it could not hold.
+def observe(config: EnvConfig, events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
+    """The observation of one control step, unless it is a window, as a fresh array.
 
     Args:
         config: Says which.
-        events: EVENT of (start_us, end_us], valid and in time order.
+        events: EVENT of the step, valid and in time order.
         luminance: float32 (H, W), the last render.
-        start_us: Start of the step [us].
-        end_us: Its end [us].
     """
-    if config.observation == "window":
-        window = fill_window(events, start_us, end_us - start_us, config.window_capacity)
-        return window, int(window[0, 1])
     if config.observation == "event_image":
-        return event_image(events, config.camera.width, config.camera.height), 0
+        return event_image(events, config.camera.width, config.camera.height)
     if config.observation == "luminance":
-        return luminance.copy(), 0
+        return luminance.copy()
     if config.observation == "none":
-        return np.empty(0, np.uint8), 0
-    return np.stack([events[name].astype(np.int64) for name in EVENT.fields or ()], axis=1), 0
+        return np.empty(0, np.uint8)
+    return np.stack([events[name].astype(np.int64) for name in EVENT.fields or ()], axis=1)
 
 
 def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from envs.compiled import inlined, kernel
 from envs.events.emission import EVENT, Span, Trains, events_of, limit_events
 from envs.events.photoreceptor import MAX_LUMINANCE, Curve, light_of, respond
 from envs.events.refractory import (
@@ -94,6 +95,18 @@ class Memory(NamedTuple):
     refractory_end_us: np.ndarray
 
 
+class Room(NamedTuple):
+    """Room for a block of pixels, (BLOCK,) each: float64, but `exponents` int64 and `lights` float32."""
+
+    before: np.ndarray
+    after: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    levels: np.ndarray
+    exponents: np.ndarray
+    lights: np.ndarray
+
+
 class Column(IntEnum):
     """Where each column begins in the table of a block, float64 (8 * BLOCK,).
 
@@ -126,6 +139,14 @@ def memory_rows(num_pixels: int, has_refractory_period: bool) -> tuple[np.ndarra
     """Rows of a `Memory`, to be set by `remember`: float32 (3, N), float64 (3, N), and the last one."""
     ends = np.zeros(num_pixels if has_refractory_period else 0, np.int64)
     return np.zeros((3, num_pixels), np.float32), np.zeros((3, num_pixels)), ends
+
+
+@numba.njit(cache=True, error_model="numpy")
+def make_room():
+    """Room for the blocks of one step."""
+    rows = np.empty((5, BLOCK))
+    numbers, lights = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.float32)
+    return Room(rows[0], rows[1], rows[2], rows[3], rows[4], numbers, lights)
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -167,28 +188,29 @@ def remember(luminance, model, memory):
 @numba.njit(cache=True, error_model="numpy")
 def _remember_levels(luminance, model, memory):
     """Take the responses of all pixels as their first levels, and set the quiet bands around them."""
+    room = make_room()
     for first in range(0, luminance.size, BLOCK):
         pixels = np.arange(first, min(first + BLOCK, luminance.size))
         levels = memory.first_level[first : first + pixels.size]
-        respond(model.curve, luminance[first : first + pixels.size], levels)
-        set_quiet_bands(pixels, levels, model, memory)
+        respond(model.curve, luminance[first : first + pixels.size], levels, room.exponents)
+        set_quiet_bands(pixels, levels, model, memory, room)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def set_quiet_bands(pixels, levels, model, memory):
-    """Quiet bands of `pixels` that remember `levels`."""
-    low, high, thresholds = np.empty(pixels.size), np.empty(pixels.size), model.thresholds
+@kernel
+def set_quiet_bands(pixels, levels, model, memory, room):
+    """Quiet bands of at most BLOCK `pixels` that remember `levels`."""
+    low, high, thresholds = room.low[: pixels.size], room.high[: pixels.size], model.thresholds
     for j in range(pixels.size):
         k = pixels[j] if thresholds.on.size > 1 else 0
         low[j], high[j] = levels[j] - thresholds.quiet_down[k], levels[j] + thresholds.quiet_up[k]
-    light_of(model.curve, low)
-    light_of(model.curve, high)
+    light_of(model.curve, low, room.exponents)
+    light_of(model.curve, high, room.exponents)
     for j in range(pixels.size):
         memory.quiet_low[pixels[j]] = _bound(low[j], 1.0 + HALF_ULP)
         memory.quiet_high[pixels[j]] = _bound(high[j], 1.0 - HALF_ULP)
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _bound(value, inwards):
     """A bound of the quiet band as float32, never further out than `value` and never invalid."""
     return np.float32(min(max(value * inwards, 0.0), MAX_LUMINANCE))
@@ -256,7 +278,7 @@ def _step(luminance, span, width, limit, model, memory, scratch):
     return -1, 0 if model.rule.carries else wanted - total, events
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def scan(luminance, memory, flags, outside):
     """Write the pixels outside their quiet band, in raster order; return how many.
 
@@ -283,15 +305,13 @@ def _decide(luminance, span, model, memory, trains, motions):
     Returns:
         First invalid pixel or -1, and the number of trains kept.
     """
-    table = np.empty(8 * BLOCK)
-    lights = np.empty(BLOCK, np.float32)
-    kept = 0
+    table, room, kept = np.empty(8 * BLOCK), make_room(), 0
     for first in range(0, trains.crossings.size, BLOCK):
         pixels = trains.pixels[first : min(first + BLOCK, trains.crossings.size)]
-        bad = respond_at(pixels, luminance, model.curve, table[Column.AFTER :], lights)
+        bad = respond_at(pixels, luminance, model.curve, table[Column.AFTER :], room)
         if bad >= 0:
             return bad, 0
-        respond_at(pixels, memory.previous, model.curve, table, lights)
+        respond_at(pixels, memory.previous, model.curve, table, room)
         _recall(pixels, model, memory, table)
         if model.rule.refractory_us > 0:
             kept = _keep_refractory(pixels, span, model.rule, memory, table, trains, motions, kept)
@@ -301,14 +321,15 @@ def _decide(luminance, span, model, memory, trains, motions):
     return -1, kept
 
 
-@numba.njit(cache=True, error_model="numpy")
-def respond_at(pixels, luminance, curve, levels, lights):
+@kernel
+def respond_at(pixels, luminance, curve, levels, room):
     """Write the responses to the luminance of `pixels`; the first pixel with an invalid one, or -1."""
+    lights = room.lights
     for j in range(pixels.size):
         lights[j] = luminance[pixels[j]]
         if not 0.0 <= lights[j] <= MAX_LUMINANCE:
             return pixels[j]
-    respond(curve, lights[: pixels.size], levels)
+    respond(curve, lights[: pixels.size], levels, room.exponents)
     return -1
 
 
@@ -324,7 +345,7 @@ def _recall(pixels, model, memory, table):
         table[Column.REMEMBERED + j] = level
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def level_of(memory, i, on, off):
     """Remembered level; equal thresholds multiply the exact net count once."""
     if on == off:
@@ -403,10 +424,11 @@ def _advance(luminance, span, model, memory, trains, motions):
                 memory.on_count[pixels[j]] += crossed
             else:
                 memory.off_count[pixels[j]] += crossed
-    levels = np.empty(min(pixels.size, BLOCK))
+    room = make_room()
+    levels = room.levels
     for first in range(0, pixels.size, BLOCK):
         block = pixels[first : min(first + BLOCK, pixels.size)]
         for j in range(block.size):
             k = block[j] if thresholds.on.size > 1 else 0
             levels[j] = level_of(memory, block[j], thresholds.on[k], thresholds.off[k])
-        set_quiet_bands(block, levels, model, memory)
+        set_quiet_bands(block, levels, model, memory, room)

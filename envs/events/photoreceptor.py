@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from envs.compiled import kernel
+
 MAX_LUMINANCE = float(np.finfo(np.float32).max)
 ROOT_HALF = 0x3FE6A09E667F3BCD  # the bits of sqrt(1/2)
 INVERSE_LN2 = 1.4426950408889634
@@ -49,15 +51,15 @@ def response_curve(response: str, luminance_floor: float) -> Curve:
     return Curve(0.0, luminance_floor, 1.0 / luminance_floor, math.log(luminance_floor))
 
 
-@numba.njit(cache=True, error_model="numpy")
-def natural_logarithm(values):
-    """Replace each of `values` (float64, normal, > 0) by its logarithm.
+@kernel
+def natural_logarithm(values, exponents):
+    """Replace each of `values` (float64, normal, > 0) by its logarithm; `exponents` is room, int64 as many.
 
     x = 2^k (1 + f) with 1 + f in [sqrt(1/2), sqrt(2)); log(1 + f) is the odd series in
     s = f / (2 + f), as in Tang (1990) and fdlibm. Error below 1 ulp
     (tests/envs/events/test_extremes.py).
     """
-    bits, exponents = values.view(np.int64), np.empty(values.size, np.int64)
+    bits = values.view(np.int64)
     for i in range(values.size):
         k = (bits[i] - ROOT_HALF) >> 52
         exponents[i] = k
@@ -77,22 +79,28 @@ def natural_logarithm(values):
         values[i] = k * LN2_HIGH - ((half - (s * (half + r) + k * LN2_LOW)) - f)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def respond(curve, luminance, levels):
-    """Write into the first `levels` (float64) the responses to `luminance` (float32, finite, >= 0)."""
+@kernel
+def respond(curve, luminance, levels, exponents):
+    """Write into the first `levels` (float64) the responses to `luminance` (float32, finite, >= 0).
+
+    `exponents` is room, int64 (N,).
+    """
     levels = levels[: luminance.size]
     for i in range(luminance.size):
         levels[i] = max(luminance[i] + curve.shift, curve.knee)
-    natural_logarithm(levels)
+    natural_logarithm(levels, exponents)
     if curve.gain > 0.0:
         for i in range(luminance.size):
             levels[i] += min(luminance[i] - curve.knee, 0.0) * curve.gain
 
 
-@numba.njit(cache=True, error_model="numpy")
-def exponential(values):
-    """Replace each of `values` (float64, between -700 and 700) by its exponential, relative error 1e-12."""
-    bits, exponents = values.view(np.int64), np.empty(values.size, np.int64)
+@kernel
+def exponential(values, exponents):
+    """Replace each of `values` (float64, between -700 and 700) by its exponential, relative error 1e-12.
+
+    `exponents` is room, int64 (N,).
+    """
+    bits = values.view(np.int64)
     for i in range(values.size):
         k = np.rint(values[i] * INVERSE_LN2)
         exponents[i] = np.int64(k)
@@ -112,11 +120,14 @@ def exponential(values):
         bits[i] += exponents[i] << 52
 
 
-@numba.njit(cache=True, error_model="numpy")
-def light_of(curve, levels):
-    """Replace responses (float64) by their luminances; below 0 where no luminance responds so low."""
+@kernel
+def light_of(curve, levels, exponents):
+    """Replace responses (float64) by their luminances; below 0 where no luminance responds so low.
+
+    `exponents` is room, int64 (N,).
+    """
     if curve.knee == 0.0:
-        exponential(levels)
+        exponential(levels, exponents)
         for i in range(levels.size):
             levels[i] -= curve.shift
         return

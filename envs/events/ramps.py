@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from envs.compiled import kernel
 from envs.config import CameraConfig
-from envs.events.crossings import BLOCK, Memory, Model, level_of, respond_at, scan, set_quiet_bands
+from envs.events.crossings import BLOCK, Memory, Model, Room, level_of, respond_at, scan, set_quiet_bands
 from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME, sorted_events
 from envs.events.photoreceptor import light_of
 from envs.events.refractory import TOLERANCE
@@ -55,6 +56,7 @@ class Watch(NamedTuple):
         seen_us: int64 (W,), when each column was looked at last [us].
         scratch: As `crossings.steps` takes it.
         ramps: Room for the `Ramps` between two renders.
+        room: `Room` for a block of pixels.
     """
 
     model: Model
@@ -62,6 +64,7 @@ class Watch(NamedTuple):
     seen_us: np.ndarray
     scratch: tuple
     ramps: Ramps
+    room: Room
 
 
 def make_ramps(size: int) -> Ramps:
@@ -77,7 +80,7 @@ def can_look(camera: CameraConfig) -> bool:
     return camera.memory == "reference" and exact and events <= MAX_EVENTS_PER_FRAME
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def look_at(image, first, last, t_us, watch, kept):
     """Look at columns `first` .. `last` - 1 of an image: keep the ramps of their pixels that fire.
 
@@ -92,33 +95,30 @@ def look_at(image, first, last, t_us, watch, kept):
     Returns:
         First invalid pixel or -1, ramps in use, and events lost.
     """
-    flat, (flags, outside) = image.ravel(), watch.scratch
+    flat, (flags, outside) = image.reshape(image.size), watch.scratch
     model, memory, ramps = watch.model, watch.memory, watch.ramps
     whole = last - first == image.shape[1]
     found = (
         scan(flat, memory, flags, outside) if whole else _scan_columns(image, first, last, memory, outside)
     )
-    begun, lost = kept, 0
-    responses, lights = np.empty((3, BLOCK)), np.empty(BLOCK, np.float32)
+    begun, lost, room = kept, 0, watch.room
     for begin in range(0, found, BLOCK):
         pixels = outside[begin : min(begin + BLOCK, found)]
-        bad = respond_at(pixels, flat, model.curve, responses[1], lights)
+        bad = respond_at(pixels, flat, model.curve, room.after, room)
         if bad >= 0:
             return bad, begun, 0
-        respond_at(pixels, memory.previous, model.curve, responses[0], lights)
-        kept = _keep(pixels, responses, flat, t_us, watch, kept)
+        respond_at(pixels, memory.previous, model.curve, room.before, room)
+        kept = _keep(pixels, flat, t_us, watch, kept)
     for j in range(begun, kept):
         lost += abs(ramps.crossings[j]) - ramps.sent[j]
-    _advance(ramps, begun, kept, model, memory)
-    if whole:
-        memory.previous[:] = flat
-    else:
-        _copy_columns(image, first, last, memory.previous)
-    watch.seen_us[first:last] = t_us
+    _advance(begun, kept, watch)
+    _copy_columns(image, first, last, memory.previous)
+    for column in range(first, last):
+        watch.seen_us[column] = t_us
     return -1, kept, 0 if model.rule.carries else lost
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _scan_columns(image, first, last, memory, outside):
     """Write the pixels of some columns outside their quiet band, in raster order; return how many."""
     found = 0
@@ -132,7 +132,7 @@ def _scan_columns(image, first, last, memory, outside):
     return found
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _copy_columns(image, first, last, previous):
     """Remember some columns of an image."""
     for row in range(image.shape[0]):
@@ -141,17 +141,17 @@ def _copy_columns(image, first, last, previous):
             previous[i + column] = image[row, column]
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _keep(pixels, responses, flat, t_us, watch, kept):
+@kernel
+def _keep(pixels, flat, t_us, watch, kept):
     """Append the ramps of the pixels that fire; return how many there are now."""
     rule, thresholds = watch.model.rule, watch.model.thresholds
-    memory, seen_us, ramps = watch.memory, watch.seen_us, watch.ramps
+    memory, seen_us, ramps, room = watch.memory, watch.seen_us, watch.ramps, watch.room
     for j in range(pixels.size):
         i = pixels[j]
         k = i if thresholds.on.size > 1 else 0
         on, off = thresholds.on[k], thresholds.off[k]
-        remembered, way = level_of(memory, i, on, off), responses[1, j] - responses[0, j]
-        change = responses[1, j] - remembered
+        remembered, way = level_of(memory, i, on, off), room.after[j] - room.before[j]
+        change = room.after[j] - remembered
         step = on if change > 0.0 else -off
         count = np.int64((abs(change) + TOLERANCE) / abs(step))
         if count == 0 or not (rule.carries or way != 0.0):
@@ -167,10 +167,11 @@ def _keep(pixels, responses, flat, t_us, watch, kept):
     return kept
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _advance(ramps, begun, kept, model, memory):
+@kernel
+def _advance(begun, kept, watch):
     """Move remembered levels and quiet bands of the pixels of the newest ramps."""
-    thresholds, levels = model.thresholds, np.empty(BLOCK)
+    model, memory, ramps, levels = watch.model, watch.memory, watch.ramps, watch.room.levels
+    thresholds = model.thresholds
     for begin in range(begun, kept, BLOCK):
         pixels = ramps.pixels[begin : min(begin + BLOCK, kept)]
         for j in range(pixels.size):
@@ -182,7 +183,7 @@ def _advance(ramps, begun, kept, model, memory):
                 memory.off_count[i] += crossed
             k = i if thresholds.on.size > 1 else 0
             levels[j] = level_of(memory, i, thresholds.on[k], thresholds.off[k])
-        set_quiet_bands(pixels, levels, model, memory)
+        set_quiet_bands(pixels, levels, model, memory, watch.room)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -202,7 +203,7 @@ def events_of_ramps(watch, kept, span):
         for k in range(ramps.sent[j]):
             lights[event] = ramps.level[j] + k * ramps.stride[j]
             event += 1
-    light_of(watch.model.curve, lights)
+    light_of(watch.model.curve, lights, np.empty(total, np.int64))
     event = 0
     for j in range(kept):
         y = ramps.pixels[j] // width

@@ -1,5 +1,7 @@
 """Events of one control step as an array of fixed size, or as a picture (appendix D.1.2)."""
 
+import itertools
+
 import numba
 import numpy as np
 
@@ -39,14 +41,35 @@ def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int
             f"events must be sorted by t within ({start_us}, {start_us + window_us}] us with p in {{-1, 1}}; "
             f"event {bad} is {events[bad]}."
         )
-    return fill_window(events, start_us, window_us, capacity)
-
-
-def fill_window(events: np.ndarray, start_us: int, window_us: int, capacity: int) -> np.ndarray:
-    """As `pack_window`, for events that are known to be valid, such as those of `EventCamera`."""
     window = np.zeros((capacity + 1, 4), np.int32)
     _fill(events, start_us, window_us, window)
     return window
+
+
+def pack_windows(
+    events: np.ndarray, ends: np.ndarray, starts_us: np.ndarray, lengths_us: np.ndarray, capacity: int | None
+) -> np.ndarray | tuple[np.ndarray, ...]:
+    """Several windows, each as by `pack_window`, of events that are known to be valid.
+
+    Args:
+        events: EVENT of all windows, one after the other, such as those of `EventCamera`.
+        ends: int64 (B + 1,), window b has events ends[b] .. ends[b + 1] - 1.
+        starts_us: Where each window starts, int64 (B,) [us].
+        lengths_us: How long it is, int64 (B,) [us].
+        capacity: Most events that a window holds; None: each has as many rows as it needs.
+
+    Returns:
+        int32 (B, capacity + 1, 4), or B arrays (N + 1, 4).
+    """
+    count = len(starts_us)
+    if capacity is not None:
+        windows = np.zeros((count, capacity + 1, 4), np.int32)
+        _fill_all(events, ends, starts_us, lengths_us, windows)
+        return windows
+    rows = np.empty((events.size + count, 4), np.int32)
+    _fill_flat(events, ends, starts_us, lengths_us, rows)
+    begins = (ends + np.arange(count + 1)).tolist()
+    return tuple([rows[begin:end] for begin, end in itertools.pairwise(begins)])
 
 
 def unpack_window(window: np.ndarray) -> tuple[np.ndarray, int]:
@@ -111,6 +134,22 @@ def _fill(events, start_us, window_us, window):
         event, row = events[i], i - dropped + 1
         window[row, 0], window[row, 1] = event.t - start_us, event.x
         window[row, 2], window[row, 3] = event.y, event.p
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill_all(events, ends, starts_us, lengths_us, windows):
+    """Fill the empty windows (B, capacity + 1, 4)."""
+    for b in range(starts_us.size):
+        _fill(events[ends[b] : ends[b + 1]], starts_us[b], lengths_us[b], windows[b])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill_flat(events, ends, starts_us, lengths_us, rows):
+    """Fill windows of just the length that each needs, one after the other."""
+    for b in range(starts_us.size):
+        own = rows[ends[b] + b : ends[b + 1] + b + 1]
+        own[0, 3] = 0
+        _fill(events[ends[b] : ends[b + 1]], starts_us[b], lengths_us[b], own)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.raycast.records import Record, inlined, kernel
+from envs.compiled import inlined, kernel
+from envs.raycast.records import Record
 from envs.scene import BOX, CONE, ELLIPSOID, POLE
 
 MIN_DEPTH = 1e-9  # [m]; so that a division is always defined

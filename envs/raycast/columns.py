@@ -12,10 +12,11 @@ import numba
 import numpy as np
 
 from envs.checks import LIMIT_M, LIMIT_S
+from envs.compiled import inlined, kernel
 from envs.raycast.bodies import MIN_DEPTH, corner, depths, is_before, outline, see_bodies
 from envs.raycast.coverage import LAYERS, PADDING, cover_ground, ends, put, resolve
 from envs.raycast.patterns import texture_cell
-from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Canvas, Ends, Record, inlined, kernel
+from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Canvas, Ends, Record
 from envs.raycast.surfaces import enter_gap, show_body, show_walls, wall_depth
 from envs.scene import BOX, CONE, ELLIPSOID
 

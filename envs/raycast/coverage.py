@@ -14,7 +14,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from envs.raycast.records import Ends, Record, inlined, kernel
+from envs.compiled import inlined, kernel
+from envs.raycast.records import Ends, Record
 
 MIN_RISE = 1e-9  # [rows] an edge that slopes less is level
 BLOCK = 4  # columns that are resolved together, because sums that do not wait for each other are fast

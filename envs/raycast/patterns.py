@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from envs.compiled import inlined, kernel
 from envs.raycast.bodies import box_slab, depths
 from envs.raycast.coverage import Layer, share_below
-from envs.raycast.records import Canvas, Ends, Record, inlined, kernel
+from envs.raycast.records import Canvas, Ends, Record
 from envs.scene import BOX, CONE
 from envs.scene.textures import LEVELS, NOISE, RINGS, STACK_TEXELS, STRIPES
 

@@ -7,13 +7,7 @@ in metres, rows and columns in pixels; slopes are right / forward, as seen from 
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
-import numba
 import numpy as np
-
-# Kernels allocate nothing, so that arrays need no counting of references: that, by atomic
-# instructions at each call, took five times as long as the work.
-kernel = numba.njit(cache=True, error_model="numpy", _nrt=False)
-inlined = numba.njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 
 # What the elements of such arrays are to mypy: attributes of any name.
 Record: TypeAlias = np.record

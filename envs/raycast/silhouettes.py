@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from envs.compiled import inlined, kernel
 from envs.raycast.bodies import see_bodies, silhouette_of
 from envs.raycast.columns import Workspace, aim
-from envs.raycast.records import Record, inlined, kernel
+from envs.raycast.records import Record
 
 BESIDE = 2.0  # columns beside the image in which silhouettes are followed too
 CORRECTIONS = 2  # of the time of a crossing, which linear motion estimates first

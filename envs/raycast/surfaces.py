@@ -8,11 +8,12 @@ import math
 
 import numpy as np
 
+from envs.compiled import inlined, kernel
 from envs.raycast import coverage, patterns
 from envs.raycast.bodies import MIN_DEPTH, box_slab, cosine, depths, mean_root, root
 from envs.raycast.coverage import Layer, beyond, ends, is_open, put
 from envs.raycast.patterns import Quadric, Rows
-from envs.raycast.records import Canvas, Ends, Record, inlined, kernel
+from envs.raycast.records import Canvas, Ends, Record
 from envs.scene import BOX, ELLIPSOID, POLE
 
 MIN_CROSSING = 0.02  # [rows] edges that cross by less are not cut there

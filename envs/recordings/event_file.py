@@ -12,6 +12,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+import numba
 import numpy as np
 
 from envs.events import EVENT
@@ -190,28 +191,43 @@ def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0) 
         ValueError: A coordinate is outside the sensor, a time is outside [0, 2**52), or the
             times go back by more than a second.
     """
-    for name, size in (("x", request.width), ("y", request.height)):
-        if size is not None and len(events) and int(events[name].max()) >= size:
+    x_max, y_max, t_min, t_max, late, back_us = _extremes(events)
+    for name, size, largest in (("x", request.width, x_max), ("y", request.height, y_max)):
+        if size is not None and largest >= size:
             first = int(np.argmax(events[name] >= size))
             raise request.refusal(
                 f"event {first} has {name}={events[name][first]} outside the sensor of "
                 f"{request.width}x{request.height}; give the right width and height or repair the file"
             )
-    t_us = np.ascontiguousarray(events["t"])
-    if len(t_us) and (t_us.min() < 0 or t_us.max() >= T_LIMIT_US):
+    if t_min < 0 or t_max >= T_LIMIT_US:
         raise request.refusal("times must lie in [0, 2**52) us; shift them")
-    newest = np.maximum.accumulate(t_us)
-    back_us = newest - t_us
-    late = int(np.count_nonzero(back_us))
+    if back_us > MAX_DISORDER_US:
+        steps_us = np.maximum.accumulate(events["t"]) - events["t"]
+        first = int(np.argmax(steps_us > MAX_DISORDER_US))
+        raise request.refusal(
+            f"event {first} is {steps_us[first]} us older than one before it; up to {MAX_DISORDER_US} us "
+            "are sorted, more is a reset clock or damage: cut the file there"
+        )
     if late:
-        if back_us.max() > MAX_DISORDER_US:
-            first = int(np.argmax(back_us > MAX_DISORDER_US))
-            raise request.refusal(
-                f"event {first} is {back_us[first]} us older than one before it; up to {MAX_DISORDER_US} us "
-                "are sorted, more is a reset clock or damage: cut the file there"
-            )
-        events = events[np.argsort(t_us, kind="stable")]
+        events = events[np.argsort(events["t"], kind="stable")]
     return EventFile(events, request.width, request.height, format, late, skipped)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _extremes(events: np.ndarray) -> tuple[int, int, int, int, int, int]:
+    """Largest x and y, least and largest t, number of late events, and how late the latest is [us].
+
+    One pass, because events take more memory than a processor's caches have.
+    """
+    x, y, oldest, newest, late, back_us = 0, 0, 0, 0, 0, 0
+    for i in range(events.size):
+        event = events[i]
+        t = event.t
+        x, y = max(x, event.x), max(y, event.y)
+        oldest, newest = min(oldest, t), max(newest, t)
+        late += t < newest
+        back_us = max(back_us, newest - t)
+    return x, y, oldest, newest, late, back_us
 
 
 def unwrap(counter: np.ndarray, bits: int) -> np.ndarray:

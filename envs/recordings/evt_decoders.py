@@ -1,6 +1,6 @@
-"""Kernels that decode the words of Prophesee's encodings EVT 2.0, EVT 2.1 and EVT 3.0.
+"""Kernels that decode the words of Prophesee's DAT and of its encodings EVT 2.0, EVT 2.1 and EVT 3.0.
 
-Call a decoder once with empty `events` to count, and once with room for all of them. It returns
+Call a decoder of EVT once with empty `events` to count, and once with room for all of them. It returns
 the number of events, the number of events skipped because their time or row was not yet known,
 and the index of the first word of a reserved type, or -1.
 """
@@ -36,6 +36,10 @@ class Evt3(IntEnum):
     TRIGGER = 10
 
 
+# One bit for each type that EVT 3.0 does not have.
+RESERVED_EVT3 = sum(1 << kind for kind in range(FIRST_VENDOR_TYPE) if kind not in set(Evt3))
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _bits(mask: int) -> int:
     """How many of the lowest 32 bits are set."""
@@ -50,23 +54,22 @@ def _emit(events: np.ndarray, n: int, mask: int, t: int, x: int, y: int, p: int)
     if n >= events.size:
         return n + _bits(mask)
     while mask:
-        if mask & 1:
-            event = events[n]
-            event.t, event.x, event.y, event.p = t, x, y, p
-            n += 1
-        x += 1
-        mask >>= 1
+        event = events[n]
+        event.t, event.x, event.y, event.p = t, x + _bits((mask & -mask) - 1), y, p
+        n += 1
+        mask &= mask - 1
     return n
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _time_base(value: int, base: int) -> int:
-    """The time of a new high part [us]; the 34-bit clock began again if it fell by half its range."""
+def _time_base(value: int, base: int, low_bits: int, high_bits: int) -> int:
+    """The time of a new high part [us]; the clock began again if that fell by more than half its range."""
+    bits = low_bits + high_bits
     if base < 0:
-        return value << 6
-    if value < (base >> 6 & 0xFFFFFFF) - (1 << 27):
-        base += 1 << 34
-    return (base >> 34 << 34) | value << 6
+        return value << low_bits
+    if value < (base >> low_bits & (1 << high_bits) - 1) - (1 << high_bits - 1):
+        base += 1 << bits
+    return (base >> bits << bits) | value << low_bits
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -90,24 +93,10 @@ def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tup
                 t = base | (word >> 22 & 63)
                 n = _emit(events, n, mask, t, word >> 11 & 2047, word & 2047, 2 * kind - 1)
         elif kind == Evt2.TIME_HIGH:
-            base = _time_base(word & 0xFFFFFFF, base)
+            base = _time_base(word & 0xFFFFFFF, base, 6, 28)
         elif kind != Evt2.TRIGGER and kind < FIRST_VENDOR_TYPE:
             return n, skipped, i
     return n, skipped, -1
-
-
-class Stream(IntEnum):
-    """Places in the memory of an EVT 3.0 stream."""
-
-    HIGH = 0  # upper and lower 12 bits of the clock
-    LOW = 1
-    TURNS = 2  # how often the 24-bit clock began again
-    Y = 3
-    X = 4
-    P = 5
-
-
-STREAM_SIZE = len(Stream)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -118,50 +107,95 @@ def decode_evt3(words: np.ndarray, events: np.ndarray) -> tuple[int, int, int]:
 
     Args:
         words: uint16 (N,): type 4 bits, value 12 bits.
-        events: EVENT array to fill.
+        events: EVENT array to fill, empty or of exactly the counted size.
     """
-    n, skipped = 0, 0
-    stream = np.zeros(STREAM_SIZE, np.int64)
-    stream[Stream.HIGH], stream[Stream.Y] = -1, -1
+    start = _first_known(words)
+    if events.size:
+        _fill_evt3(words, start, events)
+        return events.size, 0, -1
+    skipped, bad_before = _count_evt3(words[:start])
+    n, bad_after = _count_evt3(words[start:])
+    return n, skipped, _first_reserved(words) if bad_before or bad_after else -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _first_known(words: np.ndarray) -> int:
+    """Index of the word from which on time, row and polarity are known; N if they never are."""
+    time, row, polarity = False, False, False
     for i in range(words.size):
+        kind = np.int64(words[i]) >> 12
+        time |= kind == Evt3.TIME_HIGH
+        row |= kind == Evt3.ROW
+        polarity |= kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE
+        if time and row and polarity:
+            return i
+    return words.size
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _first_reserved(words: np.ndarray) -> int:
+    """Index of the first word of a type that EVT 3.0 does not have, or -1."""
+    for i in range(words.size):
+        if RESERVED_EVT3 >> (np.int64(words[i]) >> 12) & 1:
+            return i
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _mask(kind: int, value: int) -> int:
+    """Which of the pixels from x on have an event by an EVT 3.0 word."""
+    if kind == Evt3.VECTOR_12:
+        return value
+    return value & 255 if kind == Evt3.VECTOR_8 else int(kind == Evt3.EVENT)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _count_evt3(words: np.ndarray) -> tuple[int, bool]:
+    """Number of events, and whether a type is reserved; no branches, so several words go at once."""
+    n, reserved = 0, np.int64(0)
+    for i in range(words.size):
+        word = np.int64(words[i])
+        n += _bits(_mask(word >> 12, word & 0xFFF))
+        reserved |= RESERVED_EVT3 >> (word >> 12)
+    return n, reserved & 1 == 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill_evt3(words: np.ndarray, start: int, events: np.ndarray) -> None:
+    """Write the events of the words from `start` on; the words before it only say where and when."""
+    n, i, base = 0, 0, -1
+    x = y = p = low = np.int64(0)
+    while n < events.size:
         kind, value = np.int64(words[i]) >> 12, np.int64(words[i]) & 0xFFF
-        mask, advance = 0, 0
-        if kind == Evt3.VECTOR_12:
-            mask, advance = int(value), 12
-        elif kind == Evt3.VECTOR_8:
-            mask, advance = int(value & 255), 8
-        elif kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE:
-            stream[Stream.X], stream[Stream.P] = value & 2047, 2 * (value >> 11) - 1
-            mask = 1 if kind == Evt3.EVENT else 0
-        elif not _take_row_or_time(kind, value, stream):
-            return n, skipped, i
-        if mask:
-            n, skipped = _emit_vector(events, n, skipped, mask, stream)
-        stream[Stream.X] += advance
-    return n, skipped, -1
+        if kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE:
+            x, p = value & 2047, 2 * (value >> 11) - 1
+            if kind == Evt3.EVENT:
+                n = _emit(events, n, 1, base | low, x, y, p) if i >= start else n
+        elif kind == Evt3.ROW:
+            y = value & 2047
+        elif kind == Evt3.VECTOR_12 or kind == Evt3.VECTOR_8:
+            n = _emit(events, n, _mask(kind, value), base | low, x, y, p) if i >= start else n
+            x += 12 if kind == Evt3.VECTOR_12 else 8
+        elif kind == Evt3.TIME_LOW:
+            low = value
+        elif kind == Evt3.TIME_HIGH:
+            before, base = base, _time_base(value, base, 12, 12)
+            low = low if base == before else np.int64(0)
+        i += 1
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _emit_vector(events: np.ndarray, n: int, skipped: int, mask: int, stream: np.ndarray) -> tuple[int, int]:
-    """Events of a mask, or skipped ones where time, row or polarity are not yet known."""
-    if stream[Stream.HIGH] < 0 or stream[Stream.Y] < 0 or stream[Stream.P] == 0:
-        return n, skipped + _bits(mask)
-    t = stream[Stream.TURNS] << 24 | stream[Stream.HIGH] << 12 | stream[Stream.LOW]
-    return _emit(events, n, mask, t, stream[Stream.X], stream[Stream.Y], stream[Stream.P]), skipped
+def decode_dat(words: np.ndarray, events: np.ndarray) -> None:
+    """Decode DAT, whose clock of 32 bits is unwrapped as by `unwrap`.
 
-
-@numba.njit(cache=True, error_model="numpy")
-def _take_row_or_time(kind: int, value: int, stream: np.ndarray) -> bool:
-    """Take a word that makes no event into the stream's memory; False for a reserved type."""
-    if kind == Evt3.ROW:
-        stream[Stream.Y] = value & 2047
-    elif kind == Evt3.TIME_LOW:
-        stream[Stream.LOW] = value
-    elif kind == Evt3.TIME_HIGH:
-        if value < stream[Stream.HIGH] - 2048:  # the 24-bit clock began again
-            stream[Stream.TURNS] += 1
-        if value != stream[Stream.HIGH]:
-            stream[Stream.HIGH], stream[Stream.LOW] = value, 0
-    else:
-        return kind == Evt3.CONTINUED_4 or kind == Evt3.TRIGGER or kind >= FIRST_VENDOR_TYPE
-    return True
+    Args:
+        words: Shape (N,), fields t and data, uint32: x 14 bits, y 14 bits, polarity 1 bit.
+        events: EVENT array (N,) to fill.
+    """
+    t, half = np.int64(0), 1 << 31
+    for i in range(events.size):
+        step = np.int64(words[i].t) - t
+        t += (step + half & 2 * half - 1) - half if i else step
+        data, event = words[i].data, events[i]
+        event.t, event.x, event.y = t, data & 0x3FFF, data >> 14 & 0x3FFF
+        event.p = 2 * np.int8(data >> 28 & 1) - 1

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from envs.events import EVENT
-from envs.recordings.event_file import EventFile, Request, finish, replaced, unwrap
-from envs.recordings.evt_decoders import decode_evt2, decode_evt3
+from envs.recordings.event_file import EventFile, Request, finish, replaced
+from envs.recordings.evt_decoders import decode_dat, decode_evt2, decode_evt3
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_WORDS = 1 << 30
@@ -44,9 +44,7 @@ def read_dat(request: Request, format: str = "dat") -> EventFile:
     request.check_count(len(words))
     request = request.sized(_number(fields.get("Width")), _number(fields.get("Height")))
     events = np.empty(len(words), EVENT)
-    events["t"] = unwrap(words["t"], 32)
-    events["x"], events["y"] = words["data"] & 0x3FFF, words["data"] >> 14 & 0x3FFF
-    events["p"] = np.where(words["data"] >> 28 & 1, 1, -1)
+    decode_dat(words, events)
     return finish(request, format, events)
 
 

@@ -5,43 +5,113 @@ at when the silhouette of a body enters or leaves it, and once half-way where on
 light of a pixel is linear in time between, so far fewer renders give the same events.
 """
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
 from envs.checks import LIMIT_M, LIMIT_S
-from envs.events.crossings import named
+from envs.compiled import kernel
+from envs.events.crossings import Room, make_room, named
 from envs.events.emission import EVENT, Span
-from envs.events.ramps import Watch, events_of_ramps, look_at
-from envs.raycast.columns import paint_columns
-from envs.raycast.silhouettes import Stretch, aim_along, fastest, find_looks, find_silhouettes
+from envs.events.ramps import Ramps, Watch, events_of_ramps, look_at, make_ramps
+from envs.raycast.columns import Workspace, make_workspace, paint_columns
+from envs.raycast.silhouettes import (
+    Looks,
+    Stretch,
+    aim_along,
+    fastest,
+    find_looks,
+    find_silhouettes,
+    make_looks,
+)
 
 BAD_POSE = -2
 FAST = 0.7  # columns from one render to the next; a body that moves more is near, and all its edges move
 
 
+class Scratch(NamedTuple):
+    """Room for one step of one camera, which all cameras of a process with images of this size share.
+
+    Attributes:
+        room: `Workspace` for as many bodies as a scene has, or more.
+        image: float32 (H, W), what is painted.
+        pixels: As `crossings.steps` takes its scratch.
+        ramps: For three times as many pixels as the image has.
+        looks: For the looks at it.
+        block: For a block of pixels.
+    """
+
+    room: Workspace
+    image: np.ndarray
+    pixels: tuple[np.ndarray, np.ndarray]
+    ramps: Ramps
+    looks: Looks
+    block: Room
+
+
+class View(NamedTuple):
+    """What one camera sees, and what it remembers of it; arrays that a step changes in place.
+
+    Attributes:
+        bodies: (N,) BODY, the obstacles.
+        stacks: Float32, the filtered tiles of the scene's noise.
+        frame: (1,) FRAME without what a pose determines.
+        cull_m: Obstacles farther than this are not drawn [m].
+        model: The model of an `EventCamera`, as its `state` gives it.
+        memory: Its memory; the last image is a part of it.
+        seen_us: int64 (W,), when each column was looked at last [us].
+        scratch: Room for a step.
+    """
+
+    bodies: np.ndarray
+    stacks: np.ndarray
+    frame: np.ndarray
+    cull_m: float
+    model: tuple
+    memory: tuple
+    seen_us: np.ndarray
+    scratch: Scratch
+
+
+def scratch_for(width: int, height: int, num_bodies: int) -> Scratch:
+    """Scratch for images of `width` x `height` pixels of a scene of `num_bodies` bodies."""
+    return _scratch(width, height, 1 << (num_bodies - 1).bit_length())
+
+
+@lru_cache(maxsize=4)
+def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
+    """One of each size: few scenes then work in the same memory, which stays in the cache."""
+    size, words = width * height, (width * height + 7) // 8
+    return Scratch(
+        room=make_workspace(num_bodies, height),
+        image=np.zeros((height, width), np.float32),
+        pixels=(np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)),
+        ramps=make_ramps(3 * size),
+        looks=make_looks(width),
+        block=make_room(),
+    )
+
+
 @numba.njit(cache=True, error_model="numpy")
-def sense_way(scene, way, parts, image, camera, looks):
-    """Events of a way, and the image at its end.
+def sense_way(view, way, parts):
+    """Events of a way.
 
     Args:
-        scene: Bodies, filtered tiles, FRAME without a pose, distance beyond which bodies are not
-            drawn [m], and `Workspace`.
+        view: `View`, in whose memory the last image becomes that at the end.
         way: `Way`.
         parts: In how many parts of equal time the way is cut; twice as many where something is near.
-        image: float32 (H, W), the last one; becomes that at the end.
-        camera: The model, memory and scratch of an `EventCamera`, when each column was looked at
-            last [us], and room for `Ramps` of three times as many pixels.
-        looks: Room for `Looks`.
 
     Returns:
         First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
     """
-    bodies, stacks, scene_frame, cull, room = scene
-    values, rows, scratch, seen_us, ramps = camera
-    model, memory = named(values, rows)
-    watch = Watch(model, memory, seen_us, scratch, ramps)
+    bodies, stacks, cull, seen_us = view.bodies, view.stacks, view.cull_m, view.seen_us
+    room, image, pixels, ramps, looks, block = view.scratch
+    model, memory = named(view.model, view.memory)
+    watch = Watch(model, memory, seen_us, pixels, ramps, block)
     frame, width = room.frames[0], image.shape[1]
-    room.frames[0] = scene_frame[0]
+    room.frames[0] = view.frame[0]
     if not _is_near(way):
         return BAD_POSE, 0, 0, np.empty(0, EVENT)
     before, after = np.empty((len(bodies), 2)), np.empty((len(bodies), 2))
@@ -63,7 +133,7 @@ def sense_way(scene, way, parts, image, camera, looks):
             t_us, first, last = end_us, 0, width
             if k < count:
                 t_us, first, last = looks.t_us[k], looks.first[k], looks.last[k]
-                if kept + 2 * image.size > ramps.pixels.size or seen_us[first:last].max() >= t_us:
+                if kept + 2 * image.size > ramps.pixels.size or _is_seen(seen_us, first, last, t_us):
                     continue
             aim_along(frame, way, t_us)
             paint_columns(bodies, stacks, image, first, last, cull, room)
@@ -77,7 +147,16 @@ def sense_way(scene, way, parts, image, camera, looks):
     return -1, lost, columns, events
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
+def _is_seen(seen_us, first, last, t_us):
+    """Whether one of some columns was looked at as late as that, or later."""
+    latest = seen_us[first]
+    for column in range(first + 1, last):
+        latest = max(latest, seen_us[column])
+    return latest >= t_us
+
+
+@kernel
 def _is_near(way):
     """Whether `envs.checks.check_pose` would accept the end of a way."""
     near = abs(way.end_x) <= LIMIT_M and abs(way.end_y) <= LIMIT_M and 0.0 <= way.height <= LIMIT_M

@@ -5,14 +5,15 @@ from typing import Any
 import numpy as np
 
 from envs.checks import check_pose
-from envs.config import EnvConfig, FaultsConfig
+from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, apply_faults, draw_pixel_faults
-from envs.events.ramps import make_ramps
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
-from envs.raycast.silhouettes import Way, make_looks
+from envs.raycast.records import BODY, FRAME
+from envs.raycast.renderer import NO_STACKS
+from envs.raycast.silhouettes import Way
 from envs.scene import Scene
-from envs.sensor.looks import BAD_POSE, sense_way
+from envs.sensor.looks import BAD_POSE, View, scratch_for, sense_way
 
 FAULTLESS = FaultsConfig()
 MAX_PIXELS_TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
@@ -24,9 +25,12 @@ class Sensor:
     Only what is observed is simulated: with observation "luminance" one render a step and no event
     camera, with "none" a clock alone.
 
+    A step that is seen by looks needs no more than `view`, so that `envs.vehicles` can take those of many
+    sensors together; such a sensor is not stepped by itself then, and its clock stands still.
+
     Attributes:
         events: EVENT array of the last step, faults included; empty where no camera is simulated.
-        luminance: float32 (H, W), the last render.
+        luminance: float32 (H, W), the last render; by looks, an array that the next step changes.
         dropped: Events of the last step lost to the camera's cap.
         renders: Renders of the last step.
         t_us: The simulated clock [us].
@@ -40,8 +44,6 @@ class Sensor:
         self._together = max(1, MAX_PIXELS_TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
-        self._looks = make_looks(config.camera.width)
-        self._ramps = make_ramps(3 * config.camera.width * config.camera.height)
         self._seen_us = np.zeros(config.camera.width, np.int64)
         self.plan: RenderPlan
 
@@ -59,6 +61,8 @@ class Sensor:
             self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
             self._camera.reset(self.luminance, t_us)
             self._seen_us[:] = t_us
+            if self.plan.by_looks:
+                self.luminance = self._camera.last_frame
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
         """Simulate one control step: render the part that the vehicle moved, and set the events.
@@ -93,29 +97,45 @@ class Sensor:
         else:
             events = self._render_along(start, outcome.end, moving_us)
         self.t_us = end_us
-        faults = self._config.faults
-        if faults != FAULTLESS:
-            span_us = start_us, end_us
-            events = apply_faults(events, *span_us, self.luminance, faults, self._pixels, self._rng)
-        self.events = events
+        self.events = self.spoil(events, start_us, end_us)
+
+    @property
+    def sees_by_looks(self) -> bool:
+        """Whether `view` and `scratch` are all that a step of this sensor needs."""
+        return self._config.observation not in WITHOUT_EVENTS and self.plan.by_looks
+
+    @property
+    def has_faults(self) -> bool:
+        """Whether `spoil` changes anything."""
+        return self._config.faults != FAULTLESS
+
+    def view(self) -> View:
+        """What a compiled step needs of this sensor; without a scene where it does not see by looks."""
+        scene = np.empty(0, BODY), NO_STACKS, np.zeros(1, FRAME), 0.0
+        if self.sees_by_looks:
+            renderer = self._renderer
+            scene = renderer.bodies, renderer.stacks, renderer.frame, renderer.cull_m
+        model, memory, _ = self._camera.state
+        camera = self._config.camera
+        scratch = scratch_for(camera.width, camera.height, len(scene[0]))
+        return View(*scene, model, memory, self._seen_us, scratch)
+
+    def spoil(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
+        """The events of a step after the faults of this sensor."""
+        if not self.has_faults:
+            return events
+        faults, seen = self._config.faults, self.luminance
+        return apply_faults(events, start_us, end_us, seen, faults, self._pixels, self._rng)
 
     def _look_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
         """Events of a way, of which each column is looked at when something changes in it."""
+        self.dropped = 0
         if not moving_us:
-            self.dropped = 0
             return np.empty(0, EVENT)
-        renderer = self._renderer
-        scene = renderer.bodies, renderer.stacks, renderer.frame, renderer.cull_m, renderer.room
-        way = Way(*start, *end, self._config.camera_height_m, self.t_us, moving_us)
-        image = self.luminance.copy()
-        camera = (*self._camera.state, self._seen_us, self._ramps)
-        bad, self.dropped, columns, events = sense_way(scene, way, self.renders, image, camera, self._looks)
-        if bad == BAD_POSE:
-            check_pose((*end, way.height, 0.0), (way.start_us + moving_us) * 1e-6)
-        if bad >= 0:
-            y, x = divmod(bad, image.shape[1])
-            raise ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {image[y, x]!s}.")
-        self.luminance, self.renders = image, columns / image.shape[1]
+        way, view = Way(*start, *end, self._config.camera_height_m, self.t_us, moving_us), self.view()
+        bad, self.dropped, columns, events = sense_way(view, way, self.renders)
+        check_sensed(bad, way, view.scratch.image)
+        self.renders = columns / self._config.camera.width
         return events
 
     def _render_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
@@ -166,3 +186,12 @@ class Sensor:
             return
         self.close()
         self._renderer = make_renderer(chosen, scene, camera.width, camera.height, camera.fov_deg)
+
+
+def check_sensed(bad: int, way: Way, image: np.ndarray) -> None:
+    """Raise ValueError for what `sense_way` found to be wrong, if anything; `image` is what it painted."""
+    if bad == BAD_POSE:
+        check_pose((way.end_x, way.end_y, way.height, 0.0), (way.start_us + way.moving_us) * 1e-6)
+    if bad >= 0:
+        y, x = divmod(bad, image.shape[1])
+        raise ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {image[y, x]!s}.")

@@ -2,8 +2,9 @@
 
 Run: python -m jobs.bench.against [COMMIT], the one before HEAD unless another is named
 Expect: a table in about five minutes on one core. Two processes, one of each checkout, take turns
-at the same flights; a ratio is the median over the rounds of the other's time over this one's. The
-event error is that against the converged simulation of the same checkout, at tolerance 0.05.
+at the same flights, 32 corridors side by side; a ratio is the median over the rounds of the other's
+time over this one's. The event error is that against the converged simulation of the same checkout,
+at tolerance 0.05.
 """
 
 import inspect
@@ -36,27 +37,23 @@ def worker() -> None:
     import numpy as np
 
     from envs.config import EnvConfig
-    from envs.corridor import CorridorEnv
+    from envs.corridor import CorridorVectorEnv
     from envs.event_error import measure_event_error
 
-    steps, known = 300, {}
+    corridors, steps, known = 32, 12, {}
     for line in sys.stdin:
         scene = line.strip()
         if scene not in known:
-            known[scene] = (
-                CorridorEnv(EnvConfig(scene=scene)),
-                measure_event_error(EnvConfig(scene=scene)).error,
-            )
+            env = CorridorVectorEnv(corridors, EnvConfig(scene=scene))
+            env.reset(seed=0)
+            known[scene] = env, measure_event_error(EnvConfig(scene=scene)).error
         env, error = known[scene]
         rng, seconds = np.random.default_rng(0), []
-        env.reset(seed=0)
         for _ in range(steps):
-            action = int(rng.integers(3))
+            actions = rng.integers(3, size=corridors)
             began = time.perf_counter()
-            over = any(env.step(action)[2:4])
-            seconds.append(time.perf_counter() - began)
-            if over:
-                env.reset()
+            env.step(actions)
+            seconds.append((time.perf_counter() - began) / corridors)
         print(json.dumps([float(np.median(seconds)), error]), flush=True)
 
 

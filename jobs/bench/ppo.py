@@ -2,10 +2,11 @@
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo
 Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
-`jobs.training.ppo_learner`, "stable-baselines3" its PPO with the same networks, encoder, corridors and
-settings. All take turns in one process; an iteration samples 2,048 steps in 16 corridors and
-learns 10 epochs. Seconds are wall time, medians over the rounds: `ppo_fast` samples in processes
-of its own, so the machine should be quiet. The second table is ours for every kind of policy.
+`jobs.training.ppo_learner`, "tensor by tensor" the same without `jobs.training.dense_update`,
+"stable-baselines3" its PPO with the same networks, encoder, corridors and settings. All take turns in
+one process; an iteration samples 2,048 steps in 16 corridors and learns 10 epochs. Seconds are wall
+time, medians over the rounds: `ppo_fast` samples in processes of its own, so the machine should be
+quiet. The second table is ours for every kind of policy.
 """
 
 import dataclasses
@@ -30,6 +31,7 @@ from jobs.bench.timing import interleaved
 from jobs.config.config import Config
 from jobs.run.ray_cluster import start_ray
 from jobs.training.ppo import build_ppo, policy_spec
+from jobs.training.ppo_learner import PlainPPOLearner
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
@@ -41,6 +43,13 @@ ROUNDS, FEW_ROUNDS = 5, 2
 MINIBATCHES = (32, 256)
 STEPS = 2048  # of an iteration (appendix D.1.2)
 CONSTANT = "algo.lr_schedule=constant"
+RIVALS = tuple(f"stable-baselines3, {size}" for size in MINIBATCHES)
+
+
+class TensorByTensor(PlainPPOLearner):
+    """Updates dense networks as all others."""
+
+    _dense = False
 
 
 class EncodedCorridors(VecEnv):
@@ -107,23 +116,23 @@ def main() -> None:
     """Measure and print both tables."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        show("bytestream", interleaved(against_others(Path(folder)), ROUNDS), "stable-baselines3, 32")
-        show(
-            "every policy, minibatches of 32", interleaved(every_kind(Path(folder)), FEW_ROUNDS), "bytestream"
-        )
+        show("bytestream", interleaved(against_others(Path(folder)), ROUNDS), RIVALS)
+        kinds = interleaved(every_kind(Path(folder)), FEW_ROUNDS)
+        show("every policy, minibatches of 32", kinds, ("bytestream",))
 
 
-def show(title: str, seconds: dict[str, float], unit: str) -> None:
-    """Print environment steps per second, and as multiples of one row."""
+def show(title: str, seconds: dict[str, float], units: tuple[str, ...]) -> None:
+    """Print environment steps per second, and as multiples of some rows."""
     rows = [
-        (name, f"{STEPS / value:,.0f}", f"{seconds[unit] / value:.2f}x") for name, value in seconds.items()
+        (name, f"{STEPS / value:,.0f}", *(f"{seconds[unit] / value:.2f}x" for unit in units))
+        for name, value in seconds.items()
     ]
     title = f"PPO, {title}: iterations of {STEPS:,} steps that take turns, medians"
-    show_table(title, ("training loop", "steps/s", f"of {unit}"), rows)
+    show_table(title, ("training loop", "steps/s", *(f"of {unit}" for unit in units)), rows)
 
 
 def against_others(folder: Path) -> dict[str, Callable[[], object]]:
-    """One iteration on bytestream of our learner, RLlib's and stable-baselines3's."""
+    """One iteration on bytestream of our learner, with and without compiled steps, and of the others."""
     evae = EventVAE.of(evae_settings(composed())).freeze()
     path, table = encoder_file(evae, folder), EncoderTable.from_evae(evae)
     work: dict[str, Callable[[], object]] = {}
@@ -132,8 +141,9 @@ def against_others(folder: Path) -> dict[str, Callable[[], object]]:
         start_ray(config.cluster, folder)
         ppo = build_ppo(config, path)
         work[f"ours, {size}"] = ppo.build_algo().train
-        theirs = ppo.copy(copy_frozen=False).learners(learner_class=PPOTorchLearner)
-        work[f"RLlib's learner, {size}"] = theirs.build_algo().train
+        for name, learner in (("tensor by tensor", TensorByTensor), ("RLlib's learner", PPOTorchLearner)):
+            other = ppo.copy(copy_frozen=False).learners(learner_class=learner)
+            work[f"{name}, {size}"] = other.build_algo().train
         rival = stable_baselines(config, table)
         work[f"stable-baselines3, {size}"] = partial(rival.learn, STEPS, reset_num_timesteps=False)
     fast = composed("algo=ppo_fast", CONSTANT)

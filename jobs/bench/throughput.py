@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,14 +26,17 @@ from envs.scene import Scene, make_scene
 from jobs.analysis.tables import show_table
 from jobs.bench.timing import interleaved
 from jobs.config.config import Config, parse
+from jobs.rollout.policies import PRETRAINED
 from jobs.run.progress import console
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
 from models.encoder.weights import save_encoder
+from models.policy import load_policy
 
-NUM_ENVS = 16
+NUM_ENVS = 32
 CONFIG = EnvConfig()
+POLICY = "bytestream-s0"
 
 
 def main() -> None:
@@ -86,14 +90,15 @@ def _pyrender(scene: Scene) -> PyrenderRenderer | None:
 
 
 def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
-    """Seconds per environment step: alone, with pyrender, as a vector, with the encoder."""
-    table = EncoderTable.from_evae(evae)
-    steps, batches = 400, 400 // NUM_ENVS
+    """Seconds per environment step: alone, with pyrender, as a vector, with the encoder, with a policy."""
+    table, policy = EncoderTable.from_evae(evae), load_policy(PRETRAINED / POLICY)
+    steps, batches = 416, 416 // NUM_ENVS
     rng = np.random.default_rng(0)
     single = CorridorEnv(CONFIG)
     drawn = CorridorEnv(CONFIG, renderer="pyrender")
-    several = CorridorVectorEnv(NUM_ENVS, CONFIG)
+    several = CorridorVectorEnv(NUM_ENVS, CONFIG, window_capacity=None)
     several.reset(seed=0)
+    policy.reset(NUM_ENVS)
 
     def step(env: CorridorEnv) -> None:
         env.reset(seed=0)
@@ -103,16 +108,16 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
             if over:
                 env.reset()
 
-    def step_several(encode: bool) -> None:
+    def step_several(look: Callable[[Any], object]) -> None:
         for _ in range(batches):
-            windows = several.step(rng.integers(3, size=NUM_ENVS))[0]
-            if encode:
-                table.encode_windows(windows)
+            look(several.step(rng.integers(3, size=NUM_ENVS))[0])
 
+    together = f"env step: raycast, {NUM_ENVS} as a vector"
     work: dict[str, Callable[[], object]] = {
         "env step: raycast": lambda: step(single),
-        f"env step: raycast, {NUM_ENVS} as a vector": lambda: step_several(False),
-        f"env step: raycast, {NUM_ENVS} as a vector, encoded": lambda: step_several(True),
+        together: lambda: step_several(len),
+        f"{together}, encoded": lambda: step_several(table.encode_windows),
+        f"{together}, encoded and decided": lambda: step_several(policy.logits),
     }
     try:
         drawn.reset(seed=0)

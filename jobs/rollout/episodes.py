@@ -7,12 +7,12 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from envs.config import EnvConfig
-from envs.corridor import CorridorEnv, Info
+from envs.corridor import CorridorEnv, CorridorVectorEnv, Info
 from envs.scene import Scene
 from jobs.rollout.agents import Agent
 from jobs.run.files import write_atomic
@@ -59,43 +59,48 @@ def roll_out(
         that neither pixel nor window could hold.
     """
     config = dataclasses.replace(config, observation=agent.observation)
-    envs = [CorridorEnv(config) for _ in range(min(num_envs, len(seeds)))]
     parts = [np.empty(0, EPISODE)]
-    try:
-        for first in range(0, len(seeds), num_envs):
-            batch = [int(seed) for seed in seeds[first : first + num_envs]]
-            parts.append(_roll_out_batch(agent, envs[: len(batch)], batch, watch))
-    finally:
-        for env in envs:
+    for first in range(0, len(seeds), num_envs):
+        batch = [int(seed) for seed in seeds[first : first + num_envs]]
+        env = CorridorVectorEnv(len(batch), config)
+        try:
+            parts.append(_roll_out_batch(agent, env, batch, watch))
+        finally:
             env.close()
     return np.concatenate(parts)
 
 
 def _roll_out_batch(
-    agent: Agent, envs: Sequence[CorridorEnv], seeds: Sequence[int], watch: Watch | None
+    agent: Agent, env: CorridorVectorEnv, seeds: Sequence[int], watch: Watch | None
 ) -> np.ndarray:
     """One episode per environment, until the last one ends."""
-    started = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
-    observations = np.stack([observation for observation, _ in started])
-    infos = [info for _, info in started]
-    agent.reset(envs, seeds)
-    totals = [np.zeros(4) for _ in envs]
-    episodes = np.zeros(len(envs), EPISODE)
+    observations, told = env.reset(seed=list(seeds))
+    infos = _by_row(told)
+    agent.reset(env.envs, seeds)
+    totals = np.zeros((len(seeds), 4))
+    episodes = np.zeros(len(seeds), EPISODE)
     episodes["seed"] = seeds
-    running = list(range(len(envs)))
-    while running:
-        actions = agent(observations, infos)
-        for row in tuple(running):
-            observation, reward, terminated, truncated, info = envs[row].step(int(actions[row]))
-            observations[row], infos[row] = observation, info
-            totals[row] += reward, 1, info["num_events"], info["dropped_events"]
+    running = np.ones(len(seeds), bool)
+    while running.any():
+        results = env.step_some(agent(observations, infos), running)
+        observations, rewards, terminated, truncated, told = results
+        infos, ones = _by_row(told), np.ones(len(seeds))
+        taken = np.stack((rewards, ones, told["num_events"], told["dropped_events"]), axis=1)
+        totals[running] += taken[running]
+        for row in np.flatnonzero(running).tolist():
             if watch is not None:
-                watch(envs[row], seeds[row], observation, info)
-            if terminated or truncated:
-                _record(episodes[row], totals[row], truncated, info)
-                running.remove(row)
-                observations[row] = 0  # an empty window costs the agent nothing
+                watch(env.envs[row], seeds[row], observations[row], infos[row])
+            if terminated[row] or truncated[row]:
+                _record(episodes[row], totals[row], truncated[row], infos[row])
+        running &= ~(terminated | truncated)
     return episodes
+
+
+def _by_row(told: Mapping[str, np.ndarray]) -> list[Info]:
+    """The info of each environment of a vector; names with an underscore are Gymnasium's masks."""
+    names = [name for name in told if not name.startswith("_")]
+    columns = zip(*(told[name].tolist() for name in names), strict=True)
+    return [cast(Info, dict(zip(names, values, strict=True))) for values in columns]
 
 
 def _record(episode: np.void, totals: np.ndarray, truncated: bool, info: Info) -> None:

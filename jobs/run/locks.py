@@ -10,14 +10,24 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from jobs.run.files import RunError, naming
+from jobs.run.progress import console
 
 
 @contextlib.contextmanager
-def locked(file: Path) -> Iterator[None]:
-    """Hold a lock file, which is made if it is missing; wait while another process holds it."""
+def locked(file: Path, waiting: str = "") -> Iterator[None]:
+    """Hold a lock file, which is made if it is missing; while another process holds it, say so and wait."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(file):
+    lock = FileLock(file)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        if waiting:
+            console.print(waiting)
+        lock.acquire()
+    try:
         yield
+    finally:
+        lock.release()
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ from typing import Any
 
 from jobs.config.config import ConfigError
 from jobs.config.schema import ClusterConfig
+from jobs.run.compile import compile_kernels
 from jobs.run.head_watch import watching_head
 from jobs.run.locks import locked, private_folder
 from jobs.run.ray_sessions import forget_sessions
@@ -75,8 +76,11 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
 
     if ray.is_initialized():
         return
+    compile_kernels()
     for name in ("ray", "ray.rllib", "ray.tune"):
         logging.getLogger(name).setLevel(logging.ERROR)
+    # It logs the traceback of a trial's error, which it also writes beside the trial and jobs report.
+    logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
         "runtime_env": {"env_vars": WORKER_THREADS},
         "log_to_driver": False,

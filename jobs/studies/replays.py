@@ -176,7 +176,7 @@ def latents_of(agent: PolicyAgent, windows: Sequence[np.ndarray]) -> np.ndarray:
     table = agent.policy.encoder
     if not isinstance(table, EncoderTable):
         raise TypeError(f"the policy's encoder must be an EncoderTable, got {type(table).__name__}")
-    return np.concatenate([table.encode_windows(window[None]) for window in windows])
+    return table.encode_windows(windows)
 
 
 def latent_error(latents: np.ndarray, exact: np.ndarray) -> float:

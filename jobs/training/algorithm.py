@@ -1,5 +1,6 @@
 """RLlib's PPO, made to end with the same bytes whatever interrupts it."""
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,13 @@ class PPO(RLlibPPO):
             self._rounds = Rounds(self.env_runner_group)
         except Exception as error:
             self._refused = error
+
+    def save(self, checkpoint_dir: str | None = None) -> Any:
+        """As RLlib's, which leaves its temporary folder where a full disk ends it."""
+        if checkpoint_dir or not self._storage:
+            return super().save(checkpoint_dir)
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            return super().save(folder)
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Write what the future of the training depends on."""

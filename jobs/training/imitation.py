@@ -142,7 +142,7 @@ class ImitationLearner(PlainPPOLearner):
         }
         return {name: torch.from_numpy(np.concatenate(parts)) for name, parts in columns.items()}
 
-    def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Tensor]:
+    def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
         """Gradient steps on random rows of all so far; the means of their figures."""
         likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
         self._lessons.add(rows[Columns.OBS].numpy(), costs.numpy())

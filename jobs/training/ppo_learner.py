@@ -3,11 +3,13 @@
 The value targets, the loss, its gradient and the optimiser are RLlib's (`test_ppo_learner.py`
 compares them, and the weights after an update). Around each minibatch of 32 steps RLlib slices,
 dispatches, times and logs, which takes longer than the gradient of two small networks; here that
-is done once per iteration, and no pipeline of connectors makes the batch. RLlib appends a row to
-each episode to bootstrap its value: it masks that row in the loss, but counts it in minibatches
-and in the mean and deviation of the advantages. Here it is in neither.
+is done once per iteration, and no pipeline of connectors makes the batch. Policies of dense layers
+alone take their steps in `jobs.training.dense_update`. RLlib appends a row to each episode to
+bootstrap its value: it masks that row in the loss, but counts it in minibatches and in the mean and
+deviation of the advantages. Here it is in neither.
 """
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,6 +28,7 @@ from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
+from jobs.training.dense_update import Rows, Settings, update_dense
 from jobs.training.rllib_internals import LEARNER, require
 
 READ = (
@@ -36,6 +39,8 @@ READ = (
     Postprocessing.VALUE_TARGETS,
 )
 GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
+# Of a minibatch, in the order in which `update_dense` returns them.
+FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
 EXPLAINED_ROWS = 1024  # values are compared with their targets so many at a time
 MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
 REWARD_SCALE = (
@@ -121,10 +126,11 @@ class PlainPPOLearner(PPOTorchLearner):
         self.after_gradient_based_update(timesteps=counters)
         return self.metrics.reduce()
 
-    def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Tensor]:
+    def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
         """All epochs over the rows; the figures of the last."""
-        for _ in range(num_epochs):
-            figures = self._epoch(rows, minibatch_size)
+        orders = torch.stack([torch.randperm(len(rows[Columns.ACTIONS])) for _ in range(num_epochs)])
+        learn = self._epochs_of_dense if self._dense else self._epochs
+        figures = learn(rows, orders, minibatch_size)
         return figures | {LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY: self._explained_variance(rows)}
 
     def kept(self) -> dict[str, np.ndarray]:
@@ -136,8 +142,12 @@ class PlainPPOLearner(PPOTorchLearner):
 
     def _threads(self) -> int:
         """As many as there are env runners, which wait meanwhile; one for networks too small to share."""
-        large = any(True for _ in self.module[DEFAULT_MODULE_ID].unwrapped().trunk.parameters())
-        return max(1, min(self.config.num_env_runners, os.cpu_count() or 1)) if large else 1
+        return 1 if self._dense else max(1, min(self.config.num_env_runners, os.cpu_count() or 1))
+
+    @property
+    def _dense(self) -> bool:
+        """Whether the policy is two networks of dense layers that share nothing."""
+        return not any(True for _ in self.module[DEFAULT_MODULE_ID].unwrapped().trunk.parameters())
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
         """The steps of all episodes, one after the other, with the targets of the loss."""
@@ -168,12 +178,29 @@ class PlainPPOLearner(PPOTorchLearner):
         }
         return {name: torch.from_numpy(column) for name, column in columns.items()}
 
-    def _epoch(self, rows: dict[str, Tensor], minibatch_size: int) -> dict[str, Tensor]:
-        """One pass over the rows in random order; the mean of each figure."""
-        order = torch.randperm(len(rows[Columns.ACTIONS]))
-        parts = [rows[key][order].split(minibatch_size) for key in READ]
-        figures = [self._step(dict(zip(READ, part, strict=True))) for part in zip(*parts, strict=True)]
-        return {name: torch.stack([one[name] for one in figures]).mean() for name in figures[0]}
+    def _epochs_of_dense(
+        self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
+    ) -> dict[str, Any]:
+        """As `_epochs`, compiled."""
+        config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
+        optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
+        adam = optimizer.param_groups[0]
+        of_loss = config.clip_param, config.vf_loss_coeff, config.vf_clip_param, self._entropy_coeff
+        of_adam = self._grad_clip, adam["lr"], *adam["betas"], adam["eps"]
+        settings = Settings(minibatch_size, *map(float, (*of_loss, *of_adam)))
+        stacks = rows[Columns.OBS].flatten(1).numpy()
+        others = (rows[name].numpy() for name in READ[1:])
+        means = update_dense(
+            (module.pi, module.vf), optimizer, Rows(stacks, *others), orders.numpy(), settings
+        )
+        return dict(zip(FIGURES, means.tolist(), strict=True))
+
+    def _epochs(self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int) -> dict[str, Any]:
+        """Passes over the rows, in the order of each; means over the minibatches of the last."""
+        for order in orders:
+            parts = [rows[key][order].split(minibatch_size) for key in READ]
+            figures = [self._step(dict(zip(READ, part, strict=True))) for part in zip(*parts, strict=True)]
+        return {name: torch.stack([one[name] for one in figures]).mean() for name in FIGURES}
 
     def _step(self, rows: dict[str, Tensor]) -> dict[str, Tensor]:
         """One gradient step; its losses, entropy and the gradient's norm before the clip."""
@@ -182,10 +209,19 @@ class PlainPPOLearner(PPOTorchLearner):
         total, figures = self._loss(rows)
         optimizer.zero_grad(set_to_none=True)
         total.backward()
-        limit = float("inf") if self.config.grad_clip is None else self.config.grad_clip
-        norm = nn.utils.clip_grad_norm_(parameters, limit, error_if_nonfinite=True)
+        norm = nn.utils.clip_grad_norm_(parameters, self._grad_clip, error_if_nonfinite=True)
         optimizer.step()
-        return {**figures, self.TOTAL_LOSS_KEY: total.detach(), GRADIENT_NORM_KEY: norm}
+        return {**figures, PPOTorchLearner.TOTAL_LOSS_KEY: total.detach(), GRADIENT_NORM_KEY: norm}
+
+    @property
+    def _grad_clip(self) -> float:
+        """The largest norm of a gradient."""
+        return math.inf if self.config.grad_clip is None else self.config.grad_clip
+
+    @property
+    def _entropy_coeff(self) -> float:
+        """The weight of the entropy now."""
+        return float(self.entropy_coeff_schedulers_per_module[DEFAULT_MODULE_ID].get_current_value())
 
     def _loss(self, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """The clipped surrogate, the value's squared error and the entropy, joined as RLlib joins them."""
@@ -199,8 +235,7 @@ class PlainPPOLearner(PPOTorchLearner):
         values = module.compute_values(rows, embeddings=out.get(Columns.EMBEDDINGS))
         errors = (values - rows[Postprocessing.VALUE_TARGETS]).square().clamp(max=config.vf_clip_param)
         value_loss, entropy = errors.mean(), -(logps.exp() * logps).sum(-1).mean()
-        bonus = self.entropy_coeff_schedulers_per_module[DEFAULT_MODULE_ID].get_current_value()
-        total = policy_loss + config.vf_loss_coeff * value_loss - bonus * entropy
+        total = policy_loss + config.vf_loss_coeff * value_loss - self._entropy_coeff * entropy
         figures = {POLICY_LOSS_KEY: policy_loss, VF_LOSS_KEY: value_loss, ENTROPY_KEY: entropy}
         return total, {name: value.detach() for name, value in figures.items()}
 

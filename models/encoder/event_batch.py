@@ -4,6 +4,7 @@ x, y, p and the time bin take finitely many values (appendix C), so that an even
 integers. Training (`EventBatch`) and the frozen table read the same addresses.
 """
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -50,17 +51,26 @@ class EventBatch:
         for name, values, limit in limits:
             if values.dtype != np.int32 or values.shape != self.code.shape:
                 raise ValueError(f"{name} must be int32, one per event, got {values.dtype} {values.shape}")
-            if len(values) and not 0 <= values.min() <= values.max() < limit:
+            if not _within(values, limit):
                 raise ValueError(f"{name} must lie in 0..{limit - 1}, got {values.min()}..{values.max()}")
         ends = self.offsets
         if ends.dtype != np.int64 or len(ends) < 1 or ends[0] != 0 or ends[-1] != len(self.code):
             raise ValueError(f"offsets must be int64 from 0 to {len(self.code)} events, got {ends}")
-        if np.any(np.diff(ends) < 0):
+        if (ends[1:] < ends[:-1]).any():
             raise ValueError(f"offsets must not decrease, got {ends}")
 
     def __len__(self) -> int:
         """Number of windows."""
         return len(self.offsets) - 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _within(values: np.ndarray, limit: int) -> bool:
+    """Whether all values lie in 0 .. limit - 1."""
+    outside = False
+    for value in values:
+        outside |= value < 0 or value >= limit
+    return not outside
 
 
 def address_events(events: Any, start_us: int, window_us: int, grid: Grid) -> np.ndarray:
@@ -121,32 +131,65 @@ def batch_windows(windows: Iterable[tuple[Any, int, int]], grid: Grid) -> EventB
 
 
 def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> EventBatch:
-    """Batch packed windows, int32 (B, capacity + 1, 4) as the environment observes them, or cut short.
+    """Batch packed windows of any lengths, by one compiled call.
+
+    Args:
+        windows: Each an int32 (rows, 4): row 0 is [count, dropped, window_us, 0], the next `count`
+            rows are [t - start, x, y, p]. A window without events may be all zeros. A stack of
+            equally long ones (B, capacity + 1, 4) is not copied.
+        grid: Sensor size and time bins.
 
     Raises:
-        ValueError: As `unpack_fields` and `index_events`.
+        ValueError: Wrong shape or dtype, a count beyond the rows, or as `index_events`; it names the window.
     """
-    return _join([index_packed(window, grid) for window in windows], grid)
+    rows, starts = _flat_rows(windows)
+    address, offsets, bad = _index_packed(rows, starts, grid)
+    if bad >= 0:
+        _refuse(bad, rows[starts[bad] : starts[bad + 1]], grid)
+    return EventBatch(grid, address[0], address[1], offsets)
 
 
-def index_packed(window: np.ndarray, grid: Grid) -> np.ndarray:
-    """Addresses int32 (2, count) of one packed window, int32 (capacity + 1, 4).
+def _flat_rows(windows: np.ndarray | Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The rows (R, 4) of all windows, and where each window starts and the last ends (B + 1,)."""
+    for number, window in enumerate(windows):
+        if window.shape[1:] != (4,) or not len(window) or window.dtype.kind != "i":
+            rule = "a packed window is int32 (count + 1, 4)"
+            raise ValueError(f"window {number}: {rule}, got {window.dtype} {window.shape}")
+    starts = _sums([len(window) for window in windows])
+    if isinstance(windows, np.ndarray):
+        return windows.reshape(-1, 4), starts
+    return np.concatenate([np.empty((0, 4), np.int32), *windows]), starts
 
-    Row 0 is [count, dropped, window_us, 0], the next `count` rows are [t - start, x, y, p].
-    A window without events may be all zeros.
 
-    Raises:
-        ValueError: Wrong shape or dtype, a count beyond the capacity, or as `index_events`.
-    """
-    if window.dtype.kind != "i" or window.ndim != 2 or window.shape[1] != 4 or len(window) < 1:
-        raise ValueError(f"a packed window is int32 (capacity + 1, 4), got {window.dtype} {window.shape}")
+@numba.njit(cache=True, error_model="numpy")
+def _index_packed(rows, starts, grid):  # type: ignore[no-untyped-def]
+    """Addresses int32 (2, N) and offsets (B + 1,) of packed windows; the first refused window, or -1."""
+    offsets = np.zeros(len(starts), np.int64)
+    for b in range(len(starts) - 1):
+        count, window_us = rows[starts[b], 0], rows[starts[b], 2]
+        if not 0 <= count < starts[b + 1] - starts[b] or (count > 0 and not 1 <= window_us <= MAX_WINDOW_US):
+            return np.empty((2, 0), np.int32), offsets, b
+        offsets[b + 1] = offsets[b] + count
+    address = np.empty((2, offsets[-1]), np.int32)
+    for b in range(len(starts) - 1):
+        first, count = starts[b] + 1, offsets[b + 1] - offsets[b]
+        events = rows[first : first + count]
+        span = (np.int64(0), np.int64(rows[first - 1, 2]))
+        own = address[:, offsets[b] : offsets[b + 1]]
+        if _index(events[:, 0], events[:, 1], events[:, 2], events[:, 3], span, grid, own) >= 0:
+            return address, offsets, b
+    return address, offsets, -1
+
+
+def _refuse(number: int, window: np.ndarray, grid: Grid) -> None:
+    """Raises ValueError with what `_index_packed` refused in a window."""
     count, window_us = int(window[0, 0]), int(window[0, 2])
     if not 0 <= count < len(window):
-        raise ValueError(f"packed window announces {count} events, its capacity is {len(window) - 1}")
-    if count == 0:
-        return np.empty((2, 0), np.int32)
-    rows = window[1 : count + 1]
-    return index_events((rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3]), 0, window_us, grid)
+        raise ValueError(f"window {number} announces {count} events, its capacity is {len(window) - 1}")
+    try:
+        index_events(tuple(window[1 : count + 1].T), 0, window_us, grid)
+    except ValueError as error:
+        raise ValueError(f"window {number}: {error}") from None
 
 
 def cut_packed(window: np.ndarray) -> np.ndarray:
@@ -154,37 +197,43 @@ def cut_packed(window: np.ndarray) -> np.ndarray:
     return window[: int(window[0, 0]) + 1].copy()
 
 
-def thin(address: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` of a window's addresses (2, N), evenly over their order.
+def thin(batch: EventBatch, most: int) -> EventBatch:
+    """At most `most` events of each window, evenly over their order.
 
     Of N > most the one in the middle of each of `most` equal parts is kept.
     """
-    count = address.shape[1]
-    if count <= most:
-        return address
-    return address[:, ((2 * np.arange(most) + 1) * count) // (2 * most)]
+    counts = np.diff(batch.offsets)
+    if counts.max(initial=0) <= most:
+        return batch
+    kept = np.minimum(counts, most)
+    offsets = np.zeros_like(batch.offsets)
+    np.cumsum(kept, out=offsets[1:])
+    window = np.repeat(np.arange(len(batch)), kept)
+    place = np.arange(offsets[-1]) - offsets[window]
+    chosen = batch.offsets[window] + (2 * place + 1) * counts[window] // (2 * kept[window])
+    return EventBatch(batch.grid, batch.code[chosen], batch.bin[chosen], offsets)
+
+
+def event_rows(batch: EventBatch, size: int) -> np.ndarray:
+    """Windows as arrays of fixed size, int16 (B, size, 4): [kind, time bin, x, y] of each event.
+
+    kind is 1 for ON, 2 for OFF, 0 for no event: the rows after those of the window's events. Assumes at
+    most `size` events in each window, and sides and time bins of at most 2^15.
+    """
+    rows = np.zeros((len(batch), size, 4), np.int16)
+    _roll(batch.code, batch.bin, batch.offsets, batch.grid, rows)
+    return rows
 
 
 @numba.njit(cache=True, error_model="numpy")
-def event_rows(address: np.ndarray, size: int, width: int, height: int) -> np.ndarray:
-    """A window's addresses as an array of fixed size, int16 (size, 4): [kind, time bin, x, y] each.
-
-    Args:
-        address: int32 (2, N) with N <= size; sides and time bins are at most 2^15.
-        size: Rows.
-        width: Pixels.
-        height: Pixels.
-
-    Returns:
-        kind is 1 for ON, 2 for OFF, 0 for no event: the rows after the N events.
-    """
-    rows = np.zeros((size, 4), np.int16)
-    for n in range(address.shape[1]):
-        code = address[0, n]
-        rows[n, 0] = ROW_ON if code >= width * height else ROW_OFF
-        rows[n, 1] = address[1, n]
-        rows[n, 2], rows[n, 3] = code % width, code // width % height
-    return rows
+def _roll(code, bins, offsets, grid, rows) -> None:  # type: ignore[no-untyped-def]
+    width, height, _ = grid
+    for b in range(len(rows)):
+        for k in range(offsets[b + 1] - offsets[b]):
+            cell, row = code[offsets[b] + k], rows[b, k]
+            row[0] = ROW_ON if cell >= width * height else ROW_OFF
+            row[1] = bins[offsets[b] + k]
+            row[2], row[3] = cell % width, cell // width % height
 
 
 def batch_rows(rows: np.ndarray, grid: Grid) -> EventBatch:
@@ -239,7 +288,11 @@ def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _join(parts: list[np.ndarray], grid: Grid) -> EventBatch:
-    offsets = np.zeros(len(parts) + 1, np.int64)
-    np.cumsum([part.shape[1] for part in parts], out=offsets[1:])
-    code, time_bins = np.concatenate([np.empty((2, 0), np.int32), *parts], axis=1)
-    return EventBatch(grid, code, time_bins, offsets)
+    offsets = _sums([part.shape[1] for part in parts])
+    address = parts[0] if len(parts) == 1 else np.concatenate([np.empty((2, 0), np.int32), *parts], axis=1)
+    return EventBatch(grid, address[0], address[1], offsets)
+
+
+def _sums(sizes: list[int]) -> np.ndarray:
+    """0 and the running sums of sizes, int64 (B + 1,); of few, faster than by numpy."""
+    return np.array(list(itertools.accumulate(sizes, initial=0)), np.int64)

@@ -7,6 +7,7 @@ of images. So these two policies differ only in what the encoder sees.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -125,8 +126,8 @@ class PictureEncoder:
         """Latent mu (latent,) of one window. Raises ValueError as `event_batch.index_events`."""
         return self._mu(batch_windows([(events, start_us, window_us)], self.grid))[0]
 
-    def encode_windows(self, windows: np.ndarray) -> np.ndarray:
-        """Latents (B, latent) of packed windows. Raises ValueError as `event_batch.index_packed`."""
+    def encode_windows(self, windows: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
+        """Latents (B, latent) of packed windows. Raises ValueError as `event_batch.batch_packed`."""
         return self._mu(batch_packed(windows, self.grid))
 
     def _mu(self, batch: EventBatch) -> np.ndarray:

@@ -13,6 +13,7 @@ With EventNet's coding a context also holds the time bin of the event that each 
 of equal ones the newest; the phase of that bin follows when the latent is asked for.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +23,7 @@ import torch
 
 from models.encoder.embedding import bin_centres, eventnet_phase, time_code
 from models.encoder.evae import EventVAE
-from models.encoder.event_batch import Grid, address_events, index_packed, thin
+from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows, thin
 
 PRECISIONS = ("model", "int16", "int8")
 INT16_TOP, INT8_TOP = 32_767, 127
@@ -116,21 +117,25 @@ class EncoderTable:
             raise ValueError(
                 f"context must be {expected} (start from empty()), got {context.dtype} {context.shape}"
             )
-        address = address_events(events, start_us, window_us, self.grid)
         result = context.copy()
-        self._raise(address, result)
+        self._raise(batch_windows([(events, start_us, window_us)], self.grid), result[None])
         return result
 
-    def _raise(self, address: np.ndarray, context: np.ndarray) -> None:
-        """Raise `context` to the maximum over it and the addressed events (2, N)."""
+    def _raise(self, batch: EventBatch, contexts: np.ndarray) -> None:
+        """Raise each of `contexts` (B, ...) to the maximum over it and its window's events."""
         kernel = _raise_to if self.phase is None else _raise_to_newest
-        kernel(self.features, self.embedding, address, context)
+        kernel(self.features, self.embedding, batch.code, batch.bin, batch.offsets, contexts)
 
     def latent(self, context: np.ndarray) -> np.ndarray:
         """Latent mu (latent,) of a context."""
-        values = context.astype(self.head[1].dtype)
+        return self._latents(context[None])[0]
+
+    def _latents(self, contexts: np.ndarray) -> np.ndarray:
+        """Latents (B, latent) of contexts (B, ...)."""
+        values = contexts.astype(self.head[1].dtype, copy=False)
         if self.phase is not None:
-            values = (values[0] * self.phase[:, context[1].astype(np.int64)]).ravel()
+            turns = self.phase[:, contexts[:, 1].astype(np.int64)]  # (2, B, D)
+            values = np.concatenate(list(values[:, 0] * turns), axis=1)
         return _mlp(values, *self.hidden, *self.head)
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
@@ -144,25 +149,22 @@ class EncoderTable:
         Raises:
             ValueError: As `models.encoder.event_batch.index_events`.
         """
-        address = address_events(events, start_us, window_us, self.grid)
-        return self._encode(address)
+        return self._encode(batch_windows([(events, start_us, window_us)], self.grid))[0]
 
-    def encode_windows(self, windows: np.ndarray) -> np.ndarray:
-        """Latents (B, latent) of packed windows, int32 (B, capacity + 1, 4); each as `encode`'s, bit for bit.
+    def encode_windows(self, windows: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
+        """Latents (B, latent) of packed windows, int32 (rows, 4) of any lengths; as `encode`'s, bit for bit.
 
         Raises:
-            ValueError: As `models.encoder.event_batch.index_packed`.
+            ValueError: As `models.encoder.event_batch.batch_packed`.
         """
-        latents = np.empty((len(windows), len(self.head[1])), self.head[1].dtype)
-        for row, window in enumerate(windows):
-            latents[row] = self._encode(index_packed(window, self.grid))
-        return latents
+        return self._encode(batch_packed(windows, self.grid))
 
-    def _encode(self, address: np.ndarray) -> np.ndarray:
-        """Latent mu (latent,) of the addressed events (2, N) of one window."""
-        context = self.empty()
-        self._raise(address if self.most_events is None else thin(address, self.most_events), context)
-        return self.latent(context)
+    def _encode(self, batch: EventBatch) -> np.ndarray:
+        """Latents (B, latent) of a batch."""
+        own = self.empty()
+        contexts = np.zeros((len(batch), *own.shape), own.dtype)
+        self._raise(batch if self.most_events is None else thin(batch, self.most_events), contexts)
+        return self._latents(contexts)
 
 
 def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
@@ -198,53 +200,69 @@ def _read_only(array: np.ndarray, dtype: Any = None) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _raise_to(features, embedding, address, context) -> None:  # type: ignore[no-untyped-def]
-    """Raise `context` (D,) to the maximum over the addressed events (2, N).
+def _raise_to(features, embedding, code, bins, offsets, contexts) -> None:  # type: ignore[no-untyped-def]
+    """Raise each row of `contexts` (B, D) to the maximum over its window's events.
 
     Four events at a time, so that the context is read and written a quarter as often; the
-    last four may hold an event several times, which changes no maximum.
+    last four may hold an event several times, which changes no maximum. Each sum keeps the type of the
+    context, which numba would widen to int64: a vector register then holds as many as there are.
     """
-    cells, last = len(features), address.shape[1] - 1
-    for n in range(0, last + 1, 4):
-        second, third, fourth = min(n + 1, last), min(n + 2, last), min(n + 3, last)
-        feature_1, code_1 = features[address[0, n] % cells], embedding[address[1, n]]
-        feature_2, code_2 = features[address[0, second] % cells], embedding[address[1, second]]
-        feature_3, code_3 = features[address[0, third] % cells], embedding[address[1, third]]
-        feature_4, code_4 = features[address[0, fourth] % cells], embedding[address[1, fourth]]
-        for j in range(len(context)):
-            early = max(feature_1[j] + code_1[j], feature_2[j] + code_2[j])
-            late = max(feature_3[j] + code_3[j], feature_4[j] + code_4[j])
-            context[j] = max(max(early, late), context[j])
+    cells, unit = len(features), contexts.dtype.type
+    for b in range(len(contexts)):
+        context, last = contexts[b], offsets[b + 1] - 1
+        for n in range(offsets[b], last + 1, 4):
+            second, third, fourth = min(n + 1, last), min(n + 2, last), min(n + 3, last)
+            feature_1, code_1 = features[code[n] % cells], embedding[bins[n]]
+            feature_2, code_2 = features[code[second] % cells], embedding[bins[second]]
+            feature_3, code_3 = features[code[third] % cells], embedding[bins[third]]
+            feature_4, code_4 = features[code[fourth] % cells], embedding[bins[fourth]]
+            for j in range(len(context)):
+                early = max(unit(feature_1[j] + code_1[j]), unit(feature_2[j] + code_2[j]))
+                late = max(unit(feature_3[j] + code_3[j]), unit(feature_4[j] + code_4[j]))
+                context[j] = max(max(early, late), context[j])
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _raise_to_newest(features, embedding, address, context) -> None:  # type: ignore[no-untyped-def]
-    """Raise magnitudes and their time bins `context` (2, D); of equal magnitudes the newest stays."""
-    best, newest, cells = context[0], context[1], len(features)
-    for n in range(address.shape[1]):
-        feature, code = features[address[0, n] % cells], embedding[address[1, n]]
-        time = context.dtype.type(address[1, n])
-        for j in range(len(best)):
-            value = context.dtype.type(feature[j] + code[j])
-            better = (value > best[j]) | ((value == best[j]) & (time > newest[j]))
-            best[j] = value if better else best[j]
-            newest[j] = time if better else newest[j]
+def _raise_to_newest(features, embedding, code, bins, offsets, contexts) -> None:  # type: ignore[no-untyped-def]
+    """Raise magnitudes and their time bins `contexts` (B, 2, D); of equal magnitudes the newest stays."""
+    cells, unit = len(features), contexts.dtype.type
+    for b in range(len(contexts)):
+        best, newest = contexts[b]
+        for n in range(offsets[b], offsets[b + 1]):
+            feature, shift, time = features[code[n] % cells], embedding[bins[n]], unit(bins[n])
+            for j in range(len(best)):
+                value = unit(feature[j] + shift[j])
+                better = (value > best[j]) | ((value == best[j]) & (time > newest[j]))
+                best[j] = value if better else best[j]
+                newest[j] = time if better else newest[j]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _mlp(contexts, hidden_weight, hidden_bias, weight, bias):  # type: ignore[no-untyped-def]
+    """Second half of the encoder: ReLU layer, then mu, (B, latent) of contexts (B, K)."""
+    hidden = _dense(contexts, hidden_weight, hidden_bias)
+    return _dense(np.maximum(hidden, np.float32(0.0)), weight, bias)
 
 
 # Reordering the sums lets them use vector registers (20 times faster); it decides no event.
 @numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _mlp(context, hidden_weight, hidden_bias, weight, bias):  # type: ignore[no-untyped-def]
-    """Second half of the encoder: ReLU layer, then mu."""
-    hidden = hidden_bias.copy()
-    for i in range(len(hidden)):
-        total = hidden[i]
-        for j in range(len(context)):
-            total += hidden_weight[i, j] * context[j]
-        hidden[i] = max(total, np.float32(0.0))
-    latent = bias.copy()
-    for i in range(len(latent)):
-        total = latent[i]
-        for j in range(len(hidden)):
-            total += weight[i, j] * hidden[j]
-        latent[i] = total
-    return latent
+def _dense(inputs, weight, bias):  # type: ignore[no-untyped-def]
+    """The products inputs (B, K) @ weight (M, K).T + bias (M,).
+
+    Two rows of either at a time, so that a number is loaded half as often. An odd last one comes twice:
+    so its sums are added in the same order in any batch, which BLAS does not promise.
+    """
+    outputs = np.empty((len(inputs), len(bias)), bias.dtype)
+    for i in range(0, len(bias), 2):
+        k = min(i + 1, len(bias) - 1)
+        for b in range(0, len(inputs), 2):
+            c = min(b + 1, len(inputs) - 1)
+            total_ib, total_ic, total_kb, total_kc = bias[i], bias[i], bias[k], bias[k]
+            for j in range(inputs.shape[1]):
+                total_ib += weight[i, j] * inputs[b, j]
+                total_ic += weight[i, j] * inputs[c, j]
+                total_kb += weight[k, j] * inputs[b, j]
+                total_kc += weight[k, j] * inputs[c, j]
+            outputs[b, i], outputs[c, i] = total_ib, total_ic
+            outputs[b, k], outputs[c, k] = total_kb, total_kc
+    return outputs

@@ -4,12 +4,12 @@ Each `Feature` says its type and shape, and how it is computed from a batch of o
 the events of one step. `models.kinds.KINDS` names the feature of each kind of policy.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from models.encoder.event_batch import Grid, address_events, event_rows, index_packed, thin
+from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows, event_rows, thin
 from models.encoder.event_images import draw_last
 from models.encoder.finetuned import EVENTS as ENCODED_EVENTS
 from models.encoder.frozen import Encoder
@@ -18,6 +18,7 @@ from models.policy.event_set import EVENTS, TIMES
 
 PICTURE_ON, PICTURE_OFF = 255, 125  # values of a pixel in an event image (appendix D.1.2)
 GAMMA = 2.2
+Windows = np.ndarray | Sequence[np.ndarray]  # packed ones, of one length or of several
 
 
 class Step(NamedTuple):
@@ -40,7 +41,7 @@ class Feature(NamedTuple):
     Attributes:
         dtype: Of its array.
         shape: The policy -> its shape.
-        from_observations: (observations (B, ...), policy, encoder) -> features (B, ...) of that shape.
+        from_observations: (B observations, policy, encoder) -> features (B, ...) of that shape.
         from_events: (step, policy, encoder) -> feature; None: it cannot be computed from events.
 
     The encoder is that of a policy with a frozen one, else None.
@@ -48,7 +49,7 @@ class Feature(NamedTuple):
 
     dtype: type
     shape: Callable[[PolicySpec], tuple[int, ...]]
-    from_observations: Callable[[np.ndarray, PolicySpec, Any], np.ndarray]
+    from_observations: Callable[[Any, PolicySpec, Any], np.ndarray]
     from_events: Callable[[Step, PolicySpec, Any], np.ndarray] | None
 
 
@@ -76,27 +77,23 @@ def push_features(stacks: np.ndarray, features: np.ndarray, first: np.ndarray) -
     return pushed
 
 
-def column_counts(address: np.ndarray, width: int, height: int) -> np.ndarray:
-    """log(1 + count) of the ON, then of the OFF events in each image column, float32 (2 * width,).
-
-    Args:
-        address: int32 (2, N) of `models.encoder.event_batch`: row 0 is ((p > 0) * height + y) * width + x.
-        width: Pixels.
-        height: Pixels.
-    """
-    off = address[0] < width * height
-    counts = np.bincount(address[0] % width + width * off, minlength=2 * width)
-    return np.log1p(counts).astype(np.float32)
+def column_counts(batch: EventBatch) -> np.ndarray:
+    """log(1 + count) of the ON, then of the OFF events in each image column, float32 (B, 2 * width)."""
+    width, height, _ = batch.grid
+    window = np.repeat(np.arange(len(batch)), np.diff(batch.offsets))
+    place = (2 * window + (batch.code < width * height)) * width + batch.code % width
+    counts = np.bincount(place, minlength=2 * width * len(batch))
+    return np.log1p(counts).astype(np.float32).reshape(len(batch), 2 * width)
 
 
-def event_picture(address: np.ndarray, width: int, height: int) -> np.ndarray:
+def event_picture(code: np.ndarray, width: int, height: int) -> np.ndarray:
     """255 where a pixel's last event was ON, 125 where it was OFF, else 0: uint8 (H, W).
 
-    The rule of `envs.events.event_image` (appendix D.1.2); events in time order, arguments
-    as in `column_counts`.
+    The rule of `envs.events.event_image` (appendix D.1.2); `code` of events in time order, as in
+    `models.encoder.event_batch.EventBatch`.
     """
     picture = np.zeros(width * height, np.uint8)
-    draw_last(address[0], picture, PICTURE_ON, PICTURE_OFF)
+    draw_last(code, picture, PICTURE_ON, PICTURE_OFF)
     return picture.reshape(height, width)
 
 
@@ -118,11 +115,7 @@ def _grid(spec: PolicySpec, time_bins: int = 1) -> Grid:
     return Grid(spec.width, spec.height, time_bins)
 
 
-def _address(step: Step, grid: Grid) -> np.ndarray:
-    return address_events(*step, grid)
-
-
-def _latents_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: Encoder) -> np.ndarray:
+def _latents_of_windows(windows: Windows, spec: PolicySpec, encoder: Encoder) -> np.ndarray:
     return encoder.encode_windows(windows)
 
 
@@ -130,45 +123,30 @@ def _latent_of_step(step: Step, spec: PolicySpec, encoder: Encoder) -> np.ndarra
     return encoder.encode(*step)
 
 
-def _columns_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
-    grid = _grid(spec)
-    counts = np.empty((len(windows), 2 * grid.width), np.float32)
-    for row, window in enumerate(windows):
-        counts[row] = column_counts(index_packed(window, grid), grid.width, grid.height)
-    return counts
+def _columns_of_windows(windows: Windows, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return column_counts(batch_packed(windows, _grid(spec)))
 
 
 def _columns_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return column_counts(_address(step, _grid(spec)), spec.width, spec.height)
+    return column_counts(batch_windows([step], _grid(spec)))[0]
 
 
-def _rows(address: np.ndarray, grid: Grid, most: int) -> np.ndarray:
-    return event_rows(thin(address, most), most, grid.width, grid.height)
-
-
-def _rows_of_windows(windows: np.ndarray, grid: Grid, most: int) -> np.ndarray:
-    rows = np.empty((len(windows), most, 4), np.int16)
-    for row, window in zip(rows, windows, strict=True):
-        row[:] = _rows(index_packed(window, grid), grid, most)
-    return rows
-
-
-def _set_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return _rows_of_windows(windows, _grid(spec, TIMES), EVENTS)
+def _set_of_windows(windows: Windows, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return event_rows(thin(batch_packed(windows, _grid(spec, TIMES)), EVENTS), EVENTS)
 
 
 def _set_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    grid = _grid(spec, TIMES)
-    return _rows(_address(step, grid), grid, EVENTS)
+    return event_rows(thin(batch_windows([step], _grid(spec, TIMES)), EVENTS), EVENTS)[0]
 
 
-def _encoded_of_windows(windows: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return _rows_of_windows(windows, _grid(spec, spec.evae.time_bins), ENCODED_EVENTS)
+def _encoded_of_windows(windows: Windows, spec: PolicySpec, encoder: None) -> np.ndarray:
+    batch = batch_packed(windows, _grid(spec, spec.evae.time_bins))
+    return event_rows(thin(batch, ENCODED_EVENTS), ENCODED_EVENTS)
 
 
 def _encoded_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    grid = _grid(spec, spec.evae.time_bins)
-    return _rows(_address(step, grid), grid, ENCODED_EVENTS)
+    batch = batch_windows([step], _grid(spec, spec.evae.time_bins))
+    return event_rows(thin(batch, ENCODED_EVENTS), ENCODED_EVENTS)[0]
 
 
 def _picture_shape(spec: PolicySpec) -> tuple[int, ...]:
@@ -189,7 +167,7 @@ def _same_pictures(pictures: np.ndarray, spec: PolicySpec, encoder: None) -> np.
 
 
 def _picture_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return event_picture(_address(step, _grid(spec)), spec.width, spec.height)
+    return event_picture(batch_windows([step], _grid(spec)).code, spec.width, spec.height)
 
 
 def _grey_of_luminance(luminance: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:

@@ -5,12 +5,10 @@ between them. Decaying means, one for each time constant, say how long something
 rate of control: a feature holds until the next one, so that m <- f + (m - f) exp(-dt / tau).
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from models.kinds import PolicySpec
-from models.policy.features import push_features
+from models.policy.features import Windows, push_features
 
 
 def remember(
@@ -40,6 +38,6 @@ def remember(
     )
 
 
-def windows_us(observations: Sequence[np.ndarray] | np.ndarray, spec: PolicySpec) -> np.ndarray | int:
+def windows_us(observations: Windows, spec: PolicySpec) -> np.ndarray | int:
     """How long the packed window of each observation is [us]; 0 for a policy that does not ask."""
     return np.array([window[0, 2] for window in observations]) if spec.memory_ms else 0

@@ -34,7 +34,7 @@ from models.encoder.weights import (
     write_atomic,
 )
 from models.kinds import PolicySpec, read_spec
-from models.policy.features import LATENT, Step, feature_of
+from models.policy.features import LATENT, Step, Windows, feature_of
 from models.policy.memory import remember, windows_us
 from models.policy.networks import assemble
 
@@ -60,7 +60,7 @@ class PolicyManifest(TypedDict, total=False):
     run: str
     seed: int
     observation: str
-    window_capacity: int
+    window_capacity: int | None
     sensor: dict[str, object]
     sensor_hash: str
     figures: dict[str, float]
@@ -109,13 +109,13 @@ class Policy:
         self._stacks: np.ndarray = np.zeros((num_envs, *self.stack_shape), self.feature.dtype)
         self._first = np.ones(num_envs, bool)
 
-    def __call__(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
+    def __call__(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Choose an action for each episode.
 
         Args:
-            observations: (B, ...), one per episode, of the kind that `observation` names:
-                windows int32 (B, capacity + 1, 4), event images uint8 (B, H, W) or luminance
-                float32 (B, H, W).
+            observations: One per episode, of the kind that `observation` names: windows int32
+                (B, capacity + 1, 4), or a sequence of (count + 1, 4) of any lengths; event images
+                uint8 (B, H, W) or luminance float32 (B, H, W).
             restarted: bool (B,), True where the observation is the first of a new episode
                 (with Gymnasium's NEXT_STEP autoreset: where the step before was terminated
                 or truncated); None: nowhere.
@@ -147,7 +147,7 @@ class Policy:
         feature = self.feature.from_events(Step(events, start_us, window_us), self.spec, self.encoder)
         return self._logits(feature[None], window_us, None)[0]
 
-    def logits(self, observations: np.ndarray, restarted: np.ndarray | None = None) -> np.ndarray:
+    def logits(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Unnormalised log-probabilities float32 (B, actions); arguments as in a call."""
         features = self.feature.from_observations(observations, self.spec, self.encoder)
         return self._logits(features, windows_us(observations, self.spec), restarted)

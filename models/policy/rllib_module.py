@@ -21,7 +21,7 @@ from models.encoder.event_batch import cut_packed
 from models.encoder.frozen import Encoder, read_encoder_part, tabulate
 from models.encoder.weights import EncoderManifest
 from models.kinds import EvaeSettings, PolicySpec
-from models.policy.features import feature_of
+from models.policy.features import Windows, feature_of
 from models.policy.memory import remember, windows_us
 from models.policy.networks import PARTS, build_networks
 
@@ -96,15 +96,15 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         """The networks, as `models.policy.networks.assemble` names them."""
         return nn.ModuleDict({name: getattr(self, name) for name in PARTS})
 
-    def features(self, observations: np.ndarray) -> np.ndarray:
-        """Features (B, ...) of observations (B, ...)."""
+    def features(self, observations: Windows) -> np.ndarray:
+        """Features (B, ...) of B observations, as those of `models.policy.policy.Policy`."""
         if self.encoder is not None:
             self._table = self._table or tabulate(self.encoder, self.model_config["encoder_file"].settings)
             self.met.append(cut_packed(observations[self.steps % len(observations)]))
             self.steps += 1
         return feature_of(self.spec).from_observations(observations, self.spec, self._table)
 
-    def remember(self, kept: np.ndarray, observations: np.ndarray, first: np.ndarray) -> np.ndarray:
+    def remember(self, kept: np.ndarray, observations: Windows, first: np.ndarray) -> np.ndarray:
         """What the networks read, with the features of the newest observations (`models.policy.memory`)."""
         features = self.features(observations)
         return remember(kept, features, first, self.spec, windows_us(observations, self.spec))

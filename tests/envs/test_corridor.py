@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, seen_settings
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import unpack_window
-from envs.kinematics import advance, clock_us, planned_position
+from envs.kinematics import Lane, advance, clock_us, planned_position
 from envs.scene import OBSTACLE, POLE, Scene
 
 SMALL = CameraConfig(width=16, height=16)
@@ -21,7 +21,13 @@ FAULTY = FaultsConfig(sparsity=0.3, background_activity=0.2, background_activity
 
 def corridor(poles=(), width_m=30.0):
     obstacles = np.array([(POLE, x, y, 3.0, r, r, 3.0, 0.5) for x, y, r in poles], OBSTACLE)
-    return Scene("test", obstacles, width_m=width_m)
+    return Scene("test", obstacles, width_m=width_m, spawn_range_m=(0.0, 0.0))
+
+
+def move(scene, start, planned, radius_m):
+    """One control step of a vehicle at a height of 2 m."""
+    lane = Lane(radius_m, 0.5 * scene.width_m, scene.length_m)
+    return advance(lane, scene.sections(2.0), start, planned)
 
 
 def straight(env, seed=0, **options):
@@ -34,7 +40,7 @@ def straight(env, seed=0, **options):
 
 
 def flight_bytes(env, seed, actions):
-    """All that a flight gives, as bytes; it starts again when it is over."""
+    """All that a vehicle gives, as bytes; it starts again when it is over."""
     observation, info = env.reset(seed=seed)
     seen = [observation.tobytes(), repr(info)]
     for action in actions:
@@ -76,10 +82,9 @@ def test_a_straight_success_returns_200_at_any_rate(control_hz):
 
 
 def test_a_thousand_steps_of_a_tenth_of_a_metre_are_a_hundred_metres():
-    config = EnvConfig()
-    assert planned_position(0.0, [1000, 0, 0], config) == (0.0, 100.0)
-    assert planned_position(3.0, [0, 500, 500], config)[0] == 3.0
-    x, y = planned_position(0.0, [0, 1, 0], config)
+    assert planned_position(0.0, (1000, 0, 0), (20.0, 200.0)) == (0.0, 100.0)
+    assert planned_position(3.0, (0, 500, 500), (20.0, 200.0))[0] == 3.0
+    x, y = planned_position(0.0, (0, 1, 0), (20.0, 200.0))
     assert x == -y == pytest.approx(-0.1 / math.sqrt(2), abs=1e-15)
 
 
@@ -96,19 +101,19 @@ def test_a_collision_returns_the_metres_to_the_contact_less_100():
             gaps = [math.dist((pole["x"], pole["y"]), here) - pole["rx"] for pole in env.scene.obstacles]
             assert min(gaps) == pytest.approx(0.3, abs=1e-6)
             return
-    pytest.fail("no flight met a pole")
+    pytest.fail("no vehicle met a pole")
 
 
 @pytest.mark.parametrize("action", [1, 2])
 def test_a_flight_to_the_side_ends_at_the_wall(action):
     env = CorridorEnv(**EMPTY, time_limit_s=100.0)
     _, info = env.reset(seed=0)
-    steps = 0
+    steps, spawn_x = 0, info["x_m"]
     while not info["collision"]:
         info = env.step(action)[4]
         steps += 1
     assert abs(info["x_m"]) == pytest.approx(15.0 - 0.3, abs=1e-9)
-    assert info["y_m"] == pytest.approx(abs(info["x_m"] - env._spawn_x), abs=1e-9)
+    assert info["y_m"] == pytest.approx(abs(info["x_m"] - spawn_x), abs=1e-9)
     assert steps == math.ceil(info["y_m"] * math.sqrt(2) / 0.1 - 1e-9)
 
 
@@ -121,7 +126,7 @@ def test_a_flight_to_the_side_ends_at_the_wall(action):
     ],
 )
 def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
-    outcome = advance(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5, 2.0)
+    outcome = move(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5)
     assert (outcome.success, outcome.collision) == (success, not success)
     assert outcome.reward == pytest.approx(reward, abs=1e-9)
     assert outcome.end == (0.0, pytest.approx(end_y, abs=1e-9))
@@ -129,23 +134,23 @@ def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
 
 def test_a_success_ends_exactly_on_the_goal_line():
     for start_y, end_y in np.random.default_rng(0).uniform((0.0, 100.0), (100.0, 1e5), (200, 2)):
-        outcome = advance(corridor(), (0.0, start_y), (0.3, end_y), 0.3, 2.0)
+        outcome = move(corridor(), (0.0, start_y), (0.3, end_y), 0.3)
         assert outcome.success
         assert outcome.end[1] == 100.0
         assert outcome.reward == 100.0 - start_y + 100.0
 
 
 def test_a_start_in_contact_is_a_collision_without_progress():
-    outcome = advance(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3, 2.0)
+    outcome = move(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3)
     assert outcome == ((0.0, 0.0), 0.0, -100.0, False, True)
 
 
 @pytest.mark.parametrize("speed_mps", [20.0, 1e3, 1e6])
-def test_no_speed_jumps_over_a_pole(speed_mps):
+def test_no_speed_jumps_over_a_pole(monkeypatch, speed_mps):
+    monkeypatch.setattr("envs.corridor.make_scene", lambda *_, **__: corridor([(0.0, 40.0, 1.0)]))
     config = EnvConfig(speed_mps=speed_mps, layout={"num_obstacles": 0}, camera=SMALL)
     env = CorridorEnv(config, fidelity=FidelityConfig(max_step_m=1.0))
     env.reset(seed=0)
-    env.scene = corridor([(env.camera_pose()[0], 40.0, 1.0)])
     info: dict = {"collision": False}
     while not info["collision"]:
         _, _, terminated, _, info = env.step(0)
@@ -277,10 +282,13 @@ def test_a_bad_number_stops_the_flight_naming_episode_step_and_seed():
 
 
 def test_a_reward_that_is_not_finite_is_refused():
-    endless = corridor()
-    object.__setattr__(endless, "length_m", math.nan)  # which a scene itself refuses
-    with pytest.raises(ValueError, match="finite"):
-        advance(endless, (0.0, math.nan), (0.0, 1.0), 0.0, 2.0)
+    env = CorridorEnv(camera=SMALL)
+    env.reset(seed=3)
+    env._vehicles.rows["y_m"] = math.nan
+    with pytest.raises(ValueError, match=r"episode 0, step 1, seed 3: the reward must be finite; got nan"):
+        env.step(0)
+    with pytest.raises(ResetNeeded):
+        env.step(0)
 
 
 @pytest.mark.parametrize(

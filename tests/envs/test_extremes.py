@@ -120,11 +120,12 @@ def test_any_camera_height_sees_something_finite(height_m):
 
 
 @pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID, BOX])
-def test_a_spawn_inside_an_obstacle_is_a_collision_at_the_first_step(kind):
+def test_a_spawn_inside_an_obstacle_is_a_collision_at_the_first_step(monkeypatch, kind):
+    obstacle = np.array([(kind, 0.0, 0.0, 2.0, 1.0, 1.0, 2.0, 0.5)], OBSTACLE)
+    scene = Scene("hand", obstacle, spawn_range_m=(0.0, 0.0))
+    monkeypatch.setattr("envs.corridor.make_scene", lambda *_, **__: scene)
     env = CorridorEnv(camera=TINY)
     env.reset(seed=0)
-    x = env.camera_pose()[0]
-    env.scene = Scene("hand", np.array([(kind, x, 0.0, 2.0, 1.0, 1.0, 2.0, 0.5)], OBSTACLE))
     _, reward, terminated, _, info = check_step(env)
     assert terminated
     assert info["collision"]

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.clusters import cluster  # noqa: F401  a fixture
+from tests.support.clusters import TOKEN, cluster  # noqa: F401  a fixture
 from tests.support.faults import DEADLINE_S, TABLE
+
+# Ray reads them once in a process, whichever of its tests comes first; jobs make their own.
+os.environ.update(TOKEN)
 
 
 def pytest_collection_modifyitems(items):

@@ -41,6 +41,13 @@ def test_what_follows_a_fault_is_judged(follows, ends, seconds, well):
     assert judged(Fault("", lambda soak: None, follows), ends, seconds)[1] is well
 
 
+def test_a_trend_is_that_of_long_lives_whose_samples_lie_apart():
+    growing = [(10.0 * k, 100.0 + k) for k in range(100)]  # 1 MB in 10 s
+    assert slope_mb_per_hour([growing]) == pytest.approx(360.0)
+    assert slope_mb_per_hour([growing[:20]]) is None
+    assert slope_mb_per_hour([[growing[0], growing[-1]]]) is None
+
+
 def test_one_digit_makes_a_table_differ_and_one_byte_a_policy():
     whole = Tables({"table.md": "0.1 "}, {"networks": "a"})
     assert whole.differing(whole) == []

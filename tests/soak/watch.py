@@ -127,7 +127,7 @@ def slope_mb_per_hour(lives: Sequence[Sequence[tuple[float, float]]]) -> float |
     It is the median slope between two samples of one process: a stage that begins and loads what it
     needs moves it little, what grows all the time moves it.
     """
-    slopes = []
+    slopes: list[float] = []
     for life in lives:
         t_s, memory = np.array(life).T
         old = t_s - t_s[0] > YOUNG_S
@@ -135,8 +135,8 @@ def slope_mb_per_hour(lives: Sequence[Sequence[tuple[float, float]]]) -> float |
             first, later = np.triu_indices(int(old.sum()), 1)
             apart_h = (t_s[old][later] - t_s[old][first]) / 3600
             far = apart_h > FAR_S / 3600
-            slopes.append((memory[old][later] - memory[old][first])[far] / apart_h[far])
-    return float(np.median(np.concatenate(slopes))) if slopes else None
+            slopes += ((memory[old][later] - memory[old][first])[far] / apart_h[far]).tolist()
+    return float(np.median(slopes)) if slopes else None
 
 
 def plot(watch: Watch, faults: Sequence[tuple[float, bool]]) -> Figure:

@@ -183,12 +183,18 @@ def start(
         process = subprocess.Popen(
             command,
             cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": path, **variables},
+            env={**environment_for(command), "PYTHONPATH": path, **variables},
             stdout=file,
             stderr=subprocess.STDOUT,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
     return Job(process, log, folder / "runs")
+
+
+def environment_for(command: list[str]) -> dict[str, str]:
+    """This process's environment, without the token of its cluster for a job that does not join one."""
+    joins = "cluster=ray" in command
+    return {name: value for name, value in os.environ.items() if joins or not name.startswith("RAY_AUTH")}
 
 
 def write_hook(folder: Path, first: str = "", after: dict[str, str] | None = None) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 
 from envs.config import CameraConfig
 from envs.events import EventCamera
-from envs.events.crossings import named
+from envs.events.crossings import make_room, named
 from envs.events.emission import Span
 from envs.events.ramps import Watch, events_of_ramps, look_at, make_ramps
 
@@ -21,7 +21,8 @@ class Looker:
         self.seen_us = np.full(WIDTH, t_us, np.int64)
         values, rows, scratch = self.camera.state
         model, memory = named(values, rows)
-        self.watch = Watch(model, memory, self.seen_us, scratch, make_ramps(8 * WIDTH * HEIGHT))
+        ramps = make_ramps(8 * WIDTH * HEIGHT)
+        self.watch = Watch(model, memory, self.seen_us, scratch, ramps, make_room())
 
     def look(self, *looks):
         """Events of looks (image, first column, column after the last, time [us]), and how many are lost."""

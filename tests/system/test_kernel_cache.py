@@ -37,3 +37,60 @@ def test_an_edited_kernel_is_compiled_again_also_where_a_file_of_another_package
     assert before == compiled() != []
     (package / "low" / "inside.py").write_text(KERNEL.format(2.0))
     assert run() == "3.0\n"
+
+
+@pytest.mark.parametrize("room", ["envs", "models"])
+def test_an_edit_compiles_the_kernels_again_that_reach_the_edited_file_and_no_others(tmp_path, room):
+    package = tmp_path / room
+    package.mkdir()
+    shutil.copy(ROOT / room / "__init__.py", package)
+    numbers = {"one": 1.0, "two": 2.0, "many": 3.0}
+    for name, number in numbers.items():
+        (package / f"{name}.py").write_text(f"VALUE = {number}\n")
+        caller = f"import numba\nfrom {room} import (\n    {name},\n)\nVALUE = {name}.VALUE\n\n"
+        caller += f"@numba.njit(cache=True)\ndef call_{name}():\n    return VALUE\n"
+        (package / f"of_{name}.py").write_text(caller)
+    calls = "\n".join(f"from {room}.of_{name} import call_{name}; print(call_{name}())" for name in numbers)
+
+    def run():
+        words = [sys.executable, "-c", calls]
+        out = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120).stdout
+        return [float(line) for line in out.split()]
+
+    def compiled():
+        return {path.name.partition(".")[0]: path.stat().st_mtime_ns for path in package.rglob("*.nbc")}
+
+    assert run() == [1.0, 2.0, 3.0]
+    before = compiled()
+    assert sorted(before) == ["of_many", "of_one", "of_two"]
+    for file in package.glob("*.py"):
+        file.touch()  # newer, and the same
+    (package / "two.py").write_text("VALUE = 20.0\n")
+    assert run() == [1.0, 20.0, 3.0]
+    assert {name for name, time in compiled().items() if time != before[name]} == {"of_two"}
+
+
+COMPILE = """
+import sys, time
+from pathlib import Path
+from jobs.run import compile
+compile.CACHE = folder = Path(sys.argv[1])
+def fly():
+    with (folder / "flown").open("a") as file:
+        file.write("once ")
+    time.sleep(3)
+compile.fly, compile.encode = fly, lambda: None
+compile.main()
+"""
+
+
+def test_of_processes_that_start_at_once_one_compiles_and_the_others_say_that_they_wait(tmp_path):
+    words = [sys.executable, "-c", COMPILE, str(tmp_path)]
+    both = [subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    said = [process.communicate(timeout=120)[0] for process in both]
+    assert (tmp_path / "flown").read_text() == "once "
+    assert sum("Compiled the kernels in" in text for text in said) == 1
+    assert sum("waiting" in text for text in said) >= 1
+    (tmp_path / "compiled").write_text("other sources")
+    subprocess.run(words, cwd=ROOT, check=True, timeout=120)
+    assert (tmp_path / "flown").read_text() == "once once "

@@ -12,7 +12,7 @@ from envs.scene.range_scan import NEAR_M, proximity, sector_bearings
 from jobs.training.collect import HoldingAgent, steps_of
 from jobs.training.pretrain import Window
 from models.encoder.evae import EventVAE
-from models.encoder.event_batch import Grid, address_events, batch_windows
+from models.encoder.event_batch import Grid, batch_windows
 from models.encoder.event_images import cell_counts
 from models.encoder.frozen import encoder_of
 from models.policy.features import column_counts
@@ -86,8 +86,7 @@ def nothing(probe_data: ProbeData) -> np.ndarray:
 
 def column_features(probe_data: ProbeData, grid: Grid) -> np.ndarray:
     """The features of the policy event_columns at each step, float32 (N, 2 width)."""
-    addresses = (address_events(*window, grid) for window in probe_data.windows)
-    return np.stack([column_counts(address, grid.width, grid.height) for address in addresses])
+    return column_counts(batch_windows(probe_data.windows, grid))
 
 
 def cell_features(probe_data: ProbeData, grid: Grid, across: int) -> np.ndarray:

@@ -8,13 +8,15 @@ from hypothesis import strategies as st
 
 from envs.events import EVENT
 from envs.recordings import read_events, write_events
-from envs.recordings.event_file import Request
+from envs.recordings.event_file import Request, finish, unwrap
+from envs.recordings.evt_decoders import decode_dat, decode_evt3
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 EVT3_SAMPLE = DATA / "expelliarmus_evt" / "evt3_sample.raw"
 needs_sample = pytest.mark.skipif(not EVT3_SAMPLE.is_file(), reason=f"no {EVT3_SAMPLE}; set EVADE_DATA")
 
 OFF, ON, TIME_HIGH, TRIGGER, VENDOR = 0, 1, 8, 10, 14
+RESERVED = (1, 9, 11, 12, 13)  # types of words that EVT 3.0 does not have
 
 
 def slow_evt3(words: list[int]) -> list[tuple[int, int, int, int]]:  # noqa: C901
@@ -121,6 +123,41 @@ def test_evt3_words_in_any_order_decode_as_by_the_published_table(seed, tmp_path
     found = read_events(raw(tmp_path / "a.raw", words, "format EVT3;height=2048;width=4096"))
     assert tuples(found.events) == expected
     assert len(expected) > 3000
+
+
+@given(seed=st.integers(0, 2**32 - 1), length=st.integers(0, 100), bad_words=st.integers(0, 1))
+def test_any_evt3_words_give_the_events_the_skipped_ones_and_the_bad_word_of_the_table(
+    seed, length, bad_words
+):
+    rng = np.random.default_rng(seed)
+    kinds = rng.choice([0, 2, 3, 4, 5, 6, 7, 8, 8, 10, 14, *RESERVED[: 2 * bad_words]], length)
+    array = (kinds << 12 | rng.integers(0, 4096, length) & rng.choice([1, 4095], length)).astype("<u2")
+    words = array.tolist()
+    count, skipped, bad = decode_evt3(array, np.empty(0, EVENT))
+    assert bad == next((i for i, word in enumerate(words) if word >> 12 in RESERVED), -1)
+    if bad < 0:
+        events, expected = np.empty(count, EVENT), slow_evt3(words)
+        decode_evt3(array, events)
+        assert tuples(events) == expected
+        masks = {0x2: lambda _: 1, 0x4: lambda value: value, 0x5: lambda value: value % 256}
+        entries = [masks[word >> 12](word % 4096) for word in words if word >> 12 in masks]
+        assert count + skipped == sum(mask.bit_count() for mask in entries)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_dat_entries_give_the_columns_of_the_published_table(seed):
+    rng = np.random.default_rng(seed)
+    entries = np.empty(100, [("t", "<u4"), ("data", "<u4")])
+    steps = rng.integers(-(2**31), 2**31, 100) if seed % 2 else rng.integers(-1000, 2**31, 100)
+    entries["t"] = np.cumsum(steps) % 2**32
+    entries["data"] = rng.integers(0, 2**32, 100)
+    events = np.empty(100, EVENT)
+    decode_dat(entries, events)
+    data = entries["data"].tolist()
+    assert tuples(events) == [
+        (t, d % 2**14, d // 2**14 % 2**14, 1 if d // 2**28 % 2 else -1)
+        for t, d in zip(unwrap(entries["t"], 32).tolist(), data, strict=True)
+    ]
 
 
 @pytest.mark.parametrize("endianness", ["little", "legacy"])
@@ -281,6 +318,16 @@ def test_times_a_little_out_of_order_are_sorted_and_a_reset_clock_is_refused(tmp
     assert file.late == 1
     with pytest.raises(ValueError, match="reset clock or damage"):
         read_events(raw(tmp_path / "b.raw", words(1, 300, 2), "evt 3.0"))
+
+
+@given(steps_us=st.lists(st.integers(-400, 500), min_size=1, max_size=50))
+def test_late_events_are_counted_and_sorted_in_with_ties_in_the_order_of_the_file(steps_us):
+    t_us = 30_000 + np.cumsum(steps_us)
+    events = some_events(0, len(t_us), 640, 480, 1)
+    events["t"] = t_us
+    file = finish(Request(Path("a"), 640, 480), "evt3", events)
+    assert file.late == sum(t < max(t_us[: i + 1]) for i, t in enumerate(t_us))
+    assert tuples(file.events) == sorted(tuples(events), key=lambda event: event[0])
 
 
 def test_more_events_than_asked_for_are_refused_before_memory_is_taken(tmp_path):

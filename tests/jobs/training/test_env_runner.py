@@ -46,7 +46,8 @@ class StackFeatures(ConnectorV2):
 
 def make_runners(name, folder, *overrides):
     """Ours, and RLlib's with the connector; both with larger logits, so that actions differ."""
-    config = make_config(*SHORT, f"model={name}", "algo.num_envs_per_env_runner=3", *overrides)
+    equal = "env.window_capacity=512"  # RLlib's own takes no observations of different length
+    config = make_config(*SHORT, f"model={name}", "algo.num_envs_per_env_runner=3", equal, *overrides)
     ppo = build_ppo(config, write_encoder(folder, config) if KINDS[name].encoder else None)
     space = ppo.rl_module_spec.observation_space
     theirs = ppo.copy(copy_frozen=False).env_runners(

@@ -7,6 +7,7 @@ import torch
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.utils.postprocessing.value_predictions import compute_value_targets
 
+from jobs.training import ppo_learner
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
 from jobs.training.ppo_learner import PlainPPOLearner, advantages
@@ -55,9 +56,17 @@ def scaled(episodes, factor):
     return episodes
 
 
+def tensor_by_tensor(monkeypatch):
+    """Let the learner update dense networks as all others."""
+    monkeypatch.setattr(PlainPPOLearner, "_dense", False)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("training", [{}, {"grad_clip": 1e-3}, {"clip_param": 0.01}, {"vf_clip_param": 0.5}])
-def test_an_update_is_rllibs_own(ppo, flights, training, monkeypatch):
+def test_an_update_is_rllibs_own(ppo, flights, training, compiled, monkeypatch):
     env, samples = flights
+    if not compiled:
+        tensor_by_tensor(monkeypatch)
     rllibs, make_rows = {}, PlainPPOLearner._rows
     theirs, ours = (make_learner(ppo, env, kind, **training) for kind in (PPOTorchLearner, PlainPPOLearner))
     ours.set_state(theirs.get_state())
@@ -113,8 +122,40 @@ def test_advantages_are_those_of_a_plain_loop_and_of_rllib(terminated):
     np.testing.assert_allclose(found + values[:40], targets[:40], rtol=1e-5, atol=1e-5)
 
 
+def test_compiled_steps_are_those_of_tensors(ppo, flights, monkeypatch):
+    """Many small minibatches, the last of which is not whole, across updates and a restored optimiser."""
+    env, samples = flights
+    compiled, plain = (make_learner(ppo, env, PlainPPOLearner, entropy_coeff=0.1) for _ in range(2))
+    plain.set_state(compiled.get_state())
+    first = weights(compiled)
+    for k, episodes in enumerate(samples):
+        told = []
+        for learner in (compiled, plain) if k % 2 else (plain, compiled):
+            torch.manual_seed(k)
+            with monkeypatch.context() as patched:
+                if learner is plain:
+                    tensor_by_tensor(patched)
+                told.append(learner.update(episodes=copy.deepcopy(episodes), num_epochs=3, minibatch_size=10))
+        for name in (NORM, *FIGURES):
+            one, other = (reduced(result, name) for result in told)
+            assert one == pytest.approx(other, rel=1e-4, abs=1e-5), name
+        again = make_learner(ppo, env, PlainPPOLearner, entropy_coeff=0.1)
+        again.set_state(compiled.get_state())
+        compiled = again
+    moved = max(float((weights(plain)[name] - first[name]).abs().max()) for name in first)
+    for name, value in weights(compiled).items():
+        assert float((value - weights(plain)[name]).abs().max()) < 1e-4 * moved, name
+    adam, plain_adam = (
+        learner.get_optimizer("default_policy").state_dict()["state"] for learner in (compiled, plain)
+    )
+    for key, state in plain_adam.items():
+        for name, value in state.items():
+            torch.testing.assert_close(adam[key][name], value, rtol=1e-3, atol=1e-6)
+
+
 def test_every_step_is_seen_once_an_epoch_in_another_order(ppo, flights, monkeypatch):
     env, samples = flights
+    tensor_by_tensor(monkeypatch)
     learner = make_learner(ppo, env, PlainPPOLearner)
     seen = []
     loss = learner._loss
@@ -158,7 +199,12 @@ def test_a_gradient_that_is_not_finite_stops_before_the_weights_move(ppo, flight
     learner = make_learner(ppo, env, PlainPPOLearner)
     before, loss = weights(learner), learner._loss
     with monkeypatch.context() as broken:
+        tensor_by_tensor(broken)
         broken.setattr(learner, "_loss", lambda rows: (loss(rows)[0] * math.nan, {}))
+        with pytest.raises(RuntimeError, match="non-finite"):
+            learner.update(episodes=copy.deepcopy(samples[0]), num_epochs=1, minibatch_size=32)
+    with monkeypatch.context() as broken:
+        broken.setattr(ppo_learner, "advantages", lambda values, rewards, *rest: np.nan * rewards)
         with pytest.raises(RuntimeError, match="non-finite"):
             learner.update(episodes=copy.deepcopy(samples[0]), num_epochs=1, minibatch_size=32)
     assert all(torch.equal(value, before[name]) for name, value in weights(learner).items())

@@ -49,6 +49,35 @@ def test_packed_windows_have_the_addresses_of_their_events():
         assert np.array_equal(getattr(structured, name), getattr(from_packed, name))
 
 
+def test_windows_of_any_lengths_are_the_stack_that_they_would_fill():
+    windows = [packed(n, 10, [(n, 1, 2, -1), (9, 4, 0, 1)][:n]) for n in (2, 0, 1)]
+    stack = np.stack([packed(5, 10, window[1:].tolist()) for window in windows])
+    for other in (windows, tuple(windows)):
+        found, expected = batch_packed(other, GRID), batch_packed(stack, GRID)
+        assert found.offsets.tolist() == [0, 2, 2, 3]
+        for name in ("code", "bin", "offsets"):
+            assert np.array_equal(getattr(found, name), getattr(expected, name))
+    assert batch_packed([], GRID).offsets.tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (packed(2, 10, [(1, 0, 0, 1), (1, 5, 0, 1)]), "window 1: event 1 has x=5, y=0, p=1"),
+        (packed(2, 0, [(1, 0, 0, 1)]), "window 1: window_us must be in .* got 0"),
+        (np.array([[3, 0, 10, 0]] * 3, np.int32), "window 1 announces 3 events, its capacity is 2"),
+        (np.array([[-1, 0, 10, 0]] * 3, np.int32), "window 1 announces -1 events, its capacity is 2"),
+        (np.zeros((0, 4), np.int32), "window 1: a packed window is int32 .*got int32 \\(0, 4\\)"),
+        (np.zeros((2, 3), np.int32), "window 1: a packed window is int32 .*got int32 \\(2, 3\\)"),
+        (np.zeros((2, 4)), "window 1: a packed window is int32 .*got float64 \\(2, 4\\)"),
+    ],
+)
+def test_a_refusal_names_the_first_window_that_it_is_about(bad, message):
+    fine = packed(3, 10, [(3, 1, 2, -1)])
+    with pytest.raises(ValueError, match=message):
+        batch_packed([fine, bad, fine, bad], GRID)
+
+
 def test_a_packed_window_of_zeros_is_an_empty_window():
     assert batch_packed(np.zeros((2, 5, 4), np.int32), GRID).offsets.tolist() == [0, 0, 0]
 
@@ -109,29 +138,37 @@ def addresses(count, seed=0, width=40, height=30, time_bins=1024):
     return np.stack([code, np.sort(rng.integers(0, time_bins, count))]).astype(np.int32)
 
 
-@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 5000])
-def test_the_events_that_are_kept_are_spread_evenly_over_the_window(count):
-    address = np.stack([np.arange(count), np.arange(count)]).astype(np.int32)
-    kept = thin(address, 64)[0]
-    assert len(kept) == min(count, 64)
-    if count <= 64:
-        assert kept.tolist() == list(range(count))
-    else:
-        gaps = np.diff([-1, *kept, count])
-        assert gaps[1:-1].max() <= count / 64 + 1
-        assert max(gaps[0], gaps[-1]) <= count / 128 + 1.5
+def batch_of(grid, *parts):
+    offsets = np.cumsum([0, *(part.shape[1] for part in parts)])
+    return EventBatch(grid, *np.concatenate(parts, axis=1), offsets)
+
+
+def test_the_events_that_are_kept_are_spread_evenly_over_each_window():
+    counts = [0, 1, 63, 64, 65, 5000, 0, 200]
+    parts = [np.stack([np.arange(count)] * 2).astype(np.int32) for count in counts]
+    batch = thin(batch_of(Grid(50, 50, 5000), *parts), 64)
+    assert np.diff(batch.offsets).tolist() == np.minimum(counts, 64).tolist()
+    np.testing.assert_array_equal(batch.code, batch.bin)
+    for count, kept in zip(counts, np.split(batch.code, batch.offsets[1:-1]), strict=True):
+        if count <= 64:
+            assert kept.tolist() == list(range(count))
+        else:
+            gaps = np.diff([-1, *kept, count])
+            assert gaps[1:-1].max() <= count / 64 + 1
+            assert max(gaps[0], gaps[-1]) <= count / 128 + 1.5
 
 
 def test_a_row_says_kind_time_and_place_and_empty_rows_follow():
     address = np.array([[1200 + 5 * 40 + 7, 39], [300, 1023]], np.int32)
-    rows = event_rows(address, 4, 40, 30)
-    assert (rows.dtype, rows.tolist()) == (np.int16, [[1, 300, 7, 5], [2, 1023, 39, 0], [0] * 4, [0] * 4])
+    rows = event_rows(batch_of(Grid(40, 30, 1024), address[:, :0], address), 4)
+    assert rows.dtype == np.int16
+    assert rows.tolist() == [[[0] * 4] * 4, [[1, 300, 7, 5], [2, 1023, 39, 0], [0] * 4, [0] * 4]]
 
 
 def test_rows_hold_a_window_exactly_up_to_the_largest_sides_and_time_bins():
     grid = Grid(1 << 9, 1 << 7, 1 << 15)
     parts = [addresses(count, count, *grid) for count in (30, 0, 64)]
-    rows = np.stack([event_rows(part, 64, grid.width, grid.height) for part in parts])
+    rows = event_rows(batch_of(grid, *parts), 64)
     batch = batch_rows(rows, grid)
     assert batch.offsets.tolist() == [0, 30, 30, 94]
     np.testing.assert_array_equal(np.stack([batch.code, batch.bin]), np.concatenate(parts, axis=1))

@@ -34,7 +34,7 @@ def batch_of(*counts):
 def test_the_picture_is_the_event_image_on_a_scale_where_on_is_one():
     batch = batch_of(0, 1, 2000)
     for row, (start, stop) in enumerate(zip(batch.offsets, batch.offsets[1:], strict=False)):
-        expected = event_picture(np.stack([batch.code[start:stop], batch.bin[start:stop]]), SIDE, SIDE)
+        expected = event_picture(batch.code[start:stop], SIDE, SIDE)
         np.testing.assert_allclose(255.0 * event_pictures(batch)[row, 0], expected, rtol=1e-6)
     assert np.array_equal(last_polarity(batch), event_targets(batch, "signed").numpy())
     assert 0.4 < OFF_SHARE < 0.5

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from models.encoder.event_batch import batch_windows
-from models.encoder.table import PRECISIONS, EncoderTable
+from models.encoder.table import PRECISIONS, EncoderTable, _dense
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
@@ -217,10 +217,27 @@ def test_an_empty_window_is_the_encoder_at_the_zero_context(evae, table):
 
 def test_packed_windows_have_the_latents_of_their_events_bit_for_bit(table):
     windows = [make_events(count, seed=count) for count in (0, 1, 40, 300)]
-    latents = table.encode_windows(np.stack([pack(events, 300) for events in windows]))
-    assert latents.dtype == np.float32
-    for events, latent in zip(windows, latents, strict=True):
-        assert np.array_equal(latent, table.encode(events, 0, WINDOW_US))
+    expected = np.stack([table.encode(events, 0, WINDOW_US) for events in windows])
+    assert expected.dtype == np.float32
+    for packed in (np.stack([pack(events, 300) for events in windows]), [pack(w, len(w)) for w in windows]):
+        assert np.array_equal(table.encode_windows(packed), expected)
+
+
+def test_a_latent_does_not_depend_on_the_other_windows_of_its_batch(table):
+    windows = [pack(make_events(count % 7 * 9, seed=count), 60) for count in range(20)]
+    whole = table.encode_windows(windows)
+    assert len(np.unique(whole, axis=0)) > 15
+    for first, last in ((0, 1), (9, 11), (4, 7), (5, 20), (19, 20)):
+        assert np.array_equal(table.encode_windows(windows[first:last]), whole[first:last])
+    assert table.encode_windows([]).shape == (0, whole.shape[1])
+
+
+def test_the_layers_after_the_maximum_are_matrix_products():
+    rng = np.random.default_rng(0)
+    for windows, inputs, outputs in ((1, 128, 1), (4, 33, 7), (5, 64, 8)):
+        contexts, weight = rng.normal(size=(windows, inputs)), rng.normal(size=(outputs, inputs))
+        bias = rng.normal(size=outputs)
+        np.testing.assert_allclose(_dense(contexts, weight, bias), contexts @ weight.T + bias, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("field", "value"), [("x", 16), ("y", 12), ("p", 0), ("x", 65535)])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from models.encoder.event_batch import event_rows, thin
+from models.encoder.event_batch import EventBatch, Grid, event_rows, thin
 from models.policy.event_set import EVENTS, TIMES, EventSet
 
 
@@ -21,9 +21,9 @@ def network(stack=3):
 
 def rows_of(*windows):
     """One stack (1, stack, EVENTS, 4) of windows given as addresses."""
-    return torch.from_numpy(
-        np.stack([event_rows(thin(window, EVENTS), EVENTS, 40, 30) for window in windows])
-    )[None]
+    offsets = np.cumsum([0, *(window.shape[1] for window in windows)])
+    batch = EventBatch(Grid(40, 30, TIMES), *np.concatenate(windows, axis=1), offsets)
+    return torch.from_numpy(event_rows(thin(batch, EVENTS), EVENTS))[None]
 
 
 def oracle(net, stacks):

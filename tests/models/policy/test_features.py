@@ -79,6 +79,21 @@ def test_the_events_of_a_step_give_what_their_window_and_their_image_give(seed, 
         assert made.dtype == expected.dtype
 
 
+@pytest.mark.parametrize("name", ["event_columns", "event_set"])
+def test_windows_of_any_lengths_give_the_features_of_each(name):
+    hidden = {"hidden": [8]} if KINDS[name].settings is DenseModel else {}
+    spec = PolicySpec(KINDS[name].settings(name=name, stack=3, **hidden), *SIZES)
+    rng = np.random.default_rng(0)
+    steps = [make_events(rng, count) for count in (5, 0, 400, 1)]
+    feature = feature_of(spec)
+    packed = tuple(pack_window(step, 0, WINDOW_US, max(len(step), 1))[: len(step) + 1] for step in steps)
+    made = feature.from_observations(packed, spec, None)
+    assert (made.dtype, made.shape) == (feature.dtype, (4, *feature.shape(spec)))
+    for row, step in zip(made, steps, strict=True):
+        np.testing.assert_array_equal(row, feature.from_events(Step(step, 0, WINDOW_US), spec, None))
+    assert Policy(build_networks(spec), spec)(packed[:1]).shape == (1,)
+
+
 def test_the_last_event_of_a_pixel_colours_it():
     events = np.zeros(3, EVENT)
     events["t"], events["x"], events["p"] = [1, 2, 3], [2, 2, 5], [1, -1, 1]

@@ -1,0 +1,130 @@
+"""One control step of many vehicles in one compiled call.
+
+It moves each vehicle, finds contact and goal, and simulates the camera of every sensor that sees
+by looks (`envs.sensor`). Other sensors, and faults, take their turn in Python afterwards.
+"""
+
+import numba
+import numpy as np
+from numba.typed import List
+
+from envs.events import EVENT
+from envs.fidelity import parts_of
+from envs.kinematics import Lane, advance, clock_us, planned_position
+from envs.raycast.silhouettes import Way
+from envs.sensor import sense_way
+
+GOOD, BAD_REWARD = -1, -10
+
+_FLOATS = (
+    *("spawn_x_m", "x_m", "y_m"),
+    *("speed_mps", "control_hz", "radius_m", "height_m", "half_width_m", "length_m"),
+    *("max_step_m", "limit_us"),  # way between two renders, and when the time is up
+    # The last step: where it began, the share of it that it moved, its reward, its renders.
+    *("start_x_m", "start_y_m", "share", "reward", "renders"),
+)
+_WHOLE = (
+    *("forward", "left", "right"),  # how often each action was taken
+    *(
+        "start_us",
+        "t_us",
+        "window_us",
+    ),  # when the last step began and ended; its length, or that of the first
+    *("num_events", "dropped"),  # events of it, and those that the camera lost in it
+    "problem",  # `GOOD`, `BAD_REWARD`, or what `sense_way` says
+)
+_FLAGS = ("by_looks", "success", "collision", "truncated", "over")
+VEHICLE = np.dtype(
+    [(name, "f8") for name in _FLOATS] + [(name, "i8") for name in _WHOLE] + [(name, "?") for name in _FLAGS],
+    align=True,
+)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def line_up(corridor, count):
+    """A list with `count` times the same corridor: level sections of what stands there, and a `View`."""
+    corridors = List()
+    for _ in range(count):
+        corridors.append(corridor)
+    return corridors
+
+
+@numba.njit(cache=True, error_model="numpy")
+def put(corridors, row, corridor):
+    """Exchange one corridor of a list."""
+    corridors[row] = corridor
+
+
+@numba.njit(cache=True, error_model="numpy")
+def step_all(rows, corridors, actions, active):
+    """One control step of all active vehicles.
+
+    Args:
+        rows: (B,) VEHICLE, changed in place.
+        corridors: A list of B, see `line_up`.
+        actions: int64 (B,).
+        active: bool (B,).
+
+    Returns:
+        EVENT of those that see by looks, vehicle after vehicle; int64 (B + 1,), where the events of each end.
+    """
+    found, ends = [np.empty(0, EVENT)], np.zeros(rows.size + 1, np.int64)
+    for row in range(rows.size):
+        ends[row + 1] = ends[row]
+        if active[row]:
+            sections, view = corridors[row]
+            _move(rows[row], actions[row], sections)
+            if rows[row].by_looks and rows[row].problem == GOOD:
+                events = _look(rows[row], view)
+                found.append(events)
+                ends[row + 1] += events.size
+            rows[row].over |= rows[row].problem != GOOD
+    together, size = np.empty(ends[-1], EVENT), 0
+    for events in found:
+        together[size : size + events.size] = events
+        size += events.size
+    return together, ends
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _move(vehicle, action, sections):
+    """Move a vehicle, and say what that brought."""
+    vehicle.forward += action == 0
+    vehicle.left += action == 1
+    vehicle.right += action == 2
+    moves, step_m = (vehicle.forward, vehicle.left, vehicle.right), (vehicle.speed_mps, vehicle.control_hz)
+    lane = Lane(vehicle.radius_m, vehicle.half_width_m, vehicle.length_m)
+    start = vehicle.x_m, vehicle.y_m
+    outcome = advance(lane, sections, start, planned_position(vehicle.spawn_x_m, moves, step_m))
+    vehicle.start_x_m, vehicle.start_y_m = start
+    vehicle.x_m, vehicle.y_m = outcome.end
+    vehicle.share, vehicle.reward = outcome.share, outcome.reward
+    vehicle.success, vehicle.collision = outcome.success, outcome.collision
+    vehicle.start_us, vehicle.t_us = vehicle.t_us, clock_us(sum(moves), vehicle.control_hz)
+    vehicle.window_us = vehicle.t_us - vehicle.start_us
+    vehicle.dropped, vehicle.renders = 0, 0.0
+    ended = outcome.success or outcome.collision
+    vehicle.truncated = not ended and vehicle.t_us >= vehicle.limit_us
+    vehicle.over = ended or vehicle.truncated
+    vehicle.problem = GOOD if np.isfinite(outcome.reward) else BAD_REWARD
+
+
+@numba.njit(cache=True, error_model="numpy")
+def way_of(vehicle):
+    """The `Way` of the last step, up to where the vehicle stopped."""
+    moving_us = round(vehicle.share * vehicle.window_us)
+    place = vehicle.start_x_m, vehicle.start_y_m, vehicle.x_m, vehicle.y_m
+    return Way(place[0], place[1], place[2], place[3], vehicle.height_m, vehicle.start_us, moving_us)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _look(vehicle, view):
+    """Events of the last step of a vehicle; it stands still, and sees nothing, once it has stopped."""
+    way = way_of(vehicle)
+    if way.moving_us == 0:
+        return np.empty(0, EVENT)
+    way_m = vehicle.share * vehicle.speed_mps / vehicle.control_hz
+    parts = min(parts_of(way_m, vehicle.max_step_m), way.moving_us)
+    vehicle.problem, vehicle.dropped, columns, events = sense_way(view, way, parts)
+    vehicle.renders = columns / view.seen_us.size
+    return events

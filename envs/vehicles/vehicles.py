@@ -1,0 +1,126 @@
+"""Vehicles side by side: where each is, and what its last step brought."""
+
+from typing import Any
+
+import numpy as np
+
+from envs.config import EnvConfig
+from envs.events import EVENT
+from envs.kinematics import Outcome, clock_us
+from envs.scene import Scene
+from envs.sensor import Sensor, check_sensed
+from envs.vehicles.step import BAD_REWARD, GOOD, VEHICLE, line_up, put, step_all, way_of
+
+
+class StepError(ValueError):
+    """A step that went wrong, and the row of the vehicle."""
+
+    def __init__(self, row: int, reason: str) -> None:
+        """Remember both."""
+        super().__init__(reason)
+        self.row = row
+
+
+class Vehicles:
+    """Vehicles side by side, each in a corridor of its own.
+
+    Attributes:
+        rows: (B,) VEHICLE, where each is and what its last step brought.
+        events: EVENT of the last step of all, vehicle after vehicle, faults included.
+        ends: int64 (B + 1,), vehicle b has events ends[b] .. ends[b + 1] - 1.
+    """
+
+    def __init__(self, count: int) -> None:
+        """Room for `count` vehicles, none of which has started."""
+        self.rows = np.zeros(count, VEHICLE)
+        self.rows["over"] = True
+        self._sensors: list[Sensor | None] = [None] * count
+        self._by_hand: set[int] = set()
+        self._corridors: Any = None
+        self.forget_events()
+
+    def start(self, row: int, config: EnvConfig, scene: Scene, sensor: Sensor, spawn_x_m: float) -> None:
+        """Put a vehicle at the start of a scene that its sensor has been reset to."""
+        vehicle = self.rows[row : row + 1]
+        vehicle[:] = np.zeros(1, VEHICLE)
+        vehicle["spawn_x_m"] = vehicle["x_m"] = spawn_x_m
+        vehicle["speed_mps"], vehicle["control_hz"] = config.speed_mps, config.control_hz
+        vehicle["radius_m"], vehicle["height_m"] = config.vehicle_radius_m, config.camera_height_m
+        vehicle["half_width_m"], vehicle["length_m"] = 0.5 * scene.width_m, scene.length_m
+        vehicle["limit_us"], vehicle["by_looks"] = config.time_limit_s * 1e6, sensor.sees_by_looks
+        vehicle["max_step_m"] = sensor.plan.max_step_m if sensor.sees_by_looks else np.inf
+        vehicle["window_us"], vehicle["problem"] = clock_us(1, config.control_hz), GOOD
+        self._sensors[row] = sensor
+        corridor = scene.sections(config.camera_height_m), sensor.view()
+        if self._corridors is None:
+            self._corridors = line_up(corridor, len(self.rows))
+        put(self._corridors, row, corridor)
+        self._by_hand.discard(row)
+        if not sensor.sees_by_looks or sensor.has_faults:
+            self._by_hand.add(row)
+        if len(self.rows) == 1:
+            self.forget_events()
+
+    def step(self, actions: np.ndarray, active: np.ndarray) -> None:
+        """One control step of the active vehicles; `rows`, `events` and `ends` tell what it brought.
+
+        Args:
+            actions: int64 (B,), valid.
+            active: bool (B,); others stay as they are, without events. At least one vehicle has started.
+
+        Raises:
+            StepError: A number became NaN or infinite; the vehicle's episode is over.
+        """
+        rows = self.rows
+        self.events, self.ends = step_all(rows, self._corridors, actions, active)
+        wrong = rows["problem"] != GOOD
+        if wrong.any():
+            self._refuse(int((wrong & active).argmax()))
+        by_hand = [row for row in sorted(self._by_hand) if active[row]]
+        if by_hand:
+            parts = [self.events_of(row) for row in range(len(rows))]
+            for row in by_hand:
+                parts[row] = self._sense(row, parts[row])
+            np.cumsum([part.size for part in parts], out=self.ends[1:])
+            self.events = np.concatenate(parts)
+        rows["num_events"][active] = np.diff(self.ends)[active]
+
+    def events_of(self, row: int) -> np.ndarray:
+        """EVENT array of a vehicle in the last step of any; empty if it did not take part."""
+        if not self.rows["t_us"][row]:
+            return np.empty(0, EVENT)
+        return self.events[self.ends[row] : self.ends[row + 1]]
+
+    def forget_events(self) -> None:
+        """Begin anew with a step that had no events."""
+        self.events, self.ends = np.empty(0, EVENT), np.zeros(len(self.rows) + 1, np.int64)
+
+    def _sense(self, row: int, events: np.ndarray) -> np.ndarray:
+        """Events of a step that the compiled call has not simulated to the end."""
+        vehicle, sensor = self.rows[row], self._sensors[row]
+        assert sensor is not None  # noqa: S101  for the type checker
+        start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
+        try:
+            if vehicle["by_looks"]:
+                return sensor.spoil(events, start_us, t_us)
+            end = float(vehicle["x_m"]), float(vehicle["y_m"])
+            share, ends = float(vehicle["share"]), (bool(vehicle["success"]), bool(vehicle["collision"]))
+            outcome = Outcome(end, share, float(vehicle["reward"]), *ends)
+            sensor.step((float(vehicle["start_x_m"]), float(vehicle["start_y_m"])), outcome, t_us)
+        except ValueError as error:
+            vehicle["over"] = True
+            raise StepError(row, str(error)) from error
+        vehicle["dropped"], vehicle["renders"] = sensor.dropped, sensor.renders
+        return sensor.events
+
+    def _refuse(self, row: int) -> None:
+        """Raise the error of a step that the compiled call has found."""
+        vehicle, sensor = self.rows[row].copy(), self._sensors[row]
+        assert sensor is not None  # noqa: S101  for the type checker
+        if vehicle["problem"] == BAD_REWARD:
+            way = f"from {vehicle['start_x_m']}, {vehicle['start_y_m']} to {vehicle['x_m']}, {vehicle['y_m']}"
+            raise StepError(row, f"the reward must be finite; got {vehicle['reward']} on the way {way}.")
+        try:
+            check_sensed(int(vehicle["problem"]), way_of(vehicle), sensor.view().scratch.image)
+        except ValueError as error:
+            raise StepError(row, str(error)) from error

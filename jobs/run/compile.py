@@ -1,0 +1,116 @@
+"""Compiles the kernels into numba's cache, by using each once: python -m jobs.run.compile.
+
+What is compiled already is only loaded, and nothing is done while no source file has changed. One
+process compiles, others that are started meanwhile wait for it. The rooms are imported only where there is
+something to compile, because that takes seconds.
+"""
+
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from jobs.run.files import write_atomic
+from jobs.run.locks import locked
+from jobs.run.progress import console
+from jobs.run.provenance import REPOSITORY
+
+CACHE = REPOSITORY / "envs" / "__pycache__"
+
+
+def compile_kernels() -> None:
+    """Compile, in a process of its own, before several processes start that would each do it.
+
+    Nothing is done where the folder of the source cannot be written: numba then compiles elsewhere.
+    """
+    if not _is_current() and os.access(CACHE.parent, os.W_OK):
+        subprocess.run([sys.executable, "-m", "jobs.run.compile"], cwd=REPOSITORY, check=False)
+
+
+def main() -> None:
+    """Compile what has changed since the last time, and say how long it took."""
+    with locked(CACHE / "compile.lock", "Another process compiles the kernels; waiting for it ..."):
+        if _is_current():
+            return
+        now = _digest()
+        console.print("Compiling the kernels (a minute at the first time) ...")
+        start = time.perf_counter()
+        fly()
+        encode()
+        console.print(f"Compiled the kernels in {time.perf_counter() - start:.0f} s.")
+        write_atomic(CACHE / "compiled", now)
+
+
+def _is_current() -> bool:
+    """Whether nothing has changed since all was compiled."""
+    compiled = CACHE / "compiled"
+    return compiled.is_file() and compiled.read_text() == _digest()
+
+
+def _digest() -> str:
+    """A hash of all sources of kernels, of what is compiled of them, by which numba and where to."""
+    files = sorted(path for room in ("envs", "models") for path in (REPOSITORY / room).rglob("*.py"))
+    whole = hashlib.sha256(b"".join(path.read_bytes() for path in (Path(__file__), *files)))
+    whole.update(f"{version('numba')} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
+    return whole.hexdigest()
+
+
+def fly() -> None:
+    """Move through a few corridors, and write and read a recording."""
+    from envs.config import CameraConfig, EnvConfig, FaultsConfig
+    from envs.corridor import CorridorEnv, CorridorVectorEnv
+    from envs.event_error import measure_event_error
+    from envs.recordings import read_events, write_events
+    from envs.scene.planning import cost_to_go
+
+    small = partial(CameraConfig, width=16, height=16)
+    noisy = FaultsConfig(sparsity=0.1, background_activity=0.1, shot_noise_hz=10.0, leak_hz=1.0)
+    for config in (
+        EnvConfig(camera=small(), faults=noisy),
+        EnvConfig(camera=small(memory="frame"), observation="event_image", scene="gates"),
+        EnvConfig(camera=small(refractory_us=100), scene="texture_change"),
+        EnvConfig(camera=small(), observation="luminance", scene="dynamic"),
+    ):
+        env = CorridorEnv(config)
+        env.reset(seed=0)
+        env.step(1)
+    several = CorridorVectorEnv(2, camera=small(), window_capacity=None)
+    several.reset(seed=0)
+    several.step(np.zeros(2, np.int64))
+    cost_to_go(several.envs[0].scene, 0.3).of_actions(0.0, 0.0)
+    measure_event_error(EnvConfig(camera=small()), flights=1, steps=1)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("dat", "evt2", "evt3"):
+            write_events(Path(folder) / name, some_events(), 16, 16, name)
+            read_events(Path(folder) / name)
+
+
+def encode() -> None:
+    """Encode a few events, as in a flight and as in the training of an encoder."""
+    from models.encoder.evae import EventVAE
+    from models.encoder.event_batch import batch_windows
+    from models.encoder.frozen import encoder_of
+
+    evae, events = EventVAE(context=64), some_events()
+    evae.ecn(batch_windows([(events, 0, 5000)] * 2, evae.grid)).sum().backward()
+    encoder_of(evae.freeze()).encode(events, 0, 5000)
+
+
+def some_events() -> np.ndarray:
+    """A hundred events."""
+    from envs.events import EVENT
+
+    events = np.zeros(100, EVENT)
+    events["t"], events["p"] = np.arange(100), 1
+    return events
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies
+
+from envs.events import EVENT
+from envs.events.neighbour_filter import filter_neighbours, quiet_sensor
+
+WIDTH, HEIGHT, TAU_US = 7, 5, 300
+
+streams = strategies.tuples(strategies.integers(0, 2**32 - 1), strategies.integers(0, 120))
+supports = strategies.integers(1, 8)
+
+
+def make_stream(seed, count, end_us=3000):
+    rng = np.random.default_rng(seed)
+    events = np.zeros(count, EVENT)
+    events["t"] = np.sort(rng.integers(0, end_us, count))
+    events["x"], events["y"] = rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count)
+    events["p"] = rng.choice([-1, 1], count)
+    return events
+
+
+def passing(events, support, tau_us=TAU_US):
+    return filter_neighbours(events, quiet_sensor(WIDTH, HEIGHT), support, tau_us)
+
+
+def plain(events, support, tau_us):
+    """The rule, looking back at every earlier event."""
+    kept = []
+    for n, event in enumerate(events):
+        fired = {
+            (int(other["x"]), int(other["y"]))
+            for other in events[:n]
+            if event["t"] - other["t"] <= tau_us
+            and max(abs(int(other["x"]) - int(event["x"])), abs(int(other["y"]) - int(event["y"]))) == 1
+        }
+        if len(fired) >= support:
+            kept.append(event)
+    return np.array(kept, EVENT)
+
+
+@settings(max_examples=40)
+@given(streams, supports, strategies.integers(0, 3000))
+def test_events_pass_by_the_plain_rule(stream, support, tau_us):
+    events = make_stream(*stream)
+    np.testing.assert_array_equal(passing(events, support, tau_us), plain(events, support, tau_us))
+
+
+@given(streams, supports, strategies.lists(strategies.integers(0, 120), max_size=6))
+def test_any_pieces_of_a_stream_pass_the_same_events(stream, support, cuts):
+    events, last_us = make_stream(*stream), quiet_sensor(WIDTH, HEIGHT)
+    pieces = [filter_neighbours(p, last_us, support, TAU_US) for p in np.split(events, sorted(cuts))]
+    np.testing.assert_array_equal(np.concatenate(pieces), passing(events, support))
+
+
+@given(streams, supports)
+def test_a_higher_support_and_a_shorter_time_pass_fewer_of_the_same(stream, support):
+    events = make_stream(*stream)
+    events["t"] = 10 * events["t"] + np.arange(len(events)) % 10  # apart, to tell them by
+    events.sort(order="t")
+    events = events[np.unique(events["t"], return_index=True)[1]]
+    more = set(passing(events, support)["t"].tolist())
+    assert set(passing(events, support + 1 if support < 8 else 8)["t"].tolist()) <= more
+    assert set(passing(events, support, TAU_US // 2)["t"].tolist()) <= more
+
+
+def test_no_support_passes_every_event_and_notes_none():
+    events, last_us = make_stream(0, 50), quiet_sensor(WIDTH, HEIGHT)
+    assert filter_neighbours(events, last_us, 0, TAU_US) is events
+    np.testing.assert_array_equal(last_us, quiet_sensor(WIDTH, HEIGHT))
+
+
+@pytest.mark.parametrize(("x", "y"), [(3, 2), (0, 0), (WIDTH - 1, HEIGHT - 1)])
+@pytest.mark.parametrize("support", [1, 8])
+def test_a_hot_pixel_alone_never_passes(x, y, support):
+    events = np.zeros(500, EVENT)
+    events["t"], events["x"], events["y"], events["p"] = np.arange(500), x, y, 1
+    assert len(passing(events, support)) == 0
+
+
+def test_polarity_says_nothing_and_the_time_is_inclusive():
+    events = np.zeros(2, EVENT)
+    events["x"], events["p"] = [2, 3], [1, -1]
+    for later_us, passes in ((TAU_US, 1), (TAU_US + 1, 0), (0, 1)):
+        events["t"] = [40, 40 + later_us]
+        assert len(passing(events, 1)) == passes
+    assert len(passing(events, 2)) == 0
+
+
+@pytest.mark.parametrize(("support", "tau_us"), [(-1, 10), (9, 10), (1, -1)])
+def test_settings_out_of_range_are_refused(support, tau_us):
+    with pytest.raises(ValueError, match=f"got {support} and {tau_us}"):
+        passing(make_stream(0, 3), support, tau_us)

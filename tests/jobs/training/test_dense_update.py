@@ -1,0 +1,136 @@
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from jobs.training.dense_update import Rows, Settings, update_dense
+from models.policy.networks import mlp
+
+PLAIN = Settings(
+    minibatch_size=16,
+    clip_param=0.2,
+    vf_loss_coeff=0.5,
+    vf_clip_param=math.inf,
+    entropy_coeff=0.0,
+    grad_clip=math.inf,
+    lr=1e-3,
+    beta1=0.9,
+    beta2=0.999,
+    eps=1e-8,
+)
+INPUTS, ACTIONS, COUNT = 6, 3, 40
+
+
+def make(hidden=(16, 16)):
+    """Two networks, Adam, rows whose ratios lie within and beyond the clip, and the orders of two epochs."""
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    networks = [mlp(INPUTS, hidden, outputs) for outputs in (ACTIONS, 1)]
+    optimizer = torch.optim.Adam([value for one in networks for value in one.parameters()], fused=True)
+    stacks, logps, advantages, targets = (
+        rng.normal(size=shape).astype("f4") for shape in ((COUNT, INPUTS), COUNT, COUNT, COUNT)
+    )
+    rows = Rows(stacks, rng.integers(0, ACTIONS, COUNT), 0.3 * logps - 1.1, advantages, 3.0 * targets)
+    return networks, optimizer, rows, np.stack([rng.permutation(COUNT) for _ in range(2)])
+
+
+def by_tensors(networks, optimizer, rows, orders, settings):
+    """`update_dense` with torch's own gradient, norm and Adam, in the networks' precision."""
+    parameters = [value for one in networks for value in one.parameters()]
+    optimizer.param_groups[0]["lr"] = settings.lr
+    kind = parameters[0].dtype
+    stacks, actions, logps, advantages, targets = map(torch.from_numpy, rows)
+    for order in orders:
+        figures = []
+        for n in torch.from_numpy(order).split(settings.minibatch_size):
+            chances = torch.log_softmax(networks[0](stacks[n].to(kind)), -1)
+            ratio = (chances.gather(1, actions[n, None])[:, 0] - logps[n]).exp()
+            clipped = ratio.clamp(1.0 - settings.clip_param, 1.0 + settings.clip_param)
+            policy_loss = -torch.minimum(advantages[n] * ratio, advantages[n] * clipped).mean()
+            errors = networks[1](stacks[n].to(kind))[:, 0] - targets[n]
+            value_loss = errors.square().clamp(max=settings.vf_clip_param).mean()
+            entropy = -(chances.exp() * chances).sum(-1).mean()
+            total = policy_loss + settings.vf_loss_coeff * value_loss - settings.entropy_coeff * entropy
+            optimizer.zero_grad()
+            total.backward()
+            norm = nn.utils.clip_grad_norm_(parameters, settings.grad_clip, error_if_nonfinite=True)
+            optimizer.step()
+            figures.append(
+                [float(value.detach()) for value in (policy_loss, value_loss, entropy, total, norm)]
+            )
+    return np.mean(figures, axis=0)
+
+
+def flat(networks):
+    return torch.cat([value.detach().flatten() for one in networks for value in one.parameters()]).double()
+
+
+@pytest.mark.parametrize(
+    ("hidden", "changes"),
+    [
+        ((16, 16), {}),
+        ((), {}),
+        ((5,), {"entropy_coeff": 0.1}),
+        ((16, 7, 32), {"grad_clip": 0.01}),
+        ((16, 16), {"vf_clip_param": 0.5, "clip_param": 0.05}),
+    ],
+)
+def test_weights_moments_and_figures_are_those_of_torch_in_double_precision(hidden, changes):
+    networks, optimizer, rows, orders = make(hidden)
+    settings = PLAIN._replace(**changes)
+    exact = [copy.deepcopy(one).double() for one in networks]
+    adam = torch.optim.Adam([value for one in exact for value in one.parameters()])
+    before = flat(networks)
+    for part in orders[:1], orders[1:]:  # the second goes on with Adam's state
+        found = update_dense(networks, optimizer, rows, part, settings)
+        expected = by_tensors(exact, adam, rows, part, settings)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    moved = (flat(exact) - before).abs().max()
+    assert (flat(networks) - flat(exact)).abs().max() < 2e-3 * moved
+    for value, other in zip(optimizer.param_groups[0]["params"], adam.param_groups[0]["params"], strict=True):
+        one, two = optimizer.state[value], adam.state[other]
+        assert float(one["step"]) == float(two["step"]) == 6.0
+        for name in ("exp_avg", "exp_avg_sq"):
+            scale = float(two[name].abs().max())
+            torch.testing.assert_close(one[name].double(), two[name], rtol=0.0, atol=1e-4 * scale)
+
+
+def test_one_gradient_is_exact_to_rounding():
+    networks, optimizer, rows, orders = make()
+    exact = [copy.deepcopy(one).double() for one in networks]
+    adam = torch.optim.Adam([value for one in exact for value in one.parameters()])
+    settings = PLAIN._replace(minibatch_size=COUNT)
+    update_dense(networks, optimizer, rows, orders[:1], settings)
+    by_tensors(exact, adam, rows, orders[:1], settings)
+    found, expected = (
+        torch.cat([state["exp_avg"].flatten().double() for state in one.state.values()])
+        for one in (optimizer, adam)
+    )
+    assert (found - expected).norm() < 1e-6 * expected.norm()
+
+
+def test_tensors_stay_in_place_and_steps_of_no_size_change_nothing():
+    networks, optimizer, rows, orders = make()
+    places = [value.data_ptr() for one in networks for value in one.parameters()]
+    before = flat(networks)
+    update_dense(networks, optimizer, rows, orders, PLAIN._replace(lr=0.0))
+    assert torch.equal(flat(networks), before)
+    assert [value.data_ptr() for one in networks for value in one.parameters()] == places
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [*((name, math.nan) for name in ("stacks", "logps", "advantages", "targets")), ("stacks", math.inf)],
+)
+def test_a_number_that_is_not_finite_stops_before_the_step_that_meets_it(name, value):
+    networks, optimizer, rows, orders = make()
+    getattr(rows, name)[orders[0][20]] = value  # in the second minibatch
+    exact = copy.deepcopy(networks)
+    adam = torch.optim.Adam([value for one in exact for value in one.parameters()])
+    by_tensors(exact, adam, rows, orders[:1, :16], PLAIN)
+    with pytest.raises(RuntimeError, match="non-finite norm after 1 steps"):
+        update_dense(networks, optimizer, rows, orders, PLAIN)
+    torch.testing.assert_close(flat(networks), flat(exact), rtol=1e-4, atol=1e-6)
