@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from envs.config import EnvConfig
-from envs.kinematics import advance, planned_position
+from envs.kinematics import Lane, advance, planned_position
 from envs.scene import make_scene
 from envs.scene.planning import BLOCKED, LATTICE_M, SIDE_PRICE, CostToGo, _costs, cost_to_go
 
@@ -82,11 +82,12 @@ def flown(scene, seed, random_share, plan=None):
     plan = plan or cost_to_go(scene, RADIUS_M, HEIGHT_M)
     rng, config = np.random.default_rng(seed), EnvConfig()
     spawn_x, moves = rng.uniform(*scene.spawn_range_m), [0, 0, 0]
-    place = (spawn_x, 0.0)
+    place, lane = (spawn_x, 0.0), Lane(RADIUS_M, 0.5 * scene.width_m, scene.length_m)
     while True:
         action = rng.integers(3) if rng.random() < random_share else plan.of_actions(*place).argmin()
         moves[action] += 1
-        told = advance(scene, place, planned_position(spawn_x, moves, config), RADIUS_M, HEIGHT_M)
+        planned = planned_position(spawn_x, tuple(moves), (config.speed_mps, config.control_hz))
+        told = advance(lane, scene.sections(HEIGHT_M), place, planned)
         if told.success or told.collision:
             return told.success
         place = told.end

@@ -184,7 +184,7 @@ def test_the_networks_are_built_from_what_the_configuration_says():
     )
     evae = {"context": 256, "latent": 32, "norm": "batch", "target": "occupancy", "time_bins": 1024}
     evae |= {"coding": "none", "encoder": "frozen"}
-    assert bytestream == {"name": "bytestream_xy", "hidden": [64, 64], **evae, **sizes}
+    assert bytestream == {"name": "bytestream_xy", "hidden": [64, 64], "memory_ms": [], **evae, **sizes}
     assert image == {"name": "event_image", **sizes}
 
 
