@@ -52,7 +52,7 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 	    echo "    sudo apt-get install --no-install-recommends $(GL_PACKAGES)"; \
 	fi
 
-bytestream: setup ## from nothing to an evaluated policy (20 minutes; ARGS="budget=smoke": a minute)
+bytestream: setup ## from nothing to an evaluated policy (15 minutes; ARGS="budget=smoke": a minute)
 	$(LAUNCH) +exp=bytestream $(ARGS)
 
 train-all: setup ## train every policy with three seeds into models/pretrained (hours; give it again to continue)
