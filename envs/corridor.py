@@ -189,8 +189,8 @@ class CorridorEnv(gymnasium.Env):
         return pack_windows(events, ends, row["start_us"], row["window_us"], self.config.window_capacity)[0]
 
     def _info(self) -> Info:
-        told = _tell([self], self._vehicles.rows[self._row : self._row + 1])
-        return cast(Info, {name: values.tolist()[0] for name, values in told.items()})
+        infos = _infos_of([self], self._vehicles.rows[self._row : self._row + 1])
+        return cast(Info, {name: values.tolist()[0] for name, values in infos.items()})
 
 
 class CorridorVectorEnv(VectorEnv):
@@ -256,7 +256,7 @@ class CorridorVectorEnv(VectorEnv):
         for env, own_seed in zip(self.envs, seeds, strict=True):
             env.begin(own_seed, options)
         self._vehicles.forget_events()
-        return self._observations(), self.tell()
+        return self._observations(), self.infos()
 
     def step(
         self, actions: np.ndarray
@@ -269,7 +269,7 @@ class CorridorVectorEnv(VectorEnv):
                 `CorridorEnv.step`.
         """
         over = self._over
-        self._take(actions, ~over)
+        self._step_active(actions, ~over)
         for row in np.flatnonzero(over):
             self.envs[row].begin(None, None)
         results = self._results()
@@ -289,15 +289,15 @@ class CorridorVectorEnv(VectorEnv):
             ResetNeeded: The episode of an active one is over, or has not begun.
             ValueError: As `step`.
         """
-        self._take(actions, active)
+        self._step_active(actions, active)
         return self._results()
 
     def _results(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         rows = self._vehicles.rows
         terminated, truncated = rows["success"] | rows["collision"], rows["truncated"].copy()
-        return self._observations(), rows["reward"].copy(), terminated, truncated, self.tell()
+        return self._observations(), rows["reward"].copy(), terminated, truncated, self.infos()
 
-    def _take(self, actions: np.ndarray, active: np.ndarray) -> None:
+    def _step_active(self, actions: np.ndarray, active: np.ndarray) -> None:
         """One control step of the active environments."""
         taken, rows = np.asarray(actions), self._vehicles.rows
         if taken.shape != (self.num_envs,):
@@ -312,10 +312,10 @@ class CorridorVectorEnv(VectorEnv):
         except StepError as error:
             raise ValueError(f"{self.envs[error.row].name_step()}: {error}") from error
 
-    def tell(self) -> dict[str, np.ndarray]:
+    def infos(self) -> dict[str, np.ndarray]:
         """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
-        told, mask = _tell(self.envs, self._vehicles.rows), np.ones(self.num_envs, bool)
-        return told | {f"_{name}": mask for name in told}
+        infos, mask = _infos_of(self.envs, self._vehicles.rows), np.ones(self.num_envs, bool)
+        return infos | {f"_{name}": mask for name in infos}
 
     def replay(
         self, episodes: Sequence[tuple[int, int, Sequence[int]]]
@@ -341,7 +341,7 @@ class CorridorVectorEnv(VectorEnv):
                 observation, _, terminated, truncated, _ = env.step(int(action))
                 self._over[row] = terminated or truncated
             observations.append(observation)
-        return self._batch(observations), self._over.copy(), self.tell()
+        return self._batch(observations), self._over.copy(), self.infos()
 
     def render(self) -> Any:
         """One picture per environment, as `CorridorEnv.render`."""
@@ -367,7 +367,7 @@ class CorridorVectorEnv(VectorEnv):
         return np.stack(observations)
 
 
-def _tell(envs: Sequence[CorridorEnv], rows: np.ndarray) -> dict[str, np.ndarray]:
+def _infos_of(envs: Sequence[CorridorEnv], rows: np.ndarray) -> dict[str, np.ndarray]:
     """`Info` of several environments, each value an array; `rows` are their VEHICLE."""
     config, lost = envs[0].config, rows["dropped"].copy()
     if config.observation == "window" and config.window_capacity is not None:

@@ -23,9 +23,8 @@ def _forget_stale_kernels() -> None:
     folder = Path(__file__).parent
     index = folder / "__pycache__" / "kernels.json"
     now = _digests(folder)
-    with contextlib.suppress(
-        OSError
-    ):  # another process was faster, or the folder is not ours: numba then decides
+    # Another process may be faster, or the folder not ours: numba then decides.
+    with contextlib.suppress(OSError):
         try:
             before = json.loads(index.read_bytes())
         except (OSError, ValueError):

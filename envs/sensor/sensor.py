@@ -97,16 +97,16 @@ class Sensor:
         else:
             events = self._render_along(start, outcome.end, moving_us)
         self.t_us = end_us
-        self.events = self.spoil(events, start_us, end_us)
+        self.events = self.with_faults(events, start_us, end_us)
 
     @property
     def sees_by_looks(self) -> bool:
-        """Whether `view` and `scratch` are all that a step of this sensor needs."""
+        """Whether `view` is all that a step of this sensor needs."""
         return self._config.observation not in WITHOUT_EVENTS and self.plan.by_looks
 
     @property
     def has_faults(self) -> bool:
-        """Whether `spoil` changes anything."""
+        """Whether `with_faults` changes anything."""
         return self._config.faults != FAULTLESS
 
     def view(self) -> View:
@@ -120,7 +120,7 @@ class Sensor:
         scratch = scratch_for(camera.width, camera.height, len(scene[0]))
         return View(*scene, model, memory, self._seen_us, scratch)
 
-    def spoil(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
+    def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
         """The events of a step after the faults of this sensor."""
         if not self.has_faults:
             return events

@@ -25,11 +25,8 @@ _FLOATS = (
 )
 _WHOLE = (
     *("forward", "left", "right"),  # how often each action was taken
-    *(
-        "start_us",
-        "t_us",
-        "window_us",
-    ),  # when the last step began and ended; its length, or that of the first
+    *("start_us", "t_us"),  # when the last step began and ended
+    "window_us",  # its length; before the first step, the length of that
     *("num_events", "dropped"),  # events of it, and those that the camera lost in it
     "problem",  # `GOOD`, `BAD_REWARD`, or what `sense_way` says
 )
@@ -41,7 +38,7 @@ VEHICLE = np.dtype(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def line_up(corridor, count):
+def corridor_list(corridor, count):
     """A list with `count` times the same corridor: level sections of what stands there, and a `View`."""
     corridors = List()
     for _ in range(count):
@@ -50,7 +47,7 @@ def line_up(corridor, count):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def put(corridors, row, corridor):
+def set_corridor(corridors, row, corridor):
     """Exchange one corridor of a list."""
     corridors[row] = corridor
 
@@ -61,7 +58,7 @@ def step_all(rows, corridors, actions, active):
 
     Args:
         rows: (B,) VEHICLE, changed in place.
-        corridors: A list of B, see `line_up`.
+        corridors: A list of B, see `corridor_list`.
         actions: int64 (B,).
         active: bool (B,).
 

@@ -9,7 +9,7 @@ from envs.events import EVENT
 from envs.kinematics import Outcome, clock_us
 from envs.scene import Scene
 from envs.sensor import Sensor, check_sensed
-from envs.vehicles.step import BAD_REWARD, GOOD, VEHICLE, line_up, put, step_all, way_of
+from envs.vehicles.step import BAD_REWARD, GOOD, VEHICLE, corridor_list, set_corridor, step_all, way_of
 
 
 class StepError(ValueError):
@@ -35,7 +35,7 @@ class Vehicles:
         self.rows = np.zeros(count, VEHICLE)
         self.rows["over"] = True
         self._sensors: list[Sensor | None] = [None] * count
-        self._by_hand: set[int] = set()
+        self._in_python: set[int] = set()
         self._corridors: Any = None
         self.forget_events()
 
@@ -53,11 +53,11 @@ class Vehicles:
         self._sensors[row] = sensor
         corridor = scene.sections(config.camera_height_m), sensor.view()
         if self._corridors is None:
-            self._corridors = line_up(corridor, len(self.rows))
-        put(self._corridors, row, corridor)
-        self._by_hand.discard(row)
+            self._corridors = corridor_list(corridor, len(self.rows))
+        set_corridor(self._corridors, row, corridor)
+        self._in_python.discard(row)
         if not sensor.sees_by_looks or sensor.has_faults:
-            self._by_hand.add(row)
+            self._in_python.add(row)
         if len(self.rows) == 1:
             self.forget_events()
 
@@ -73,13 +73,13 @@ class Vehicles:
         """
         rows = self.rows
         self.events, self.ends = step_all(rows, self._corridors, actions, active)
-        wrong = rows["problem"] != GOOD
+        wrong = active & (rows["problem"] != GOOD)
         if wrong.any():
-            self._refuse(int((wrong & active).argmax()))
-        by_hand = [row for row in sorted(self._by_hand) if active[row]]
-        if by_hand:
+            self._refuse(int(wrong.argmax()))
+        in_python = [row for row in sorted(self._in_python) if active[row]]
+        if in_python:
             parts = [self.events_of(row) for row in range(len(rows))]
-            for row in by_hand:
+            for row in in_python:
                 parts[row] = self._sense(row, parts[row])
             np.cumsum([part.size for part in parts], out=self.ends[1:])
             self.events = np.concatenate(parts)
@@ -102,7 +102,7 @@ class Vehicles:
         start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
         try:
             if vehicle["by_looks"]:
-                return sensor.spoil(events, start_us, t_us)
+                return sensor.with_faults(events, start_us, t_us)
             end = float(vehicle["x_m"]), float(vehicle["y_m"])
             share, ends = float(vehicle["share"]), (bool(vehicle["success"]), bool(vehicle["collision"]))
             outcome = Outcome(end, share, float(vehicle["reward"]), *ends)

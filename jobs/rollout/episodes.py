@@ -74,8 +74,8 @@ def _roll_out_batch(
     agent: Agent, env: CorridorVectorEnv, seeds: Sequence[int], watch: Watch | None
 ) -> np.ndarray:
     """One episode per environment, until the last one ends."""
-    observations, told = env.reset(seed=list(seeds))
-    infos = _by_row(told)
+    observations, all_infos = env.reset(seed=list(seeds))
+    infos = _by_row(all_infos)
     agent.reset(env.envs, seeds)
     totals = np.zeros((len(seeds), 4))
     episodes = np.zeros(len(seeds), EPISODE)
@@ -83,9 +83,9 @@ def _roll_out_batch(
     running = np.ones(len(seeds), bool)
     while running.any():
         results = env.step_some(agent(observations, infos), running)
-        observations, rewards, terminated, truncated, told = results
-        infos, ones = _by_row(told), np.ones(len(seeds))
-        taken = np.stack((rewards, ones, told["num_events"], told["dropped_events"]), axis=1)
+        observations, rewards, terminated, truncated, all_infos = results
+        infos, ones = _by_row(all_infos), np.ones(len(seeds))
+        taken = np.stack((rewards, ones, all_infos["num_events"], all_infos["dropped_events"]), axis=1)
         totals[running] += taken[running]
         for row in np.flatnonzero(running).tolist():
             if watch is not None:
@@ -96,10 +96,10 @@ def _roll_out_batch(
     return episodes
 
 
-def _by_row(told: Mapping[str, np.ndarray]) -> list[Info]:
+def _by_row(all_infos: Mapping[str, np.ndarray]) -> list[Info]:
     """The info of each environment of a vector; names with an underscore are Gymnasium's masks."""
-    names = [name for name in told if not name.startswith("_")]
-    columns = zip(*(told[name].tolist() for name in names), strict=True)
+    names = [name for name in all_infos if not name.startswith("_")]
+    columns = zip(*(all_infos[name].tolist() for name in names), strict=True)
     return [cast(Info, dict(zip(names, values, strict=True))) for values in columns]
 
 

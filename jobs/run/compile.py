@@ -42,7 +42,7 @@ def main() -> None:
         now = _digest()
         console.print("Compiling the kernels (a minute at the first time) ...")
         start = time.perf_counter()
-        fly()
+        simulate()
         encode()
         console.print(f"Compiled the kernels in {time.perf_counter() - start:.0f} s.")
         write_atomic(CACHE / "compiled", now)
@@ -62,7 +62,7 @@ def _digest() -> str:
     return whole.hexdigest()
 
 
-def fly() -> None:
+def simulate() -> None:
     """Move through a few corridors, and write and read a recording."""
     from envs.config import CameraConfig, EnvConfig, FaultsConfig
     from envs.corridor import CorridorEnv, CorridorVectorEnv
@@ -93,7 +93,7 @@ def fly() -> None:
 
 
 def encode() -> None:
-    """Encode a few events, as in a flight and as in the training of an encoder."""
+    """Encode a few events, as for a policy and as in the training of an encoder."""
     from models.encoder.evae import EventVAE
     from models.encoder.event_batch import batch_windows
     from models.encoder.frozen import encoder_of

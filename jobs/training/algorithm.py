@@ -46,7 +46,7 @@ class PPO(RLlibPPO):
             self._refused = error
 
     def save(self, checkpoint_dir: str | None = None) -> Any:
-        """As RLlib's, which leaves its temporary folder where a full disk ends it."""
+        """As RLlib's, but its temporary folder goes also where a full disk ends the save."""
         if checkpoint_dir or not self._storage:
             return super().save(checkpoint_dir)
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:

@@ -124,3 +124,30 @@ def test_actions_that_outlast_their_episode_are_refused():
     env = CorridorVectorEnv(1, camera=SMALL, time_limit_s=0.02)
     with pytest.raises(ValueError, match="environment 0, seed 3, episode 1 ended at step 4"):
         env.replay([(3, 1, [0] * 5)])
+
+
+def test_windows_without_a_capacity_hold_every_event():
+    camera = CameraConfig(contrast_threshold=0.05)
+    short, whole = (CorridorVectorEnv(2, camera=camera, window_capacity=most) for most in (8, None))
+    for env in (short, whole):
+        env.reset(seed=3)
+    for _ in range(3):
+        (cut, *_, infos), (windows, *_, others) = (env.step(np.array([0, 1])) for env in (short, whole))
+        for row, window in enumerate(windows):
+            assert len(window) - 1 == window[0, 0] == others["num_events"][row] > 8
+            assert window[-8:].tobytes() == cut[row][1:].tobytes()
+        assert others["dropped_events"].tolist() == [0, 0]
+        np.testing.assert_array_equal(infos["dropped_events"], infos["num_events"] - 8)
+
+
+def test_what_is_not_active_stays_where_it_is():
+    some, alone = CorridorVectorEnv(2, camera=SMALL), CorridorEnv(camera=SMALL)
+    _, before = some.reset(seed=[1, 2])
+    alone.reset(seed=2)
+    for _ in range(3):
+        windows, rewards, _, _, infos = some.step_some(np.array([0, 2]), np.array([False, True]))
+        window, reward, _, _, info = alone.step(2)
+        assert windows[1].tobytes() == window.tobytes()
+        assert (rewards[1], infos["x_m"][1]) == (reward, info["x_m"])
+        assert windows[0][0].tolist() == [0, 0, 5000, 0]
+        assert (infos["x_m"][0], infos["t_us"][0]) == (before["x_m"][0], 0)

@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.events import EVENT, event_image, pack_window, unpack_window
+from envs.events.windows import pack_windows
 
 PIXELS = st.integers(0, 65535)
 ROWS = st.lists(st.tuples(st.integers(1, 5000), PIXELS, PIXELS, st.sampled_from([-1, 1])), max_size=12)
@@ -70,3 +71,24 @@ def test_the_picture_shows_the_last_polarity_of_each_pixel():
 def test_an_event_outside_the_picture_is_refused(x, y):
     with pytest.raises(ValueError, match="event 0"):
         event_image(as_events([(1, x, y, 1)]), 3, 2)
+
+
+@pytest.mark.parametrize("capacity", [3, 50, None])
+def test_windows_packed_together_are_those_packed_alone(capacity):
+    rng, span_us, starts_us = np.random.default_rng(0), 1000, [0, 500, 7000, 9000]
+    parts = []
+    for start_us, count in zip(starts_us, (20, 0, 1, 7), strict=True):
+        columns = (
+            rng.integers(1, span_us + 1, count),
+            *rng.integers(9, size=(2, count)),
+            rng.choice([-1, 1], count),
+        )
+        parts.append(as_events(list(zip(*columns, strict=True)), start_us))
+    ends = np.cumsum([0, *(part.size for part in parts)])
+    lengths_us = np.full(4, span_us)
+    windows = pack_windows(np.concatenate(parts), ends, np.array(starts_us), lengths_us, capacity)
+    assert len(windows) == 4
+    for window, events, start_us in zip(windows, parts, starts_us, strict=True):
+        size = max(events.size, 1) if capacity is None else capacity
+        alone = pack_window(events, start_us, span_us, size)[: events.size + 1 if capacity is None else None]
+        assert window.tobytes() == alone.tobytes()
