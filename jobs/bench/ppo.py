@@ -2,7 +2,7 @@
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo
 Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
-`jobs.training.ppo_learner`, "tensor by tensor" the same without `jobs.training.dense_update`,
+`jobs.training.ppo_learner`, "tensor by tensor" the same without `models.policy.dense_update`,
 "stable-baselines3" its PPO with the same networks, encoder, corridors and settings. All take turns in
 one process; an iteration samples 2,048 steps in 16 corridors and learns 10 epochs. Seconds are wall
 time, medians over the rounds: `ppo_fast` samples in processes of its own, so the machine should be

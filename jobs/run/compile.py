@@ -44,6 +44,7 @@ def main() -> None:
         start = time.perf_counter()
         simulate()
         encode()
+        learn()
         console.print(f"Compiled the kernels in {time.perf_counter() - start:.0f} s.")
         write_atomic(CACHE / "compiled", now)
 
@@ -101,6 +102,21 @@ def encode() -> None:
     evae, events = EventVAE(context=64), some_events()
     evae.ecn(batch_windows([(events, 0, 5000)] * 2, evae.grid)).sum().backward()
     encoder_of(evae.freeze()).encode(events, 0, 5000)
+
+
+def learn() -> None:
+    """Take a gradient step of a small policy."""
+    import torch
+
+    from models.policy.dense_update import Rows, Settings, update_dense
+    from models.policy.networks import mlp
+
+    networks = [mlp(2, (2,), outputs) for outputs in (3, 1)]
+    optimizer = torch.optim.Adam([value for one in networks for value in one.parameters()], fused=True)
+    one = np.zeros(1, np.float32)
+    rows = Rows(np.zeros((1, 2), np.float32), np.zeros(1, np.int64), one, one, one)
+    settings = Settings(1, 0.2, 1.0, 1.0, 0.0, 1.0, 1e-3, 0.9, 0.999, 1e-8)
+    update_dense(networks, optimizer, rows, np.zeros((1, 1), np.int64), settings)
 
 
 def some_events() -> np.ndarray:

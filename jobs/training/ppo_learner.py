@@ -4,7 +4,7 @@ The value targets, the loss, its gradient and the optimiser are RLlib's (`test_p
 compares them, and the weights after an update). Around each minibatch of 32 steps RLlib slices,
 dispatches, times and logs, which takes longer than the gradient of two small networks; here that
 is done once per iteration, and no pipeline of connectors makes the batch. Policies of dense layers
-alone take their steps in `jobs.training.dense_update`. RLlib appends a row to each episode to
+alone take their steps in `models.policy.dense_update`. RLlib appends a row to each episode to
 bootstrap its value: it masks that row in the loss, but counts it in minibatches and in the mean and
 deviation of the advantages. Here it is in neither.
 """
@@ -28,7 +28,7 @@ from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
-from jobs.training.dense_update import Rows, Settings, update_dense
+from models.policy.dense_update import Rows, Settings, update_dense
 from jobs.training.rllib_internals import LEARNER, require
 
 READ = (

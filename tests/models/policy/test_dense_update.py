@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from jobs.training.dense_update import Rows, Settings, update_dense
+from models.policy.dense_update import Rows, Settings, update_dense
 from models.policy.networks import mlp
 
 PLAIN = Settings(

@@ -2,7 +2,7 @@
 
 At a minibatch of 32 the arithmetic of such networks takes tens of microseconds, and dispatching its
 tensor operations and their gradients ten times as long. The loss, the clipped gradient and Adam are
-those of `jobs.training.ppo_learner`, which serves all other networks and which the tests compare this
+those of RLlib's PPO in torch, which serves all other networks and which the tests compare this
 with; sums run in another order, and a tanh errs by at most 4e-7 of its value.
 """
 
