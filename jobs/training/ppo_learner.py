@@ -28,8 +28,8 @@ from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
-from models.policy.dense_update import Rows, Settings, update_dense
 from jobs.training.rllib_internals import LEARNER, require
+from models.policy.dense_update import Rows, Settings, update_dense
 
 READ = (
     Columns.OBS,
