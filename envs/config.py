@@ -20,16 +20,20 @@ Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-def _number_or_truth(value: Any) -> float | bool:
-    """One rule and one message, where a union of types would give two."""
-    if isinstance(value, bool):
+def _layout_value(value: Any) -> Any:
+    """One rule and one message, where a union of types would give several."""
+    if isinstance(value, bool | str):
         return value
+    if isinstance(value, Mapping):
+        return {str(name): _layout_value(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_layout_value(part) for part in value]
     if not isinstance(value, int | float) or not abs(value) <= 1e300:
-        raise ValueError(f"must be a finite number, true or false, got {value!r}")
+        raise ValueError(f"must be a finite number, a truth value, a word or a texture, got {value!r}")
     return float(value)
 
 
-Value = Annotated[float | bool, PlainValidator(_number_or_truth)]
+Value = Annotated[Any, PlainValidator(_layout_value)]
 
 Setting = float | int | str | None  # of the sensor
 Observation = Literal["window", "event_image", "luminance", "events", "none"]
@@ -147,14 +151,17 @@ class FidelityConfig:
     cull_m: Positive | None = None
 
 
+SECTIONS: dict[str, Any] = {"camera": CameraConfig, "faults": FaultsConfig, "fidelity": FidelityConfig}
+
+
 @dataclass(frozen=True, config=STRICT)
 class EnvConfig:
     """A corridor: the world, the vehicle, the sensor and the observation.
 
     Attributes:
         scene: Name of a layout in `envs.scene.layouts`, or the path of a mesh file.
-        layout: Numbers and truth values that replace the layout's own, such as
-            {"num_obstacles": 60, "passable": False}; keys are the layout's fields.
+        layout: Values that replace the layout's own, such as {"num_obstacles": 60, "shape": "box",
+            "ground_texture": {"pattern": "rings"}}; keys are the layout's fields.
         control_hz: Actions (and event windows) per second [Hz].
         speed_mps: Constant speed [m/s]; the way of one step is speed_mps / control_hz.
         vehicle_radius_m: The vehicle is a disc of this radius [m].
@@ -164,6 +171,9 @@ class EnvConfig:
             event camera; or "none": nothing is rendered, for an agent that looks at nothing.
         window_capacity: Most events that one window holds; the oldest beyond it are
             dropped and counted. None: a window is as long as its step has events.
+        filter_support: An event is observed only if at least so many of its 8 neighbours fired shortly
+            before (`envs.events.neighbour_filter`); 0: every event is.
+        filter_tau_us: How long before, at most [us].
         split: Which corridors: those of one split never occur in another, whatever the seed.
         renderer: "raycast", "pyrender", or "auto": the cheapest that can draw the scene.
     """
@@ -177,11 +187,19 @@ class EnvConfig:
     time_limit_s: Positive = 10.0
     observation: Observation = "window"
     window_capacity: Annotated[int, Field(ge=1, le=10_000_000)] | None = 4096
+    filter_support: Annotated[int, Field(ge=0, le=8)] = 0
+    filter_tau_us: Annotated[int, Field(ge=0, le=10**9)] = 5_000
     split: Split = "train"
     renderer: Literal["auto", "raycast", "pyrender"] = "auto"
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     faults: FaultsConfig = dataclasses.field(default_factory=FaultsConfig)
     fidelity: FidelityConfig = dataclasses.field(default_factory=FidelityConfig)
+
+    @field_validator("camera", "faults", "fidelity", mode="before")
+    @classmethod
+    def _by_name(cls, value: Any, info: ValidationInfo) -> Any:
+        """A section by its fields' names, as a policy's manifest holds them."""
+        return SECTIONS[str(info.field_name)](**value) if isinstance(value, Mapping) else value
 
 
 def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
@@ -198,6 +216,8 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
         config,
         observation=cast(Observation, observation),
         window_capacity=EnvConfig.window_capacity,
+        filter_support=EnvConfig.filter_support,
+        filter_tau_us=EnvConfig.filter_tau_us,
         camera=CameraConfig(**lens),
         faults=FaultsConfig(),
         fidelity=dataclasses.replace(config.fidelity, max_step_m=None),
@@ -208,9 +228,14 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
 
 
 def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
-    """The settings that give an event its meaning: data, encoder and policy must share them."""
-    motion = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
-    return {**dataclasses.asdict(config.camera), **motion, **dataclasses.asdict(config.fidelity)}
+    """The settings that give an event its meaning: data, encoder and policy must share them.
+
+    Those of the neighbour filter are among them where there is one.
+    """
+    own: dict[str, Setting] = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
+    if config.filter_support > 0:
+        own |= {"filter_support": config.filter_support, "filter_tau_us": config.filter_tau_us}
+    return {**dataclasses.asdict(config.camera), **own, **dataclasses.asdict(config.fidelity)}
 
 
 def sensor_differences(theirs: Mapping[str, object], config: EnvConfig) -> dict[str, tuple[object, object]]:

@@ -10,7 +10,7 @@ of its own, made of (split, seed, episode): a corridor of one split never occurs
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypedDict, cast
 
 import gymnasium
@@ -27,6 +27,8 @@ from envs.observations import observation_space, observe, picture
 from envs.scene import make_scene
 from envs.sensor import Sensor
 from envs.vehicles import StepError, Vehicles
+
+Draw = Callable[[EnvConfig, np.random.Generator], EnvConfig]  # the settings of an episode, drawn
 
 
 class Info(TypedDict):
@@ -65,22 +67,36 @@ class CorridorEnv(gymnasium.Env):
     Past `time_limit_s` the episode is truncated.
 
     Attributes:
-        config: The settings, `EnvConfig`.
+        config: The settings of this episode, `EnvConfig`.
         scene: The corridor of this episode.
         series: Seed of the series of episodes, and the number of this one in it.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012 - Gymnasium's name
 
-    def __init__(self, config: EnvConfig | None = None, render_mode: Any = None, **fields: Any) -> None:
-        """Make the environment from a config (default `EnvConfig()`) and fields of it to replace.
+    def __init__(
+        self,
+        config: EnvConfig | None = None,
+        render_mode: Any = None,
+        draw: Draw | None = None,
+        **fields: Any,
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            config: The settings; None: `EnvConfig()`.
+            render_mode: "rgb_array" for pictures, or None.
+            draw: Draws the settings of each episode from `config` and a generator of the episode; the
+                observation space must stay the same.
+            fields: To replace in `config`.
 
         Raises:
             ValueError: A setting or the render mode is refused.
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f'render_mode must be None or "rgb_array"; got {render_mode!r}.')
-        self.config = dataclasses.replace(config or EnvConfig(), **fields)
+        self.config = self._nominal = dataclasses.replace(config or EnvConfig(), **fields)
+        self._draw = draw
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.config.control_hz}
         self.action_space = spaces.Discrete(kinematics.NUM_ACTIONS)
@@ -112,18 +128,27 @@ class CorridorEnv(gymnasium.Env):
     def begin(self, seed: int | None, options: Mapping[str, object] | None) -> None:
         """As `reset`, without a look at what is observed."""
         super().reset(seed=seed)
-        config, number = self.config, self.series[1]
+        number, split = self.series[1], self._nominal.split
         if seed is None and self.series[0] is None:
             seed = int(self.np_random.integers(kinematics.SEED_STRIDE))
         number = kinematics.choose_episode(0 if seed is not None else number + 1, options or {})
         self.series = self.series[0] if seed is None else int(seed), number
-        streams = kinematics.random_streams(config.split, self.series[0] or 0, number)
-        scene_rng, spawn_rng, faults_rng = streams
+        streams = kinematics.random_streams(split, self.series[0] or 0, number)
+        scene_rng, spawn_rng, faults_rng, condition_rng = streams
+        if self._draw is not None:
+            self._set_config(self._draw(self._nominal, condition_rng))
+        config = self.config
         vehicle = config.vehicle_radius_m, config.camera_height_m
         self.scene = make_scene(config.scene, scene_rng, *vehicle, **config.layout)
         spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
         self._sensor.reset(self.scene, (spawn_x, 0.0), faults_rng)
         self._vehicles.start(self._row, config, self.scene, self._sensor, spawn_x)
+
+    def _set_config(self, config: EnvConfig) -> None:
+        """Take other settings, before an episode begins."""
+        if config != self.config:
+            self._sensor.close()
+            self.config, self._sensor = config, Sensor(config)
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Simulate one control step.
@@ -165,6 +190,16 @@ class CorridorEnv(gymnasium.Env):
         return self._vehicles.events_of(self._row)
 
     @property
+    def seen_events(self) -> np.ndarray:
+        """As `events`, of those that the neighbour filter leaves (`EnvConfig.filter_support`)."""
+        return self._vehicles.seen_of(self._row)
+
+    @property
+    def true_events(self) -> np.ndarray:
+        """As `events`, before the faults of the sensor."""
+        return self._vehicles.true_of(self._row)
+
+    @property
     def luminance(self) -> np.ndarray:
         """The last render, float32 (H, W), which the next step may change; 0 with observation "none"."""
         return self._sensor.luminance
@@ -183,8 +218,8 @@ class CorridorEnv(gymnasium.Env):
     def _observation(self) -> np.ndarray:
         """What is observed of the last step."""
         if self.config.observation != "window":
-            return observe(self.config, self.events, self.luminance)
-        row, events = self._vehicles.rows[self._row : self._row + 1], self.events
+            return observe(self.config, self.seen_events, self.luminance)
+        row, events = self._vehicles.rows[self._row : self._row + 1], self.seen_events
         ends = np.array([0, events.size])
         return pack_windows(events, ends, row["start_us"], row["window_us"], self.config.window_capacity)[0]
 
@@ -207,6 +242,7 @@ class CorridorVectorEnv(VectorEnv):
         num_envs: int = 1,
         config: EnvConfig | Sequence[EnvConfig] | None = None,
         render_mode: Any = None,
+        draw: Draw | None = None,
         **fields: Any,
     ) -> None:
         """Make `num_envs` environments; the arguments not named here are those of `CorridorEnv`.
@@ -215,6 +251,7 @@ class CorridorVectorEnv(VectorEnv):
             num_envs: Environments.
             config: One for all, or several, which the environments take in turn.
             render_mode: See `CorridorEnv`.
+            draw: See `CorridorEnv`.
             fields: To replace in every config.
 
         Raises:
@@ -225,7 +262,9 @@ class CorridorVectorEnv(VectorEnv):
             raise ValueError(f"num_envs must be >= 1; got {num_envs}.")
         self.num_envs, self.render_mode = num_envs, render_mode
         configs = config if isinstance(config, Sequence) else [config]
-        self.envs = [CorridorEnv(configs[k % len(configs)], render_mode, **fields) for k in range(num_envs)]
+        self.envs = [
+            CorridorEnv(configs[k % len(configs)], render_mode, draw, **fields) for k in range(num_envs)
+        ]
         spaces_seen = {repr(env.observation_space) for env in self.envs}
         if len(spaces_seen) > 1:
             raise ValueError(f"configs must have one observation space; got {sorted(spaces_seen)}.")
@@ -356,9 +395,9 @@ class CorridorVectorEnv(VectorEnv):
         """What all observe of the last step."""
         config, vehicles = self.envs[0].config, self._vehicles
         if config.observation != "window":
-            return self._batch([observe(env.config, env.events, env.luminance) for env in self.envs])
+            return self._batch([observe(env.config, env.seen_events, env.luminance) for env in self.envs])
         clocks = vehicles.rows["start_us"], vehicles.rows["window_us"]
-        return pack_windows(vehicles.events, vehicles.ends, *clocks, config.window_capacity)
+        return pack_windows(vehicles.seen, vehicles.seen_ends, *clocks, config.window_capacity)
 
     def _batch(self, observations: Any) -> Any:
         """Observations as one fresh array; those that differ in length stay a tuple."""

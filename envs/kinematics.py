@@ -50,12 +50,12 @@ class Outcome(NamedTuple):
 
 
 def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Generator, ...]:
-    """Random generators of an episode: of its scene, its spawn and its faults.
+    """Random generators of an episode: of its scene, its spawn, its faults and its condition.
 
     The split comes first in their entropy, so no seed makes a corridor of another split. The
     seed comes last: it may be longer than a word, and what followed it would run into its end.
     """
-    streams = np.random.SeedSequence([SPLITS.index(split), episode, seed]).spawn(3)
+    streams = np.random.SeedSequence([SPLITS.index(split), episode, seed]).spawn(4)
     return tuple(np.random.default_rng(stream) for stream in streams)
 
 

@@ -37,6 +37,34 @@ def filter_neighbours(events: np.ndarray, last_us: np.ndarray, support: int, tau
 
 
 @numba.njit(cache=True, error_model="numpy")
+def filter_all(
+    events: np.ndarray, ends: np.ndarray, last_us: np.ndarray, support: np.ndarray, tau_us: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`filter_neighbours` of several sensors.
+
+    Args:
+        events: EVENT of all, sensor after sensor.
+        ends: int64 (B + 1,), sensor b has events ends[b] .. ends[b + 1] - 1.
+        last_us: int64 (B, height + 2, width + 2), as of `quiet_sensor`, brought up to date.
+        support: int64 (B,), in 0..8.
+        tau_us: int64 (B,), >= 0.
+
+    Returns:
+        EVENT of those that pass, and their ends.
+    """
+    kept, new_ends, count = np.empty_like(events), np.zeros_like(ends), 0
+    for b in range(support.size):
+        for i in range(ends[b], ends[b + 1]):
+            event = events[i]
+            x, y = np.int64(event.x), np.int64(event.y)
+            if support[b] == 0 or is_supported(x, y, event.t, last_us[b], support[b], tau_us[b]):
+                kept[count] = event
+                count += 1
+        new_ends[b + 1] = count
+    return kept[:count], new_ends
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _passing(events: np.ndarray, last_us: np.ndarray, support: int, tau_us: int) -> np.ndarray:
     """Which events pass, bool (N,)."""
     passing = np.empty(events.size, np.bool_)

@@ -19,7 +19,7 @@ from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
 from envs.scene.textures import Texture
 
 SPAWN_RANGE_M = (-10.0, 10.0)  # appendix D.1
-SHAPES = {"pole": POLE, "cone": CONE, "ellipsoid": ELLIPSOID, "gate": BOX}
+SHAPES = {"pole": POLE, "box": BOX, "cone": CONE, "ellipsoid": ELLIPSOID, "gate": BOX}
 GATE_BAR_M = 0.4  # thickness of a gate's posts, lintel and sill
 TRIES_PER_OBSTACLE = 200
 MAX_COVERED = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
@@ -59,11 +59,12 @@ class Layout:
     """Obstacles of one shape at random places of a lane between two walls.
 
     Attributes:
-        shape: "pole", "cone", "ellipsoid" (all on the ground, round seen from above) or
-            "gate" (a frame across the lane, from the ground up).
+        shape: "pole", "cone", "ellipsoid" (all on the ground, round seen from above), "box" (on the
+            ground, square seen from above) or "gate" (a frame across the lane, from the ground up).
         num_obstacles: How many.
         radius_min_m, radius_max_m: Radii are uniform between these [m]: of poles, of the
-            base of cones, the level half-axis of ellipsoids, half the inside width of gates.
+            base of cones, the level half-axis of ellipsoids, half the side of boxes, half the inside
+            width of gates.
         height_m: Height of every obstacle [m].
         min_gap_m: Smallest distance between two axes [m].
         first_y_m, last_y_m: The axes stand at y uniform between these [m].
@@ -97,7 +98,8 @@ class Layout:
         """Check the values; ValueError names the rule and what was given."""
         check_types(self)
         half_x = self.radius_max_m + (GATE_BAR_M if self.shape == "gate" else 0.0)
-        size = math.hypot(half_x, 0.5 * GATE_BAR_M) if self.shape == "gate" else half_x
+        half_y = {"gate": 0.5 * GATE_BAR_M, "box": half_x}.get(self.shape, 0.0)
+        size = math.hypot(half_x, half_y)
         rules = {
             f"shape must be one of {sorted(SHAPES)}": self.shape in SHAPES,
             "num_obstacles must be a whole number": float(self.num_obstacles).is_integer(),
@@ -177,10 +179,25 @@ def with_overrides(layout: AnyLayout, overrides: Mapping[str, object]) -> AnyLay
         ValueError: A key is no field of the layout, or its value is refused.
     """
     known = [field.name for field in dataclasses.fields(layout)]
-    for key in overrides:
+    values = dict(overrides)
+    for key, value in overrides.items():
         if key not in known:
             raise ValueError(f"layout has no {key!r}; it has {', '.join(known)}")
-    return dataclasses.replace(layout, **overrides)  # type: ignore[arg-type]  # __post_init__ checks them
+        if isinstance(value, Mapping):
+            values[key] = _with_texture(key, getattr(layout, key), value)
+    return dataclasses.replace(layout, **values)  # type: ignore[arg-type]  # __post_init__ checks them
+
+
+def _with_texture(key: str, texture: object, changes: Mapping[str, Any]) -> Texture:
+    """A texture with some of its fields replaced; whole numbers and pairs may come as floats and lists."""
+    known = [field.name for field in dataclasses.fields(Texture)]
+    wrong = [name for name in changes if name not in known]
+    if not isinstance(texture, Texture) or wrong:
+        rule = f"has no {wrong[0]!r}; it has {', '.join(known)}" if wrong else "is not a texture"
+        raise ValueError(f"layout {key} {rule}")
+    exact = {"seed": int, "velocity_mps": tuple}
+    values = {name: exact[name](value) if name in exact else value for name, value in changes.items()}
+    return dataclasses.replace(texture, **values)
 
 
 def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:

@@ -30,6 +30,7 @@ class Sensor:
 
     Attributes:
         events: EVENT array of the last step, faults included; empty where no camera is simulated.
+        true_events: The same before the faults.
         luminance: float32 (H, W), the last render; by looks, an array that the next step changes.
         dropped: Events of the last step lost to the camera's cap.
         renders: Renders of the last step.
@@ -45,6 +46,7 @@ class Sensor:
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
         self._seen_us = np.zeros(config.camera.width, np.int64)
+        self.true_events = np.empty(0, EVENT)
         self.plan: RenderPlan
 
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
@@ -122,6 +124,7 @@ class Sensor:
 
     def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
         """The events of a step after the faults of this sensor."""
+        self.true_events = events
         if not self.has_faults:
             return events
         faults, seen = self._config.faults, self.luminance

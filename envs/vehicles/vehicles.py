@@ -6,6 +6,7 @@ import numpy as np
 
 from envs.config import EnvConfig
 from envs.events import EVENT
+from envs.events.neighbour_filter import NEVER, filter_all
 from envs.kinematics import Outcome, clock_us
 from envs.scene import Scene
 from envs.sensor import Sensor, check_sensed
@@ -28,6 +29,8 @@ class Vehicles:
         rows: (B,) VEHICLE, where each is and what its last step brought.
         events: EVENT of the last step of all, vehicle after vehicle, faults included.
         ends: int64 (B + 1,), vehicle b has events ends[b] .. ends[b + 1] - 1.
+        seen: EVENT of those that the neighbour filter of each vehicle leaves.
+        seen_ends: Their ends.
     """
 
     def __init__(self, count: int) -> None:
@@ -37,6 +40,8 @@ class Vehicles:
         self._sensors: list[Sensor | None] = [None] * count
         self._in_python: set[int] = set()
         self._corridors: Any = None
+        self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
+        self._support, self._tau_us = np.zeros((2, count), np.int64)
         self.forget_events()
 
     def start(self, row: int, config: EnvConfig, scene: Scene, sensor: Sensor, spawn_x_m: float) -> None:
@@ -55,6 +60,7 @@ class Vehicles:
         if self._corridors is None:
             self._corridors = corridor_list(corridor, len(self.rows))
         set_corridor(self._corridors, row, corridor)
+        self._set_filter(row, config)
         self._in_python.discard(row)
         if not sensor.sees_by_looks or sensor.has_faults:
             self._in_python.add(row)
@@ -84,6 +90,10 @@ class Vehicles:
             np.cumsum([part.size for part in parts], out=self.ends[1:])
             self.events = np.concatenate(parts)
         rows["num_events"][active] = np.diff(self.ends)[active]
+        self.seen, self.seen_ends = self.events, self.ends
+        if self._support.any():
+            filters = self._last_us, self._support, self._tau_us
+            self.seen, self.seen_ends = filter_all(self.events, self.ends, *filters)
 
     def events_of(self, row: int) -> np.ndarray:
         """EVENT array of a vehicle in the last step of any; empty if it did not take part."""
@@ -91,9 +101,34 @@ class Vehicles:
             return np.empty(0, EVENT)
         return self.events[self.ends[row] : self.ends[row + 1]]
 
+    def seen_of(self, row: int) -> np.ndarray:
+        """As `events_of`, of those that the neighbour filter leaves."""
+        if not self.rows["t_us"][row]:
+            return np.empty(0, EVENT)
+        return self.seen[self.seen_ends[row] : self.seen_ends[row + 1]]
+
+    def true_of(self, row: int) -> np.ndarray:
+        """As `events_of`, before the faults of the sensor."""
+        sensor = self._sensors[row]
+        if row not in self._in_python or sensor is None or not self.rows["t_us"][row]:
+            return self.events_of(row)
+        return sensor.true_events
+
     def forget_events(self) -> None:
         """Begin anew with a step that had no events."""
         self.events, self.ends = np.empty(0, EVENT), np.zeros(len(self.rows) + 1, np.int64)
+        self.seen, self.seen_ends = self.events, self.ends
+
+    def _set_filter(self, row: int, config: EnvConfig) -> None:
+        """Begin the episode's neighbour filter, if it has one."""
+        self._support[row], self._tau_us[row] = config.filter_support, config.filter_tau_us
+        if config.filter_support > 0:
+            shape = config.camera.height + 2, config.camera.width + 2
+            if any(np.less(self._last_us.shape[1:], shape)):
+                before, sides = self._last_us, np.maximum(self._last_us.shape[1:], shape)
+                self._last_us = np.full((len(self.rows), *sides), NEVER)
+                self._last_us[:, : before.shape[1], : before.shape[2]] = before
+            self._last_us[row] = NEVER
 
     def _sense(self, row: int, events: np.ndarray) -> np.ndarray:
         """Events of a step that the compiled call has not simulated to the end."""

@@ -1,9 +1,12 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import EVENT
+from envs.events.neighbour_filter import filter_neighbours, quiet_sensor
 
 SMALL = CameraConfig(width=16, height=16)
 EMPTY = {"layout": {"num_obstacles": 0}, "camera": SMALL}
@@ -151,3 +154,41 @@ def test_what_is_not_active_stays_where_it_is():
         assert (rewards[1], infos["x_m"][1]) == (reward, info["x_m"])
         assert windows[0][0].tolist() == [0, 0, 5000, 0]
         assert (infos["x_m"][0], infos["t_us"][0]) == (before["x_m"][0], 0)
+
+
+def test_what_is_observed_is_what_the_neighbour_filter_leaves():
+    config = EnvConfig(camera=SMALL, faults=FAULTY, filter_support=2, filter_tau_us=4000)
+    many, one = CorridorVectorEnv(2, config), CorridorEnv(config)
+    observations = many.reset(seed=[3, 4])[0]
+    one.reset(seed=3)
+    last_us, lost = quiet_sensor(16, 16), 0
+    for _ in range(20):
+        observations, alone = many.step(np.zeros(2, int))[0], one.step(0)[0]
+        kept = filter_neighbours(one.events, last_us, 2, 4000)
+        assert np.array_equal(one.seen_events, kept)
+        assert observations[0].tobytes() == alone.tobytes()
+        assert alone[0, 0] == kept.size
+        lost += one.events.size - kept.size
+    assert lost > 0
+
+
+def test_each_episode_has_the_settings_that_are_drawn_for_it_alone_or_side_by_side():
+    def draw(config, rng):
+        return dataclasses.replace(config, control_hz=float(rng.choice([50.0, 100.0, 400.0])))
+
+    config = EnvConfig(camera=SMALL, time_limit_s=0.05)
+    many, one = CorridorVectorEnv(2, config, draw=draw), CorridorEnv(config, draw=draw)
+    many.reset(seed=[7, 8])
+    one.reset(seed=7)
+    met, over = set(), False
+    for _ in range(120):
+        assert many.envs[0].config == one.config
+        met.add(one.config.control_hz)
+        observations = many.step(np.zeros(2, int))[0]
+        if over:
+            observation, over = one.reset()[0], False
+        else:
+            observation, _, terminated, truncated, _ = one.step(0)
+            over = terminated or truncated
+        assert observations[0].tobytes() == observation.tobytes()
+    assert met == {50.0, 100.0, 400.0}

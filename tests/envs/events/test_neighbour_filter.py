@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given, settings, strategies
 
 from envs.events import EVENT
-from envs.events.neighbour_filter import filter_neighbours, quiet_sensor
+from envs.events.neighbour_filter import filter_all, filter_neighbours, quiet_sensor
+from models.policy.event_filter import EventFilter
 
 WIDTH, HEIGHT, TAU_US = 7, 5, 300
 
@@ -91,3 +92,34 @@ def test_polarity_says_nothing_and_the_time_is_inclusive():
 def test_settings_out_of_range_are_refused(support, tau_us):
     with pytest.raises(ValueError, match=f"got {support} and {tau_us}"):
         passing(make_stream(0, 3), support, tau_us)
+
+
+@settings(max_examples=30)
+@given(streams, streams, supports)
+def test_sensors_side_by_side_are_filtered_as_each_by_itself(one, two, support):
+    parts = [make_stream(*one), make_stream(*two), make_stream(*one)]
+    ends = np.cumsum([0, *(part.size for part in parts)])
+    maps = np.stack([quiet_sensor(WIDTH, HEIGHT)] * 3)
+    supports = np.array([support, 0, support])
+    kept, kept_ends = filter_all(np.concatenate(parts), ends, maps, supports, np.full(3, TAU_US))
+    expected = [passing(parts[0], support), parts[1], passing(parts[2], support)]
+    for b, own in enumerate(expected):
+        assert kept[kept_ends[b] : kept_ends[b + 1]].tobytes() == own.tobytes()
+
+
+@settings(max_examples=30)
+@given(streams, supports)
+def test_a_policy_that_is_shown_raw_events_filters_as_the_environment(stream, support):
+    events, own = make_stream(*stream), EventFilter.begin(support, TAU_US, WIDTH, HEIGHT)
+    half = events.size // 2
+    kept = [own(part) for part in (events[:half], events[half:])]
+    expected = passing(events, support)
+    for name in ("t", "x", "y", "p"):
+        assert np.array_equal(np.concatenate([part[name] for part in kept]), expected[name])
+
+
+def test_an_event_outside_the_sensor_is_refused():
+    events = make_stream(0, 5)
+    events["x"][3] = WIDTH
+    with pytest.raises(ValueError, match=f"within {WIDTH} x {HEIGHT} pixels; event 3 is at x={WIDTH}"):
+        EventFilter.begin(1, TAU_US, WIDTH, HEIGHT)(events)
