@@ -7,11 +7,13 @@ For robots without Python. The graph is the whole policy, with the preprocessing
     luminance    float32 (H, W), linear                     (policies that see luminance)
     last_stack   (depth, ...), next_stack of the step before; for an episode's first step anything
     first        bool (), whether this is an episode's first step
+    last_us      int64 (H + 2, W + 2), next_us of the step before  (policies with a neighbour filter)
 
 and gives::
 
     logits       float32 (actions,), unnormalised log-probabilities
     next_stack   as last_stack: float32, uint8 for pictures, int32 for sets of events
+    next_us      as last_us: when each pixel fired last, since the end of this step [us]
 
 `tests/models/policy/test_onnx.py` compares it with `models.policy.Policy` in onnxruntime. Needs the extra
 `onnx` of this package.
@@ -28,6 +30,7 @@ from torch import Tensor, nn
 from models.encoder.event_batch import ROW_OFF, ROW_ON
 from models.encoder.event_images import OFF_SHARE, PictureEncoder
 from models.kinds import KINDS, resolve
+from models.policy.event_filter import NEVER, EventFilter, filter_of
 from models.policy.event_set import EVENTS, TIMES, EventSet
 from models.policy.features import GAMMA, PICTURE_OFF, PICTURE_ON
 from models.policy.policy import Policy
@@ -59,11 +62,18 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
     seen, examples, dynamic = graph.examples()
     stack = torch.zeros(graph.shape, dtype=graph.dtype)
     names = {"input_names": [*seen, "last_stack", "first"], "output_names": ["logits", "next_stack"]}
+    inputs = [*examples, stack, torch.tensor(True)]
+    if graph.filter is not None:
+        inputs.append(torch.from_numpy(graph.filter.last_us.copy()))
+        names = {
+            "input_names": [*names["input_names"], "last_us"],
+            "output_names": [*names["output_names"], "next_us"],
+        }
     program: Any = torch.onnx.export(
         graph,
-        (*examples, stack, torch.tensor(True)),
+        tuple(inputs),
         dynamo=True,
-        dynamic_shapes=((*dynamic, None, None),),  # of the one argument *inputs
+        dynamic_shapes=((*dynamic, *(None for _ in inputs[len(examples) :])),),  # of the one argument *inputs
         verbose=False,
         **names,
     )
@@ -82,6 +92,7 @@ class PolicyGraph(nn.Module):
         self.dtype = torch.int32 if kept == torch.int16 else kept  # of which onnxruntime knows more
         self.size = spec.height, spec.width
         self.tau_us = torch.tensor([1e3 * time_ms for time_ms in spec.memory_ms])
+        self.filter = filter_of(policy.manifest.get("sensor", {}), spec.width, spec.height)
         self.sees_events = policy.feature.from_events is not None
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
         self.read = self.trunk.plain if isinstance(self.trunk, EventSet) else self.trunk
@@ -108,8 +119,16 @@ class PolicyGraph(nn.Module):
             return ["events", "window_us"], (events, torch.tensor(5000)), ({0: count}, None)
         return ["luminance"], (torch.zeros(self.size),), (None,)
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits and the next stack; inputs as the module's docstring lists them."""
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """What the module's docstring lists; inputs too."""
+        if self.filter is None:
+            return self._step(*inputs)
+        events, window_us, stack, first, last_us = inputs
+        passing, next_us = _filtered(self.filter, events, torch.where(first, NEVER, last_us))
+        return *self._step(events[passing], window_us, stack, first), next_us - window_us
+
+    def _step(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits and the next stack."""
         *seen, stack, first = inputs
         feature = self.feature(self, *seen).to(self.dtype)
         newest = feature[None]
@@ -121,6 +140,26 @@ class PolicyGraph(nn.Module):
     def _rest(self, events: Tensor, window_us: Tensor) -> Tensor:
         """Share (K, 1) of each mean that outlives the step (`models.policy.memory`)."""
         return torch.exp(-window_us.float() / self.tau_us)[:, None]
+
+
+def _filtered(chosen: EventFilter, events: Tensor, last_us: Tensor) -> tuple[Tensor, Tensor]:
+    """Which events pass (`models.policy.event_filter`), bool (N,), and when each pixel fired last.
+
+    Every event is compared with all others: exact, and quick for up to some thousand.
+    """
+    t, x, y, _ = events.unbind(1)
+    width = chosen.last_us.shape[1]
+    place, since = (y + 1) * width + x + 1, t - chosen.tau_us
+    number = torch.ones_like(t).cumsum(0)
+    recent = (number[None] < number[:, None]) & (t[None] >= since[:, None])
+    fired, before = torch.zeros_like(t), last_us.flatten()
+    for step in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
+        beside = place + step
+        fired = (
+            fired + ((recent & (place[None] == beside[:, None])).any(1) | (before[beside] >= since)).long()
+        )
+    after = before.scatter_reduce(0, place, t, "amax").reshape(last_us.shape)
+    return fired >= chosen.support, after
 
 
 def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:

@@ -34,6 +34,7 @@ from models.encoder.weights import (
     write_atomic,
 )
 from models.kinds import PolicySpec, read_spec
+from models.policy.event_filter import filter_of
 from models.policy.features import LATENT, Step, Windows, feature_of
 from models.policy.memory import remember, windows_us
 from models.policy.networks import assemble
@@ -42,6 +43,9 @@ MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.sa
 ENCODER_FILES = (ENCODER, "encoder.json")
 REQUIRED = ("sha256", "name", "sensor", "sensor_hash")
 FORMAT = 2
+# Of a manifest's sensor settings: those that are the environment's own, and those of its simulation.
+ENV_FIELDS = ("control_hz", "speed_mps", "filter_support", "filter_tau_us")
+FIDELITY_FIELDS = ("tolerance", "max_step_m", "samples", "cull_m")
 REMEDY = "copy it again, or delete stages/train.json of its run folder and give the command again"
 MAX_BYTES = 1 << 28  # of one file, which is read whole
 
@@ -63,6 +67,8 @@ class PolicyManifest(TypedDict, total=False):
     window_capacity: int | None
     sensor: dict[str, object]
     sensor_hash: str
+    world: dict[str, Any]
+    conditions: list[dict[str, Any]]
     figures: dict[str, float]
 
 
@@ -100,6 +106,19 @@ class Policy:
         return self.spec.kind.observation
 
     @property
+    def env_fields(self) -> dict[str, Any]:
+        """Fields of `envs.config.EnvConfig` with which an environment shows it what it was trained to see.
+
+        `CorridorEnv(**policy.env_fields)` observes as in training, its neighbour filter included.
+        """
+        sensor = dict(self.manifest.get("sensor", {}))
+        own = {name: sensor.pop(name) for name in ENV_FIELDS if name in sensor}
+        fidelity = {name: sensor.pop(name) for name in FIDELITY_FIELDS if name in sensor}
+        parts = {name: part for name, part in (("camera", sensor), ("fidelity", fidelity)) if part}
+        capacity = {"window_capacity": self.manifest.get("window_capacity")}
+        return {"observation": self.observation, **capacity, **own, **parts}
+
+    @property
     def stack_shape(self) -> tuple[int, ...]:
         """Shape of what the networks read for one episode: (depth, *feature), the newest last."""
         return self.spec.depth, *self.feature.shape(self.spec)
@@ -108,14 +127,15 @@ class Policy:
         """Forget everything: the next observations are the first of `num_envs` episodes."""
         self._stacks: np.ndarray = np.zeros((num_envs, *self.stack_shape), self.feature.dtype)
         self._first = np.ones(num_envs, bool)
+        self._filter = filter_of(self.manifest.get("sensor", {}), self.spec.width, self.spec.height)
 
     def __call__(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Choose an action for each episode.
 
         Args:
-            observations: One per episode, of the kind that `observation` names: windows int32
-                (B, capacity + 1, 4), or a sequence of (count + 1, 4) of any lengths; event images
-                uint8 (B, H, W) or luminance float32 (B, H, W).
+            observations: One per episode, as environments with `env_fields` show them, of the kind that
+                `observation` names: windows int32 (B, capacity + 1, 4), or a sequence of (count + 1, 4)
+                of any lengths; event images uint8 (B, H, W) or luminance float32 (B, H, W).
             restarted: bool (B,), True where the observation is the first of a new episode
                 (with Gymnasium's NEXT_STEP autoreset: where the step before was terminated
                 or truncated); None: nowhere.
@@ -132,6 +152,8 @@ class Policy:
     def event_logits(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
         """Unnormalised log-probabilities float32 (actions,) of one episode's next step, from its events.
 
+        The events are filtered as in training (`env_fields`).
+
         Args:
             events: Integer arrays t, x, y, p by name, such as an EVENT array: the events of the
                 step in time order, t in (start_us, start_us + window_us].
@@ -144,6 +166,8 @@ class Policy:
         if self.feature.from_events is None:
             rule = f"this policy takes {self.observation} images, not events"
             raise ValueError(f"{rule}: call it with observations")
+        if self._filter is not None:
+            events = self._filter(events)
         feature = self.feature.from_events(Step(events, start_us, window_us), self.spec, self.encoder)
         return self._logits(feature[None], window_us, None)[0]
 

@@ -87,6 +87,29 @@ def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(fol
     assert np.ptp(np.array(expected), axis=0).max() > 0.01 * scale
 
 
+@pytest.mark.parametrize("support", [1, 3])
+def test_the_file_filters_the_events_of_each_step_as_the_policy_does(support, tmp_path):
+    spec = make_spec("event_columns")
+    about = {**ABOUT, "sensor": {**ABOUT["sensor"], "filter_support": support, "filter_tau_us": 4000}}
+    policy = load_policy(save_policy(tmp_path / "policy", build_networks(spec, seed=3), spec, about))
+    file = export_onnx(policy, tmp_path / "policy.onnx")
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    stack, first = np.zeros(policy.stack_shape, np.float32), np.array(True)
+    last_us, start_us = np.zeros((SIDE + 2, SIDE + 2), np.int64), 0
+    for events in steps():
+        rows = np.stack([events[name].astype(np.int64) for name in "txyp"], axis=1)
+        inputs = {"events": rows, "window_us": np.array(5000), "last_stack": stack, "first": first}
+        logits, stack, last_us = session.run(None, {**inputs, "last_us": last_us})
+        events["t"] += start_us
+        expected = policy.event_logits(events, start_us, 5000)
+        np.testing.assert_allclose(logits, expected, rtol=1e-4, atol=1e-5)
+        first, start_us = np.array(False), start_us + 5000
+    whole = load_policy(tmp_path / "policy", rng=None)
+    whole.manifest["sensor"]["filter_support"] = 0
+    whole.reset()
+    assert np.abs(whole.event_logits(events, start_us - 5000, 5000) - expected).max() > 1e-3
+
+
 @pytest.mark.system
 def test_the_rest_of_the_package_does_without_onnx():
     code = "import models.policy.policy, models.policy.onnx, sys; sys.exit('onnx' in sys.modules)"

@@ -1,3 +1,4 @@
+import dataclasses
 import hashlib
 import json
 import subprocess
@@ -8,9 +9,12 @@ import pytest
 import torch
 from torch import nn
 
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, sensor_settings
+from envs.corridor import CorridorEnv
 from models.encoder.frozen import encoder_of
 from models.policy import Policy, load_policy, save_policy
 from models.policy.features import Step, feature_of
+from models.policy.networks import build_networks
 from models.policy.policy import ENCODER, MANIFEST
 from tests.support.policies import (
     ABOUT,
@@ -176,3 +180,27 @@ def test_an_encoder_is_saved_if_and_only_if_the_policy_has_one(tmp_path):
 def test_flying_needs_no_ray():
     code = "import sys, models.policy.policy; sys.exit('ray' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_an_environment_with_the_fields_of_a_policy_shows_it_what_it_was_trained_to_see(tmp_path):
+    spec = make_spec("event_columns")
+    trained = EnvConfig(
+        control_hz=100.0,
+        window_capacity=None,
+        filter_support=1,
+        camera=CameraConfig(width=SIDE, height=SIDE, contrast_threshold=0.3),
+        fidelity=FidelityConfig(tolerance=0.1),
+    )
+    about = {**ABOUT, "sensor": sensor_settings(trained), "window_capacity": None}
+    policy = load_policy(save_policy(tmp_path / "policy", build_networks(spec, seed=3), spec, about))
+    env = CorridorEnv(**policy.env_fields, faults=FaultsConfig(background_activity=0.3))
+    assert dataclasses.replace(env.config, faults=trained.faults) == trained
+    observation, info = env.reset(seed=0)
+    other = load_policy(tmp_path / "policy")
+    for step in range(10):
+        start_us = info["t_us"] - 10_000 if step else 0
+        events = env.events if step else env.events[:0]
+        np.testing.assert_array_equal(
+            policy.logits(observation[None])[0], other.event_logits(events, start_us, 10_000)
+        )
+        observation, _, _, _, info = env.step(0)
