@@ -1,22 +1,34 @@
-"""Axes and conditions: settings of the simulation that change together, point by point."""
+"""Axes and conditions: settings of the simulation that change together.
+
+A sweep takes the points of an axis one by one. A training or a data set draws a condition for each episode:
+one of a list, by their `weight` (1 unless it is given), and in it each value: a number or a word as it
+stands, one of a list, or one of a range {low: 50, high: 500}, even in its logarithm with `log: true`; between
+whole numbers it is a whole number.
+"""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any
 
+import numpy as np
 import pydantic
 from pydantic import Field, PlainValidator
 
 from envs.config import EnvConfig
-from jobs.config.env_keys import ENV_KEYS, env_with
+from jobs.config.env_keys import ENV_KEYS, LAYOUT, env_with
 from jobs.config.errors import nearest
+from jobs.config.scenes import scene_errors
 
 CONDITION_KEYS = [key for key in ENV_KEYS if key != "env.layout"]
 NETWORK_KEYS = (
     "camera.width",
     "camera.height",
     "env.window_capacity",
-)  # the policy's network is built for them
+    "env.filter_support",
+    "env.filter_tau_us",
+)  # the policy's network is built for them, or its window
+WEIGHT = "weight"
 
 
 def _number_or_word(value: object) -> float | str | None:
@@ -28,11 +40,30 @@ def _number_or_word(value: object) -> float | str | None:
     return value
 
 
+def _settings(value: object) -> Any:
+    """A setting, a list of which one is drawn, or a range."""
+    if isinstance(value, Mapping):
+        low, high, log = value.get("low"), value.get("high"), value.get("log", False)
+        known = value.keys() <= {"low", "high", "log"} and isinstance(log, bool)
+        numbers = all(isinstance(end, int | float) and math.isfinite(end) for end in (low, high))
+        if not known or not numbers or not low < high or (log and low <= 0):  # type: ignore[operator]
+            rule = "must be {low: number, high: greater one}, for log: true above 0"
+            raise ValueError(f"{rule}, got {value!r}")
+        return dict(value)
+    if isinstance(value, list):
+        if not value:
+            raise ValueError("must name a value at least, got []")
+        return [_number_or_word(one) for one in value]
+    return _number_or_word(value)
+
+
 Setting = Annotated[float | str | None, PlainValidator(_number_or_word)]
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Values = Annotated[list[Setting], Field(min_length=1)]
 Axis = Annotated[dict[str, Values], Field(min_length=1)]
 Condition = dict[str, Setting]
+Drawn = Annotated[Any, PlainValidator(_settings)]
+Conditions = Annotated[list[dict[str, Drawn]], Field(min_length=1)]
 
 
 def axis_points(axis: Mapping[str, Sequence[Setting]]) -> list[Condition]:
@@ -72,18 +103,67 @@ def axis_errors(axes: Mapping[str, Mapping[str, Sequence[Setting]]], env: EnvCon
     ]
 
 
-def condition_errors(conditions: Sequence[Condition], env: EnvConfig) -> list[str]:
-    """One line for each setting that the simulation would reject in the conditions of a training."""
+def condition_errors(name: str, conditions: Sequence[Mapping[str, Any]], env: EnvConfig) -> list[str]:
+    """One line for each setting that the simulation would reject in the conditions of the key `name`."""
     errors = []
     for place, condition in enumerate(conditions):
-        reasons = _key_errors(condition) or _value_errors(condition, env)
-        reasons += [
-            f"{key}: must be the same for all of a training, got {condition[key]!r}"
-            for key in NETWORK_KEYS
-            if key in condition
+        weight, settings = condition.get(WEIGHT, 1), _without_weight(condition)
+        reasons = _key_errors(settings) or [
+            reason for point in _extremes(settings) for reason in _value_errors(point, env)
         ]
-        errors += [f"train.conditions[{place}]: {reason}" for reason in reasons]
+        if not isinstance(weight, int | float) or not weight > 0:
+            reasons.append(f"weight: must be a number > 0, got {weight!r}")
+        reasons += [
+            f"{key}: must be the same for all of a training, got {settings[key]!r}"
+            for key in NETWORK_KEYS
+            if key in settings
+        ]
+        errors += [f"{name}[{place}]: {reason}" for reason in dict.fromkeys(reasons)]
     return errors
+
+
+def episode_draw(
+    conditions: Sequence[Mapping[str, Any]],
+) -> Callable[[EnvConfig, np.random.Generator], EnvConfig] | None:
+    """What draws the settings of an episode, for `CorridorEnv`; None where nothing is to be drawn."""
+    return None if list(conditions) == [{}] else partial(_drawn_env, conditions)
+
+
+def _drawn_env(
+    conditions: Sequence[Mapping[str, Any]], env: EnvConfig, rng: np.random.Generator
+) -> EnvConfig:
+    weights = np.cumsum([condition.get(WEIGHT, 1) for condition in conditions])
+    chosen = conditions[int(np.searchsorted(weights, rng.random() * weights[-1], side="right"))]
+    return env_with(env, {key: _drawn(value, rng) for key, value in _without_weight(chosen).items()})
+
+
+def _drawn(value: Any, rng: np.random.Generator) -> Any:
+    """One value of a setting, a list or a range."""
+    if isinstance(value, list):
+        return value[int(rng.integers(len(value)))]
+    if not isinstance(value, Mapping):
+        return value
+    low, high = value["low"], value["high"]
+    if isinstance(low, int) and isinstance(high, int) and not value.get("log"):
+        return int(rng.integers(low, high, endpoint=True))
+    drawn = math.exp(rng.uniform(*np.log([low, high]))) if value.get("log") else rng.uniform(low, high)
+    drawn = min(max(drawn, low), high)
+    return round(drawn) if isinstance(low, int) and isinstance(high, int) else float(drawn)
+
+
+def _extremes(settings: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Conditions in which every value that may be drawn occurs; of a range its ends."""
+    ends = {
+        key: [value["low"], value["high"]] if isinstance(value, Mapping) else value
+        for key, value in settings.items()
+    }
+    several = {key: value if isinstance(value, list) else [value] for key, value in ends.items()}
+    for place in range(max(map(len, several.values()), default=1)):
+        yield {key: values[place % len(values)] for key, values in several.items()}
+
+
+def _without_weight(condition: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in condition.items() if key != WEIGHT}
 
 
 def _axis_errors(axis: Mapping[str, Sequence[Setting]], env: EnvConfig) -> list[str]:
@@ -99,7 +179,11 @@ def _axis_errors(axis: Mapping[str, Sequence[Setting]], env: EnvConfig) -> list[
 
 def _key_errors(settings: Mapping[str, object]) -> list[str]:
     """One line for each key that is no setting of the simulation."""
-    unknown = {key: value for key, value in settings.items() if key not in CONDITION_KEYS}
+    unknown = {
+        key: value
+        for key, value in settings.items()
+        if key not in CONDITION_KEYS and not key.startswith(LAYOUT)
+    }
     return [
         f"{key}: no such setting, got {value}{nearest(key, CONDITION_KEYS)}" for key, value in unknown.items()
     ]
@@ -108,8 +192,8 @@ def _key_errors(settings: Mapping[str, object]) -> list[str]:
 def _value_errors(point: Condition, env: EnvConfig) -> list[str]:
     """One line for each value that is not valid among settings that are replaced together."""
     try:
-        env_with(env, point)
+        changed = env_with(env, point)
     except pydantic.ValidationError as error:
         named = ", ".join(f"{key}={value!r}" for key, value in point.items())
         return [f"{named}: {problem['msg']}" for problem in error.errors()]
-    return []
+    return scene_errors([("env.scene", changed.scene)], changed) if changed.layout != env.layout else []

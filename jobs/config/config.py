@@ -103,7 +103,8 @@ def parse(values: Mapping[str, object]) -> Config:
         errors += [
             *_image_errors(config),
             *axis_errors(config.sweep.axes, config.env),
-            *condition_errors(config.train.conditions, config.env),
+            *condition_errors("train.conditions", config.train.conditions, config.env),
+            *condition_errors("collect.conditions", config.collect.conditions, config.env),
             *_size_errors(config),
             *scene_errors(list(_named_scenes(config)), config.env),
         ]
@@ -188,9 +189,13 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
         yield "trade_simulator.scenes", name
     for name in config.collect.scenes:
         yield "collect.scenes", name
-    for condition in config.train.conditions:
-        if isinstance(scene := condition.get("env.scene"), str):
-            yield "train.conditions", scene
+    for key, conditions in (
+        ("train.conditions", config.train.conditions),
+        ("collect.conditions", config.collect.conditions),
+    ):
+        for condition in conditions:
+            scenes = condition.get("env.scene", [])
+            yield from ((key, scene) for scene in ([scenes] if isinstance(scenes, str) else scenes))
     swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
     for scene in dict.fromkeys(swept):
         if isinstance(scene, str):
@@ -199,10 +204,6 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
 
 def _size_errors(config: Config) -> Iterator[str]:
     """Lists that are too long, or empty where something is needed."""
-    at_once, wanted = config.algo.num_envs_per_env_runner, len(config.train.conditions)
-    if wanted > at_once:
-        rule = f"must be at most the {at_once} of algo.num_envs_per_env_runner"
-        yield f"train.conditions: {rule}, got {wanted}"
     if not config.collect.scenes and not config.collect.recordings:
         yield "collect.scenes: must name a scene where collect.recordings is empty, got []"
 

@@ -37,6 +37,9 @@ def key_of(section: str, path: Sequence[int | str]) -> str:
     return ".".join([*([section] if section and not beside else []), *map(str, path)])
 
 
+LAYOUT = "env.layout."  # begins the key of a layout's field, such as env.layout.ground_texture.pattern
+
+
 def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
     """The simulation with settings replaced together, such as {"camera.memory": "frame"}.
 
@@ -46,6 +49,10 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
     fields: dict[str, typing.Any] = {}
     groups: dict[str, dict[str, object]] = {}
     for key, value in changes.items():
+        if key.startswith(LAYOUT):
+            layout = typing.cast(dict[str, object], fields.get("layout", env.layout))
+            fields["layout"] = _with_part(layout, key.removeprefix(LAYOUT).split("."), value)
+            continue
         path = ENV_KEYS.get(key, (key,))  # an unknown key is for pydantic to reject
         if len(path) == 2:
             groups.setdefault(path[0], {})[path[1]] = value
@@ -53,6 +60,15 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
             fields[path[0]] = value
     parts = {group: dataclasses.replace(getattr(env, group), **values) for group, values in groups.items()}
     return dataclasses.replace(env, **fields, **parts)
+
+
+def _with_part(values: Mapping[str, object], path: Sequence[str], value: object) -> dict[str, object]:
+    """Nested mappings with one value replaced."""
+    name, *rest = path
+    if not rest:
+        return {**values, name: value}
+    inner = values.get(name, {})
+    return {**values, name: _with_part(inner if isinstance(inner, Mapping) else {}, rest, value)}
 
 
 def flat_env(env: EnvConfig) -> dict[str, object]:

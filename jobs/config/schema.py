@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
-from jobs.config.conditions import Axis, AxisName, Condition
+from jobs.config.conditions import Axis, AxisName, Conditions
 from models.kinds import Latent, Stack, Target, checked
 
 Count = Annotated[int, Field(ge=1)]
@@ -81,6 +81,7 @@ class CollectConfig:
         recordings: Event files of real cameras; a short one contributes all that it has.
         policy: Run or policy folder of a policy to record beside random actions.
         policy_share: Share of the control steps that the policy takes.
+        conditions: As those of `TrainConfig`, of the episodes that are recorded.
     """
 
     scenes: list[Name]
@@ -89,13 +90,19 @@ class CollectConfig:
     num_validation_steps: Count
     policy: str | None
     policy_share: Fraction
+    conditions: Conditions
 
 
 @dataclass(frozen=True, config=STRICT)
 class PretrainConfig:
-    """How the event VAE is trained (appendix B.2)."""
+    """How the event VAE is trained (appendix B.2).
+
+    Attributes:
+        denoise: Whether it decodes the events as they were before the faults of the sensor.
+    """
 
     encoder: str | None
+    denoise: bool
     iterations: Count
     batch_windows: Count
     window_events: Count
@@ -114,12 +121,12 @@ class TrainConfig:
 
     Attributes:
         conditions: Settings of the simulation that are replaced together, as a sweep replaces
-            them; the environments take them in turn. [{}] changes nothing.
+            them; each episode draws one (`jobs.config.conditions`). [{}] changes nothing.
     """
 
     env_steps: Count
     checkpoint_every: Count
-    conditions: Annotated[list[Condition], Field(min_length=1)]
+    conditions: Conditions
 
 
 @dataclass(frozen=True, config=STRICT)

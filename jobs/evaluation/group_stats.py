@@ -1,7 +1,7 @@
 """Statistics of a sweep: what the trainings of a group achieved under each condition."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,9 @@ from jobs.analysis.tables import (
 Condition = tuple[str, str]  # axis and value
 LABELS = ("Axis", "Value", "Group", "Training")
 TrainingEpisodes = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the same corridors
+
+
+MET = "°"  # behind a result whose condition lies within what the group was trained on
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,7 @@ def success_table(
     conditions: Sequence[Condition],
     groups: Sequence[str],
     gaps: Mapping[tuple[str, str, str], str],
+    met: Collection[tuple[str, str, str]] = (),
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Conditions x groups, as headings and lines: success [%] with its interval.
 
@@ -139,9 +143,12 @@ def success_table(
         conditions: One line each.
         groups: One column each.
         gaps: Axis, value and group -> what stands in an empty place; by default "-".
+        met: Axis, value and group of results that `MET` marks.
     """
     found = dict(gaps)
-    found |= {(*result.condition, result.group): success_text(result) for result in results}
+    for result in results:
+        place = *result.condition, result.group
+        found[place] = success_text(result) + (MET if place in met else "")
     lines = [(*place, *(found.get((*place, group), "-") for group in groups)) for place in conditions]
     return ("Axis", "Value", *groups), lines
 

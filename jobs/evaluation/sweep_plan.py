@@ -10,6 +10,7 @@ from envs.config import EnvConfig, settings_hash
 from jobs.config.conditions import Condition, Setting, axis_points
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import env_with
+from jobs.evaluation.met import met
 from jobs.rollout.policies import Differences, EvaluatedPolicy, own_sensor_differences, with_sensor
 from jobs.rollout.tasks import EvaluationTask, make_task
 
@@ -26,12 +27,14 @@ class Sweep:
         differences: Agent -> where its own sensor, with which it is evaluated, is not the configured one.
         axes: The first axis is `NOMINAL`.
         tasks: One for each policy and condition; two may share a key.
+        met: Axis, value and group of those that lie within what a training of the group drew.
     """
 
     policies: tuple[EvaluatedPolicy, ...]
     differences: dict[str, Differences]
     axes: Axes
     tasks: tuple[EvaluationTask, ...]
+    met: frozenset[tuple[str, str, str]] = frozenset()
 
     @property
     def identity(self) -> str:
@@ -76,9 +79,22 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
         for value, changes in points.items()
     ]
     differences = {policy.agent: own_sensor_differences(policy, configured) for policy in policies}
-    return Sweep(
-        tuple(policies), {agent: found for agent, found in differences.items() if found}, axes, tuple(tasks)
+    nominal = {task.policy.name: task.env for task in tasks if task.condition[0] == NOMINAL}
+    within = frozenset(
+        (*task.condition, task.policy.group)
+        for task in tasks
+        if was_met(task.policy, nominal[task.policy.name], task.env)
     )
+    own = {agent: found for agent, found in differences.items() if found}
+    return Sweep(tuple(policies), own, axes, tuple(tasks), within)
+
+
+def was_met(policy: EvaluatedPolicy, nominal: EnvConfig, cell: EnvConfig) -> bool:
+    """Whether a cell lies within what a policy's training drew; not known of policies of older versions."""
+    if not policy.conditions:
+        return False
+    trained = with_sensor(EnvConfig(**policy.world), policy.sensor)
+    return met(policy.conditions, trained, nominal, cell)
 
 
 def _changed_env(

@@ -16,6 +16,7 @@ from jobs.config.config import Config
 from jobs.evaluation.evaluate import VIEW_COLUMNS, film_episode
 from jobs.evaluation.group_stats import (
     LABELS,
+    MET,
     Condition,
     GroupResult,
     axis_curves,
@@ -47,6 +48,7 @@ CHILD_PARAMS = ("axis", "value", "group")
 CURVES_NOTE = (
     "One group along every axis of numbers: the step of a metric is the axis value. See the parent run."
 )
+WITHIN = f"{MET} The condition lies within what the group was trained on."
 TITLE = "Success [%] with 95 % intervals; rows: what is changed, columns: groups"
 
 
@@ -251,9 +253,12 @@ def write_tables(
     """Print, write and track the tables."""
     sweep, failed = found.sweep, [task for task in found.sweep.tasks if task.key in found.failed]
     gaps = {(*task.condition, task.policy.group): "failed" for task in failed}
-    head, lines = success_table(groups, sweep.conditions, list(sweep.groups), gaps)
+    head, lines = success_table(groups, sweep.conditions, list(sweep.groups), gaps, sweep.met)
     show_table(TITLE, head, lines, len(head))
     text = f"{TITLE}.\n\n{markdown_table(head, lines, 2)}"
+    if sweep.met:
+        console.print(WITHIN, markup=False)
+        text += f"\n{WITHIN}\n"
     if failed:
         reasons = sorted(
             {(*task.condition, task.policy.group, training_text(task), found.failed[task.key])

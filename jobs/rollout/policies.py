@@ -1,8 +1,8 @@
 """Policies by name: the folder that a name stands for, what it says, and its sensor in training."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ class EvaluatedPolicy:
         identity: Hash of its manifest, which holds the SHA-256 sums of its files.
         sensor: Sensor settings that it was trained with; none for a baseline.
         observation: What it sees, as `envs.config.EnvConfig` names it.
+        world: Scene, layout and faults of its training; empty where its manifest does not say.
+        conditions: That its training drew, as `jobs.config.schema.TrainConfig` has them.
     """
 
     agent: str
@@ -39,6 +41,8 @@ class EvaluatedPolicy:
     identity: str
     sensor: Mapping[str, Any]
     observation: str
+    world: Mapping[str, Any] = field(default_factory=dict)
+    conditions: Sequence[Mapping[str, Any]] = ()
 
     @property
     def name(self) -> str:
@@ -63,7 +67,8 @@ def read_policy(agent: str) -> EvaluatedPolicy:
         raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")
     group = str(manifest.get("exp", manifest["name"]))
     identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
-    return EvaluatedPolicy(agent, group, int(manifest["seed"]), identity, manifest["sensor"], observation)
+    seed, met = int(manifest["seed"]), (manifest.get("world", {}), manifest.get("conditions", ()))
+    return EvaluatedPolicy(agent, group, seed, identity, manifest["sensor"], observation, *met)
 
 
 def find_policy(config: Config, run: Run) -> EvaluatedPolicy:

@@ -29,7 +29,9 @@ NOT_IN_RUN_NAME = (
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "model": ADDED_MODEL_SETTINGS,
     "algo": {"imitation": None},
-    "collect": {"recordings": []},
+    "env": {"filter_support": 0, "filter_tau_us": 5_000},
+    "collect": {"recordings": [], "conditions": [{}]},
+    "pretrain": {"denoise": False},
     "train": {"conditions": [{}]},
 }
 COMPARED_STEPS = 500_000  # length of the trainings that are compared with each other; the paper's

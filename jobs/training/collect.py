@@ -4,13 +4,15 @@ Recordings of real cameras (`collect.recordings`) are data beside the episodes, 
 
 Run: python -m platform.launch +exp=collect
 Expect: about 3,000 control steps per second on one core; `data/train.h5` and
-`data/validation.h5` in the run folder, each of whole episodes that no other file shares.
+`data/validation.h5` in the run folder, each of whole episodes that no other file shares. Where the encoder
+learns to denoise, `train_true.h5` and `validation_true.h5` hold the same steps before the sensor's faults.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from envs.corridor import CorridorEnv, Info
 from envs.events import EVENT
 from envs.kinematics import NUM_ACTIONS
 from envs.recordings import Recording, write_recording
+from jobs.config.conditions import episode_draw
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.agents import Agent, make_agent
 from jobs.rollout.diagnostics import report_event_error
@@ -63,13 +66,17 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
                 (dataclasses.replace(config.env, scene=scene, split=split, observation="events"), share)
                 for scene, share in zip(scenes, shares, strict=False)
             ]
-            recording = no_episodes(config.env)
+            recording = true = no_episodes(config.env)
             if own:
-                recording = record(own, config.seed, advance, policy, config.collect.policy_share)
+                recording, true = record(
+                    own, config.seed, advance, policy, config.collect.policy_share, config.collect.conditions
+                )
             if recorded:
-                taken = [part[split] for part in recorded]
-                recording = with_recorded(recording, list(zip(taken, shares[len(scenes) :], strict=True)))
+                taken = list(zip([part[split] for part in recorded], shares[len(scenes) :], strict=True))
+                recording, true = with_recorded(recording, taken), with_recorded(true, taken)
             write_recording(data_file(folder, split), recording)
+            if config.pretrain.denoise:
+                write_recording(data_file(folder, f"{split}_true"), true)
             figures[f"collect/{split}_events"] = len(recording.events)
             figures[f"collect/{split}_episodes"] = recording.about["flights"]
     seal(folder.data)
@@ -126,7 +133,8 @@ def record(
     advance: Callable[[int], None],
     policy: Path | None = None,
     policy_share: float = 0.5,
-) -> Recording:
+    conditions: Sequence[Mapping[str, Any]] = ({},),
+) -> tuple[Recording, Recording]:
     """Roll out each environment for a number of control steps; join all episodes on one clock.
 
     Args:
@@ -136,22 +144,27 @@ def record(
         policy: Folder of a policy that acts in a share of the steps, in whole episodes of its own,
             sampling its actions as in training; None: all are random.
         policy_share: That share, 0..1.
+        conditions: Of which each episode draws one.
 
     Returns:
-        Events of all episodes, `EPISODE_GAP_US` apart. `index` holds `step_t_us`, `step_end_us`
-        and `step_flight` (start and end [us] and episode number of each step).
+        Events of all episodes, `EPISODE_GAP_US` apart, as they are observed, and as they were before the
+        faults of the sensor. `index` holds `step_t_us`, `step_end_us` and `step_flight` (start and end [us]
+        and episode number of each step).
     """
     tape = _Tape()
     for config, num_steps, by_policy in stints(shares, policy, policy_share):
         actions, draws = (np.random.SeedSequence([seed, len(tape.events), stream]) for stream in (1, 2))
         agent = make_agent(str(by_policy), "stochastic") if by_policy else HoldingAgent(actions)
-        _record_stint(tape, config, num_steps, agent, np.random.default_rng(draws), seed, advance)
+        env = CorridorEnv(config, observation=_shown_to(agent), draw=episode_draw(conditions))
+        _record_stint(tape, env, num_steps, agent, np.random.default_rng(draws), seed, advance)
+        env.close()
     start, end, number = np.array(tape.steps, dtype=np.int64).T
     settings = sensor_settings(shares[0][0])
     about = {
         "sensor": settings,
         "sensor_hash": settings_hash(settings),
         "scenes": [config.scene for config, _ in shares],
+        "conditions": [dict(condition) for condition in conditions],
         "faults": [dataclasses.asdict(config.faults) for config, _ in shares],
         "seed": seed,
         "flights": tape.episodes,
@@ -159,24 +172,32 @@ def record(
         "policy_share": 0.0 if policy is None else policy_share,
     }
     index = {"step_t_us": start, "step_end_us": end, "step_flight": number}
-    return Recording(np.concatenate([np.empty(0, EVENT), *tape.events]), index, about)
+    seen, true = (
+        Recording(np.concatenate([np.empty(0, EVENT), *events]), index, about)
+        for events in (tape.events, tape.true_events)
+    )
+    return seen, true
 
 
 @dataclass
 class _Tape:
-    """Episodes one after the other on one clock: events of each step; start, end and episode of each step."""
+    """Episodes one after the other on one clock: events of each step, start, end and episode of each step."""
 
     events: list[np.ndarray] = field(default_factory=list)
+    true_events: list[np.ndarray] = field(default_factory=list)
     steps: list[tuple[int, int, int]] = field(default_factory=list)
     clock_us: int = 0
     episodes: int = 0
 
-    def add(self, events: Sequence[np.ndarray], ends_us: Sequence[int]) -> None:
+    def add(
+        self, events: Sequence[np.ndarray], true_events: Sequence[np.ndarray], ends_us: Sequence[int]
+    ) -> None:
         """Append an episode: the events of each step, and when it ended [us since the episode's start]."""
-        for of_step in events:
-            shifted = of_step.copy()
-            shifted["t"] += self.clock_us
-            self.events.append(shifted)
+        for parts, kept in ((events, self.events), (true_events, self.true_events)):
+            for of_step in parts:
+                shifted = of_step.copy()
+                shifted["t"] += self.clock_us
+                kept.append(shifted)
         for start, end in zip([0, *ends_us], ends_us, strict=False):
             self.steps.append((self.clock_us + start, self.clock_us + end, self.episodes))
         self.episodes += 1
@@ -185,7 +206,7 @@ class _Tape:
 
 def _record_stint(
     tape: _Tape,
-    config: EnvConfig,
+    env: CorridorEnv,
     num_steps: int,
     agent: Agent,
     agent_seeds: np.random.Generator,
@@ -193,19 +214,21 @@ def _record_stint(
     advance: Callable[[int], None],
 ) -> None:
     """Add episodes of one agent in one scene to the tape, `num_steps` control steps of them."""
-    blind = agent.observation in WITHOUT_EVENTS  # its episodes are recorded with events all the same
-    env = CorridorEnv(config, observation="events" if blind else agent.observation)
     first = 0 if isinstance(agent, HoldingAgent) else POLICY_EPISODES
     started = env.reset(seed=seed, options={"episode_number": first})
     taken = 0
     while taken < num_steps:
         agent.reset([env], [int(agent_seeds.integers(2**63))])
-        events, ends_us = run_episode(env, agent, started, num_steps - taken)
-        tape.add(events, ends_us)
+        events, true_events, ends_us = run_episode(env, agent, started, num_steps - taken)
+        tape.add(events, true_events, ends_us)
         taken += len(ends_us)
         advance(len(ends_us))
         started = env.reset()
-    env.close()
+
+
+def _shown_to(agent: Agent) -> Observation:
+    """What an environment observes; the episodes of an agent that sees no events have them all the same."""
+    return "events" if agent.observation in WITHOUT_EVENTS else agent.observation
 
 
 def stints(
@@ -243,17 +266,19 @@ class HoldingAgent:
 
 def run_episode(
     env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int
-) -> tuple[list[np.ndarray], list[int]]:
+) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
     """One episode of an environment and an agent that were just reset; `started` is what the reset gave.
 
     Returns:
-        The events of each step, and the time at which each step ended [us since the start].
+        The events of each step as they are observed, those before the sensor's faults, and the time at
+        which each step ended [us since the start].
     """
-    events, ends_us = [], []
+    events, true_events, ends_us = [], [], []
     for end_us in steps_of(env, agent, started, most_steps):
-        events.append(env.events)
+        events.append(env.seen_events)
+        true_events.append(env.true_events)
         ends_us.append(end_us)
-    return events, ends_us
+    return events, true_events, ends_us
 
 
 def steps_of(

@@ -16,7 +16,7 @@ from ray.tune.registry import register_env
 from envs.config import Observation, sensor_differences, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from envs.kinematics import NUM_ACTIONS
-from jobs.config.conditions import env_with
+from jobs.config.conditions import episode_draw
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.diagnostics import drift_metrics
 from jobs.run.files import RunError
@@ -235,9 +235,9 @@ def corridor_settings(config: Config) -> dict[str, object]:
 
 
 def make_corridors(context: dict[str, Any]) -> CorridorVectorEnv:
-    """The environments of one env runner, which take the conditions of the training in turn."""
-    worlds = [env_with(context["config"], condition) for condition in context.get("conditions", [{}])]
-    return CorridorVectorEnv(context["num_envs"], worlds)
+    """The environments of one env runner; each episode draws one of the conditions of the training."""
+    draw = episode_draw(context.get("conditions", [{}]))
+    return CorridorVectorEnv(context["num_envs"], context["config"], draw=draw)
 
 
 def policy_spec(config: Config) -> PolicySpec:
@@ -255,8 +255,11 @@ def policy_about(config: Config) -> dict[str, object]:
         "window_capacity": config.env.window_capacity,
         "sensor": sensor,
         "sensor_hash": settings_hash(sensor),
+        "world": {name: getattr(config.env, name) for name in ("scene", "layout")}
+        | {"faults": dataclasses.asdict(config.env.faults)},
+        "conditions": config.train.conditions,
         "seed": config.seed,
-        "ppo": dataclasses.asdict(config.algo),
+        "algo": dataclasses.asdict(config.algo),
     }
 
 

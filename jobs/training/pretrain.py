@@ -9,7 +9,7 @@ continues from its last checkpoint.
 import dataclasses
 import hashlib
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,12 +40,14 @@ from models.encoder.weights import EncoderFileError, load_encoder, save_encoder
 from models.kinds import KINDS, EvaeSettings, PolicySpec
 
 Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
+HeldOut = dict[str, tuple[EventBatch, EventBatch]]  # windows by their length, and what is decoded from each
 
 ENCODER, CHECKPOINTS = "encoder.safetensors", "checkpoint-*.pt"
 CHECKPOINTS_KEPT = 2  # should the newest be damaged
 MIN_STEPS, MAX_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
 PICTURE_WINDOWS = 8
+MANY = 10**9  # events
 COLLAPSED = (
     "the latent says nothing of its window (posterior collapse), a policy would see nothing; "
     "if more iterations do not help, take a smaller pretrain.beta or pretrain.beta_schedule=constant"
@@ -129,11 +131,16 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     check_data(folder)
     train = read_recording(data_file(folder, "train"))
     validation = read_recording(data_file(folder, "validation"))
-    training = EvaeTraining.begin(evae_settings(config), train, settings, (config.seed, 2))
+    true, validation_true = None, None
+    if settings.denoise:
+        true, validation_true = (
+            read_recording(data_file(folder, f"{split}_true")) for split in ("train", "validation")
+        )
+    training = EvaeTraining.begin(evae_settings(config), train, settings, (config.seed, 2), true)
     evae, begin = training.evae, initial_state(folder)
     if begin is not None:
         evae.load_state_dict(begin)
-    held_out = held_out_windows(validation, settings, evae.grid)
+    held_out = held_out_windows(validation, settings, evae.grid, validation_true)
     first = restore(folder.encoder, training)
     latest: dict[str, float] = {}
     with progress("Pretrain the event VAE", settings.iterations, "iterations", done=first) as advance:
@@ -176,6 +183,7 @@ class EvaeTraining:
         evae: The model.
         optimizer: Over its parameters.
         recording: What windows are sampled from.
+        true: What is decoded, events of the same time; None: those of the window.
         settings: Of the training.
         rng: Draws the windows and the noise of the latent.
     """
@@ -183,12 +191,18 @@ class EvaeTraining:
     evae: EventVAE
     optimizer: torch.optim.Optimizer
     recording: Recording
+    true: Recording | None
     settings: PretrainConfig
     rng: np.random.Generator
 
     @classmethod
     def begin(
-        cls, model: EvaeSettings, recording: Recording, settings: PretrainConfig, seed: tuple[int, int]
+        cls,
+        model: EvaeSettings,
+        recording: Recording,
+        settings: PretrainConfig,
+        seed: tuple[int, int],
+        true: Recording | None = None,
     ) -> "EvaeTraining":
         """A training from random weights; `seed` is that of the experiment and the number of its stream."""
         torch.manual_seed(seed[0])
@@ -196,14 +210,18 @@ class EvaeTraining:
         optimizer = torch.optim.Adam(
             evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
         )
-        return cls(evae, optimizer, recording, settings, np.random.default_rng(np.random.SeedSequence(seed)))
+        rng = np.random.default_rng(np.random.SeedSequence(seed))
+        return cls(evae, optimizer, recording, true, settings, rng)
 
     def step(self, iteration: int) -> dict[str, float]:
         """One update on a batch of sampled windows; returns the losses that `train_step` does."""
         evae, settings = self.evae.train(), self.settings
         windows = sample_windows(self.recording, settings, settings.batch_windows, self.rng)
         batch = batch_windows(windows, evae.grid)
-        targets = event_targets(batch, evae.target)
+        decoded = batch
+        if self.true is not None:
+            decoded = batch_windows(true_windows(self.true, windows, settings.window_events), evae.grid)
+        targets = event_targets(decoded, evae.target)
         return train_step(evae, self.optimizer, batch, targets, beta(settings, iteration), self.rng)
 
 
@@ -267,24 +285,38 @@ def cut_window(recording: Recording, start_us: int, window_us: int, most_events:
     return recording.events[max(first, stop - most_events) : stop], start_us, window_us
 
 
-def held_out_windows(recording: Recording, settings: PretrainConfig, grid: Grid) -> dict[str, EventBatch]:
-    """Fixed windows of unseen episodes: one control step long, and four."""
+def true_windows(true: Recording, windows: Sequence[Window], most_events: int) -> list[Window]:
+    """What a recording holds of the time of windows that have `most_events` at most, the newest."""
+    found = []
+    for events, start_us, window_us in windows:
+        first_us = start_us if len(events) < most_events else int(events["t"][0]) - 1
+        cut, _, _ = cut_window(true, first_us, start_us + window_us - first_us, MANY)
+        found.append((cut, start_us, window_us))
+    return found
+
+
+def held_out_windows(
+    recording: Recording, settings: PretrainConfig, grid: Grid, true: Recording | None = None
+) -> HeldOut:
+    """Fixed windows of unseen episodes, one and four control steps long, and what each is to decode to."""
     rng = np.random.default_rng(0)
     start, end = recording.index["step_t_us"], recording.index["step_end_us"]
-    windows: dict[str, EventBatch] = {}
+    windows: HeldOut = {}
     for name, steps in (("step", 1), ("four_steps", 4)):
         chosen = rng.choice(len(start), VALIDATION_WINDOWS)
         spans = [(int(start[step]), steps * int(end[step] - start[step])) for step in chosen]
         cut = [cut_window(recording, begin, span, settings.window_events) for begin, span in spans]
-        windows[name] = batch_windows(cut, grid)
+        decoded = cut if true is None else true_windows(true, cut, settings.window_events)
+        windows[name] = batch_windows(cut, grid), batch_windows(decoded, grid)
     return windows
 
 
-def held_out_figures(evae: EventVAE, held_out: dict[str, EventBatch]) -> dict[str, float]:
+def held_out_figures(evae: EventVAE, held_out: HeldOut) -> dict[str, float]:
     """Figures of `evae.validate` for each window length; `collapsed` is 1 if it is so at all."""
     evae.eval()
     found = {
-        name: validate(evae, batch, event_targets(batch, evae.target)) for name, batch in held_out.items()
+        name: validate(evae, batch, event_targets(decoded, evae.target))
+        for name, (batch, decoded) in held_out.items()
     }
     figures = {
         f"{key}_{name}": value
@@ -301,7 +333,7 @@ def freeze(
     tracker: Tracker,
     evae: EventVAE,
     about: Mapping[str, object],
-    held_out: dict[str, EventBatch],
+    held_out: HeldOut,
 ) -> dict[str, float]:
     """Write the encoder file and a picture of its reconstructions; return its held-out figures."""
     figures = held_out_figures(evae, held_out)
@@ -320,10 +352,10 @@ def freeze(
 
 
 @torch.no_grad()
-def example_pictures(evae: EventVAE, held_out: dict[str, EventBatch]) -> tuple[np.ndarray, np.ndarray]:
+def example_pictures(evae: EventVAE, held_out: HeldOut) -> tuple[np.ndarray, np.ndarray]:
     """Target pictures and their reconstructions, the first few of each length: (K, H, W) each."""
-    targets = [event_targets(batch, evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
-    drawn = [reconstruct(evae(batch)[0], evae.target)[:PICTURE_WINDOWS] for batch in held_out.values()]
+    targets = [event_targets(decoded, evae.target)[:PICTURE_WINDOWS] for _, decoded in held_out.values()]
+    drawn = [reconstruct(evae(batch)[0], evae.target)[:PICTURE_WINDOWS] for batch, _ in held_out.values()]
     shown = [pictures(torch.cat(values), evae.target, evae.grid).numpy() for values in (targets, drawn)]
     return shown[0], shown[1]
 

@@ -136,8 +136,7 @@ def test_without_an_experiment_the_message_lists_them(launch, words):
     status, _, err = launch(*words)
     assert status == 2
     assert (
-        "name an experiment with +exp=NAME, one of bytestream, bytestream_finetuned, bytestream_imitation, "
-        in err
+        "name an experiment with +exp=NAME, one of bytestream, bytestream_finetuned, bytestream_hold, " in err
     )
     assert len(err.splitlines()) == 1
 

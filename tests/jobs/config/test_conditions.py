@@ -1,13 +1,16 @@
+import numpy as np
 import pydantic
 import pytest
 
 from envs.config import EnvConfig
 from jobs.config.conditions import (
     CONDITION_KEYS,
+    Conditions,
     axis_errors,
     axis_numbers,
     axis_points,
     condition_errors,
+    episode_draw,
     moving_settings,
 )
 from jobs.config.env_keys import env_with
@@ -97,9 +100,79 @@ def test_an_axis_of_numbers_changes_one_setting_and_no_words():
 
 def test_conditions_of_a_training_have_an_error_for_each_line_and_keep_the_networks_image():
     conditions = [{}, {"faults.sparsity": 2.0}, {"env.hz": 5}, {"camera.width": 32}]
-    assert condition_errors(conditions, EnvConfig()) == [
+    assert condition_errors("train.conditions", conditions, EnvConfig()) == [
         "train.conditions[1]: faults.sparsity=2.0: Input should be less than or equal to 1",
         "train.conditions[2]: env.hz: no such setting, got 5; --cfg job shows every key",
         "train.conditions[3]: camera.width: must be the same for all of a training, got 32",
     ]
-    assert condition_errors([{}, {"faults.sparsity": 0.5, "env.control_hz": 100}], EnvConfig()) == []
+    assert (
+        condition_errors(
+            "train.conditions", [{}, {"faults.sparsity": 0.5, "env.control_hz": 100}], EnvConfig()
+        )
+        == []
+    )
+
+
+DRAWN = {
+    "weight": 3,
+    "faults.sparsity": {"low": 0.1, "high": 0.6},
+    "env.control_hz": {"low": 30.0, "high": 500.0, "log": True},
+    "env.layout.num_obstacles": {"low": 10, "high": 12},
+    "env.layout.ground_texture.pattern": ["rings", "stripes"],
+    "env.scene": ["poles", "poles_dense"],
+    "camera.memory": "frame",
+}
+
+
+def draws(conditions, count):
+    draw, rng = episode_draw(conditions), np.random.default_rng(0)
+    return [draw(EnvConfig(), rng) for _ in range(count)]
+
+
+def test_a_condition_is_drawn_by_its_weight_and_its_values_each_from_list_or_range():
+    drawn = draws([{}, DRAWN], 2000)
+    changed = [env for env in drawn if env != EnvConfig()]
+    assert len(changed) / len(drawn) == pytest.approx(0.75, abs=0.04)
+    sparsity = np.array([env.faults.sparsity for env in changed])
+    assert 0.1 <= sparsity.min() < 0.11 < 0.59 < sparsity.max() <= 0.6
+    assert sparsity.mean() == pytest.approx(0.35, abs=0.02)
+    hz = np.log([env.control_hz for env in changed])
+    assert hz.mean() == pytest.approx(np.log([30.0, 500.0]).mean(), abs=0.1)
+    layouts = [env.layout for env in changed]
+    assert {layout["num_obstacles"] for layout in layouts} == {10.0, 11.0, 12.0}
+    assert {layout["ground_texture"]["pattern"] for layout in layouts} == {"rings", "stripes"}
+    assert {env.scene for env in changed} == {"poles", "poles_dense"}
+    assert {env.camera.memory for env in changed} == {"frame"}
+
+
+def test_the_same_generator_draws_the_same_and_nothing_to_draw_is_told():
+    assert draws([{}, DRAWN], 20) == draws([{}, DRAWN], 20)
+    assert episode_draw([{}]) is None
+
+
+@pytest.mark.parametrize(
+    ("condition", "reason"),
+    [
+        ({"faults.sparsity": {"low": 0.5, "high": 1.5}}, "less than or equal to 1"),
+        ({"faults.sparsity": [0.5, -0.5]}, "greater than or equal to 0"),
+        ({"weight": 0}, "weight: must be a number > 0, got 0"),
+        ({"env.layout.num_obstacle": 3}, "layout has no 'num_obstacle'"),
+        ({"env.layout.ground_texture.patern": "rings"}, "layout ground_texture has no 'patern'"),
+        ({"env.layout.shape": ["pole", "sphere"]}, "shape must be one of"),
+        ({"env.filter_support": 2}, "must be the same for all of a training, got 2"),
+    ],
+)
+def test_whatever_may_be_drawn_is_checked_before(condition, reason):
+    errors = condition_errors("train.conditions", [condition], EnvConfig())
+    assert len(errors) == 1
+    assert errors[0].startswith("train.conditions[0]: ")
+    assert reason in errors[0]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [{"low": 1, "high": 1}, {"low": 0, "high": 2, "log": True}, {"low": 1}, {"low": 1, "high": "x"}, []],
+)
+def test_a_range_that_is_none_is_refused(value):
+    with pytest.raises(pydantic.ValidationError, match="must"):
+        pydantic.TypeAdapter(Conditions).validate_python([{"faults.sparsity": value}])

@@ -21,12 +21,30 @@ def flights(**fields):
 
 @pytest.fixture(scope="module")
 def recording():
-    return record(flights(), 0, lambda count: None)
+    return record(flights(), 0, lambda count: None)[0]
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(recording):
-    assert record(flights(), 0, lambda count: None).events.tobytes() == recording.events.tobytes()
-    assert record(flights(), 1, lambda count: None).events.tobytes() != recording.events.tobytes()
+    assert record(flights(), 0, lambda count: None)[0].events.tobytes() == recording.events.tobytes()
+    assert record(flights(), 1, lambda count: None)[0].events.tobytes() != recording.events.tobytes()
+
+
+def test_what_is_recorded_before_the_faults_is_what_a_sensor_without_any_sees(recording):
+    faults = FaultsConfig(sparsity=0.4, background_activity=0.2, hot_pixel_share=0.01, hot_pixel_hz=200.0)
+    seen, true = record(flights(faults=faults, filter_support=1), 0, lambda count: None)
+    assert true.events.tobytes() == recording.events.tobytes()
+    assert seen.events.tobytes() != true.events.tobytes()
+    for name, places in recording.index.items():
+        assert np.array_equal(seen.index[name], places)
+
+
+def test_each_episode_draws_its_condition():
+    conditions = [{"env.control_hz": 100.0}, {"env.control_hz": 400.0}]
+    made, _ = record(flights(), 0, lambda count: None, conditions=conditions)
+    lasting = made.index["step_end_us"] - made.index["step_t_us"]
+    assert set(lasting) == {10_000, 2_500}
+    episode = made.index["step_flight"]
+    assert all(len(set(lasting[episode == number])) == 1 for number in set(episode))
 
 
 def test_another_seed_flies_other_corridors(monkeypatch):
@@ -34,7 +52,7 @@ def test_another_seed_flies_other_corridors(monkeypatch):
 
     def look(env, agent, started, most_steps):
         seen.append(env.scene.obstacles.tobytes())
-        return [env.events], [5000]
+        return [env.events], [env.events], [5000]
 
     monkeypatch.setattr(collect, "run_episode", look)
     for seed in (0, 1):
@@ -60,12 +78,12 @@ def test_events_are_in_time_order_and_on_the_sensor(recording):
 
 
 def test_splits_share_no_flight(recording):
-    other = record(flights(split="validation"), 0, lambda count: None)
+    other, _ = record(flights(split="validation"), 0, lambda count: None)
     assert other.events.tobytes() != recording.events.tobytes()
 
 
 def test_the_facts_name_sensor_scenes_and_faults():
-    about = record(flights(faults=FaultsConfig(sparsity=0.5)), 4, lambda count: None).about
+    about = record(flights(faults=FaultsConfig(sparsity=0.5)), 4, lambda count: None)[0].about
     assert about["sensor"]["contrast_threshold"] == 0.2
     assert about["scenes"] == ["poles"]
     assert about["faults"][0]["sparsity"] == 0.5
@@ -100,7 +118,7 @@ def test_a_policy_flies_its_share_of_the_steps_in_corridors_of_its_own(policy, m
     run_episode = collect.run_episode
     monkeypatch.setattr(collect, "run_episode", fly)
     monkeypatch.setattr(CorridorEnv, "step", count)
-    mixed = record(flights(), 0, lambda count: None, policy, 1 / 3)
+    mixed = record(flights(), 0, lambda count: None, policy, 1 / 3)[0]
     assert flown == {True: 300, False: 600}
     assert not corridors[True] & corridors[False]
     assert mixed.about["policy"] == str(policy)
@@ -110,20 +128,20 @@ def test_a_policy_flies_its_share_of_the_steps_in_corridors_of_its_own(policy, m
 
 
 def test_the_random_flights_are_those_of_a_recording_without_a_policy(recording, policy):
-    mixed = record(flights(), 0, lambda count: None, policy, 0.5)
-    first = record([(EnvConfig(observation="events"), 450)], 0, lambda count: None).events
+    mixed = record(flights(), 0, lambda count: None, policy, 0.5)[0]
+    first = record([(EnvConfig(observation="events"), 450)], 0, lambda count: None)[0].events
     np.testing.assert_array_equal(mixed.events[: len(first)], first)
     assert (recording.about["policy"], recording.about["policy_share"]) == (None, 0.0)
 
 
 def test_a_policy_draws_its_actions_and_the_same_seed_gives_the_same_bytes(policy):
-    one, again, other = (record(flights(), seed, lambda count: None, policy, 1.0) for seed in (0, 0, 1))
+    one, again, other = (record(flights(), seed, lambda count: None, policy, 1.0)[0] for seed in (0, 0, 1))
     assert one.events.tobytes() == again.events.tobytes() != other.events.tobytes()
 
 
 def test_flights_of_a_policy_that_sees_pictures_are_recorded_with_their_events(tmp_path):
     rgb = save_untrained(tmp_path, name="rgb")
-    flown = record([(EnvConfig(), 40)], 0, lambda count: None, rgb, 1.0)
+    flown = record([(EnvConfig(), 40)], 0, lambda count: None, rgb, 1.0)[0]
     steps = np.unique(np.searchsorted(flown.index["step_t_us"], flown.t_us))
     assert len(steps) > 30, "there are events in nearly every step"
 

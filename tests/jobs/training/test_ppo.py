@@ -188,13 +188,16 @@ def test_the_networks_are_built_from_what_the_configuration_says():
     assert image == {"name": "event_image", **sizes}
 
 
-def test_the_corridors_flown_at_once_take_the_conditions_of_training_in_turn():
+def test_each_episode_of_a_training_draws_one_of_its_conditions():
     conditions = "train.conditions=[{},{faults.sparsity: 0.5, env.control_hz: 100}]"
     settings = corridor_settings(make_config("model=event_columns", conditions))
-    worlds = [env.config for env in make_corridors({**settings, "num_envs": 3}).envs]
-    changed = [(world.faults.sparsity, world.control_hz) for world in worlds]
-    assert changed == [(0.0, 200.0), (0.5, 100.0), (0.0, 200.0)]
-    assert {world.split for world in worlds} == {"train"}
+    env = make_corridors({**settings, "num_envs": 4})
+    seen = set()
+    for seed in range(4):
+        env.reset(seed=seed)
+        seen |= {(one.config.faults.sparsity, one.config.control_hz) for one in env.envs}
+    assert seen == {(0.0, 200.0), (0.5, 100.0)}
+    assert {one.config.split for one in env.envs} == {"train"}
 
 
 def test_a_training_without_conditions_has_the_keys_of_those_begun_before_there_were_any():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from envs.config import EnvConfig
+from envs.config import EnvConfig, FaultsConfig
 from jobs.config.config import ConfigError
 from jobs.config.schema import PretrainConfig
 from jobs.run.folder import open_run
@@ -22,6 +22,7 @@ from jobs.training.pretrain import (
     run,
     sample_windows,
     save_checkpoint,
+    true_windows,
 )
 from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder, save_encoder
@@ -30,6 +31,7 @@ from tests.support.configs import small_config
 
 SETTINGS = PretrainConfig(
     encoder=None,
+    denoise=False,
     iterations=100,
     batch_windows=8,
     window_events=500,
@@ -46,7 +48,7 @@ COUNT = dataclasses.replace(SETTINGS, windows="count")
 
 @pytest.fixture(scope="module")
 def recording():
-    return record([(EnvConfig(observation="events"), 900)], 0, lambda count: None)
+    return record([(EnvConfig(observation="events"), 900)], 0, lambda count: None)[0]
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, COUNT], ids=["mixed", "count"])
@@ -88,11 +90,11 @@ def test_beta_follows_its_schedule():
     assert beta(appendix, 20_000) == pytest.approx(2e-3)
 
 
-def trained(recording, iterations, checkpoint=None):
+def trained(recording, iterations, checkpoint=None, true=None):
     """A training after some iterations, interrupted and continued at `checkpoint` if given."""
     model = EventVAE(context=64, latent=32, target="occupancy").settings
     settings = dataclasses.replace(SETTINGS, batch_windows=8)
-    training = EvaeTraining.begin(model, recording, settings, (0, 0))
+    training = EvaeTraining.begin(model, recording, settings, (0, 0), true)
     for iteration in range(0 if checkpoint is None else restore(checkpoint, training), iterations):
         training.step(iteration)
     return training
@@ -121,7 +123,7 @@ def test_a_damaged_checkpoint_is_left_for_the_one_before_it(recording, tmp_path,
 
 
 def test_training_explains_windows_of_flights_that_it_never_saw(recording):
-    unseen = record([(EnvConfig(observation="events", split="validation"), 300)], 0, lambda count: None)
+    unseen = record([(EnvConfig(observation="events", split="validation"), 300)], 0, lambda count: None)[0]
     torch.manual_seed(0)
     untrained = EventVAE(context=64, latent=32, target="occupancy")
     held_out = held_out_windows(unseen, SETTINGS, untrained.grid)
@@ -212,3 +214,19 @@ def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
         run(config)
     assert not (tmp_path / "runs").exists()  # refused before anything was made
     assert prepare_encoder(config, open_run(config), None) is None
+
+
+def test_an_encoder_that_denoises_decodes_the_events_before_the_faults():
+    noisy = EnvConfig(observation="events", faults=FaultsConfig(sparsity=0.5, background_activity=1.0))
+    seen, true = record([(noisy, 300)], 0, lambda count: None)
+    rng = np.random.default_rng(0)
+    windows = sample_windows(seen, SETTINGS, 200, rng)
+    found = true_windows(true, windows, SETTINGS.window_events)
+    for (events, start_us, window_us), (clean, begin_us, length_us) in zip(windows, found, strict=True):
+        assert (start_us, window_us) == (begin_us, length_us)
+        times = true.t_us[(true.t_us > start_us) & (true.t_us <= start_us + window_us)]
+        if len(events) == SETTINGS.window_events:  # the window begins with its oldest event
+            times = times[times >= events["t"][0]]
+        assert np.array_equal(clean["t"], times)
+    plain, denoising = (trained(seen, 1, true=whole) for whole in (None, true))
+    assert not torch.equal(plain.evae.decoder[0].weight, denoising.evae.decoder[0].weight)

@@ -174,7 +174,7 @@ def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     window = np.zeros((1, 4097, 4), np.int32)
     window[0, 0, 2] = 5000
     assert np.isfinite(policy.logits(window)).all()
-    assert policy.manifest["ppo"] == dataclasses.asdict(config.algo)
+    assert policy.manifest["algo"] == dataclasses.asdict(config.algo)
 
 
 class Chunk:

@@ -1,0 +1,78 @@
+"""Whether a training met what a sweep evaluates: a robustness that was trained is not one that was found."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from envs.config import EnvConfig
+from envs.scene.layouts import LAYOUTS, with_overrides
+from jobs.config.conditions import WEIGHT
+from jobs.config.env_keys import ENV_KEYS, LAYOUT, env_with
+
+NO_CONDITION = ("renderer", "env.scene", "env.layout", "env.time_limit_s", "env.window_capacity")
+COMPARED = [key for key in ENV_KEYS if key not in NO_CONDITION and not key.startswith("fidelity.")]
+
+
+def met(
+    conditions: Sequence[Mapping[str, Any]], trained: EnvConfig, nominal: EnvConfig, cell: EnvConfig
+) -> bool:
+    """Whether a training's episodes could have what distinguishes a cell of a sweep from the nominal one.
+
+    A number counts as met between the smallest and the largest that a condition may draw, a word if it may
+    draw that. All that distinguishes the cell must be met in one condition; a cell in which nothing changes,
+    or whose scene is a mesh, is not.
+
+    Args:
+        conditions: Of the training, as `TrainConfig`.
+        trained: The simulation that they change.
+        nominal: The simulation of the sweep with nothing changed.
+        cell: That of the cell.
+    """
+    if cell.scene not in LAYOUTS:
+        return False
+    before, here = settings_of(nominal), settings_of(cell)
+    changed = {key: value for key, value in here.items() if before.get(key) != value}
+    if any(key.startswith(LAYOUT) for key in changed):  # another world, of which nothing may be new
+        changed |= {key: value for key, value in here.items() if key.startswith(LAYOUT)}
+    return bool(changed) and any(
+        all(_may_be(drawn.get(key, []), value) for key, value in changed.items())
+        for drawn in (_drawn_settings(condition, trained) for condition in conditions)
+    )
+
+
+def settings_of(env: EnvConfig) -> dict[str, object]:
+    """The settings that tell conditions apart, by their keys; a scene as the fields of its layout."""
+    values: dict[str, Any] = {}
+    for key in COMPARED:
+        value: Any = env
+        for name in ENV_KEYS[key]:
+            value = getattr(value, name)
+        values[key] = value
+    layout = dataclasses.asdict(with_overrides(LAYOUTS[env.scene], env.layout))
+    for name, value in layout.items():
+        parts = value if isinstance(value, dict) else {"": value}
+        for part, inner in parts.items():
+            values[LAYOUT + f"{name}.{part}".rstrip(".")] = inner
+    return values
+
+
+def _drawn_settings(condition: Mapping[str, Any], trained: EnvConfig) -> dict[str, list[object]]:
+    """Of each setting the values that a condition may draw, of a range its ends."""
+    ends = {key: _ends(value) for key, value in condition.items() if key != WEIGHT}
+    scenes = [scene for scene in ends.pop("env.scene", [trained.scene]) if scene in LAYOUTS]
+    worlds = [settings_of(env_with(trained, {"env.scene": scene})) for scene in scenes]
+    drawn = {key: [world[key] for world in worlds] for key in worlds[0]} if worlds else {}
+    return drawn | ends
+
+
+def _ends(value: Any) -> list[Any]:
+    if isinstance(value, Mapping):
+        return [value["low"], value["high"]]
+    return value if isinstance(value, list) else [value]
+
+
+def _may_be(drawn: Sequence[Any], value: object) -> bool:
+    numbers = [one for one in drawn if isinstance(one, int | float) and not isinstance(one, bool)]
+    if isinstance(value, int | float) and not isinstance(value, bool) and numbers:
+        return min(numbers) <= value <= max(numbers)
+    return value in drawn
