@@ -131,12 +131,17 @@ class TrainConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class EvaluateConfig:
-    """In how many held-out corridors a policy is evaluated, and with which renderers."""
+    """In how many held-out corridors a policy is evaluated, and with which renderers.
+
+    Attributes:
+        beside: Published policies that are evaluated beside it, each a name in models/pretrained.
+    """
 
     episodes: Count
     renderers: Annotated[list[Literal["raycast", "pyrender"]], Field(min_length=1)]
     pyrender_episodes: Count
     action: Literal["deterministic", "stochastic"]
+    beside: list[Name]
     video: bool
 
 

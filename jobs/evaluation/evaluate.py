@@ -29,12 +29,19 @@ from jobs.analysis.tables import (
     summary_metrics,
 )
 from jobs.analysis.video import Decode, open_film
-from jobs.config.config import HELD_OUT_SCENE, Config, as_dict
+from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
 from jobs.rollout.agents import BASELINES, make_agent
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.episodes import Trajectory, TrajectoryRecorder, roll_out, write_episodes
 from jobs.rollout.executors import Executor
-from jobs.rollout.policies import EvaluatedPolicy, check_sensor, find_policy, read_policy
+from jobs.rollout.policies import (
+    PRETRAINED,
+    EvaluatedPolicy,
+    check_sensor,
+    find_policy,
+    read_policy,
+    with_sensor,
+)
 from jobs.rollout.scheduler import default_executor, evaluate_tasks
 from jobs.rollout.store import EpisodeStore, TaskResult
 from jobs.rollout.tasks import EvaluationTask, make_task
@@ -45,7 +52,7 @@ from models.encoder.evae import pictures, reconstruct
 from models.encoder.event_batch import batch_packed
 from models.encoder.weights import load_encoder
 from models.policy import load_policy
-from models.policy.policy import ENCODER
+from models.policy.policy import ENCODER, MANIFEST
 
 LABELS = ("Agent", "Scene", "Renderer")
 Label = tuple[str, str, str]  # what was evaluated, as in `LABELS`
@@ -125,6 +132,7 @@ def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationT
     scenes = dict.fromkeys((HELD_OUT_SCENE, config.env.scene))
     actions = sorted(ACTIONS, key=lambda action: action != config.evaluate.action)
     agents = [(policy, action) for action in actions]
+    agents += [(published(name), "stochastic") for name in config.evaluate.beside]
     agents += [(read_policy(name), name) for name in BASELINES]
     return [
         *(_task(config, *agent, scene, first) for scene in scenes for agent in agents),
@@ -132,10 +140,22 @@ def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationT
     ]
 
 
+def published(name: str) -> EvaluatedPolicy:
+    """A policy of models/pretrained.
+
+    Raises:
+        ConfigError: There is none of this name.
+    """
+    if not (PRETRAINED / name / MANIFEST).is_file():
+        raise ConfigError(f"evaluate.beside: must be names in models/pretrained, got {name!r}")
+    return read_policy(str(PRETRAINED / name))
+
+
 def _task(
     config: Config, policy: EvaluatedPolicy, action: str, scene: str, renderer: Renderer
 ) -> EvaluationTask:
-    env = dataclasses.replace(config.env, scene=scene, split="eval", renderer=renderer)
+    own = with_sensor(config.env, policy.sensor)  # the configured one, unless it is a published policy
+    env = dataclasses.replace(own, scene=scene, split="eval", renderer=renderer)
     episodes = config.evaluate.episodes
     if renderer == "pyrender":  # for another picture, not for one as exact as the tolerance asks
         env = dataclasses.replace(env, fidelity=dataclasses.replace(env.fidelity, samples=2))
@@ -144,8 +164,10 @@ def _task(
 
 
 def label_of(task: EvaluationTask) -> Label:
-    """Agent, scene and renderer of a task; the policy's agent names its choice of action."""
+    """Agent, scene and renderer of a task; the run's policy is named by its choice of action."""
     agent = task.policy.agent
+    if Path(agent).parent == PRETRAINED:
+        return task.policy.name, *task.condition
     return (agent if agent in BASELINES else f"policy {task.action}", *task.condition)
 
 

@@ -89,7 +89,7 @@ def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
         config = read_json(path / "config.json")
         if config["budget"] != budget or not (path / "policy" / "policy.json").is_file():
             continue
-        group, seed = group_name(config["exp"], config["train"]["env_steps"]), int(config["seed"])
+        group, seed = group_name(config), int(config["seed"])
         about = {
             "exp": group,
             "run": path.name,

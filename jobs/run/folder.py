@@ -128,16 +128,22 @@ def run_name(config: Config) -> str:
 
     `ADDED_SETTINGS` count only where they change something, so that older folders keep their names.
     """
-    settings = {name: value for name, value in as_dict(config).items() if name not in NOT_IN_RUN_NAME}
+    settings: dict[str, Any] = {
+        name: value for name, value in as_dict(config).items() if name not in NOT_IN_RUN_NAME
+    }
     for section, added in ADDED_SETTINGS.items():
-        values = dataclasses.asdict(getattr(config, section)).items()
+        values = settings[section].items()
         settings[section] = {name: value for name, value in values if added.get(name, ...) != value}
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
 
 
-def group_name(exp: str, env_steps: int) -> str:
-    """The group that a training belongs to: its experiment, and its length unless it is `COMPARED_STEPS`."""
-    return exp + ("" if env_steps == COMPARED_STEPS else f"_{env_steps // 1000}k")
+def group_name(settings: Mapping[str, Any]) -> str:
+    """The group that a training of these settings belongs to.
+
+    Its experiment, and behind it its length, unless that is `COMPARED_STEPS` or a planner taught it.
+    """
+    env_steps, taught = settings["train"]["env_steps"], settings["algo"].get("imitation") is not None
+    return str(settings["exp"]) + ("" if taught or env_steps == COMPARED_STEPS else f"_{env_steps // 1000}k")
 
 
 def finished(run: Run, stage: str) -> dict[str, Any] | None:

@@ -157,7 +157,8 @@ def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(confi
     run = open_run(config)
     stored = read_json(run.path / "config.json")
     del stored["collect"]["recordings"], stored["train"]["conditions"], stored["algo"]["imitation"]
-    del stored["model"]["memory_ms"]
+    del stored["model"]["memory_ms"], stored["env"]["filter_support"], stored["env"]["filter_tau_us"]
+    del stored["collect"]["conditions"], stored["pretrain"]["denoise"]
     write_json(run.path / "config.json", stored)
     assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
     settings = {name: value for name, value in stored.items() if name not in NOT_IN_RUN_NAME}
@@ -196,7 +197,7 @@ def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_k
     ]  # fmt: skip
     assert set(stored["env"]) == {
         "scene", "layout", "control_hz", "speed_mps", "vehicle_radius_m", "camera_height_m", "time_limit_s",
-        "window_capacity",
+        "window_capacity", "filter_support", "filter_tau_us",
     }  # fmt: skip
 
 
