@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from envs.recordings.aedat import MAGIC_2, MAGIC_4, read_aedat2, read_aedat4
+from envs.recordings.aedat_writer import write_aedat4
 from envs.recordings.event_file import MAX_BYTES, EventFile, Request, check_events, check_file, usual_events
+from envs.recordings.event_stream import MAGIC_ES, read_es
 from envs.recordings.hdf5 import read_hdf5, write_hdf5
 from envs.recordings.plain import US_PER, read_nmnist, read_npz, read_text, write_npz, write_text
 from envs.recordings.prophesee import read_dat, read_evt, write_prophesee
@@ -15,6 +17,7 @@ READERS: dict[str, Callable[[Request], EventFile]] = {
     "aedat2": read_aedat2,
     "aedat4": read_aedat4,
     "dat": read_dat,
+    "es": read_es,
     "evt": read_evt,
     "evt2": lambda request: read_evt(request, "evt2"),
     "evt21": lambda request: read_evt(request, "evt21"),
@@ -26,6 +29,7 @@ READERS: dict[str, Callable[[Request], EventFile]] = {
 }
 FORMATS = tuple(name for name in READERS if name != "evt")
 WRITERS: dict[str, Callable[[Path, np.ndarray, int, int], None]] = {
+    "aedat4": write_aedat4,
     "csv": lambda path, events, width, height: write_text(path, events, width, height, ","),
     "dat": lambda path, events, width, height: write_prophesee(path, events, width, height, "dat"),
     "evt2": lambda path, events, width, height: write_prophesee(path, events, width, height, "evt2"),
@@ -43,18 +47,21 @@ BEGINNINGS = (
     (b"PK\x03\x04", "npz"),
     (b"% Data file containing", "dat"),
     (b"% ", "evt"),  # or DAT, as its header says
+    (MAGIC_ES, "es"),
 )
 SUFFIXES = {
+    ".aedat4": "aedat4",
     ".bin": "nmnist",
     ".csv": "txt",
     ".dat": "dat",
+    ".es": "es",
     ".h5": "hdf5",
     ".hdf5": "hdf5",
     ".npz": "npz",
     ".raw": "evt",
     ".txt": "txt",
 }
-WRITTEN_SUFFIXES = {**SUFFIXES, ".csv": "csv", ".raw": "evt3", ".bin": ""}
+WRITTEN_SUFFIXES = {**SUFFIXES, ".csv": "csv", ".raw": "evt3"}
 
 
 def read_events(
@@ -117,7 +124,7 @@ def write_events(
     """Write events to a file, which appears whole or not at all; `read_events` gives the same events.
 
     Formats: "npz", "hdf5" (the layout of DSEC), "txt" and "csv" (a header names columns and unit),
-    and what the cameras' own tools open: Prophesee's "dat", "evt2" and "evt3".
+    and what the cameras' own tools open: iniVation's "aedat4", Prophesee's "dat", "evt2" and "evt3".
 
     Args:
         path: The file; its folder is made. A file of that name is replaced.
@@ -152,7 +159,7 @@ def _guessed(path: Path) -> str:
             return name
     name = SUFFIXES.get(path.suffix.lower(), "")
     # These formats always begin as above, so a file that does not is another one or damaged.
-    if not name or name in ("hdf5", "npz", "dat"):
+    if not name or name in ("aedat4", "dat", "es", "hdf5", "npz"):
         raise ValueError(
             f"{path}: begins like no known event file; give format as one of {', '.join(FORMATS)}"
         )

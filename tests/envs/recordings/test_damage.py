@@ -14,7 +14,7 @@ import pytest
 
 from envs.events import EVENT
 from envs.recordings import FORMATS, read_events, write_events
-from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2
+from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, ecf_chunk, es, metavision
 
 ROOT = Path(__file__).resolve().parents[3]
 MEMORY_BYTES = 3 << 30  # of address space, most of it taken by the libraries
@@ -82,7 +82,7 @@ def some_events() -> np.ndarray:
 def one_of_each(folder: Path) -> list[Path]:
     """A good file of every format."""
     events, paths = some_events(), []
-    for format in ("npz", "hdf5", "txt", "csv", "dat", "evt2", "evt3"):
+    for format in ("npz", "hdf5", "txt", "csv", "dat", "evt2", "evt3", "aedat4"):
         suffix = {"txt": ".txt", "csv": ".csv", "hdf5": ".h5"}.get(format, "")
         paths.append(folder / f"{format}{suffix}")
         write_events(paths[-1], events, 34, 34, format)
@@ -94,6 +94,7 @@ def one_of_each(folder: Path) -> list[Path]:
     paths.append(folder / "nmnist.bin")
     entries = [(x << 32 | y << 24 | t).to_bytes(5, "big") for x, y, t in zip(*columns, strict=True)]
     paths[-1].write_bytes(b"".join(entries))
+    paths += [es(folder / "es", events, 34, 34), metavision(folder / "metavision.h5", [ecf_chunk(0)])]
     halves = np.zeros((4, 2), "<u4")
     halves[:, 1] = [8 << 28, 1 << 28, 1 << 28 | 5, 0]
     halves[:, 0] = 7
