@@ -118,6 +118,17 @@ def _next_base(words: np.ndarray, place: int, base: int, low_bits: int, high_bit
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _first_beyond(words: np.ndarray, masks: np.ndarray) -> int:
+    """Index of the first word of EVT 2.1 that reaches beyond the last column, or -1."""
+    for i in range(masks.size):
+        kind, x = np.int64(words[i]) >> 28, np.int64(words[i]) >> 11 & 2047
+        is_event = kind == Evt2.OFF or kind == Evt2.ON
+        if is_event and x > COLUMNS - 32 and np.int64(masks[i]) >> (COLUMNS - x):
+            return i
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
 def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tuple[int, int, int, int]:
     """Decode EVT 2.0, or EVT 2.1 from the upper halves of its words and their masks.
 
@@ -126,19 +137,20 @@ def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tup
         masks: uint32 (N,): which of the 32 pixels from x on have an event; empty for EVT 2.0.
         events: EVENT array to fill.
     """
+    beyond = _first_beyond(words, masks)
+    if beyond >= 0:
+        return 0, 0, 0, beyond
     n, skipped, strays, base = 0, 0, 0, np.int64(-1)
     for i in range(words.size):
         word = np.int64(words[i])
         kind = word >> 28
         if kind == Evt2.OFF or kind == Evt2.ON:
             mask = np.int64(masks[i]) if masks.size else np.int64(1)
-            x = word >> 11 & 2047
-            if x > COLUMNS - 32 and mask >> (COLUMNS - x):
-                return n, skipped, strays, i
             if base < 0:
                 skipped += _bits(mask)
             else:
-                n = _emit(events, n, mask, base | (word >> 22 & 63), x, word & 2047, 2 * kind - 1)
+                t = base | (word >> 22 & 63)
+                n = _emit(events, n, mask, t, word >> 11 & 2047, word & 2047, 2 * kind - 1)
         elif kind == Evt2.TIME_HIGH:
             later = _next_base(words, i, base, 6, 28)
             strays += later < 0
