@@ -18,7 +18,7 @@ import numpy as np
 from envs.events import EVENT
 from envs.events.camera import T_LIMIT_US
 
-MAX_EVENTS = 100_000_000  # 1.3 GB in the end, and up to 6 GB on the way
+MAX_EVENTS = 100_000_000  # 1.3 GB in the end, and up to 8 GB on the way
 SMALL_EVENTS = 10_000_000  # what any file may hold
 EVENTS_PER_BYTE = 2  # of dense recordings, five times as many as a camera's EVT 3.0 has
 MAX_BYTES = 8 << 30
@@ -231,7 +231,7 @@ def _extremes(events: np.ndarray) -> tuple[int, int, int, int, int, int]:
 
     One pass, because events take more memory than a processor's caches have.
     """
-    x, y, oldest, newest, late, back_us = 0, 0, 0, 0, 0, 0
+    x, y, oldest, newest, late, back_us = -1, -1, 0, 0, 0, 0
     for i in range(events.size):
         event = events[i]
         t = event.t

@@ -88,9 +88,9 @@ def read_events(
         columns: Names of the columns of a text file, in place of those that it gives, such as
             ("t", "x", "y", "p"); others than these four are passed over.
         time_unit: "s", "ms", "us" or "ns", for text and npz files that do not say.
-        max_events: Most events that are read; each takes 13 bytes in the end and up to 60 on the way.
-            None: two for each byte of the file, but ten million of any file and at most a
-            hundred million.
+        max_events: Most events that are read; each takes 13 bytes in the end and up to 80 on the way
+            (a camera's own format: 50). None: two for each byte of the file, but ten million
+            of any file and at most a hundred million.
         max_bytes: Largest file that is opened [bytes].
 
     Returns:

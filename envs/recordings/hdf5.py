@@ -9,6 +9,8 @@ events were made. Polarity is 0 or 1 on disk, as in DSEC; files with -1 and 1 ar
 import contextlib
 import dataclasses
 import json
+import mmap
+import struct
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +42,7 @@ MAX_CHUNK_BYTES = 1 << 28
 # bitshuffle) crashed on damaged files, or (lz4, zstd) take the memory that the data declare.
 FILTERS = (1, 2, 3, 32000, 32001, 32026)
 BLOSC = (32001, 32026)
+HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
 # How data sets are compressed, and given a checksum, so that a flipped bit is noticed.
 PACKING = {**hdf5plugin.Blosc2(cname="zstd", clevel=3), "fletcher32": True}
 
@@ -90,6 +93,7 @@ def read_recording(path: Path) -> Recording:
     """
     try:
         check_file(path, MAX_BYTES)
+        _check_heaps(path)
         with h5py.File(path, "r") as file:
             events = _columns(Request(path, max_events=MAX_EVENTS), file)
             index = {}
@@ -117,6 +121,7 @@ def read_hdf5(request: Request) -> EventFile:
             than `max_events`, or breaks a rule of `finish`.
     """
     try:
+        _check_heaps(request.path)
         with h5py.File(request.path, "r") as file:
             request = request.sized(*_sensor(file))
             events = (_metavision if "CD" in file else _columns)(request, file)
@@ -250,6 +255,21 @@ def _check_plain(file: h5py.File, name: str, shape: tuple[None, ...]) -> None:
     if data.dtype.kind not in "iufb":
         raise ValueError(f"{name} holds {data.dtype}, not numbers")
     _check_chunks(data, name)
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a heap of texts with an object that is its own next one: HDF5 would read it for ever."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
+        heap = raw.find(HEAP)
+        while heap >= 0:
+            place, end = heap + 16, min(len(raw), heap + int.from_bytes(raw[heap + 8 : heap + 16], "little"))
+            while place + 16 <= end:
+                number, size = struct.unpack_from("<H6xQ", raw, place)
+                step = 16 + -(-size // 8) * 8 if number else size  # without a number it is free space
+                if step == 0 or step >= 1 << 63:
+                    raise ValueError(f"the heap at byte {heap} leads in a circle")
+                place += step
+            heap = raw.find(HEAP, heap + 1)
 
 
 def _check_own(file: h5py.File, name: str) -> None:

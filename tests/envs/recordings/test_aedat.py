@@ -216,7 +216,7 @@ def test_a_table_of_packets_that_is_not_where_the_header_says_is_refused(tmp_pat
     whole = zlib.decompress(base64.b85decode(LZ4_FILE))
     table = whole.rindex(b"\x04\x22\x4d\x18")  # the last LZ4 frame
     place = whole.index(struct.pack("<q", table))
-    first = whole.index(b"</dv>") + 13
+    first = 18 + int.from_bytes(whole[14:18], "little")
     for wrong in (first, first + 8, table + 4, 0, len(whole), 1 << 40, -2):
         bad = whole[:place] + struct.pack("<q", wrong) + whole[place + 8 :]
         (tmp_path / "a.aedat4").write_bytes(bad)

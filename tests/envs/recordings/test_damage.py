@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 import zlib
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from envs.events import EVENT
-from envs.recordings import FORMATS, read_events, write_events
+from envs.recordings import FORMATS, WRITERS, read_events, write_events
 from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, ecf_chunk, es, metavision
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -124,6 +125,37 @@ def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
     assert run_child(names) == {path.name: {"read": 0, "refused": 1} for path in names}
     for path in names:
         path.unlink()
+
+
+@pytest.mark.parametrize("format", ["es", "floats", *WRITERS])
+def test_reading_takes_no_more_memory_than_stated(format, tmp_path):
+    events, path = np.tile(some_events(), 200), tmp_path / f"a.{format}"
+    events["t"] = np.arange(len(events)) ^ 1  # half of them late
+    ordered = events[np.argsort(events["t"])]
+    if format == "es":
+        es(path, ordered, 34, 34)
+    elif format == "floats":
+        columns = {name: np.where(events[name] < 0, 0, events[name]).astype(np.float64) for name in "txyp"}
+        np.savez(tmp_path / "a", **columns)
+        path = tmp_path / "a.npz"
+    else:
+        write_events(path, ordered, 34, 34, format)
+    if format == "dat":
+        head, body = path.read_bytes()[: -8 * len(events)], path.read_bytes()[-8 * len(events) :]
+        path.write_bytes(head + np.frombuffer(body, "<u8").reshape(-1, 2)[:, ::-1].tobytes())
+    arguments = {
+        "format": "txt" if format == "csv" else None,
+        "time_unit": "us" if format == "floats" else None,
+    }
+    read_events(path, **arguments)  # imports what it needs
+    tracemalloc.start()
+    try:
+        assert len(read_events(path, **arguments).events) == len(events)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    each = 50 if format in ("es", "dat", "evt2", "evt3") else 80
+    assert peak < each * len(events) + (1 << 20)
 
 
 @pytest.mark.parametrize("format", [None, *FORMATS])

@@ -35,6 +35,7 @@ def test_resets_are_nothing_and_exposures_of_an_atis_are_passed_over(tmp_path):
     path = es(tmp_path / "a.es", some_events(0, 0, 5), 8, 6)
     path.write_bytes(path.read_bytes() + b"\xfe\xfe\xfe" + struct.pack("<BHH", 3 << 1 | 1, 7, 5))
     assert read_events(path).events.tolist() == [(3, 7, 0, 1)]
+    assert read_events(es(tmp_path / "none.es", some_events(0, 0, 5), 0, 0)).events.size == 0
     head = b"Event Stream" + bytes((2, 0, 0, 2)) + struct.pack("<HH", 8, 6)
     rows = [(5 << 2 | 2, 1, 0), (1 << 2 | 3, 1, 1), (1 << 2 | 0, 2, 5)]
     path.write_bytes(head + b"\xfe" + b"".join(struct.pack("<BHH", *row) for row in rows))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envs.events import EVENT
-from envs.recordings import read_events
+from envs.recordings import read_events, read_recording
 from envs.recordings.ecf import decode_ecf
 from tests.support.event_files import METAVISION_ROW, ecf_chunk, metavision, packed_events
 
@@ -52,6 +52,20 @@ def test_a_cut_chunk_is_refused_and_a_damaged_one_writes_only_where_it_may(way, 
     decode_ecf(bad, guarded[10:160])
     assert not guarded[:10].tobytes().strip(b"\0")
     assert not guarded[160:].tobytes().strip(b"\0")
+
+
+@pytest.mark.parametrize("size", [0, 2**64 - 16])
+def test_a_heap_of_texts_that_leads_in_a_circle_is_refused_and_not_read_for_ever(size, tmp_path):
+    path = metavision(tmp_path / "a.h5", [ecf_chunk(0)])
+    whole = bytearray(path.read_bytes())
+    place = whole.index(b"GCOL") + 16
+    while whole[place] or whole[place + 1]:  # to the free space after the texts
+        place += 16 + -(-int.from_bytes(whole[place + 8 : place + 16], "little") // 8) * 8
+    whole[place + 8 : place + 16] = size.to_bytes(8, "little")
+    path.write_bytes(whole)
+    for read in (read_events, read_recording):
+        with pytest.raises(ValueError, match=r"a\.h5.* leads in a circle"):
+            read(path)
 
 
 @pytest.mark.parametrize(
