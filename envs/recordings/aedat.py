@@ -1,8 +1,9 @@
-"""Files of iniVation cameras and jAER: AEDAT 2.0 and AEDAT 4.0.
+"""Files of iniVation cameras and jAER are read: AEDAT 2.0 and AEDAT 4.0.
 
 AEDAT 2.0 is read from its description (inivation.github.io, "AEDAT file formats"). AEDAT 4.0
-is packets of compressed flatbuffers; the walk through them checks every offset, so that a
-damaged file is refused. Other streams in a file (frames, inertial samples) are passed over.
+is packets of compressed flatbuffers; the walk through them checks every offset and that each is
+of the kind that it should be, so that a damaged file is refused. Other streams in a file (frames,
+inertial samples) are passed over.
 """
 
 import struct
@@ -14,6 +15,7 @@ from envs.recordings.event_file import EventFile, Request, assemble, finish, unw
 
 MAGIC_2 = b"#!AER-DAT2"
 MAGIC_4 = b"#!AER-DAT4.0\r\n"
+EVENT_PACKET, PACKET_TABLE = b"EVTS", b"FTAB"  # identifiers of flatbuffers
 MAX_HEADER_BYTES = 1 << 20
 MAX_PACKET_BYTES = 1 << 28
 
@@ -110,7 +112,8 @@ def read_aedat4(request: Request) -> EventFile:
 
     Raises:
         ValueError: A truncated or damaged packet, none or several event streams, a packet of
-            more than 256 MiB, or a rule of `finish`.
+            more than 256 MiB, a table of packets that is not where the header says, or a rule of
+            `finish`.
     """
     raw = request.path.read_bytes()
     try:
@@ -122,11 +125,17 @@ def read_aedat4(request: Request) -> EventFile:
         stream, width, height = _event_stream(header)
         request = request.sized(width, height)
         codec = CODECS.get(_scalar(header, 0, "<i", 0))
-        table = _scalar(header, 1, "<q", -1)
-        end = table if start + size <= table <= len(raw) else len(raw)
+        end = _scalar(header, 1, "<q", -1)  # where the table of packets begins, if there is one
+        if end == -1:
+            end = len(raw)
+        elif not start + size <= end < len(raw):
+            raise ValueError(f"its table of packets should be at byte {end} of {len(raw)}")
+        else:
+            _unpacked(memoryview(raw)[end:], codec, PACKET_TABLE)
         parts, count = [], 0
         for body in _packets(raw, start + size, end, stream):
-            parts.append(_events(_unpacked(body, codec)).copy())  # lets go of the rest of its packet
+            # A copy lets go of the rest of its packet.
+            parts.append(_events(_unpacked(body, codec, EVENT_PACKET)).copy())
             count += len(parts[-1])
             request.check_count(count)
     except (struct.error, ElementTree.ParseError, UnicodeDecodeError, OSError, ValueError) as error:
@@ -152,19 +161,22 @@ def _packets(raw: bytes, start: int, end: int, stream: int) -> list[memoryview]:
     return bodies
 
 
-def _unpacked(body: memoryview, codec: str | None) -> bytes:
-    """One flatbuffer; no more is unpacked than its first four bytes declare."""
+def _unpacked(body: memoryview, codec: str | None, kind: bytes) -> bytes:
+    """One flatbuffer of a kind; no more is unpacked than its first four bytes declare."""
     if codec is None:
-        return bytes(body[4:])
-    import pyarrow  # half a second, and only for this format
+        whole = bytes(body[4:])
+    else:
+        import pyarrow  # half a second, and only for this format
 
-    with pyarrow.CompressedInputStream(pyarrow.py_buffer(body), codec) as packed:
-        (size,) = struct.unpack("<I", packed.read(4))
-        if size > MAX_PACKET_BYTES:
-            raise ValueError(f"a packet declares {size} bytes; at most {MAX_PACKET_BYTES} are unpacked")
-        whole = packed.read(size)
-    if len(whole) != size:
-        raise ValueError(f"a packet declares {size} bytes and holds {len(whole)}")
+        with pyarrow.CompressedInputStream(pyarrow.py_buffer(body), codec) as packed:
+            (size,) = struct.unpack("<I", packed.read(4))
+            if size > MAX_PACKET_BYTES:
+                raise ValueError(f"a packet declares {size} bytes; at most {MAX_PACKET_BYTES} are unpacked")
+            whole = packed.read(size)
+        if len(whole) != size:
+            raise ValueError(f"a packet declares {size} bytes and holds {len(whole)}")
+    if whole[4:8] != kind:
+        raise ValueError(f"where a packet of {kind.decode()} should be is one of {whole[4:8]!r}")
     return whole
 
 

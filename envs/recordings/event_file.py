@@ -18,7 +18,9 @@ import numpy as np
 from envs.events import EVENT
 from envs.events.camera import T_LIMIT_US
 
-MAX_EVENTS = 200_000_000
+MAX_EVENTS = 100_000_000  # 1.3 GB in the end, and up to 8 GB on the way
+SMALL_EVENTS = 10_000_000  # what any file may hold
+EVENTS_PER_BYTE = 2  # of dense recordings, five times as many as a camera's EVT 3.0 has
 MAX_BYTES = 8 << 30
 MAX_DISORDER_US = 1_000_000
 MAX_PACKED = 1000  # times a file's size that it may unpack to; events pack to a tenth
@@ -37,6 +39,8 @@ class EventFile:
         skipped: Entries left out: no brightness change (triggers, frames, inertial samples of an
             AEDAT 2 file), or before the first time or row of an EVT stream.
         dropped: Events that the simulated sensor lost to its limit (videos only).
+        strays: Times of an EVT stream that damage moved by more than a second, left out; the
+            events after one keep the time before it, until the next.
     """
 
     events: np.ndarray
@@ -46,6 +50,7 @@ class EventFile:
     late: int = 0
     skipped: int = 0
     dropped: int = 0
+    strays: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Request:
     Attributes:
         path: A regular file.
         width, height: Pixels of the sensor [px], or None: as the file says.
-        columns: Names of the columns of a text file without a header.
+        columns: Names of the columns of a text file, in place of those that it gives.
         time_unit: "s", "ms", "us" or "ns", where the file does not say.
         max_events: Most events that are read.
     """
@@ -123,6 +128,11 @@ def check_file(path: Path, max_bytes: int) -> int:
     return info.st_size
 
 
+def usual_events(size: int) -> int:
+    """Most events that a file of a size [bytes] may hold unless the caller allows more."""
+    return min(MAX_EVENTS, max(SMALL_EVENTS, EVENTS_PER_BYTE * size))
+
+
 def check_declared(path: Path, name: str, declared_bytes: int) -> None:
     """Refuse what a file says it holds if it is far too small for that, before memory is taken.
 
@@ -157,7 +167,8 @@ def assemble(request: Request, t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p
             outside [0, 2**52), or a polarity is not coded in one of the two ways.
     """
     events = np.empty(len(t_us), EVENT)
-    for name, values, limit in (("t", t_us, T_LIMIT_US), ("x", x, 65536), ("y", y, 65536)):
+    for name, stored, limit in (("t", t_us, T_LIMIT_US), ("x", x, 65536), ("y", y, 65536)):
+        values = stored.astype(np.float64) if stored.dtype.kind == "f" else stored  # half floats end at 65504
         good = (values >= 0) & (values < limit)  # NaN and infinity are not good either
         if not good.all():
             first = int(np.argmin(good))
@@ -174,7 +185,7 @@ def assemble(request: Request, t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p
     return events
 
 
-def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0) -> EventFile:
+def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0, strays: int = 0) -> EventFile:
     """Check the rules that hold for every format, and put the events in time order.
 
     Times that go back by at most one second are sorted in (stable: ties keep the order of
@@ -186,6 +197,7 @@ def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0) 
         format: Name of the format.
         events: EVENT array in the order of the file.
         skipped: Entries that were left out.
+        strays: Times that were left out.
 
     Raises:
         ValueError: A coordinate is outside the sensor, a time is outside [0, 2**52), or the
@@ -210,7 +222,7 @@ def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0) 
         )
     if late:
         events = events[np.argsort(events["t"], kind="stable")]
-    return EventFile(events, request.width, request.height, format, late, skipped)
+    return EventFile(events, request.width, request.height, format, late, skipped, strays=strays)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -219,7 +231,7 @@ def _extremes(events: np.ndarray) -> tuple[int, int, int, int, int, int]:
 
     One pass, because events take more memory than a processor's caches have.
     """
-    x, y, oldest, newest, late, back_us = 0, 0, 0, 0, 0, 0
+    x, y, oldest, newest, late, back_us = -1, -1, 0, 0, 0, 0
     for i in range(events.size):
         event = events[i]
         t = event.t

@@ -1,8 +1,13 @@
 """Kernels that decode the words of Prophesee's DAT and of its encodings EVT 2.0, EVT 2.1 and EVT 3.0.
 
 Call a decoder of EVT once with empty `events` to count, and once with room for all of them. It returns
-the number of events, the number of events skipped because their time or row was not yet known,
-and the index of the first word of a reserved type, or -1.
+the number of events, the number of events skipped because their time or row was not yet known, the number
+of stray high parts of the time (EVT 3.0: of the second call), and the index of the first word of a
+reserved type or beyond the last column, or -1.
+
+A high part of the time is stray if it lies more than a second from the time before it and one of the next
+few is near that time again: a flipped bit, not a gap. It is passed over; taken for the time, it would move
+every later event by a turn of the clock.
 """
 
 from enum import IntEnum
@@ -11,6 +16,9 @@ import numba
 import numpy as np
 
 FIRST_VENDOR_TYPE = 14  # words of this type and above are the vendor's own, in all encodings
+COLUMNS = 1 << 11  # that an address of 11 bits tells apart; a vector may not reach beyond them
+FAR_US = 1_000_000  # as far as events may be out of order
+LOOK_AHEAD = 16  # high parts
 
 
 class Evt2(IntEnum):
@@ -73,7 +81,55 @@ def _time_base(value: int, base: int, low_bits: int, high_bits: int) -> int:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tuple[int, int, int]:
+def _is_far(value: int, base: int, low_bits: int, high_bits: int) -> bool:
+    """Whether a high part lies more than a second from the time before it."""
+    return abs(_time_base(value, base, low_bits, high_bits) - base) > FAR_US
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _is_stray(words: np.ndarray, place: int, base: int, low_bits: int, high_bits: int) -> bool:
+    """Whether a high part far from the time before it is stray; the first one if the next two are earlier."""
+    value, seen = np.int64(words[place]) & (1 << high_bits) - 1, 0
+    for i in range(place + 1, words.size):
+        word = np.int64(words[i])
+        if word >> high_bits != Evt2.TIME_HIGH:  # the same type in EVT 3.0
+            continue
+        later = word & (1 << high_bits) - 1
+        seen += 1
+        if base < 0:
+            if later >= value or not _is_far(later, value << low_bits, low_bits, high_bits):
+                return False
+            if seen == 2:
+                return True
+        elif not _is_far(later, base, low_bits, high_bits):
+            return True
+        elif seen == LOOK_AHEAD:
+            return False
+    return base < 0 and seen > 0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _next_base(words: np.ndarray, place: int, base: int, low_bits: int, high_bits: int) -> int:
+    """The time of the high part in a word [us], or -1 if it is stray."""
+    later = _time_base(np.int64(words[place]) & (1 << high_bits) - 1, base, low_bits, high_bits)
+    if abs(later - base) > FAR_US and _is_stray(words, place, base, low_bits, high_bits):
+        return -1
+    return later
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _first_beyond(words: np.ndarray, masks: np.ndarray) -> int:
+    """Index of the first word of EVT 2.1 that reaches beyond the last column, or -1."""
+    for i in range(masks.size):
+        kind, x = np.int64(words[i]) >> 28, np.int64(words[i]) >> 11 & 2047
+        is_event = kind == Evt2.OFF or kind == Evt2.ON
+        if is_event and x > COLUMNS - 32 and np.int64(masks[i]) >> (COLUMNS - x):
+            return i
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tuple[int, int, int, int]:
     """Decode EVT 2.0, or EVT 2.1 from the upper halves of its words and their masks.
 
     Args:
@@ -81,7 +137,10 @@ def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tup
         masks: uint32 (N,): which of the 32 pixels from x on have an event; empty for EVT 2.0.
         events: EVENT array to fill.
     """
-    n, skipped, base = 0, 0, np.int64(-1)
+    beyond = _first_beyond(words, masks)
+    if beyond >= 0:
+        return 0, 0, 0, beyond
+    n, skipped, strays, base = 0, 0, 0, np.int64(-1)
     for i in range(words.size):
         word = np.int64(words[i])
         kind = word >> 28
@@ -93,14 +152,16 @@ def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tup
                 t = base | (word >> 22 & 63)
                 n = _emit(events, n, mask, t, word >> 11 & 2047, word & 2047, 2 * kind - 1)
         elif kind == Evt2.TIME_HIGH:
-            base = _time_base(word & 0xFFFFFFF, base, 6, 28)
+            later = _next_base(words, i, base, 6, 28)
+            strays += later < 0
+            base = base if later < 0 else later
         elif kind != Evt2.TRIGGER and kind < FIRST_VENDOR_TYPE:
-            return n, skipped, i
-    return n, skipped, -1
+            return n, skipped, strays, i
+    return n, skipped, strays, -1
 
 
 @numba.njit(cache=True, error_model="numpy")
-def decode_evt3(words: np.ndarray, events: np.ndarray) -> tuple[int, int, int]:
+def decode_evt3(words: np.ndarray, events: np.ndarray) -> tuple[int, int, int, int]:
     """Decode EVT 3.0.
 
     The low part of the time counts as zero from a changed high part until the next low part.
@@ -111,11 +172,11 @@ def decode_evt3(words: np.ndarray, events: np.ndarray) -> tuple[int, int, int]:
     """
     start = _first_known(words)
     if events.size:
-        _fill_evt3(words, start, events)
-        return events.size, 0, -1
+        strays, beyond = _fill_evt3(words, start, events)
+        return events.size, 0, strays, beyond
     skipped, bad_before = _count_evt3(words[:start])
     n, bad_after = _count_evt3(words[start:])
-    return n, skipped, _first_reserved(words) if bad_before or bad_after else -1
+    return n, skipped, 0, _first_reserved(words) if bad_before or bad_after else -1
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -124,7 +185,7 @@ def _first_known(words: np.ndarray) -> int:
     time, row, polarity = False, False, False
     for i in range(words.size):
         kind = np.int64(words[i]) >> 12
-        time |= kind == Evt3.TIME_HIGH
+        time |= kind == Evt3.TIME_HIGH and not _is_stray(words, i, -1, 12, 12)
         row |= kind == Evt3.ROW
         polarity |= kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE
         if time and row and polarity:
@@ -161,11 +222,15 @@ def _count_evt3(words: np.ndarray) -> tuple[int, bool]:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _fill_evt3(words: np.ndarray, start: int, events: np.ndarray) -> None:
-    """Write the events of the words from `start` on; the words before it only say where and when."""
-    n, i, base = 0, 0, -1
+def _fill_evt3(words: np.ndarray, start: int, events: np.ndarray) -> tuple[int, int]:
+    """Write the events of the words from `start` on; the words before it only say where and when.
+
+    Returns:
+        Number of stray high parts of the time, and the index of a vector beyond the last column or -1.
+    """
+    n, i, strays, beyond, base = 0, 0, 0, -1, np.int64(-1)
     x = y = p = low = np.int64(0)
-    while n < events.size:
+    while n < events.size and beyond < 0:
         kind, value = np.int64(words[i]) >> 12, np.int64(words[i]) & 0xFFF
         if kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE:
             x, p = value & 2047, 2 * (value >> 11) - 1
@@ -174,14 +239,19 @@ def _fill_evt3(words: np.ndarray, start: int, events: np.ndarray) -> None:
         elif kind == Evt3.ROW:
             y = value & 2047
         elif kind == Evt3.VECTOR_12 or kind == Evt3.VECTOR_8:
-            n = _emit(events, n, _mask(kind, value), base | low, x, y, p) if i >= start else n
+            mask = _mask(kind, value)
+            beyond = i if x > COLUMNS - 12 and mask >> max(COLUMNS - x, 0) else -1
+            n = _emit(events, n, mask, base | low, x, y, p) if i >= start else n
             x += 12 if kind == Evt3.VECTOR_12 else 8
         elif kind == Evt3.TIME_LOW:
             low = value
         elif kind == Evt3.TIME_HIGH:
-            before, base = base, _time_base(value, base, 12, 12)
-            low = low if base == before else np.int64(0)
+            later = _next_base(words, i, base, 12, 12)
+            strays += later < 0
+            low = low if later < 0 or later == base else np.int64(0)
+            base = base if later < 0 else later
         i += 1
+    return strays, beyond
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from envs.recordings.aedat import MAGIC_2, MAGIC_4, read_aedat2, read_aedat4
-from envs.recordings.event_file import MAX_BYTES, MAX_EVENTS, EventFile, Request, check_events, check_file
+from envs.recordings.aedat_writer import write_aedat4
+from envs.recordings.event_file import MAX_BYTES, EventFile, Request, check_events, check_file, usual_events
+from envs.recordings.event_stream import MAGIC_ES, read_es
 from envs.recordings.hdf5 import read_hdf5, write_hdf5
 from envs.recordings.plain import US_PER, read_nmnist, read_npz, read_text, write_npz, write_text
 from envs.recordings.prophesee import read_dat, read_evt, write_prophesee
@@ -15,6 +17,7 @@ READERS: dict[str, Callable[[Request], EventFile]] = {
     "aedat2": read_aedat2,
     "aedat4": read_aedat4,
     "dat": read_dat,
+    "es": read_es,
     "evt": read_evt,
     "evt2": lambda request: read_evt(request, "evt2"),
     "evt21": lambda request: read_evt(request, "evt21"),
@@ -26,6 +29,7 @@ READERS: dict[str, Callable[[Request], EventFile]] = {
 }
 FORMATS = tuple(name for name in READERS if name != "evt")
 WRITERS: dict[str, Callable[[Path, np.ndarray, int, int], None]] = {
+    "aedat4": write_aedat4,
     "csv": lambda path, events, width, height: write_text(path, events, width, height, ","),
     "dat": lambda path, events, width, height: write_prophesee(path, events, width, height, "dat"),
     "evt2": lambda path, events, width, height: write_prophesee(path, events, width, height, "evt2"),
@@ -42,19 +46,22 @@ BEGINNINGS = (
     (b"\x89HDF\r\n\x1a\n", "hdf5"),
     (b"PK\x03\x04", "npz"),
     (b"% Data file containing", "dat"),
-    (b"% ", "evt"),
+    (b"% ", "evt"),  # or DAT, as its header says
+    (MAGIC_ES, "es"),
 )
 SUFFIXES = {
+    ".aedat4": "aedat4",
     ".bin": "nmnist",
     ".csv": "txt",
     ".dat": "dat",
+    ".es": "es",
     ".h5": "hdf5",
     ".hdf5": "hdf5",
     ".npz": "npz",
     ".raw": "evt",
     ".txt": "txt",
 }
-WRITTEN_SUFFIXES = {**SUFFIXES, ".csv": "csv", ".raw": "evt3", ".bin": ""}
+WRITTEN_SUFFIXES = {**SUFFIXES, ".csv": "csv", ".raw": "evt3"}
 
 
 def read_events(
@@ -65,7 +72,7 @@ def read_events(
     height: int | None = None,
     columns: Sequence[str] | None = None,
     time_unit: str | None = None,
-    max_events: int = MAX_EVENTS,
+    max_events: int | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> EventFile:
     """Read an event file of any known format.
@@ -78,10 +85,12 @@ def read_events(
         format: One of `FORMATS`; None: by how the file begins, else by its suffix.
         width: Columns of the sensor [px], where the file does not say.
         height: Its rows [px].
-        columns: Names of the columns of a text file without a header, such as
+        columns: Names of the columns of a text file, in place of those that it gives, such as
             ("t", "x", "y", "p"); others than these four are passed over.
         time_unit: "s", "ms", "us" or "ns", for text and npz files that do not say.
-        max_events: Most events that are read; each takes 13 bytes in the end and up to 60 on the way.
+        max_events: Most events that are read; each takes 13 bytes in the end and up to 80 on the way
+            (a camera's own format: 50). None: two for each byte of the file, but ten million
+            of any file and at most a hundred million.
         max_bytes: Largest file that is opened [bytes].
 
     Returns:
@@ -93,15 +102,16 @@ def read_events(
             breaks a rule of its format; the message names the file, the rule and the remedy.
     """
     path = Path(path)
-    check_file(path, max_bytes)
+    size = check_file(path, max_bytes)
     kind = format or _guessed(path)
     if kind not in READERS:
         raise ValueError(f"{path}: format must be one of {', '.join(FORMATS)}, got {format!r}")
     if time_unit is not None and time_unit not in US_PER:
         raise ValueError(f"time_unit must be one of {', '.join(US_PER)}, got {time_unit!r}")
     names = None if columns is None else tuple(columns)
+    most = usual_events(size) if max_events is None else max_events
     try:
-        return READERS[kind](Request(path, width, height, names, time_unit, max_events))
+        return READERS[kind](Request(path, width, height, names, time_unit, most))
     except MemoryError:
         raise ValueError(
             f"{path}: does not fit into memory; cut the file, or lower max_events to be told earlier"
@@ -113,8 +123,8 @@ def write_events(
 ) -> None:
     """Write events to a file, which appears whole or not at all; `read_events` gives the same events.
 
-    Formats: "npz", "hdf5" (the layout of DSEC), "txt" and "csv" (a header names columns, unit
-    and polarity code), and Prophesee's "dat", "evt2" and "evt3", which other tools open.
+    Formats: "npz", "hdf5" (the layout of DSEC), "txt" and "csv" (a header names columns and unit),
+    and what the cameras' own tools open: iniVation's "aedat4", Prophesee's "dat", "evt2" and "evt3".
 
     Args:
         path: The file; its folder is made. A file of that name is replaced.
@@ -149,7 +159,7 @@ def _guessed(path: Path) -> str:
             return name
     name = SUFFIXES.get(path.suffix.lower(), "")
     # These formats always begin as above, so a file that does not is another one or damaged.
-    if not name or name in ("hdf5", "npz", "dat"):
+    if not name or name in ("aedat4", "dat", "es", "hdf5", "npz"):
         raise ValueError(
             f"{path}: begins like no known event file; give format as one of {', '.join(FORMATS)}"
         )

@@ -1,13 +1,16 @@
-"""HDF5 event files in the layout of the DSEC data set, and the recordings that add to it.
+"""HDF5 event files in the layouts of the DSEC data set and of Metavision, and the project's recordings.
 
 `/events/{t,x,y,p}`, `/t_offset` and `/ms_to_idx` are what other tools read; `/index/*` and
 the attribute `about` are ours: where each control step and episode begins, and how the
-events were made. Polarity is 0 or 1 on disk, as in DSEC; files with -1 and 1 are read too.
+events were made. Polarity is 0 or 1 on disk, as in DSEC; files with -1 and 1 are read too. Metavision's
+`/CD/events` are rows of x, y, p, t, packed by a filter of its own.
 """
 
 import contextlib
 import dataclasses
 import json
+import mmap
+import struct
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +21,7 @@ import hdf5plugin
 import numpy as np
 
 from envs.events import EVENT
+from envs.recordings.ecf import FILTER_ECF, MAX_CHUNK_EVENTS, decode_ecf
 from envs.recordings.event_file import (
     MAX_BYTES,
     EventFile,
@@ -38,6 +42,7 @@ MAX_CHUNK_BYTES = 1 << 28
 # bitshuffle) crashed on damaged files, or (lz4, zstd) take the memory that the data declare.
 FILTERS = (1, 2, 3, 32000, 32001, 32026)
 BLOSC = (32001, 32026)
+HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
 # How data sets are compressed, and given a checksum, so that a flipped bit is noticed.
 PACKING = {**hdf5plugin.Blosc2(cname="zstd", clevel=3), "fletcher32": True}
 
@@ -88,6 +93,7 @@ def read_recording(path: Path) -> Recording:
     """
     try:
         check_file(path, MAX_BYTES)
+        _check_heaps(path)
         with h5py.File(path, "r") as file:
             events = _columns(Request(path, max_events=MAX_EVENTS), file)
             index = {}
@@ -96,7 +102,7 @@ def read_recording(path: Path) -> Recording:
                 _declared_length(file, f"index/{name}", MAX_INDEX)
                 index[name] = file[f"index/{name}"][:]
             about = json.loads(file.attrs["about"])
-    except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+    except (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError) as error:
         raise ValueError(f"{path} is no readable event recording ({error}); collect it again") from error
     return Recording(events, index, about)
 
@@ -108,17 +114,18 @@ def write_hdf5(path: Path, events: np.ndarray, width: int, height: int) -> None:
 
 
 def read_hdf5(request: Request) -> EventFile:
-    """Events of an HDF5 file in the layout of DSEC, `write_hdf5` or `write_recording`.
+    """Events of an HDF5 file in the layout of DSEC, Metavision, `write_hdf5` or `write_recording`.
 
     Raises:
         ValueError: It has no such layout, is truncated, links to other files, declares more
             than `max_events`, or breaks a rule of `finish`.
     """
     try:
+        _check_heaps(request.path)
         with h5py.File(request.path, "r") as file:
             request = request.sized(*_sensor(file))
-            events = _columns(request, file)
-    except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+            events = (_metavision if "CD" in file else _columns)(request, file)
+    except (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError) as error:
         if str(error).startswith(str(request.path)):
             raise
         raise request.refusal(f"is no readable HDF5 event file ({error}); copy or record it again") from None
@@ -159,6 +166,9 @@ def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
 
 def _sensor(file: h5py.File) -> tuple[int | None, int | None]:
     """Width and height by the attributes, or by the sensor settings of a recording."""
+    if "geometry" in file.attrs:
+        width, _, height = str(file.attrs["geometry"]).partition("x")
+        return int(width), int(height)
     if "width" in file.attrs and "height" in file.attrs:
         return int(file.attrs["width"]), int(file.attrs["height"])
     about = json.loads(file.attrs.get("about", "{}"))
@@ -181,9 +191,48 @@ def _columns(request: Request, file: h5py.File) -> np.ndarray:
     if file.get("t_offset", getlink=True) is not None:
         _check_plain(file, "t_offset", ())
         offset = int(file["t_offset"][()])
+        if offset != file["t_offset"][()]:
+            raise ValueError("t_offset is no whole number of microseconds")
     if t.dtype.kind not in "iu" or (len(t) and not 0 <= int(t.max()) + abs(offset) < 1 << 62):
         raise ValueError("events/t are no whole microseconds")
     return assemble(request, t.astype(np.int64) + offset, x, y, p)
+
+
+def _metavision(request: Request, file: h5py.File) -> np.ndarray:
+    """The events of Metavision's layout."""
+    _check_own(file, "CD")
+    _check_own(file, "CD/events")
+    data = file["CD/events"]
+    if not isinstance(data, h5py.Dataset) or data.ndim != 1 or data.external or data.is_virtual:
+        raise ValueError("CD/events is not a plain data set of 1 dimension")
+    names = data.dtype.names or ()
+    if not all(name in names and data.dtype[name].kind in "iu" for name in "txyp"):
+        raise ValueError(f"CD/events holds {data.dtype}, not rows of x, y, p and t")
+    request.check_count(len(data))
+    check_declared(request.path, "CD/events", data.nbytes)
+    if FILTER_ECF not in _filters(data):
+        _check_chunks(data, "CD/events")
+        rows = data[:]
+        return assemble(request, rows["t"], rows["x"], rows["y"], rows["p"])
+    if _filters(data) != [FILTER_ECF] or data.chunks[0] > MAX_CHUNK_EVENTS:
+        raise ValueError("CD/events has another filter beside Metavision's, or larger chunks")
+    parts = [_chunk(request, data, first) for first in range(0, len(data), data.chunks[0])]
+    return np.concatenate([np.empty(0, EVENT), *parts])
+
+
+def _chunk(request: Request, data: h5py.Dataset, first: int) -> np.ndarray:
+    """The events of one chunk of Metavision's layout; its filter, which trusts its input, is not run."""
+    stored = data.id.get_chunk_info_by_coord((first,)).size
+    if stored > request.path.stat().st_size:
+        raise ValueError(f"the chunk at event {first} declares {stored} bytes")
+    unpacked, raw = data.id.read_direct_chunk((first,))
+    events = np.empty(min(data.chunks[0], len(data) - first), EVENT)
+    if unpacked:  # a writer without the filter
+        rows = np.frombuffer(raw, data.dtype, len(events))
+        return assemble(request, rows["t"], rows["x"], rows["y"], rows["p"])
+    if not decode_ecf(np.frombuffer(raw, np.uint8), events):
+        raise ValueError(f"the chunk at event {first} is damaged")
+    return events
 
 
 def _declared_length(file: h5py.File, name: str, most: int) -> int:
@@ -205,9 +254,22 @@ def _check_plain(file: h5py.File, name: str, shape: tuple[None, ...]) -> None:
         raise ValueError(f"{name} is not a plain data set of {len(shape)} dimensions")
     if data.dtype.kind not in "iufb":
         raise ValueError(f"{name} holds {data.dtype}, not numbers")
-    if data.chunks and int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize > MAX_CHUNK_BYTES:
-        raise ValueError(f"{name} has chunks of more than {MAX_CHUNK_BYTES} bytes")
-    _check_filters(data, name)
+    _check_chunks(data, name)
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a heap of texts with an object that is its own next one: HDF5 would read it for ever."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
+        heap = raw.find(HEAP)
+        while heap >= 0:
+            place, end = heap + 16, min(len(raw), heap + int.from_bytes(raw[heap + 8 : heap + 16], "little"))
+            while place + 16 <= end:
+                number, size = struct.unpack_from("<H6xQ", raw, place)
+                step = 16 + -(-size // 8) * 8 if number else size  # without a number it is free space
+                if step == 0 or step >= 1 << 63:
+                    raise ValueError(f"the heap at byte {heap} leads in a circle")
+                place += step
+            heap = raw.find(HEAP, heap + 1)
 
 
 def _check_own(file: h5py.File, name: str) -> None:
@@ -216,13 +278,20 @@ def _check_own(file: h5py.File, name: str) -> None:
         raise ValueError(f"{name} is missing or a link")
 
 
-def _check_filters(data: h5py.Dataset, name: str) -> None:
-    """Refuse filters that are unknown, or told another size of elements or chunks than there is."""
+def _check_chunks(data: h5py.Dataset, name: str) -> None:
+    """Refuse huge chunks, and filters that are unknown or are told another size of elements or chunks."""
+    if data.chunks and int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize > MAX_CHUNK_BYTES:
+        raise ValueError(f"{name} has chunks of more than {MAX_CHUNK_BYTES} bytes")
     pipeline = data.id.get_create_plist()
-    for number in range(pipeline.get_nfilters()):
-        code, _, values, _ = pipeline.get_filter(number)
+    for number, code in enumerate(_filters(data)):
         if code not in FILTERS:
             raise ValueError(f"{name} is packed with the filter {code}; write it again with blosc or gzip")
         sizes = (data.dtype.itemsize, data.dtype.itemsize * data.chunks[0]) if data.chunks else ()
-        if code in BLOSC and values[2:4] != sizes:
+        if code in BLOSC and pipeline.get_filter(number)[2][2:4] != sizes:
             raise ValueError(f"{name} describes its packing wrongly")
+
+
+def _filters(data: h5py.Dataset) -> list[int]:
+    """Numbers of the filters that packed a data set."""
+    pipeline = data.id.get_create_plist()
+    return [pipeline.get_filter(number)[0] for number in range(pipeline.get_nfilters())]

@@ -22,6 +22,7 @@ ALIASES = {
     "polarity": "p",
     "on": "p",
 }
+E2VID = {"columns": "t x y p", "usual_unit": "s"}  # what follows a first line with the sensor's size
 MAX_LINE_BYTES = 1000
 MAX_HEADER_LINES = 1000
 CHUNK_BYTES = 1 << 20
@@ -52,7 +53,9 @@ def read_npz(request: Request) -> EventFile:
                 for name in ("width", "height")
             )
             unit = str(_array(request, archive, "time_unit", 0)) if "time_unit.npy" in names else None
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
+        if str(error).startswith(str(request.path)):
+            raise
         raise request.refusal(f"is no readable npz file ({error}); copy or save it again") from None
     if len({len(column) for column in columns}) > 1:
         raise request.refusal("has arrays t, x, y, p of different lengths; save one entry per event in each")
@@ -89,7 +92,7 @@ def _npy_header(request: Request, file: IO[bytes], name: str) -> tuple[tuple[int
             version
         ]
         shape, _, dtype = read(file, max_header_size=MAX_NPY_HEADER_BYTES)
-    except (ValueError, KeyError, EOFError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
+    except Exception as error:  # numpy's parser of headers promises no type
         raise request.refusal(
             f"array {name} has no sound header ({type(error).__name__}); save it again"
         ) from None
@@ -102,7 +105,8 @@ def read_text(request: Request) -> EventFile:
     Lines that begin with `#` may say `columns`, `time_unit`, `width` and `height`, as
     `write_text` does; or the first line names the columns, the time with its unit, such as
     `t_us,x,y,p` or `timestamp[s] x y polarity`. What the file does not say the caller must.
-    Columns are separated by commas or spaces. Further columns are passed over.
+    Columns are separated by commas or spaces. Further columns are passed over. A first line of
+    two numbers is E2VID's: width and height, before `t x y p` in seconds.
 
     Raises:
         ValueError: Columns or unit are unknown, a line is no row of numbers or longer than
@@ -110,10 +114,12 @@ def read_text(request: Request) -> EventFile:
     """
     _check_lines(request)
     try:
-        with request.path.open(encoding="utf-8") as file:
+        with request.path.open(encoding="utf-8-sig") as file:
             facts, words, skip, has_commas = _text_header(file)
             names = _column_names(request, facts, words)
             unit = facts.get("time_unit", names.pop("unit", None))
+            if not (unit or request.time_unit):
+                unit = facts.get("usual_unit")
             size = (int(facts[name]) if name in facts else None for name in ("width", "height"))
             request = request.sized(*size)
             file.seek(0)
@@ -153,6 +159,7 @@ def _check_lines(request: Request) -> None:
 def _text_header(file: IO[str]) -> tuple[dict[str, str], list[str], int, bool]:
     """Facts of the `#` lines, names in the first other line, lines to skip, and whether commas separate."""
     facts: dict[str, str] = {}
+    number = -1
     for number, line in enumerate(file):
         text = line.strip()
         if text.startswith("#") or not text:
@@ -160,14 +167,17 @@ def _text_header(file: IO[str]) -> tuple[dict[str, str], list[str], int, bool]:
             facts[name.strip().lower()] = value.strip()
             continue
         words = [word.strip() for word in (text.split(",") if "," in text else text.split())]
+        if len(words) == 2 and all(word.isdecimal() for word in words) and "width" not in facts:
+            facts |= E2VID | dict(zip(("width", "height"), words, strict=True))
+            continue
         is_header = re.match(r"[A-Za-z_]", words[0]) is not None and words[0].lower() not in ("nan", "inf")
         return facts, words if is_header else [], number + is_header, "," in text
-    return facts, [], 0, False
+    return facts, [], number + 1, False
 
 
 def _column_names(request: Request, facts: dict[str, str], names: list[str]) -> dict[str, str]:
     """Which column holds t, x, y and p; and the unit of t if its name tells it."""
-    words = names or facts.get("columns", "").replace(",", " ").split() or list(request.columns or ())
+    words = list(request.columns or names or facts.get("columns", "").replace(",", " ").split())
     places: dict[str, str] = {}
     for place, word in enumerate(words):
         name, unit = re.fullmatch(r"(.*?)(?:[_\[(](s|ms|us|ns)[\])]?)?", word.lower(), re.DOTALL).groups()  # type: ignore[union-attr]
@@ -196,7 +206,7 @@ def _microseconds(request: Request, t: np.ndarray, said: str | None) -> np.ndarr
         raise request.refusal(
             f"does not say the unit of its times; give time_unit as one of {', '.join(US_PER)}"
         )
-    return t if unit == "us" else t * US_PER[unit]
+    return t if unit == "us" else t.astype(np.float64) * US_PER[unit]
 
 
 def read_nmnist(request: Request) -> EventFile:
@@ -233,10 +243,15 @@ def write_npz(path: Path, events: np.ndarray, width: int, height: int) -> None:
 
 
 def write_text(path: Path, events: np.ndarray, width: int, height: int, separator: str = " ") -> None:
-    """Write checked events as lines, under a header that names columns, unit and polarity code."""
+    """Write checked events as lines, under lines that say columns, unit, polarity code and sensor.
+
+    Separated by commas the first line names the columns and no other is there: what opens CSV
+    knows no comments. The sensor's size is not in such a file.
+    """
+    about = f"# time_unit: us\n# polarity: -1 is OFF (darker), 1 is ON (brighter)\n# width: {width}\n"
+    about += f"# height: {height}\n# columns: t x y p\n"
     with replaced(path) as part, part.open("w", encoding="ascii", newline="\n") as file:
-        file.write("# time_unit: us\n# polarity: -1 is OFF (darker), 1 is ON (brighter)\n")
-        file.write(f"# width: {width}\n# height: {height}\n# columns: t x y p\n")
+        file.write("t_us,x,y,p\n" if separator == "," else about)
         for first in range(0, len(events), CHUNK_BYTES):
             rows = events[first : first + CHUNK_BYTES].tolist()
             file.writelines(separator.join(map(str, row)) + "\n" for row in rows)

@@ -1,8 +1,9 @@
 """Files of Prophesee cameras: DAT, and RAW with the encodings EVT 2.0, EVT 2.1 and EVT 3.0.
 
-From the published descriptions (docs.prophesee.ai: "DAT File Format", "EVT 2.0 Format",
-"EVT 2.1 Format", "EVT 3.0 Format"). Every decoder runs twice: once to count, so that the
-number of events is known and checked before memory is taken for them, once to fill.
+Both begin with lines `% name value`, and what these name tells them apart. From the published
+descriptions (docs.prophesee.ai: "DAT File Format", "EVT 2.0 Format", "EVT 2.1 Format", "EVT 3.0
+Format"). Every decoder runs twice: once to count, so that the number of events is known and checked
+before memory is taken for them, once to fill.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import numpy as np
 
 from envs.events import EVENT
 from envs.recordings.event_file import EventFile, Request, finish, replaced
-from envs.recordings.evt_decoders import decode_dat, decode_evt2, decode_evt3
+from envs.recordings.evt_decoders import COLUMNS, decode_dat, decode_evt2, decode_evt3
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_WORDS = 1 << 30
@@ -26,7 +27,7 @@ SENSORS = (("genx320", 320, 320), ("imx636", 1280, 720), ("gen4", 1280, 720), ("
 LIMITS = {"dat": (32, 14), "evt2": (34, 11), "evt3": (24, 11)}
 
 
-def read_dat(request: Request, format: str = "dat") -> EventFile:
+def read_dat(request: Request) -> EventFile:
     """Events of a DAT file, version 2. The 32-bit clock of 71.6 minutes is unwrapped.
 
     Raises:
@@ -45,35 +46,38 @@ def read_dat(request: Request, format: str = "dat") -> EventFile:
     request = request.sized(_number(fields.get("Width")), _number(fields.get("Height")))
     events = np.empty(len(words), EVENT)
     decode_dat(words, events)
-    return finish(request, format, events)
+    return finish(request, "dat", events)
 
 
 def read_evt(request: Request, format: str | None = None) -> EventFile:
     """Events of a RAW file, in the encoding that its header names or that `format` says.
 
-    External triggers and vendor words are passed over. Words of reserved types are refused.
+    External triggers and vendor words are passed over. Words of reserved types are refused. A header
+    with a version and without an encoding is that of a DAT file, in whatever order its lines are.
 
     Raises:
         ValueError: No known encoding, a truncated body, words that the encoding does not have,
             or a rule of `finish`.
     """
     fields, start = _header(request)
+    if format is None and "Version" in fields and not fields.keys() & {"evt", "format"}:
+        return read_dat(request)
     options = dict(part.partition("=")[::2] for part in fields.get("format", "").split(";")[1:])
     encoding = _encoding(request, fields, format)
     request = request.sized(*_geometry(fields, options))
     if options.get("endianness", "little") not in ("little", "legacy"):
         raise request.refusal(f"has {options['endianness']}-endian words; only little-endian ones are read")
     if encoding == "evt3":
-        events, skipped = _decoded(request, decode_evt3, _words(request, start, np.dtype("<u2")))
+        decoded = _decoded(request, decode_evt3, _words(request, start, np.dtype("<u2")))
     elif encoding == "evt2":
         words = _words(request, start, np.dtype("<u4"))
-        events, skipped = _decoded(request, decode_evt2, words, np.empty(0, "<u4"))
+        decoded = _decoded(request, decode_evt2, words, np.empty(0, "<u4"))
     else:
         pairs = _words(request, start, np.dtype("<u8")).view("<u4").reshape(-1, 2)
         upper = 0 if options.get("endianness") == "legacy" else 1  # IMX636 sends the upper half first
         columns = np.ascontiguousarray(pairs.T)
-        events, skipped = _decoded(request, decode_evt2, columns[upper], columns[1 - upper])
-    return finish(request, encoding, events, skipped)
+        decoded = _decoded(request, decode_evt2, columns[upper], columns[1 - upper])
+    return finish(request, encoding, *decoded)
 
 
 def write_prophesee(path: Path, events: np.ndarray, width: int, height: int, format: str) -> None:
@@ -177,7 +181,7 @@ def _encoding(request: Request, fields: dict[str, str], format: str | None) -> s
     if encoding and format and format != encoding:
         raise request.refusal(f"says {encoding} and the caller says {format}; leave format out")
     if not (encoding or format):
-        raise request.refusal("names no encoding; give format='evt2', 'evt21' or 'evt3'")
+        raise request.refusal("names no encoding; give format='evt2', 'evt21', 'evt3' or 'dat'")
     return encoding or str(format)
 
 
@@ -212,14 +216,16 @@ def _words(request: Request, start: int, word: np.dtype) -> np.ndarray:
 
 
 def _decoded(
-    request: Request, decode: Callable[..., tuple[int, int, int]], *words: np.ndarray
-) -> tuple[np.ndarray, int]:
-    """Events and the number of entries skipped."""
-    count, skipped, bad = decode(*words, np.empty(0, EVENT))
+    request: Request, decode: Callable[..., tuple[int, int, int, int]], *words: np.ndarray
+) -> tuple[np.ndarray, int, int]:
+    """Events, the number of entries skipped and the number of stray times."""
+    count, skipped, strays, bad = decode(*words, np.empty(0, EVENT))
+    events = np.empty(request.check_count(count), EVENT)
+    if bad < 0:
+        _, _, strays, bad = decode(*words, events)
     if bad >= 0:
         raise request.refusal(
-            f"word {bad} is of no type that this encoding has; the file is damaged or of another one"
+            f"word {bad} is of no type that this encoding has, or lies beyond its {COLUMNS} columns; "
+            "the file is damaged or of another encoding"
         )
-    events = np.empty(request.check_count(count), EVENT)
-    decode(*words, events)
-    return events, skipped
+    return events, skipped, strays

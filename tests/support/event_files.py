@@ -1,7 +1,15 @@
 """Event files of cameras, built by hand for tests."""
 
+import base64
 import struct
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
+
+import h5py
+import numpy as np
+
+from envs.events import EVENT
 
 # Twelve events written by dv-processing 2.0.4 (zlib, base 85): event i has the time
 # 1,700,000,000,000,000 us + 100 i^2, x = 37 i mod 346, y = 29 i mod 260, ON when 3 divides i.
@@ -25,6 +33,63 @@ ZSTD_FILE = (
     "269`b};j>l{XxGz-J(Fhmoz>`anVfy9CcWhUVqFn0e+^9uF|iX)`qLJw3}G?5YG`CWfFRyb=qxMl%2B4^xo;_uKe&f$hno(t"
     "??Xc5e}RzvU=LL;0;FPA`#VZv#yOQ&!pC`7`Tibs$Tlv^)zNg93xsg3}w<u3<>iWbg+7`sPSO"
 )
+
+# The events of `packed_events` as the ECF library of Prophesee packs them in its three ways (zlib, base 85).
+ECF_CHUNKS = (
+    "c-o6#VqjnpSbF6JkmA>5D5L;<|MmO#Uq(`O$uk%+>}N4zi03q7c*U@aF^fry`4#gjmMm5+wpVPc*t0maIA3wD;>zOI;(5VC4Hf^J"
+    "7(@U%)>!5",
+    "c-o6(VqjnpSbF6JkmA>5D5L;<|MmO#Uq(`O$uk%+>}N4zi03q7kY<?b6F+70q`mg-%|nwt#V2k`)1*E2ZOvR**bMdz3;+Xym_7",
+    "c-o6%VqjnpSbF6JkmA>5D5L;<|MmO#Uq(`Oon~ZUn7Z-`V|)oK^Jh&@_PsBJIomh$aE*%7PkahcJPs)SNyC$U4^X@fD1M58IB^CB"
+    "VNReB0|2m8(4z",
+)
+METAVISION_ROW = np.dtype(
+    {"names": list("xypt"), "formats": ["<u2", "<u2", "<i2", "<i8"], "offsets": [0, 2, 4, 8], "itemsize": 16}
+)
+
+
+def ecf_chunk(way: int) -> bytes:
+    return zlib.decompress(base64.b85decode(ECF_CHUNKS[way]))
+
+
+def packed_events(way: int) -> np.ndarray:
+    """Runs of equal times, rows and polarities beyond what a word of each holds, and a long step."""
+    i, events = np.arange(150), np.empty(150, EVENT)
+    events["t"] = 10**12 + 7 * np.maximum(0, i - 40) + 900_000 * (i > 100)
+    events["x"] = 2 * (i % 50) + 7 if way == 0 else 613 * (i % 8) % 1280
+    events["y"] = 29 * (i % 8) if way == 2 else 37 * (i // 50)
+    events["p"] = np.where(i < 130, 1, -1)
+    return events
+
+
+def metavision(
+    path: Path, chunks: Sequence[bytes], count: int = 150, geometry: str = "1280x720", unpacked: int = 0
+) -> Path:
+    """A file in the layout of Metavision, of chunks of 150 events that are packed already."""
+    with h5py.File(path, "w") as file:
+        packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        packing.set_chunk((150,))
+        packing.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL)
+        kind, space = (
+            h5py.h5t.py_create(METAVISION_ROW),
+            h5py.h5s.create_simple((count,), (h5py.h5s.UNLIMITED,)),
+        )
+        data = h5py.h5d.create(file.create_group("CD").id, b"events", kind, space, packing)
+        for number, chunk in enumerate(chunks):
+            data.write_direct_chunk((150 * number,), chunk, unpacked)
+        file.attrs["geometry"], file.attrs["format"] = geometry, "HDF5"
+    return path
+
+
+def es(path: Path, events: np.ndarray, width: int, height: int) -> Path:
+    """A DVS file of Event Stream, version 2, one event at a time."""
+    body, now = bytearray(b"Event Stream" + bytes((2, 0, 0, 1))), 0
+    body += struct.pack("<HH", width, height)
+    for t, x, y, p in events.tolist():
+        turns, rest = divmod(t - now, 127)
+        body += b"\xff" * turns + struct.pack("<BHH", rest << 1 | (p > 0), x, height - 1 - y)
+        now = t
+    path.write_bytes(body)
+    return path
 
 
 def aedat2(path: Path, entries: list[tuple[int, int]], chip: str = "") -> Path:

@@ -11,7 +11,7 @@ import pyarrow
 import pytest
 
 from envs.events import EVENT
-from envs.recordings import read_events
+from envs.recordings import read_events, write_events
 from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
@@ -150,6 +150,8 @@ def test_packets_of_other_streams_are_passed_over_whatever_they_hold(tmp_path):
         ([(0, packet([(5, -1, 2, 1)]))], 0, None, "x must lie in"),
         ([(0, packet([(-5, 1, 2, 1)]))], 0, None, "t must lie in"),
         ([(0, b"no lz4 frame")], 1, None, "damaged"),
+        ([(0, bytes(64))], 0, None, "where a packet of EVTS should be is one of"),
+        ([(0, packet([]).replace(b"EVTS", b"FRME"))], 0, None, "should be is one of b'FRME'"),
         ([], 0, xml(2), "2 event streams"),
         ([], 0, xml(0), "0 event streams"),
         ([], 0, b"<!DOCTYPE x [<!ENTITY a 'b'>]><dv>&a;</dv>", "XML entities"),
@@ -179,7 +181,7 @@ def test_a_packet_that_unpacks_to_gigabytes_takes_no_memory(codec, name, tmp_pat
     def packed(size: int) -> bytes:
         sink = pyarrow.BufferOutputStream()
         with pyarrow.CompressedOutputStream(sink, name) as out:
-            out.write(struct.pack("<I", size))
+            out.write(struct.pack("<I", size) + b"\0\0\0\0EVTS")
             for _ in range(256):
                 out.write(bytes(1 << 20))
         return sink.getvalue().to_pybytes()
@@ -188,7 +190,7 @@ def test_a_packet_that_unpacks_to_gigabytes_takes_no_memory(codec, name, tmp_pat
     large = aedat4(tmp_path / "b.aedat4", [(0, packed(1 << 30))], codec)
     assert large.stat().st_size < 4 << 20
     before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert read_events(small).events.tolist() == []  # all zero: a table without fields
+    assert read_events(small).events.tolist() == []  # a table without fields
     with pytest.raises(ValueError, match="at most 268435456 are unpacked"):
         read_events(large)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 64 << 10
@@ -210,10 +212,66 @@ def test_packets_that_hold_one_event_and_megabytes_of_nothing_are_let_go(tmp_pat
         tracemalloc.stop()
 
 
-def test_another_reader_gives_the_same_events(tmp_path):
+def test_a_table_of_packets_that_is_not_where_the_header_says_is_refused(tmp_path):
+    whole = zlib.decompress(base64.b85decode(LZ4_FILE))
+    table = whole.rindex(b"\x04\x22\x4d\x18")  # the last LZ4 frame
+    place = whole.index(struct.pack("<q", table))
+    first = 18 + int.from_bytes(whole[14:18], "little")
+    for wrong in (first, first + 8, table + 4, 0, len(whole), 1 << 40, -2):
+        bad = whole[:place] + struct.pack("<q", wrong) + whole[place + 8 :]
+        (tmp_path / "a.aedat4").write_bytes(bad)
+        with pytest.raises(ValueError, match=r"a\.aedat4: is damaged"):
+            read_events(tmp_path / "a.aedat4")
+
+
+def some_events(count: int) -> np.ndarray:
+    rng = np.random.default_rng(count)
+    events = np.empty(count, EVENT)
+    events["t"] = 1_700_000_000_000_000 + np.sort(rng.integers(0, 10 * count + 1, count))
+    events["x"], events["y"] = rng.integers(0, 346, count), rng.integers(0, 260, count)
+    events["p"] = rng.choice([-1, 1], count)
+    return events
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, (1 << 14) - 1, 1 << 14, 40_000])
+def test_what_is_written_is_read(count, tmp_path):
+    events = some_events(count)
+    write_events(tmp_path / "a.aedat4", events, 346, 260)
+    back = read_events(tmp_path / "a.aedat4")
+    assert back.events.tobytes() == events.tobytes()
+    assert (back.format, back.width, back.height) == ("aedat4", 346, 260)
+
+
+def test_a_sensor_that_signed_16_bits_cannot_address_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="at most 32768 pixels"):
+        write_events(tmp_path / "a.aedat4", some_events(1), 32769, 260)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", [0, 1, 40_000])
+def test_the_makers_library_reads_what_is_written(count, tmp_path):
+    dv = pytest.importorskip("dv_processing", reason="the package dv-processing is the maker's reader")
+    events = some_events(count)
+    write_events(tmp_path / "a.aedat4", events, 346, 260)
+    reader = dv.io.MonoCameraRecording(str(tmp_path / "a.aedat4"))
+    assert tuple(reader.getEventResolution()) == (346, 260)
+    parts = []
+    while (part := reader.getNextEventBatch()) is not None:
+        parts.append(part.numpy())
+    assert sum(map(len, parts)) == count
+    for name, theirs in (("t", "timestamp"), ("x", "x"), ("y", "y"), ("p", "polarity")):
+        found = np.concatenate([np.empty(0), *(part[theirs] for part in parts)])
+        assert np.array_equal(found, events[name] > 0 if name == "p" else events[name])
+
+
+@pytest.mark.parametrize("written_here", [False, True])
+def test_another_reader_gives_the_same_events(written_here, tmp_path):
     aedat = pytest.importorskip("aedat", reason="the package aedat reads AEDAT 4.0 independently")
     path = tmp_path / "a.aedat4"
-    path.write_bytes(zlib.decompress(base64.b85decode(LZ4_FILE)))
+    if written_here:
+        write_events(path, some_events(40_000), 346, 260)
+    else:
+        path.write_bytes(zlib.decompress(base64.b85decode(LZ4_FILE)))
     theirs = np.concatenate([part["events"] for part in aedat.Decoder(path) if "events" in part])
     ours = read_events(path).events
     assert ours.dtype == EVENT

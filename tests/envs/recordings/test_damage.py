@@ -1,9 +1,11 @@
 """Damaged and hostile files of every format: one ValueError, in bounded memory and time."""
 
 import base64
+import json
 import os
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 import zlib
 from pathlib import Path
@@ -13,61 +15,23 @@ import numpy as np
 import pytest
 
 from envs.events import EVENT
-from envs.recordings import FORMATS, read_events, write_events
-from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2
+from envs.recordings import FORMATS, WRITERS, read_events, write_events
+from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, ecf_chunk, es, metavision
 
 ROOT = Path(__file__).resolve().parents[3]
-MEMORY_BYTES = 3 << 30  # of address space, most of it taken by the libraries
-
-# Runs in a process of its own: a crash or a hang of a library must fail the test, not end it.
-CHILD = """
-import resource, sys
-from pathlib import Path
-import numpy as np
-import pyarrow
-from envs.recordings import read_events
-memory, *paths = sys.argv[1:]
-resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
-resource.setrlimit(resource.RLIMIT_CPU, (100, 100))
-for path in map(Path, paths):
-    good, rng = path.read_bytes() if ROUNDS > 1 else b"", np.random.default_rng(0)
-    for number in range(ROUNDS):
-        if ROUNDS > 1:
-            bad = np.frombuffer(good, np.uint8).copy()
-            place, size = int(rng.integers(len(bad))), int(rng.integers(1, 20))
-            if number % 5 == 0:
-                bad[rng.integers(0, len(bad), size)] ^= np.uint8(1 << rng.integers(8))
-            elif number % 5 == 1:
-                bad[rng.integers(0, min(600, len(bad)), 3)] = rng.integers(0, 256, 3)
-            elif number % 5 == 2:
-                bad = bad[:place]
-            elif number % 5 == 3:
-                bad[place:] = rng.integers(0, 256, len(bad) - place)
-            else:
-                bad[place : place + 4] = rng.choice([0, 127, 255])
-            path.write_bytes(bad.tobytes())
-        try:
-            file = read_events(path)
-            assert np.all(np.diff(file.events["t"]) >= 0)
-            print(path.name, "read")
-        except ValueError as error:
-            assert str(path) in str(error), error
-            assert str(error).count(str(path)) == 1, error
-            print(path.name, "refused")
-"""
+# Each runs in a process of its own: a crash or a hang of a library must fail the test, not end it.
 
 
-def run_child(paths: list[Path], rounds: int = 1) -> list[str]:
-    """What became of each read, in a process with little memory."""
+def run_child(paths: list[Path], rounds: int = 0, seed: int = 0) -> dict[str, dict[str, int]]:
+    """How many reads of each file, or of damaged copies of it, were "read" and "refused"."""
     child = subprocess.run(
-        [sys.executable, "-c", CHILD.replace("ROUNDS", str(rounds)), str(MEMORY_BYTES), *map(str, paths)],
+        [sys.executable, "-m", "tests.support.damaged_files", str(rounds), str(seed), *map(str, paths)],
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=200,
     )
     assert child.returncode == 0, (child.returncode, child.stdout[-500:], child.stderr[-3000:])
-    return child.stdout.splitlines()
+    return json.loads(child.stdout)
 
 
 def some_events() -> np.ndarray:
@@ -82,7 +46,7 @@ def some_events() -> np.ndarray:
 def one_of_each(folder: Path) -> list[Path]:
     """A good file of every format."""
     events, paths = some_events(), []
-    for format in ("npz", "hdf5", "txt", "csv", "dat", "evt2", "evt3"):
+    for format in ("npz", "hdf5", "txt", "csv", "dat", "evt2", "evt3", "aedat4"):
         suffix = {"txt": ".txt", "csv": ".csv", "hdf5": ".h5"}.get(format, "")
         paths.append(folder / f"{format}{suffix}")
         write_events(paths[-1], events, 34, 34, format)
@@ -94,6 +58,7 @@ def one_of_each(folder: Path) -> list[Path]:
     paths.append(folder / "nmnist.bin")
     entries = [(x << 32 | y << 24 | t).to_bytes(5, "big") for x, y, t in zip(*columns, strict=True)]
     paths[-1].write_bytes(b"".join(entries))
+    paths += [es(folder / "es", events, 34, 34), metavision(folder / "metavision.h5", [ecf_chunk(0)])]
     halves = np.zeros((4, 2), "<u4")
     halves[:, 1] = [8 << 28, 1 << 28, 1 << 28 | 5, 0]
     halves[:, 0] = 7
@@ -107,12 +72,22 @@ def test_there_is_a_good_file_of_every_format(tmp_path):
     assert {read_events(path).format for path in paths} == set(FORMATS)
 
 
-def test_flipped_cut_and_scrambled_files_are_read_or_refused_by_name(tmp_path):
+def test_damaged_files_are_read_or_refused_by_name(tmp_path):
     paths = one_of_each(tmp_path)
-    results = run_child(paths, rounds=60)
-    assert len(results) == 60 * len(paths)
+    counts = run_child(paths, rounds=50)
     for path in paths:
-        assert results.count(f"{path.name} refused") > 15, path.name
+        assert sum(counts[path.name].values()) == 50
+        assert counts[path.name]["refused"] > 10, path.name
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("part", range(16))
+def test_a_million_damaged_files_are_read_or_refused_by_name(part, tmp_path):
+    paths = one_of_each(tmp_path)
+    rounds = 1 + 1_000_000 // 16 // len(paths)
+    counts = run_child(paths, rounds, seed=1 + part)
+    assert sum(map(sum, (count.values() for count in counts.values()))) > 1_000_000 // 16
 
 
 @pytest.mark.system
@@ -147,9 +122,40 @@ def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
             out.write(np.full(1 << 20, 0x4FFF, "<u2").tobytes())
     names = [bomb, shape, declared, sparse, line, vectors]
     assert all(path.stat().st_blocks * 512 < 1 << 28 for path in names)
-    assert run_child(names) == [f"{path.name} refused" for path in names]
+    assert run_child(names) == {path.name: {"read": 0, "refused": 1} for path in names}
     for path in names:
         path.unlink()
+
+
+@pytest.mark.parametrize("format", ["es", "floats", *WRITERS])
+def test_reading_takes_no_more_memory_than_stated(format, tmp_path):
+    events, path = np.tile(some_events(), 200), tmp_path / f"a.{format}"
+    events["t"] = np.arange(len(events)) ^ 1  # half of them late
+    ordered = events[np.argsort(events["t"])]
+    if format == "es":
+        es(path, ordered, 34, 34)
+    elif format == "floats":
+        columns = {name: np.where(events[name] < 0, 0, events[name]).astype(np.float64) for name in "txyp"}
+        np.savez(tmp_path / "a", **columns)
+        path = tmp_path / "a.npz"
+    else:
+        write_events(path, ordered, 34, 34, format)
+    if format == "dat":
+        head, body = path.read_bytes()[: -8 * len(events)], path.read_bytes()[-8 * len(events) :]
+        path.write_bytes(head + np.frombuffer(body, "<u8").reshape(-1, 2)[:, ::-1].tobytes())
+    arguments = {
+        "format": "txt" if format == "csv" else None,
+        "time_unit": "us" if format == "floats" else None,
+    }
+    read_events(path, **arguments)  # imports what it needs
+    tracemalloc.start()
+    try:
+        assert len(read_events(path, **arguments).events) == len(events)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    each = 50 if format in ("es", "dat", "evt2", "evt3") else 80
+    assert peak < each * len(events) + (1 << 20)
 
 
 @pytest.mark.parametrize("format", [None, *FORMATS])

@@ -1,4 +1,5 @@
 import os
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -101,7 +102,9 @@ def test_more_than_a_file_of_this_size_could_hold_is_refused_before_it_is_read(r
             for column in "txyp":  # nothing of it is stored
                 file.create_dataset(f"events/{column}", (10**8,), "i8", chunks=(1024,), **options)
         assert path.stat().st_size < 1 << 16
-        for read in (read_recording, read_events):
+        with pytest.raises(ValueError, match="at most 10000000 are read"):
+            read_events(path)
+        for read in (read_recording, partial(read_events, max_events=10**8)):
             with pytest.raises(ValueError, match="events/t declares 800000000 bytes in a file of"):
                 read(path)
     same = np.zeros(1 << 20, EVENT)  # packs as well as events can
@@ -155,6 +158,20 @@ def test_a_recording_is_an_event_file_too_and_says_its_sensor(recording, tmp_pat
     file = read_events(tmp_path / "a.h5")
     assert (file.width, file.height) == (64, 65)
     assert file.events.tobytes() == recording.events.tobytes()
+
+
+@pytest.mark.parametrize("offset", [0.5, np.nan, np.inf, -np.inf])
+def test_an_offset_that_is_no_whole_microsecond_is_refused(offset, tmp_path):
+    path = dsec(tmp_path / "a.h5")
+    for value in (offset, 10.0):
+        with h5py.File(path, "a") as file:
+            del file["t_offset"]
+            file["t_offset"] = value
+        if value == 10.0:
+            assert read_events(path).events["t"].tolist() == [10, 15, 15]
+        else:
+            with pytest.raises(ValueError, match=r"a\.h5"):
+                read_events(path)
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,8 @@ def test_what_is_written_is_read(tmp_path_factory, suffix, seed, count, until_us
     path = tmp_path_factory.mktemp("a") / f"events.{suffix}"
     events = some_events(seed, count, until_us)
     write_events(path, events, 346, 260)
-    back = read_events(path)
+    size = {"width": 346, "height": 260} if suffix == "csv" else {}  # the only one that does not say
+    back = read_events(path, **size)
     assert back.events.tobytes() == events.tobytes()
     assert (back.width, back.height, back.late, back.skipped) == (346, 260, 0, 0)
     once = path.read_bytes()
@@ -106,6 +107,47 @@ def test_numpy_reads_what_is_written(tmp_path):
         assert np.array_equal(stored[name], events[name])
         assert np.array_equal(rows[:, place], events[name])
     assert "# columns: t x y p\n" in (tmp_path / "a.txt").read_text()
+
+
+def test_pandas_reads_csv_without_options(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    events = some_events(0, 100, 10**6)
+    write_events(tmp_path / "a.csv", events, 346, 260)
+    table = pandas.read_csv(tmp_path / "a.csv")
+    assert list(table.columns) == ["t_us", "x", "y", "p"]
+    for name, column in zip(TXYP, table.columns, strict=True):
+        assert np.array_equal(table[column], events[name])
+
+
+def test_the_callers_columns_take_the_place_of_those_of_the_file(tmp_path):
+    (tmp_path / "a.csv").write_text("t,x@320,y@240,on\n1000,2,3,1\n2000,4,5,0\n")
+    with pytest.raises(ValueError, match="does not name the column 'x'"):
+        read_events(tmp_path / "a.csv", time_unit="us")
+    file = read_events(tmp_path / "a.csv", columns=TXYP, time_unit="us")
+    assert file.events.tolist() == [(1000, 2, 3, 1), (2000, 4, 5, -1)]
+    (tmp_path / "b.txt").write_text("# columns: x y p t\n# time_unit: us\n2 3 1 1000\n")
+    assert read_events(tmp_path / "b.txt", columns=("y", "x", "p", "t")).events.tolist() == [(1000, 3, 2, 1)]
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path):
+    for text in ("t_us,x,y,p\n1000,2,3,1\n", "# columns: t x y p\n# time_unit: us\n1000 2 3 1\n"):
+        (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf" + text.encode())
+        assert read_events(tmp_path / "a.txt").events.tolist() == [(1000, 2, 3, 1)]
+    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf1000 2 3 1\n")
+    assert read_events(tmp_path / "a.txt", columns=TXYP, time_unit="us").events.tolist() == [(1000, 2, 3, 1)]
+
+
+def test_a_first_line_of_two_numbers_is_the_size_that_e2vid_writes(tmp_path):
+    (tmp_path / "a.txt").write_text("240 180\n0.001 2 3 1\n0.002 4 5 0\n")
+    file = read_events(tmp_path / "a.txt")
+    assert (file.width, file.height) == (240, 180)
+    assert file.events.tolist() == [(1000, 2, 3, 1), (2000, 4, 5, -1)]
+    assert read_events(tmp_path / "a.txt", time_unit="ms").events["t"].tolist() == [1, 2]
+    assert read_events(tmp_path / "a.txt", columns=("t", "y", "x", "p")).events["x"].tolist() == [3, 5]
+    (tmp_path / "b.txt").write_text("240 180\n")
+    assert len(read_events(tmp_path / "b.txt").events) == 0
+    with pytest.raises(ValueError, match="says width=240 and the caller says 320"):
+        read_events(tmp_path / "a.txt", width=320)
 
 
 @pytest.mark.parametrize(
@@ -188,6 +230,15 @@ def test_npz_times_are_integers_of_microseconds_or_have_a_unit(tmp_path):
         read_events(seconds)
 
 
+def test_short_floats_and_integers_of_an_npz_file_do_not_overflow(tmp_path):
+    half = {name: np.array([0, 1.5 if name == "t" else 1], np.float16) for name in TXYP}
+    file = read_events(save(tmp_path / "a.npz", **half), time_unit="s")
+    assert file.events.tolist() == [(0, 0, 0, -1), (1_500_000, 1, 1, 1)]
+    for kind in (np.float16, np.float32, np.int8, np.uint64):
+        path = save(tmp_path / "b.npz", t=np.array([100, 120], kind), x=np.array([1, 2], kind))
+        assert read_events(path, time_unit="ms").events["t"].tolist() == [100_000, 120_000]
+
+
 @pytest.mark.parametrize("p", [[0, 1], [-1, 1], [False, True], [0.0, 1.0]])
 def test_both_codes_of_polarity_are_understood_in_every_type(p, tmp_path):
     assert read_events(save(tmp_path / "a.npz", p=p)).events["p"].tolist() == [-1, 1]
@@ -204,6 +255,7 @@ def test_both_codes_of_polarity_are_understood_in_every_type(p, tmp_path):
         ({"x": [0, -1]}, "x must lie in"),
         ({"width": 1, "height": 5}, "x=1 outside the sensor of 1x5"),
         ({"width": [1, 2]}, "array width"),
+        ({"width": "wide"}, "is no readable npz file"),
         ({"time_unit": "weeks"}, "does not say the unit"),
     ],
 )
@@ -272,6 +324,21 @@ def test_an_array_that_unpacks_to_more_than_it_declares_takes_no_memory(tmp_path
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 22
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (2,), ",  # numpy raises tokenize.TokenError
+        "{'descr': ('<i8',), 'fortran_order': False, 'shape': (2,), }",
+        "{'descr': ['a'], 'fortran_order': False, 'shape': (2,), }",
+        "[" * 300,
+    ],
+)
+def test_a_header_that_numpy_cannot_parse_is_refused_by_name(header, tmp_path):
+    body = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + bytes(16)
+    with pytest.raises(ValueError, match=r"a\.npz: array t has no sound header"):
+        read_events(zipped(tmp_path / "a.npz", {f"{name}.npy": body for name in TXYP}))
 
 
 def test_an_array_without_a_sound_header_and_a_missing_one_are_refused(tmp_path):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from envs.events import EVENT
 from envs.recordings import read_events, write_events
-from envs.recordings.event_file import Request, finish, unwrap
+from envs.recordings.event_file import Request, finish, unwrap, usual_events
 from envs.recordings.evt_decoders import decode_dat, decode_evt3
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
@@ -19,9 +19,32 @@ OFF, ON, TIME_HIGH, TRIGGER, VENDOR = 0, 1, 8, 10, 14
 RESERVED = (1, 9, 11, 12, 13)  # types of words that EVT 3.0 does not have
 
 
+def slow_clock(highs: list[int], step_us: int, count: int) -> list[int | None]:
+    """Times of the high parts of a clock with so many of them, None for the stray ones."""
+
+    def turned(value: int, now_us: int) -> int:
+        turns, last = divmod(now_us // step_us, count)
+        return (turns + (last - value > count // 2)) * count * step_us + value * step_us
+
+    times, now_us = [], None
+    for i, value in enumerate(highs):
+        if now_us is None:
+            t_us = value * step_us
+            before = [v < value and abs(t_us - turned(v, t_us)) > 1e6 for v in highs[i + 1 : i + 3]]
+            stray = bool(before) and all(before)
+        else:
+            t_us = turned(value, now_us)
+            near = any(abs(turned(later, now_us) - now_us) <= 1e6 for later in highs[i + 1 : i + 17])
+            stray = abs(t_us - now_us) > 1e6 and near
+        times.append(None if stray else t_us)
+        now_us = now_us if stray else t_us
+    return times
+
+
 def slow_evt3(words: list[int]) -> list[tuple[int, int, int, int]]:  # noqa: C901
     """The published table, one word at a time, written without a look at the kernel."""
-    events, row, base, time, turns, high, low = [], None, None, None, 0, None, 0
+    events, row, base, time, low = [], None, None, None, 0
+    times = iter(slow_clock([word % 4096 for word in words if word // 4096 == 0x8], 4096, 4096))
     for word in words:
         kind, value = divmod(word, 4096)
         if kind == 0x0:
@@ -31,44 +54,59 @@ def slow_evt3(words: list[int]) -> list[tuple[int, int, int, int]]:  # noqa: C90
         elif kind == 0x6:
             low = value
         elif kind == 0x8:
-            if high is not None and high - value > 2048:
-                turns += 1
-            if value != high:
-                low = 0
-            high = value
-        if high is not None:
-            time = turns * 2**24 + high * 4096 + low
+            later = next(times)
+            low = low if later in (None, time) else 0
+            time = time if later is None else later
         length = {0x2: 1, 0x4: 12, 0x5: 8}.get(kind, 0)
         for bit in range(length):
             if (kind == 0x2 or (value >> bit) % 2) and None not in (time, row, base):
-                events.append((time, base[0] + bit, row, base[1]))
+                events.append((time + low, base[0] + bit, row, base[1]))
         if kind in (0x4, 0x5) and base is not None:
             base[0] += length
     return events
 
 
+def first_beyond(words: list[int]) -> int:
+    """Index of the first vector of EVT 3.0 that reaches beyond 2048 columns, or -1."""
+    x = 0
+    for i, word in enumerate(words):
+        kind, value = divmod(word, 4096)
+        length = {0x4: 12, 0x5: 8}.get(kind, 0)
+        if any(value >> bit & 1 and x + bit >= 2048 for bit in range(length)):
+            return i
+        x = value % 2048 if kind in (0x2, 0x3) else x + length
+    return -1
+
+
 def slow_evt2(words: list[int], width: int = 1) -> list[tuple[int, int, int, int]]:
     """EVT 2.0 (width 1), or EVT 2.1 as (upper half, mask) pairs (width 32)."""
-    events, high, turns = [], None, 0
-    for word in words:
-        upper, mask = (word, 1) if width == 1 else word
+    pairs = [(word, 1) if width == 1 else word for word in words]
+    highs = [upper % 2**28 for upper, _ in pairs if upper // 2**28 == TIME_HIGH]
+    events, time, times = [], None, iter(slow_clock(highs, 64, 2**28))
+    for upper, mask in pairs:
         kind = upper // 2**28
         if kind == TIME_HIGH:
-            value = upper % 2**28
-            if high is not None and high - value > 2**27:
-                turns += 1
-            high = value
-        elif kind in (OFF, ON) and high is not None:
-            time = turns * 2**34 + high * 64 + upper // 2**22 % 64
+            later = next(times)
+            time = time if later is None else later
+        elif kind in (OFF, ON) and time is not None:
             for bit in range(width):
                 if mask >> bit & 1:
-                    events.append((time, upper // 2**11 % 2**11 + bit, upper % 2**11, 2 * kind - 1))
+                    t_us = time + upper // 2**22 % 64
+                    events.append((t_us, upper // 2**11 % 2**11 + bit, upper % 2**11, 2 * kind - 1))
     return events
 
 
 def raw(path: Path, words: np.ndarray, header: str) -> Path:
     path.write_bytes(f"% {header}\n% end\n".encode() + words.tobytes())
     return path
+
+
+def words3(*words: int) -> bytes:
+    return b"% evt 3.0\n" + np.array(words, "<u2").tobytes()
+
+
+# The last of 32 pixels from x = 2017 on.
+EVT21_BEYOND = b"% format EVT21;\n" + np.array([0, 8 << 28, 1 << 31, 1 << 28 | 2017 << 11], "<u4").tobytes()
 
 
 def tuples(events: np.ndarray) -> list[tuple[int, int, int, int]]:
@@ -119,8 +157,10 @@ def test_evt3_words_in_any_order_decode_as_by_the_published_table(seed, tmp_path
     clock = np.flatnonzero(rng.random(3000) < 0.05)  # a clock that goes round and round
     words[clock] = 0x8000 | np.arange(len(clock)) * (40 + 20 * seed) & 0xFFF
     words[words >> 12 == 6] &= 0xF07F  # no way back of more than a second in a test of 4 ms steps
+    while (place := first_beyond(words.tolist())) >= 0:
+        words[place] &= 0xF000
     expected = sorted(slow_evt3(words.tolist()), key=lambda event: event[0])
-    found = read_events(raw(tmp_path / "a.raw", words, "format EVT3;height=2048;width=4096"))
+    found = read_events(raw(tmp_path / "a.raw", words, "format EVT3;height=2048;width=2048"))
     assert tuples(found.events) == expected
     assert len(expected) > 3000
 
@@ -133,12 +173,15 @@ def test_any_evt3_words_give_the_events_the_skipped_ones_and_the_bad_word_of_the
     kinds = rng.choice([0, 2, 3, 4, 5, 6, 7, 8, 8, 10, 14, *RESERVED[: 2 * bad_words]], length)
     array = (kinds << 12 | rng.integers(0, 4096, length) & rng.choice([1, 4095], length)).astype("<u2")
     words = array.tolist()
-    count, skipped, bad = decode_evt3(array, np.empty(0, EVENT))
+    count, skipped, _, bad = decode_evt3(array, np.empty(0, EVENT))
     assert bad == next((i for i, word in enumerate(words) if word >> 12 in RESERVED), -1)
     if bad < 0:
         events, expected = np.empty(count, EVENT), slow_evt3(words)
-        decode_evt3(array, events)
-        assert tuples(events) == expected
+        beyond = decode_evt3(array, events)[3]
+        assert beyond in (-1, first_beyond(words))
+        if beyond < 0:
+            assert tuples(events) == expected
+            assert all(x < 2048 for _, x, _, _ in expected)
         masks = {0x2: lambda _: 1, 0x4: lambda value: value, 0x5: lambda value: value % 256}
         entries = [masks[word >> 12](word % 4096) for word in words if word >> 12 in masks]
         assert count + skipped == sum(mask.bit_count() for mask in entries)
@@ -165,6 +208,7 @@ def test_evt21_vectors_decode_as_by_the_published_table_in_both_orders_of_halves
     rng = np.random.default_rng(1)
     uppers = (rng.choice([OFF, ON, TRIGGER, VENDOR], 500) << 28 | rng.integers(0, 2**28, 500)).astype("<u4")
     masks = rng.integers(0, 2**32, 500, dtype="<u4")
+    uppers &= ~np.uint32(1 << 21)  # x below 1024: no vector reaches beyond the last column
     clock = np.arange(5, 500, 20)  # the first words have no time
     uppers[clock] = TIME_HIGH << 28 | np.arange(2**28 - 10, 2**28 - 10 + len(clock)) & 2**28 - 1
     halves = (uppers, masks) if endianness == "legacy" else (masks, uppers)
@@ -278,6 +322,9 @@ def test_the_size_of_the_sensor_is_what_the_header_says(header, size, tmp_path):
     ("content", "format", "rule"),
     [
         (b"% evt 3.0\n\x00", None, "is truncated"),
+        (words3(0x8000, 0, 0x3000 | 2037, 0x4800), None, "word 3 is of no type .* or lies beyond its 2048"),
+        (words3(0x8000, 0, 0x3000 | 2030, 0x4000, 0x5000, 0x5001), None, "word 5 is of no type"),
+        (EVT21_BEYOND, None, "word 1 is of no type"),
         (b"% evt 3.0\n\x00\x10", None, "word 0 is of no type"),
         (b"% evt 2.0\n\x00\x00\x00\x20", None, "word 0 is of no type"),
         (b"% evt 4.0\n", None, "encoded as '4.0'"),
@@ -317,7 +364,7 @@ def test_times_a_little_out_of_order_are_sorted_and_a_reset_clock_is_refused(tmp
     assert tuples(file.events) == [(4096, 1, 1, -1), (8192, 2, 1, -1), (12288, 3, 1, -1), (12288, 3, 1, -1)]
     assert file.late == 1
     with pytest.raises(ValueError, match="reset clock or damage"):
-        read_events(raw(tmp_path / "b.raw", words(1, 300, 2), "evt 3.0"))
+        read_events(raw(tmp_path / "b.raw", words(300, 301, 2, 3), "evt 3.0"))
 
 
 @given(steps_us=st.lists(st.integers(-400, 500), min_size=1, max_size=50))
@@ -328,6 +375,85 @@ def test_late_events_are_counted_and_sorted_in_with_ties_in_the_order_of_the_fil
     file = finish(Request(Path("a"), 640, 480), "evt3", events)
     assert file.late == sum(t < max(t_us[: i + 1]) for i, t in enumerate(t_us))
     assert tuples(file.events) == sorted(tuples(events), key=lambda event: event[0])
+
+
+METAVISION_DAT = b"% Height 720\n% Version 2\n% Width 1280\n% date 2026-11-22 10:11:12\n% end\n"
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        METAVISION_DAT,
+        METAVISION_DAT.replace(b"% end\n", b""),
+        b"% date 2026-11-22 10:11:12\n% geometry 1280x720\n" + METAVISION_DAT,
+        b"% Data file containing Event2D events.\n% Version 2\n% Height 720\n% Width 1280\n",
+    ],
+)
+@pytest.mark.parametrize(("name", "format"), [("a.dat", None), ("a", None), ("a", "dat")])
+def test_the_headers_of_metavisions_dat_files_are_read(head, name, format, tmp_path):
+    words = np.array([(5, 1279 | 719 << 14 | 1 << 28)], [("t", "<u4"), ("data", "<u4")])
+    (tmp_path / name).write_bytes(head + bytes((12, 8)) + words.tobytes())
+    file = read_events(tmp_path / name, format)
+    assert (file.format, file.width, file.height) == ("dat", 1280, 720)
+    assert file.events.tolist() == [(5, 1279, 719, 1)]
+
+
+@pytest.mark.parametrize("format", ["evt2", "evt3"])
+@given(seed=st.integers(0, 2**32 - 1), flips=st.integers(1, 3), first=st.booleans())
+@settings(max_examples=40)
+def test_a_flipped_time_is_counted_and_moves_no_event_by_a_turn(tmp_path_factory, format, seed, flips, first):
+    """Whatever bits of high parts flip: the file is refused, or all is near where it was."""
+    rng, path = np.random.default_rng(seed), tmp_path_factory.mktemp("a") / "events.out"
+    events = some_events(seed, 4000, 640, 480, 3_000_000)
+    events["t"] += rng.integers(0, 10_000_000)
+    write_events(path, events, 640, 480, format)
+    step_us, width, word = (64, 28, "<u4") if format == "evt2" else (4096, 12, "<u2")
+    head = path.read_bytes().partition(b"% end\n")[0] + b"% end\n"
+    words = np.frombuffer(path.read_bytes()[len(head) :], word).copy()
+    highs = np.flatnonzero(words >> width == 8)
+    # Damage of far bits, in places apart from each other; a flip by less is disorder.
+    far = np.arange(int(np.log2(1e6 / step_us)) + 1, width)
+    places = highs[rng.choice(np.arange(0 if first else 1, len(highs) - 1), flips, replace=False)]
+    words[places] ^= (1 << rng.choice(far, flips)).astype(word)
+    path.write_bytes(head + words.tobytes())
+    file = read_events(path)
+    moved_us = np.sort(file.events["t"]) - events["t"]
+    later_flip = not first or highs[0] not in places
+    assert file.strays == flips or not later_flip
+    if later_flip:
+        assert np.abs(moved_us).max() <= 5000 * flips + 50_000 * (format == "evt2")
+    assert len(file.events) == len(events) - file.skipped
+
+
+def test_a_stray_time_of_a_recording_moves_nothing_after_it(tmp_path):
+    def words(*highs: int) -> np.ndarray:
+        triples = [(0x8000 | high, 1, 0x2000 | n) for n, high in enumerate(highs)]
+        return np.array(triples, "<u2").ravel()
+
+    for wrong in (4000, 3000, 2056, 700):
+        file = read_events(raw(tmp_path / "a.raw", words(6, 7, wrong, 8, 9), "evt 3.0"))
+        assert file.events["t"].tolist() == [4096 * high for high in (6, 7, 7, 8, 9)]
+        assert (file.strays, file.late, file.skipped) == (1, 0, 0)
+    file = read_events(raw(tmp_path / "a.raw", words(3000, 6, 7, 8), "evt 3.0"))  # the first of all
+    assert file.events["t"].tolist() == [4096 * high for high in (6, 7, 8)]
+    assert (file.strays, file.skipped) == (1, 1)
+    gap = read_events(raw(tmp_path / "a.raw", words(6, 7, 1000, 1001, 1002), "evt 3.0"))
+    assert gap.events["t"].tolist() == [4096 * high for high in (6, 7, 1000, 1001, 1002)]
+    turn = read_events(raw(tmp_path / "a.raw", words(4094, 4095, 0, 1), "evt 3.0"))
+    assert turn.events["t"].tolist() == [4096 * high for high in (4094, 4095, 4096, 4097)]
+    assert gap.strays == turn.strays == 0
+
+
+def test_a_file_may_hold_two_events_for_each_byte_unless_the_caller_allows_more(tmp_path):
+    assert usual_events(5) == usual_events(5_000_000) == 10_000_000
+    assert usual_events(9_400_000) == 18_800_000
+    assert usual_events(1 << 33) == 100_000_000
+    words = np.full(4_000_000, 0x4FFF, "<u2")  # 24 MB that would be 24 million events
+    words[:3], words[3::100] = [0x8000, 1, 0x3000], 0x3000
+    path = raw(tmp_path / "a.raw", words, "evt 3.0")
+    with pytest.raises(ValueError, match="at most max_events=16000032 are read; raise max_events"):
+        read_events(path)
+    path.unlink()
 
 
 def test_more_events_than_asked_for_are_refused_before_memory_is_taken(tmp_path):
