@@ -24,6 +24,7 @@ from jobs.config.schema import (
     AlgoConfig,
     ClusterConfig,
     CollectConfig,
+    DemoConfig,
     EvaluateConfig,
     Name,
     PretrainConfig,
@@ -63,6 +64,7 @@ class Config:
     env: EnvConfig
     model: Model
     algo: AlgoConfig
+    demo: DemoConfig
     collect: CollectConfig
     pretrain: PretrainConfig
     train: TrainConfig

@@ -73,6 +73,13 @@ class AlgoConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class DemoConfig:
+    """Whose episode is shown: a name in models/pretrained, "newest", or a path."""
+
+    policy: Name
+
+
+@dataclass(frozen=True, config=STRICT)
 class CollectConfig:
     """What the data set of the event VAE is made of; scenes and recordings get equal shares of the steps.
 
