@@ -29,6 +29,7 @@ from jobs.config.schema import (
     Name,
     PretrainConfig,
     ProbeConfig,
+    ReplayPageConfig,
     SweepConfig,
     TrackingConfig,
     TradeConfig,
@@ -65,6 +66,7 @@ class Config:
     model: Model
     algo: AlgoConfig
     demo: DemoConfig
+    replay_page: ReplayPageConfig
     collect: CollectConfig
     pretrain: PretrainConfig
     train: TrainConfig
@@ -188,6 +190,8 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
     yield "evaluate", HELD_OUT_SCENE
     for name in config.trade_simulator.scenes:
         yield "trade_simulator.scenes", name
+    for name in config.replay_page.scenes:
+        yield "replay_page.scenes", name
     for name in config.collect.scenes:
         yield "collect.scenes", name
     for condition in config.train.conditions:
