@@ -1,7 +1,7 @@
 """Write one page, which needs no server and no network, to scrub through recorded episodes of policies.
 
 Run: python -m platform.launch +exp=replay_page
-Expect: a minute or two. `replay/replay.html` in the run folder and in MLflow; `+exp=report` copies it into docs/.
+Expect: a minute or two. `replay/replay.html` in run folder and MLflow; `+exp=report` copies it to docs/.
 Each of `replay_page.policies` goes through the corridor of `seed` in each scene, at each rate, with each
 noise. The same settings give the same bytes.
 """

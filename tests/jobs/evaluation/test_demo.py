@@ -97,11 +97,16 @@ def test_a_film_opens_only_for_a_person_at_a_display(monkeypatch, tmp_path):
     started = []
     monkeypatch.setattr(demo.subprocess, "Popen", lambda words, **_: started.append(words))
     monkeypatch.setattr(demo.shutil, "which", lambda name: f"/bin/{name}")
-    monkeypatch.setattr(demo.sys.stdout, "isatty", lambda: True, raising=False)
+    at_terminal = []
+    monkeypatch.setattr(demo.sys.stdout, "isatty", lambda: bool(at_terminal), raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.delenv("DISPLAY", raising=False)
+    at_terminal.append(True)
+    demo.show(tmp_path)
+    monkeypatch.setenv("DISPLAY", ":0")
+    at_terminal.clear()
     demo.show(tmp_path)
     assert not started
-    monkeypatch.setenv("DISPLAY", ":0")
+    at_terminal.append(True)
     demo.show(tmp_path)
     assert started == [["/bin/xdg-open", str(tmp_path)]]
