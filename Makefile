@@ -26,7 +26,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak lint check bench docs lock clean
+.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak lint check bench docs lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -51,6 +51,9 @@ system-libraries: # OpenGL without a screen, for renderer=pyrender
 	    echo "renderer=pyrender needs OpenGL; install it with:"; \
 	    echo "    sudo apt-get install --no-install-recommends $(GL_PACKAGES)"; \
 	fi
+
+demo: setup ## watch a shipped policy: its result and a film, in less than a minute
+	$(LAUNCH) +exp=demo $(ARGS)
 
 bytestream: setup ## from nothing to an evaluated policy (15 minutes; ARGS="budget=smoke": a minute)
 	$(LAUNCH) +exp=bytestream $(ARGS)

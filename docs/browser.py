@@ -24,6 +24,7 @@ FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
     "--remote-debugging-pipe", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )  # fmt: skip
+ERRORS = ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded")
 PATIENCE_S = 300.0  # a busy machine takes minutes to start the server
 # What covers a quarter of each page until it is closed once.
 NO_ASSISTANT = "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')"
@@ -90,6 +91,7 @@ class Browser:
             os.close(end)
         self.size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.number, self.session, self.buffer = 0, None, b""
+        self.errors: list[str] = []  # that the pages have logged
 
     def close(self) -> None:
         """End it."""
@@ -113,6 +115,8 @@ class Browser:
                 self.buffer += read
             text, self.buffer = self.buffer.split(b"\0", 1)
             answer = json.loads(text)
+            if answer.get("method") in ERRORS and '"error"' in text.decode():
+                self.errors.append(text.decode())
             if answer.get("id") == self.number:
                 if "error" in answer:
                     raise RuntimeError(f"{method}: {answer['error']}")
@@ -123,7 +127,8 @@ class Browser:
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         self.call("Emulation.setDeviceMetricsOverride", **self.size)
-        self.call("Page.enable")
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
         self.call("Page.addScriptToEvaluateOnNewDocument", source=NO_ASSISTANT)
         self.call("Page.navigate", url=address)
         return self.shows(*texts)
@@ -159,6 +164,11 @@ class Browser:
         find = f"{every}.find(e => e.innerText === {json.dumps(text)})"
         wait_for(lambda: self.evaluate(f"!!{find}"), text)
         self.evaluate(f"{find}.click()")
+
+    def press(self, key: str) -> None:
+        """Press a key, such as "ArrowRight" or " "."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key)
 
     def picture(self) -> bytes:
         """What the window shows, as a PNG."""

@@ -13,6 +13,7 @@ html_theme = "furo"
 html_title = "Evade"
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_mock_imports = ["ray", "mlflow"]
+html_extra_path = ["replay.html"]  # written by commands, as the figures are
 exclude_patterns = ["_build"]
 
 

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
 from envs.scene import Scene
+from jobs.analysis.ground_plan import ground_plan
 from jobs.analysis.statistics import half_width
 from jobs.rollout.episodes import Trajectory
 
@@ -145,21 +146,14 @@ def plot_trajectories(tracks: Sequence[Trajectory]) -> Figure:
 def _draw_scene(panel: Axes, scene: Scene, height_m: float) -> None:
     """Draw walls, goal line and obstacles; the agent's right is down."""
     half = scene.width_m / 2
-    shapes = [_outline(section) for section in scene.sections(height_m)]
+    circles, corners = ground_plan(scene, height_m)
+    shapes: list[Patch] = [Circle((y, x), radius) for x, y, radius in circles]
+    shapes += [Polygon(own[:, ::-1]) for own in corners]
     panel.add_collection(PatchCollection(shapes, facecolor=MUTED, edgecolor=MUTED, lw=0.5, zorder=2))
     panel.hlines([-half, half], 0, scene.length_m, color=INK, lw=2)
     panel.vlines(scene.length_m, -half, half, color=GREEN, lw=1.5, ls=":")
     panel.set(xlim=(-2, scene.length_m + 2), ylim=(half + 1, -half - 1), aspect="equal", facecolor="#fafafa")
     panel.spines[:].set_visible(False)
-
-
-def _outline(section: np.ndarray) -> Patch:
-    """A section of `envs.scene.obstacles`, its y to the right and its x upwards."""
-    x, y, ux, uy, hx, hy, radius = section
-    if hx == 0.0 and hy == 0.0:
-        return Circle((y, x), radius)
-    corners = [(a * hx, b * hy) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return Polygon([(y + a * uy + b * ux, x + a * ux - b * uy) for a, b in corners])
 
 
 def _draw_trajectory(panel: Axes, track: Trajectory) -> None:

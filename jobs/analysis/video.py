@@ -29,6 +29,7 @@ class Film:
     part: Path
     control_hz: float
     decode: Decode | None
+    fps: float = FILM_FPS
     _writer: Generator[None, np.ndarray | None, None] | None = None
     _recent: list[np.ndarray | None] = field(default_factory=list)
     _frames: int = 0
@@ -49,9 +50,12 @@ class Film:
         if self.decode is not None:
             panels.append(("decoded from the latents", coloured(self.decode(window))))
         slower = self.control_hz / stride / FILM_FPS
-        picture = frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption)
+        self.add(frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption))
+
+    def add(self, picture: np.ndarray) -> None:
+        """Show a picture, uint8 (H, W, 3), all of one size; its sides are even."""
         if self._writer is None:
-            self._writer = _start_writer(self.part, picture)
+            self._writer = _start_writer(self.part, picture, self.fps)
         self._frames += 1
         try:
             self._writer.send(picture)
@@ -83,30 +87,31 @@ class Film:
 
 
 @contextlib.contextmanager
-def open_film(path: Path, control_hz: float, decode: Decode | None) -> Iterator[Film]:
+def open_film(path: Path, control_hz: float, decode: Decode | None, fps: float = FILM_FPS) -> Iterator[Film]:
     """Write an MP4 file of one episode: luminance, events if there are any, what the latents hold if decoded.
 
-    Frames are `FRAMES_PER_FLIGHT_S` per second of flight, played `FILM_FPS` per second. The file is
-    written whole or not at all.
+    Frames of `Film.step` are `FRAMES_PER_FLIGHT_S` per second of flight. The file is written whole or not
+    at all.
 
     Args:
         path: The file.
         control_hz: Control steps per second of flight [Hz].
         decode: Event window -> picture in [-1, 1], float (H, W), of a third panel; None: there is none.
+        fps: Frames that are played per second [Hz].
     """
     with replaced(path) as part:
-        with contextlib.closing(Film(part, control_hz, decode)) as film:
+        with contextlib.closing(Film(part, control_hz, decode, fps)) as film:
             yield film
         film.check()
 
 
-def _start_writer(part: Path, picture: np.ndarray) -> Generator[None, np.ndarray | None, None]:
+def _start_writer(part: Path, picture: np.ndarray, fps: float) -> Generator[None, np.ndarray | None, None]:
     """Start the ffmpeg program that imageio-ffmpeg brings, for frames of the size of `picture`."""
     size = (picture.shape[1], picture.shape[0])
     look = {"codec": "libx264", "quality": QUALITY, "macro_block_size": 2}
     mp4 = ["-f", "mp4"]  # the name of a file that is not whole yet does not say so
     writer = imageio_ffmpeg.write_frames(
-        str(part), size, fps=FILM_FPS, ffmpeg_log_level="error", output_params=mp4, **look
+        str(part), size, fps=fps, ffmpeg_log_level="error", output_params=mp4, **look
     )
     writer.send(None)
     return writer
@@ -114,7 +119,11 @@ def _start_writer(part: Path, picture: np.ndarray) -> Generator[None, np.ndarray
 
 def last_polarity(events: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The last polarity of each pixel, -1, 0 or +1, (H, W); events in time order."""
-    image = event_image(events, shape[1], shape[0])
+    return signs(event_image(events, shape[1], shape[0]))
+
+
+def signs(image: np.ndarray) -> np.ndarray:
+    """An event image as polarities -1, 0 or +1, of the same shape."""
     return np.select([image == GREY_ON, image == GREY_OFF], [1, -1])
 
 

@@ -24,10 +24,12 @@ from jobs.config.schema import (
     AlgoConfig,
     ClusterConfig,
     CollectConfig,
+    DemoConfig,
     EvaluateConfig,
     Name,
     PretrainConfig,
     ProbeConfig,
+    ReplayPageConfig,
     SweepConfig,
     TrackingConfig,
     TradeConfig,
@@ -63,6 +65,8 @@ class Config:
     env: EnvConfig
     model: Model
     algo: AlgoConfig
+    demo: DemoConfig
+    replay_page: ReplayPageConfig
     collect: CollectConfig
     pretrain: PretrainConfig
     train: TrainConfig
@@ -187,6 +191,8 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
     yield "evaluate", HELD_OUT_SCENE
     for name in config.trade_simulator.scenes:
         yield "trade_simulator.scenes", name
+    for name in config.replay_page.scenes:
+        yield "replay_page.scenes", name
     for name in config.collect.scenes:
         yield "collect.scenes", name
     for key, conditions in (

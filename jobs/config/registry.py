@@ -26,6 +26,8 @@ JOBS = {
         "Policies at other rates and thresholds, in other worlds, with sensor faults",
     ),
     "report": Job("jobs.reporting.report", "The page of results, written from the newest sweep"),
+    "demo": Job("jobs.evaluation.demo", "A film of one episode of a policy"),
+    "replay_page": Job("jobs.reporting.replay_page", "A page to scrub through recorded episodes"),
     "ship": Job("jobs.reporting.publish", "The trained policies of models/pretrained, and how they learnt"),
     "trade": Job("jobs.studies.trade.trade", "What exactness costs from end to end"),
     "trade_simulator": Job("jobs.studies.simulator", "What exact events cost"),

@@ -73,6 +73,30 @@ class AlgoConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class DemoConfig:
+    """Whose episode is shown: a name in models/pretrained, "newest", or a path."""
+
+    policy: Name
+
+
+@dataclass(frozen=True, config=STRICT)
+class ReplayPageConfig:
+    """The episodes of the replay page: each policy in each scene, at each rate, with each noise.
+
+    Attributes:
+        policies: Each a name in models/pretrained, "newest", or a path.
+        scenes: Layouts.
+        background_activity: False events per true event.
+        control_hz: Actions per second [Hz].
+    """
+
+    policies: Annotated[list[Name], Field(min_length=1, max_length=4)]
+    scenes: Annotated[list[Name], Field(min_length=1, max_length=4)]
+    background_activity: Annotated[list[NonNegative], Field(min_length=1, max_length=4)]
+    control_hz: Annotated[list[Positive], Field(min_length=1, max_length=4)]
+
+
+@dataclass(frozen=True, config=STRICT)
 class CollectConfig:
     """What the data set of the event VAE is made of; scenes and recordings get equal shares of the steps.
 

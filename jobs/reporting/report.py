@@ -1,8 +1,9 @@
-"""Write docs/results.md from a finished sweep, and docs/trade.md from a finished trade.
+"""Copy finished studies into docs/: a sweep as results.md, a trade as trade.md, a replay page as replay.html.
 
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
-docs/images/trade.png of the newest trade; with `resume` of what that run folder holds.
+docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page; with `resume` of what
+that run folder holds.
 """
 
 import csv
@@ -28,6 +29,7 @@ from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
 from jobs.reporting.learning_curves import mean_success, read_curves
 from jobs.reporting.paper_claims import CLAIMS, GAIN, LEARNT, Claim, Finding, judge, judge_learning
+from jobs.reporting.replay_page import PAGE
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.checkpoints import sha256
@@ -60,13 +62,17 @@ SweptEpisodes = dict[
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Write the results of the newest sweep and trade, or of those in the run folder `resume`, into docs/.
+    """Write the newest sweep, trade and replay page, or those in the run folder `resume`, into docs/.
 
     Raises:
         ConfigError: If there is neither.
     """
     # In this order: the page of a sweep shows the plot of the trade.
-    writers: dict[str, Callable[[Path, Path], Path]] = {"trade": write_trade, "sweep": write_results}
+    writers: dict[str, Callable[[Path, Path], Path]] = {
+        "trade": write_trade,
+        "sweep": write_results,
+        "replay": write_replay,
+    }
     found = {name: find_study(config, name) for name in writers}
     if not any(found.values()):
         where = config.resume or config.runs_dir
@@ -84,7 +90,7 @@ def find_study(config: Config, name: str) -> Path | None:
 
     Args:
         config: The experiment.
-        name: "sweep" or "trade".
+        name: "sweep", "trade" or "replay".
     """
     where = Path(config.runs_dir).glob("*") if config.resume is None else [Path(config.resume)]
     found = [path for path in (run / name / "about.json" for run in where) if path.is_file()]
@@ -106,6 +112,12 @@ def write_trade(trade: Path, docs: Path) -> Path:
     copy_small(trade / "images" / "trade.png", docs / "images" / "trade.png")
     write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
     return docs / "trade.md"
+
+
+def write_replay(replay: Path, docs: Path) -> Path:
+    """Copy a replay page from the folder that the job has left in its run folder; return the file."""
+    write_atomic(docs / PAGE, (replay / PAGE).read_bytes())
+    return docs / PAGE
 
 
 def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Path:

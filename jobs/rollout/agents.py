@@ -92,7 +92,13 @@ class RandomAgent:
 
 
 class PolicyAgent:
-    """A trained policy; it sees its observation alone."""
+    """A trained policy; it sees its observation alone.
+
+    Attributes:
+        logits: What it chose its last actions by, float64 (B, actions).
+    """
+
+    logits: np.ndarray
 
     def __init__(self, policy: "Policy", stochastic: bool = False) -> None:
         """Take the policy's likeliest action, or draw one from its distribution as in training."""
@@ -106,7 +112,7 @@ class PolicyAgent:
 
     def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
         """Actions (B,); draws come from each episode's own stream."""
-        logits = self.policy.logits(observations).astype(np.float64)
+        self.logits = logits = self.policy.logits(observations).astype(np.float64)
         if not self.stochastic:
             return logits.argmax(axis=1)
         gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])

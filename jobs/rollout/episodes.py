@@ -168,14 +168,15 @@ class TrajectoryRecorder:
 
     def trajectories(self, agent: str, episodes: np.ndarray) -> list[Trajectory]:
         """The trajectories, with the outcomes of their EPISODE rows."""
-        outcomes = {int(episode["seed"]): _outcome(episode) for episode in episodes}
+        outcomes = {int(episode["seed"]): outcome_of(episode) for episode in episodes}
         return [
             Trajectory(agent, seed, self._scenes[seed], np.array(points), outcomes[seed], self._height_m)
             for seed, points in self._points.items()
         ]
 
 
-def _outcome(episode: np.void) -> str:
+def outcome_of(episode: np.void) -> str:
+    """How an EPISODE () ended: "goal", "collision" or "time limit"."""
     if episode["success"]:
         return "goal"
     return "collision" if episode["collision"] else "time limit"

@@ -129,6 +129,20 @@ def find_policies(
     return [read_policy(str(path)) for path in trainings]
 
 
+def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedPolicy:
+    """The one trained policy that a name stands for; arguments as `find_policies`.
+
+    Raises:
+        ConfigError: If there is no such policy, or the name stands for several or for a baseline.
+    """
+    found = find_policies(key, name, config, run)
+    if len(found) > 1 or found[0].training is None:
+        names = ", ".join(Path(policy.agent).name for policy in found if policy.training is not None)
+        one_of = f", such as one of {names}" if names else ""
+        raise ConfigError(f"{key}: must be one trained policy{one_of}, got {name!r}")
+    return found[0]
+
+
 def find_sweep_policies(
     config: Config, run: Run, pretrained: Path = PRETRAINED
 ) -> tuple[EvaluatedPolicy, ...]:

@@ -15,8 +15,8 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # `+exp=NAME` and words behind it, up to what ends a command on a page.
 WORD = r"(?:'[^']*'|\"[^\"]*\"|[^\s`#|;)'\"])+"
 LAUNCHED = re.compile(rf"(?<!\w)(\+exp=[a-z_]+(?:[ \t]+(?=[\w.~'\"]+[=.]){WORD})*)")
-MADE = {"bytestream": "+exp=bytestream", "sweep-robustness": "+exp=robustness"}
-ARGS = re.compile(r"make (bytestream|sweep-robustness)(?: train=true)? ARGS=\"([^\"]*)\"")
+MADE = {"bytestream": "+exp=bytestream", "sweep-robustness": "+exp=robustness", "demo": "+exp=demo"}
+ARGS = re.compile(r"make (bytestream|sweep-robustness|demo)(?: train=true)? ARGS=\"([^\"]*)\"")
 NAMES = re.compile(r"`((?:envs|models|jobs)(?:\.\w+)+)`")
 
 

@@ -80,7 +80,8 @@ def test_importing_the_rooms_is_light():
 
 
 TARGETS = (
-    *("setup", "bytestream", "train-all", "sweep-robustness", "mlflow", "lint", "check", "bench", "docs"),
+    *("setup", "demo", "bytestream", "train-all", "sweep-robustness", "mlflow"),
+    *("lint", "check", "bench", "docs"),
     *("test", "test-system", "test-slow", "test-faults", "test-cluster", "test-soak", "lock", "clean"),
 )
 

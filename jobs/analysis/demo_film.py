@@ -1,0 +1,168 @@
+"""The film of a recorded episode: camera, events, latent, choice, and the way from above."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from jobs.analysis.ground_plan import ground_plan
+from jobs.analysis.plots import COLOURS, INK
+from jobs.analysis.video import Decode, coloured, open_film, signs
+from jobs.rollout.episodes import outcome_of
+from jobs.rollout.recorded import Moment, RecordedEpisode
+from models.policy.features import grey_picture
+
+WIDTH, SIDE, GAP, HEAD, LINE = 1248, 320, 16, 44, 26  # pixels
+MARGIN_M, SIDES_M = 2.0, 14.0  # shown before start and behind goal; beside the way
+TOP = HEAD + LINE + SIDE + LINE + GAP // 2  # of the plan
+SLOWER, MAX_FPS, MIN_FPS = 4, 50, 10
+ACTIONS = (("left", 1), ("forward", 0), ("right", 2))  # as a person looks, with their numbers
+TEXT, DIM, WALL, TRAIL, CHOSEN = "#f1f5f9", "#94a3b8", "#64748b", "#38bdf8", "#f59e0b"
+GROUND, OBSTACLE, GOAL = "#15181f", "#cbd5e1", "#34d399"
+FONT, SMALL = ImageFont.load_default(18), ImageFont.load_default(15)
+Box = tuple[int, int, int, int]  # left, top, width, height
+
+
+def write_film(path: Path, recorded: RecordedEpisode, title: str, decode: Decode | None) -> Path:
+    """Write an MP4 file with a frame for each step of an episode; return it.
+
+    Args:
+        path: The file.
+        recorded: The episode.
+        title: Whose episode it is.
+        decode: Event window -> picture in [-1, 1], float (H, W), of a panel of its own; None: there is none.
+    """
+    control_hz = recorded.env.control_hz
+    fps = float(np.clip(round(control_hz / SLOWER), MIN_FPS, MAX_FPS))
+    canvas = _background(recorded, f"{title}   {_pace(control_hz / fps)}")
+    with open_film(path, control_hz, None, fps) as film:
+        for place in range(len(recorded.moments)):
+            film.add(np.asarray(_frame(canvas, recorded, place, decode)))
+    return path
+
+
+def _pace(slower: float) -> str:
+    return f"{slower:.0f}x slower than real time" if slower >= 1.5 else "in real time"
+
+
+def _scale(recorded: RecordedEpisode) -> float:
+    """Pixels of the plan per metre."""
+    return WIDTH / (recorded.scene.length_m + 2 * MARGIN_M)
+
+
+def _shown_m(recorded: RecordedEpisode) -> tuple[float, float]:
+    """From which x to which the plan shows the corridor [m]: what lies beside the way, or up to the walls."""
+    x_m = [moment.x_m for moment in recorded.moments]
+    wall_m = 0.5 * recorded.scene.width_m + MARGIN_M
+    return max(-wall_m, min(x_m) - SIDES_M), min(wall_m, max(x_m) + SIDES_M)
+
+
+def _on_plan(recorded: RecordedEpisode, xy_m: np.ndarray) -> list[tuple[float, float]]:
+    """Where points (N, 2) [m] of the corridor are drawn: forward is to the right, the right is down."""
+    scale, (first_m, _) = _scale(recorded), _shown_m(recorded)
+    x_m, y_m = np.atleast_2d(xy_m).T
+    across, down = (y_m + MARGIN_M) * scale, TOP + (x_m - first_m) * scale
+    return list(zip(across.tolist(), down.tolist(), strict=True))
+
+
+def _background(recorded: RecordedEpisode, title: str) -> Image.Image:
+    """What stays the same: the corridor from above, and the title."""
+    scene, (first_m, last_m) = recorded.scene, _shown_m(recorded)
+    height = int(TOP + (last_m - first_m) * _scale(recorded))
+    picture = Image.new("RGB", (WIDTH, height + height % 2), GROUND)
+    draw = ImageDraw.Draw(picture)
+    circles, corners = ground_plan(scene, recorded.env.camera_height_m)
+    for x_m, y_m, radius_m in circles:
+        ((across, down),) = _on_plan(recorded, np.array([x_m, y_m]))
+        draw.circle((across, down), max(1.5, radius_m * _scale(recorded)), OBSTACLE)
+    for own in corners:
+        draw.polygon(_on_plan(recorded, own), OBSTACLE)
+    half_m, goal_m = 0.5 * scene.width_m, scene.length_m
+    for side_m in (-half_m, half_m):
+        draw.line(_on_plan(recorded, np.array([(side_m, 0.0), (side_m, goal_m)])), WALL, 3)
+    draw.line(_on_plan(recorded, np.array([(-half_m, goal_m), (half_m, goal_m)])), GOAL, 3)
+    draw.rectangle((0, 0, WIDTH, TOP - 1), INK)  # obstacles beside the shown part too
+    draw.text((GAP, HEAD // 2), title, TEXT, FONT, anchor="lm")
+    draw.text((GAP, TOP - LINE // 2), "from above: start on the left, goal on the right", DIM, SMALL, "lm")
+    return picture
+
+
+def _frame(canvas: Image.Image, recorded: RecordedEpisode, place: int, decode: Decode | None) -> Image.Image:
+    """The picture of one moment; what has been passed stays on the canvas."""
+    moment, moments = recorded.moments[place], recorded.moments
+    before = moments[max(0, place - 1)]
+    way = _on_plan(recorded, np.array([(before.x_m, before.y_m), (moment.x_m, moment.y_m)]))
+    ImageDraw.Draw(canvas).line(way, TRAIL, 3)
+    picture = canvas.copy()
+    draw = ImageDraw.Draw(picture)
+    draw.circle(way[1], 7, CHOSEN, TEXT, 2)
+    if place == len(moments) - 1:
+        _draw_end(draw, recorded)
+    facts = f"step {place + 1} of {len(moments)}   {moment.t_us / 1e6:4.2f} s   {moment.y_m:5.1f} m"
+    draw.text((WIDTH - GAP, HEAD // 2), facts, TEXT, FONT, anchor="rm")
+    left = GAP
+    for name, panel in _panels(moment, decode):
+        draw.text((left, HEAD + LINE // 2), name, DIM, SMALL, anchor="lm")
+        picture.paste(_enlarged(panel), (left, HEAD + LINE))
+        left += SIDE + GAP
+    right = WIDTH - GAP - left
+    _draw_choice(draw, (left, HEAD, right, 150), moment)
+    if moment.latent is not None:
+        largest = max(float(np.abs(own.latent).max()) for own in moments if own.latent is not None)
+        _draw_latent(draw, (left, HEAD + 160, right, SIDE + LINE - 160), moment.latent, largest or 1.0)
+    return picture
+
+
+def _panels(moment: Moment, decode: Decode | None) -> list[tuple[str, np.ndarray]]:
+    """Name and picture, uint8 (H, W, 3), of each panel."""
+    panels = [("camera", np.repeat(grey_picture(moment.luminance)[:, :, None], 3, axis=2))]
+    if moment.events is not None:
+        name = f"events of this step: {moment.num_events} (blue ON, orange OFF)"
+        panels.append((name, coloured(signs(moment.events))))
+    if decode is not None:
+        panels.append(("decoded from the latent", coloured(decode(moment.observation))))
+    return panels
+
+
+def _enlarged(panel: np.ndarray) -> Image.Image:
+    height, width = panel.shape[:2]
+    scale = SIDE / max(height, width)
+    size = round(width * scale), round(height * scale)
+    return Image.fromarray(panel).resize(size, Image.Resampling.NEAREST)
+
+
+def _draw_choice(draw: ImageDraw.ImageDraw, box: Box, moment: Moment) -> None:
+    """The probability of each action as a bar; the one that is taken in another colour."""
+    left, top, width, _ = box
+    draw.text((left, top + LINE // 2), "probability of each action (taken: amber)", DIM, SMALL, anchor="lm")
+    start, length = left + 74, width - 74 - 56
+    for row, (name, action) in enumerate(ACTIONS):
+        share, y = moment.probabilities[action], top + LINE + 8 + row * 36
+        draw.text((left, y + 12), name, TEXT, SMALL, anchor="lm")
+        draw.rectangle((start, y, start + length, y + 24), GROUND)
+        colour = CHOSEN if action == moment.action else WALL
+        draw.rectangle((start, y, start + share * length, y + 24), colour)
+        draw.text((left + width, y + 12), f"{share:.0%}", TEXT, SMALL, anchor="rm")
+
+
+def _draw_latent(draw: ImageDraw.ImageDraw, box: Box, latent: np.ndarray, largest: float) -> None:
+    """Each number of the latent as a bar up or down; `largest` is the size of a full one."""
+    left, top, width, height = box
+    text = f"latent: the {len(latent)} numbers that the policy sees of the events"
+    draw.text((left, top + LINE // 2), text if width > 400 else "latent", DIM, SMALL, anchor="lm")
+    draw.rectangle((left, top + LINE, left + width, top + height), GROUND)
+    middle, half = top + (LINE + height) / 2, (height - LINE) / 2 - 3
+    pitch = width / len(latent)
+    for place, value in enumerate(latent):
+        x, end = left + (place + 0.15) * pitch, middle - half * float(value) / largest
+        draw.rectangle((x, min(middle, end), x + 0.7 * pitch, max(middle, end)), TRAIL)
+    draw.line((left, middle, left + width, middle), WALL)
+
+
+def _draw_end(draw: ImageDraw.ImageDraw, recorded: RecordedEpisode) -> None:
+    """Mark where and how the episode ends."""
+    outcome, row = outcome_of(recorded.episode), recorded.episode
+    ((x, y),) = _on_plan(recorded, np.array([row["x_m"], row["distance_m"]]))
+    draw.circle((x, y), 10, COLOURS[outcome], TEXT, 2)
+    near_goal = x > 0.8 * WIDTH
+    draw.text((x + (-18 if near_goal else 18), y), outcome, TEXT, FONT, anchor="rm" if near_goal else "lm")

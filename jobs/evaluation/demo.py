@@ -1,0 +1,80 @@
+"""Show a policy in one held-out corridor: its result as a line of numbers, and a film.
+
+Run: make demo, or python -m platform.launch +exp=demo demo.policy=bytestream-s1 env.scene=gates seed=3
+Expect: half a minute. The film lies in the run folder under `demo/`, with a frame for each step, and opens
+where there is a display. Nothing is trained, and Ray and MLflow are not started.
+"""
+
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from jobs.analysis.demo_film import write_film
+from jobs.analysis.tables import events_texts, show_table
+from jobs.config.config import Config
+from jobs.evaluation.evaluate import latent_decoder
+from jobs.rollout.agents import PolicyAgent
+from jobs.rollout.episodes import outcome_of
+from jobs.rollout.policies import find_one_policy, own_sensor_differences
+from jobs.rollout.recorded import RecordedEpisode, record_episode
+from jobs.run.folder import locate_run, open_run
+from jobs.run.progress import console
+from models.policy import load_policy
+from models.policy.policy import ENCODER
+
+HEADINGS = (
+    *("Policy", "Scene", "Corridor", "Success", "Ends by"),
+    *("Distance [m]", "Steps", "Events/step", "Dropped", "Time [s]"),
+)
+
+
+def run(config: Config) -> np.void:
+    """Record one episode of `demo.policy`, print its line and write its film; return the EPISODE ().
+
+    Raises:
+        ConfigError: If there is no such policy.
+    """
+    policy = find_one_policy("demo.policy", config.demo.policy, config, locate_run(config))
+    name = f"{policy.group}-s{policy.training}"
+    env = dataclasses.replace(config.env, split="eval")
+    differ = own_sensor_differences(policy, env)
+    if differ:
+        said = ", ".join(f"{key}={ours!r} (trained: {theirs!r})" for key, (theirs, ours) in differ.items())
+        console.print(f"Another sensor than in training: {said}", markup=False)
+    agent = PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic")
+    recorded = record_episode(agent, env, config.seed)
+    show_table("One episode in a held-out corridor", HEADINGS, [line(name, recorded)], words=5)
+    file = Path(policy.agent) / ENCODER
+    decode = latent_decoder(Path(policy.agent)) if file.is_file() else None
+    if decode is None and file.is_file():
+        console.print("The policy is lean, without a decoder: the film shows its latent as numbers alone.")
+    faults = [f"{key} {value:g}" for key, value in dataclasses.asdict(env.faults).items() if value]
+    title = "   ".join([name, f"{env.scene} {config.seed}", *faults])
+    path = open_run(config).path / "demo" / f"{name}.mp4"
+    console.print(f"Film: {write_film(path, recorded, title, decode)}", markup=False)
+    show(path)
+    return recorded.episode
+
+
+def line(name: str, recorded: RecordedEpisode) -> tuple[str, ...]:
+    """A text for each of `HEADINGS`."""
+    row, env = recorded.episode, recorded.env
+    return (
+        *(name, env.scene, str(row["seed"]), "yes" if row["success"] else "no", outcome_of(row)),
+        *(f"{row['distance_m']:.1f}", str(row["steps"])),
+        *events_texts(row["events_per_step"], row["dropped"]),
+        f"{row['steps'] / env.control_hz:.2f}",
+    )
+
+
+def show(path: Path) -> None:
+    """Open a file for a person at a display; elsewhere nothing happens."""
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    opener = shutil.which("xdg-open")
+    if display and opener and sys.stdout.isatty():
+        subprocess.Popen([opener, str(path)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603

@@ -1,0 +1,102 @@
+"""One episode of a policy with all that it saw and chose, for films and pages."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.config import WITHOUT_EVENTS, EnvConfig
+from envs.corridor import CorridorEnv, Info
+from envs.events import event_image
+from envs.scene import Scene
+from jobs.rollout.agents import PolicyAgent
+from jobs.rollout.episodes import roll_out
+
+
+class Moment(NamedTuple):
+    """One choice of a policy: what it saw before, and what it chose.
+
+    Attributes:
+        luminance: What the camera sees, float32 (H, W), linear.
+        events: The last event of each pixel in this control step, as `envs.events.event_image` codes it,
+            uint8 (H, W); None for a policy that sees no events.
+        num_events: Events of this control step, faults included [-].
+        observation: What the policy was shown.
+        latent: What its encoder makes of it, float32 (L,); None for a policy without encoder.
+        probabilities: Of the actions forward, left, right; float64 (3,).
+        action: The one that was taken.
+        x_m, y_m: Where the vehicle is [m].
+        t_us: Simulated time [us].
+    """
+
+    luminance: np.ndarray
+    events: np.ndarray | None
+    num_events: int
+    observation: np.ndarray
+    latent: np.ndarray | None
+    probabilities: np.ndarray
+    action: int
+    x_m: float
+    y_m: float
+    t_us: int
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedEpisode:
+    """An episode, a moment for each of its steps, and the corridor that it went through.
+
+    Attributes:
+        episode: EPISODE (), as an evaluation counts it.
+        moments: What was seen and chosen at each step.
+        scene: The corridor.
+        env: The simulation.
+    """
+
+    episode: np.void
+    moments: list[Moment]
+    scene: Scene
+    env: EnvConfig
+
+
+def record_episode(agent: PolicyAgent, env: EnvConfig, seed: int) -> RecordedEpisode:
+    """Roll out one episode, the same as without recording, in the corridor of a seed."""
+    recorder = _Recorder(agent)
+    (episode,) = roll_out(recorder, env, [seed], num_envs=1)
+    return RecordedEpisode(episode, recorder.moments, recorder.env.scene, recorder.env.config)
+
+
+class _Recorder:
+    """An agent that chooses as another one does, and remembers why."""
+
+    def __init__(self, agent: PolicyAgent) -> None:
+        self.agent, self.observation = agent, agent.observation
+        self.moments: list[Moment] = []
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Begin one episode."""
+        (self.env,) = envs
+        self.agent.reset(envs, seeds)
+
+    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
+        """The agent's action (1,)."""
+        actions, (info,), env = self.agent(observations, infos), infos, self.env
+        encoder, (logits,) = self.agent.policy.encoder, self.agent.logits
+        weights = np.exp(logits - logits.max())
+        height, width = env.luminance.shape
+        sees_events = self.observation not in WITHOUT_EVENTS
+        self.moments.append(
+            Moment(
+                luminance=env.luminance.copy(),
+                events=event_image(env.events, width, height) if sees_events else None,
+                num_events=info["num_events"],
+                observation=observations[0].copy(),
+                latent=None if encoder is None else encoder.encode_windows(observations)[0],
+                probabilities=weights / weights.sum(),
+                action=int(actions[0]),
+                x_m=info["x_m"],
+                y_m=info["y_m"],
+                t_us=info["t_us"],
+            )
+        )
+        return actions

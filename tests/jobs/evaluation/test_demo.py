@@ -1,0 +1,112 @@
+import dataclasses
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from jobs.analysis.demo_film import write_film
+from jobs.analysis.tables import events_texts
+from jobs.config.config import ConfigError, parse
+from jobs.evaluation import demo
+from jobs.rollout.agents import PolicyAgent
+from jobs.rollout.executors import Part, evaluate_part
+from jobs.rollout.policies import find_policies
+from jobs.rollout.recorded import record_episode
+from jobs.rollout.tasks import make_task
+from jobs.run.folder import locate_run
+from models.policy import load_policy
+from tests.support.configs import compose
+from tests.support.policies import HELD_OUT, save_training
+
+
+def demo_config(tmp_path, *words):
+    return parse({**compose("+exp=demo", *words), "runs_dir": str(tmp_path / "runs")})
+
+
+def frames_of(film):
+    frames = imageio_ffmpeg.read_frames(str(film))
+    about = next(frames)
+    return about, [np.frombuffer(frame, np.uint8).reshape(*about["size"][::-1], 3) for frame in frames]
+
+
+@pytest.mark.parametrize("name", ["bytestream_robust-s1", "rgb-s0"])
+def test_the_printed_line_is_the_evaluations_own_row_and_the_film_has_a_frame_for_each_step(
+    tmp_path, capsys, name
+):
+    words = ("env.time_limit_s=0.1", "seed=3", "faults.background_activity=0.1", f"demo.policy={name}")
+    config = demo_config(tmp_path, *words)
+    demo.run(config)
+    printed = capsys.readouterr().out
+    (policy,) = find_policies("demo.policy", name, config, locate_run(config))
+    env = dataclasses.replace(config.env, split="eval")
+    task = make_task(("poles_eval", "raycast"), policy, config.evaluate.action, env, 4)
+    row = evaluate_part(Part(task)).episodes[3]
+    assert row["seed"] == 3
+    cells = next(line for line in printed.splitlines() if f" {name} " in line).split("│")[1:-1]
+    assert [cell.strip() for cell in cells] == [
+        *(name, "poles_eval", "3", "no", "time limit", f"{row['distance_m']:.1f}", str(row["steps"])),
+        *events_texts(row["events_per_step"], row["dropped"]),
+        "0.10",
+    ]
+    (film,) = (tmp_path / "runs").glob("demo-*/demo/*.mp4")
+    assert f"Film: {film}" in printed
+    about, frames = frames_of(film)
+    assert (len(frames), about["fps"]) == (row["steps"], 50.0)
+
+
+def test_the_film_shows_the_way_that_was_taken_and_how_it_ended(tmp_path):
+    env = dataclasses.replace(HELD_OUT, time_limit_s=0.1)
+    folder = save_training(tmp_path / "policy", "a", 0, HELD_OUT, "bytestream")
+    recorded = record_episode(PolicyAgent(load_policy(folder)), env, 0)
+    film = write_film(tmp_path / "film.mp4", recorded, "a", lambda window: np.ones((64, 64)))
+    _, frames = frames_of(film)
+    first, last = frames[0].astype(int), frames[-1].astype(int)
+    assert np.abs(first - last).mean() > 0.1
+    decoded = last[100:300, 700:1000].mean(axis=(0, 1))
+    assert decoded[2] > decoded[0] + 50  # all ON, which is blue
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("moon", "demo.policy: must be 'pretrained', 'newest', one of .*got 'moon'"),
+        (
+            "bytestream",
+            "must be one trained policy, such as one of bytestream-s0, bytestream-s1, ",
+        ),
+        ("oracle", "demo.policy: must be one trained policy, got 'oracle'"),
+    ],
+)
+def test_another_name_than_one_policys_is_refused_before_anything_is_written(tmp_path, name, message):
+    with pytest.raises(ConfigError, match=message):
+        demo.run(demo_config(tmp_path, f"demo.policy={name}"))
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_policy_of_ones_own_with_its_decoder_is_shown_and_another_sensor_is_named(tmp_path, capsys):
+    folder = save_training(tmp_path / "policy", "own", 5, HELD_OUT, "bytestream")
+    words = ("env.time_limit_s=0.02", "camera.contrast_threshold=0.1", f"demo.policy={folder}")
+    demo.run(demo_config(tmp_path, *words))
+    printed = capsys.readouterr().out
+    assert "Another sensor than in training: contrast_threshold=0.1 (trained: 0.2)" in printed
+    assert "own-s5" in printed
+    assert "without a decoder" not in printed
+
+
+def test_a_film_opens_only_for_a_person_at_a_display(monkeypatch, tmp_path):
+    started = []
+    monkeypatch.setattr(demo.subprocess, "Popen", lambda words, **_: started.append(words))
+    monkeypatch.setattr(demo.shutil, "which", lambda name: f"/bin/{name}")
+    at_terminal = []
+    monkeypatch.setattr(demo.sys.stdout, "isatty", lambda: bool(at_terminal), raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    at_terminal.append(True)
+    demo.show(tmp_path)
+    monkeypatch.setenv("DISPLAY", ":0")
+    at_terminal.clear()
+    demo.show(tmp_path)
+    assert not started
+    at_terminal.append(True)
+    demo.show(tmp_path)
+    assert started == [["/bin/xdg-open", str(tmp_path)]]
