@@ -12,9 +12,9 @@ from jobs.training.ppo import build_ppo, corridor_settings, policy_about, policy
 from jobs.training.ppo_learner import advantages, shaping
 from jobs.training.teacher import COST_TO_GO, PricedEnvRunner
 from models.policy import load_policy, save_policy
-from models.policy.networks import build_networks
 from models.policy.rllib_module import PRIVILEGED
 from tests.support.configs import SHORT, make_config
+from tests.support.runs import write_networks
 
 SAMPLED = "num_env_steps_sampled_lifetime"
 COLUMNS = (*SHORT, "model=event_columns", "algo.num_env_runners=0", "algo.lr_schedule=constant")
@@ -184,12 +184,7 @@ def test_a_critic_learns_from_what_it_is_told(rolled_out, compiled, monkeypatch)
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A file of networks to begin from."""
-    config = make_config(*COLUMNS)
-    networks = build_networks(policy_spec(config), seed=7)
-    return (
-        save_policy(tmp_path_factory.mktemp("policy"), networks, policy_spec(config), policy_about(config))
-        / "networks.safetensors"
-    )
+    return write_networks(tmp_path_factory.mktemp("policy"), make_config(*COLUMNS))
 
 
 def test_a_training_begins_with_the_networks_that_it_is_given(rolled_out, trained):
