@@ -265,8 +265,8 @@ class PlainPPOLearner(PPOTorchLearner):
         ratio, advantages = torch.exp(logp - rows[Columns.ACTION_LOGP]), rows[Postprocessing.ADVANTAGES]
         clipped = ratio.clamp(1.0 - config.clip_param, 1.0 + config.clip_param)
         policy_loss = -torch.minimum(advantages * ratio, advantages * clipped).mean()
-        embeddings = out[Columns.EMBEDDINGS]
-        values = module.compute_values(rows, embeddings.detach() if self._warming_up else embeddings)
+        embeddings = out[Columns.EMBEDDINGS].detach() if self._warming_up else out[Columns.EMBEDDINGS]
+        values = module.compute_values(rows, embeddings=embeddings)
         errors = (values - rows[Postprocessing.VALUE_TARGETS]).square().clamp(max=config.vf_clip_param)
         value_loss, entropy = errors.mean(), -(logps.exp() * logps).sum(-1).mean()
         total = policy_loss + config.vf_loss_coeff * value_loss - self._entropy_coeff * entropy
