@@ -14,18 +14,18 @@ from jobs.run.folder import open_run
 from jobs.run.progress import console
 from jobs.tracking.model_registry import register_training
 from jobs.tracking.tracker import open_tracker
-from jobs.training.pretrain import check_sources, prepare_encoder
+from jobs.training.inputs import check_inputs, prepare_inputs
 from jobs.training.train import train
 
 
 def run(config: Config) -> dict[str, float]:
     """Run every stage that the policy needs and that is not done yet, and return the evaluation's metrics."""
-    check_sources(config)
+    check_inputs(config)
     folder = open_run(config)
     config = folder.config
     console.print(f"Run folder: {folder.path}")
     with open_tracker(config, folder) as tracker:
-        train(config, folder, prepare_encoder(config, folder, tracker), tracker.log)
+        train(config, folder, prepare_inputs(config, folder, tracker), tracker.log)
         metrics = evaluate(config, folder, tracker)
         console.print(f"Registered: {register_training(tracker, folder.path)}")
         console.print(tracker.dashboard())

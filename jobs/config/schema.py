@@ -46,6 +46,10 @@ class AlgoConfig:
     """PPO, each word as RLlib spells it (appendix D.1.2).
 
     Attributes:
+        critic: What the value network sees: what the policy does, or also what the cheapest way to the goal
+            line costs, of a teacher that knows the geometry.
+        shaping: Of the potential -shaping * log(1 + that cost), by which rewards are shaped in training only;
+            0: they are not.
         imitation: Learn from a teacher instead; of the others then only lr, sizes and grad_clip count.
     """
 
@@ -63,6 +67,8 @@ class AlgoConfig:
     reward_scale: Positive
     num_envs_per_env_runner: Count
     num_env_runners: Annotated[int, Field(ge=0, le=10_000)]
+    critic: Literal["observation", "teacher"]
+    shaping: NonNegative
     imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)]
 
     @pydantic.model_validator(mode="after")
@@ -141,15 +147,19 @@ class PretrainConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TrainConfig:
-    """How long the policy is trained, how often it is saved, and under which conditions.
+    """How long the policy is trained, how often it is saved, from what, and under which conditions.
 
     Attributes:
+        init: Run or policy folder whose policy is trained on; None: random weights.
+        value_warmup: Environment steps in which, after `init`, only the value network learns.
         conditions: Settings of the simulation that are replaced together, as a sweep replaces
             them; each episode draws one (`jobs.config.conditions`). [{}] changes nothing.
     """
 
     env_steps: Count
     checkpoint_every: Count
+    init: str | None
+    value_warmup: Annotated[int, Field(ge=0)]
     conditions: Conditions
 
 

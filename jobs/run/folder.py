@@ -29,11 +29,11 @@ NOT_IN_RUN_NAME = (
 # Settings that older run folders lack, each with the value that does what was done before it existed.
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "model": ADDED_MODEL_SETTINGS,
-    "algo": {"imitation": None},
+    "algo": {"imitation": None, "critic": "observation", "shaping": 0.0},
     "env": {"filter_support": 0, "filter_tau_us": 5_000},
     "collect": {"recordings": [], "conditions": [{}]},
     "pretrain": {"denoise": False},
-    "train": {"conditions": [{}]},
+    "train": {"conditions": [{}], "init": None, "value_warmup": 20_000},
 }
 COMPARED_STEPS = 500_000  # length of the trainings that are compared with each other; the paper's
 
@@ -56,6 +56,11 @@ class Run:
     def encoder(self) -> Path:
         """The frozen encoder, its manifest and checkpoints."""
         return self.path / "encoder"
+
+    @property
+    def init(self) -> Path:
+        """A copy of the policy that the training begins from."""
+        return self.path / "init"
 
     @property
     def train(self) -> Path:

@@ -18,10 +18,8 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from envs.scene import Scene
-from envs.scene.planning import CostToGo, cost_to_go
-from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo_learner import PlainPPOLearner
+from jobs.training.teacher import TeacherEnvRunner
 
 IMITATION = "imitation"  # of the learner's own settings: those of `ImitationConfig`, and env_steps
 COSTS = "costs"  # of a step: what each action costs more than the cheapest, float32 (actions,)
@@ -30,12 +28,8 @@ AGREEMENT_KEY = (
 )
 
 
-class TaughtEnvRunner(PlainEnvRunner):
+class TaughtEnvRunner(TeacherEnvRunner):
     """As `PlainEnvRunner`; the teacher labels every step, and acts in some."""
-
-    def __init__(self, **settings: Any) -> None:
-        self._plans: dict[int, tuple[Scene, CostToGo]] = {}  # of each environment's scene
-        super().__init__(**settings)
 
     @property
     def teacher_share(self) -> float:
@@ -46,21 +40,12 @@ class TaughtEnvRunner(PlainEnvRunner):
 
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         actions, outputs = super()._decide(stacks)
-        costs = np.stack([self._costs(row) for row in range(len(stacks))])
+        costs = self.costs()
+        costs = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
         if self.teacher_share > 0.0:
             by_teacher = torch.rand(len(stacks)).numpy() < self.teacher_share
             actions = np.where(by_teacher, costs.argmin(axis=1), actions)
         return actions, {**outputs, COSTS: costs}
-
-    def _costs(self, row: int) -> np.ndarray:
-        """`COSTS` where an environment is now."""
-        env = self.env.unwrapped.envs[row]
-        scene, plan = self._plans.get(row, (None, None))
-        if plan is None or scene is not env.scene:
-            plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
-            self._plans[row] = env.scene, plan
-        costs = plan.of_actions(*env.camera_pose()[:2])
-        return (costs - costs.min()).astype(np.float32)
 
 
 class Lessons:

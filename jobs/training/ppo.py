@@ -22,8 +22,9 @@ from jobs.rollout.diagnostics import drift_metrics
 from jobs.run.files import RunError
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.imitation import IMITATION, ImitationLearner, TaughtEnvRunner
-from jobs.training.ppo_learner import REWARD_SCALE, PlainPPOLearner
+from jobs.training.ppo_learner import REWARD_SCALE, SHAPING, VALUE_WARMUP, PlainPPOLearner
 from jobs.training.rounds import MAX_RESTARTS, SAMPLE_TIMEOUT_S
+from jobs.training.teacher import PricedEnvRunner
 from models.encoder.evae import EventVAE
 from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
 from models.kinds import KINDS, PolicySpec
@@ -134,12 +135,13 @@ def outcome(info: Mapping[str, float], episode_return: float) -> dict[str, float
     }
 
 
-def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConfig:
+def build_ppo(config: Config, encoder_path: str | Path | None = None, init: Path | None = None) -> PPOConfig:
     """The algorithm of an experiment; every default of RLlib that differs from the paper's is set.
 
     Args:
         config: The experiment.
         encoder_path: The pretrained encoder's file, for a policy that has one.
+        init: The file of networks to begin from instead of random weights.
 
     Raises:
         ConfigError: If the encoder was made for another sensor, or for another model than the
@@ -150,7 +152,13 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
     runners = algo.num_env_runners
     own_cpus = WAITING_CPUS if runners else 1
     register_env(ENV, make_corridors)
-    spec = module_spec(policy_spec(config), config.seed, pretrained_encoder(config, encoder_path))
+    spec = module_spec(
+        policy_spec(config),
+        config.seed,
+        pretrained_encoder(config, encoder_path),
+        init,
+        privileged=int(algo.critic == "teacher" and not algo.imitation),
+    )
     return (
         _optimiser(PPOConfig(), config)
         .environment(ENV, env_config=corridor_settings(config), disable_env_checking=True)
@@ -161,7 +169,7 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
             num_envs_per_env_runner=algo.num_envs_per_env_runner,
             sample_timeout_s=SAMPLE_TIMEOUT_S,
             gym_env_vectorize_mode="vector_entry_point",
-            env_runner_cls=TaughtEnvRunner if algo.imitation else PlainEnvRunner,
+            env_runner_cls=env_runner(config),
         )
         .resources(num_cpus_for_main_process=own_cpus)
         .learners(
@@ -175,6 +183,13 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None) -> PPOConf
         .fault_tolerance(max_num_env_runner_restarts=MAX_RESTARTS, delay_between_env_runner_restarts_s=1.0)
         .debugging(seed=config.seed, log_level="ERROR")
     )
+
+
+def env_runner(config: Config) -> type[PlainEnvRunner]:
+    """Which env runners a training needs."""
+    if config.algo.imitation is not None:
+        return TaughtEnvRunner
+    return PricedEnvRunner if config.algo.critic == "teacher" or config.algo.shaping else PlainEnvRunner
 
 
 def _optimiser(ppo: PPOConfig, config: Config) -> PPOConfig:
@@ -208,7 +223,11 @@ def learner_settings(config: Config) -> dict[str, object]:
     settings: dict[str, object] = {REWARD_SCALE: config.algo.reward_scale}
     if config.algo.imitation is not None:
         own = dataclasses.asdict(config.algo.imitation)
-        settings[IMITATION] = {**own, "env_steps": config.train.env_steps}
+        return settings | {IMITATION: {**own, "env_steps": config.train.env_steps}}
+    if config.algo.shaping:
+        settings[SHAPING] = config.algo.shaping
+    if config.train.init is not None:
+        settings[VALUE_WARMUP] = config.train.value_warmup
     return settings
 
 
@@ -260,6 +279,7 @@ def policy_about(config: Config) -> dict[str, object]:
         "conditions": config.train.conditions,
         "seed": config.seed,
         "algo": dataclasses.asdict(config.algo),
+        **({} if config.train.init is None else {"init": config.train.init}),
     }
 
 
@@ -272,6 +292,8 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
         ValueError: A policy that needs one got none, or the other way round.
     """
     name, needed = config.model.name, KINDS[config.model.name].encoder
+    if policy_spec(config).finetuned and config.train.init is not None:  # its networks hold their encoder
+        return None
     if needed != (path is not None):
         raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")
     if path is None:

@@ -25,14 +25,18 @@ from ray.rllib.core.learner.training_data import TrainingData
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.evaluation.postprocessing import Postprocessing
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
+from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
 from jobs.training.rllib_internals import LEARNER, require
+from jobs.training.teacher import log_costs
 from models.policy.dense_update import Rows, Settings, update_dense
+from models.policy.rllib_module import PRIVILEGED
 
 READ = (
     Columns.OBS,
+    PRIVILEGED,
     Columns.ACTIONS,
     Columns.ACTION_LOGP,
     Postprocessing.ADVANTAGES,
@@ -41,11 +45,11 @@ READ = (
 GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
 # Of a minibatch, in the order in which `update_dense` returns them.
 FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
-EXPLAINED_ROWS = 1024  # values are compared with their targets so many at a time
 MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
-REWARD_SCALE = (
-    "reward_scale"  # of the learner's own settings: multiplies rewards; episodes keep the true ones
-)
+# Of the learner's own settings: it multiplies rewards; episodes keep the true ones.
+REWARD_SCALE = "reward_scale"
+SHAPING = "shaping"  # of these: rewards are shaped by the potential -SHAPING `log_costs`
+VALUE_WARMUP = "value_warmup"  # of these: environment steps in which only the value network learns
 
 
 def advantages(
@@ -66,6 +70,19 @@ def advantages(
     return lfilter([1.0], [1.0, -gamma * lambda_], errors[::-1])[::-1]
 
 
+def shaping(potentials: np.ndarray, terminated: bool, gamma: float) -> np.ndarray:
+    """What a potential adds to the rewards of a piece of an episode (Ng, Harada and Russell 1999), (T,).
+
+    Args:
+        potentials: Of its T + 1 places, (T + 1,).
+        terminated: Whether it ended for good; its last place then has the potential 0.
+        gamma: Discount per step.
+    """
+    after = potentials[1:].copy()
+    after[-1] *= not terminated
+    return gamma * after - potentials[:-1]
+
+
 class PlainPPOLearner(PPOTorchLearner):
     """PPO for one module with discrete actions, without the divergence penalty, on one device."""
 
@@ -73,6 +90,7 @@ class PlainPPOLearner(PPOTorchLearner):
         """As RLlib's."""
         super().build()
         require(self, LEARNER)
+        self._warming_up = False
 
     def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
         """Adam with all its steps in one call."""
@@ -117,6 +135,8 @@ class PlainPPOLearner(PPOTorchLearner):
         training_data.validate()
         training_data.solve_refs()
         self._weights_seq_no += 1
+        before = counters.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0) - sum(map(len, training_data.episodes))
+        self._warming_up = before < self.config.learner_config_dict.get(VALUE_WARMUP, -math.inf)
         rows = self._rows(training_data.episodes)
         count = len(rows[Columns.ACTIONS])
         figures = self._improve(rows, num_epochs, minibatch_size or count)
@@ -129,8 +149,10 @@ class PlainPPOLearner(PPOTorchLearner):
     def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
         """All epochs over the rows; the figures of the last."""
         orders = torch.stack([torch.randperm(len(rows[Columns.ACTIONS])) for _ in range(num_epochs)])
-        learn = self._epochs_of_dense if self._dense else self._epochs
+        learn = self._epochs_of_dense if self._dense and not self._warming_up else self._epochs
         figures = learn(rows, orders, minibatch_size)
+        if self._warming_up:
+            self.get_optimizer(DEFAULT_MODULE_ID).state.clear()  # Adam counts the steps of all weights alike
         return figures | {LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY: self._explained_variance(rows)}
 
     def kept(self) -> dict[str, np.ndarray]:
@@ -152,14 +174,16 @@ class PlainPPOLearner(PPOTorchLearner):
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
         """The steps of all episodes, one after the other, with the targets of the loss."""
         config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
-        scale = config.learner_config_dict.get(REWARD_SCALE, 1.0)
         shown = [np.asarray(episode.get_observations()) for episode in episodes]
         ends = np.cumsum([len(observations) for observations in shown])
-        stacks = np.concatenate(shown)
-        values = module.compute_values({Columns.OBS: torch.from_numpy(stacks)}).numpy()
+        stacks, privileged = np.concatenate(shown), np.empty((ends[-1], module.privileged), np.float32)
+        if module.privileged:
+            privileged[:, 0] = np.concatenate([log_costs(episode) for episode in episodes])
+        told = {Columns.OBS: torch.from_numpy(stacks), PRIVILEGED: torch.from_numpy(privileged)}
+        values = module.compute_values(told).numpy()
         estimates = [
             advantages(
-                of_episode, scale * episode.get_rewards(), episode.is_terminated, config.gamma, config.lambda_
+                of_episode, self._rewards(episode), episode.is_terminated, config.gamma, config.lambda_
             )
             for of_episode, episode in zip(np.split(values, ends[:-1]), episodes, strict=True)
         ]
@@ -169,6 +193,7 @@ class PlainPPOLearner(PPOTorchLearner):
         standard = (estimate - estimate.mean()) / max(MIN_DEVIATION, estimate.std())
         columns = {
             Columns.OBS: stacks[taken],
+            PRIVILEGED: privileged[taken],
             Columns.ACTIONS: np.concatenate([episode.get_actions() for episode in episodes]),
             Columns.ACTION_LOGP: np.concatenate(
                 [episode.get_extra_model_outputs(Columns.ACTION_LOGP) for episode in episodes]
@@ -177,6 +202,14 @@ class PlainPPOLearner(PPOTorchLearner):
             Postprocessing.VALUE_TARGETS: (estimate + values[taken]).astype(np.float32),
         }
         return {name: torch.from_numpy(column) for name, column in columns.items()}
+
+    def _rewards(self, episode: SingleAgentEpisode) -> np.ndarray:
+        """What is learnt from: an episode's rewards, shaped if asked for, and scaled."""
+        settings, rewards = self.config.learner_config_dict, episode.get_rewards()
+        if settings.get(SHAPING, 0.0):
+            potentials = -settings[SHAPING] * log_costs(episode)
+            rewards = rewards + shaping(potentials, episode.is_terminated, self.config.gamma)
+        return settings.get(REWARD_SCALE, 1.0) * rewards
 
     def _epochs_of_dense(
         self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
@@ -232,10 +265,13 @@ class PlainPPOLearner(PPOTorchLearner):
         ratio, advantages = torch.exp(logp - rows[Columns.ACTION_LOGP]), rows[Postprocessing.ADVANTAGES]
         clipped = ratio.clamp(1.0 - config.clip_param, 1.0 + config.clip_param)
         policy_loss = -torch.minimum(advantages * ratio, advantages * clipped).mean()
-        values = module.compute_values(rows, embeddings=out.get(Columns.EMBEDDINGS))
+        embeddings = out[Columns.EMBEDDINGS].detach() if self._warming_up else out[Columns.EMBEDDINGS]
+        values = module.compute_values(rows, embeddings=embeddings)
         errors = (values - rows[Postprocessing.VALUE_TARGETS]).square().clamp(max=config.vf_clip_param)
         value_loss, entropy = errors.mean(), -(logps.exp() * logps).sum(-1).mean()
         total = policy_loss + config.vf_loss_coeff * value_loss - self._entropy_coeff * entropy
+        if self._warming_up:
+            total = config.vf_loss_coeff * value_loss
         figures = {POLICY_LOSS_KEY: policy_loss, VF_LOSS_KEY: value_loss, ENTROPY_KEY: entropy}
         return total, {name: value.detach() for name, value in figures.items()}
 
@@ -243,7 +279,6 @@ class PlainPPOLearner(PPOTorchLearner):
     def _explained_variance(self, rows: dict[str, Tensor]) -> Tensor:
         """Share of the targets' variance that the values explain after the update; at least -1, as RLlib."""
         module, targets = self.module[DEFAULT_MODULE_ID].unwrapped(), rows[Postprocessing.VALUE_TARGETS]
-        parts = rows[Columns.OBS].split(EXPLAINED_ROWS)
-        values = torch.cat([module.compute_values({Columns.OBS: part}) for part in parts])
+        values = module.compute_values(rows)
         unexplained = (targets - values).var() / targets.var().clamp_min(1e-12)
         return (1.0 - unexplained).clamp_min(-1.0)

@@ -35,10 +35,11 @@ from jobs.tracking.tracker import open_tracker
 from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.env_runner import RolloutError
 from jobs.training.imitation import AGREEMENT_KEY
+from jobs.training.inputs import check_inputs, prepare_inputs
 from jobs.training.ppo import build_ppo, policy_about, policy_spec
-from jobs.training.pretrain import check_sources, prepare_encoder
 from models.encoder.weights import EncoderManifest, load_encoder
 from models.policy import save_policy
+from models.policy.policy import NETWORKS
 
 OnResult = Callable[[int, Mapping[str, float]], None]
 
@@ -116,11 +117,11 @@ class Relay(tune.Callback):
 
 def run(config: Config) -> dict[str, float]:
     """Collect and pretrain where the policy needs that and it is not done; train; return the figures."""
-    check_sources(config)
+    check_inputs(config)
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:
-        train(config, folder, prepare_encoder(config, folder, tracker), tracker.log)
+        train(config, folder, prepare_inputs(config, folder, tracker), tracker.log)
     return finished(folder, "train") or {}
 
 
@@ -144,7 +145,8 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
         return folder.policy
     start_ray(config.cluster, folder.path)
     check_cpus(config)
-    algorithm = build_ppo(config, encoder_path)
+    init = folder.init / NETWORKS if config.train.init else None
+    algorithm = build_ppo(config, encoder_path, init)
     with _listening(config, folder, on_result) as last:
         results = fit(_tuner(config, folder, algorithm))
     if results.errors:

@@ -26,9 +26,15 @@ P0, Q0 = F32(4.89352455891786e-03), F32(4.89352518554385e-03)
 
 
 class Rows(NamedTuple):
-    """The steps of an iteration, each an array (N, ...); float32 but for the actions, int64."""
+    """The steps of an iteration, each an array (N, ...); float32 but for the actions, int64.
+
+    Attributes:
+        stacks: What both networks read.
+        privileged: What the value network alone reads behind it, of any width, also none.
+    """
 
     stacks: np.ndarray
+    privileged: np.ndarray
     actions: np.ndarray
     logps: np.ndarray
     advantages: np.ndarray
@@ -145,7 +151,9 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
     """Figures as `update_dense` returns them, the norm NaN if one was not finite; and Adam's steps so far."""
     epochs, count = orders.shape
     size = min(settings.minibatch_size, count)
-    inputs = np.empty((size, rows.stacks.shape[1]), np.float32)
+    seen, more = rows.stacks.shape[1], rows.privileged.shape[1]
+    inputs = np.empty((size, seen), np.float32)
+    judged = np.empty((size, seen + more), np.float32)
     figures = np.zeros(5)
     for epoch in range(epochs):
         figures[:] = 0.0
@@ -154,11 +162,16 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
             shown = inputs[: len(picked)]
             for b in range(len(picked)):
                 shown[b] = rows.stacks[picked[b]]
+            told = judged[: len(picked)] if more else shown
+            if more:
+                told[:, :seen] = shown
+                for b in range(len(picked)):
+                    told[b, seen:] = rows.privileged[picked[b]]
             logits, of_logits = _forward(shown, pi)
-            values, of_values = _forward(shown, vf)
+            values, of_values = _forward(told, vf)
             _add_losses((logits, values), (of_logits, of_values), rows, picked, settings, figures)
             _backward(shown, pi)
-            _backward(shown, vf)
+            _backward(told, vf)
             norm = math.sqrt(np.dot(adam.gradient, adam.gradient))
             if not math.isfinite(norm):
                 figures[4] = np.nan

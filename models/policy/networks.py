@@ -6,6 +6,7 @@
 the stack and the policy, and returns the parts. Weights come from `initialise`, or from a file.
 """
 
+import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -60,6 +61,15 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     for fan_in, fan_out in itertools.pairwise([inputs, *hidden]):
         layers += [nn.Linear(fan_in, fan_out), nn.Tanh()]
     return nn.Sequential(*layers, nn.Linear([inputs, *hidden][-1], outputs))
+
+
+def widened(network: nn.Module, inputs: int) -> nn.Module:
+    """A copy whose first layer has so many more inputs, of weight 0; if negative, without its last ones."""
+    wider = copy.deepcopy(network)
+    first = next(layer for layer in wider.modules() if isinstance(layer, nn.Linear))
+    first.weight = nn.Parameter(nn.functional.pad(first.weight.detach(), (0, inputs)))
+    first.in_features += inputs
+    return wider
 
 
 def nature_cnn(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:

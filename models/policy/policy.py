@@ -255,7 +255,7 @@ def save_lean_policy(source: str | Path, path: str | Path, about: Mapping[str, o
     load_policy(folder)  # checks every file
     manifest, spec = _read_manifest(folder / MANIFEST)
     evae, own = load_encoder(folder / ENCODER) if spec.frozen else (None, EncoderManifest())
-    networks = _load_networks(folder / NETWORKS, spec)
+    networks = load_networks(folder / NETWORKS, spec)
     return save_policy(path, networks, spec, {**manifest, **about}, evae, own.get("figures"), lean=True)
 
 
@@ -277,7 +277,7 @@ def load_policy(
                 f"{folder / name}: SHA-256 must be {expected}: another or a damaged file; {REMEDY}"
             )
     encoder = _load_encoder(folder, spec) if spec.frozen else None
-    networks = _load_networks(folder / NETWORKS, spec)
+    networks = load_networks(folder / NETWORKS, spec)
     if spec.finetuned:
         encoder, networks["trunk"] = _tabulated(networks["trunk"], spec), nn.Flatten()
     return Policy(networks, spec, encoder, deterministic, rng, manifest)
@@ -333,7 +333,7 @@ def _tabulated(trunk: nn.Module, spec: PolicySpec) -> Encoder:
     return dataclasses.replace(table, most_events=EVENTS)
 
 
-def _load_networks(file: Path, spec: PolicySpec) -> nn.ModuleDict:
+def load_networks(file: Path, spec: PolicySpec) -> nn.ModuleDict:
     """The networks of the file's tensors, which must fit one by one and be finite.
 
     They are built without memory for their weights, so that wrong sizes in a manifest cost nothing.

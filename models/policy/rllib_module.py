@@ -4,6 +4,7 @@
 last ones (`jobs.training.env_runner` keeps them). `models.policy.policy` is the same policy without Ray.
 """
 
+import math
 from collections import deque
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,9 +24,11 @@ from models.encoder.weights import EncoderManifest
 from models.kinds import EvaeSettings, PolicySpec
 from models.policy.features import Windows, feature_of
 from models.policy.memory import remember, windows_us
-from models.policy.networks import PARTS, build_networks
+from models.policy.networks import PARTS, build_networks, widened
+from models.policy.policy import load_networks
 
 MET_WINDOWS = 128  # that a module remembers
+PRIVILEGED = "privileged"  # of a batch: what the value network alone is told, float32 (B, numbers)
 VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
 
 
@@ -56,7 +59,8 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
     The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
     checkpoint is sufficient alone. A fine-tuned encoder is the networks' trunk instead.
-    `model_config` holds what `module_spec` puts there.
+    `model_config` holds what `module_spec` puts there. What is `PRIVILEGED` only widens the first layer of
+    the value network, and a policy that is exported is without it.
 
     Attributes:
         met: With a frozen encoder, a sample of the newest windows that it was shown, one of each vector
@@ -73,6 +77,10 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         if part is not None and self.spec.finetuned:
             networks["trunk"].load_state_dict(part.state_dict())
             part = None
+        if "init" in self.model_config:
+            _begin(networks, Path(self.model_config["init"]), self.spec)
+        self.privileged: int = self.model_config.get(PRIVILEGED, 0)
+        networks["vf"] = widened(networks["vf"], self.privileged)
         self.encoder = part
         self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
         self._table: Encoder | None = None
@@ -93,8 +101,9 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return self
 
     def networks(self) -> nn.ModuleDict:
-        """The networks, as `models.policy.networks.assemble` names them."""
-        return nn.ModuleDict({name: getattr(self, name) for name in PARTS})
+        """The networks, as `models.policy.networks.assemble` names them, without what is `PRIVILEGED`."""
+        own = {**{name: getattr(self, name) for name in PARTS}, "vf": widened(self.vf, -self.privileged)}
+        return nn.ModuleDict(own)
 
     def features(self, observations: Windows) -> np.ndarray:
         """Features (B, ...) of B observations, as those of `models.policy.policy.Policy`."""
@@ -132,20 +141,38 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), Columns.EMBEDDINGS: embeddings}
 
     def compute_values(self, batch: dict[str, Tensor], embeddings: Tensor | None = None) -> Tensor:
-        """Values float32 (B,) of the batch's observations.
+        """Values float32 (B,) of the batch's observations, and of what is `PRIVILEGED`.
 
         Without the trunk's embeddings no gradient is kept: RLlib asks so for the targets, of
         the whole batch, whose graph would be a gigabyte of activations.
         """
+        told = [batch[PRIVILEGED]] if self.privileged else []
         if embeddings is not None:
-            return self.vf(embeddings).squeeze(-1)
+            return self._judge(embeddings, *told)
         with torch.no_grad():
-            parts = [self.vf(self.trunk(part)) for part in batch[Columns.OBS].split(VALUE_ROWS)]
-        return torch.cat(parts).squeeze(-1)
+            parts = zip(*(column.split(VALUE_ROWS) for column in (batch[Columns.OBS], *told)), strict=True)
+            return torch.cat([self._judge(self.trunk(stacks), *more) for stacks, *more in parts])
+
+    def _judge(self, embeddings: Tensor, *privileged: Tensor) -> Tensor:
+        """Values float32 (B,)."""
+        return self.vf(torch.cat([embeddings, *privileged], dim=1)).squeeze(-1)
+
+
+def _begin(networks: nn.ModuleDict, file: Path, spec: PolicySpec) -> None:
+    """Load the weights of a policy's file; NaN if it is not there, which a checkpoint's own then replace."""
+    if file.is_file():
+        networks.load_state_dict(load_networks(file, spec).state_dict())
+    else:
+        for value in networks.parameters():
+            value.data.fill_(math.nan)
 
 
 def module_spec(
-    spec: PolicySpec, seed: int, encoder: tuple[str | Path, EncoderManifest] | None = None
+    spec: PolicySpec,
+    seed: int,
+    encoder: tuple[str | Path, EncoderManifest] | None = None,
+    init: Path | None = None,
+    privileged: int = 0,
 ) -> RLModuleSpec:
     """Specification of the module.
 
@@ -153,7 +180,11 @@ def module_spec(
         spec: What the networks are built from.
         seed: Of the networks' initial weights.
         encoder: The pretrained encoder's file and its manifest; None for a policy without one.
+        init: The file of networks to begin from instead.
+        privileged: Numbers that the value network alone is told of each step.
     """
+    # Only what is used: Tune continues a training only under the keys that it began with.
+    added = {"init": str(init) if init else None, PRIVILEGED: privileged}
     file = None
     if encoder is not None:
         path, manifest = encoder
@@ -162,5 +193,8 @@ def module_spec(
         module_class=PolicyModule,
         observation_space=stack_space(spec),
         action_space=gym.spaces.Discrete(spec.num_actions),
-        model_config={"spec": spec, "encoder_file": file, "seed": seed},
+        model_config={
+            **{"spec": spec, "encoder_file": file, "seed": seed},
+            **{name: value for name, value in added.items() if value},
+        },
     )

@@ -8,9 +8,13 @@ from envs.config import sensor_settings, settings_hash
 from jobs.evaluation.sweep_plan import plan_sweep
 from jobs.rollout.policies import read_policy
 from jobs.tracking.tracker import open_store
+from jobs.training.ppo import policy_about, policy_spec
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.weights import save_encoder
+from models.policy import save_policy
+from models.policy.networks import build_networks
+from models.policy.policy import NETWORKS
 
 
 def planned(config, *agents):
@@ -35,6 +39,12 @@ def tracked_sweeps(config, kind="condition", parent="sweep"):
         for run in parents
     }
     return client, {parent: {run.info.run_name: run for run in runs} for parent, runs in children.items()}
+
+
+def write_networks(folder, config):
+    """The file of the networks of a policy without an encoder."""
+    spec = policy_spec(config)
+    return save_policy(folder, build_networks(spec, seed=7), spec, policy_about(config)) / NETWORKS
 
 
 def write_encoder(folder, config):

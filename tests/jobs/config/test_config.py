@@ -121,6 +121,8 @@ def test_ppo_is_the_papers():
         "reward_scale": 1.0,
         "num_env_runners": 0,
         "num_envs_per_env_runner": 16,
+        "critic": "observation",
+        "shaping": 0.0,
         "imitation": None,
     }
 

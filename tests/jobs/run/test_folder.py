@@ -13,6 +13,7 @@ from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
 from jobs.run.files import RunError, read_json, write_json
 from jobs.run.folder import (
+    ADDED_SETTINGS,
     NOT_IN_RUN_NAME,
     finish,
     finished,
@@ -156,9 +157,9 @@ def test_without_git_the_commit_is_unknown(monkeypatch):
 def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(config):
     run = open_run(config)
     stored = read_json(run.path / "config.json")
-    del stored["collect"]["recordings"], stored["train"]["conditions"], stored["algo"]["imitation"]
-    del stored["model"]["memory_ms"], stored["env"]["filter_support"], stored["env"]["filter_tau_us"]
-    del stored["collect"]["conditions"], stored["pretrain"]["denoise"]
+    for section, added in ADDED_SETTINGS.items():
+        for name in added:
+            del stored[section][name]
     write_json(run.path / "config.json", stored)
     assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
     settings = {name: value for name, value in stored.items() if name not in NOT_IN_RUN_NAME}

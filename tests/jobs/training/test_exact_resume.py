@@ -18,7 +18,7 @@ from jobs.training.train import METRICS, export_policy, read_metrics
 from models.kinds import KINDS
 from tests.support.configs import make_config
 from tests.support.faults import FINE, TRAIN, check_complete, launch, outcome, start
-from tests.support.runs import write_encoder
+from tests.support.runs import write_encoder, write_networks
 
 pytestmark = pytest.mark.system
 TRAINED = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
@@ -30,7 +30,14 @@ SMALL = (
     "algo.num_epochs=2",
 )
 IMITATION = ("algo=imitation", "model=event_columns", "algo.imitation.fit_steps=5", "algo.minibatch_size=32")
-OWN = {"finetuned": ["model.encoder=finetuned"], "imitation": IMITATION}
+PRIVILEGED = ("model=event_columns", "algo.critic=teacher", "algo.shaping=10")
+BEGUN = ("model=event_columns", "train.init=X", "train.value_warmup=700")  # eight iterations
+OWN = {
+    "finetuned": ["model.encoder=finetuned"],
+    "imitation": IMITATION,
+    "privileged": PRIVILEGED,
+    "begun": BEGUN,
+}
 SAME = [name for name in METRICS if not name.startswith("perf/")]
 CONDITIONS = "train.conditions=[{},{faults.sparsity:0.5},{env.control_hz:100}]"
 
@@ -47,7 +54,8 @@ def built(folder, name, *words):
     """The configuration of a small training, its encoder file, and a function that makes it."""
     config = make_config(*OWN.get(name, [f"model={name}"]), *SMALL, *words)
     encoder = write_encoder(folder, config) if KINDS[config.model.name].encoder else None
-    return config, encoder, lambda: PPO(config=build_ppo(config, encoder))
+    init = write_networks(folder / "init", config) if config.train.init else None
+    return config, encoder, lambda: PPO(config=build_ppo(config, encoder, init))
 
 
 def rows(algorithm, iterations):
@@ -78,7 +86,14 @@ def assert_same(mine, other):
 
 @pytest.mark.parametrize(
     ("name", "runners"),
-    [*((name, 0) for name in TRAINED), ("finetuned", 1), ("bytestream", 2), ("imitation", 2)],
+    [
+        *((name, 0) for name in TRAINED),
+        ("finetuned", 1),
+        ("bytestream", 2),
+        ("imitation", 2),
+        ("begun", 0),
+        ("privileged", 2),
+    ],
 )
 def test_a_training_goes_on_from_its_checkpoint_with_the_same_bytes(name, runners, tmp_path):
     words = CONDITIONS, "algo.lr_schedule=linear", f"algo.num_env_runners={runners}"

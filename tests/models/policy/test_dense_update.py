@@ -24,16 +24,17 @@ PLAIN = Settings(
 INPUTS, ACTIONS, COUNT = 6, 3, 40
 
 
-def make(hidden=(16, 16)):
+def make(hidden=(16, 16), privileged=2):
     """Two networks, Adam, rows whose ratios lie within and beyond the clip, and the orders of two epochs."""
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    networks = [mlp(INPUTS, hidden, outputs) for outputs in (ACTIONS, 1)]
+    networks = [mlp(INPUTS, hidden, ACTIONS), mlp(INPUTS + privileged, hidden, 1)]
     optimizer = torch.optim.Adam([value for one in networks for value in one.parameters()], fused=True)
     stacks, logps, advantages, targets = (
         rng.normal(size=shape).astype("f4") for shape in ((COUNT, INPUTS), COUNT, COUNT, COUNT)
     )
-    rows = Rows(stacks, rng.integers(0, ACTIONS, COUNT), 0.3 * logps - 1.1, advantages, 3.0 * targets)
+    actions, told = rng.integers(0, ACTIONS, COUNT), rng.normal(size=(COUNT, privileged)).astype("f4")
+    rows = Rows(stacks, told, actions, 0.3 * logps - 1.1, advantages, 3.0 * targets)
     return networks, optimizer, rows, np.stack([rng.permutation(COUNT) for _ in range(2)])
 
 
@@ -42,7 +43,7 @@ def by_tensors(networks, optimizer, rows, orders, settings):
     parameters = [value for one in networks for value in one.parameters()]
     optimizer.param_groups[0]["lr"] = settings.lr
     kind = parameters[0].dtype
-    stacks, actions, logps, advantages, targets = map(torch.from_numpy, rows)
+    stacks, told, actions, logps, advantages, targets = map(torch.from_numpy, rows)
     for order in orders:
         figures = []
         for n in torch.from_numpy(order).split(settings.minibatch_size):
@@ -50,7 +51,7 @@ def by_tensors(networks, optimizer, rows, orders, settings):
             ratio = (chances.gather(1, actions[n, None])[:, 0] - logps[n]).exp()
             clipped = ratio.clamp(1.0 - settings.clip_param, 1.0 + settings.clip_param)
             policy_loss = -torch.minimum(advantages[n] * ratio, advantages[n] * clipped).mean()
-            errors = networks[1](stacks[n].to(kind))[:, 0] - targets[n]
+            errors = networks[1](torch.cat([stacks[n], told[n]], 1).to(kind))[:, 0] - targets[n]
             value_loss = errors.square().clamp(max=settings.vf_clip_param).mean()
             entropy = -(chances.exp() * chances).sum(-1).mean()
             total = policy_loss + settings.vf_loss_coeff * value_loss - settings.entropy_coeff * entropy
@@ -78,8 +79,9 @@ def flat(networks):
         ((16, 16), {"vf_clip_param": 0.5, "clip_param": 0.05}),
     ],
 )
-def test_weights_moments_and_figures_are_those_of_torch_in_double_precision(hidden, changes):
-    networks, optimizer, rows, orders = make(hidden)
+@pytest.mark.parametrize("privileged", [0, 2])
+def test_weights_moments_and_figures_are_those_of_torch_in_double_precision(hidden, changes, privileged):
+    networks, optimizer, rows, orders = make(hidden, privileged)
     settings = PLAIN._replace(**changes)
     exact = [copy.deepcopy(one).double() for one in networks]
     adam = torch.optim.Adam([value for one in exact for value in one.parameters()])
@@ -123,7 +125,10 @@ def test_tensors_stay_in_place_and_steps_of_no_size_change_nothing():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [*((name, math.nan) for name in ("stacks", "logps", "advantages", "targets")), ("stacks", math.inf)],
+    [
+        *((name, math.nan) for name in ("stacks", "privileged", "logps", "advantages", "targets")),
+        ("stacks", math.inf),
+    ],
 )
 def test_a_number_that_is_not_finite_stops_before_the_step_that_meets_it(name, value):
     networks, optimizer, rows, orders = make()

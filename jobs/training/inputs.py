@@ -1,0 +1,74 @@
+"""What a training begins from: a pretrained encoder, or all of a policy that was trained before.
+
+`train.init` names such a policy. The run folder keeps a copy, from which a stopped training goes on even if
+the original is gone; the encoder is the policy's, so that nothing is collected and pretrained.
+"""
+
+from pathlib import Path
+
+from jobs.config.config import Config, ConfigError
+from jobs.rollout.policies import check_sensor
+from jobs.run.files import read_json, write_atomic
+from jobs.run.folder import Run, finished, locate_run, named_policy
+from jobs.tracking.tracker import Tracker
+from jobs.training.ppo import policy_spec
+from jobs.training.pretrain import check_sources, encoder_file, prepare_encoder
+from models.policy import load_policy
+from models.policy.policy import ENCODER, ENCODER_FILES, MANIFEST, NETWORKS, Policy
+
+
+def check_inputs(config: Config) -> None:
+    """Check all files that a training begins from, before anything is made.
+
+    Raises:
+        ConfigError: `train.init` names no policy, or one that does not fit; or as `check_sources`.
+    """
+    check_sources(config)
+    folder = locate_run(config)
+    if folder.config.train.init is not None:
+        check_init(folder)
+
+
+def prepare_inputs(config: Config, folder: Run, tracker: Tracker) -> Path | None:
+    """Copy the policy to begin from, or make the encoder; the encoder's file, or None without one."""
+    if config.train.init is None:
+        return prepare_encoder(config, folder, tracker)
+    source, policy = check_init(folder)
+    if source != folder.init:
+        parent = tracker.of(source.parent).run_id
+        lineage = {"init": source, "init_sha256": policy.manifest["sha256"][NETWORKS]}
+        tracker.tags(lineage | ({"init_run": parent} if parent != tracker.run_id else {}))
+        names = (*(ENCODER_FILES if policy.spec.frozen else ()), NETWORKS, MANIFEST)  # the last one seals it
+        for name in names:
+            write_atomic(folder.init / name, (source / name).read_bytes())
+    return folder.init / ENCODER if policy.spec.frozen else None
+
+
+def check_init(folder: Run) -> tuple[Path, Policy]:
+    """The folder of the policy that a run begins from, the run's own copy if it has one, and the policy.
+
+    Raises:
+        ConfigError: `train.init` names none, or one of other settings, of another sensor or encoder.
+    """
+    named, config = str(folder.config.train.init), folder.config
+    path = named_policy(str(folder.init)) or named_policy(named)
+    if path is None:
+        raise ConfigError(f"train.init: must be a run folder or a policy folder, got {named!r}")
+    try:
+        policy = load_policy(path)
+        check_sensor(policy.manifest["sensor"], config.env)
+    except ValueError as error:
+        raise ConfigError(f"train.init: {error}") from error
+    there, here = policy.spec.manifest(), policy_spec(config).manifest()
+    differ = [key for key in {**there, **here} if there.get(key) != here.get(key)]
+    if differ:
+        got = ", ".join(f"{key}: {there.get(key)!r} there, {here.get(key)!r} here" for key in differ)
+        remedy = "set model as it is there, or begin from another"
+        raise ConfigError(f"train.init: must be a policy of the same model, got {got}; {remedy}")
+    if policy.spec.frozen and finished(folder, "pretrain") is not None:
+        files = path / ENCODER, encoder_file(folder)
+        theirs, own = (read_json(file.with_suffix(".json"))["sha256"] for file in files)
+        if theirs != own:
+            remedy = f"delete {folder.path / 'stages' / 'pretrain.json'} to take its encoder"
+            raise ConfigError(f"train.init: must have the encoder of this run, {own}, got {theirs}; {remedy}")
+    return path, policy

@@ -1,0 +1,62 @@
+"""Env runners beside which a planner stands that knows the geometry, and says what each place costs."""
+
+from typing import Any
+
+import numpy as np
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+
+from envs.scene import Scene
+from envs.scene.planning import CostToGo, cost_to_go
+from jobs.training.env_runner import PlainEnvRunner, Step
+from jobs.training.snapshots import Snapshot
+
+COST_TO_GO = "cost_to_go"  # in an info: of the cheapest way to the goal line, as `envs.scene.planning`
+
+
+class TeacherEnvRunner(PlainEnvRunner):
+    """As `PlainEnvRunner`, with a plan of each environment's scene."""
+
+    def __init__(self, **settings: Any) -> None:
+        self._plans: dict[int, tuple[Scene, CostToGo]] = {}  # of each environment's scene
+        super().__init__(**settings)
+
+    def costs(self) -> np.ndarray:
+        """What each action costs where each environment is now, float64 (N, actions)."""
+        return np.stack([self._costs(row) for row in range(self.env.num_envs)])
+
+    def _costs(self, row: int) -> np.ndarray:
+        env = self.env.unwrapped.envs[row]
+        scene, plan = self._plans.get(row, (None, None))
+        if plan is None or scene is not env.scene:
+            plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
+            self._plans[row] = env.scene, plan
+        return plan.of_actions(*env.camera_pose()[:2])
+
+
+class PricedEnvRunner(TeacherEnvRunner):
+    """As `PlainEnvRunner`; each info has `COST_TO_GO`. The policy never sees an info."""
+
+    def _reset_all(self) -> None:
+        super()._reset_all()
+        self._infos = self._priced(self._infos)
+
+    def _step(self) -> Step:
+        step = super()._step()
+        return step._replace(infos=self._priced(step.infos))
+
+    def _replay(self, snapshot: Snapshot) -> str:
+        problem = super()._replay(snapshot)
+        if not problem:
+            self._infos = self._priced(self._infos)
+        return problem
+
+    def _priced(self, infos: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {**infos, COST_TO_GO: self.costs().min(axis=1)}
+
+
+def log_costs(episode: SingleAgentEpisode) -> np.ndarray:
+    """log(1 + `COST_TO_GO`) of the places of an episode, float64 (T + 1,).
+
+    Costs are about 1 where a way is free, and 1000 where none is left; logarithms are 0.7 and 7.
+    """
+    return np.log1p(np.array([info[COST_TO_GO] for info in episode.get_infos()]))
