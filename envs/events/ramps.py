@@ -107,7 +107,7 @@ class ColumnCamera:
         (rule, curve, limits), memory, scratch = EventCamera(config).state
         self._shape = config.height, config.width
         if limits.shape[1] > 1:
-            limits = np.ascontiguousarray(limits.reshape(-1, *self._shape).swapaxes(1, 2)).reshape(limits.shape)
+            limits = limits.reshape(-1, *self._shape).swapaxes(1, 2).reshape(limits.shape)
         self.state = (rule, curve, limits), memory, scratch
 
     @property

@@ -119,8 +119,7 @@ def sense_way(view, way, parts):
     find_silhouettes(bodies, width, cull, room, before)
     aim_along(frame, way, way.start_us)
     find_silhouettes(bodies, width, cull, room, after)
-    if fastest(before, after) > FAST * parts:
-        parts *= 2
+    parts *= 2 if fastest(before, after) > FAST * parts else 1
     events, lost, columns, begin_us = np.empty(0, EVENT), 0, 0, way.start_us
     for part in range(1, parts + 1):
         end_us = way.start_us + way.moving_us * part // parts
