@@ -107,12 +107,6 @@ class EventCamera:
         """Model, memory and scratch, as the kernels take them."""
         return self._model, self._memory, self._scratch
 
-    @property
-    def last_frame(self) -> np.ndarray:
-        """The last frame, float32 (H, W), as the camera remembers it; not a copy."""
-        frame: np.ndarray = self._memory[0][0]
-        return frame.reshape(self._shape)
-
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
         """Remember a first frame; it makes no events, and no pixel is in its refractory period.
 

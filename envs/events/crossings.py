@@ -258,7 +258,7 @@ def steps(frames, times_us, width, limit, model, memory, scratch):
 def _step(luminance, span, width, limit, model, memory, scratch):
     """One frame: (first invalid pixel or -1, events lost, events)."""
     flags, outside = scratch
-    found = scan(luminance, memory, flags, outside)
+    found = scan(luminance, memory.quiet_low, memory.quiet_high, flags, outside)
     counts, times = np.empty((2, found), np.int64), np.empty((2, found))
     responses = np.empty((3, found if model.rule.refractory_us > 0 else 0))
     motions = Motions(responses[0], responses[1], responses[2])
@@ -279,18 +279,18 @@ def _step(luminance, span, width, limit, model, memory, scratch):
 
 
 @kernel
-def scan(luminance, memory, flags, outside):
-    """Write the pixels outside their quiet band, in raster order; return how many.
+def scan(luminance, low, high, flags, outside):
+    """Write the pixels outside their quiet band `low` .. `high`, in their order; return how many.
 
     The first loop has no branch, so that it compiles to wide instructions; the second looks
     at eight flags at a time.
     """
-    flag = flags.view(np.uint8)
-    low, high = memory.quiet_low, memory.quiet_high
+    flag, found, words = flags.view(np.uint8), 0, (luminance.size + 7) // 8
     for i in range(luminance.size):
         flag[i] = not ((luminance[i] >= low[i]) & (luminance[i] <= high[i]))
-    found = 0
-    for word in range(flags.size):
+    for i in range(luminance.size, 8 * words):
+        flag[i] = False
+    for word in range(words):
         if flags[word] != 0:
             for i in range(8 * word, 8 * word + 8):
                 outside[found] = i

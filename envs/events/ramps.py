@@ -1,5 +1,7 @@
 """Events of pixels that are looked at column by column, each column at times of its own.
 
+A column lies together in memory: pixel x, y of an image of H rows is number x * H + y.
+
 Between two looks the light of a pixel is taken as linear in time. So it is where an edge moves
 through the pixel at constant speed, because a pixel sees the mean over its area. The response to
 light then is not linear, and each crossing has a time of its own: when the light is what the
@@ -16,7 +18,18 @@ import numpy as np
 
 from envs.compiled import kernel
 from envs.config import CameraConfig
-from envs.events.crossings import BLOCK, Memory, Model, Room, level_of, respond_at, scan, set_quiet_bands
+from envs.events.camera import EventCamera
+from envs.events.crossings import (
+    BLOCK,
+    Memory,
+    Model,
+    Room,
+    level_of,
+    remember,
+    respond_at,
+    scan,
+    set_quiet_bands,
+)
 from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME, sorted_events
 from envs.events.photoreceptor import light_of
 from envs.events.refractory import TOLERANCE
@@ -26,7 +39,8 @@ class Ramps(NamedTuple):
     """Light of pixels that fire, from one look at each to the next.
 
     Attributes:
-        pixels: Flat indices, int64.
+        pixels: Their numbers, int64.
+        columns: Their columns, int64.
         crossings: Levels crossed, negative if downwards, int64.
         sent: How many of them become events, int64.
         level, stride: The first level crossed, and from one to the next, float64.
@@ -37,6 +51,7 @@ class Ramps(NamedTuple):
     """
 
     pixels: np.ndarray
+    columns: np.ndarray
     crossings: np.ndarray
     sent: np.ndarray
     level: np.ndarray
@@ -69,8 +84,8 @@ class Watch(NamedTuple):
 
 def make_ramps(size: int) -> Ramps:
     """Room for `size` ramps."""
-    whole, real = np.empty((5, size), np.int64), np.empty((4, size))
-    return Ramps(whole[0], whole[1], whole[2], real[0], real[1], real[2], real[3], whole[3], whole[4])
+    whole, real = np.empty((6, size), np.int64), np.empty((4, size))
+    return Ramps(*whole[:4], *real, *whole[4:])
 
 
 def can_look(camera: CameraConfig) -> bool:
@@ -80,12 +95,38 @@ def can_look(camera: CameraConfig) -> bool:
     return camera.memory == "reference" and exact and events <= MAX_EVENTS_PER_FRAME
 
 
+class ColumnCamera:
+    """What an `EventCamera` of the same settings knows and remembers, to be looked through by columns.
+
+    Attributes:
+        state: Model, memory and scratch as those of an `EventCamera`, with the pixels' numbers of this file.
+    """
+
+    def __init__(self, config: CameraConfig) -> None:
+        """Make a camera, of which `can_look` holds."""
+        (rule, curve, limits), memory, scratch = EventCamera(config).state
+        self._shape = config.height, config.width
+        if limits.shape[1] > 1:
+            limits = limits.reshape(-1, *self._shape).swapaxes(1, 2).reshape(limits.shape)
+        self.state = (rule, curve, limits), memory, scratch
+
+    @property
+    def last_frame(self) -> np.ndarray:
+        """The last frame, float32 (H, W), as the camera remembers it; not a copy."""
+        frame: np.ndarray = self.state[1][0][0]
+        return frame.reshape(self._shape[::-1]).T
+
+    def reset(self, luminance: np.ndarray) -> None:
+        """Remember a first frame, float32 (H, W), valid; it makes no events."""
+        remember(luminance.T.ravel(), *self.state[:2])
+
+
 @kernel
 def look_at(image, first, last, t_us, watch, kept):
     """Look at columns `first` .. `last` - 1 of an image: keep the ramps of their pixels that fire.
 
     Args:
-        image: float32 (H, W), linear luminance.
+        image: float32 (W, H), linear luminance, column after column.
         first: The first column.
         last: The column after the last.
         t_us: The time [us], later than the last look at each of them.
@@ -97,13 +138,14 @@ def look_at(image, first, last, t_us, watch, kept):
     """
     flat, (flags, outside) = image.reshape(image.size), watch.scratch
     model, memory, ramps = watch.model, watch.memory, watch.ramps
-    whole = last - first == image.shape[1]
-    found = (
-        scan(flat, memory, flags, outside) if whole else _scan_columns(image, first, last, memory, outside)
-    )
+    begin, end = first * image.shape[1], last * image.shape[1]
+    low, high = memory.quiet_low[begin:end], memory.quiet_high[begin:end]
+    found = scan(flat[begin:end], low, high, flags, outside)
+    for j in range(found):
+        outside[j] += begin
     begun, lost, room = kept, 0, watch.room
-    for begin in range(0, found, BLOCK):
-        pixels = outside[begin : min(begin + BLOCK, found)]
+    for start in range(0, found, BLOCK):
+        pixels = outside[start : min(start + BLOCK, found)]
         bad = respond_at(pixels, flat, model.curve, room.after, room)
         if bad >= 0:
             return bad, begun, 0
@@ -112,33 +154,11 @@ def look_at(image, first, last, t_us, watch, kept):
     for j in range(begun, kept):
         lost += abs(ramps.crossings[j]) - ramps.sent[j]
     _advance(begun, kept, watch)
-    _copy_columns(image, first, last, memory.previous)
+    for i in range(begin, end):
+        memory.previous[i] = flat[i]
     for column in range(first, last):
         watch.seen_us[column] = t_us
     return -1, kept, 0 if model.rule.carries else lost
-
-
-@kernel
-def _scan_columns(image, first, last, memory, outside):
-    """Write the pixels of some columns outside their quiet band, in raster order; return how many."""
-    found = 0
-    for row in range(image.shape[0]):
-        i = row * image.shape[1] + first
-        for column in range(first, last):
-            light = image[row, column]
-            outside[found] = i
-            found += not ((light >= memory.quiet_low[i]) & (light <= memory.quiet_high[i]))
-            i += 1
-    return found
-
-
-@kernel
-def _copy_columns(image, first, last, previous):
-    """Remember some columns of an image."""
-    for row in range(image.shape[0]):
-        i = row * image.shape[1]
-        for column in range(first, last):
-            previous[i + column] = image[row, column]
 
 
 @kernel
@@ -146,8 +166,12 @@ def _keep(pixels, flat, t_us, watch, kept):
     """Append the ramps of the pixels that fire; return how many there are now."""
     rule, thresholds = watch.model.rule, watch.model.thresholds
     memory, seen_us, ramps, room = watch.memory, watch.seen_us, watch.ramps, watch.room
+    height = flat.size // seen_us.size
+    column = pixels[0] // height
     for j in range(pixels.size):
         i = pixels[j]
+        while i >= (column + 1) * height:
+            column += 1
         k = i if thresholds.on.size > 1 else 0
         on, off = thresholds.on[k], thresholds.off[k]
         remembered, way = level_of(memory, i, on, off), room.after[j] - room.before[j]
@@ -156,10 +180,10 @@ def _keep(pixels, flat, t_us, watch, kept):
         count = np.int64((abs(change) + TOLERANCE) / abs(step))
         if count == 0 or not (rule.carries or way != 0.0):
             continue
-        length_us = t_us - seen_us[i % seen_us.size]
+        length_us = t_us - seen_us[column]
         light, sign = np.float64(memory.previous[i]), np.int64(1) if change > 0.0 else np.int64(-1)
-        ramps.pixels[kept], ramps.crossings[kept] = i, sign * count
-        ramps.sent[kept] = min(count, rule.max_events)
+        ramps.pixels[kept], ramps.columns[kept] = i, column
+        ramps.crossings[kept], ramps.sent[kept] = sign * count, min(count, rule.max_events)
         ramps.level[kept], ramps.stride[kept], ramps.light[kept] = remembered + step, step, light
         ramps.pace[kept] = length_us / (np.float64(flat[i]) - light) if way * change > 0.0 else 0.0
         ramps.start_us[kept], ramps.length_us[kept] = t_us - length_us, length_us
@@ -195,19 +219,19 @@ def events_of_ramps(watch, kept, span):
         kept: How many of the ramps are in use.
         span: `Span` in which they lie.
     """
-    ramps, width = watch.ramps, watch.seen_us.size
-    total = ramps.sent[:kept].sum()
+    ramps, height = watch.ramps, watch.memory.previous.size // watch.seen_us.size
+    order, total = _row_after_row(ramps, kept, height), ramps.sent[:kept].sum()
     lights, times, places = np.empty(total), np.empty(total, np.int64), np.empty(total, np.uint32)
     event = 0
-    for j in range(kept):
+    for j in order:
         for k in range(ramps.sent[j]):
             lights[event] = ramps.level[j] + k * ramps.stride[j]
             event += 1
     light_of(watch.model.curve, lights, np.empty(total, np.int64))
     event = 0
-    for j in range(kept):
-        y = ramps.pixels[j] // width
-        place = np.uint32((y << 13) | ((ramps.pixels[j] - y * width) << 1) | (ramps.crossings[j] > 0))
+    for j in order:
+        x = ramps.columns[j]
+        place = np.uint32(((ramps.pixels[j] - x * height) << 13) | (x << 1) | (ramps.crossings[j] > 0))
         start, length = ramps.start_us[j] - span.start_us, np.float64(ramps.length_us[j])
         for _ in range(ramps.sent[j]):
             after = np.rint((lights[event] - ramps.light[j]) * ramps.pace[j])
@@ -217,6 +241,21 @@ def events_of_ramps(watch, kept, span):
     events = sorted_events(times, places, span)
     _order_ties(events)
     return events
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _row_after_row(ramps, kept, height):
+    """The ramps' places, int64 (kept,), by rows of the image; those of a row as they come."""
+    starts, order = np.zeros(height + 1, np.int64), np.empty(kept, np.int64)
+    for j in range(kept):
+        starts[ramps.pixels[j] - ramps.columns[j] * height + 1] += 1
+    for row in range(height):
+        starts[row + 1] += starts[row]
+    for j in range(kept):
+        row = ramps.pixels[j] - ramps.columns[j] * height
+        order[starts[row]] = j
+        starts[row] += 1
+    return order
 
 
 @numba.njit(cache=True, error_model="numpy")

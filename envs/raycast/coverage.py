@@ -124,16 +124,13 @@ def resolve(
         waiting[BLOCK + place, row] = paint[row]
         steps[row] = paint[row] = 0.0
     steps[-1] = 0.0
-    if place == BLOCK - 1:
-        _sum_block(frame.sky, waiting, image, column - place)
-    elif column == last - 1:
-        for k in range(place + 1):
-            _sum_column(frame.sky, waiting[k::BLOCK], image, column - place + k)
+    if place == BLOCK - 1 or column == last - 1:
+        _sum_block(frame.sky, waiting, image, column - place, place + 1)
 
 
 @kernel
-def _sum_block(sky: float, waiting: np.ndarray, image: np.ndarray, first: int) -> None:
-    """Write columns `first` .. `first` + 3."""
+def _sum_block(sky: float, waiting: np.ndarray, image: np.ndarray, first: int, count: int) -> None:
+    """Write columns `first` .. `first` + `count` - 1; those that are not waiting are summed for nothing."""
     one = two = three = four = sky
     for row in range(image.shape[0]):
         one += waiting[0, row]
@@ -141,18 +138,12 @@ def _sum_block(sky: float, waiting: np.ndarray, image: np.ndarray, first: int) -
         three += waiting[2, row]
         four += waiting[3, row]
         image[row, first] = one + waiting[4, row]
-        image[row, first + 1] = two + waiting[5, row]
-        image[row, first + 2] = three + waiting[6, row]
-        image[row, first + 3] = four + waiting[7, row]
-
-
-@kernel
-def _sum_column(sky: float, waiting: np.ndarray, image: np.ndarray, column: int) -> None:
-    """Write one column."""
-    running = sky
-    for row in range(image.shape[0]):
-        running += waiting[0, row]
-        image[row, column] = running + waiting[1, row]
+        if count > 1:
+            image[row, first + 1] = two + waiting[5, row]
+        if count > 2:
+            image[row, first + 2] = three + waiting[6, row]
+        if count > 3:
+            image[row, first + 3] = four + waiting[7, row]
 
 
 @kernel

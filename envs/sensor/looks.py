@@ -36,7 +36,7 @@ class Scratch(NamedTuple):
 
     Attributes:
         room: `Workspace` for as many bodies as a scene has, or more.
-        image: float32 (H, W), what is painted.
+        image: float32 (H, W), what is painted; in memory column after column.
         pixels: As `crossings.steps` takes its scratch.
         ramps: For three times as many pixels as the image has.
         looks: For the looks at it.
@@ -59,7 +59,7 @@ class View(NamedTuple):
         stacks: Float32, the filtered tiles of the scene's noise.
         frame: (1,) FRAME without what a pose determines.
         cull_m: Obstacles farther than this are not drawn [m].
-        model: The model of an `EventCamera`, as its `state` gives it.
+        model: The model of a `ColumnCamera`, as its `state` gives it.
         memory: Its memory; the last image is a part of it.
         seen_us: int64 (W,), when each column was looked at last [us].
         scratch: Room for a step.
@@ -86,7 +86,7 @@ def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
     size, words = width * height, (width * height + 7) // 8
     return Scratch(
         room=make_workspace(num_bodies, height),
-        image=np.zeros((height, width), np.float32),
+        image=np.zeros((width, height), np.float32).T,
         pixels=(np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)),
         ramps=make_ramps(3 * size),
         looks=make_looks(width),
@@ -119,14 +119,14 @@ def sense_way(view, way, parts):
     find_silhouettes(bodies, width, cull, room, before)
     aim_along(frame, way, way.start_us)
     find_silhouettes(bodies, width, cull, room, after)
-    if fastest(before, after) > FAST * parts:
-        parts *= 2
+    parts *= 2 if fastest(before, after) > FAST * parts else 1
     events, lost, columns, begin_us = np.empty(0, EVENT), 0, 0, way.start_us
     for part in range(1, parts + 1):
         end_us = way.start_us + way.moving_us * part // parts
         before, after = after, before
-        aim_along(frame, way, end_us)
-        find_silhouettes(bodies, width, cull, room, after)
+        if parts > 1:  # of a way in one part, both ends are known
+            aim_along(frame, way, end_us)
+            find_silhouettes(bodies, width, cull, room, after)
         count = find_looks(bodies, way, Stretch(begin_us, end_us, before, after), room, looks)
         kept = 0
         for k in range(count + 1):
@@ -137,7 +137,7 @@ def sense_way(view, way, parts):
                     continue
             aim_along(frame, way, t_us)
             paint_columns(bodies, stacks, image, first, last, cull, room)
-            bad, kept, more = look_at(image, first, last, t_us, watch, kept)
+            bad, kept, more = look_at(image.T, first, last, t_us, watch, kept)
             if bad >= 0:
                 return bad, 0, 0, np.empty(0, EVENT)
             lost, columns = lost + more, columns + last - first

@@ -7,6 +7,7 @@ import numpy as np
 from envs.checks import check_pose
 from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, apply_faults, draw_pixel_faults
+from envs.events.ramps import ColumnCamera
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
 from envs.raycast.records import BODY, FRAME
@@ -41,7 +42,7 @@ class Sensor:
     def __init__(self, config: EnvConfig) -> None:
         """Make the sensor that `config` describes."""
         self._config = config
-        self._camera = EventCamera(config.camera)
+        self._camera: Any = EventCamera(config.camera)  # or a `ColumnCamera`, where it sees by looks
         self._together = max(1, MAX_PIXELS_TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
@@ -61,10 +62,12 @@ class Sensor:
         self.luminance = self._picture(place, t_us)
         if not self._pictures_alone:
             self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
-            self._camera.reset(self.luminance, t_us)
             self._seen_us[:] = t_us
             if self.plan.by_looks:
+                self._camera.reset(self.luminance)
                 self.luminance = self._camera.last_frame
+            else:
+                self._camera.reset(self.luminance, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
         """Simulate one control step: render the part that the vehicle moved, and set the events.
@@ -183,6 +186,9 @@ class Sensor:
         same = self._renderer is not None
         same = same and (chosen.renderer, chosen.samples) == (self.plan.renderer, self.plan.samples)
         self.plan = chosen
+        kind = ColumnCamera if chosen.by_looks else EventCamera
+        if not isinstance(self._camera, kind):
+            self._camera = kind(camera)
         if same:
             self._renderer.set_scene(scene)
             self._renderer.cull_m = chosen.cull_m
@@ -196,5 +202,5 @@ def check_sensed(bad: int, way: Way, image: np.ndarray) -> None:
     if bad == BAD_POSE:
         check_pose((way.end_x, way.end_y, way.height, 0.0), (way.start_us + way.moving_us) * 1e-6)
     if bad >= 0:
-        y, x = divmod(bad, image.shape[1])
+        x, y = divmod(bad, image.shape[0])
         raise ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {image[y, x]!s}.")

@@ -4,7 +4,7 @@ Run: python -m jobs.bench.against [COMMIT], the one before HEAD unless another i
 Expect: a table in about five minutes on one core. Two processes, one of each checkout, take turns
 at the same flights, 32 corridors side by side; a ratio is the median over the rounds of the other's
 time over this one's. The event error is that against the converged simulation of the same checkout,
-at tolerance 0.05.
+at tolerance 0.05. In the last row a shipped policy also encodes the windows and decides.
 """
 
 import inspect
@@ -23,11 +23,13 @@ from jobs.analysis.tables import show_table
 ROUNDS = 15
 SCENES = ("poles", "poles_dense", "shape_change", "gates", "texture_change", "dynamic")
 ROOT = Path(__file__).resolve().parents[2]
+DECIDED = "poles models/pretrained/bytestream-s0"
 
 
 def worker() -> None:
-    """Answer each line of the input, the name of a scene, by seconds a step and the event error, as JSON.
+    """Answer each line of the input by seconds a step and the event error, as JSON.
 
+    A line is the name of a scene, and the folder of a policy if one is to decide at each step.
     It runs by its source alone in another checkout, so that it takes nothing from this file.
     """
     import json
@@ -35,24 +37,32 @@ def worker() -> None:
     import time
 
     import numpy as np
+    import torch
 
     from envs.config import EnvConfig
     from envs.corridor import CorridorVectorEnv
     from envs.event_error import measure_event_error
+    from models.policy import load_policy
 
+    torch.set_num_threads(1)
     corridors, steps, known = 32, 12, {}
     for line in sys.stdin:
-        scene = line.strip()
-        if scene not in known:
-            env = CorridorVectorEnv(corridors, EnvConfig(scene=scene))
+        scene, *folder = line.split()
+        if line not in known:
+            env = CorridorVectorEnv(corridors, EnvConfig(scene=scene, window_capacity=1024))
             env.reset(seed=0)
-            known[scene] = env, measure_event_error(EnvConfig(scene=scene)).error
-        env, error = known[scene]
+            policy = load_policy(folder[0]) if folder else None
+            if policy is not None:
+                policy.reset(corridors)
+            known[line] = env, policy, measure_event_error(EnvConfig(scene=scene)).error
+        env, policy, error = known[line]
         rng, seconds = np.random.default_rng(0), []
         for _ in range(steps):
             actions = rng.integers(3, size=corridors)
             began = time.perf_counter()
-            env.step(actions)
+            observations = env.step(actions)[0]
+            if policy is not None:
+                policy.logits(observations)
             seconds.append((time.perf_counter() - began) / corridors)
         print(json.dumps([float(np.median(seconds)), error]), flush=True)
 
@@ -108,7 +118,8 @@ def compared(scene: str, here: Checkout, there: Checkout) -> tuple[str, ...]:
     micro = [f"{1e6 * statistics.median(pair[k][0] for pair in pairs):.0f}" for k in range(2)]
     errors = [f"{side[1]:.3f}" for side in pairs[0]]
     spread = f"{min(ratios):.2f} to {max(ratios):.2f}"
-    return scene, *micro, f"{statistics.median(ratios):.2f}", spread, *errors
+    name = "poles, encoded and decided" if scene == DECIDED else scene
+    return name, *micro, f"{statistics.median(ratios):.2f}", spread, *errors
 
 
 def main() -> None:
@@ -116,7 +127,7 @@ def main() -> None:
     commit = sys.argv[1] if len(sys.argv) > 1 else "HEAD^"
     with checked_out(commit) as place:
         here, there = Checkout(ROOT), Checkout(place)
-        rows = [compared(scene, here, there) for scene in SCENES]
+        rows = [compared(scene, here, there) for scene in (*SCENES, DECIDED)]
         here.end()
         there.end()
     head = ("scene", "us here", "us there", "there / here", "all rounds", "error here", "error there")

@@ -105,17 +105,18 @@ def encode() -> None:
 
 
 def learn() -> None:
-    """Take a gradient step of a small policy."""
+    """Decide by a small policy, and take a gradient step of it."""
     import torch
 
     from models.policy.dense_update import Rows, Settings, update_dense
-    from models.policy.networks import mlp
+    from models.policy.networks import logits_of, mlp
 
     networks = [mlp(2, (2,), outputs) for outputs in (3, 1)]
     optimizer = torch.optim.Adam([value for one in networks for value in one.parameters()], fused=True)
     one = np.zeros(1, np.float32)
     stacks, none = np.zeros((1, 2), np.float32), np.zeros((1, 0), np.float32)
     rows = Rows(stacks, none, np.zeros(1, np.int64), one, one, one)
+    logits_of(torch.nn.Flatten(), networks[0], stacks)
     settings = Settings(1, 0.2, 1.0, 1.0, 0.0, 1.0, 1e-3, 0.9, 0.999, 1e-8)
     update_dense(networks, optimizer, rows, np.zeros((1, 1), np.int64), settings)
 

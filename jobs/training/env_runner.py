@@ -26,6 +26,7 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from jobs.run.watchdog import ending_after
 from jobs.training.rllib_internals import ENV_RUNNER, require
 from jobs.training.snapshots import Snapshot, generators, set_generators
+from models.policy.networks import logits_of
 
 MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
 
@@ -297,7 +298,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Drawn actions (N,), and by name the logits (N, actions) and the actions' log-probabilities."""
-        logits = self.module._forward({Columns.OBS: torch.from_numpy(stacks)})[Columns.ACTION_DIST_INPUTS]
+        logits = torch.from_numpy(logits_of(self.module.trunk, self.module.pi, stacks))
         chances = torch.softmax(logits, dim=-1)
         actions = torch.multinomial(chances, 1, replacement=True)
         logp = torch.log_softmax(logits, dim=-1).gather(1, actions)

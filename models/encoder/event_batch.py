@@ -59,6 +59,13 @@ class EventBatch:
         if (ends[1:] < ends[:-1]).any():
             raise ValueError(f"offsets must not decrease, got {ends}")
 
+    @classmethod
+    def known(cls, grid: Grid, address: np.ndarray, offsets: np.ndarray) -> "EventBatch":
+        """A batch of addresses (2, N) that this file has computed, which need no second look."""
+        batch = object.__new__(cls)
+        batch.__dict__.update(grid=grid, code=address[0], bin=address[1], offsets=offsets)
+        return batch
+
     def __len__(self) -> int:
         """Number of windows."""
         return len(self.offsets) - 1
@@ -146,7 +153,7 @@ def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> Even
     address, offsets, bad = _index_packed(rows, starts, grid)
     if bad >= 0:
         _refuse(bad, rows[starts[bad] : starts[bad + 1]], grid)
-    return EventBatch(grid, address[0], address[1], offsets)
+    return EventBatch.known(grid, address, offsets)
 
 
 def _flat_rows(windows: np.ndarray | Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -290,7 +297,7 @@ def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _join(parts: list[np.ndarray], grid: Grid) -> EventBatch:
     offsets = _sums([part.shape[1] for part in parts])
     address = parts[0] if len(parts) == 1 else np.concatenate([np.empty((2, 0), np.int32), *parts], axis=1)
-    return EventBatch(grid, address[0], address[1], offsets)
+    return EventBatch.known(grid, address, offsets)
 
 
 def _sums(sizes: list[int]) -> np.ndarray:

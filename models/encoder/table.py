@@ -240,13 +240,13 @@ def _raise_to_newest(features, embedding, code, bins, offsets, contexts) -> None
 @numba.njit(cache=True, error_model="numpy")
 def _mlp(contexts, hidden_weight, hidden_bias, weight, bias):  # type: ignore[no-untyped-def]
     """Second half of the encoder: ReLU layer, then mu, (B, latent) of contexts (B, K)."""
-    hidden = _dense(contexts, hidden_weight, hidden_bias)
-    return _dense(np.maximum(hidden, np.float32(0.0)), weight, bias)
+    hidden = dense(contexts, hidden_weight, hidden_bias)
+    return dense(np.maximum(hidden, np.float32(0.0)), weight, bias)
 
 
 # Reordering the sums lets them use vector registers (20 times faster); it decides no event.
 @numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _dense(inputs, weight, bias):  # type: ignore[no-untyped-def]
+def dense(inputs, weight, bias):  # type: ignore[no-untyped-def]
     """The products inputs (B, K) @ weight (M, K).T + bias (M,).
 
     Two rows of either at a time, so that a number is loaded half as often. An odd last one comes twice:

@@ -206,13 +206,14 @@ def _forward(inputs, network):  # type: ignore[no-untyped-def]
             for j in range(len(bias)):
                 row[j] += bias[j]
             if k < len(widths) - 1:
-                _tanh(row)
+                tanh(row)
         shown = out
     return out, of_out
 
 
 @compiled
-def _tanh(values):  # type: ignore[no-untyped-def]
+def tanh(values):  # type: ignore[no-untyped-def]
+    """Replace each of `values` (N,), float32, by its tanh."""
     for j in range(len(values)):
         x = values[j]
         x = -TANH_IS_ONE if x < -TANH_IS_ONE else x  # NaN stays

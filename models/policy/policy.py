@@ -37,7 +37,7 @@ from models.kinds import PolicySpec, read_spec
 from models.policy.event_filter import filter_of
 from models.policy.features import LATENT, Step, Windows, feature_of
 from models.policy.memory import remember, windows_us
-from models.policy.networks import assemble
+from models.policy.networks import assemble, logits_of
 
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
 ENCODER_FILES = (ENCODER, "encoder.json")
@@ -187,8 +187,7 @@ class Policy:
         first = self._first if restarted is None else self._first | restarted
         self._stacks = remember(self._stacks, features, first, self.spec, window_us)
         self._first = np.zeros(len(features), bool)
-        with torch.inference_mode():
-            logits = self.networks["pi"](self.networks["trunk"](torch.from_numpy(self._stacks))).numpy()
+        logits = logits_of(self.networks["trunk"], self.networks["pi"], self._stacks)
         if not np.isfinite(logits).all():
             raise ValueError("the policy's logits must be finite, got NaN or infinity; train it anew")
         return logits

@@ -3,10 +3,9 @@
 import numpy as np
 
 from envs.config import CameraConfig
-from envs.events import EventCamera
 from envs.events.crossings import make_room, named
 from envs.events.emission import Span
-from envs.events.ramps import Watch, events_of_ramps, look_at, make_ramps
+from envs.events.ramps import ColumnCamera, Watch, events_of_ramps, look_at, make_ramps
 
 WIDTH, HEIGHT = 16, 12
 
@@ -16,8 +15,8 @@ class Looker:
 
     def __init__(self, first, t_us=0, **fields):
         self.config = CameraConfig(width=WIDTH, height=HEIGHT, **fields)
-        self.camera = EventCamera(self.config)
-        self.camera.reset(first, t_us)
+        self.camera = ColumnCamera(self.config)
+        self.camera.reset(first)
         self.seen_us = np.full(WIDTH, t_us, np.int64)
         values, rows, scratch = self.camera.state
         model, memory = named(values, rows)
@@ -28,7 +27,7 @@ class Looker:
         """Events of looks (image, first column, column after the last, time [us]), and how many are lost."""
         start_us, kept, lost = int(self.seen_us.min()), 0, 0
         for image, first, last, t_us in looks:
-            bad, kept, more = look_at(image, first, last, t_us, self.watch, kept)
+            bad, kept, more = look_at(np.ascontiguousarray(image.T), first, last, t_us, self.watch, kept)
             assert bad == -1
             lost += more
         span = Span(start_us, max(t_us for *_, t_us in looks))

@@ -39,7 +39,9 @@ def test_looks_at_whole_images_fire_the_pixels_that_frames_fire(response, excess
         assert np.array_equal(counts(events), counts(expected))
         assert lost == camera.dropped
     for mine, theirs in zip(looker.camera.state[1], camera.state[1], strict=True):
-        assert mine.tobytes() == theirs.tobytes()
+        by_columns = theirs.reshape(-1, HEIGHT, WIDTH).swapaxes(1, 2)
+        assert mine.tobytes() == by_columns.tobytes()
+    assert looker.camera.last_frame.tobytes() == frames[-1].tobytes()
 
 
 def test_a_crossing_comes_when_the_light_reaches_its_level():
@@ -94,8 +96,8 @@ def test_a_value_that_is_no_luminance_is_named_and_changes_nothing():
     last[5, 7] = np.nan
     looker = Looker(first)
     before = [part.copy() for part in looker.camera.state[1]]
-    bad, kept, _ = look_at(last, 6, 9, 10, looker.watch, 0)
-    assert (bad, kept) == (5 * WIDTH + 7, 0)
+    bad, kept, _ = look_at(np.ascontiguousarray(last.T), 6, 9, 10, looker.watch, 0)
+    assert (bad, kept) == (7 * HEIGHT + 5, 0)
     assert all(np.array_equal(part, kept) for part, kept in zip(looker.camera.state[1], before, strict=True))
 
 

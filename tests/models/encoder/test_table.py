@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from models.encoder.event_batch import batch_windows
-from models.encoder.table import PRECISIONS, EncoderTable, _dense
+from models.encoder.table import PRECISIONS, EncoderTable, dense
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
@@ -237,7 +237,7 @@ def test_the_layers_after_the_maximum_are_matrix_products():
     for windows, inputs, outputs in ((1, 128, 1), (4, 33, 7), (5, 64, 8)):
         contexts, weight = rng.normal(size=(windows, inputs)), rng.normal(size=(outputs, inputs))
         bias = rng.normal(size=outputs)
-        np.testing.assert_allclose(_dense(contexts, weight, bias), contexts @ weight.T + bias, rtol=1e-12)
+        np.testing.assert_allclose(dense(contexts, weight, bias), contexts @ weight.T + bias, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("field", "value"), [("x", 16), ("y", 12), ("p", 0), ("x", 65535)])

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from models.kinds import MIN_IMAGE, EncoderModel, FixedModel, PolicySpec
-from models.policy.networks import PARTS, assemble, build_networks
+from models.policy.networks import PARTS, assemble, build_networks, logits_of
 
 ENCODER = EncoderModel("bytestream", 64, 8, "batch", "signed", 32, "additive", "frozen", 3, [64, 64])
 MLP = PolicySpec(ENCODER, 64, 64, 3)
@@ -47,6 +47,24 @@ def test_two_mlps_share_nothing():
         assert shapes == [(64, 24), (64, 64), (outputs, 64)]
         assert [type(part) for part in networks[name][1::2]] == [nn.Tanh, nn.Tanh]
     assert not torch.equal(networks["pi"][0].weight, networks["vf"][0].weight)
+
+
+@pytest.mark.parametrize("hidden", [[], [64, 64], [7, 5, 3]])
+def test_logits_without_torch_are_those_of_the_networks_in_any_batch(hidden):
+    spec = dataclasses.replace(MLP, model=dataclasses.replace(ENCODER, hidden=hidden))
+    networks = build_networks(spec, seed=7)
+    networks["pi"][-1].weight.data.mul_(100.0)  # so that logits differ
+    trunk, pi = networks["trunk"], networks["pi"]
+    stacks = (3.0 * np.random.default_rng(0).normal(size=(9, 3, 8))).astype(np.float32)
+    logits = logits_of(trunk, pi, stacks)
+    with torch.no_grad():
+        expected = pi(trunk(torch.from_numpy(stacks))).numpy()
+    np.testing.assert_allclose(logits, expected, rtol=1e-5, atol=1e-5)
+    assert (logits.dtype, logits.shape) == (np.float32, (9, 3))
+    for first, last in ((0, 1), (2, 5), (8, 9)):
+        assert np.array_equal(logits_of(trunk, pi, stacks[first:last]), logits[first:last])
+    assert logits_of(trunk, pi, stacks[:0]).shape == (0, 3)
+    assert np.isnan(logits_of(trunk, pi, np.full_like(stacks, np.nan))).all()
 
 
 def test_the_cnn_is_that_of_stable_baselines():
