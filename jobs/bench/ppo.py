@@ -66,7 +66,7 @@ class EncodedCorridors(VecEnv):
         """Start all episodes."""
         windows = [env.reset(seed=k << 32)[0] for k, env in enumerate(self.corridors)]
         self.stacks = np.zeros(self.shape, np.float32)
-        self.stacks = self._push(np.stack(windows), np.ones(self.num_envs, bool))
+        self.stacks = self._push(windows, np.ones(self.num_envs, bool))
         return self.stacks
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -77,10 +77,10 @@ class EncodedCorridors(VecEnv):
         """Simulate one step in every corridor."""
         results = [env.step(int(action)) for env, action in zip(self.corridors, self._actions, strict=True)]
         done = np.array([result[2] or result[3] for result in results])
-        stacks = self._push(np.stack([result[0] for result in results]), np.zeros(self.num_envs, bool))
+        stacks = self._push([result[0] for result in results], np.zeros(self.num_envs, bool))
         infos: list[dict[str, object]] = [{} for _ in results]
         if done.any():
-            windows = np.stack([results[k][0] for k in range(self.num_envs)])
+            windows = [result[0] for result in results]
             for k in np.flatnonzero(done):
                 infos[k] |= {"terminal_observation": stacks[k], "TimeLimit.truncated": results[k][3]}
                 windows[k] = self.corridors[k].reset()[0]
@@ -88,7 +88,7 @@ class EncodedCorridors(VecEnv):
         self.stacks = stacks
         return stacks, np.array([result[1] for result in results], np.float32), done, infos
 
-    def _push(self, windows: np.ndarray, first: np.ndarray) -> np.ndarray:
+    def _push(self, windows: list[np.ndarray], first: np.ndarray) -> np.ndarray:
         return push_features(self.stacks, self.table.encode_windows(windows), first)
 
     def close(self) -> None:
