@@ -1,16 +1,20 @@
 """Environment steps per second of whole PPO training, compared with stable-baselines3 in the same corridors.
 
-Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo
-Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
-`jobs.training.ppo_learner`, "tensor by tensor" the same without `models.policy.dense_update`,
+Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo [gradients]
+Expect: three tables in about ten minutes, or the last alone. "RLlib's learner" is RLlib as it
+comes, "ours" is `jobs.training.ppo_learner`, "tensor by tensor" the same without compiled gradient steps,
 "stable-baselines3" its PPO with the same networks, encoder, corridors and settings. All take turns in
 one process; an iteration samples 2,048 steps in 16 corridors and learns 10 epochs. Seconds are wall
 time, medians over the rounds: `ppo_fast` samples in processes of its own, so the machine should be
-quiet. The second table is ours for every kind of policy.
+quiet. The second table is ours for every kind of policy, the third the gradient steps alone of a policy
+of convolutions: smallest and median of its rounds, with one thread and with two.
 """
 
 import dataclasses
+import itertools
+import sys
 import tempfile
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -31,7 +35,7 @@ from jobs.bench.timing import interleaved
 from jobs.config.config import Config
 from jobs.run.ray_cluster import start_ray
 from jobs.training.ppo import build_ppo, policy_spec
-from jobs.training.ppo_learner import PlainPPOLearner
+from jobs.training.ppo_learner import READ, PlainPPOLearner
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
@@ -39,7 +43,7 @@ from models.encoder.weights import save_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
 
-ROUNDS, FEW_ROUNDS = 5, 2
+ROUNDS, FEW_ROUNDS, GRADIENT_ROUNDS = 5, 2, 7
 MINIBATCHES = (32, 256)
 STEPS = 2048  # of an iteration (appendix D.1.2)
 CONSTANT = "algo.lr_schedule=constant"
@@ -47,9 +51,9 @@ RIVALS = tuple(f"stable-baselines3, {size}" for size in MINIBATCHES)
 
 
 class TensorByTensor(PlainPPOLearner):
-    """Updates dense networks as all others."""
+    """Updates all networks as those without compiled gradient steps."""
 
-    _dense = False
+    _dense = _cnn = False
 
 
 class EncodedCorridors(VecEnv):
@@ -113,12 +117,16 @@ class EncodedCorridors(VecEnv):
 
 
 def main() -> None:
-    """Measure and print both tables."""
+    """Measure and print the tables."""
     torch.set_num_threads(1)
+    if sys.argv[1:] == ["gradients"]:
+        show_gradients()
+        return
     with tempfile.TemporaryDirectory() as folder:
         show("bytestream", interleaved(against_others(Path(folder)), ROUNDS), RIVALS)
         kinds = interleaved(every_kind(Path(folder)), FEW_ROUNDS)
         show("every policy, minibatches of 32", kinds, ("bytestream",))
+    show_gradients()
 
 
 def show(title: str, seconds: dict[str, float], units: tuple[str, ...]) -> None:
@@ -163,6 +171,37 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
         path = encoder_file(evae, folder) if evae else None
         work[name] = build_ppo(config, path).build_algo().train
     return work
+
+
+def show_gradients() -> None:
+    """Print what a gradient step of convolutions costs, tensor by tensor and compiled, in turns."""
+    learner = build_ppo(composed("model=rgb", CONSTANT), None).build_algo().learner_group._learner
+    rng, numbers = np.random.default_rng(0), np.zeros(STEPS, np.float32)
+    pictures = rng.integers(0, 256, (STEPS, 3, 64, 64)).astype(np.uint8)
+    columns = pictures, rng.integers(0, 3, STEPS), numbers - 1.1, rng.normal(size=STEPS).astype("f4"), numbers
+    rows = {name: torch.from_numpy(column) for name, column in zip(READ, columns, strict=True)}
+    orders = torch.stack([torch.randperm(STEPS) for _ in range(2)])
+    table = []
+    for size in MINIBATCHES:
+        seconds: dict[tuple[str, int], list[float]] = {}
+        for turn in range(GRADIENT_ROUNDS + 1):
+            for name, threads in itertools.product(("_epochs", "_epochs_compiled"), (1, 2)):
+                torch.set_num_threads(threads)
+                learner._threads = partial(int, threads)
+                start = time.perf_counter()
+                getattr(learner, name)(rows, orders, size)
+                taken = (time.perf_counter() - start) / (len(orders) * STEPS / size)
+                seconds.setdefault((name, threads), []).extend([taken] * bool(turn))
+        for (name, threads), own in seconds.items():
+            plain = seconds["_epochs", threads]
+            figures = (
+                f"{1e3 * least(own):.1f}, {least(plain) / least(own):.1f}x" for least in (min, np.median)
+            )
+            table.append((size, threads, "compiled" if "comp" in name else "tensor by tensor", *figures))
+    title = (
+        "A gradient step of rgb [ms], and how many times faster than tensor by tensor with as many threads"
+    )
+    show_table(title, ("minibatch", "threads", "way", "smallest", "median"), table)
 
 
 def encoder_file(evae: EventVAE, folder: Path) -> Path:

@@ -68,12 +68,14 @@ class Kept(NamedTuple):
     Attributes:
         images: float32 (groups, values), its inputs, with zeros beyond their edges.
         points: float32 (groups, values), the same at the points.
-        of: Gradients of its parameters; those at the points are added up there first.
+        of_weights, of_bias, of_points: Gradients of a `Layer`'s.
     """
 
     images: np.ndarray
     points: np.ndarray
-    of: Layer
+    of_weights: np.ndarray
+    of_bias: np.ndarray
+    of_points: np.ndarray
 
 
 class Work(NamedTuple):
@@ -204,12 +206,14 @@ def _work(size: int, networks: Sequence[nn.Module], sides: Sequence[int]) -> Wor
         made = of.tiles * len(of.output_rule)
         shown = GROUP * inputs * np.prod(made + of.kernel_rule.shape[1] - 1)
         places = GROUP * PLACES * np.prod(of.tiles)
-        kept.append(Kept(np.empty((groups, shown), F32), np.empty((groups, places * inputs), F32), of))
+        images, points = (np.empty((groups, values), F32) for values in (shown, places * inputs))
+        kept.append(Kept(images, points, of.weights, of.bias, of.points))
         scratch = POINTS * max(inputs * outputs, shown)
         most = np.maximum(most, [GROUP * outputs * np.prod(made), places * outputs, shown, scratch])
     flat, of_flat = (np.empty((PIECE, len(of_dense.weights)), F32) for _ in range(2))
-    once = (np.empty(values, F32) for values in most)
-    return Work(gradient, tuple(kept), of_dense, flat, of_flat, *once, figures=np.zeros(5))
+    image, points, slopes, scratch = (np.empty(values, F32) for values in most)
+    buffers = flat, of_flat, image, points, slopes, scratch
+    return Work(gradient, tuple(kept), of_dense, *buffers, np.zeros(5))
 
 
 def _pieces(count: int) -> int:
@@ -295,16 +299,17 @@ def _learn(layers, dense, work, rows, picked, settings, share):  # type: ignore[
             _forward(layers, work, k, begin, min(GROUP, count - begin))
     _learn_dense(dense, work, rows, picked, settings, share)
     for kept in work.kept:
-        kept.of.points[:] = ZERO
-        kept.of.bias[:] = ZERO
+        kept.of_points[:] = ZERO
+        kept.of_bias[:] = ZERO
     for begin in range(0, count, GROUP):
         for k in range(len(layers) - 1, -1, -1):
             _backward(layers, work, k, begin, min(GROUP, count - begin))
-    for kept in work.kept:
-        reach, _, inputs, outputs = kept.of.weights.shape
-        rule = np.ascontiguousarray(kept.of.kernel_rule.T)
-        points = kept.of.points.reshape((PLACES, 1, inputs * outputs))
-        gather(rule, points, kept.of.weights.reshape((reach, reach, inputs * outputs)), 1, work.scratch)
+    for k in range(len(layers)):
+        of_points, of_weights = work.kept[k].of_points, work.kept[k].of_weights
+        reach, _, inputs, outputs = of_weights.shape
+        at_points, kernel = (PLACES, 1, inputs * outputs), (reach, reach, inputs * outputs)
+        rule = np.ascontiguousarray(layers[k].kernel_rule.T)
+        gather(rule, of_points.reshape(at_points), of_weights.reshape(kernel), 1, work.scratch)
 
 
 @compiled
@@ -369,12 +374,12 @@ def _backward(layers, work, k, begin, count):  # type: ignore[no-untyped-def]
     rows = of_sums.reshape((PLACES, tiles * count, outputs))
     for row in rows[POINTS + 1]:  # at 1 a polynomial is the sum of its coefficients
         for n in range(outputs):
-            kept.of.bias[n] += row[n]
+            kept.of_bias[n] += row[n]
     points = _cube(kept.points[begin // GROUP], PLACES, tiles, count * inputs)
     product = work.scratch[: inputs * outputs].reshape((inputs, outputs))
     for p in range(PLACES):
         np.dot(points[p].reshape((tiles * count, inputs)).T, rows[p], product)
-        kept.of.points[p] += product
+        kept.of_points[p] += product
     if k > 0:
         _multiply(of_sums, layer.adjoint, points)
         below = _cube(work.slopes, height, width, count * inputs)
