@@ -4,10 +4,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from models.policy.dense_update import Rows, Settings, update_dense
 from models.policy.networks import mlp
+from tests.support.ppo_steps import by_tensors, flat
 
 PLAIN = Settings(
     minibatch_size=16,
@@ -36,37 +36,6 @@ def make(hidden=(16, 16), privileged=2):
     actions, told = rng.integers(0, ACTIONS, COUNT), rng.normal(size=(COUNT, privileged)).astype("f4")
     rows = Rows(stacks, told, actions, 0.3 * logps - 1.1, advantages, 3.0 * targets)
     return networks, optimizer, rows, np.stack([rng.permutation(COUNT) for _ in range(2)])
-
-
-def by_tensors(networks, optimizer, rows, orders, settings):
-    """`update_dense` with torch's own gradient, norm and Adam, in the networks' precision."""
-    parameters = [value for one in networks for value in one.parameters()]
-    optimizer.param_groups[0]["lr"] = settings.lr
-    kind = parameters[0].dtype
-    stacks, told, actions, logps, advantages, targets = map(torch.from_numpy, rows)
-    for order in orders:
-        figures = []
-        for n in torch.from_numpy(order).split(settings.minibatch_size):
-            chances = torch.log_softmax(networks[0](stacks[n].to(kind)), -1)
-            ratio = (chances.gather(1, actions[n, None])[:, 0] - logps[n]).exp()
-            clipped = ratio.clamp(1.0 - settings.clip_param, 1.0 + settings.clip_param)
-            policy_loss = -torch.minimum(advantages[n] * ratio, advantages[n] * clipped).mean()
-            errors = networks[1](torch.cat([stacks[n], told[n]], 1).to(kind))[:, 0] - targets[n]
-            value_loss = errors.square().clamp(max=settings.vf_clip_param).mean()
-            entropy = -(chances.exp() * chances).sum(-1).mean()
-            total = policy_loss + settings.vf_loss_coeff * value_loss - settings.entropy_coeff * entropy
-            optimizer.zero_grad()
-            total.backward()
-            norm = nn.utils.clip_grad_norm_(parameters, settings.grad_clip, error_if_nonfinite=True)
-            optimizer.step()
-            figures.append(
-                [float(value.detach()) for value in (policy_loss, value_loss, entropy, total, norm)]
-            )
-    return np.mean(figures, axis=0)
-
-
-def flat(networks):
-    return torch.cat([value.detach().flatten() for one in networks for value in one.parameters()]).double()
 
 
 @pytest.mark.parametrize(
