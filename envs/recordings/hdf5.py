@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import json
 import mmap
+import re
 import struct
 from collections.abc import Iterator
 from functools import cached_property
@@ -166,9 +167,9 @@ def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
 
 def _sensor(file: h5py.File) -> tuple[int | None, int | None]:
     """Width and height by the attributes, or by the sensor settings of a recording."""
-    if "geometry" in file.attrs:
-        width, _, height = str(file.attrs["geometry"]).partition("x")
-        return int(width), int(height)
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", str(file.attrs.get("geometry", "")), re.ASCII)
+    if found:
+        return int(found[1]), int(found[2])
     if "width" in file.attrs and "height" in file.attrs:
         return int(file.attrs["width"]), int(file.attrs["height"])
     about = json.loads(file.attrs.get("about", "{}"))

@@ -69,6 +69,8 @@ def simulate() -> None:
     from envs.corridor import CorridorEnv, CorridorVectorEnv
     from envs.event_error import measure_event_error
     from envs.recordings import read_events, write_events
+    from envs.recordings.ecf import decode_ecf
+    from envs.recordings.event_stream import MAGIC_ES
     from envs.scene.planning import cost_to_go
 
     small = partial(CameraConfig, width=16, height=16)
@@ -91,6 +93,9 @@ def simulate() -> None:
         for name in ("dat", "evt2", "evt3"):
             write_events(Path(folder) / name, some_events(), 16, 16, name)
             read_events(Path(folder) / name)
+        (Path(folder) / "es").write_bytes(MAGIC_ES + bytes((2, 0, 0, 1, 16, 0, 16, 0)))
+        read_events(Path(folder) / "es")
+    decode_ecf(np.frombuffer(bytes(12), np.uint8), some_events()[:0])
 
 
 def encode() -> None:

@@ -39,6 +39,8 @@ def test_chunks_follow_each_other_and_one_may_be_stored_as_it_is(tmp_path):
         out.create_dataset("CD/events", data=rows(packed_events(2)), compression="gzip")
     assert read_events(tmp_path / "c.h5").events.tobytes() == packed_events(2).tobytes()
     assert read_events(metavision(tmp_path / "d.h5", [], 0)).events.size == 0
+    unsized = read_events(metavision(tmp_path / "e.h5", [ecf_chunk(0)], geometry="wide"), width=1280)
+    assert (unsized.width, unsized.height) == (1280, None)
 
 
 @pytest.mark.parametrize("way", [0, 1, 2])
@@ -76,7 +78,6 @@ def test_a_heap_of_texts_that_leads_in_a_circle_is_refused_and_not_read_for_ever
         ([ecf_chunk(0), bytes(12)], {"count": 300}, "the chunk at event 150 is damaged"),
         ([ecf_chunk(0)], {"count": 300}, "is no readable HDF5 event file"),
         ([bytes(2399)], {"unpacked": 1}, "is no readable HDF5 event file"),
-        ([ecf_chunk(0)], {"geometry": "wide"}, "is no readable HDF5 event file"),
         ([ecf_chunk(0)], {"geometry": "640x8"}, "outside the sensor of 640x8"),
         ([], {"count": 10**12}, "at most max_events=10000000 are read"),
     ],
