@@ -133,14 +133,16 @@ def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedP
     """The one trained policy that a name stands for; arguments as `find_policies`.
 
     Raises:
-        ConfigError: If there is no such policy, or the name stands for several or for a baseline.
+        ConfigError: If there is none; the message names the published ones.
     """
-    found = find_policies(key, name, config, run)
-    if len(found) > 1 or found[0].training is None:
-        names = ", ".join(Path(policy.agent).name for policy in found if policy.training is not None)
-        one_of = f", such as one of {names}" if names else ""
-        raise ConfigError(f"{key}: must be one trained policy{one_of}, got {name!r}")
-    return found[0]
+    published = sorted(path.parent.name for path in PRETRAINED.glob(f"*/{MANIFEST}"))
+    if name != "newest" and name not in published and named_policy(name) is None:
+        names = ", ".join(published)
+        raise ConfigError(
+            f"{key}: must be one trained policy: newest, a path, or in models/pretrained one of {names}, "
+            f"got {name!r}"
+        )
+    return find_policies(key, name, config, run)[0]
 
 
 def find_sweep_policies(

@@ -66,19 +66,10 @@ def test_the_film_shows_the_way_that_was_taken_and_how_it_ended(tmp_path):
     assert decoded[2] > decoded[0] + 50  # all ON, which is blue
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("moon", "demo.policy: must be 'pretrained', 'newest', one of .*got 'moon'"),
-        (
-            "bytestream",
-            "must be one trained policy, such as one of bytestream-s0, bytestream-s1, ",
-        ),
-        ("oracle", "demo.policy: must be one trained policy, got 'oracle'"),
-    ],
-)
-def test_another_name_than_one_policys_is_refused_before_anything_is_written(tmp_path, name, message):
-    with pytest.raises(ConfigError, match=message):
+@pytest.mark.parametrize("name", ["moon", "bytestream", "oracle", "pretrained"])
+def test_another_name_than_one_policys_is_refused_before_anything_is_written(tmp_path, name):
+    rule = rf"demo\.policy: must be one trained policy: .* bytestream-s0, .* rgb-s2, got '{name}'"
+    with pytest.raises(ConfigError, match=rule):
         demo.run(demo_config(tmp_path, f"demo.policy={name}"))
     assert not (tmp_path / "runs").exists()
 
