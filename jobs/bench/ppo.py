@@ -1,20 +1,16 @@
 """Environment steps per second of whole PPO training, compared with stable-baselines3 in the same corridors.
 
-Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo [gradients]
-Expect: three tables in about ten minutes, or the last alone. "RLlib's learner" is RLlib as it
-comes, "ours" is `jobs.training.ppo_learner`, "tensor by tensor" the same without compiled gradient steps,
+Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.ppo
+Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
+`jobs.training.ppo_learner`, "tensor by tensor" the same without `models.policy.dense_update`,
 "stable-baselines3" its PPO with the same networks, encoder, corridors and settings. All take turns in
 one process; an iteration samples 2,048 steps in 16 corridors and learns 10 epochs. Seconds are wall
 time, medians over the rounds: `ppo_fast` samples in processes of its own, so the machine should be
-quiet. The second table is ours for every kind of policy, the third the gradient steps alone of a policy
-of convolutions: smallest times of its rounds, with one thread and with two.
+quiet. The second table is ours for every kind of policy.
 """
 
 import dataclasses
-import itertools
-import sys
 import tempfile
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -34,9 +30,8 @@ from jobs.bench.throughput import composed
 from jobs.bench.timing import interleaved
 from jobs.config.config import Config
 from jobs.run.ray_cluster import start_ray
-from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo, policy_spec
-from jobs.training.ppo_learner import READ, PlainPPOLearner
+from jobs.training.ppo_learner import PlainPPOLearner
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
@@ -44,7 +39,7 @@ from models.encoder.weights import save_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
 
-ROUNDS, FEW_ROUNDS, GRADIENT_ROUNDS = 5, 2, 5
+ROUNDS, FEW_ROUNDS = 5, 2
 MINIBATCHES = (32, 256)
 STEPS = 2048  # of an iteration (appendix D.1.2)
 CONSTANT = "algo.lr_schedule=constant"
@@ -52,9 +47,9 @@ RIVALS = tuple(f"stable-baselines3, {size}" for size in MINIBATCHES)
 
 
 class TensorByTensor(PlainPPOLearner):
-    """Updates all networks as those without compiled gradient steps."""
+    """Updates dense networks as all others."""
 
-    _dense = _cnn = False
+    _dense = False
 
 
 class EncodedCorridors(VecEnv):
@@ -118,16 +113,12 @@ class EncodedCorridors(VecEnv):
 
 
 def main() -> None:
-    """Measure and print the tables."""
+    """Measure and print both tables."""
     torch.set_num_threads(1)
-    if sys.argv[1:] == ["gradients"]:
-        show_gradients()
-        return
     with tempfile.TemporaryDirectory() as folder:
         show("bytestream", interleaved(against_others(Path(folder)), ROUNDS), RIVALS)
         kinds = interleaved(every_kind(Path(folder)), FEW_ROUNDS)
         show("every policy, minibatches of 32", kinds, ("bytestream",))
-    show_gradients()
 
 
 def show(title: str, seconds: dict[str, float], units: tuple[str, ...]) -> None:
@@ -172,34 +163,6 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
         path = encoder_file(evae, folder) if evae else None
         work[name] = build_ppo(config, path).build_algo().train
     return work
-
-
-def show_gradients() -> None:
-    """Print what a gradient step of convolutions costs, tensor by tensor and compiled, in turns."""
-    ppo = build_ppo(composed("model=rgb", CONSTANT))
-    learner = ppo.build_learner(env=PlainEnvRunner(config=ppo, worker_index=0).env)
-    rng, numbers = np.random.default_rng(0), np.zeros(STEPS, np.float32)
-    pictures = rng.integers(0, 256, (STEPS, 3, 64, 64)).astype(np.uint8)
-    columns = pictures, rng.integers(0, 3, STEPS), numbers - 1.1, rng.normal(size=STEPS).astype("f4"), numbers
-    rows = {name: torch.from_numpy(column) for name, column in zip(READ, columns, strict=True)}
-    orders, table = torch.randperm(STEPS)[None], []
-    for size in MINIBATCHES:
-        taken: dict[tuple[str, int], list[np.ndarray]] = {}
-        for _ in range(GRADIENT_ROUNDS + 1):
-            for name, threads in itertools.product(("_epochs", "_epochs_compiled"), (1, 2)):
-                torch.set_num_threads(threads)
-                learner._threads = partial(int, threads)
-                start = np.array([time.perf_counter(), time.process_time()])
-                getattr(learner, name)(rows, orders, size)
-                seconds = np.array([time.perf_counter(), time.process_time()]) - start
-                taken.setdefault((name, threads), []).append(1e3 * seconds * size / STEPS)
-        least = {key: np.min(of[1:], axis=0) for key, of in taken.items()}
-        for (name, threads), own in least.items():
-            way = "tensor by tensor" if name == "_epochs" else "compiled"
-            pairs = zip(own, least["_epochs", threads], strict=True)
-            table.append((str(size), str(threads), way, *(f"{ms:.1f}, {of / ms:.2f}x" for ms, of in pairs)))
-    title = "A gradient step of rgb [ms], and its speed as a multiple of tensor by tensor"
-    show_table(title, ("minibatch", "threads", "way", "wall time", "time of all cores"), table)
 
 
 def encoder_file(evae: EventVAE, folder: Path) -> Path:

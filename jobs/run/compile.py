@@ -110,28 +110,20 @@ def encode() -> None:
 
 
 def learn() -> None:
-    """Decide by a small policy, and take a gradient step of it and of one of convolutions."""
+    """Decide by a small policy, and take a gradient step of it."""
     import torch
     from torch import nn
 
-    from models.kinds import MIN_IMAGE, FixedModel, PolicySpec
-    from models.policy.cnn_update import update_cnn
     from models.policy.dense_update import Rows, Settings, update_dense
-    from models.policy.networks import logits_of, mlp, nature_cnn
+    from models.policy.networks import logits_of, mlp
 
-    small = PolicySpec(FixedModel("rgb", stack=1), MIN_IMAGE, MIN_IMAGE)
-    picture, one = np.zeros((1, 1, MIN_IMAGE, MIN_IMAGE), np.uint8), np.zeros(1, np.float32)
-    stack, none = np.zeros((1, 2), np.float32), np.zeros((1, 0), np.float32)
-    dense = [mlp(2, (2,), outputs) for outputs in (3, 1)]
-    logits_of(nn.Flatten(), dense[0], stack)
-    for update, networks, stacks in (
-        (update_dense, dense, stack),
-        (update_cnn, nature_cnn(picture.shape[1:], small), picture),
-    ):
-        optimizer = torch.optim.Adam(nn.ModuleList(networks).parameters(), fused=True)
-        rows = Rows(stacks, none, np.zeros(1, np.int64), one, one, one)
-        settings = Settings(1, 0.2, 1.0, 1.0, 0.0, 1.0, 1e-3, 0.9, 0.999, 1e-8)
-        update(networks, optimizer, rows, np.zeros((1, 1), np.int64), settings)
+    networks = [mlp(2, (2,), outputs) for outputs in (3, 1)]
+    optimizer = torch.optim.Adam(nn.ModuleList(networks).parameters(), fused=True)
+    stacks, none, one = np.zeros((1, 2), np.float32), np.zeros((1, 0), np.float32), np.zeros(1, np.float32)
+    rows = Rows(stacks, none, np.zeros(1, np.int64), one, one, one)
+    logits_of(nn.Flatten(), networks[0], stacks)
+    settings = Settings(1, 0.2, 1.0, 1.0, 0.0, 1.0, 1e-3, 0.9, 0.999, 1e-8)
+    update_dense(networks, optimizer, rows, np.zeros((1, 1), np.int64), settings)
 
 
 def some_events() -> np.ndarray:

@@ -4,8 +4,7 @@ The value targets, the loss, its gradient and the optimiser are RLlib's (`test_p
 compares them, and the weights after an update). Around each minibatch of 32 steps RLlib slices,
 dispatches, times and logs, which takes longer than the gradient of two small networks; here that
 is done once per iteration, and no pipeline of connectors makes the batch. Policies of dense layers
-alone take their steps in `models.policy.dense_update`, those of `models.policy.networks.nature_cnn` in
-`models.policy.cnn_update`. RLlib appends a row to each episode to
+alone take their steps in `models.policy.dense_update`. RLlib appends a row to each episode to
 bootstrap its value: it masks that row in the loss, but counts it in minibatches and in the mean and
 deviation of the advantages. Here it is in neither.
 """
@@ -32,7 +31,6 @@ from torch import Tensor, nn
 
 from jobs.training.rllib_internals import LEARNER, require
 from jobs.training.teacher import log_costs
-from models.policy.cnn_update import update_cnn
 from models.policy.dense_update import Rows, Settings, update_dense
 from models.policy.rllib_module import PRIVILEGED
 
@@ -151,7 +149,7 @@ class PlainPPOLearner(PPOTorchLearner):
     def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
         """All epochs over the rows; the figures of the last."""
         orders = torch.stack([torch.randperm(len(rows[Columns.ACTIONS])) for _ in range(num_epochs)])
-        learn = self._epochs_compiled if self._compiled and not self._warming_up else self._epochs
+        learn = self._epochs_of_dense if self._dense and not self._warming_up else self._epochs
         figures = learn(rows, orders, minibatch_size)
         if self._warming_up:
             self.get_optimizer(DEFAULT_MODULE_ID).state.clear()  # Adam counts the steps of all weights alike
@@ -213,14 +211,7 @@ class PlainPPOLearner(PPOTorchLearner):
             rewards = rewards + shaping(potentials, episode.is_terminated, self.config.gamma)
         return settings.get(REWARD_SCALE, 1.0) * rewards
 
-    @property
-    def _compiled(self) -> bool:
-        """Whether there is a compiled update of the policy's networks."""
-        module = self.module[DEFAULT_MODULE_ID].unwrapped()
-        cnn = module.spec.kind.network.endswith(":nature_cnn")
-        return self._dense or (cnn and not module.privileged)
-
-    def _epochs_compiled(
+    def _epochs_of_dense(
         self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
     ) -> dict[str, Any]:
         """As `_epochs`, compiled."""
@@ -231,12 +222,8 @@ class PlainPPOLearner(PPOTorchLearner):
         of_adam = self._grad_clip, adam["lr"], *adam["betas"], adam["eps"]
         settings = Settings(minibatch_size, *map(float, (*of_loss, *of_adam)))
         read = Rows(*(rows[name].numpy() for name in READ))
-        if self._dense:
-            read = read._replace(stacks=rows[Columns.OBS].flatten(1).numpy())
-            means = update_dense((module.pi, module.vf), optimizer, read, orders.numpy(), settings)
-        else:
-            networks = module.trunk, module.pi, module.vf
-            means = update_cnn(networks, optimizer, read, orders.numpy(), settings, self._threads())
+        read = read._replace(stacks=rows[Columns.OBS].flatten(1).numpy())
+        means = update_dense((module.pi, module.vf), optimizer, read, orders.numpy(), settings)
         return dict(zip(FIGURES, means.tolist(), strict=True))
 
     def _epochs(self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int) -> dict[str, Any]:

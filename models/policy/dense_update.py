@@ -7,17 +7,16 @@ with; sums run in another order, and a tanh errs by at most 4e-7 of its value.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 compiled = numba.njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract"})
 F32 = np.float32
-View = Callable[[Sequence[Tensor]], list[Tensor]]
 TANH_IS_ONE = F32(7.9053111)  # in float32, from here on
 # tanh(x) = x P(x^2) / Q(x^2), highest power first: the rational approximation of the library Eigen.
 P6, P5, P4 = F32(-2.76076847742355e-16), F32(2.00018790482477e-13), F32(-8.60467152213735e-11)
@@ -108,46 +107,24 @@ def update_dense(
         RuntimeError: A gradient is not finite; the weights are those before it.
     """
     parameters = [value for network in networks for value in network.parameters()]
-    adam, taken = read_adam(optimizer, parameters)
+    states = [_adam_state(optimizer, value) for value in parameters]
+    ends = np.cumsum([value.numel() for value in parameters])
+    kept = parameters, [one["exp_avg"] for one in states], [one["exp_avg_sq"] for one in states]
+    values, first, second = (torch.cat([part.detach().flatten() for part in parts]).numpy() for parts in kept)
+    adam = Adam(values, np.empty_like(values), first, second)
     pi, vf = _flat(networks, adam, min(settings.minibatch_size, len(rows.actions)))
-    figures, taken = _take_steps(pi, vf, adam, rows, orders, settings, taken)
-    write_adam(adam, taken, optimizer, parameters)
+    figures, taken = _take_steps(pi, vf, adam, rows, orders, settings, float(states[0]["step"]))
+    for flat, parts in zip((values, first, second), kept, strict=True):
+        for part, new in zip(parts, np.split(flat, ends[:-1]), strict=True):
+            part.detach().copy_(torch.from_numpy(new).view_as(part))
+    for state in states:
+        state["step"].fill_(taken)
     if not math.isfinite(figures[-1]):
         raise RuntimeError(f"gradients must be finite, got a non-finite norm after {taken:.0f} steps")
     return figures
 
 
-def read_adam(
-    optimizer: torch.optim.Adam, parameters: Sequence[Tensor], view: View = list
-) -> tuple[Adam, float]:
-    """What Adam works on in new arrays, each parameter as `view` shows it, and the steps taken so far."""
-    values, first, second = (
-        torch.cat([part.flatten() for part in parts]).numpy() for parts in _views(optimizer, parameters, view)
-    )
-    return Adam(values, np.empty_like(values), first, second), float(optimizer.state[parameters[0]]["step"])
-
-
-def write_adam(
-    adam: Adam, taken: float, optimizer: torch.optim.Adam, parameters: Sequence[Tensor], view: View = list
-) -> None:
-    """Put all back in place where `read_adam` read it."""
-    flats = adam.values, adam.first, adam.second
-    for flat, parts in zip(flats, _views(optimizer, parameters, view), strict=True):
-        ends = np.cumsum([part.numel() for part in parts])
-        for part, new in zip(parts, np.split(flat, ends[:-1]), strict=True):
-            part.copy_(torch.from_numpy(new).view(part.shape))
-    for value in parameters:
-        optimizer.state[value]["step"].fill_(taken)
-
-
-def _views(optimizer: torch.optim.Adam, parameters: Sequence[Tensor], view: View) -> list[list[Tensor]]:
-    """The parameters and both of their moments, as `view` shows them."""
-    states = [_adam_state(optimizer, value) for value in parameters]
-    moments = ([one[name] for one in states] for name in ("exp_avg", "exp_avg_sq"))
-    return [view(parts) for parts in ([value.detach() for value in parameters], *moments)]
-
-
-def _adam_state(optimizer: torch.optim.Adam, value: Tensor) -> dict[str, Any]:
+def _adam_state(optimizer: torch.optim.Adam, value: torch.Tensor) -> dict[str, Any]:
     """Adam's state of one parameter; of its first step, as torch begins it."""
     state = optimizer.state[value]
     if not state:
@@ -192,7 +169,7 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
                     told[b, seen:] = rows.privileged[picked[b]]
             logits, of_logits = _forward(shown, pi)
             values, of_values = _forward(told, vf)
-            add_losses((logits, values), (of_logits, of_values), rows, picked, settings, figures)
+            _add_losses((logits, values), (of_logits, of_values), rows, picked, settings, figures)
             _backward(shown, pi)
             _backward(told, vf)
             norm = math.sqrt(np.dot(adam.gradient, adam.gradient))
@@ -201,7 +178,7 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
                 return figures, taken
             figures[4] += norm
             taken += 1.0
-            step_adam(adam, settings, min(1.0, settings.grad_clip / (norm + 1e-6)), taken)
+            _step(adam, settings, min(1.0, settings.grad_clip / (norm + 1e-6)), taken)
     return figures / ((count + size - 1) // size), taken
 
 
@@ -247,7 +224,7 @@ def tanh(values):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def add_losses(outputs, of_outputs, rows, picked, settings, figures):  # type: ignore[no-untyped-def]
+def _add_losses(outputs, of_outputs, rows, picked, settings, figures):  # type: ignore[no-untyped-def]
     """Add the losses of a minibatch to the figures; fill the gradients of logits and values."""
     logits, values = outputs
     of_logits, of_values = of_outputs
@@ -312,7 +289,7 @@ def _backward(inputs, network):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def step_adam(adam, settings, scale, taken):  # type: ignore[no-untyped-def]
+def _step(adam, settings, scale, taken):  # type: ignore[no-untyped-def]
     """One step of Adam (Kingma and Ba 2015) along `scale` times the gradient, its `taken`-th."""
     scale, eps, two = F32(scale), F32(settings.eps), F32(math.sqrt(1.0 - settings.beta2**taken))
     size = F32(settings.lr / (1.0 - settings.beta1**taken))

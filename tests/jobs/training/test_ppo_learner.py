@@ -153,26 +153,6 @@ def test_compiled_steps_are_those_of_tensors(ppo, flights, monkeypatch):
             torch.testing.assert_close(adam[key][name], value, rtol=1e-3, atol=1e-6)
 
 
-def test_convolutions_learn_compiled_what_they_learn_tensor_by_tensor(monkeypatch):
-    ppo = build_ppo(make_config(*SHORT, "model=rgb", "algo.entropy_coeff=0.03"), None)
-    runner = PlainEnvRunner(config=ppo, worker_index=0)
-    episodes = runner.sample(num_timesteps=64)
-    compiled, plain = (make_learner(ppo, runner.env, PlainPPOLearner) for _ in range(2))
-    plain.set_state(compiled.get_state())
-    first, told = weights(compiled), []
-    for learner in (compiled, plain):
-        torch.manual_seed(0)
-        told.append(learner.update(episodes=copy.deepcopy(episodes), num_epochs=2, minibatch_size=24))
-        monkeypatch.setattr(PlainPPOLearner, "_cnn", False)
-    for name in (NORM, *FIGURES):
-        one, other = (reduced(result, name) for result in told)
-        assert one == pytest.approx(other, rel=1e-4, abs=1e-5), name
-    for name, value in weights(plain).items():
-        apart, moved = weights(compiled)[name] - value, value - first[name]
-        assert float(apart.norm()) < 1e-2 * float(moved.norm()), name
-    runner.stop()
-
-
 def test_every_step_is_seen_once_an_epoch_in_another_order(ppo, flights, monkeypatch):
     env, samples = flights
     tensor_by_tensor(monkeypatch)
