@@ -39,7 +39,7 @@ def compose(*words: str) -> dict:
 
 def small_config(tmp_path: Path, **changes: object) -> Config:
     """A checked configuration whose runs lie in a folder of the test's own."""
-    values = compose("+exp=bytestream", "budget=smoke")
+    values = compose("+exp=bytestream", "budget=smoke", "evaluate.beside=[]")
     return parse({**values, "runs_dir": str(tmp_path / "runs"), **changes})
 
 

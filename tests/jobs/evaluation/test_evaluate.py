@@ -9,7 +9,7 @@ from envs.corridor import CorridorEnv
 from envs.sensor import Sensor
 from jobs.analysis.tables import summarise
 from jobs.analysis.video import frame
-from jobs.config.config import ConfigError
+from jobs.config.config import HELD_OUT_SCENE, ConfigError
 from jobs.evaluation.evaluate import (
     announce,
     evaluate,
@@ -17,6 +17,7 @@ from jobs.evaluation.evaluate import (
     evaluation_metrics,
     label_of,
     plan_evaluation,
+    published,
     seed_to_film,
 )
 from jobs.evaluation.evaluate import run as run_evaluation
@@ -315,3 +316,17 @@ def test_a_caption_has_room_under_a_single_panel():
     one, three = (frame([panel] * count, caption)[-40:] for count in (1, 3))
     np.testing.assert_array_equal(one, three[:, : one.shape[1]])
     assert (three[:, one.shape[1] :] == three[0, -1]).all(), "all of the caption is in the narrow one"
+
+
+def test_a_published_policy_is_evaluated_beside_with_its_own_sensor_and_named(tmp_path):
+    config = small_config(tmp_path)
+    settings = dataclasses.replace(config.evaluate, beside=["bytestream_hold-s0"])
+    tasks = plan_evaluation(dataclasses.replace(config, evaluate=settings), read_policy("straight"))
+    beside = [task for task in tasks if label_of(task)[0] == "bytestream_hold s0"]
+    assert {task.condition for task in beside} == {(HELD_OUT_SCENE, "raycast"), ("poles", "raycast")}
+    assert {task.env.filter_support for task in beside} == {1}
+    assert len(tasks) == len(plan_evaluation(config, read_policy("straight"))) + 2
+    with pytest.raises(
+        ConfigError, match=r"^evaluate.beside: must be names in models/pretrained, got 'moon'"
+    ):
+        published("moon")
