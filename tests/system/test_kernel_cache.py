@@ -73,14 +73,15 @@ def test_an_edit_compiles_the_kernels_again_that_reach_the_edited_file_and_no_ot
 COMPILE = """
 import sys, time
 from pathlib import Path
+from unittest.mock import patch
 from jobs.run import compile
-compile.CACHE = folder = Path(sys.argv[1])
-def fly():
-    with (folder / "flown").open("a") as file:
+folder = Path(sys.argv[1])
+def simulate():
+    with (folder / "compiled_by").open("a") as file:
         file.write("once ")
     time.sleep(3)
-compile.fly, compile.encode = fly, lambda: None
-compile.main()
+with patch.multiple(compile, CACHE=folder, simulate=simulate, encode=lambda: None, learn=lambda: None):
+    compile.main()
 """
 
 
@@ -88,9 +89,9 @@ def test_of_processes_that_start_at_once_one_compiles_and_the_others_say_that_th
     words = [sys.executable, "-c", COMPILE, str(tmp_path)]
     both = [subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     said = [process.communicate(timeout=120)[0] for process in both]
-    assert (tmp_path / "flown").read_text() == "once "
+    assert (tmp_path / "compiled_by").read_text() == "once "
     assert sum("Compiled the kernels in" in text for text in said) == 1
     assert sum("waiting" in text for text in said) >= 1
     (tmp_path / "compiled").write_text("other sources")
     subprocess.run(words, cwd=ROOT, check=True, timeout=120)
-    assert (tmp_path / "flown").read_text() == "once once "
+    assert (tmp_path / "compiled_by").read_text() == "once once "
