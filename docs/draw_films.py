@@ -1,7 +1,7 @@
 """Roll out shipped policies for docs/gallery.md, and keep the films small.
 
 Run from the repository root: python -m docs.draw_films [NAME ...]
-Writes docs/films/NAME.mp4, twice as fast as the demo's own films and 720 pixels wide, and docs/images/demo.gif for
+Writes docs/films/NAME.mp4, 720 pixels wide, and docs/images/demo.gif for
 the README. Every film is one corridor, the first (seed 0), whatever happens in it. Expect 3 minutes.
 """
 
@@ -22,10 +22,10 @@ FILMS = {  # name: the words of the demo
     "dead_pixels": ("faults.sparsity=0.5",),
     "crash": ("demo.policy=bytestream-s1", "env.scene=texture_change", "fidelity.tolerance=0.2"),
 }
-# Of the demo's frames, 50 a second, keep each fifth and show 20 a second.
-SMALL = ("-vf", "select=not(mod(n\\,5)),setpts=N/20/TB,scale=720:-2", "-r", "20", "-crf", "33", "-an")
+# Of the frames of a demo, 50 a second, keep each fifth and show 10 a second: the same speed.
+SMALL = ("-vf", "select=not(mod(n\\,5)),setpts=N/10/TB,scale=720:-2", "-r", "10", "-crf", "33", "-an")
 MOVING = (
-    "select=not(mod(n\\,10)),setpts=N/10/TB,scale=600:-2,split[a][b];[a]palettegen=max_colors=40:stats_mode=diff[p];"
+    "select=not(mod(n\\,6)),setpts=N*0.12/TB,scale=600:-2,split[a][b];[a]palettegen=max_colors=40:stats_mode=diff[p];"
     "[b][p]paletteuse=dither=none:diff_mode=rectangle"
 )
 
@@ -43,7 +43,7 @@ def main() -> None:
             subprocess.run([*small, *SMALL, str(DOCS / "films" / f"{name}.mp4")], check=True)
             if name == "poles":
                 subprocess.run(
-                    [*small, "-vf", MOVING, "-r", "10", str(DOCS / "images" / "demo.gif")], check=True
+                    [*small, "-vf", MOVING, "-r", "25/3", str(DOCS / "images" / "demo.gif")], check=True
                 )
 
 

@@ -182,7 +182,7 @@ def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
 
 
 def with_own_filter(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
-    """The simulation with the neighbour filter of a policy, which belongs to the policy and not to a camera."""
+    """The simulation with the neighbour filter of a policy, to which it belongs as its networks do."""
     own = {name: policy.sensor[name] for name in FILTER if name in policy.sensor}
     return replace(env, **own)
 
