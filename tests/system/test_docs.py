@@ -158,14 +158,15 @@ def folder(tmp_path_factory):
     fill(place)
     (place / "runs" / "NAME").mkdir()
     (place / "runs" / "NAME" / "policy").symlink_to(PRETRAINED / "bytestream_hold-s0")
-    rng, count = np.random.default_rng(0), 5000
+    rng, count = np.random.default_rng(0), 60_000
     events = np.zeros(count, EVENT)
-    events["t"] = np.sort(rng.integers(0, 50_000, count))
+    events["t"], events["p"] = np.sort(rng.integers(0, 50_000, count)), 1
     events["x"], events["y"] = rng.integers(0, 240, count), rng.integers(0, 180, count)
-    events["p"] = rng.choice([-1, 1], count)
-    write_events(place / "street.raw", events, 1280, 720)
-    rows = [f"{one['t'] * 1e-6:.6f} {one['x']} {one['y']} {one['p']}" for one in events]
+    rows = [f"{one['t'] * 1e-6:.6f} {one['x']} {one['y']} {one['p']}" for one in events[:1000]]
     (place / "events.txt").write_text("\n".join(rows) + "\n")
+    events["x"] += 520  # in the middle of a larger sensor
+    events["y"] += 270
+    write_events(place / "street.raw", events, 1280, 720)
     film = imageio_ffmpeg.write_frames(str(place / "ride.mp4"), (64, 64), fps=25)
     film.send(None)
     for _ in range(8):
