@@ -28,6 +28,7 @@ autodoc_typehints_format = "short"
 maximum_signature_line_length = 80
 napoleon_use_ivar = True
 html_extra_path = ["replay.html", "films"]  # written by commands, as the figures are
+WRITTEN_LATER = ("install", "camera", "tune", "plugins", "results_tables", "dose_response", "ablation")
 exclude_patterns = ["_build", "_templates"]
 
 
@@ -59,10 +60,13 @@ def _is_settings(obj):
     return dataclasses.is_dataclass(obj) and hasattr(obj, "__pydantic_config__")
 
 
-def _fill_in(_app, docname, source):
-    """Put the tables of keys, which the schema gives, into their page."""
+def _fill_in(app, docname, source):
+    """Put the tables of keys, which the schema gives, into their page; list pages that are there."""
     if docname == "keys":
         source[0] += tables()
+    if docname == "index":
+        lines = source[0].splitlines()
+        source[0] = "\n".join(line for line in lines if line not in WRITTEN_LATER or line in app.env.found_docs)
 
 
 def setup(app):
