@@ -1,6 +1,7 @@
 """Sphinx: the pages, the keys of the configuration from the schema, and the API from the docstrings."""
 
 import dataclasses
+import re
 import sys
 import typing
 from pathlib import Path
@@ -16,6 +17,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx
 myst_enable_extensions = ["attrs_block", "colon_fence"]
 myst_heading_anchors = 3  # links to #headings, as on GitHub
 nb_execution_mode = "off"  # python -m docs.run_notebooks writes their outputs, a test runs them
+highlight_language = "text"
 html_theme = "furo"
 html_title = "Evade"
 html_static_path = ["_static"]
@@ -38,7 +40,12 @@ def _skip_fields(_app, _what, _name, member, skip, _options):
 
 
 def _escape(_app, _what, _name, _obj, _options, lines):
-    """Bars and stars of formulas as they are: docstrings have no reST markup but backquotes."""
+    """Bars and stars of formulas as they are: docstrings have no reST markup but backquotes.
+
+    An entry for several attributes becomes one with a single name, which napoleon can read.
+    """
+    several = re.compile(r"^( {4}\w+)((?:, \w+)+): ")
+    lines[:] = [several.sub(lambda found: f"{found[1]}: (also{found[2][1:]}) ", line) for line in lines]
     lines[:] = [line if "`" in line else line.replace("|", r"\|").replace("*", r"\*") for line in lines]
 
 
@@ -66,7 +73,9 @@ def _fill_in(app, docname, source):
         source[0] += tables()
     if docname == "index":
         lines = source[0].splitlines()
-        source[0] = "\n".join(line for line in lines if line not in WRITTEN_LATER or line in app.env.found_docs)
+        source[0] = "\n".join(
+            line for line in lines if line not in WRITTEN_LATER or line in app.env.found_docs
+        )
 
 
 def setup(app):

@@ -32,6 +32,7 @@ MADE = {"bytestream": "+exp=bytestream", "sweep-robustness": "+exp=robustness", 
 ARGS = re.compile(r"make (bytestream|sweep-robustness|demo)(?: train=true)? ARGS=\"([^\"]*)\"")
 NAMES = re.compile(r"`((?:envs|models|jobs)(?:\.\w+)+)`")
 LINKS = re.compile(r"\]\((?!https?:)([^)\s#]*)(?:#([^)\s]+))?\)")
+FILES = re.compile(r"`((?:tests|envs|models|jobs|conf|docker|platform)/[\w/.]+\.(?:py|yaml|json|csv))`")
 BLOCKS = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # What a page takes for granted: its blocks run one after the other, in a folder as `folder` makes it.
 GRANTED = {
@@ -106,6 +107,12 @@ def test_every_link_leads_to_a_file_and_a_heading_that_are_there():
                 broken.append((page.name, target, anchor))
     assert broken == []
     assert count > 150
+
+
+def test_the_files_that_pages_name_are_there():
+    named = {path for page in PAGES for path in FILES.findall(page.read_text()) if "NAME" not in path}
+    assert len(named) > 60
+    assert sorted(path for path in named if not (ROOT / path).exists()) == []
 
 
 def test_the_readme_is_short():
