@@ -31,6 +31,7 @@ ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "model": ADDED_MODEL_SETTINGS,
     "algo": {"imitation": None, "critic": "observation", "shaping": 0.0},
     "env": {"filter_support": 0, "filter_tau_us": 5_000},
+    "faults": {"displaced": 0.0, "flipped": 0.0},
     "collect": {"recordings": [], "conditions": [{}]},
     "pretrain": {"denoise": False},
     "train": {"conditions": [{}], "init": None, "value_warmup": 20_000},

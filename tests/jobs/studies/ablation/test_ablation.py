@@ -106,7 +106,7 @@ def test_every_variant_is_trained_and_evaluated_once(tmp_path):
     config = dataclasses.replace(config, sweep=sweep)
     metrics = ablation.run(config)
     folder = locate_run(config).path / "ablation"
-    assert metrics == {f"ablation/{name}_success": 0.0 for name in variants}
+    assert metrics == {f"eval/{name}_success": 0.0 for name in variants}
     with (folder / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {(row["Axis"], row["Group"], row["Training"]) for row in rows} == {
