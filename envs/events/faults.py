@@ -2,15 +2,22 @@
 
 `draw_pixel_faults` draws the faulty pixels of an episode, `apply_faults` applies all faults to the
 events of one interval. A fault that is off costs nothing and draws nothing.
+
+A plug-in adds a fault by `ADDED_FAULTS[name] = make`. At the start of an episode `make(amount, shape, rng)`
+is called, with the amount of `faults.added.NAME`, the image's (H, W) and the episode's random stream. It
+returns `apply(events, t0_us, t1_us, luminance)`, which is called after the faults of this file with the
+arguments of `apply_faults`, and returns what the events become: EVENT, sorted by t.
 """
 
 import dataclasses
+from collections.abc import Callable, Mapping
 
 import numba
 import numpy as np
 
-from envs.config import FaultsConfig
+from envs.config import ADDED_FAULTS, FaultsConfig
 from envs.events.camera import MAX_EVENTS_PER_FRAME
+from envs.events.emission import EVENT
 
 Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
 SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
@@ -26,12 +33,14 @@ class PixelFaults:
         hot: int64 (K,), flat indices of the hot ones among these.
         leak_phase: float64 (L,), part of a leak period until each live pixel's first leak
             event; of length 0 without leakage.
+        added: What applies each fault of a plug-in, by its name.
     """
 
     dead: np.ndarray
     live: np.ndarray
     hot: np.ndarray
     leak_phase: np.ndarray
+    added: Mapping[str, Callable[..., np.ndarray]] = dataclasses.field(default_factory=dict)
 
 
 def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.random.Generator) -> PixelFaults:
@@ -51,7 +60,9 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
         hot = np.sort(rng.permutation(live)[: round(faults.hot_pixel_share * dead.size)])
     if faults.leak_hz > 0.0:
         phase = rng.random(live.size)
-    return PixelFaults(dead, live, hot, phase)
+    amounts = sorted(faults.added.items())
+    added = {name: ADDED_FAULTS[name](amount, shape, rng) for name, amount in amounts if amount > 0.0}
+    return PixelFaults(dead, live, hot, phase, added)
 
 
 def apply_faults(
@@ -91,8 +102,40 @@ def apply_faults(
         EVENT with t in (t0_us, t1_us], sorted by (t, y, x), true events first where all are equal.
 
     Raises:
-        ValueError: The interval is empty, or more than 2**24 false events are to be expected.
+        ValueError: The interval is empty, more than 2**24 false events are to be expected, or a plug-in's
+            fault returned something else than events of the interval.
     """
+    events = _with_own_faults(events, t0_us, t1_us, luminance, faults, pixels, rng)
+    for name, apply in pixels.added.items():
+        events = apply(events, t0_us, t1_us, luminance)
+        _check_added(name, events, (t0_us, t1_us), luminance.shape)
+    return events
+
+
+def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, ...]) -> None:
+    """Raise ValueError if a plug-in's fault returned what is not events of this interval and image."""
+    rule = f"fault {name!r} of {ADDED_FAULTS[name].__module__} must return EVENT"
+    if getattr(events, "dtype", None) != EVENT or events.ndim != 1:
+        raise ValueError(f"{rule} (N,), got {type(events).__name__} {getattr(events, 'dtype', '')}".strip())
+    t = events["t"]
+    if t.size and (t[0] <= span_us[0] or t[-1] > span_us[1] or (t[1:] < t[:-1]).any()):
+        raise ValueError(f"{rule} sorted by t and with t in ({span_us[0]}, {span_us[1]}] us")
+    if t.size and (events["y"].max() >= shape[0] or events["x"].max() >= shape[1]):
+        raise ValueError(f"{rule} inside an image of {shape[1]} x {shape[0]} pixels")
+    if not np.isin(events["p"], (-1, 1)).all():
+        raise ValueError(f"{rule} with p in {{-1, 1}}")
+
+
+def _with_own_faults(
+    events: np.ndarray,
+    t0_us: int,
+    t1_us: int,
+    luminance: np.ndarray,
+    faults: FaultsConfig,
+    pixels: PixelFaults,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """As `apply_faults`, of the faults of this file."""
     if t1_us <= t0_us:
         raise ValueError(f"faults need t1_us > t0_us; got {t0_us} and {t1_us}.")
     if faults.sparsity > 0.0:

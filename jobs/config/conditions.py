@@ -16,11 +16,11 @@ import pydantic
 from pydantic import Field, PlainValidator
 
 from envs.config import EnvConfig
-from jobs.config.env_keys import ENV_KEYS, LAYOUT, env_with
+from jobs.config.env_keys import ENV_KEYS, OPEN_KEYS, env_with
 from jobs.config.errors import nearest
 from jobs.config.scenes import scene_errors
 
-CONDITION_KEYS = [key for key in ENV_KEYS if key != "env.layout"]
+CONDITION_KEYS = [key for key in ENV_KEYS if f"{key}." not in OPEN_KEYS]
 NETWORK_KEYS = (
     "camera.width",
     "camera.height",
@@ -182,7 +182,7 @@ def _key_errors(settings: Mapping[str, object]) -> list[str]:
     unknown = {
         key: value
         for key, value in settings.items()
-        if key not in CONDITION_KEYS and not key.startswith(LAYOUT)
+        if key not in CONDITION_KEYS and not key.startswith(OPEN_KEYS)
     }
     return [
         f"{key}: no such setting, got {value}{nearest(key, CONDITION_KEYS)}" for key, value in unknown.items()

@@ -1,4 +1,4 @@
-"""Copy finished studies into docs/: a sweep as results.md, a trade as trade.md, a replay page as replay.html.
+"""Copy finished studies into docs/ of this folder: results.md, trade.md, replay.html.
 
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
@@ -36,7 +36,6 @@ from jobs.run.checkpoints import sha256
 from jobs.run.files import RunError, read_json, replaced, write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
-from jobs.run.provenance import REPOSITORY
 from jobs.run.templates import render
 
 TEMPLATE = Path(__file__).parent / "templates" / "results.md.j2"
@@ -80,8 +79,7 @@ def run(config: Config) -> dict[str, Any]:
         raise ConfigError(f"resume: no finished sweep or trade in {where!r}: run {commands}")
     for name, folder in found.items():
         if folder is not None:
-            file = writers[name](folder, REPOSITORY / "docs")
-            console.print(f"Written: {file.relative_to(REPOSITORY)}", markup=False)
+            console.print(f"Written: {writers[name](folder, Path('docs'))}", markup=False)
     return {}
 
 

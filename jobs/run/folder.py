@@ -14,6 +14,7 @@ import yaml
 
 from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
+from jobs.config.plugins import plugin_digests
 from jobs.run.files import RunError, read_json, write_atomic, write_json
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
@@ -22,7 +23,7 @@ from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
 # Sections that do not change what is trained: where a run is computed and recorded, and what is
 # done with its policy afterwards.
 NOT_IN_RUN_NAME = (
-    "job", "resume", "runs_dir", "cluster", "tracking",
+    "job", "resume", "runs_dir", "plugins", "cluster", "tracking",
     "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe",
     "demo", "replay_page",
 )  # fmt: skip
@@ -30,6 +31,7 @@ NOT_IN_RUN_NAME = (
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "model": ADDED_MODEL_SETTINGS,
     "algo": {"imitation": None, "critic": "observation", "shaping": 0.0},
+    "faults": {"added": {}},
     "env": {"filter_support": 0, "filter_tau_us": 5_000},
     "collect": {"recordings": [], "conditions": [{}]},
     "pretrain": {"denoise": False},
@@ -132,7 +134,8 @@ def reopen(path: Path, config: Config) -> Run:
 def run_name(config: Config) -> str:
     """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained.
 
-    `ADDED_SETTINGS` count only where they change something, so that older folders keep their names.
+    `ADDED_SETTINGS` count only where they change something, so that older folders keep their names. Of
+    plug-ins the content counts: another version of one is another experiment.
     """
     settings: dict[str, Any] = {
         name: value for name, value in as_dict(config).items() if name not in NOT_IN_RUN_NAME
@@ -140,6 +143,8 @@ def run_name(config: Config) -> str:
     for section, added in ADDED_SETTINGS.items():
         values = settings[section].items()
         settings[section] = {name: value for name, value in values if added.get(name, ...) != value}
+    if config.plugins:
+        settings["plugins"] = plugin_digests()
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
 
 
