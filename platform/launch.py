@@ -25,7 +25,12 @@ from jobs.run.threads import ONE_THREAD
 CONF = ROOT / "conf"
 
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
-OPEN_GROUPS = ("env.layout", "faults.added", "sweep.axes")  # take entries that conf/ does not have
+OPEN_GROUPS = (
+    "env.layout",
+    "faults.added",
+    "sweep.axes",
+    "tune.space",
+)  # take entries that conf/ does not have
 DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 
 

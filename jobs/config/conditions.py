@@ -57,11 +57,21 @@ def _settings(value: object) -> Any:
     return _number_or_word(value)
 
 
+def _searched(value: object) -> Any:
+    """A list of any values, or a range."""
+    if isinstance(value, list) and value:
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError(f"must be a list of values, or a range {{low: number, high: number}}, got {value!r}")
+    return _settings(value)
+
+
 Setting = Annotated[float | str | None, PlainValidator(_number_or_word)]
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Values = Annotated[list[Setting], Field(min_length=1)]
 Axis = Annotated[dict[str, Values], Field(min_length=1)]
 Condition = dict[str, Setting]
+Searched = Annotated[Any, PlainValidator(_searched)]
 Drawn = Annotated[Any, PlainValidator(_settings)]
 Conditions = Annotated[list[dict[str, Drawn]], Field(min_length=1)]
 

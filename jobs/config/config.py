@@ -37,6 +37,7 @@ from jobs.config.schema import (
     TradeEncoderConfig,
     TradeSimulatorConfig,
     TrainConfig,
+    TuneConfig,
 )
 from models.kinds import KINDS, Model, model_keys, read_model
 
@@ -77,6 +78,7 @@ class Config:
     trade_simulator: TradeSimulatorConfig
     trade_encoder: TradeEncoderConfig
     probe: ProbeConfig
+    tune: TuneConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
     plugins: list[Name]

@@ -272,11 +272,18 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             advance(env_steps - reported, note=_note(last))
             reported = env_steps
 
-        _LISTENERS[LISTENER] = listen
-        try:
+        with relayed_to(LISTENER, listen):
             yield last
-        finally:
-            del _LISTENERS[LISTENER]
+
+
+@contextlib.contextmanager
+def relayed_to(name: str, listen: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
+    """Let a function hear each result that a `Relay` of this name gets."""
+    _LISTENERS[name] = listen
+    try:
+        yield
+    finally:
+        del _LISTENERS[name]
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
