@@ -17,6 +17,7 @@ import numpy as np
 
 from envs.config import ADDED_FAULTS, FaultsConfig
 from envs.events.camera import MAX_EVENTS_PER_FRAME
+from envs.events.disturbances import disturb
 from envs.events.emission import EVENT
 
 Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
@@ -77,7 +78,8 @@ def apply_faults(
     """Lose true events and add false ones.
 
     Of the true events those of dead pixels are lost, and each other one with probability
-    event_dropout. To the rest are added, in an interval of T seconds:
+    event_dropout; some are displaced or flipped (`envs.events.disturbances`). To the rest are
+    added, in an interval of T seconds:
 
     - background_activity: Poisson, this share of the true events left (appendix D.3);
     - background_activity_hz: Poisson, rate * T per live pixel;
@@ -142,6 +144,7 @@ def _with_own_faults(
         events = events[~pixels.dead[events["y"], events["x"]]]
     if faults.event_dropout > 0.0:
         events = events[rng.random(events.size) >= faults.event_dropout]
+    events = disturb(events, faults, pixels.dead.shape, rng)
     seconds = (t1_us - t0_us) * 1e-6
     kinds = _expected(events.size, seconds, luminance, faults, pixels)
     expected = sum(float(upto[-1]) for _, upto in kinds) + faults.leak_hz * pixels.live.size * seconds

@@ -22,6 +22,7 @@ from jobs.config.plugins import load_plugins
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
+    AblationConfig,
     AlgoConfig,
     ClusterConfig,
     CollectConfig,
@@ -79,6 +80,7 @@ class Config:
     trade_encoder: TradeEncoderConfig
     probe: ProbeConfig
     tune: TuneConfig
+    ablation: AblationConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
     plugins: list[Name]

@@ -33,5 +33,6 @@ JOBS = {
     "trade_simulator": Job("jobs.studies.simulator", "What exact events cost"),
     "trade_encoder": Job("jobs.studies.encoder.trade", "What an exact encoder costs"),
     "tune": Job("jobs.studies.search.search", "Which settings a training learns best with"),
+    "ablation": Job("jobs.studies.ablation.ablation", "What each part of a recipe contributes"),
     "probe": Job("jobs.studies.probe.probe", "What a representation of events tells an agent"),
 }

@@ -24,7 +24,7 @@ from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
 # done with its policy afterwards.
 NOT_IN_RUN_NAME = (
     "job", "resume", "runs_dir", "plugins", "cluster", "tracking",
-    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "tune",
+    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "tune", "ablation",
     "demo", "replay_page",
 )  # fmt: skip
 # Settings that older run folders lack, each with the value that does what was done before it existed.

@@ -10,11 +10,13 @@ from ray import tune
 
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.env_keys import OPEN_KEYS, flat_env
+from jobs.run.folder import NOT_IN_RUN_NAME
 from jobs.training.pretrain import evae_settings
 from models.kinds import KINDS
 
-# Where and what a search is; and what all its trials must have in common to be compared.
-FIXED = ("job", "exp", "budget", "resume", "runs_dir", "plugins", "cluster", "tracking", "tune", "evaluate")
+# What a search is called, and what all its trials must have in common to be compared; what is no part of a
+# training is no part of a trial either.
+FIXED = (*NOT_IN_RUN_NAME, "exp", "budget")
 FIXED_KEYS = ("train.env_steps", "algo.num_env_runners", "algo.lr_schedule")
 
 
