@@ -4,6 +4,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 ARGS ?=
 
+PYTHONS ?= 3.11 3.12 3.13
 SEEDS ?= 0 1 2
 STEPS ?= 500000
 POLICIES ?= bytestream bytestream_xy event_columns event_image_vae event_set event_image rgb
@@ -26,7 +27,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak lint check bench docs lock clean
+.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak test-pythons lint check bench docs dist lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -95,6 +96,14 @@ test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at o
 test-soak: setup ## training, sweep and dashboard for an hour, with a fault every minute (ARGS="minutes=10 seed=1")
 	$(BIN)/python -m tests.soak.soak $(ARGS)
 
+# Interpreters are found as python3.X; pyenv, uv and Debian can install them.
+test-pythons: ## the quick tests on each supported Python, in .venv-3.X (PYTHONS="3.12 3.13" ARGS=tests/envs)
+	@for version in $(PYTHONS); do \
+	    if ! python$$version -c '' 2>/dev/null; then said="$$said  $$version: no interpreter\n"; \
+	    elif make test PYTHON=python$$version VENV=.venv-$$version; then said="$$said  $$version: passed\n"; \
+	    else said="$$said  $$version: FAILED\n"; fi; \
+	done; printf "Python\n$$said"; case "$$said" in *FAILED*|*"no inter"*) exit 1;; esac
+
 lint: setup ## check style, format, types, and who imports whom
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -110,8 +119,12 @@ bench: setup ## measure the speed of the parts, and what accuracy of the simulat
 docs: setup ## build this site in docs/_build/html; a broken link or docstring stops it
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html $(ARGS)
 
+dist: setup ## build the wheel dist/evade-*.whl: environment, camera, recordings, policies
+	rm -rf build
+	$(BIN)/python -m build --wheel --no-isolation --outdir dist
+
 lock: setup ## update requirements.lock (ARGS=--upgrade: to the newest versions)
-	$(BIN)/pip-compile --quiet --extra dev,docs --strip-extras --allow-unsafe \
+	$(BIN)/pip-compile --quiet --extra jobs,meshes,dev,docs --strip-extras --allow-unsafe \
 	    --no-annotate --no-header --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 	    --output-file requirements.lock $(ARGS) pyproject.toml
 	sed -i 's/+cpu$$//' requirements.lock # so that a CPU wheel satisfies the same pin

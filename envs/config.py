@@ -8,10 +8,10 @@ ValueError) that names the key, the value and the rule; an unknown key does too.
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -35,6 +35,18 @@ def _layout_value(value: Any) -> Any:
 
 Value = Annotated[Any, PlainValidator(_layout_value)]
 
+# Faults that plug-ins add: name -> what makes one at the start of an episode, see `envs.events.faults`.
+ADDED_FAULTS: dict[str, Callable[..., Any]] = {}
+
+
+def _of_a_fault(name: str) -> str:
+    if name not in ADDED_FAULTS:
+        known = f"one of {', '.join(ADDED_FAULTS)}" if ADDED_FAULTS else "of a plug-in, and none is loaded"
+        raise ValueError(f"must be {known}, got {name!r}")
+    return name
+
+
+AddedFault = Annotated[str, AfterValidator(_of_a_fault)]
 Setting = float | int | str | None  # of the sensor
 Observation = Literal["window", "event_image", "luminance", "events", "none"]
 Split = Literal["train", "validation", "eval"]
@@ -139,6 +151,7 @@ class FaultsConfig:
             of shot noise and leakage [decades].
         hot_pixel_share: Fraction of pixels that are hot for the whole episode.
         hot_pixel_hz: Events per second of a hot pixel.
+        added: How much of each fault that a plug-in adds, such as {"flicker": 0.2}; 0 is none of it.
     """
 
     sparsity: Fraction = 0.0
@@ -153,6 +166,7 @@ class FaultsConfig:
     noise_spread: Annotated[float, Field(ge=0, le=2)] = 0.0
     hot_pixel_share: Fraction = 0.0
     hot_pixel_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    added: dict[AddedFault, Annotated[float, Field(ge=0, le=1e6)]] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -6,6 +6,7 @@ that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
 """
 
 import importlib
+import importlib.util
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -93,9 +94,11 @@ def choose_renderer(name: str, scene: Scene) -> str:
 
 
 def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov_deg: float) -> Any:
-    """The renderer of a plan. Raises RuntimeError if it is pyrender and OpenGL cannot run."""
+    """The renderer of a plan. Raises RuntimeError if it is pyrender, and that or OpenGL is missing."""
     make: Any = RaycastRenderer
     if chosen.renderer == "pyrender":  # imported only where it is needed: it loads OpenGL
+        if importlib.util.find_spec("pyrender") is None:
+            raise RuntimeError("renderer='pyrender', which meshes need, is not installed: evade[meshes]")
         make = importlib.import_module("envs.rasterize.renderer").PyrenderRenderer
     return make(scene, width, height, fov_deg, samples=chosen.samples, cull_m=chosen.cull_m)
 

@@ -305,6 +305,14 @@ def find_kind(name: object) -> Kind:
     return KINDS[str(name)]
 
 
+def needed_plugins(manifest: Mapping[str, object]) -> str:
+    """What to add to the refusal of a policy whose training had plug-ins; empty for any other."""
+    plugins = manifest.get("plugins")
+    if not isinstance(plugins, Mapping) or not plugins:
+        return ""
+    return f"; trained with the plug-ins {', '.join(plugins)}: import them first, in a job by plugins=[...]"
+
+
 def renamed(name: object) -> str:
     """What to add to the refusal of a kind's name of an earlier version; empty for any other name."""
     now = RENAMED.get(name) if isinstance(name, str) else None

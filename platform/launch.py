@@ -25,7 +25,12 @@ from jobs.run.threads import ONE_THREAD
 CONF = ROOT / "conf"
 
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
-OPEN_GROUPS = ("env.layout", "sweep.axes")  # take entries that conf/ does not have
+OPEN_GROUPS = (
+    "env.layout",
+    "faults.added",
+    "sweep.axes",
+    "tune.space",
+)  # take entries that conf/ does not have
 DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 
 
@@ -46,8 +51,10 @@ def main() -> int:
 
 
 def command(words: list[str]) -> str:
-    """The same command line for a shell in the repository's root."""
-    return shlex.join([sys.executable, "-m", "platform.launch", *words])
+    """The same command line for a shell in this folder; only `evade` works outside the repository's root."""
+    started = Path(sys.argv[0])
+    evade = started.name == "evade" and started.is_file()
+    return shlex.join([*([sys.argv[0]] if evade else [sys.executable, "-m", "platform.launch"]), *words])
 
 
 def compose(words: list[str]) -> dict[str, object] | None:
@@ -167,6 +174,7 @@ def report(error: Exception) -> int:
     too. Passwords in addresses are never shown.
     """
     from jobs.config.errors import redacted
+    from jobs.config.plugins import one_line
 
     ours = raised_here(error)
     wrong_value = isinstance(error, ValueError) and ours
@@ -174,7 +182,7 @@ def report(error: Exception) -> int:
     documented = wrong_value or (isinstance(error, RuntimeError) and ours) or full is not None
     if os.environ.get("HYDRA_FULL_ERROR") == "1" or not documented:
         print(redacted("".join(traceback.format_exception(error))), end="", file=sys.stderr)
-    message = redacted(full or (str(error) if documented else f"{type(error).__name__}: {error}"))
+    message = redacted(full or (str(error) if documented else one_line(error)))
     message = "\n  ".join(["", *message.splitlines()]) if "\n" in message else f" {message}"
     print(f"evade: {'refused' if wrong_value else 'failed'}:{message}", file=sys.stderr)
     return WRONG_VALUE if wrong_value else FAILED

@@ -3,16 +3,23 @@
 `draw_pixel_faults` draws the faulty pixels of an episode, `apply_faults` applies their faults to the events
 of one interval; `RealSensor` adds what acts on the pixels themselves, and what happens between them and the
 reader. What is off costs nothing and draws nothing.
+
+A plug-in adds a fault by `ADDED_FAULTS[name] = make`. At the start of an episode `make(amount, shape, rng)`
+is called, with the amount of `faults.added.NAME`, the image's (H, W) and the episode's random stream. It
+returns `apply(events, t0_us, t1_us)`, which is called after the faults of this file and returns what the
+events become: EVENT, sorted by t.
 """
 
 import dataclasses
+from collections.abc import Callable, Mapping
 
 import numba
 import numpy as np
 
-from envs.config import CameraConfig, FaultsConfig
+from envs.config import ADDED_FAULTS, CameraConfig, FaultsConfig
 from envs.events.camera import MAX_EVENTS_PER_FRAME
 from envs.events.disturbances import disturb
+from envs.events.emission import EVENT
 from envs.events.pixel_noise import PixelNoise
 from envs.events.readout import Readout
 
@@ -27,11 +34,13 @@ class PixelFaults:
         dead: bool (H, W); these never fire, not even noise.
         live: int64 (L,), flat indices of the others.
         hot: int64 (K,), flat indices of the hot ones among these.
+        added: What applies each fault of a plug-in, by its name.
     """
 
     dead: np.ndarray
     live: np.ndarray
     hot: np.ndarray
+    added: Mapping[str, Callable[..., np.ndarray]] = dataclasses.field(default_factory=dict)
 
 
 def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.random.Generator) -> PixelFaults:
@@ -49,7 +58,9 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
     hot = live[:0]
     if faults.hot_pixel_share > 0.0:
         hot = np.sort(rng.permutation(live)[: round(faults.hot_pixel_share * dead.size)])
-    return PixelFaults(dead, live, hot)
+    amounts = sorted(faults.added.items())
+    added = {name: ADDED_FAULTS[name](amount, shape, rng) for name, amount in amounts if amount > 0.0}
+    return PixelFaults(dead, live, hot, added)
 
 
 class RealSensor:
@@ -133,8 +144,40 @@ def apply_faults(
         EVENT with t in (t0_us, t1_us], sorted by (t, y, x), true events first where all are equal.
 
     Raises:
-        ValueError: The interval is empty, or more than 2**24 false events are to be expected.
+        ValueError: The interval is empty, more than 2**24 false events are to be expected, or a plug-in's
+            fault returned something else than events of the interval.
     """
+    events = _with_own_faults(events, t0_us, t1_us, faults, pixels, rng, noise)
+    for name, apply in pixels.added.items():
+        events = apply(events, t0_us, t1_us)
+        _check_added(name, events, (t0_us, t1_us), pixels.dead.shape)
+    return events
+
+
+def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, ...]) -> None:
+    """Raise ValueError if a plug-in's fault returned what is not events of this interval and image."""
+    rule = f"fault {name!r} of {ADDED_FAULTS[name].__module__} must return EVENT"
+    if getattr(events, "dtype", None) != EVENT or events.ndim != 1:
+        raise ValueError(f"{rule} (N,), got {type(events).__name__} {getattr(events, 'dtype', '')}".strip())
+    t = events["t"]
+    if t.size and (t[0] <= span_us[0] or t[-1] > span_us[1] or (t[1:] < t[:-1]).any()):
+        raise ValueError(f"{rule} sorted by t and with t in ({span_us[0]}, {span_us[1]}] us")
+    if t.size and (events["y"].max() >= shape[0] or events["x"].max() >= shape[1]):
+        raise ValueError(f"{rule} inside an image of {shape[1]} x {shape[0]} pixels")
+    if not np.isin(events["p"], (-1, 1)).all():
+        raise ValueError(f"{rule} with p in {{-1, 1}}")
+
+
+def _with_own_faults(
+    events: np.ndarray,
+    t0_us: int,
+    t1_us: int,
+    faults: FaultsConfig,
+    pixels: PixelFaults,
+    rng: np.random.Generator,
+    noise: Noise | None,
+) -> np.ndarray:
+    """As `apply_faults`, of the faults of this file."""
     if t1_us <= t0_us:
         raise ValueError(f"faults need t1_us > t0_us; got {t0_us} and {t1_us}.")
     if faults.sparsity > 0.0:

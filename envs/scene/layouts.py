@@ -1,9 +1,10 @@
 """Layouts of corridors as data: what stands in them, how much of it, how it looks.
 
-A new corridor is one more `Layout` in `LAYOUTS`. The sources are the appendix's B.1 (poles,
-cones and gates, from which the event data are made), D.1 (the training lane), D.2 (the
-evaluation scenes) and F.1 (moving textures). It describes them in words with few numbers, so
-the numbers are our choices, made for a camera at 2 m above the ground and a vehicle of radius 0.3 m.
+A new corridor is one more `Layout` in `LAYOUTS`, or a `MeshLayout` with the path of its file. The
+sources are the appendix's B.1 (poles, cones and gates, from which the event data are made), D.1 (the
+training lane), D.2 (the evaluation scenes) and F.1 (moving textures). It describes them in words with few
+numbers, so the numbers are our choices, made for a camera at 2 m above the ground and a vehicle of radius
+0.3 m.
 """
 
 import dataclasses
@@ -124,12 +125,14 @@ class MeshLayout:
         scale: Metres per unit of the file.
         width_m, wall_height_m: The lane and its walls [m].
         passable: Whether a way to the goal line must lead from every start.
+        file: Path of what `envs.scene.mesh_file` reads.
     """
 
     scale: float = 1.0
     width_m: float = 30.0
     wall_height_m: float = 6.0
     passable: bool = True
+    file: str = ""
 
     def __post_init__(self) -> None:
         """Check the values; ValueError names the rule and what was given."""
@@ -141,13 +144,13 @@ class MeshLayout:
         refuse_unless(rules, "layout", self)
 
 
-AnyLayout = TypeVar("AnyLayout", Layout, MeshLayout)
+AnyLayout = TypeVar("AnyLayout", bound=Layout | MeshLayout)
 POLES_EVAL = Layout(num_obstacles=80, width_m=50.0)
 
 # Cones are as wide as poles where the camera flies, 2 m above the ground; so are ellipsoids,
 # whose middle is there. Hence the places where a vehicle fits through are the same, and a
 # difference in success between these layouts and `poles_eval` is one of looks alone.
-LAYOUTS: dict[str, Layout] = {
+LAYOUTS: dict[str, Layout | MeshLayout] = {
     "poles": Layout(),
     "cones": Layout("cone", radius_min_m=0.75, radius_max_m=0.75, height_m=6.0),
     "gates": Layout("gate", 20, radius_min_m=1.2, radius_max_m=1.6, height_m=4.0, min_gap_m=4.5),

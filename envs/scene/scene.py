@@ -228,19 +228,18 @@ def make_scene(
             "make_scene: vehicle radius must be >= 0, it and the height finite, "
             f"got {vehicle_radius_m}, {height_m}"
         )
-    if name in LAYOUTS:
-        layout = with_overrides(LAYOUTS[name], overrides)
-        passable, scenes = layout.passable, (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
-        remedy = "lower num_obstacles or the radii, raise min_gap_m, widen the lane"
-    elif is_mesh_path(name):
-        lane = with_overrides(MeshLayout(), overrides)
-        passable, scenes = lane.passable, (_mesh_corridor(name, lane) for _ in range(1))
-        remedy = "lower scale, widen the lane, fly at another height"
-    else:
+    if name not in LAYOUTS and not is_mesh_path(name):
         known = ", ".join(sorted(LAYOUTS))
         raise ValueError(f"scene must be one of {known}, or the path of a mesh file, got {name!r}")
+    layout = with_overrides(LAYOUTS.get(name) or MeshLayout(file=name), overrides)
+    if isinstance(layout, MeshLayout):
+        scenes = iter([_mesh_corridor(name, layout)])
+        remedy = "lower scale, widen the lane, fly at another height"
+    else:
+        scenes = (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
+        remedy = "lower num_obstacles or the radii, raise min_gap_m, widen the lane"
     for scene in scenes:
-        if not passable or scene.passable(vehicle_radius_m, height_m):
+        if not layout.passable or scene.passable(vehicle_radius_m, height_m):
             return scene
     raise ValueError(
         f"layout of scene {name!r} gave no corridor that a vehicle of radius {vehicle_radius_m} m can pass "
@@ -262,18 +261,18 @@ def _corridor(name: str, layout: Layout, rng: np.random.Generator) -> Scene:
     )
 
 
-def _mesh_corridor(path: str, layout: MeshLayout) -> Scene:
-    file = Path(path)
+def _mesh_corridor(name: str, layout: MeshLayout) -> Scene:
+    file = Path(layout.file)
     stamp = (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else (0, 0)
-    return _read_mesh_corridor(path, stamp, layout)
+    return _read_mesh_corridor(name, stamp, layout)
 
 
 @functools.lru_cache(maxsize=2)
-def _read_mesh_corridor(path: str, stamp: tuple[int, int], layout: MeshLayout) -> Scene:
+def _read_mesh_corridor(name: str, stamp: tuple[int, int], layout: MeshLayout) -> Scene:
     """The scene of a mesh file, read once for all episodes; `stamp` differs once the file has changed."""
-    corners, normals, albedo = read_mesh(path)
+    corners, normals, albedo = read_mesh(layout.file)
     nothing = np.empty(0, bodies.OBSTACLE)
-    bare = Scene(path, nothing, width_m=layout.width_m, wall_height_m=layout.wall_height_m)
+    bare = Scene(name, nothing, width_m=layout.width_m, wall_height_m=layout.wall_height_m)
     luminance = bare.shade(albedo, normals[:, None, :]).ravel()
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return dataclasses.replace(bare, mesh=(layout.scale * corners.reshape(-1, 3), faces, luminance))

@@ -16,11 +16,11 @@ import pydantic
 from pydantic import Field, PlainValidator
 
 from envs.config import EnvConfig
-from jobs.config.env_keys import ENV_KEYS, LAYOUT, env_with
+from jobs.config.env_keys import ENV_KEYS, OPEN_KEYS, env_with
 from jobs.config.errors import nearest
 from jobs.config.scenes import scene_errors
 
-CONDITION_KEYS = [key for key in ENV_KEYS if key != "env.layout"]
+CONDITION_KEYS = [key for key in ENV_KEYS if f"{key}." not in OPEN_KEYS]
 NETWORK_KEYS = (
     "camera.width",
     "camera.height",
@@ -57,11 +57,21 @@ def _settings(value: object) -> Any:
     return _number_or_word(value)
 
 
+def _searched(value: object) -> Any:
+    """A list of any values, or a range."""
+    if isinstance(value, list) and value:
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError(f"must be a list of values, or a range {{low: number, high: number}}, got {value!r}")
+    return _settings(value)
+
+
 Setting = Annotated[float | str | None, PlainValidator(_number_or_word)]
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Values = Annotated[list[Setting], Field(min_length=1)]
 Axis = Annotated[dict[str, Values], Field(min_length=1)]
 Condition = dict[str, Setting]
+Searched = Annotated[Any, PlainValidator(_searched)]
 Drawn = Annotated[Any, PlainValidator(_settings)]
 Conditions = Annotated[list[dict[str, Drawn]], Field(min_length=1)]
 
@@ -182,7 +192,7 @@ def _key_errors(settings: Mapping[str, object]) -> list[str]:
     unknown = {
         key: value
         for key, value in settings.items()
-        if key not in CONDITION_KEYS and not key.startswith(LAYOUT)
+        if key not in CONDITION_KEYS and not key.startswith(OPEN_KEYS)
     }
     return [
         f"{key}: no such setting, got {value}{nearest(key, CONDITION_KEYS)}" for key, value in unknown.items()

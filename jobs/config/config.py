@@ -18,6 +18,7 @@ from envs.config import STRICT, EnvConfig
 from jobs.config.conditions import axis_errors, condition_errors
 from jobs.config.env_keys import BESIDE_ENV, ENV_GROUPS, ENV_KEYS, fields_of, flat_env, key_of
 from jobs.config.errors import SET_BY_JOBS, ConfigError, nearest, redacted
+from jobs.config.plugins import load_plugins
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
@@ -37,6 +38,7 @@ from jobs.config.schema import (
     TradeEncoderConfig,
     TradeSimulatorConfig,
     TrainConfig,
+    TuneConfig,
 )
 from models.kinds import KINDS, Model, model_keys, read_model
 
@@ -77,9 +79,11 @@ class Config:
     trade_simulator: TradeSimulatorConfig
     trade_encoder: TradeEncoderConfig
     probe: ProbeConfig
+    tune: TuneConfig
     ablation: AblationConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
+    plugins: list[Name]
 
 
 SECTIONS = {
@@ -99,10 +103,12 @@ def parse(values: Mapping[str, object]) -> Config:
         ConfigError: With one line per wrong key: the key, the rule, the value received.
     """
     errors: list[str] = []
+    load_plugins(values.get("plugins"))
     parts: dict[str, object] = {"env": _env(values, errors)}
     parts |= {name: _section(section, values.get(name), name, errors) for name, section in SECTIONS.items()}
     parts["model"] = _section(read_model, values.get("model"), "model", errors)
-    top = {name: value for name, value in values.items() if name not in BESIDE_ENV}
+    top = {name: value for name, value in values.items() if name not in (*BESIDE_ENV, "name")}
+    top |= {} if values.get("name") is None else {"exp": values["name"]}
     wrong = [name for name, part in parts.items() if part is None]
     config = _build(Config, {**top, **parts}, "", errors, skip=wrong)
     if config is not None and not errors:
@@ -130,7 +136,7 @@ def as_dict(config: Config) -> dict[str, object]:
 
 def known_keys() -> list[str]:
     """Every key that a configuration may have."""
-    keys = [*fields_of(Config), *ENV_GROUPS, *ENV_KEYS]
+    keys = [*fields_of(Config), "name", *ENV_GROUPS, *ENV_KEYS]
     for name, section in SECTIONS.items():
         keys += [f"{name}.{field}" for field in fields_of(section)]
     return keys + [f"model.{name}" for name in model_keys()]

@@ -38,6 +38,8 @@ def key_of(section: str, path: Sequence[int | str]) -> str:
 
 
 LAYOUT = "env.layout."  # begins the key of a layout's field, such as env.layout.ground_texture.pattern
+ADDED_FAULT = "faults.added."  # begins the key of a plug-in's fault
+OPEN_KEYS = (LAYOUT, ADDED_FAULT)
 
 
 def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
@@ -52,6 +54,10 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
         if key.startswith(LAYOUT):
             layout = typing.cast(dict[str, object], fields.get("layout", env.layout))
             fields["layout"] = _with_part(layout, key.removeprefix(LAYOUT).split("."), value)
+            continue
+        if key.startswith(ADDED_FAULT):
+            added = groups.setdefault("faults", {}).setdefault("added", dict(env.faults.added))
+            typing.cast(dict[str, object], added)[key.removeprefix(ADDED_FAULT)] = value
             continue
         path = ENV_KEYS.get(key, (key,))  # an unknown key is for pydantic to reject
         if len(path) == 2:

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
-from jobs.config.conditions import Axis, AxisName, Conditions
+from jobs.config.conditions import Axis, AxisName, Conditions, Searched
 from models.kinds import Latent, Stack, Target, checked
 
 Count = Annotated[int, Field(ge=1)]
@@ -268,6 +268,23 @@ class ProbeConfig:
     latents: Annotated[list[Latent], Field(min_length=1, max_length=8)]
     targets: Annotated[list[Target], Field(min_length=1, max_length=4)]
     stacks: Annotated[list[Stack], Field(min_length=1, max_length=8)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class TuneConfig:
+    """Which settings are searched, and how much each trial of some may cost.
+
+    Attributes:
+        space: Key -> a list of values, or a range as in `jobs.config.conditions`.
+        trials: Trainings that are begun; most are stopped early.
+        report_steps: Environment steps between two measurements; the first is the earliest end of a trial.
+        episodes: Validation corridors of a measurement.
+    """
+
+    space: Annotated[dict[str, Searched], Field(min_length=1)]
+    trials: Count
+    report_steps: Count
+    episodes: Count
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -53,7 +53,9 @@ def run(config: Config) -> np.void:
     decode = latent_decoder(Path(policy.agent)) if file.is_file() else None
     if decode is None and file.is_file():
         console.print("The policy is lean, without a decoder: the film shows its latent as numbers alone.")
-    faults = [f"{key} {value:g}" for key, value in dataclasses.asdict(env.faults).items() if value]
+    amounts = dataclasses.asdict(env.faults)
+    amounts |= amounts.pop("added")
+    faults = [f"{key} {value:g}" for key, value in amounts.items() if value]
     title = "   ".join([name, f"{env.scene} {config.seed}", *faults])
     path = open_run(config).path / "demo" / f"{name}.mp4"
     console.print(f"Film: {write_film(path, recorded, title, decode)}", markup=False)

@@ -5,11 +5,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from envs.config import EnvConfig
-from envs.scene.layouts import LAYOUTS, with_overrides
+from envs.scene.layouts import LAYOUTS, Layout, with_overrides
 from jobs.config.conditions import WEIGHT
-from jobs.config.env_keys import ENV_KEYS, LAYOUT, env_with
+from jobs.config.env_keys import ADDED_FAULT, ENV_KEYS, LAYOUT, env_with
 
-NO_CONDITION = ("renderer", "env.scene", "env.layout", "env.time_limit_s", "env.window_capacity")
+NO_CONDITION = (
+    "renderer",
+    "env.scene",
+    "env.layout",
+    "env.time_limit_s",
+    "env.window_capacity",
+    "faults.added",
+)
 COMPARED = [key for key in ENV_KEYS if key not in NO_CONDITION and not key.startswith("fidelity.")]
 
 
@@ -28,7 +35,7 @@ def met(
         nominal: The simulation of the sweep with nothing changed.
         cell: That of the cell.
     """
-    if cell.scene not in LAYOUTS:
+    if not _is_drawn(cell.scene):
         return False
     before, here = settings_of(nominal), settings_of(cell)
     changed = {key: value for key, value in here.items() if before.get(key) != value}
@@ -48,6 +55,7 @@ def settings_of(env: EnvConfig) -> dict[str, object]:
         for name in ENV_KEYS[key]:
             value = getattr(value, name)
         values[key] = value
+    values |= {ADDED_FAULT + name: amount for name, amount in env.faults.added.items()}
     layout = dataclasses.asdict(with_overrides(LAYOUTS[env.scene], env.layout))
     for name, value in layout.items():
         parts = value if isinstance(value, dict) else {"": value}
@@ -56,10 +64,15 @@ def settings_of(env: EnvConfig) -> dict[str, object]:
     return values
 
 
+def _is_drawn(scene: str) -> bool:
+    """Whether a scene is a layout, not a mesh."""
+    return isinstance(LAYOUTS.get(scene), Layout)
+
+
 def _drawn_settings(condition: Mapping[str, Any], trained: EnvConfig) -> dict[str, list[object]]:
     """Of each setting the values that a condition may draw, of a range its ends."""
     ends = {key: _ends(value) for key, value in condition.items() if key != WEIGHT}
-    scenes = [scene for scene in ends.pop("env.scene", [trained.scene]) if scene in LAYOUTS]
+    scenes = [scene for scene in ends.pop("env.scene", [trained.scene]) if _is_drawn(scene)]
     worlds = [settings_of(env_with(trained, {"env.scene": scene})) for scene in scenes]
     drawn = {key: [world[key] for world in worlds] for key in worlds[0]} if worlds else {}
     return drawn | ends

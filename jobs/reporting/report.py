@@ -1,4 +1,4 @@
-"""Copy finished studies into docs/: a sweep as results.md, a trade as trade.md, a replay page as replay.html.
+"""Copy finished studies into docs/ of this folder: results.md, trade.md, replay.html.
 
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
@@ -41,7 +41,6 @@ from jobs.run.checkpoints import sha256
 from jobs.run.files import RunError, read_json, replaced, write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
-from jobs.run.provenance import REPOSITORY
 from jobs.run.templates import render
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -81,8 +80,7 @@ def run(config: Config) -> dict[str, Any]:
         raise ConfigError(f"resume: no finished sweep or trade in {where!r}: run {commands}")
     for name, folder in found.items():
         if folder is not None:
-            file = writers[name](folder, REPOSITORY / "docs")
-            console.print(f"Written: {file.relative_to(REPOSITORY)}", markup=False)
+            console.print(f"Written: {writers[name](folder, Path('docs'))}", markup=False)
     return {}
 
 
@@ -146,6 +144,18 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
     if about.get("episodes_sha256") not in (None, sha256(sweep / "episodes.csv")):
         raise RunError(f"{sweep / 'episodes.csv'}: damaged; give the command of the sweep again")
     episodes = read_sweep_episodes(sweep / "episodes.csv")
+    write_data(docs / "data", sweep, episodes)
+    values = page_values(about, episodes, docs, pretrained)
+    shown = [(name, TITLES.get(name, name)) for name in plots]
+    for name in ("results", "results_tables"):
+        write_atomic(docs / f"{name}.md", render(TEMPLATES / f"{name}.md.j2", plots=shown, **values))
+    return docs / "results.md"
+
+
+def page_values(
+    about: SweepFacts, episodes: SweptEpisodes, docs: Path, pretrained: Path
+) -> dict[str, object]:
+    """What the templates name, after the map and the plot of the claims have been drawn."""
     changes = changes_of(about, episodes)
     baselines = {place(one["condition"]): place(one["baseline"]) for one in about["compared"]}
     findings = judge_all(
@@ -154,10 +164,9 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
     labels = {at: condition_text(*at) for at in baselines}
     save_plot(docs / "images" / "results_map.png", change_map(changes, list(about["groups"]), labels))
     save_plot(docs / "images" / "results_claims.png", claims_plot(findings))
-    write_data(docs / "data", sweep, episodes)
     success, every = estimate_tables(about, episodes)
     most = max(map(len, about["groups"].values()))
-    values = {
+    return {
         "about": about,
         "commits": ", ".join(commit[:7] for commit in about["evaluated_at"]),
         "groups": ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
@@ -171,15 +180,11 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
         "most": most,
         "coverage": coverage_text(most, about["trials"]),
         "shared": shared_encoders(about, pretrained),
-        "plots": [(name, TITLES.get(name, name)) for name in plots],
         "trade": (docs / "trade.md").is_file(),
         "success": success,
         "details": every,
         "exactness": exactness_table(about.get("exactness", [])),
     }
-    for name in ("results", "results_tables"):
-        write_atomic(docs / f"{name}.md", render(TEMPLATES / f"{name}.md.j2", **values))
-    return docs / "results.md"
 
 
 def condition_text(axis: str, value: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from envs.event_error import measure_event_error
+from jobs.config.plugins import one_line
 from jobs.rollout.agents import Agent, make_agent
 from jobs.rollout.diagnostics import DriftSampler
 from jobs.rollout.episodes import EPISODE, roll_out
@@ -86,7 +87,7 @@ def attempt(evaluation: Callable[[], PartResult]) -> PartResult | str:
     try:
         return evaluation()
     except Exception as error:
-        return " ".join(f"{type(error).__name__}: {error}".split())
+        return one_line(error)
 
 
 def evaluate_part(part: Part) -> PartResult:

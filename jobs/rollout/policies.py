@@ -11,11 +11,9 @@ from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import ENV_KEYS, env_with
 from jobs.rollout.agents import BASELINES
 from jobs.run.folder import Run, latest_policies, named_policy
-from jobs.run.provenance import REPOSITORY
-from models.kinds import find_kind
-from models.policy.policy import MANIFEST, PolicyFileError, read_policy_manifest
+from models.kinds import find_kind, needed_plugins
+from models.policy.policy import MANIFEST, PRETRAINED, PolicyFileError, read_policy_manifest
 
-PRETRAINED = REPOSITORY / "models" / "pretrained"
 SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
 FILTER = ("filter_support", "filter_tau_us")
 Differences = dict[str, tuple[object, object]]  # sensor setting -> (the policy's value, the environment's)
@@ -67,7 +65,10 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     if missing:
         raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")
     group = str(manifest.get("exp", manifest["name"]))
-    identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
+    try:
+        identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
+    except ValueError as error:
+        raise ConfigError(f"policy: {agent!r}: {error}{needed_plugins(manifest)}") from None
     seed, met = int(manifest["seed"]), (manifest.get("world", {}), manifest.get("conditions", ()))
     return EvaluatedPolicy(agent, group, seed, identity, manifest["sensor"], observation, *met)
 

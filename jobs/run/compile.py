@@ -59,7 +59,8 @@ def _digest() -> str:
     """A hash of all sources of kernels, of what is compiled of them, by which numba and where to."""
     files = sorted(path for room in ("envs", "models") for path in (REPOSITORY / room).rglob("*.py"))
     whole = hashlib.sha256(b"".join(path.read_bytes() for path in (Path(__file__), *files)))
-    whole.update(f"{version('numba')} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
+    python = sys.version_info[:2]  # each has machine code of its own
+    whole.update(f"{version('numba')} {python} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
     return whole.hexdigest()
 
 

@@ -14,6 +14,7 @@ import yaml
 
 from envs.config import LATER_SETTINGS, CameraConfig, settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
+from jobs.config.plugins import plugin_digests
 from jobs.run.files import RunError, read_json, write_atomic, write_json
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
@@ -22,8 +23,8 @@ from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
 # Sections that do not change what is trained: where a run is computed and recorded, and what is
 # done with its policy afterwards.
 NOT_IN_RUN_NAME = (
-    "job", "resume", "runs_dir", "cluster", "tracking",
-    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "ablation",
+    "job", "resume", "runs_dir", "plugins", "cluster", "tracking",
+    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "tune", "ablation",
     "demo", "replay_page",
 )  # fmt: skip
 # Settings that older run folders lack, each with the value that does what was done before it existed.
@@ -32,7 +33,7 @@ ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "algo": {"imitation": None, "critic": "observation", "shaping": 0.0},
     "env": {"filter_support": 0, "filter_tau_us": 5_000},
     "camera": {name: getattr(CameraConfig, name) for name in LATER_SETTINGS},
-    "faults": {"displaced": 0.0, "flipped": 0.0, "leak_jitter": 0.0, "noise_spread": 0.0},
+    "faults": {"added": {}, "displaced": 0.0, "flipped": 0.0, "leak_jitter": 0.0, "noise_spread": 0.0},
     "collect": {"recordings": [], "conditions": [{}]},
     "pretrain": {"denoise": False},
     "train": {"conditions": [{}], "init": None, "value_warmup": 20_000},
@@ -134,7 +135,8 @@ def reopen(path: Path, config: Config) -> Run:
 def run_name(config: Config) -> str:
     """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained.
 
-    `ADDED_SETTINGS` count only where they change something, so that older folders keep their names.
+    `ADDED_SETTINGS` count only where they change something, so that older folders keep their names. Of
+    plug-ins the content counts: another version of one is another experiment.
     """
     settings: dict[str, Any] = {
         name: value for name, value in as_dict(config).items() if name not in NOT_IN_RUN_NAME
@@ -142,6 +144,8 @@ def run_name(config: Config) -> str:
     for section, added in ADDED_SETTINGS.items():
         values = settings[section].items()
         settings[section] = {name: value for name, value in values if added.get(name, ...) != value}
+    if config.plugins:
+        settings["plugins"] = plugin_digests()
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jobs.config.config import ConfigError
+from jobs.config.plugins import with_plugins
 from jobs.config.schema import ClusterConfig
 from jobs.run.compile import compile_kernels
 from jobs.run.head_watch import watching_head
@@ -82,7 +83,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     # It logs the traceback of a trial's error, which it also writes beside the trial and jobs report.
     logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
-        "runtime_env": {"env_vars": WORKER_THREADS},
+        "runtime_env": with_plugins({"env_vars": WORKER_THREADS}),
         "log_to_driver": False,
         "logging_level": logging.ERROR,
         "configure_logging": True,

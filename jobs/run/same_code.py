@@ -6,6 +6,7 @@ from importlib.metadata import version
 from typing import Any
 
 from jobs.config.config import ConfigError
+from jobs.config.plugins import plugin_digests
 from jobs.run.provenance import REPOSITORY
 
 ROOMS = ("envs", "models", "jobs")
@@ -19,7 +20,8 @@ def fingerprint() -> dict[str, str]:
     for room in ROOMS:
         for file in sorted((REPOSITORY / room).rglob("*.py")):
             digest.update(f"{file.relative_to(REPOSITORY)}\0".encode() + file.read_bytes() + b"\0")
-    return {"evade": digest.hexdigest()[:12], **{name: version(name) for name in PACKAGES}}
+    versions = {name: version(name) for name in PACKAGES}
+    return {"evade": digest.hexdigest()[:12], **versions, **plugin_digests()}
 
 
 def check_machines() -> None:

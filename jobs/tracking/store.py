@@ -8,7 +8,7 @@ from jobs.config.config import Config, ConfigError
 from jobs.config.errors import HIDDEN, redacted
 from jobs.run.provenance import REPOSITORY
 
-SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep")
+SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep", "tune")
 MAX_METRICS = 40  # of one call; a page with hundreds of charts can be neither read nor drawn
 MAX_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
 LOCAL_PAGE = "http://127.0.0.1:5000"

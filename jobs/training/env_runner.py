@@ -23,6 +23,7 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
+from jobs.config.plugins import one_line
 from jobs.run.watchdog import ending_after
 from jobs.training.rllib_internals import ENV_RUNNER, require
 from jobs.training.snapshots import Snapshot, generators, set_generators
@@ -75,11 +76,6 @@ class Part(NamedTuple):
 
 class RolloutError(RuntimeError):
     """An error of the simulation or the policy in an env runner."""
-
-
-def one_line(error: Exception) -> str:
-    """Type and text of an error."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 class Raised:

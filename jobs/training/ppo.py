@@ -18,6 +18,7 @@ from envs.corridor import CorridorVectorEnv
 from envs.kinematics import NUM_ACTIONS
 from jobs.config.conditions import episode_draw
 from jobs.config.config import Config, ConfigError
+from jobs.config.plugins import plugin_digests
 from jobs.rollout.diagnostics import drift_metrics
 from jobs.run.files import RunError
 from jobs.training.env_runner import PlainEnvRunner
@@ -280,6 +281,7 @@ def policy_about(config: Config) -> dict[str, object]:
         "seed": config.seed,
         "algo": dataclasses.asdict(config.algo),
         **({} if config.train.init is None else {"init": config.train.init}),
+        **({"plugins": plugin_digests()} if config.plugins else {}),
     }
 
 

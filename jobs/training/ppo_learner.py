@@ -32,6 +32,7 @@ from torch import Tensor, nn
 from jobs.training.rllib_internals import LEARNER, require
 from jobs.training.teacher import log_costs
 from models.policy.dense_update import Rows, Settings, update_dense
+from models.policy.networks import is_mlp
 from models.policy.rllib_module import PRIVILEGED
 
 READ = (
@@ -169,7 +170,8 @@ class PlainPPOLearner(PPOTorchLearner):
     @property
     def _dense(self) -> bool:
         """Whether the policy is two networks of dense layers that share nothing."""
-        return not any(True for _ in self.module[DEFAULT_MODULE_ID].unwrapped().trunk.parameters())
+        module = self.module[DEFAULT_MODULE_ID].unwrapped()
+        return isinstance(module.trunk, nn.Flatten) and is_mlp(module.pi) and is_mlp(module.vf)
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
         """The steps of all episodes, one after the other, with the targets of the loss."""

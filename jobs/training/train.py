@@ -23,6 +23,7 @@ from ray import tune
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.config.config import Config, ConfigError
+from jobs.config.plugins import with_culprit
 from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
 from jobs.run.files import json_lines, naming, read_json_lines, whole_lines
@@ -170,7 +171,8 @@ def last_line(error: Exception | str) -> str:
         return f"its process was ended {ended}; stop other programs, or take a machine with more"
     lines = str(error).strip().splitlines()
     raised = f"{RolloutError.__module__}.{RolloutError.__qualname__}: "  # as Ray writes it before the message
-    return lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
+    said = lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
+    return with_culprit(said, str(error))
 
 
 def check_cpus(config: Config) -> None:
@@ -270,11 +272,18 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             advance(env_steps - reported, note=_note(last))
             reported = env_steps
 
-        _LISTENERS[LISTENER] = listen
-        try:
+        with relayed_to(LISTENER, listen):
             yield last
-        finally:
-            del _LISTENERS[LISTENER]
+
+
+@contextlib.contextmanager
+def relayed_to(name: str, listen: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
+    """Let a function hear each result that a `Relay` of this name gets."""
+    _LISTENERS[name] = listen
+    try:
+        yield
+    finally:
+        del _LISTENERS[name]
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:

@@ -57,12 +57,11 @@ def logits_of(trunk: nn.Module, pi: nn.Module, stacks: np.ndarray) -> np.ndarray
 
     Those run without torch, whose calls take ten times as long as the arithmetic of a few rows.
     """
-    layers = list(pi) if isinstance(pi, nn.Sequential) else [pi]
-    if not isinstance(trunk, nn.Flatten) or any(type(layer) not in (nn.Linear, nn.Tanh) for layer in layers):
+    if not isinstance(trunk, nn.Flatten) or not is_mlp(pi):
         with torch.inference_mode():
             return pi(trunk(torch.from_numpy(stacks))).numpy()
     values = stacks.reshape(len(stacks), math.prod(stacks.shape[1:]))
-    for layer in layers:
+    for layer in pi.children():
         if isinstance(layer, nn.Linear):
             values = dense(values, layer.weight.detach().numpy(), layer.bias.detach().numpy())
         else:
@@ -82,6 +81,14 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     for fan_in, fan_out in itertools.pairwise([inputs, *hidden]):
         layers += [nn.Linear(fan_in, fan_out), nn.Tanh()]
     return nn.Sequential(*layers, nn.Linear([inputs, *hidden][-1], outputs))
+
+
+def is_mlp(network: nn.Module) -> bool:
+    """Whether `mlp` could have built it: what is compiled for such networks would compute others wrong."""
+    layers = list(network) if isinstance(network, nn.Sequential) else []
+    kinds = [nn.Tanh if place % 2 else nn.Linear for place in range(len(layers))]
+    biased = all(layer.bias is not None for layer in layers[::2] if isinstance(layer, nn.Linear))
+    return len(layers) % 2 == 1 and [type(layer) for layer in layers] == kinds and biased
 
 
 def widened(network: nn.Module, inputs: int) -> nn.Module:

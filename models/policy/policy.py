@@ -33,12 +33,13 @@ from models.encoder.weights import (
     without_checksum,
     write_atomic,
 )
-from models.kinds import PolicySpec, read_spec
+from models.kinds import PolicySpec, needed_plugins, read_spec
 from models.policy.event_filter import filter_of
 from models.policy.features import LATENT, Step, Windows, feature_of
 from models.policy.memory import remember, windows_us
 from models.policy.networks import assemble, logits_of
 
+PRETRAINED = Path(__file__).parents[1] / "pretrained"  # the shipped policies, a folder each
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
 ENCODER_FILES = (ENCODER, "encoder.json")
 REQUIRED = ("sha256", "name", "sensor", "sensor_hash")
@@ -312,7 +313,7 @@ def _read_manifest(file: Path) -> tuple[PolicyManifest, PolicySpec]:
     try:
         spec = read_spec(manifest)
     except ValueError as error:
-        raise PolicyFileError(f"{file}: {error}") from None
+        raise PolicyFileError(f"{file}: {error}{needed_plugins(manifest)}") from None
     if not isinstance(manifest["sha256"], dict) or set(manifest["sha256"]) != set(_files(spec)):
         wanted = ", ".join(_files(spec))
         raise PolicyFileError(f"{file}: sha256 must name {wanted}, got {manifest['sha256']!r}")

@@ -49,6 +49,11 @@ def make_config(*overrides: str) -> Config:
     return parse(compose("+exp=train", *algo, *overrides))
 
 
+def tune_config(*overrides: str) -> Config:
+    """The checked configuration of a search."""
+    return parse(compose("+exp=tune", *overrides))
+
+
 def sweep_config(tmp_path, trials=2, policies=("straight",), axes=AXES, **changes):
     """A sweep of short episodes."""
     config = small_config(tmp_path, job="sweep", exp="robustness")

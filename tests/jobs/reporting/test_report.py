@@ -163,7 +163,7 @@ def test_the_page_of_a_trade_is_copied_with_its_picture(trade, tmp_path):
 
 
 def test_what_there_is_is_written_and_nothing_else(trade, tmp_path, monkeypatch):
-    monkeypatch.setattr(results, "REPOSITORY", tmp_path)
+    monkeypatch.chdir(tmp_path)
     results.run(small_config(tmp_path, job="report"))
     assert [path.name for path in (tmp_path / "docs").glob("*.md")] == ["trade.md"]
 

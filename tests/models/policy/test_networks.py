@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from models.kinds import MIN_IMAGE, EncoderModel, FixedModel, PolicySpec
-from models.policy.networks import PARTS, assemble, build_networks, logits_of
+from models.policy.networks import PARTS, assemble, build_networks, is_mlp, logits_of, mlp
 
 ENCODER = EncoderModel("bytestream", 64, 8, "batch", "signed", 32, "additive", "frozen", 3, [64, 64])
 MLP = PolicySpec(ENCODER, 64, 64, 3)
@@ -99,3 +99,24 @@ def test_the_smallest_picture_is_the_smallest():
     assert build_networks(smallest)["trunk"](pictures).shape == (1, 512)
     with pytest.raises(RuntimeError):
         assemble(smallest)["trunk"](pictures[..., 1:])
+
+
+OTHERS = {
+    "another function": lambda: nn.Sequential(nn.Linear(6, 5), nn.ReLU(), nn.Linear(5, 3)),
+    "no bias": lambda: nn.Sequential(nn.Linear(6, 3, bias=False)),
+    "a function at the end": lambda: nn.Sequential(nn.Linear(6, 3), nn.Tanh()),
+    "no sequence": lambda: nn.Linear(6, 3),
+    "two layers with nothing between": lambda: nn.Sequential(nn.Linear(6, 5), nn.Linear(5, 3)),
+}
+
+
+@pytest.mark.parametrize("what", OTHERS)
+def test_only_what_mlp_builds_is_computed_as_such(what):
+    torch.manual_seed(0)
+    network, stacks = OTHERS[what](), np.random.default_rng(0).normal(size=(4, 2, 3)).astype(np.float32)
+    assert not is_mlp(network)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(stacks).flatten(1)).numpy()
+    assert np.array_equal(logits_of(nn.Flatten(), network, stacks), expected)
+    assert is_mlp(mlp(6, (), 3))
+    assert is_mlp(mlp(6, (4, 4), 3))

@@ -1,0 +1,178 @@
+"""Plug-ins: Python files outside this repository that add scenes, faults and kinds of policy.
+
+A plug-in is a file or the folder of a package. Importing it adds rows to `LAYOUTS`, `ADDED_FAULTS` and
+`KINDS`, in which every job looks names up. The key `plugins` names them; Ray ships their code to each worker,
+which imports them before it does anything else (docs/plugins.md).
+"""
+
+import hashlib
+import importlib
+import importlib.util
+import os
+import re
+import sys
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from envs.config import ADDED_FAULTS
+from envs.scene.layouts import LAYOUTS
+from jobs.config.errors import ConfigError
+from models.kinds import KINDS, resolve
+
+VARIABLE = "EVADE_PLUGINS"  # of a Ray worker: the names of its plug-ins
+ROWS: dict[str, dict[str, Any]] = {"scene": LAYOUTS, "fault": ADDED_FAULTS, "kind of policy": KINDS}
+
+_loaded: dict[str, ModuleType] = {}
+
+
+def load_plugins(names: object) -> None:
+    """Import the plug-ins that a configuration names, each once, and check what they add.
+
+    Args:
+        names: Each a module that Python finds, or the path of a file or of a package's folder.
+
+    Raises:
+        ConfigError: One cannot be imported, takes a name that is taken, or adds what cannot be used.
+    """
+    for name in names if isinstance(names, list) else ():  # anything else is refused with its key
+        before, known = {what: dict(rows) for what, rows in ROWS.items()}, set(_loaded)
+        try:
+            _load(str(name), before)
+        except Exception as error:
+            said = one_line(error)
+            for what, rows in ROWS.items():
+                rows.clear()
+                rows.update(before[what])
+            for stem in _loaded.keys() - known:
+                del _loaded[stem], sys.modules[stem]
+            raise ConfigError(f"plugins: {name}: {said}") from error
+
+
+def _load(name: str, before: Mapping[str, Mapping[str, Any]]) -> None:
+    """Import one, unless it is there, and check what is new since `before`."""
+    path = Path(name).resolve() if name.endswith(".py") or os.sep in name else None
+    stem = path.stem if path else name
+    if stem in _loaded and (path is None or path in _files(_loaded[stem])):
+        return
+    if path is None:
+        _loaded[stem] = importlib.import_module(stem)
+    else:
+        _import_file(stem, path)
+    for what, rows in before.items():
+        taken = [row for row, value in rows.items() if ROWS[what].get(row) is not value]
+        if taken:
+            raise ValueError(f"replaces the {what} {taken[0]!r}; give its own another name")
+    for what, rows in ROWS.items():
+        for row in rows.keys() - before[what].keys():
+            try:
+                _check(what, row, rows[row])
+            except (ValueError, ImportError, AttributeError) as error:
+                raise ValueError(f"its {what} {row!r}: {error}") from error
+
+
+def _import_file(stem: str, path: Path) -> None:
+    """Import a file or a package's folder under the name by which workers import it."""
+    file = path / "__init__.py" if path.is_dir() else path
+    if not file.is_file() or not stem.isidentifier():
+        raise ValueError("must be a module, a .py file or the folder of a package")
+    if stem in sys.modules or importlib.util.find_spec(stem) is not None:
+        raise ValueError(f"its name {stem!r} is that of another module; rename it")
+    inside = [str(path)] if path.is_dir() else None
+    spec = importlib.util.spec_from_file_location(stem, file, submodule_search_locations=inside)
+    assert spec is not None  # noqa: S101  for the type checker
+    assert spec.loader is not None  # noqa: S101  as above
+    module = _loaded[stem] = sys.modules[stem] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+
+def _check(what: str, name: str, row: Any) -> None:
+    """Raise ValueError for a row that jobs could not use."""
+    if what == "scene":
+        import numpy as np
+
+        from envs.scene import make_scene  # loads numba, which takes long
+
+        make_scene(name, np.random.default_rng(0))
+    elif what == "fault" and not callable(row):
+        raise ValueError(f"must be a function, got {row!r}")
+    elif what == "kind of policy":
+        resolve(row.feature)
+        resolve(row.network)
+
+
+def with_plugins(runtime_env: Mapping[str, Any]) -> dict[str, Any]:
+    """Ray's runtime environment with the plug-ins in it; as it was where there is none."""
+    if not _loaded:
+        return dict(runtime_env)
+    tops = {sys.modules[name.partition(".")[0]] for name in _loaded}
+    return {
+        **runtime_env,
+        "env_vars": {**runtime_env.get("env_vars", {}), VARIABLE: ",".join(_loaded)},
+        "py_modules": sorted(str(_place(module)) for module in tops),
+        "worker_process_setup_hook": f"{__name__}.load_in_worker",
+    }
+
+
+def load_in_worker() -> None:
+    """Import the plug-ins of a Ray worker; what cannot be imported is told when its content is asked for."""
+    for name in filter(None, os.environ.get(VARIABLE, "").split(",")):
+        try:
+            _loaded[name] = importlib.import_module(name)
+        except Exception as error:
+            sys.stderr.write(f"plugins: {name}: {one_line(error)}\n")
+
+
+def plugin_digests() -> dict[str, str]:
+    """Name and content, a SHA-256, of each plug-in.
+
+    Raises:
+        ConfigError: In a Ray worker, if one could not be imported.
+    """
+    missing = [name for name in os.environ.get(VARIABLE, "").split(",") if name and name not in _loaded]
+    for name in missing:
+        try:
+            _loaded[name] = importlib.import_module(name)
+        except Exception as error:
+            raise ConfigError(f"plugins: {name}: {one_line(error)}") from error
+    return {name: _digest(module) for name, module in sorted(_loaded.items())}
+
+
+def one_line(error: BaseException) -> str:
+    """Type and text of an error, and the plug-in whose code raised it, if one did."""
+    said = " ".join(f"{type(error).__name__}: {error}".split())
+    return with_culprit(said, "".join(traceback.format_exception(error)))
+
+
+def with_culprit(said: str, trace: str) -> str:
+    """What is said of an error, and the plug-in that its traceback passes through, here or in a worker."""
+    for name, module in _loaded.items():
+        place = _place(module)
+        shipped = rf"[^\"]*/py_modules_files/[^\"/]+/{re.escape(place.name)}"
+        lines = re.findall(rf'File "(?:{re.escape(str(place))}|{shipped})[^"]*", line (\d+)', trace)
+        if lines and "(plug-in " not in said:
+            return f"{said} (plug-in {name}, line {lines[-1]})"
+    return said
+
+
+def _place(module: ModuleType) -> Path:
+    """The file of a module, or the folder of a package."""
+    file = Path(str(module.__file__)).resolve()
+    return file.parent if file.name == "__init__.py" else file
+
+
+def _files(module: ModuleType) -> list[Path]:
+    """The Python files of a module or a package; for a package its folder too."""
+    place = _place(module)
+    return [place, *sorted(place.rglob("*.py"))] if place.is_dir() else [place]
+
+
+def _digest(module: ModuleType) -> str:
+    place = _place(module)
+    digest = hashlib.sha256()
+    for file in sorted(place.rglob("*")) if place.is_dir() else [place]:
+        if file.is_file() and "__pycache__" not in file.parts:
+            digest.update(f"{file.relative_to(place.parent)}\0".encode() + file.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]

@@ -1,0 +1,1 @@
+"""Searching for settings: the space, a trial, and the search."""

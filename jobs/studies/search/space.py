@@ -1,0 +1,85 @@
+"""The space of a search: which settings may be tried, and a configuration with some of them."""
+
+import copy
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from ray import tune
+
+from jobs.config.config import Config, ConfigError, as_dict, parse
+from jobs.config.env_keys import OPEN_KEYS, flat_env
+from jobs.run.folder import NOT_IN_RUN_NAME
+from jobs.training.pretrain import evae_settings
+from models.kinds import KINDS
+
+# What a search is called, and what all its trials must have in common to be compared; what is no part of a
+# training is no part of a trial either.
+FIXED = (*NOT_IN_RUN_NAME, "exp", "budget")
+FIXED_KEYS = ("train.env_steps", "algo.num_env_runners", "algo.lr_schedule")
+
+
+def search_space(space: Mapping[str, Any]) -> dict[str, Any]:
+    """The space as Tune has it; values of lists travel as JSON, so that they may be lists themselves."""
+    return {key: _domain(values) for key, values in space.items()}
+
+
+def _domain(values: Any) -> Any:
+    if isinstance(values, list):
+        return tune.choice([json.dumps(value) for value in values])
+    low, high = values["low"], values["high"]
+    if isinstance(low, int) and isinstance(high, int):
+        return (tune.lograndint if values.get("log") else tune.randint)(low, high + 1)
+    return (tune.loguniform if values.get("log") else tune.uniform)(low, high)
+
+
+def read_settings(sampled: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a trial, from what Tune has drawn."""
+    return {key: json.loads(value) if isinstance(value, str) else value for key, value in sampled.items()}
+
+
+def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
+    """The configuration of a trial: with some settings replaced, and all work in one process.
+
+    Raises:
+        ConfigError: One is unknown, or its value is refused.
+    """
+    values: dict[str, Any] = copy.deepcopy(as_dict(config))
+    values["algo"]["num_env_runners"] = 0
+    for key, value in settings.items():
+        *groups, name = key.split(".")
+        inner: Any = values
+        for group in groups:
+            inner = inner.setdefault(group, {}) if key.startswith(OPEN_KEYS) else inner.get(group)
+            if not isinstance(inner, dict):
+                raise ConfigError(f"{key}: no such key, got {value!r}")
+        inner[name] = value
+    return parse(values)
+
+
+def space_errors(config: Config) -> Iterator[str]:
+    """One line for each key that cannot be searched, and for each of its values that would be refused."""
+    for key, values in config.tune.space.items():
+        if key.partition(".")[0] in FIXED or key in FIXED_KEYS:
+            yield f"tune.space: {key} must be the same for all trials"
+            continue
+        for value in extremes(values):
+            try:
+                with_settings(config, {key: value})
+            except ConfigError as error:
+                yield f"tune.space: {error}"
+
+
+def extremes(values: Any) -> list[Any]:
+    """All values of a list, the ends of a range."""
+    return values if isinstance(values, list) else [values["low"], values["high"]]
+
+
+def encoder_facts(config: Config) -> dict[str, Any] | None:
+    """What decides a frozen encoder: trials that have it in common share one; None without an encoder."""
+    if not KINDS[config.model.name].encoder:
+        return None
+    parts = {name: dataclasses.asdict(getattr(config, name)) for name in ("collect", "pretrain")}
+    evae = dataclasses.asdict(evae_settings(config))
+    return {**flat_env(config.env), **parts, "evae": evae, "seed": config.seed, "init": config.train.init}

@@ -1,0 +1,97 @@
+"""A plug-in of one file outside the repository: it trains, is swept and reported, and its errors name it."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from models.policy import load_policy
+from models.policy.policy import PolicyFileError
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(900), pytest.mark.xdist_group("plugins")]
+ROOT = Path(__file__).resolve().parents[2]
+EVADE = Path(sys.executable).parent / "evade"
+PLUGIN = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL)[1]
+TRAIN = (
+    *("+exp=event_columns", "job=train", "name=halves", "model.name=halves", "model.hidden=[]"),
+    *("env.scene=forest", "+faults.added.blind_spot=0.3", "env.time_limit_s=1.0"),
+    *("algo.train_batch_size_per_learner=256", "train.env_steps=512"),
+)
+SWEEP = (
+    *("+exp=robustness", "sweep.policies=[newest]", "model=event_columns", "model.name=halves"),
+    *("sweep.trials=1", "~sweep.axes", "env.time_limit_s=0.5"),
+    "+sweep.axes={spot: {faults.added.blind_spot: [0.0, 0.9]}, world: {env.scene: [poles_eval, forest]}}",
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with the plug-in, in which it has been trained."""
+    folder = tmp_path_factory.mktemp("outside")
+    (folder / "forest.py").write_text(PLUGIN)
+    evade(folder, *TRAIN)
+    return folder
+
+
+def evade(folder: Path, *words: str, status: int = 0) -> str:
+    """What the launcher says of a command given in a folder with a plug-in."""
+    environment = {**os.environ, "PYTHONPATH": ""}
+    command = [EVADE, *words, "budget=smoke", "plugins=[forest.py]"]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == status, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_it_is_a_file_of_thirty_lines():
+    assert len([line for line in PLUGIN.splitlines() if line.strip()]) <= 30
+
+
+def test_its_policy_trains_in_its_world(trained):
+    (run,) = (trained / "runs").glob("halves-*")
+    manifest = json.loads((run / "policy" / "policy.json").read_text())
+    assert (manifest["name"], manifest["world"]["scene"], manifest["stack"]) == ("halves", "forest", 3)
+    assert list(manifest["plugins"]) == ["forest"]
+    with pytest.raises(PolicyFileError, match=r"got 'halves'; trained with the plug-ins forest: import them"):
+        load_policy(run / "policy")
+
+
+def test_its_policy_scene_and_fault_are_swept_and_reported(trained):
+    said = evade(trained, *SWEEP)
+    for point in (r"spot\s+│ 0\.9", r"world\s+│ forest"):
+        assert re.search(point, said), said
+    assert "Written: docs/results.md" in evade(trained, "+exp=report")
+    assert "halves" in (trained / "docs" / "results.md").read_text()
+
+
+def test_without_it_a_job_says_which_plug_in_is_missing(trained):
+    (policy,) = (trained / "runs").glob("halves-*/policy")
+    words = ("+exp=demo", f"demo.policy={policy}")
+    done = subprocess.run([EVADE, *words], cwd=trained, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "trained with the plug-ins forest: import them first, in a job by plugins=[...]" in done.stderr
+
+
+BROKEN = {
+    "a network that raises": (
+        "    return nn.Flatten()",
+        "    1 / 0\n    return nn.Flatten()",
+        "ZeroDivisionError: division by zero (plug-in forest, line",
+    ),
+    "a fault that raises": (
+        "    return lambda events,",
+        "    return lambda events, *rest: 1 / 0\n    return lambda events,",
+        "ZeroDivisionError: division by zero (plug-in forest, line",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_an_error_in_a_worker_names_it(tmp_path, what):
+    before, after, message = BROKEN[what]
+    assert PLUGIN.count(before) == 1
+    (tmp_path / "forest.py").write_text(PLUGIN.replace(before, after))
+    assert message in evade(tmp_path, *TRAIN, status=1)
