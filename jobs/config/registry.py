@@ -34,5 +34,6 @@ JOBS = {
     "trade_encoder": Job("jobs.studies.encoder.trade", "What an exact encoder costs"),
     "tune": Job("jobs.studies.search.search", "Which settings a training learns best with"),
     "ablation": Job("jobs.studies.ablation.ablation", "What each part of a recipe contributes"),
+    "numerics": Job("jobs.studies.numerics.numerics", "What the numbers do at the ends of their ranges"),
     "probe": Job("jobs.studies.probe.probe", "What a representation of events tells an agent"),
 }

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from envs.config import settings_hash
+from envs.config import LATER_SETTINGS, CameraConfig, settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.plugins import plugin_digests
 from jobs.run.files import RunError, read_json, write_atomic, write_json
@@ -31,8 +31,9 @@ NOT_IN_RUN_NAME = (
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "model": ADDED_MODEL_SETTINGS,
     "algo": {"imitation": None, "critic": "observation", "shaping": 0.0},
-    "faults": {"added": {}},
     "env": {"filter_support": 0, "filter_tau_us": 5_000},
+    "camera": {name: getattr(CameraConfig, name) for name in LATER_SETTINGS},
+    "faults": {"added": {}, "displaced": 0.0, "flipped": 0.0, "leak_jitter": 0.0, "noise_spread": 0.0},
     "collect": {"recordings": [], "conditions": [{}]},
     "pretrain": {"denoise": False},
     "train": {"conditions": [{}], "init": None, "value_warmup": 20_000},

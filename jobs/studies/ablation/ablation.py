@@ -140,7 +140,7 @@ def compare(
         results = [variant_result(name, success[name], success[first], times[name]) for name in success]
         write_all_episodes(place, found)
         write_page(folder, tracker, results, facts_of(config, folder))
-        metrics = {f"ablation/{result.name}_success": result.mean.value for result in results}
+        metrics = {f"eval/{result.name}_success": result.mean.value for result in results}
         tracker.log(0, metrics)
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "ablation", metrics)

@@ -65,6 +65,8 @@ def test_the_experiment_names_variants_that_can_be_trained():
         for name, changed in configs.items()
     }
     first, *others = settings.values()
+    assert config.train.env_steps == 400_000
+    assert ablation_config("budget=smoke").train.env_steps == 4_096
     assert all(other != first for other in others)
     assert {changed.seed for changed in configs.values()} == {1}
     assert configs["ppo"].algo.imitation is None
@@ -106,7 +108,7 @@ def test_every_variant_is_trained_and_evaluated_once(tmp_path):
     config = dataclasses.replace(config, sweep=sweep)
     metrics = ablation.run(config)
     folder = locate_run(config).path / "ablation"
-    assert metrics == {f"ablation/{name}_success": 0.0 for name in variants}
+    assert metrics == {f"eval/{name}_success": 0.0 for name in variants}
     with (folder / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {(row["Axis"], row["Group"], row["Training"]) for row in rows} == {
