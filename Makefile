@@ -27,7 +27,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak test-pythons lint check bench docs dist lock clean
+.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench docs dist lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -103,6 +103,9 @@ test-pythons: ## the quick tests on each supported Python, in .venv-3.X (PYTHONS
 	    elif make test PYTHON=python$$version VENV=.venv-$$version; then said="$$said  $$version: passed\n"; \
 	    else said="$$said  $$version: FAILED\n"; fi; \
 	done; printf "Python\n$$said"; case "$$said" in *FAILED*|*"no inter"*) exit 1;; esac
+
+test-image: ## build the image by debootstrap and buildah, as root, and run its commands (ARGS="--build-arg ...")
+	docker/test_image.sh $(ARGS)
 
 lint: setup ## check style, format, types, and who imports whom
 	$(BIN)/ruff check .

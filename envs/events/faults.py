@@ -6,12 +6,11 @@ reader. What is off costs nothing and draws nothing.
 
 A plug-in adds a fault by `ADDED_FAULTS[name] = make`. At the start of an episode `make(amount, shape, rng)`
 is called, with the amount of `faults.added.NAME`, the image's (H, W) and the episode's random stream. It
-returns `apply(events, t0_us, t1_us)`, which is called after the faults of this file and returns what the
-events become: EVENT, sorted by t.
+returns `apply(events, t0_us, t1_us)`, which is called after the faults of this file and before the readout,
+with EVENT of the interval (t0_us, t1_us], and returns what they become: EVENT, sorted by t.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
 
 import numba
 import numpy as np
@@ -34,13 +33,11 @@ class PixelFaults:
         dead: bool (H, W); these never fire, not even noise.
         live: int64 (L,), flat indices of the others.
         hot: int64 (K,), flat indices of the hot ones among these.
-        added: What applies each fault of a plug-in, by its name.
     """
 
     dead: np.ndarray
     live: np.ndarray
     hot: np.ndarray
-    added: Mapping[str, Callable[..., np.ndarray]] = dataclasses.field(default_factory=dict)
 
 
 def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.random.Generator) -> PixelFaults:
@@ -58,9 +55,7 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
     hot = live[:0]
     if faults.hot_pixel_share > 0.0:
         hot = np.sort(rng.permutation(live)[: round(faults.hot_pixel_share * dead.size)])
-    amounts = sorted(faults.added.items())
-    added = {name: ADDED_FAULTS[name](amount, shape, rng) for name, amount in amounts if amount > 0.0}
-    return PixelFaults(dead, live, hot, added)
+    return PixelFaults(dead, live, hot)
 
 
 class RealSensor:
@@ -86,7 +81,8 @@ class RealSensor:
             ValueError: The pixels are too slow for the rate of shot noise.
         """
         self._faults, self._rng, self.lost = faults, rng, 0
-        self._pixels = draw_pixel_faults((camera.height, camera.width), faults, rng)
+        shape = camera.height, camera.width
+        self._pixels = draw_pixel_faults(shape, faults, rng)
         self._noise = self._readout = None
         if faults.shot_noise_hz > 0.0 or faults.leak_hz > 0.0:
             own, numbers = state
@@ -94,6 +90,10 @@ class RealSensor:
             self._noise = PixelNoise(camera, faults, own, alive, t_us, rng)
         if has_readout(camera):
             self._readout = Readout(camera, t_us, rng)
+        amounts = sorted(faults.added.items())
+        self._added = {
+            name: ADDED_FAULTS[name](amount, shape, rng) for name, amount in amounts if amount > 0.0
+        }
 
     def events(self, events: np.ndarray, t0_us: int, t1_us: int) -> np.ndarray:
         """What leaves the sensor in (t0_us, t1_us], of what the light's changes fired in it.
@@ -102,9 +102,26 @@ class RealSensor:
         """
         noise = self._noise.events(t0_us, t1_us) if self._noise is not None else None
         events = apply_faults(events, t0_us, t1_us, self._faults, self._pixels, self._rng, noise)
+        for name, apply in self._added.items():
+            events = apply(events, t0_us, t1_us)
+            _check_added(name, events, (t0_us, t1_us), self._pixels.dead.shape)
         if self._readout is not None:
             events, self.lost = self._readout.send(events, t1_us)
         return events
+
+
+def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, ...]) -> None:
+    """Raise ValueError if a plug-in's fault returned what is not events of this interval and image."""
+    rule = f"fault {name!r} of {ADDED_FAULTS[name].__module__} must return EVENT"
+    if getattr(events, "dtype", None) != EVENT or events.ndim != 1:
+        raise ValueError(f"{rule} (N,), got {type(events).__name__} {getattr(events, 'dtype', '')}".strip())
+    t = events["t"]
+    if t.size and (t[0] <= span_us[0] or t[-1] > span_us[1] or (t[1:] < t[:-1]).any()):
+        raise ValueError(f"{rule} sorted by t and with t in ({span_us[0]}, {span_us[1]}] us")
+    if t.size and (events["y"].max() >= shape[0] or events["x"].max() >= shape[1]):
+        raise ValueError(f"{rule} inside an image of {shape[1]} x {shape[0]} pixels")
+    if not np.isin(events["p"], (-1, 1)).all():
+        raise ValueError(f"{rule} with p in {{-1, 1}}")
 
 
 def has_readout(camera: CameraConfig) -> bool:
@@ -144,40 +161,8 @@ def apply_faults(
         EVENT with t in (t0_us, t1_us], sorted by (t, y, x), true events first where all are equal.
 
     Raises:
-        ValueError: The interval is empty, more than 2**24 false events are to be expected, or a plug-in's
-            fault returned something else than events of the interval.
+        ValueError: The interval is empty, or more than 2**24 false events are to be expected.
     """
-    events = _with_own_faults(events, t0_us, t1_us, faults, pixels, rng, noise)
-    for name, apply in pixels.added.items():
-        events = apply(events, t0_us, t1_us)
-        _check_added(name, events, (t0_us, t1_us), pixels.dead.shape)
-    return events
-
-
-def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, ...]) -> None:
-    """Raise ValueError if a plug-in's fault returned what is not events of this interval and image."""
-    rule = f"fault {name!r} of {ADDED_FAULTS[name].__module__} must return EVENT"
-    if getattr(events, "dtype", None) != EVENT or events.ndim != 1:
-        raise ValueError(f"{rule} (N,), got {type(events).__name__} {getattr(events, 'dtype', '')}".strip())
-    t = events["t"]
-    if t.size and (t[0] <= span_us[0] or t[-1] > span_us[1] or (t[1:] < t[:-1]).any()):
-        raise ValueError(f"{rule} sorted by t and with t in ({span_us[0]}, {span_us[1]}] us")
-    if t.size and (events["y"].max() >= shape[0] or events["x"].max() >= shape[1]):
-        raise ValueError(f"{rule} inside an image of {shape[1]} x {shape[0]} pixels")
-    if not np.isin(events["p"], (-1, 1)).all():
-        raise ValueError(f"{rule} with p in {{-1, 1}}")
-
-
-def _with_own_faults(
-    events: np.ndarray,
-    t0_us: int,
-    t1_us: int,
-    faults: FaultsConfig,
-    pixels: PixelFaults,
-    rng: np.random.Generator,
-    noise: Noise | None,
-) -> np.ndarray:
-    """As `apply_faults`, of the faults of this file."""
     if t1_us <= t0_us:
         raise ValueError(f"faults need t1_us > t0_us; got {t0_us} and {t1_us}.")
     if faults.sparsity > 0.0:

@@ -83,7 +83,16 @@ def test_importing_the_rooms_is_light():
 TARGETS = (
     *("setup", "demo", "bytestream", "train-all", "sweep-robustness", "mlflow"),
     *("lint", "check", "bench", "docs"),
-    *("test", "test-system", "test-slow", "test-faults", "test-cluster", "test-soak", "test-pythons"),
+    *(
+        "test",
+        "test-system",
+        "test-slow",
+        "test-faults",
+        "test-cluster",
+        "test-soak",
+        "test-pythons",
+        "test-image",
+    ),
     *("dist", "lock", "clean"),
 )
 

@@ -148,7 +148,7 @@ def test_what_a_fault_returns_is_checked(write, code):
     path = write(
         HEAD
         + "import numpy as np\n"
-        + f"ADDED_FAULTS['wrong'] = lambda *made: lambda events, t0, t1, seen: {code}\n"
+        + f"ADDED_FAULTS['wrong'] = lambda *made: lambda events, t0, t1: {code}\n"
     )
     plugins.load_plugins([path])
     env = CorridorEnv(EnvConfig(faults=FaultsConfig(added={"wrong": 1.0})))
