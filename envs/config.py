@@ -71,6 +71,14 @@ class CameraConfig:
         encoding: What the luminance, white = 1, goes through before the response.
             "linear32": nothing. "linear8": clipped to [0, 1] and rounded to 8 bits.
             "gamma8": the same on a scale of gamma 2.2, decoded again.
+        cutoff_hz: Bandwidth of the photoreceptors, a first-order low-pass filter on the response
+            [Hz]; 0: they follow at once. Pixels see what is behind it.
+        cutoff_grows_with_light: Whether that is the bandwidth in white, which falls in proportion to
+            the light to 7 % of it in black (v2e).
+        latency_us: From the crossing of a level to the time of its event [us].
+        latency_jitter_us: Standard deviation of that time from event to event [us].
+        readout_hz: Most events per second that leave the sensor; 0: all. Rows take turns, the events
+            of a row leave together, and a pixel that waits for its turn fires no other event.
     """
 
     width: Annotated[int, Field(ge=1, le=4096)] = 64
@@ -87,6 +95,11 @@ class CameraConfig:
     refractory_us: Annotated[int, Field(ge=0, le=10**9)] = 0
     excess: Literal["drop", "carry"] = "drop"
     encoding: Literal["linear32", "linear8", "gamma8"] = "linear32"
+    cutoff_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    cutoff_grows_with_light: bool = True
+    latency_us: Annotated[int, Field(ge=0, le=10**6)] = 0
+    latency_jitter_us: Annotated[float, Field(ge=0, le=1e5)] = 0.0
+    readout_hz: Annotated[float, Field(ge=0, le=1e12)] = 0.0
 
     @field_validator("refractory_us")
     @classmethod
@@ -113,14 +126,17 @@ class FaultsConfig:
         background_activity: Events without cause, as a fraction of the true events
             (appendix D.3); 0.1 adds one false event to ten true ones on average.
         background_activity_hz: Events without cause per pixel and second, as a real
-            sensor makes them, also in a still scene.
+            sensor makes them, also in a still scene. Both are laid on top of the other events.
         event_dropout: Probability that a true event is lost, each on its own.
         displaced: Probability that a true event is reported by a neighbouring pixel.
         flipped: Probability that a true event is reported with the other polarity.
         shot_noise_hz: Events without cause per pixel and second in black, as photons arrive
-            unevenly; a quarter of that at white, on a straight line between (v2e).
-        leak_hz: ON events per pixel and second from leakage: regular, with a phase of its
-            own for each pixel.
+            unevenly; a quarter of that at white, on a straight line between (v2e). They are
+            crossings of the pixel's own levels, so ON and OFF alternate (`envs.events.pixel_noise`).
+        leak_hz: ON events per pixel and second of a still pixel, because its level leaks.
+        leak_jitter: Standard deviation of the time between two of them, as a share of its mean.
+        noise_spread: Standard deviation over the pixels of the logarithm to base 10 of their rates
+            of shot noise and leakage [decades].
         hot_pixel_share: Fraction of pixels that are hot for the whole episode.
         hot_pixel_hz: Events per second of a hot pixel.
     """
@@ -131,8 +147,10 @@ class FaultsConfig:
     event_dropout: Fraction = 0.0
     displaced: Fraction = 0.0
     flipped: Fraction = 0.0
-    shot_noise_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    leak_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    shot_noise_hz: Annotated[float, Field(ge=0, le=1e4)] = 0.0
+    leak_hz: Annotated[float, Field(ge=0, le=1e4)] = 0.0
+    leak_jitter: Fraction = 0.0
+    noise_spread: Annotated[float, Field(ge=0, le=2)] = 0.0
     hot_pixel_share: Fraction = 0.0
     hot_pixel_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
 
@@ -155,6 +173,11 @@ class FidelityConfig:
     cull_m: Positive | None = None
 
 
+# Of the camera, that came later than the first published policies.
+LATER_SETTINGS = (
+    *("cutoff_hz", "cutoff_grows_with_light"),
+    *("latency_us", "latency_jitter_us", "readout_hz"),
+)
 SECTIONS: dict[str, Any] = {"camera": CameraConfig, "faults": FaultsConfig, "fidelity": FidelityConfig}
 
 
@@ -234,12 +257,17 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
 def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
     """The settings that give an event its meaning: data, encoder and policy must share them.
 
-    Those of the neighbour filter are among them where there is one.
+    Those of the neighbour filter are among them where there is one, and `LATER_SETTINGS` where they are
+    not the defaults: what was made before they existed has its hash still.
     """
+    camera = dataclasses.asdict(config.camera)
+    for name in LATER_SETTINGS:
+        if camera[name] == getattr(CameraConfig, name):
+            del camera[name]
     own: dict[str, Setting] = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
     if config.filter_support > 0:
         own |= {"filter_support": config.filter_support, "filter_tau_us": config.filter_tau_us}
-    return {**dataclasses.asdict(config.camera), **own, **dataclasses.asdict(config.fidelity)}
+    return {**camera, **own, **dataclasses.asdict(config.fidelity)}
 
 
 def sensor_differences(theirs: Mapping[str, object], config: EnvConfig) -> dict[str, tuple[object, object]]:

@@ -31,7 +31,8 @@ import numpy as np
 from envs.config import CameraConfig
 from envs.events import crossings
 from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME
-from envs.events.photoreceptor import encode, encoding_tables, response_curve
+from envs.events.lowpass import filter_frames, filter_rates, low_pass, start_filter
+from envs.events.photoreceptor import Curve, encode, encoding_tables, response_curve
 
 __all__ = ["EVENT", "EventCamera"]
 
@@ -97,6 +98,7 @@ class EventCamera:
         curve = response_curve(config.response, config.luminance_floor)
         thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if rule.legacy else 1)
         self._model = tuple(rule), tuple(curve), thresholds
+        self._low_pass = low_pass(config) if config.cutoff_hz > 0.0 else None
         num_pixels = config.width * config.height
         self._memory = crossings.memory_rows(num_pixels, config.refractory_us > 0)
         num_words = (num_pixels + 7) // 8
@@ -106,6 +108,11 @@ class EventCamera:
     def state(self) -> tuple[Any, Any, Any]:
         """Model, memory and scratch, as the kernels take them."""
         return self._model, self._memory, self._scratch
+
+    @property
+    def pixels(self) -> np.ndarray:
+        """The flat pixel y * W + x of each pixel of the memory, int64 (H * W,)."""
+        return np.arange(self.config.width * self.config.height)
 
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
         """Remember a first frame; it makes no events, and no pixel is in its refractory period.
@@ -122,6 +129,8 @@ class EventCamera:
         if bad >= 0:
             raise self._invalid(flat, bad)
         seen = flat if self._tables is None else self._encoded(flat)
+        if self._low_pass is not None:
+            start_filter(seen[0], Curve(*self._model[1]), self._low_pass)
         crossings.remember(seen[0], self._model, self._memory)
         self.t_us, self.dropped = t_us, 0
 
@@ -166,8 +175,9 @@ class EventCamera:
             if new_us <= last_us:
                 raise ValueError(f"t_us must increase from frame to frame; got {t_us} after {last_us}.")
             last_us = new_us
+        seen = flat if self._tables is None else self._encoded(flat)
         bad, dropped, events = crossings.steps(
-            flat if self._tables is None else self._encoded(flat),
+            seen if self._low_pass is None else self._filtered(seen, times),
             times,
             self.config.width,
             MAX_EVENTS_PER_FRAME,
@@ -188,6 +198,16 @@ class EventCamera:
         if bad >= 0:
             raise self._invalid(flat, bad)
         return encoded
+
+    def _filtered(self, seen: np.ndarray, times_us: np.ndarray) -> np.ndarray:
+        """The frames (K, N) as the photoreceptors' bandwidth hands them on."""
+        bad = int(crossings.first_invalid(seen.ravel()))
+        if bad >= 0:
+            raise self._invalid(seen, bad)
+        filtered: np.ndarray = filter_frames(
+            seen, times_us, Curve(*self._model[1]), filter_rates(self.config), self._low_pass
+        )
+        return filtered
 
     def _checked(self, frames: np.ndarray, count: int) -> np.ndarray:
         """The frames as a contiguous (K, N) array."""

@@ -1,7 +1,8 @@
 """Faults of a real sensor: dead and hot pixels, lost events, events without cause (appendix D.3).
 
-`draw_pixel_faults` draws the faulty pixels of an episode, `apply_faults` applies all faults to the
-events of one interval. A fault that is off costs nothing and draws nothing.
+`draw_pixel_faults` draws the faulty pixels of an episode, `apply_faults` applies their faults to the events
+of one interval; `RealSensor` adds what acts on the pixels themselves, and what happens between them and the
+reader. What is off costs nothing and draws nothing.
 """
 
 import dataclasses
@@ -9,12 +10,13 @@ import dataclasses
 import numba
 import numpy as np
 
-from envs.config import FaultsConfig
+from envs.config import CameraConfig, FaultsConfig
 from envs.events.camera import MAX_EVENTS_PER_FRAME
 from envs.events.disturbances import disturb
+from envs.events.pixel_noise import PixelNoise
+from envs.events.readout import Readout
 
 Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
-SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,18 +27,15 @@ class PixelFaults:
         dead: bool (H, W); these never fire, not even noise.
         live: int64 (L,), flat indices of the others.
         hot: int64 (K,), flat indices of the hot ones among these.
-        leak_phase: float64 (L,), part of a leak period until each live pixel's first leak
-            event; of length 0 without leakage.
     """
 
     dead: np.ndarray
     live: np.ndarray
     hot: np.ndarray
-    leak_phase: np.ndarray
 
 
 def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.random.Generator) -> PixelFaults:
-    """Draw which pixels are dead (appendix D.3, induced sparsity) or hot, and when each leaks.
+    """Draw which pixels are dead (appendix D.3, induced sparsity) or hot.
 
     Args:
         shape: (H, W).
@@ -47,47 +46,88 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
     if faults.sparsity > 0.0:
         dead.flat[rng.permutation(dead.size)[: round(faults.sparsity * dead.size)]] = True
     live = np.flatnonzero(~dead)
-    hot, phase = live[:0], np.zeros(0)
+    hot = live[:0]
     if faults.hot_pixel_share > 0.0:
         hot = np.sort(rng.permutation(live)[: round(faults.hot_pixel_share * dead.size)])
-    if faults.leak_hz > 0.0:
-        phase = rng.random(live.size)
-    return PixelFaults(dead, live, hot, phase)
+    return PixelFaults(dead, live, hot)
+
+
+class RealSensor:
+    """All that a real sensor adds to the events of one camera, from its first frame on.
+
+    Attributes:
+        lost: Events of the last interval that the readout lost.
+    """
+
+    def __init__(
+        self, camera: CameraConfig, faults: FaultsConfig, state: tuple, rng: np.random.Generator, t_us: int
+    ) -> None:
+        """Draw the faults of a camera that has just seen its first frame.
+
+        Args:
+            camera: Its settings.
+            faults: The faults.
+            state: Its `state`, and the flat pixel y * W + x of each pixel of its memory, int64.
+            rng: Source of all draws.
+            t_us: The time of that frame [us].
+
+        Raises:
+            ValueError: The pixels are too slow for the rate of shot noise.
+        """
+        self._faults, self._rng, self.lost = faults, rng, 0
+        self._pixels = draw_pixel_faults((camera.height, camera.width), faults, rng)
+        self._noise = self._readout = None
+        if faults.shot_noise_hz > 0.0 or faults.leak_hz > 0.0:
+            own, numbers = state
+            alive = np.where(self._pixels.dead.flat[numbers], -1, numbers)
+            self._noise = PixelNoise(camera, faults, own, alive, t_us, rng)
+        if has_readout(camera):
+            self._readout = Readout(camera, t_us, rng)
+
+    def events(self, events: np.ndarray, t0_us: int, t1_us: int) -> np.ndarray:
+        """What leaves the sensor in (t0_us, t1_us], of what the light's changes fired in it.
+
+        The camera has seen the light of t1_us. As `apply_faults`, which also says what is raised.
+        """
+        noise = self._noise.events(t0_us, t1_us) if self._noise is not None else None
+        events = apply_faults(events, t0_us, t1_us, self._faults, self._pixels, self._rng, noise)
+        if self._readout is not None:
+            events, self.lost = self._readout.send(events, t1_us)
+        return events
+
+
+def has_readout(camera: CameraConfig) -> bool:
+    """Whether events leave the sensor otherwise than the pixels fire them."""
+    return camera.latency_us > 0 or camera.latency_jitter_us > 0.0 or camera.readout_hz > 0.0
 
 
 def apply_faults(
     events: np.ndarray,
     t0_us: int,
     t1_us: int,
-    luminance: np.ndarray,
     faults: FaultsConfig,
     pixels: PixelFaults,
     rng: np.random.Generator,
+    noise: Noise | None = None,
 ) -> np.ndarray:
     """Lose true events and add false ones.
 
     Of the true events those of dead pixels are lost, and each other one with probability
     event_dropout; some are displaced or flipped (`envs.events.disturbances`). To the rest are
-    added, in an interval of T seconds:
+    added, in an interval of T seconds, at uniform times and with uniform polarities:
 
     - background_activity: Poisson, this share of the true events left (appendix D.3);
     - background_activity_hz: Poisson, rate * T per live pixel;
-    - shot_noise_hz: Poisson, rate * T * (1 - 0.75 L) per live pixel, with the luminance L
-      clipped to [0, 1] (v2e's formula: white has a quarter of the noise of black);
-    - hot_pixel_hz: Poisson, rate * T per hot pixel;
-    - leak_hz: an ON event of each live pixel every 1 / rate seconds since time 0, shifted by
-      the pixel's phase, however time is cut into intervals.
-
-    Times of all but the last are uniform in the interval; so are their polarities.
+    - hot_pixel_hz: Poisson, rate * T per hot pixel.
 
     Args:
         events: EVENT of the interval, sorted by (t, y, x).
         t0_us: Start of the interval [us].
         t1_us: Its end [us], later than the start.
-        luminance: float32 (H, W), what the pixels see; 1 is white.
         faults: How much.
         pixels: Which pixels.
         rng: Source of the draws.
+        noise: What the noise of the pixels fired in the interval, if they have any.
 
     Returns:
         EVENT with t in (t0_us, t1_us], sorted by (t, y, x), true events first where all are equal.
@@ -102,64 +142,35 @@ def apply_faults(
     if faults.event_dropout > 0.0:
         events = events[rng.random(events.size) >= faults.event_dropout]
     events = disturb(events, faults, pixels.dead.shape, rng)
-    seconds = (t1_us - t0_us) * 1e-6
-    kinds = _expected(events.size, seconds, luminance, faults, pixels)
-    expected = sum(float(upto[-1]) for _, upto in kinds) + faults.leak_hz * pixels.live.size * seconds
+    kinds = _expected(events.size, (t1_us - t0_us) * 1e-6, faults, pixels)
+    expected = sum(mean for _, mean in kinds)
     if expected > MAX_EVENTS_PER_FRAME:
         raise ValueError(
             f"faults may add {MAX_EVENTS_PER_FRAME} events to an interval; these rates add about "
             f"{expected:.3g} from {t0_us} to {t1_us} us. Lower the rates or shorten the interval."
         )
-    noise = [_at_any_time(_drawn(where, upto, rng), (t0_us, t1_us), rng) for where, upto in kinds]
-    if faults.leak_hz > 0.0:
-        noise.append(_leak(t0_us, t1_us, faults.leak_hz, pixels.live, pixels.leak_phase))
-    if not noise:
+    drawn = [where[rng.integers(0, where.size, int(rng.poisson(mean)))] for where, mean in kinds]
+    false = [_at_any_time(where, (t0_us, t1_us), rng) for where in drawn] + ([noise] if noise else [])
+    if not false:
         return events
-    times, places, polarities = (np.concatenate(parts) for parts in zip(*noise, strict=True))
+    times, places, polarities = (np.concatenate(parts) for parts in zip(*false, strict=True))
     if times.size == 0:
         return events
-    order = np.lexsort((places, times))
-    return _merged(events, times[order], places[order], polarities[order], pixels.dead.shape[1])
+    return _merged(events, times, places, polarities, t0_us, pixels.dead.shape)
 
 
 def _expected(
-    num_events: int, seconds: float, luminance: np.ndarray, faults: FaultsConfig, pixels: PixelFaults
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each kind of noise that is on: flat pixels, and the mean number of false events up to each.
-
-    One number where all pixels are alike.
-    """
+    num_events: int, seconds: float, faults: FaultsConfig, pixels: PixelFaults
+) -> list[tuple[np.ndarray, float]]:
+    """For each kind of noise that is on: flat pixels, and the mean number of false events of all of them."""
     kinds = []
     background = faults.background_activity * num_events
     background += faults.background_activity_hz * seconds * pixels.live.size
     if background > 0.0 and pixels.live.size:
-        kinds.append((pixels.live, np.array([background])))
-    if faults.shot_noise_hz > 0.0 and pixels.live.size:
-        in_black = faults.shot_noise_hz * seconds
-        kinds.append((pixels.live, _shot_noise(luminance.ravel(), pixels.live, in_black)))
+        kinds.append((pixels.live, background))
     if faults.hot_pixel_hz > 0.0 and pixels.hot.size:
-        kinds.append((pixels.hot, np.array([faults.hot_pixel_hz * seconds * pixels.hot.size])))
+        kinds.append((pixels.hot, faults.hot_pixel_hz * seconds * pixels.hot.size))
     return kinds
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _shot_noise(luminance: np.ndarray, live: np.ndarray, in_black: float) -> np.ndarray:
-    """Mean number of shot noise events up to each live pixel, float64 (L,); `in_black` is a black pixel's."""
-    black, white, fall = np.float32(in_black), np.float32(1.0), np.float32(SHOT_NOISE_FALL)
-    upto, total = np.empty(live.size), 0.0
-    for k in range(live.size):
-        total += black * (white - fall * min(luminance[live[k]], white))
-        upto[k] = total
-    return upto
-
-
-def _drawn(where: np.ndarray, upto: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Flat pixels of false events: Poisson around each pixel's mean, or around one mean for all alike."""
-    number = int(rng.poisson(upto[-1]))
-    if upto.size == 1:
-        return where[rng.integers(0, where.size, number)]
-    place = np.searchsorted(upto, rng.random(number) * upto[-1], side="right")
-    return where[np.minimum(place, where.size - 1)]
 
 
 def _at_any_time(where: np.ndarray, span_us: tuple[int, int], rng: np.random.Generator) -> Noise:
@@ -169,29 +180,18 @@ def _at_any_time(where: np.ndarray, span_us: tuple[int, int], rng: np.random.Gen
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _leak(t0_us: int, t1_us: int, leak_hz: float, live: np.ndarray, phase: np.ndarray) -> Noise:
-    """Events of leakage; event k of a pixel comes (k + phase) / rate seconds after time 0."""
-    first, last = np.empty(live.size), np.empty(live.size)
-    total = 0
-    for k in range(live.size):
-        first[k] = np.floor(t0_us * 1e-6 * leak_hz - phase[k])
-        last[k] = np.floor(t1_us * 1e-6 * leak_hz - phase[k])
-        total += int(last[k] - first[k])
-    times, places, n = np.empty(total, np.int64), np.empty(total, np.int64), 0
-    for k in range(live.size):
-        for order in range(int(last[k] - first[k])):
-            seconds = (first[k] + 1.0 + order + phase[k]) / leak_hz
-            times[n] = int(min(max(np.ceil(seconds * 1e6), t0_us + 1), t1_us))
-            places[n] = live[k]
-            n += 1
-    return times, places, np.ones(total, np.int64)
-
-
-@numba.njit(cache=True, error_model="numpy")
 def _merged(
-    events: np.ndarray, times: np.ndarray, places: np.ndarray, polarities: np.ndarray, width: int
+    events: np.ndarray,
+    times: np.ndarray,
+    places: np.ndarray,
+    polarities: np.ndarray,
+    t0_us: int,
+    shape: tuple[int, int],
 ) -> np.ndarray:
-    """EVENT sorted by (t, y, x) of events and noise that are; of equal ones the true events come first."""
+    """EVENT sorted by (t, y, x) of events, which are, and noise; of equal ones the true events come first."""
+    width = shape[1]
+    order = np.argsort((times - t0_us) * (shape[0] * width) + places, kind="mergesort")
+    times, places, polarities = times[order], places[order], polarities[order]
     both = np.empty(events.size + times.size, events.dtype)
     true = false = 0
     for k in range(both.size):

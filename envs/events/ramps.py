@@ -91,7 +91,7 @@ def make_ramps(size: int) -> Ramps:
 def can_look(camera: CameraConfig) -> bool:
     """Whether a camera follows the rules of this file; others need whole images."""
     events = camera.width * camera.height * camera.max_events_per_pixel
-    exact = camera.encoding == "linear32" and camera.refractory_us == 0
+    exact = camera.encoding == "linear32" and camera.refractory_us == 0 and camera.cutoff_hz == 0.0
     return camera.memory == "reference" and exact and events <= MAX_EVENTS_PER_FRAME
 
 
@@ -109,6 +109,11 @@ class ColumnCamera:
         if limits.shape[1] > 1:
             limits = limits.reshape(-1, *self._shape).swapaxes(1, 2).reshape(limits.shape)
         self.state = (rule, curve, limits), memory, scratch
+
+    @property
+    def pixels(self) -> np.ndarray:
+        """The flat pixel y * W + x of each pixel of the memory, int64 (W * H,)."""
+        return np.arange(self._shape[0] * self._shape[1]).reshape(self._shape).T.ravel()
 
     @property
     def last_frame(self) -> np.ndarray:

@@ -116,7 +116,7 @@ def video_steps(
     if transfer not in ("srgb", "linear"):
         raise ValueError(f"transfer must be 'srgb' or 'linear', got {transfer!r}")
     check_file(path, max_bytes)
-    light = _light(transfer)
+    light = light_of_grey(transfer)
     eye: EventCamera | None = None
     average: Callable[[np.ndarray], np.ndarray] | None = None
     frames, last_us = 0, None
@@ -169,7 +169,7 @@ def _overlap(old: int, new: int) -> np.ndarray:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def _light(transfer: str) -> np.ndarray:
+def light_of_grey(transfer: Literal["srgb", "linear"]) -> np.ndarray:
     """Linear light in [0, 1], float32, of each 8-bit value."""
     value = np.arange(256) / 255.0
     if transfer == "srgb":

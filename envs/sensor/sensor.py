@@ -6,7 +6,8 @@ import numpy as np
 
 from envs.checks import check_pose
 from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig
-from envs.events import EVENT, EventCamera, apply_faults, draw_pixel_faults
+from envs.events import EVENT, EventCamera, RealSensor
+from envs.events.faults import has_readout
 from envs.events.ramps import ColumnCamera
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
@@ -33,7 +34,7 @@ class Sensor:
         events: EVENT array of the last step, faults included; empty where no camera is simulated.
         true_events: The same before the faults.
         luminance: float32 (H, W), the last render; by looks, an array that the next step changes.
-        dropped: Events of the last step lost to the camera's cap.
+        dropped: Events of the last step lost to the camera's cap and its readout.
         renders: Renders of the last step.
         t_us: The simulated clock [us].
         plan: How the scene is simulated, `envs.fidelity.RenderPlan`.
@@ -52,7 +53,7 @@ class Sensor:
 
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
         """Start in a new scene at `place` (x, y) [m], without events; `rng` draws the faults."""
-        camera, self._rng = self._config.camera, rng
+        camera = self._config.camera
         if self._config.observation == "none":
             self.luminance = np.zeros((camera.height, camera.width), np.float32)
             self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
@@ -61,13 +62,14 @@ class Sensor:
         self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
         self.luminance = self._picture(place, t_us)
         if not self._pictures_alone:
-            self._pixels = draw_pixel_faults((camera.height, camera.width), self._config.faults, rng)
             self._seen_us[:] = t_us
             if self.plan.by_looks:
                 self._camera.reset(self.luminance)
                 self.luminance = self._camera.last_frame
             else:
                 self._camera.reset(self.luminance, t_us)
+            state = self._camera.state, self._camera.pixels
+            self._real = RealSensor(camera, self._config.faults, state, rng, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
         """Simulate one control step: render the part that the vehicle moved, and set the events.
@@ -103,6 +105,7 @@ class Sensor:
             events = self._render_along(start, outcome.end, moving_us)
         self.t_us = end_us
         self.events = self.with_faults(events, start_us, end_us)
+        self.dropped += self.lost
 
     @property
     def sees_by_looks(self) -> bool:
@@ -112,7 +115,12 @@ class Sensor:
     @property
     def has_faults(self) -> bool:
         """Whether `with_faults` changes anything."""
-        return self._config.faults != FAULTLESS
+        return self._config.faults != FAULTLESS or has_readout(self._config.camera)
+
+    @property
+    def lost(self) -> int:
+        """Events of the last step that the readout lost."""
+        return self._real.lost
 
     def view(self) -> View:
         """What a compiled step needs of this sensor; without a scene where it does not see by looks."""
@@ -130,8 +138,7 @@ class Sensor:
         self.true_events = events
         if not self.has_faults:
             return events
-        faults, seen = self._config.faults, self.luminance
-        return apply_faults(events, start_us, end_us, seen, faults, self._pixels, self._rng)
+        return self._real.events(events, start_us, end_us)
 
     def _look_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
         """Events of a way, of which each column is looked at when something changes in it."""

@@ -137,7 +137,9 @@ class Vehicles:
         start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
         try:
             if vehicle["by_looks"]:
-                return sensor.with_faults(events, start_us, t_us)
+                events = sensor.with_faults(events, start_us, t_us)
+                vehicle["dropped"] += sensor.lost
+                return events
             end = float(vehicle["x_m"]), float(vehicle["y_m"])
             share, ends = float(vehicle["share"]), (bool(vehicle["success"]), bool(vehicle["collision"]))
             outcome = Outcome(end, share, float(vehicle["reward"]), *ends)

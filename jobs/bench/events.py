@@ -13,6 +13,10 @@ the pixel's level 16 and band 8). "published": how many times longer the paper's
 than one call per frame, and than all in one; typed anew: a loop over all pixels with two
 logarithms each, and a structured sort by field name. It makes fewer events, see memory
 "legacy" in `envs.events.camera`.
+
+A second table has the cost of each effect of a real sensor, and of the lights of conf/light: process time of
+an environment step at 64x64 and 200 Hz in the same corridors, one effect after the other in each step, and
+the median of the ratios to a step without any.
 """
 
 import time
@@ -20,9 +24,14 @@ from collections.abc import Callable
 
 import numba
 import numpy as np
+import yaml
 
+from envs.config import EnvConfig
+from envs.corridor import CorridorEnv
 from envs.events import EventCamera
 from jobs.analysis.tables import show_table
+from jobs.config.env_keys import env_with
+from jobs.run.provenance import REPOSITORY
 
 SIZES = ((64, 64), (346, 260), (640, 480), (1280, 720))
 SPEEDS = (("sparse", 0.1), ("dense", 1.0))  # pixels per frame
@@ -31,6 +40,18 @@ INTERVAL_US = 5000
 THRESHOLD = 0.2
 SECONDS = 2.5  # of measuring, per row
 PIXEL_BYTES, EVENT_BYTES = 12, 37
+EPISODES, STEPS = 4, 150  # of which effects are timed
+EFFECTS: dict[str, dict[str, object]] = {
+    "none": {},
+    "whole images": {"camera.refractory_us": 1},
+    "cutoff": {"camera.cutoff_hz": 30.0},
+    "mismatch": {"camera.threshold_mismatch": 0.25},
+    "leakage": {"faults.leak_hz": 0.1, "faults.leak_jitter": 0.1},
+    "shot noise": {"faults.shot_noise_hz": 5.0},
+    "hot pixels": {"faults.hot_pixel_share": 0.005, "faults.hot_pixel_hz": 100.0},
+    "latency, jitter": {"camera.latency_us": 100, "camera.latency_jitter_us": 50.0},
+    "readout limit": {"camera.readout_hz": 1e6},
+}
 PUBLISHED_EVENT = np.dtype([("timestamp", "f8"), ("x", "u2"), ("y", "u2"), ("polarity", "b")], align=True)
 
 
@@ -50,6 +71,41 @@ def main() -> None:
             rows.append((f"{width}x{height}", name, *row, *ratios))
     title = "Event camera, one thread, 5 ms per frame, threshold 0.2"
     show_table(title, [*head, "published", "together"], rows, 2)
+    show_effects()
+
+
+def show_effects() -> None:
+    """Measure and print the cost of each effect of a real sensor."""
+    changes = EFFECTS | {f"light={name}": light_settings(name) for name in ("day", "dusk", "night")}
+    base = EnvConfig(window_capacity=None, split="validation")
+    envs = {name: CorridorEnv(env_with(base, change)) for name, change in changes.items()}
+    seconds: dict[str, list[float]] = {name: [] for name in envs}
+    events, names = dict.fromkeys(envs, 0), list(envs)
+    for episode in range(EPISODES):
+        for env in envs.values():
+            env.reset(seed=episode)
+        for step, action in enumerate(np.random.default_rng(episode).integers(0, 3, STEPS).tolist()):
+            over, first = False, step % len(names)  # none is always the first, which finds the caches cold
+            for name in names[first:] + names[:first]:
+                env = envs[name]
+                start = time.process_time()
+                over |= env.step(action)[2]
+                seconds[name].append(time.process_time() - start)
+                events[name] += env.events.size
+            if over:
+                break
+    none, rows = np.array(seconds["none"]), []
+    for name, taken in seconds.items():
+        ratio = float(np.median(np.array(taken) / none))
+        per_step = f"{1e6 * np.median(taken):,.0f}", f"{ratio:.2f}x", f"{events[name] / none.size:.0f}"
+        rows.append((name, *per_step))
+    show_table("Effects of a real sensor", ["effect", "us/step", "of none", "events/step"], rows, 1)
+
+
+def light_settings(name: str) -> dict[str, object]:
+    """The settings of a light of conf/, by their keys."""
+    groups = yaml.safe_load((REPOSITORY / "conf" / "light" / f"{name}.yaml").read_text())
+    return {f"{group}.{key}": value for group, values in groups.items() for key, value in values.items()}
 
 
 def moving_gratings(width: int, height: int, speed: float) -> list[np.ndarray]:

@@ -79,6 +79,7 @@ def simulate() -> None:
         EnvConfig(camera=small(), faults=noisy),
         EnvConfig(camera=small(memory="frame"), observation="event_image", scene="gates"),
         EnvConfig(camera=small(refractory_us=100), scene="texture_change"),
+        EnvConfig(camera=small(cutoff_hz=100.0, readout_hz=1e6), faults=noisy),
         EnvConfig(camera=small(), observation="luminance", scene="dynamic"),
     ):
         env = CorridorEnv(config)

@@ -277,13 +277,12 @@ def corridors() -> float:
 
 def too_many_faults() -> float:
     """Rates of false events beyond memory that are accepted."""
-    light, rng = np.ones((64, 64), np.float32), np.random.default_rng(0)
-    none = np.zeros(0, EVENT)
+    none, rng = np.zeros(0, EVENT), np.random.default_rng(0)
 
     def add(rate: float) -> None:
         faults = FaultsConfig(background_activity_hz=rate)
         pixels = draw_pixel_faults((64, 64), faults, rng)
-        apply_faults(none, 0, 10**7, light, faults, pixels, rng)
+        apply_faults(none, 0, 10**7, faults, pixels, rng)
 
     return refused((1e4, 1e5, 1e6, 1e7, np.nan, np.inf, -1.0), add)
 

@@ -195,9 +195,8 @@ def test_17_dead_pixels_from_none_to_all(sparsity, left):
     faults = FaultsConfig(sparsity=sparsity)
     pixels = [draw_pixel_faults((8, 12), faults, np.random.default_rng(3)) for _ in range(2)]
     assert np.array_equal(pixels[0].dead, pixels[1].dead)
-    light = frame(0.9, (8, 12))
     _, events = two_frames(0.5, 0.9, shape=(8, 12), contrast_threshold=0.5)
-    kept = apply_faults(events, 0, 1000, light, faults, pixels[0], np.random.default_rng(0))
+    kept = apply_faults(events, 0, 1000, faults, pixels[0], np.random.default_rng(0))
     assert len(events) == 96
     assert len(kept) == left
     with pytest.raises(ValueError, match="sparsity"):
@@ -210,11 +209,11 @@ def test_18_noise_from_none_to_ten_times_the_signal_lies_on_the_sensor(share):
     pixels = draw_pixel_faults((30, 40), faults, np.random.default_rng(0))
     _, events = two_frames(0.5, 0.9, shape=(30, 40), contrast_threshold=0.5)
     rng = np.random.default_rng(1)
-    noisy = apply_faults(events, 0, 1000, frame(0.9, (30, 40)), faults, pixels, rng)
+    noisy = apply_faults(events, 0, 1000, faults, pixels, rng)
     assert abs(len(noisy) - 1200 * (1 + share)) <= 4 * np.sqrt(1200 * share)
     assert noisy["x"].max() < 40
     assert noisy["y"].max() < 30
-    assert apply_faults(events[:0], 0, 1000, frame(0.9, (30, 40)), faults, pixels, rng).size == 0
+    assert apply_faults(events[:0], 0, 1000, faults, pixels, rng).size == 0
 
 
 @pytest.mark.parametrize("rate_hz", [45, 200, 1000, 100_000, 1_000_000])

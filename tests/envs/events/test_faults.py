@@ -1,16 +1,11 @@
-import itertools
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from envs.config import FaultsConfig
 from envs.events import EVENT, apply_faults, draw_pixel_faults
 
 SHAPE = (8, 12)
 SIZE = 96
-MID_GREY = np.full(SHAPE, 0.5, np.float32)
 NO_EVENTS = np.empty(0, EVENT)
 SECOND = 10**6
 
@@ -24,11 +19,11 @@ def some_events(count=1000, seed=0):
     return events[np.lexsort((events["x"], events["y"], events["t"]))]
 
 
-def faulty(events, t0_us, t1_us, luminance=MID_GREY, seed=0, **fields):
+def faulty(events, t0_us, t1_us, seed=0, **fields):
     """The pixels' faults, and the events that they leave and make."""
     faults, rng = FaultsConfig(**fields), np.random.default_rng(seed)
-    pixels = draw_pixel_faults(luminance.shape, faults, rng)
-    return pixels, apply_faults(events, t0_us, t1_us, luminance, faults, pixels, rng)
+    pixels = draw_pixel_faults(SHAPE, faults, rng)
+    return pixels, apply_faults(events, t0_us, t1_us, faults, pixels, rng)
 
 
 def counts_of(events, shape=SHAPE):
@@ -45,10 +40,10 @@ def near(number, mean):
 def test_a_sensor_without_faults_hands_its_events_on_and_draws_nothing():
     events, rng = some_events(), np.random.default_rng(0)
     pixels = draw_pixel_faults(SHAPE, FaultsConfig(), rng)
-    assert apply_faults(events, 0, 5000, MID_GREY, FaultsConfig(), pixels, rng) is events
+    assert apply_faults(events, 0, 5000, FaultsConfig(), pixels, rng) is events
     assert rng.random() == np.random.default_rng(0).random()
     assert not pixels.dead.any()
-    assert pixels.hot.size == pixels.leak_phase.size == 0
+    assert pixels.hot.size == 0
 
 
 @pytest.mark.parametrize(("sparsity", "dead"), [(0.0, 0), (0.2, 19), (0.5, 48), (1.0, 96)])
@@ -61,11 +56,11 @@ def test_sparsity_kills_that_fraction_of_the_pixels_and_nothing_else(sparsity, d
 
 
 def test_the_same_stream_draws_the_same_faults_and_another_draws_others():
-    faults = FaultsConfig(sparsity=0.5, hot_pixel_share=0.2, leak_hz=1.0)
+    faults = FaultsConfig(sparsity=0.5, hot_pixel_share=0.2)
     first, again, other = (
         draw_pixel_faults(SHAPE, faults, np.random.default_rng(seed)) for seed in (1, 1, 2)
     )
-    for field in ("dead", "live", "hot", "leak_phase"):
+    for field in ("dead", "live", "hot"):
         assert np.array_equal(getattr(first, field), getattr(again, field))
         assert not np.array_equal(getattr(first, field), getattr(other, field))
 
@@ -111,52 +106,6 @@ def test_background_rate_counts_live_pixels_and_time_also_in_a_still_scene():
     assert abs(noise["p"].mean()) < 4 / np.sqrt(len(noise))
 
 
-def test_shot_noise_falls_with_the_light_to_a_quarter():
-    light = np.repeat(np.float32([0.0, 0.5, 1.0, 40.0]), 24).reshape(SHAPE)
-    noise = faulty(NO_EVENTS, 0, 100 * SECOND, light, shot_noise_hz=5.0)[1]
-    rows = counts_of(noise).reshape(4, 24).sum(1)
-    for number, factor in zip(rows, (1.0, 0.625, 0.25, 0.25), strict=True):
-        assert near(number, 100 * 24 * 5.0 * factor)
-    assert abs(noise["p"].mean()) < 4 / np.sqrt(len(noise))
-
-
-def test_shot_noise_does_not_depend_on_how_time_is_cut():
-    faults = FaultsConfig(shot_noise_hz=100.0)
-    pixels = draw_pixel_faults(SHAPE, faults, np.random.default_rng(0))
-    for parts in (1, 20, 1000):
-        rng, times = np.random.default_rng(1), np.linspace(0, SECOND, parts + 1).astype(int).tolist()
-        spans = itertools.pairwise(times)
-        numbers = [apply_faults(NO_EVENTS, a, b, MID_GREY, faults, pixels, rng).size for a, b in spans]
-        assert near(sum(numbers), 100.0 * SIZE * 0.625)
-
-
-def test_leakage_is_regular_in_each_pixel_and_spread_over_the_sensor():
-    pixels, noise = faulty(NO_EVENTS, 0, 10 * SECOND, leak_hz=7.0, sparsity=0.25)
-    assert (noise["p"] == 1).all()
-    assert (counts_of(noise)[~pixels.dead] == 70).all()
-    assert (counts_of(noise)[pixels.dead] == 0).all()
-    for place in pixels.live[:10]:
-        t = noise["t"][noise["y"].astype(int) * SHAPE[1] + noise["x"] == place]
-        assert np.abs(np.diff(t) - SECOND / 7).max() <= 1
-    busy = np.histogram(noise["t"], bins=100, range=(0, 10 * SECOND))[0]
-    assert busy.max() < 3 * busy.mean(), "pixels do not leak all at once"
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.integers(1, SECOND), max_size=12, unique=True), st.sampled_from([0.3, 7.0, 333.3, 1e5]))
-def test_leakage_does_not_depend_on_how_time_is_cut(cuts, leak_hz):
-    faults, t0 = FaultsConfig(leak_hz=leak_hz), 10**13
-    pixels = draw_pixel_faults((1, 2), faults, np.random.default_rng(0))
-    light, rng = np.zeros((1, 2), np.float32), np.random.default_rng(0)
-    whole = apply_faults(NO_EVENTS, t0, t0 + SECOND + 1, light, faults, pixels, rng)
-    times = [t0, *(t0 + cut for cut in sorted(cuts)), t0 + SECOND + 1]
-    pairs = itertools.pairwise(times)
-    parts = np.concatenate([apply_faults(NO_EVENTS, a, b, light, faults, pixels, rng) for a, b in pairs])
-    assert abs(len(whole) - 2 * leak_hz) <= 2 + 1e-6 * 2 * leak_hz
-    assert len(parts) == len(whole)
-    assert np.abs(np.sort(parts["t"]) - whole["t"]).max(initial=0) <= 1
-
-
 def test_hot_pixels_fire_at_their_rate_and_no_other_pixel_does():
     fields = {"hot_pixel_share": 0.1, "hot_pixel_hz": 200.0, "sparsity": 0.5}
     pixels, noise = faulty(NO_EVENTS, 0, 10 * SECOND, **fields)
@@ -176,8 +125,6 @@ def test_no_more_pixels_are_hot_than_alive():
 ALL_NOISE = {
     "background_activity": 0.5,
     "background_activity_hz": 1000.0,
-    "shot_noise_hz": 2000.0,
-    "leak_hz": 500.0,
     "hot_pixel_share": 0.1,
     "hot_pixel_hz": 5000.0,
 }
@@ -186,7 +133,7 @@ ALL_NOISE = {
 def test_noise_is_merged_in_total_order_and_keeps_every_true_event():
     events = some_events()
     noisy = faulty(events, 0, 5000, **ALL_NOISE)[1]
-    mean = 500 + SIZE * 5.0 + SIZE * 10.0 * 0.625 + SIZE * 2.5 + 10 * 25.0
+    mean = 500 + SIZE * 5.0 + 10 * 25.0
     assert near(len(noisy) - len(events), mean)
     assert np.array_equal(np.lexsort((noisy["x"], noisy["y"], noisy["t"])), np.arange(len(noisy)))
     assert 1 <= noisy["t"].min() <= noisy["t"].max() <= 5000
@@ -207,17 +154,16 @@ def test_dead_pixels_make_no_noise_and_a_sensor_without_a_live_one_none_at_all()
 
 
 def test_the_shortest_interval_holds_noise_at_its_end_and_an_empty_one_is_refused():
-    noise = faulty(NO_EVENTS, 41, 42, background_activity_hz=1e6, leak_hz=1e6, shot_noise_hz=1e6)[1]
+    noise = faulty(NO_EVENTS, 41, 42, background_activity_hz=1e6, hot_pixel_share=0.5, hot_pixel_hz=1e6)[1]
     assert noise.size > 100
     assert (noise["t"] == 42).all()
     with pytest.raises(ValueError, match="t1_us > t0_us; got 42 and 42"):
-        faulty(NO_EVENTS, 42, 42, leak_hz=1.0)
+        faulty(NO_EVENTS, 42, 42, background_activity_hz=1.0)
 
 
 def test_rates_that_would_fill_the_memory_are_refused_with_the_number():
-    for name in ("background_activity_hz", "shot_noise_hz", "leak_hz"):
-        with pytest.raises(ValueError, match=r"16777216 .*e\+09 .*Lower the rates"):
-            faulty(NO_EVENTS, 0, 100 * SECOND, **{name: 1e6})
+    with pytest.raises(ValueError, match=r"16777216 .*e\+09 .*Lower the rates"):
+        faulty(NO_EVENTS, 0, 100 * SECOND, background_activity_hz=1e6)
 
 
 @pytest.mark.parametrize("name", ["sparsity", "event_dropout", "hot_pixel_share", "leak_hz", "shot_noise_hz"])

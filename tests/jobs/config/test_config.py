@@ -6,8 +6,9 @@ import pytest
 import yaml
 
 from envs.config import EnvConfig
+from jobs.config.conditions import axis_points
 from jobs.config.config import ConfigError, as_dict, known_keys, parse
-from jobs.config.env_keys import flat_env
+from jobs.config.env_keys import env_with, flat_env
 from jobs.config.errors import SET_BY_JOBS
 from jobs.run.folder import run_name
 from models.kinds import KINDS, model_keys
@@ -62,6 +63,13 @@ def test_every_file_of_every_group_is_accepted(choice):
     parse(compose("+exp=bytestream", choice))
 
 
+def test_the_sweep_is_by_day_and_by_night_what_the_lights_are(values):
+    """Of a light that a sweep changes nothing is left out, and nothing added."""
+    nominal, axis = parse(values), parse(compose("+exp=robustness")).sweep.axes["sensor_noise"]
+    for light, point in zip(("none", "day", "night"), axis_points(axis), strict=True):
+        assert parse(compose("+exp=bytestream", f"light={light}")).env == env_with(nominal.env, point)
+
+
 def test_the_yaml_of_the_world_says_what_its_dataclasses_say(values):
     defaults = flat_env(EnvConfig(window_capacity=None))  # Gymnasium's clients need arrays of one size
     assert {group: values[group] for group in defaults} == defaults
@@ -88,7 +96,9 @@ def test_every_value_says_its_unit_or_source_in_a_comment(file):
 @pytest.mark.parametrize(
     "file",
     sorted(
-        path for path in CONF.rglob("*.yaml") if path.parent.name not in ("exp", "help", "budget", "length")
+        path
+        for path in CONF.rglob("*.yaml")
+        if path.parent.name not in ("exp", "help", "budget", "length", "light")
     ),
 )
 def test_every_group_names_the_class_that_its_keys_are_fields_of(file):
@@ -127,7 +137,7 @@ def test_ppo_is_the_papers():
     }
 
 
-@pytest.mark.parametrize("length", options("length"))
+@pytest.mark.parametrize("length", [name for name in options("length") if not name.endswith("_ablation")])
 def test_an_algorithm_trains_as_long_as_it_needs_in_each_budget(length):
     budget, _, algo = length.partition("_")
     told = compose("+exp=bytestream", f"budget={budget}", f"algo={algo}")

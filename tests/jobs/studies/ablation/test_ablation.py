@@ -65,6 +65,8 @@ def test_the_experiment_names_variants_that_can_be_trained():
         for name, changed in configs.items()
     }
     first, *others = settings.values()
+    assert config.train.env_steps == 400_000
+    assert ablation_config("budget=smoke").train.env_steps == 4_096
     assert all(other != first for other in others)
     assert {changed.seed for changed in configs.values()} == {1}
     assert configs["ppo"].algo.imitation is None

@@ -1,0 +1,461 @@
+"""Noise that acts on the pixel: leakage that moves its level, and shot noise that crosses its levels.
+
+Both are events like any other: they move the level that the pixel remembers, wait for the end of its
+refractory period, and start one. So a still pixel does not drift.
+
+Leakage lowers the level at the pixel's rate, one threshold from one ON event of a still pixel to the next.
+
+Shot noise is a stationary Ornstein-Uhlenbeck process x on top of the pixel's response, with standard
+deviation sigma, a share of the pixel's thresholds, and the time constant tau of the photoreceptor. From its
+mean up to d, it needs a mean time of (Siegert 1951; Hendrickson & Haefner, arXiv:2504.02803)
+
+    m(d) = tau sqrt(2 pi) * integral of exp(y^2 / 2) Phi(y) dy from 0 to d / sigma,
+
+and, if d is not small, it takes an exponentially distributed time. From d back to the mean it takes exactly
+(tau / 2) log(1 + (d / sigma Z)^2), Z a normal number. Then the level just left is the nearer one: ON and OFF
+alternate. So events are drawn by waiting times, and no step of the simulation is too long (first passages:
+Graca & Delbruck, arXiv:2505.07386). Sigma is chosen so that the rate, in the closed form of `mean_rate`, is
+`shot_noise_hz` on average over all levels that a pixel may remember. A refractory period of tau or more
+makes the noise rarer: at its end the level is the light's, and not a threshold away.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from envs.compiled import inlined, kernel
+from envs.config import CameraConfig, FaultsConfig
+from envs.events.crossings import (
+    BLOCK,
+    Memory,
+    Model,
+    level_of,
+    make_room,
+    named,
+    respond_at,
+    set_quiet_bands,
+)
+from envs.events.emission import Span
+
+DEFAULT_BANDWIDTH_HZ = 300.0  # of the noise where the photoreceptors have none: v2e's cutoff by day
+SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
+PER_SIGMA = 64  # entries of the table of waiting rates
+MOST_SIGMAS, FEWEST_SIGMAS = 12.0, 0.5  # of a threshold
+SLICE = 1 / 32  # of a threshold, the most that a level leaks before the waiting times are taken anew
+SAME_LIGHT = 5e-4  # relative; a change of the light that the waiting times need not follow
+
+
+class Noise(NamedTuple):
+    """The noise of N pixels, in the order of the camera's memory, float64; changed in place.
+
+    Attributes:
+        leak: Thresholds per second by which each level falls, until the pixel's next leak event.
+        leak_mean: The mean of it.
+        shot: Each pixel's rate of shot noise, as a multiple of that of others in black.
+        budget: What was left of each pixel's waiting time, in mean waiting times, at the time
+        from_us: From which it is used up [us], at
+        pace: So many mean waiting times per microsecond.
+        since_us: Until when each pixel's leakage is in its level [us].
+        rest_us: Until when each pixel's noise returns to its mean [us].
+        kept: Noise that a pixel kept as a part of its level at the end of a refractory period.
+        due_us: When each pixel is to be looked at again, if light and level stay.
+        light, band: Its light and the lower end of its quiet band at the last look, float32.
+        kept_us: When that period ends [us], int64.
+    """
+
+    leak: np.ndarray
+    leak_mean: np.ndarray
+    shot: np.ndarray
+    budget: np.ndarray
+    from_us: np.ndarray
+    pace: np.ndarray
+    since_us: np.ndarray
+    rest_us: np.ndarray
+    kept: np.ndarray
+    due_us: np.ndarray
+    light: np.ndarray
+    band: np.ndarray
+    kept_us: np.ndarray
+
+
+class Process(NamedTuple):
+    """The noise of one sensor.
+
+    Attributes:
+        sigma: Standard deviation of the shot noise, as a share of a pixel's mean threshold; 0: none.
+        tau_us: Its time constant [us].
+        rates: Rate of passages by distance, in steps of sigma / PER_SIGMA [1 / us].
+        jitter: Of leakage.
+        slice_us: Longest time in which leakage may be put off [us].
+    """
+
+    sigma: float
+    tau_us: float
+    rates: np.ndarray
+    jitter: float
+    slice_us: float
+
+
+@lru_cache(maxsize=1)
+def passage_times() -> np.ndarray:
+    """Mean time from the mean up to k / PER_SIGMA sigmas, in units of tau; float64."""
+    fine = 16
+    y = np.arange(int(MOST_SIGMAS * PER_SIGMA * fine) + 1) / (PER_SIGMA * fine)
+    below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in y])
+    density = math.sqrt(2.0 * math.pi) * np.exp(0.5 * y * y) * below
+    area = np.cumsum(0.5 * (density[1:] + density[:-1])) / (PER_SIGMA * fine)
+    return np.concatenate(([0.0], area[fine - 1 :: fine]))
+
+
+@lru_cache(maxsize=1)
+def return_times() -> np.ndarray:
+    """Mean time from k / PER_SIGMA sigmas back to the mean, in units of tau; float64.
+
+    sqrt(2 pi) times the integral of exp(y^2 / 2) Phi(-y): Siegert's formula on the other side.
+    """
+    y = np.arange(int(MOST_SIGMAS * PER_SIGMA) + 1) / PER_SIGMA
+    above = np.array([math.exp(0.5 * v * v) * 0.5 * math.erfc(v / math.sqrt(2.0)) for v in y])
+    area = np.cumsum(0.5 * (above[1:] + above[:-1])) / PER_SIGMA * math.sqrt(2.0 * math.pi)
+    return np.concatenate(([0.0], area))
+
+
+def mean_rate(sigmas: float) -> float:
+    """Shot noise events per tau of a still pixel whose threshold is so many sigmas, over all its levels.
+
+    Of the two levels next to the light's, one stands a share f of a threshold below it: the way from one to
+    the other and back is a pair of events. So is a passage outwards, beyond the nearer level.
+    """
+    share, grid = (np.arange(256) + 0.5) / 256, np.arange(passage_times().size) / PER_SIGMA
+    inwards = np.interp(sigmas * share, grid, passage_times())
+    back = np.interp(sigmas * share, grid, return_times())
+    outwards = np.interp(sigmas * (1.0 + share), grid, passage_times())
+    pair, stays = inwards + back, inwards[::-1] / (inwards + inwards[::-1])
+    return float(np.mean(2.0 / (pair + pair[::-1]) + 4.0 * stays / outwards))
+
+
+def threshold_in_sigmas(events_per_tau: float) -> float:
+    """How many sigmas a threshold is, for so many shot noise events per tau.
+
+    Raises:
+        ValueError: If noise of that bandwidth cannot cross thresholds as often.
+    """
+    low, high = FEWEST_SIGMAS, MOST_SIGMAS
+    if events_per_tau > mean_rate(low):
+        most = mean_rate(low) / events_per_tau
+        raise ValueError(
+            f"shot_noise_hz is too high for the bandwidth of the pixel: at most {most:.3g} of it; "
+            "raise camera.cutoff_hz or use faults.background_activity_hz"
+        )
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if mean_rate(middle) > events_per_tau else (low, middle)
+    return 0.5 * (low + high)
+
+
+class Noisy(NamedTuple):
+    """A camera and its noise."""
+
+    model: Model
+    memory: Memory
+    noise: Noise
+    process: Process
+
+
+class Still(NamedTuple):
+    """A pixel whose light rests.
+
+    Attributes:
+        pixel: Its number.
+        response: To its light.
+        light: Its luminance.
+        low, high: Changes of the response down and up to its next events, at the end of the span.
+    """
+
+    pixel: int
+    response: float
+    light: float
+    low: float
+    high: float
+
+
+class PixelNoise:
+    """Leakage and shot noise of one camera's pixels."""
+
+    def __init__(
+        self,
+        camera: CameraConfig,
+        faults: FaultsConfig,
+        state: tuple,
+        numbers: np.ndarray,
+        t_us: int,
+        rng: np.random.Generator,
+    ) -> None:
+        """Draw the noise of a camera that has just seen its first frame; levels begin anywhere.
+
+        Args:
+            camera: Its settings.
+            faults: The noise's.
+            state: `EventCamera.state` of it.
+            numbers: int64 (N,), the flat pixel y * W + x of each pixel of its memory; -1: a dead one.
+            t_us: The time of that frame [us].
+            rng: Source of all draws.
+
+        Raises:
+            ValueError: If `shot_noise_hz` cannot be had with the bandwidth of the pixels.
+        """
+        self._model, self._memory, _ = state
+        self._numbers, self._rng = numbers, rng
+        size, alive = numbers.size, numbers >= 0
+        tau_s = 1.0 / (2.0 * math.pi * (camera.cutoff_hz or DEFAULT_BANDWIDTH_HZ))
+        spread = alive * 10.0 ** (faults.noise_spread * rng.standard_normal(size))
+        sigma, shot = 0.0, np.zeros(size)
+        if faults.shot_noise_hz > 0.0:
+            sigma = 1.0 / threshold_in_sigmas(faults.shot_noise_hz * tau_s)
+            shot = spread
+        rates = np.append(1.0 / np.maximum(passage_times(), 1.0 / PER_SIGMA), 0.0) * (1e-6 / tau_s)
+        slice_us = 1e6 * SLICE / max(faults.leak_hz, 1e-9)
+        self._process = Process(sigma, 1e6 * tau_s, rates, faults.leak_jitter, slice_us)
+        leak = faults.leak_hz * spread
+        rows, seen = np.zeros((size, 9)), np.zeros((2, size), np.float32)
+        rows[:, 0] = leak / np.maximum(1.0 + faults.leak_jitter * rng.standard_normal(size), 0.1)
+        rows[:, 1], rows[:, 2], rows[:, 3] = leak, shot, rng.standard_exponential(size)
+        rows[:, 4], rows[:, 6], rows[:, 7], seen[1] = t_us, t_us, -np.inf, np.nan
+        due_us, kept_us = np.full(size, float(t_us)), np.full(size, np.iinfo(np.int64).min)
+        self._rows = rows, seen, due_us, kept_us
+        self._scratch = make_room(), make_room(), np.empty(size, np.int64)
+        move_levels(self._model, self._memory, -rng.random(size) * alive)
+
+    def events(self, t0_us: int, t1_us: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the noise fires in (t0_us, t1_us], after the events of the light, which is that of t1_us.
+
+        Returns:
+            Times [us], flat pixels y * W + x and polarities, int64 each.
+        """
+        parts = 1 + int((t1_us - t0_us) / self._process.slice_us)
+        cuts = np.array([t0_us + (t1_us - t0_us) * part // parts for part in range(parts + 1)])
+        found = fire(cuts, self._model, self._memory, self._rows, self._process, self._rng, self._scratch)
+        times, pixels, polarities = found
+        return times, self._numbers[pixels], polarities
+
+
+@numba.njit(cache=True, error_model="numpy")
+def move_levels(model, memory, shares):
+    """Move all remembered levels by these shares of the ON threshold, and the quiet bands with them."""
+    model, memory = named(model, memory)
+    room, on = make_room(), model.thresholds.on
+    for first in range(0, shares.size, BLOCK):
+        pixels = np.arange(first, min(first + BLOCK, shares.size))
+        for i in pixels:
+            memory.first_level[i] += shares[i] * on[i if on.size > 1 else 0]
+        set_quiet_bands(pixels, memory.first_level[first : first + pixels.size], model, memory, room)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fire(cuts, model, memory, rows, process, rng, scratch):
+    """Events of the noise between times that are cut finely enough for leakage; see `PixelNoise.events`."""
+    model, memory = named(model, memory)
+    noise, (room, spare, changed) = _noise(rows[0], rows[1], rows[2], rows[3]), scratch
+    noisy = Noisy(model, memory, noise, process)
+    fired = [(np.int64(0), np.int64(0), np.int64(0))]
+    for cut in range(cuts.size - 1):
+        span = Span(cuts[cut], cuts[cut + 1])
+        found = _find(span, memory, noise, changed)
+        for first in range(0, found, BLOCK):
+            pixels = changed[first : min(first + BLOCK, found)]
+            _restore(pixels, cuts[-1], memory, noise)
+            respond_at(pixels, memory.previous, model.curve, room.before, room)
+            _wait(pixels, span, noisy, room)
+            for j in range(pixels.size):
+                if room.after[j] > 0.0:
+                    still = Still(pixels[j], room.before[j], room.lights[j], room.low[j], room.high[j])
+                    _fire_pixel(still, span, cuts[-1], noisy, rng, spare, fired)
+    events = np.empty((3, len(fired) - 1), np.int64)
+    for k in range(1, len(fired)):
+        events[0, k - 1], events[1, k - 1], events[2, k - 1] = fired[k]
+    return events[0], events[1], events[2]
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _noise(real, seen, due_us, kept_us):
+    """`Noise` of float64 (N, 9), whose rows are read together, float32 (2, N), and two more of (N,)."""
+    return Noise(
+        real[:, 0], real[:, 1], real[:, 2], real[:, 3], real[:, 4], real[:, 5], real[:, 6], real[:, 7],
+        real[:, 8], due_us, seen[0], seen[1], kept_us,
+    )  # fmt: skip
+
+
+@kernel
+def _find(span, memory, noise, changed):
+    """Write the pixels whose light or level has changed, or whose time has come; return how many."""
+    found, end_us = 0, np.float64(span.end_us)
+    for i in range(noise.leak.size):
+        other = abs(memory.previous[i] - noise.light[i]) > SAME_LIGHT * noise.light[i]
+        other |= (memory.quiet_low[i] != noise.band[i]) | (noise.due_us[i] <= end_us)
+        changed[found] = i
+        found += other
+    return found
+
+
+@kernel
+def _restore(pixels, now_us, memory, noise):
+    """Add what pixels kept of the noise to the levels that they took at the end of a refractory period."""
+    if memory.refractory_end_us.size > 0:
+        for i in pixels:
+            if noise.kept_us[i] < now_us and noise.kept[i] != 0.0:
+                if noise.kept_us[i] == memory.refractory_end_us[i]:
+                    memory.first_level[i] += noise.kept[i]
+                    memory.quiet_low[i], memory.quiet_high[i] = 1.0, 0.0  # decided in the next frame
+                noise.kept[i] = 0.0
+
+
+@kernel
+def _wait(pixels, span, noisy, room):
+    """Lead pixels through a span, under the light at its end, if nothing fires; else mark them.
+
+    Into the columns of `room`: `low` and `high`, the changes down and up to the next events at the end of the
+    span; `after`, 1 where an event comes within it. `before` has the responses.
+    """
+    model, memory, noise, process = noisy
+    for j in range(pixels.size):
+        i = pixels[j]
+        on, off = _thresholds(i, model)
+        noise.budget[i] -= noise.pace[i] * max(span.start_us - noise.from_us[i], 0.0)
+        memory.first_level[i] -= noise.leak[i] * on * 1e-6 * (span.end_us - noise.since_us[i])
+        level = level_of(memory, i, on, off)
+        low, high = off + room.before[j] - level, on + level - room.before[j]
+        pending = model.rule.carries and high <= -noise.leak[i] * on * 1e-6 * (span.end_us - span.start_us)
+        begin_us = max(np.float64(span.start_us), _free_us(i, memory, noise))
+        sigma = process.sigma * 0.5 * (on + off)
+        rate = (_rate(low, sigma, process) + _rate(high, sigma, process)) * _dimmed(
+            noise.shot[i], room.lights[j]
+        )
+        noise.since_us[i] = span.end_us
+        left = noise.budget[i] - rate * max(span.end_us - begin_us, 0.0)
+        due = min(low, high) <= 0.0 and begin_us < span.end_us and noise.leak_mean[i] + noise.shot[i] > 0.0
+        room.low[j], room.high[j] = low, high
+        room.after[j] = (left <= 0.0 or due) and not pending
+        if not room.after[j]:
+            noise.budget[i] = left
+            noise.light[i] = room.lights[j]
+            _schedule(i, span.end_us, low, high, noise.leak[i] * on * 1e-6, rate, noisy)
+
+
+@inlined
+def _thresholds(i, model):
+    """ON and OFF threshold of a pixel."""
+    k = i if model.thresholds.on.size > 1 else 0
+    return model.thresholds.on[k], model.thresholds.off[k]
+
+
+@inlined
+def _free_us(i, memory, noise):
+    """When a pixel's noise has returned to its mean and its refractory period is over [us]."""
+    if memory.refractory_end_us.size > 0:
+        return max(noise.rest_us[i], np.float64(memory.refractory_end_us[i]))
+    return noise.rest_us[i]
+
+
+@inlined
+def _schedule(i, now_us, low, high, fall, rate, noisy):
+    """When a pixel is to be looked at again, if its light rests: at an event at the latest."""
+    memory, noise, process = noisy.memory, noisy.noise, noisy.process
+    begin_us = max(np.float64(now_us), _free_us(i, memory, noise))
+    noise.pace[i], noise.from_us[i], noise.band[i] = rate, begin_us, memory.quiet_low[i]
+    due_us = begin_us + noise.budget[i] / rate if rate > 0.0 else np.inf
+    if fall > 0.0:
+        due_us = min(due_us, max(begin_us, now_us + high / fall), now_us + process.slice_us)
+    noise.due_us[i] = begin_us if low <= 0.0 else due_us
+
+
+@inlined
+def _rate(change, sigma, process):
+    """Rate at which noise of that standard deviation reaches a change of the response [1 / us]."""
+    if sigma == 0.0:
+        return 0.0
+    place = min(max(change / sigma, 0.0) * PER_SIGMA, process.rates.size - 2.0)
+    entry = int(place)
+    return process.rates[entry] + (place - entry) * (process.rates[entry + 1] - process.rates[entry])
+
+
+@inlined
+def _dimmed(shot, light):
+    """Rate of shot noise under a light, as a multiple of that in black."""
+    return shot * (1.0 - SHOT_NOISE_FALL * min(np.float64(light), 1.0))
+
+
+@kernel
+def _return_us(displaced, sigma, normal, process):
+    """Time in which the noise returns from a displacement to its mean [us], of a normal number."""
+    if displaced == 0.0 or sigma == 0.0:
+        return 0.0
+    ratio = displaced / (sigma * normal)
+    return 0.5 * process.tau_us * np.log1p(ratio * ratio)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
+    """Append the events of one pixel in a span, one after the other, and set its level and its quiet band."""
+    model, memory, noise, process = noisy
+    i, refractory_us = still.pixel, model.rule.refractory_us
+    on, off = _thresholds(i, model)
+    low, high, t = still.low, still.high, np.float64(span.start_us)
+    sigma = process.sigma * 0.5 * (on + off)
+    while True:
+        begin = max(t, _free_us(i, memory, noise))
+        up, down = _rate(high, sigma, process), _rate(low, sigma, process)
+        rate = (up + down) * _dimmed(noise.shot[i], still.light)
+        fall, due = noise.leak[i] * on * 1e-6, min(low, high) <= 0.0
+        coming = begin + max(noise.budget[i], 0.0) / rate if rate > 0.0 else np.inf
+        if due:
+            coming = max(begin, span.end_us + high / fall if high <= 0.0 and fall > 0.0 else begin)
+        if coming > span.end_us:
+            noise.budget[i] -= 0.0 if due else rate * max(span.end_us - begin, 0.0)
+            break
+        event_us = np.int64(min(max(np.ceil(coming), span.start_us + 1), span.end_us))
+        rises = high <= low if due else rng.random() * (up + down) < up
+        fired.append((event_us, i, np.int64(2 * rises - 1)))
+        displaced = 0.0
+        if not due:
+            displaced = max(high, 0.0) if rises else -max(low, 0.0)
+            noise.budget[i] = rng.standard_exponential()
+        elif rises and fall > 0.0:
+            noise.leak[i] = noise.leak_mean[i] / max(1.0 + process.jitter * rng.standard_normal(), 0.1)
+            gained = (fall - noise.leak[i] * on * 1e-6) * (span.end_us - event_us)
+            memory.first_level[i] += gained
+            low, high = low - gained, high + gained
+        low, high = (low - on, high + on) if rises else (low + off, high - off)
+        memory.on_count[i] += rises
+        memory.off_count[i] += not rises
+        t = np.float64(event_us)
+        if refractory_us > 0:
+            t, displaced = _rest(still, event_us, now_us, displaced, sigma, noisy, rng)
+            low, high = off - displaced, on + displaced
+        noise.rest_us[i] = t + _return_us(displaced, sigma, rng.standard_normal(), process)
+    if refractory_us == 0 or memory.refractory_end_us[i] <= now_us:
+        spare.levels[0], spare.exponents[1] = level_of(memory, i, on, off), i
+        set_quiet_bands(spare.exponents[1:2], spare.levels, model, memory, spare)
+    noise.light[i] = still.light
+    _schedule(i, span.end_us, low, high, fall, rate, noisy)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _rest(still, event_us, now_us, displaced, sigma, noisy, rng):
+    """Start a refractory period; when it ends [us], and how far the noise, and so the level, is off by then.
+
+    A period that outlasts the last frame is ended by the camera, which takes the light of that moment as the
+    level; what the noise adds to it is kept until then.
+    """
+    model, memory, noise, process = noisy
+    refractory_us = model.rule.refractory_us
+    i, end_us, left = still.pixel, event_us + refractory_us, np.exp(-refractory_us / process.tau_us)
+    displaced = displaced * left + sigma * np.sqrt(1.0 - left * left) * rng.standard_normal()
+    memory.refractory_end_us[i] = end_us
+    if end_us <= now_us:
+        memory.first_level[i], memory.on_count[i], memory.off_count[i] = still.response + displaced, 0.0, 0.0
+    else:
+        noise.kept[i], noise.kept_us[i] = displaced, end_us
+        memory.quiet_low[i], memory.quiet_high[i] = 1.0, 0.0
+    return np.float64(end_us), displaced
