@@ -77,7 +77,7 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine on
 test: setup ## the quick tests (3 minutes on two cores)
 	$(PYTEST) --dist worksteal $(ARGS)
 
-test-system: setup ## whole jobs, Ray, the launcher, and every kind of policy (4 minutes)
+test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the site, the notebooks (7 minutes)
 	$(PYTEST) -m "system and not slow" --dist loadgroup $(ARGS)
 
 test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)

@@ -78,6 +78,11 @@ def _fill_in(app, docname, source):
         )
 
 
+def _read_again(*_):
+    """The contents, which depend on what other pages there are, and the keys, on the schema."""
+    return ["index", "keys"]
+
+
 def setup(app):
     """Called by Sphinx."""
     app.connect("autodoc-skip-member", _skip_fields)
@@ -85,3 +90,4 @@ def setup(app):
     app.connect("autodoc-process-docstring", _escape, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", _say_types)
     app.connect("source-read", _fill_in)
+    app.connect("env-get-outdated", _read_again)

@@ -105,6 +105,7 @@ def evaluate(
     episodes = {label: result.episodes for label, result in results.items()}
     summaries = [summarise(label, rows) for label, rows in episodes.items()]
     write_episodes(folder.evaluation / "episodes.csv", LABELS, episodes)
+    tracker.artifact(folder.evaluation / "episodes.csv", "eval")
     publish(folder, tracker, summaries, trajectories(tasks))
     found = evaluation_metrics(summaries) | drift_by_label(results)
     found |= report_event_error(dataclasses.replace(config.env, scene=HELD_OUT_SCENE))

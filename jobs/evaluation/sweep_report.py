@@ -138,6 +138,7 @@ def report(config: Config, folder: Run, tracker: Tracker, found: SweepResults) -
     episodes = {(*task.condition, task.policy.group, training_text(task)): found.results[task.key].episodes
                 for task in sweep.tasks if task.key in found.results}  # fmt: skip
     write_episodes(place / "episodes.csv", LABELS, episodes)
+    tracker.artifact(place / "episodes.csv", "sweep")
     facts = about(config, folder, found)
     write_json(place / "about.json", {**facts, "episodes_sha256": sha256(place / "episodes.csv")})
     write_tables(place, tracker, config.sweep.reference, found, groups)

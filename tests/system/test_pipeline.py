@@ -145,6 +145,7 @@ def test_the_store_holds_settings_figures_and_pictures(flown):
     }
     assert "config.yaml" in {file.path for file in client.list_artifacts(run.info.run_id)}
     wanted = {"evae/reconstructions.png", "eval/trajectories.png", "eval/episode.mp4", "eval/table.md"}
+    wanted |= {"eval/episodes.csv"}
     assert wanted <= files
 
 
