@@ -107,8 +107,8 @@ bench: setup ## measure the speed of the parts, and what accuracy of the simulat
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
 	$(LAUNCH) +exp=trade_simulator $(ARGS)
 
-docs: setup ## build the guide and the API as web pages in docs/_build
-	$(BIN)/python -m sphinx -q -b html docs docs/_build
+docs: setup ## build this site in docs/_build/html; a broken link or docstring stops it
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html $(ARGS)
 
 lock: setup ## update requirements.lock (ARGS=--upgrade: to the newest versions)
 	$(BIN)/pip-compile --quiet --extra dev,docs --strip-extras --allow-unsafe \

@@ -128,6 +128,8 @@ class FaultsConfig:
         background_activity_hz: Events without cause per pixel and second, as a real
             sensor makes them, also in a still scene. Both are laid on top of the other events.
         event_dropout: Probability that a true event is lost, each on its own.
+        displaced: Probability that a true event is reported by a neighbouring pixel.
+        flipped: Probability that a true event is reported with the other polarity.
         shot_noise_hz: Events without cause per pixel and second in black, as photons arrive
             unevenly; a quarter of that at white, on a straight line between (v2e). They are
             crossings of the pixel's own levels, so ON and OFF alternate (`envs.events.pixel_noise`).
@@ -143,6 +145,8 @@ class FaultsConfig:
     background_activity: Annotated[float, Field(ge=0, le=100)] = 0.0
     background_activity_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     event_dropout: Fraction = 0.0
+    displaced: Fraction = 0.0
+    flipped: Fraction = 0.0
     shot_noise_hz: Annotated[float, Field(ge=0, le=1e4)] = 0.0
     leak_hz: Annotated[float, Field(ge=0, le=1e4)] = 0.0
     leak_jitter: Fraction = 0.0

@@ -12,6 +12,7 @@ import numpy as np
 
 from envs.config import CameraConfig, FaultsConfig
 from envs.events.camera import MAX_EVENTS_PER_FRAME
+from envs.events.disturbances import disturb
 from envs.events.pixel_noise import PixelNoise
 from envs.events.readout import Readout
 
@@ -112,8 +113,8 @@ def apply_faults(
     """Lose true events and add false ones.
 
     Of the true events those of dead pixels are lost, and each other one with probability
-    event_dropout. To the rest are added, in an interval of T seconds, at uniform times and with uniform
-    polarities:
+    event_dropout; some are displaced or flipped (`envs.events.disturbances`). To the rest are
+    added, in an interval of T seconds, at uniform times and with uniform polarities:
 
     - background_activity: Poisson, this share of the true events left (appendix D.3);
     - background_activity_hz: Poisson, rate * T per live pixel;
@@ -140,6 +141,7 @@ def apply_faults(
         events = events[~pixels.dead[events["y"], events["x"]]]
     if faults.event_dropout > 0.0:
         events = events[rng.random(events.size) >= faults.event_dropout]
+    events = disturb(events, faults, pixels.dead.shape, rng)
     kinds = _expected(events.size, (t1_us - t0_us) * 1e-6, faults, pixels)
     expected = sum(mean for _, mean in kinds)
     if expected > MAX_EVENTS_PER_FRAME:

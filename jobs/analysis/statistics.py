@@ -1,23 +1,21 @@
 """95 % intervals of a rate, of a mean, over several trainings, and of a difference on the same corridors.
 
-Every random draw comes from a generator that the caller gives. scipy computes what it can; it has no
-bootstrap in two stages, and no interval of a difference of paired rates.
+What is replicated is the training: every training is evaluated in the same corridors, a crossed design of
+two random factors. scipy computes what it can; it has no interval of a mean over two crossed factors, and
+none of a difference of paired rates. `python -m jobs.bench.coverage` prints how often the intervals hold.
 """
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, sem, t, trim_mean, ttest_ind
+from scipy.stats import binomtest, bootstrap, norm, sem, t
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-TWO_STAGE_RESAMPLES = 2_000  # as rliable draws for such intervals
-TAIL = 0.25  # that the interquartile mean leaves out at each end
+POWER = 0.8
 
 Interval = tuple[float, float]
-Statistic = Callable[[np.ndarray], np.ndarray]  # (resamples, n) -> (resamples,)
 
 
 class Estimate(NamedTuple):
@@ -25,6 +23,17 @@ class Estimate(NamedTuple):
 
     value: float
     interval: Interval | None
+
+
+class Difference(NamedTuple):
+    """A value that may be 0, its 95 % interval, and the two-sided p of the test that it is 0.
+
+    Interval and p are None where a single episode leaves nothing to compare.
+    """
+
+    value: float
+    interval: Interval | None
+    p: float | None
 
 
 def wilson_interval(successes: int, trials: int) -> Interval:
@@ -59,49 +68,64 @@ def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
-def mean(values: np.ndarray) -> np.ndarray:
-    """The mean of each row."""
-    return values.mean(axis=-1)
+def rate_estimate(successes: np.ndarray) -> Estimate:
+    """Success rate over trainings and corridors; trainings are what is replicated.
+
+    The interval reaches as far as the farthest of three: Student's of the training means with what the
+    corridors add (`crossed_mean`), the same of their arcsines (Anscombe 1948), which fits rates near 0 and 1,
+    and Wilson's of all episodes, without which trainings that agree would leave no doubt. How often it holds
+    the true rate: `python -m jobs.bench.coverage`.
+
+    Args:
+        successes: Shape (trainings, corridors), 0 or 1.
+
+    Raises:
+        ValueError: If there is no value, or one is NaN or infinite.
+    """
+    successes = _checked(successes, "successes")
+    trainings, corridors = successes.shape
+    ends = [wilson_interval(int(successes.sum()), successes.size)]
+    if trainings > 1:
+        ends.append(crossed_mean(successes).interval or ends[0])
+        won = successes.sum(axis=1)
+        angles = np.arcsin(np.sqrt((won + 0.375) / (corridors + 0.75)))
+        centre, half = angles.mean(), float(half_width(angles[:, None])[0])
+        low, high = np.sin(np.clip([centre - half, centre + half], 0.0, np.pi / 2)) ** 2
+        ends.append((float(low), float(high)))
+    lows, highs = zip(*ends, strict=True)
+    return Estimate(float(successes.mean()), (max(min(lows), 0.0), min(max(highs), 1.0)))
 
 
-def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """The mean of the middle half of each row (Agarwal et al. 2021, as their rliable computes it)."""
-    return trim_mean(values, TAIL, axis=-1)
+def crossed_mean(values: np.ndarray, bounds: Interval | None = None) -> Difference:
+    """Mean over trainings and corridors, and the test that it is 0; both are drawn at random, and crossed.
 
-
-def two_stage_estimate(values: np.ndarray, rng: np.random.Generator, statistic: Statistic = mean) -> Estimate:
-    """A statistic over trainings and corridors, its interval from a two-stage bootstrap.
-
-    Trainings are drawn first, then corridors, which all trainings share.
-    Of n trainings n - 1 are drawn, which makes the variance of the resamples that of the mean
-    (Rao and Wu 1988); n draws would make intervals over three trainings a fifth too narrow.
+    Student's interval of the training means, widened by what the corridors add to their scatter (the analysis
+    of variance of a crossed design; degrees of freedom as Satterthwaite 1946). A single training says nothing
+    of others: the interval is then over corridors.
 
     Args:
         values: Shape (trainings, corridors).
-        rng: Draws the resamples.
-        statistic: Of each row of an array; `mean` or `interquartile_mean`.
+        bounds: The least and the greatest value that there can be; where all values agree, one of each is
+            added to find how sure that is. None: there are none.
 
     Raises:
         ValueError: If there is no value, or one is NaN or infinite.
     """
     values = _checked(values, "values")
-    value = float(statistic(values.reshape(1, -1))[0])
-    if values.size == 1:
-        return Estimate(value, None)
-    rows, columns = _trainings(len(values), rng), _corridors(values.shape[1], rng)
-    drawn = values[rows[:, :, None], columns[:, None, :]].reshape(TWO_STAGE_RESAMPLES, -1)
-    return Estimate(value, _percentiles(statistic(drawn)))
+    parts = [(_by_trainings(values), len(values) - 1), (_by_corridors([values]), values.shape[1] - 1)]
+    return _tested(values.mean(), parts, _least(values, bounds))
 
 
-def paired_difference(ours: np.ndarray, theirs: np.ndarray, rng: np.random.Generator) -> Estimate:
-    """Mean of ours minus mean of theirs on the same corridors, with its paired bootstrap interval.
+def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | None = None) -> Difference:
+    """Mean of ours minus mean of theirs, of other trainings in the same corridors, and the test that it is 0.
 
-    The trainings of each side are drawn separately, the corridors for both together.
+    Welch's interval of the training means, widened as in `crossed_mean`. Where a side has one training, the
+    interval is over corridors, for these trainings alone.
 
     Args:
         ours: Shape (trainings, corridors).
         theirs: Shape (other trainings, the same corridors).
-        rng: Draws the resamples.
+        bounds: As in `crossed_mean`.
 
     Raises:
         ValueError: If the corridors are not as many, or a value is NaN or infinite.
@@ -109,15 +133,92 @@ def paired_difference(ours: np.ndarray, theirs: np.ndarray, rng: np.random.Gener
     ours, theirs = _checked(ours, "ours"), _checked(theirs, "theirs")
     if ours.shape[1] != theirs.shape[1]:
         raise ValueError(f"both must be of the same corridors, got {ours.shape[1]} and {theirs.shape[1]}")
-    value = float(ours.mean() - theirs.mean())
-    if ours.size == theirs.size == 1:
-        return Estimate(value, None)
-    columns = _corridors(ours.shape[1], rng)
-    sides = []
-    for values in (ours, theirs):
-        rows = _trainings(len(values), rng)
-        sides.append(values[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2)))
-    return Estimate(value, _percentiles(sides[0] - sides[1]))
+    parts = [(_by_corridors([ours, -theirs]), ours.shape[1] - 1)]
+    if min(len(ours), len(theirs)) > 1:
+        parts += [(_by_trainings(side), len(side) - 1) for side in (ours, theirs)]
+    return _tested(ours.mean() - theirs.mean(), parts, _least(ours, bounds) + _least(theirs, bounds))
+
+
+def _by_trainings(values: np.ndarray) -> float:
+    """Variance of the mean by its trainings and by chance; 0 for a single training."""
+    return float(values.mean(axis=1).var(ddof=1) / len(values)) if len(values) > 1 else 0.0
+
+
+def _by_corridors(sides: Sequence[np.ndarray]) -> float:
+    """Variance that corridors add to the sum of the sides' means; of a single training, with chance."""
+    corridors = sides[0].shape[1]
+    if corridors == 1:
+        return 0.0
+    all_of_it = sum(side.mean(axis=0) for side in sides)
+    chance = sum(_residual(side) for side in sides) if min(map(len, sides)) > 1 else 0.0
+    return max(float(np.var(all_of_it, ddof=1)) / corridors - chance, 0.0)
+
+
+def _residual(values: np.ndarray) -> float:
+    """Variance of the mean by what neither trainings nor corridors explain."""
+    trainings, corridors = values.shape
+    rest = values - values.mean(axis=0) - values.mean(axis=1, keepdims=True) + values.mean()
+    return float((rest**2).sum() / ((trainings - 1) * (corridors - 1)) / values.size)
+
+
+def _least(values: np.ndarray, bounds: Interval | None) -> float:
+    """Variance of the mean with one value more at each bound (Agresti and Coull 1998); 0 without bounds."""
+    return 0.0 if bounds is None else float(np.append(values, bounds).var() / (values.size + 2))
+
+
+def _tested(value: float, parts: Sequence[tuple[float, int]], least: float) -> Difference:
+    """Student's interval and two-sided test of a value; None where no part has degrees of freedom.
+
+    Args:
+        value: What is tested.
+        parts: Parts of its variance with their degrees of freedom, joined as Welch and Satterthwaite do.
+        least: Variance that it has at least.
+    """
+    value, known = float(value), [(part, freedom) for part, freedom in parts if freedom > 0]
+    if not known:
+        return Difference(value, None, None)
+    variance = sum(part for part, _ in known)
+    freedom = float(sum(count for _, count in known))
+    if variance > 0:
+        freedom = variance**2 / sum(part**2 / count for part, count in known)
+    error = float(np.sqrt(max(variance, least)))
+    half = float(t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+    if error == 0.0:
+        return Difference(value, (value, value), float(value == 0.0))
+    return Difference(value, (value - half, value + half), float(2 * t.sf(abs(value) / error, freedom)))
+
+
+def exact_pair_p(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Two-sided p of two policies' successes bool (n,) in the same corridors (McNemar's exact test)."""
+    won, lost = int((ours > theirs).sum()), int((ours < theirs).sum())
+    return float(binomtest(won, won + lost).pvalue) if won + lost else 1.0
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p values so that one below 0.05 is wrong in at most 5 % of such families (Holm 1979)."""
+    order = np.argsort(p_values)
+    scaled = np.array(p_values)[order] * np.arange(len(order), 0, -1)
+    adjusted = np.empty(len(order))
+    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return [float(p) for p in adjusted]
+
+
+def trainings_needed(ours: np.ndarray, theirs: np.ndarray, gain: float) -> int | None:
+    """How many trainings of each side would show a difference of `gain` in four of five studies.
+
+    Args:
+        ours: Training means (n,).
+        theirs: Those of the other side.
+        gain: Difference of the means.
+
+    Returns:
+        None where a side has one training, of which no spread is known.
+    """
+    if min(len(ours), len(theirs)) < 2:
+        return None
+    variance = np.var(ours, ddof=1) + np.var(theirs, ddof=1)
+    quantiles = norm.ppf((1 + CONFIDENCE) / 2) + norm.ppf(POWER)
+    return max(2, int(np.ceil(variance * (quantiles / gain) ** 2)))
 
 
 def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
@@ -169,39 +270,9 @@ def half_width(values: np.ndarray) -> np.ndarray:
     return t.ppf((1 + CONFIDENCE) / 2, count - 1) * sem(values, axis=0)
 
 
-def mean_difference(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
-    """Mean of ours minus mean of theirs, of independent trainings, with its 95 % interval.
-
-    The interval is Welch's (1947), which allows unequal variances; None where a side has fewer than
-    two values, or all values of each side are equal.
-    """
-    value = float(np.mean(ours) - np.mean(theirs))
-    if min(len(ours), len(theirs)) < 2 or np.ptp(ours) == np.ptp(theirs) == 0:
-        return Estimate(value, None)
-    with warnings.catch_warnings():  # scipy warns where the values of one side are equal
-        warnings.simplefilter("ignore", RuntimeWarning)
-        interval = ttest_ind(ours, theirs, equal_var=False).confidence_interval(CONFIDENCE)
-    return Estimate(value, (float(interval.low), float(interval.high)))
-
-
 def _checked(values: np.ndarray, name: str) -> np.ndarray:
     values = np.asarray(values, dtype=np.float64)
     if values.ndim != 2 or values.size == 0 or not np.isfinite(values).all():
         rule = f"{name} must be finite numbers of shape (trainings, corridors)"
         raise ValueError(f"{rule}, got {values!r}; leave out what failed")
     return values
-
-
-def _trainings(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw the trainings of each resample, (resamples, count - 1); where there is one, that one."""
-    return rng.integers(count, size=(TWO_STAGE_RESAMPLES, max(count - 1, 1)))
-
-
-def _corridors(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw the corridors of each resample, (resamples, count)."""
-    return rng.integers(count, size=(TWO_STAGE_RESAMPLES, count))
-
-
-def _percentiles(resampled: np.ndarray) -> Interval:
-    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)

@@ -9,7 +9,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from jobs.analysis.statistics import Estimate, bootstrap_interval, wilson_interval
+from jobs.analysis.statistics import Difference, Estimate, bootstrap_interval, wilson_interval
 from jobs.run.files import replaced, write_atomic
 from jobs.run.folder import Run
 from jobs.run.progress import console
@@ -63,7 +63,7 @@ def summarise(label: Sequence[str], episodes: np.ndarray) -> Summary:
     )
 
 
-def estimate_text(estimate: Estimate | None, scale: float = 1, form: str = ".1f") -> str:
+def estimate_text(estimate: Estimate | Difference | None, scale: float = 1, form: str = ".1f") -> str:
     """Format a value with its interval, such as "84 [76, 90]"; "-" for None."""
     if estimate is None:
         return "-"
@@ -107,7 +107,7 @@ def summary_columns(names: Sequence[str], rows: Sequence[Summary]) -> dict[str, 
     }
 
 
-def estimate_metrics(name: str, estimate: Estimate | None) -> dict[str, float]:
+def estimate_metrics(name: str, estimate: Estimate | Difference | None) -> dict[str, float]:
     """An estimate as metrics: its value, and the ends of its interval as name_low and name_high, if any."""
     if estimate is None:
         return {}

@@ -21,6 +21,7 @@ from jobs.config.errors import SET_BY_JOBS, ConfigError, nearest, redacted
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
+    AblationConfig,
     AlgoConfig,
     ClusterConfig,
     CollectConfig,
@@ -78,6 +79,7 @@ class Config:
     trade_simulator: TradeSimulatorConfig
     trade_encoder: TradeEncoderConfig
     probe: ProbeConfig
+    ablation: AblationConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
 

@@ -33,5 +33,7 @@ JOBS = {
     "trade": Job("jobs.studies.trade.trade", "What exactness costs from end to end"),
     "trade_simulator": Job("jobs.studies.simulator", "What exact events cost"),
     "trade_encoder": Job("jobs.studies.encoder.trade", "What an exact encoder costs"),
+    "ablation": Job("jobs.studies.ablation.ablation", "What each part of a recipe contributes"),
+    "numerics": Job("jobs.studies.numerics.numerics", "What the numbers do at the ends of their ranges"),
     "probe": Job("jobs.studies.probe.probe", "What a representation of events tells an agent"),
 }

@@ -1,7 +1,7 @@
 """The settings of each part of an experiment: names, types, ranges. Their values and units are in conf/."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import BeforeValidator, Field
@@ -254,6 +254,20 @@ class TradeEncoderConfig:
     seeds: Count
     windows: Annotated[int, Field(ge=4)]
     rounds: Count
+
+
+@dataclass(frozen=True, config=STRICT)
+class AblationConfig:
+    """Which parts of an experiment are changed, one at a time.
+
+    Attributes:
+        seeds: Of the trainings of each variant.
+        variants: Name -> what it changes, key -> value, with the place in a list as a number. Each is
+            compared with the first. `train.init` names the first: its policy of the same seed is trained on.
+    """
+
+    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]
+    variants: Annotated[dict[AxisName, dict[str, Any]], Field(min_length=1)]
 
 
 @dataclass(frozen=True, config=STRICT)

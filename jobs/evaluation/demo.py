@@ -20,7 +20,7 @@ from jobs.config.config import Config
 from jobs.evaluation.evaluate import latent_decoder
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
-from jobs.rollout.policies import find_one_policy, own_sensor_differences
+from jobs.rollout.policies import find_one_policy, own_sensor_differences, with_own_filter
 from jobs.rollout.recorded import RecordedEpisode, record_episode
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console
@@ -41,7 +41,7 @@ def run(config: Config) -> np.void:
     """
     policy = find_one_policy("demo.policy", config.demo.policy, config, locate_run(config))
     name = f"{policy.group}-s{policy.training}"
-    env = dataclasses.replace(config.env, split="eval")
+    env = with_own_filter(policy, dataclasses.replace(config.env, split="eval"))
     differ = own_sensor_differences(policy, env)
     if differ:
         said = ", ".join(f"{key}={ours!r} (trained: {theirs!r})" for key, (theirs, ours) in differ.items())

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from jobs.analysis.statistics import (
+    Difference,
     Estimate,
-    Interval,
-    interquartile_mean,
-    paired_difference,
-    two_stage_estimate,
-    wilson_interval,
+    crossed_difference,
+    crossed_mean,
+    rate_estimate,
 )
 from jobs.analysis.tables import (
     estimate_metrics,
@@ -25,8 +24,7 @@ from jobs.analysis.tables import (
 Condition = tuple[str, str]  # axis and value
 LABELS = ("Axis", "Value", "Group", "Training")
 TrainingEpisodes = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the same corridors
-
-
+RATE = (0.0, 1.0)  # bounds of a rate
 MET = "°"  # behind a result whose condition lies within what the group was trained on
 
 
@@ -39,10 +37,8 @@ class GroupResult:
         group: What was trained.
         trainings: Training seeds that were evaluated; a baseline has None.
         episodes: Of all of them [-].
-        success: Fraction that reached the goal, two-stage interval.
-        wilson: The Wilson interval of the same, as if episodes were independent.
+        success: Fraction that reached the goal.
         distance_m: Mean forward distance without collision [m].
-        middle_m: Interquartile mean of the distance [m].
         success_difference: To the reference group on the same corridors; None: there is none.
         distance_difference_m: The same of the distance [m].
         events_per_step: Mean events of a control step [-]; 0 for an agent that sees none.
@@ -54,11 +50,9 @@ class GroupResult:
     trainings: tuple[int | None, ...]
     episodes: int
     success: Estimate
-    wilson: Interval
-    distance_m: Estimate
-    middle_m: Estimate
-    success_difference: Estimate | None
-    distance_difference_m: Estimate | None
+    distance_m: Difference
+    success_difference: Difference | None
+    distance_difference_m: Difference | None
     events_per_step: float
     dropped: int
 
@@ -67,16 +61,6 @@ class GroupResult:
         """Condition and group: "control_hz=45 bytestream"."""
         return f"{'='.join(self.condition)} {self.group}"
 
-    @property
-    def success_interval(self) -> Interval:
-        """From the lower end of both intervals of success to the upper.
-
-        Wilson's alone would not see that trainings differ, the bootstrap alone would give none
-        where all episodes succeed or fail.
-        """
-        low, high = self.success.interval or self.wilson
-        return min(low, self.wilson[0]), max(high, self.wilson[1])
-
 
 def summarise_group(
     condition: Condition,
@@ -84,7 +68,7 @@ def summarise_group(
     trainings: TrainingEpisodes,
     reference: TrainingEpisodes | None = None,
 ) -> GroupResult:
-    """The result of one group under one condition; a fixed generator draws the resamples.
+    """The result of one group under one condition.
 
     Args:
         condition: Axis and value.
@@ -93,21 +77,19 @@ def summarise_group(
         reference: The same of the group to compare with.
     """
     success, distance = episode_values(trainings, "success"), episode_values(trainings, "distance_m")
-    differences: list[Estimate | None] = [None, None]
+    differences: list[Difference | None] = [None, None]
     if reference:
         differences = [
-            paired_difference(ours, episode_values(reference, name), np.random.default_rng(0))
-            for ours, name in ((success, "success"), (distance, "distance_m"))
+            crossed_difference(success, episode_values(reference, "success"), RATE),
+            crossed_difference(distance, episode_values(reference, "distance_m")),
         ]
     return GroupResult(
         condition=condition,
         group=group,
         trainings=tuple(trainings),
         episodes=success.size,
-        success=two_stage_estimate(success, np.random.default_rng(0)),
-        wilson=wilson_interval(int(success.sum()), success.size),
-        distance_m=two_stage_estimate(distance, np.random.default_rng(0)),
-        middle_m=two_stage_estimate(distance, np.random.default_rng(0), interquartile_mean),
+        success=rate_estimate(success),
+        distance_m=crossed_mean(distance),
         success_difference=differences[0],
         distance_difference_m=differences[1],
         events_per_step=float(episode_values(trainings, "events_per_step").mean()),
@@ -156,7 +138,7 @@ def success_table(
 def details_table(results: Sequence[GroupResult], reference: str) -> str:
     """Every result with all its estimates as a Markdown table."""
     own = ("Axis", "Value", "Group", "Trainings", "Episodes", "Success [%]", "Distance [m]")
-    compared = ("Middle half [m]", f"Success - {reference}", f"Distance - {reference} [m]")
+    compared = (f"Success - {reference}", f"Distance - {reference} [m]")
     head = (*own, *compared, "Events/step", "Dropped")
     lines = [
         (
@@ -166,7 +148,6 @@ def details_table(results: Sequence[GroupResult], reference: str) -> str:
             str(result.episodes),
             success_text(result),
             estimate_text(result.distance_m),
-            estimate_text(result.middle_m),
             estimate_text(result.success_difference, 100, "+.0f"),
             estimate_text(result.distance_difference_m, 1, "+.1f"),
             *events_texts(result.events_per_step, result.dropped),
@@ -178,7 +159,7 @@ def details_table(results: Sequence[GroupResult], reference: str) -> str:
 
 def success_text(result: GroupResult) -> str:
     """The success rate [%] with its interval."""
-    return percent_text(Estimate(result.success.value, result.success_interval))
+    return percent_text(result.success)
 
 
 def result_columns(results: Sequence[GroupResult]) -> dict[str, list[str | float]]:
@@ -198,11 +179,9 @@ def result_columns(results: Sequence[GroupResult]) -> dict[str, list[str | float
 
 def result_metrics(result: GroupResult) -> dict[str, float]:
     """Metrics under the names that trackers and tables share; what is not known is left out."""
-    success = Estimate(result.success.value, result.success_interval)
     metrics = {
-        **estimate_metrics("eval/success_rate", success),
+        **estimate_metrics("eval/success_rate", result.success),
         **estimate_metrics("eval/distance_m", result.distance_m),
-        **estimate_metrics("sweep/middle_half_m", result.middle_m),
         **estimate_metrics("sweep/success_difference", result.success_difference),
         **estimate_metrics("sweep/distance_difference_m", result.distance_difference_m),
     }

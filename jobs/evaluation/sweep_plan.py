@@ -2,12 +2,12 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pydantic
 
 from envs.config import EnvConfig, settings_hash
-from jobs.config.conditions import Condition, Setting, axis_points
+from jobs.config.conditions import Condition, Setting, axis_points, moving_settings
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import env_with
 from jobs.evaluation.met import met
@@ -15,6 +15,7 @@ from jobs.rollout.policies import Differences, EvaluatedPolicy, own_sensor_diffe
 from jobs.rollout.tasks import EvaluationTask, make_task
 
 NOMINAL = "nominal"  # the axis of the one condition that changes nothing
+Place = tuple[str, str]  # axis and value of a condition
 Axes = dict[str, dict[str, Condition]]  # axis -> value as text -> settings that it changes
 
 
@@ -28,6 +29,8 @@ class Sweep:
         axes: The first axis is `NOMINAL`.
         tasks: One for each policy and condition; two may share a key.
         met: Axis, value and group of those that lie within what a training of the group drew.
+        baselines: Condition -> what it is compared with, see `baselines_of`.
+        same_as: Condition -> the first one that is the same simulation.
     """
 
     policies: tuple[EvaluatedPolicy, ...]
@@ -35,6 +38,8 @@ class Sweep:
     axes: Axes
     tasks: tuple[EvaluationTask, ...]
     met: frozenset[tuple[str, str, str]] = frozenset()
+    baselines: Mapping[Place, Place] = field(default_factory=dict)
+    same_as: Mapping[Place, Place] = field(default_factory=dict)
 
     @property
     def identity(self) -> str:
@@ -86,7 +91,34 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
         if was_met(task.policy, nominal[task.policy.name], task.env)
     )
     own = {agent: found for agent, found in differences.items() if found}
-    return Sweep(tuple(policies), own, axes, tuple(tasks), within)
+    same = same_simulations(configured, axes)
+    return Sweep(tuple(policies), own, axes, tuple(tasks), within, baselines_of(configured, axes), same)
+
+
+def same_simulations(configured: EnvConfig, axes: Axes) -> dict[Place, Place]:
+    """Condition -> the first condition that is the same simulation, often itself."""
+    every = {(axis, value): changes for axis, points in axes.items() for value, changes in points.items()}
+    envs = {at: env_with(configured, changes) for at, changes in every.items()}
+    return {at: next(first for first, other in envs.items() if other == env) for at, env in envs.items()}
+
+
+def baselines_of(configured: EnvConfig, axes: Axes) -> dict[Place, Place]:
+    """Condition -> the condition that it is compared with, to see what the axis itself changes.
+
+    That is the one in which only those settings are changed that stay the same along the axis: the same
+    scene at the usual rate for rates in a dense scene. It is the nominal one where the sweep has none such.
+    """
+    every = {(axis, value): changes for axis, points in axes.items() for value, changes in points.items()}
+    envs = {at: env_with(configured, changes) for at, changes in every.items()}
+    nominal = next(iter(every))
+    found = {}
+    for axis, points in axes.items():
+        moving = moving_settings(points) if len(points) > 1 else list(next(iter(points.values())))
+        for value, changes in points.items():
+            kept = {key: setting for key, setting in changes.items() if key not in moving}
+            env = env_with(configured, kept)
+            found[axis, value] = next((at for at, other in envs.items() if other == env), nominal)
+    return found
 
 
 def was_met(policy: EvaluatedPolicy, nominal: EnvConfig, cell: EnvConfig) -> bool:

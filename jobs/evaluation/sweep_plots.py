@@ -156,7 +156,7 @@ def _range(counts: set[int]) -> str:
 
 
 def _success_percent(result: GroupResult) -> tuple[float, Interval]:
-    low, high = result.success_interval
+    low, high = result.success.interval or (0.0, 1.0)
     return 100 * result.success.value, (100 * low, 100 * high)
 
 

@@ -61,6 +61,14 @@ class Exactness(TypedDict):
     renders_per_step: float
 
 
+class Compared(TypedDict):
+    """What a condition is compared with, and the first condition that is the same simulation."""
+
+    condition: tuple[str, str]
+    baseline: tuple[str, str]
+    same_as: tuple[str, str]
+
+
 class SweepFacts(TypedDict):
     """What made a sweep, as its about.json says it."""
 
@@ -78,6 +86,7 @@ class SweepFacts(TypedDict):
     groups: dict[str, list[int | None]]
     axes: Axes
     exactness: list[Exactness]
+    compared: NotRequired[list[Compared]]  # older sweeps have none
     episodes_sha256: NotRequired[str]  # older sweeps have none
 
 
@@ -227,6 +236,10 @@ def about(config: Config, folder: Run, found: SweepResults) -> SweepFacts:
         "groups": sweep.groups,
         "axes": sweep.axes,
         "exactness": exactness(found),
+        "compared": [
+            Compared(condition=at, baseline=sweep.baselines[at], same_as=sweep.same_as[at])
+            for at in sweep.conditions
+        ],
     }
 
 

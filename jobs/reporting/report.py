@@ -7,6 +7,9 @@ that run folder holds.
 """
 
 import csv
+import gzip
+import io
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +17,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from jobs.analysis.statistics import two_stage_estimate
-from jobs.analysis.tables import estimate_text, markdown_table
+from jobs.analysis.tables import estimate_text, markdown_table, save_plot
+from jobs.bench.coverage import coverage_text
 from jobs.config.config import Config, ConfigError
 from jobs.evaluation.group_stats import (
     LABELS,
@@ -27,9 +30,11 @@ from jobs.evaluation.group_stats import (
 )
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
+from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, place
 from jobs.reporting.learning_curves import mean_success, read_curves
-from jobs.reporting.paper_claims import CLAIMS, GAIN, LEARNT, Claim, Finding, judge, judge_learning
+from jobs.reporting.paper_claims import GAIN, Claim, Finding, judge_all
 from jobs.reporting.replay_page import PAGE
+from jobs.reporting.summary_plots import change_map, claims_plot
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.checkpoints import sha256
@@ -39,8 +44,7 @@ from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
 from jobs.run.templates import render
 
-TEMPLATE = Path(__file__).parent / "templates" / "results.md.j2"
-MAX_COLOURS = 128  # of a copied plot
+TEMPLATES = Path(__file__).parent / "templates"
 UNITS = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
 TITLES = {
     "control_hz": "Control rate",
@@ -56,9 +60,6 @@ TITLES = {
     "worst": "Several at once",
     "contacts": "Where episodes end in contact",
 }
-SweptEpisodes = dict[
-    tuple[Condition, str], dict[int | None, np.ndarray]
-]  # of each group under each condition
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -109,7 +110,7 @@ def write_trade(trade: Path, docs: Path) -> Path:
         The file.
     """
     (docs / "images").mkdir(parents=True, exist_ok=True)
-    copy_small(trade / "images" / "trade.png", docs / "images" / "trade.png")
+    copy_plot(trade / "images" / "trade.png", docs / "images" / "trade.png")
     write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
     return docs / "trade.md"
 
@@ -136,45 +137,136 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
         RunError: If a file of the sweep is damaged.
     """
     about: SweepFacts = read_json(sweep / "about.json")
-    if "evaluated_at" not in about:
+    if "compared" not in about:
         raise ConfigError(f"resume: {sweep} is a sweep of an earlier version; give its command again")
     plots = [name for name in (*about["axes"], "contacts") if (sweep / f"{name}.png").is_file()]
     (docs / "images").mkdir(parents=True, exist_ok=True)
     for name in plots:
-        copy_small(sweep / f"{name}.png", docs / "images" / f"results_{name}.png")
+        copy_plot(sweep / f"{name}.png", docs / "images" / f"results_{name}.png")
     if about.get("episodes_sha256") not in (None, sha256(sweep / "episodes.csv")):
         raise RunError(f"{sweep / 'episodes.csv'}: damaged; give the command of the sweep again")
     episodes = read_sweep_episodes(sweep / "episodes.csv")
-    success, every = estimate_tables(about, episodes)
-    text = render(
-        TEMPLATE,
-        about=about,
-        commits=", ".join(commit[:7] for commit in about["evaluated_at"]),
-        groups=", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
-        breaks=breaks_table(about, episodes),
-        claims=claims_table(episodes, learning_success(pretrained)),
-        gain=GAIN,
-        compared_steps=COMPARED_STEPS,
-        plots=[(name, TITLES.get(name, name)) for name in plots],
-        trade=(docs / "images" / "trade.png").is_file(),
-        success=success,
-        details=every,
-        exactness=exactness_table(about.get("exactness", [])),
+    changes = changes_of(about, episodes)
+    baselines = {place(one["condition"]): place(one["baseline"]) for one in about["compared"]}
+    findings = judge_all(
+        lambda condition, group: episodes.get((condition, group), {}), baselines, learning_success(pretrained)
     )
-    write_atomic(docs / "results.md", text)
+    labels = {at: condition_text(*at) for at in baselines}
+    save_plot(docs / "images" / "results_map.png", change_map(changes, list(about["groups"]), labels))
+    save_plot(docs / "images" / "results_claims.png", claims_plot(findings))
+    write_data(docs / "data", sweep, episodes)
+    success, every = estimate_tables(about, episodes)
+    most = max(map(len, about["groups"].values()))
+    values = {
+        "about": about,
+        "commits": ", ".join(commit[:7] for commit in about["evaluated_at"]),
+        "groups": ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
+        "short": in_short(about, episodes, changes, findings),
+        "breaks": breaks_table(about, changes),
+        "tests": len(changes),
+        "claims": claims_table(findings),
+        "family": sum(one.adjusted_p is not None for one in findings.values()),
+        "gain": GAIN,
+        "compared_steps": COMPARED_STEPS,
+        "most": most,
+        "coverage": coverage_text(most, about["trials"]),
+        "shared": shared_encoders(about, pretrained),
+        "plots": [(name, TITLES.get(name, name)) for name in plots],
+        "trade": (docs / "trade.md").is_file(),
+        "success": success,
+        "details": every,
+        "exactness": exactness_table(about.get("exactness", [])),
+    }
+    for name in ("results", "results_tables"):
+        write_atomic(docs / f"{name}.md", render(TEMPLATES / f"{name}.md.j2", **values))
     return docs / "results.md"
 
 
-def copy_small(picture: Path, target: Path) -> None:
-    """Copy a plot in `MAX_COLOURS` colours, at a third of the size: enough for lines and print."""
+def condition_text(axis: str, value: str) -> str:
+    """A condition in words."""
+    return f"{TITLES.get(axis, axis)}: {value}"
+
+
+def write_data(folder: Path, sweep: Path, episodes: SweptEpisodes) -> None:
+    """Write every episode, packed, and a table of each training under each condition."""
+    folder.mkdir(parents=True, exist_ok=True)
+    packed = gzip.compress((sweep / "episodes.csv").read_bytes(), mtime=0)
+    write_atomic(folder / "robustness_episodes.csv.gz", packed)
+    rows = [
+        (axis, value, group, "" if seed is None else seed, len(own),
+         f"{own['success'].mean():.4f}", f"{own['distance_m'].mean():.2f}")
+        for ((axis, value), group), trainings in episodes.items()
+        for seed, own in trainings.items()
+    ]  # fmt: skip
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([(*LABELS, "episodes", "success_rate", "distance_m"), *rows])
+    write_atomic(folder / "robustness_trainings.csv", text.getvalue())
+
+
+def in_short(
+    about: SweepFacts,
+    episodes: SweptEpisodes,
+    changes: Sequence[Change],
+    findings: Mapping[Claim, Finding],
+) -> list[str]:
+    """What a reader wants to know first: which policy to take, what breaks most, what the paper had right."""
+    (nominal,) = [(NOMINAL, value) for value in about["axes"][NOMINAL]]
+    trained = [group for group in about["groups"] if any(change.group == group for change in changes)]
+    mean = {
+        group: np.mean([change.success.mean() for change in changes if change.group == group])
+        for group in trained
+    }
+    least = {
+        group: min(
+            (change for change in changes if change.group == group), key=lambda one: one.success.mean()
+        )
+        for group in trained
+    }
+    sentences = []
+    if trained:
+        best = max(mean, key=lambda group: mean[group])
+        at, worst_of_best = condition_text(*least[best].condition), 100 * least[best].success.mean()
+        unchanged = 100 * episode_values(episodes[nominal, best], "success").mean()
+        sentences.append(
+            f"Take `{best}`: {unchanged:.0f} % with nothing changed, {100 * mean[best]:.0f} % as the mean "
+            f'of all conditions, least in "{at}" with {worst_of_best:.0f} %.'
+        )
+    losses = [change for change in changes if change.certain and change.difference.value < 0]
+    breakers = Counter(change.condition for change in losses)
+    worst = [
+        f'"{condition_text(*at)}" ({count} of {len(trained)} groups)' for at, count in breakers.most_common(3)
+    ]
+    sentences.append(f"What breaks most groups for certain: {', '.join(worst) or 'nothing'}.")
+    verdicts = Counter(one.verdict for one in findings.values())
+    counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+    return [*sentences, f"Of the paper's {len(findings)} claims: {counted}."]
+
+
+def shared_encoders(about: SweepFacts, pretrained: Path) -> str:
+    """Names of the published trainings that share an encoder; "" if none do."""
+    names: dict[str, list[str]] = {}
+    for group, seeds in about["groups"].items():
+        for seed in seeds:
+            file = pretrained / f"{group}-s{seed}" / "encoder.safetensors"
+            if file.is_file():
+                names.setdefault(sha256(file), []).append(f"{group} s{seed}")
+    return "; ".join(" and ".join(same) for same in names.values() if len(same) > 1)
+
+
+def copy_plot(picture: Path, target: Path) -> None:
+    """Copy a plot, packed as small as it can be without changing a colour.
+
+    Raises:
+        RunError: The plot is damaged.
+    """
     try:
         with Image.open(picture) as whole:
-            colours = Image.Quantize.MAXCOVERAGE
-            small = whole.convert("RGB").quantize(MAX_COLOURS, colours, dither=Image.Dither.NONE)
+            colours = whole.convert("RGB")
     except (OSError, SyntaxError, ValueError) as error:
         raise RunError(f"{picture}: damaged ({error}); give the command that drew it again") from None
     with replaced(target) as part:
-        small.save(part, "png", optimize=True)
+        colours.save(part, "png", optimize=True)
 
 
 def read_sweep_episodes(file: Path) -> SweptEpisodes:
@@ -193,25 +285,24 @@ def _episode(row: Mapping[str, str]) -> tuple[object, ...]:
     return tuple(kinds[EPISODE[name].kind](row[name]) for name in EPISODE.names or ())
 
 
-def breaks_table(about: SweepFacts, episodes: SweptEpisodes) -> str:
-    """The conditions that take success from each trained group, against itself with nothing changed."""
-    (nominal,) = [(NOMINAL, value) for value in about["axes"][NOMINAL]]
+def breaks_table(about: SweepFacts, changes: Sequence[Change]) -> str:
+    """The conditions that certainly take success from each trained group."""
+    (nominal,) = about["axes"][NOMINAL]
     lines = []
-    for group in about["groups"]:
-        own = episodes.get((nominal, group), {None: np.empty(0, EPISODE)})
-        if None in own:  # a baseline, or not evaluated
-            continue
-        before = episode_values(own, "success")
-        lost = {}
-        for (condition, other), trainings in episodes.items():
-            if other == group and condition != nominal and trainings.keys() == own.keys():
-                change = episode_values(trainings, "success") - before
-                found = two_stage_estimate(change, np.random.default_rng(0))
-                if found.interval is not None and found.interval[1] < 0:
-                    lost[condition] = found
-        worst = sorted(lost, key=lambda condition: lost[condition].value)
-        texts = [f"{axis} {value}: {estimate_text(lost[axis, value], 100, '+.0f')}" for axis, value in worst]
-        lines.append((f"`{group}`", f"{100 * before.mean():.0f}", "; ".join(texts) or "none is certain"))
+    for group, seeds in about["groups"].items():
+        own = [change for change in changes if change.group == group]
+        lost = sorted(
+            (change for change in own if change.certain and change.difference.value < 0),
+            key=lambda change: change.difference.value,
+        )
+        texts = [
+            f"{' '.join(change.condition)}: {estimate_text(change.difference, 100, '+.0f')}"
+            for change in lost
+        ]
+        if own:
+            before = next((one.before for one in own if one.baseline == (NOMINAL, nominal)), own[0].before)
+            name = f"`{group}`" + (" (1 training)" if len(seeds) == 1 else "")
+            lines.append((name, f"{100 * before.mean():.0f}", "; ".join(texts) or "none is certain"))
     head = ("Group", "Nothing changed [%]", "Breaks under")
     return markdown_table(head, lines, len(head))
 
@@ -225,31 +316,25 @@ def learning_success(pretrained: Path) -> dict[str, list[float]]:
     return found
 
 
-def claims_table(episodes: SweptEpisodes, trainings: Mapping[str, Sequence[float]]) -> str:
+def claims_table(findings: Mapping[Claim, Finding]) -> str:
     """The paper's claims with our findings."""
-    lines = [
-        _claim_line(claim, judge(claim, lambda condition, group: episodes.get((condition, group), {})))
-        for claim in CLAIMS
-    ]
-    lines += [_claim_line(claim, judge_learning(claim, trainings)) for claim in LEARNT]
-    head = ("The paper says of", "Source", "Against", "Finding", "Difference, all conditions", "By condition")
-    return markdown_table(head, lines, len(head))
+    lines = [_claim_line(claim, one) for claim, one in findings.items()]
+    head = ("The paper says of", "Source", "Against", "Finding", "Difference", "p (Holm)", "Trainings needed")
+    return markdown_table(head, lines, 4)
 
 
 def _claim_line(claim: Claim, finding: Finding) -> tuple[str, ...]:
     scale, form, unit = UNITS[claim.measure]
     overall = f"{estimate_text(finding.overall, scale, form)}{unit}"
-    each = [
-        f"{axis} {value}: {estimate_text(found, scale, form)}"
-        for (axis, value), found in finding.conditions.items()
-    ]
+    undecided = finding.verdict == "undecided" and finding.needed is not None
     return (
         f"`{claim.ours}`: {claim.text}",
         claim.source,
         f"`{claim.theirs}`",
         finding.verdict,
         overall if finding.overall else "one of them is missing",
-        "; ".join(each),
+        "-" if finding.adjusted_p is None else f"{finding.adjusted_p:.2g}",
+        str(finding.needed) if undecided else "-",
     )
 
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from models.policy.policy import MANIFEST, PolicyFileError, read_policy_manifest
 
 PRETRAINED = REPOSITORY / "models" / "pretrained"
 SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
+FILTER = ("filter_support", "filter_tau_us")
 Differences = dict[str, tuple[object, object]]  # sensor setting -> (the policy's value, the environment's)
 
 
@@ -178,6 +179,12 @@ def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
         pydantic.ValidationError: If a setting is unknown or its value is out of range.
     """
     return env_with(env, {SENSOR_KEYS.get(name, name): value for name, value in sensor.items()})
+
+
+def with_own_filter(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
+    """The simulation with the neighbour filter of a policy, to which it belongs as its networks do."""
+    own = {name: policy.sensor[name] for name in FILTER if name in policy.sensor}
+    return replace(env, **own)
 
 
 def own_sensor_differences(policy: EvaluatedPolicy, env: EnvConfig) -> Differences:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from envs.config import settings_hash
+from envs.config import LATER_SETTINGS, CameraConfig, settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.run.files import RunError, read_json, write_atomic, write_json
 from jobs.run.progress import console
@@ -23,7 +23,7 @@ from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
 # done with its policy afterwards.
 NOT_IN_RUN_NAME = (
     "job", "resume", "runs_dir", "cluster", "tracking",
-    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe",
+    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "ablation",
     "demo", "replay_page",
 )  # fmt: skip
 # Settings that older run folders lack, each with the value that does what was done before it existed.
@@ -31,6 +31,8 @@ ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "model": ADDED_MODEL_SETTINGS,
     "algo": {"imitation": None, "critic": "observation", "shaping": 0.0},
     "env": {"filter_support": 0, "filter_tau_us": 5_000},
+    "camera": {name: getattr(CameraConfig, name) for name in LATER_SETTINGS},
+    "faults": {"displaced": 0.0, "flipped": 0.0, "leak_jitter": 0.0, "noise_spread": 0.0},
     "collect": {"recordings": [], "conditions": [{}]},
     "pretrain": {"denoise": False},
     "train": {"conditions": [{}], "init": None, "value_warmup": 20_000},

@@ -34,12 +34,14 @@ METRICS = {  # metric: what it is, how it is written
 }
 FIRST = ("eval/", "sweep/control_hz.", "sweep/contrast_threshold.", "sweep/sparsity.",
          "sweep/background_activity.", "sweep/", "train/")  # fmt: skip
+# A run that stopped with an error or was interrupted is no result; one that is under way may be looked at.
+NOT_ENDED_EARLY = "attributes.status != 'FAILED' and attributes.status != 'KILLED'"
 COLUMNS = {  # view: name, filter, columns; the first column orders the runs
-    "results": ("Results", "tags.kind = 'run'", (
+    "results": ("Results", f"tags.kind = 'run' and {NOT_ENDED_EARLY}", (
         "metrics.`eval/success_rate`", "metrics.`eval/distance_m`", "metrics.`train/success_rate`",
         "metrics.`sim/event_error`", "params.`exp`", "params.`seed`", "params.`train.env_steps`",
     )),
-    "sweeps": ("Sweeps", "tags.kind = 'sweep'", (
+    "sweeps": ("Sweeps", f"tags.kind = 'sweep' and {NOT_ENDED_EARLY}", (
         "metrics.`sweep/conditions`", "metrics.`sweep/groups`", "metrics.`sweep/episodes`", "tags.`groups`",
     )),
 }  # fmt: skip
@@ -49,11 +51,12 @@ READING = """
 |---|---|
 {kinds}
 
-A row of **Results** is a run folder: its page begins with its metrics and holds the resolved settings
-(Parameters), commit and host (Tags), and tables and films (Artifacts). Of a **sweep**, the page shows the
-plots with 95 % intervals; below it lie a run for each condition and group, named `axis=value group`, and a
-run for each group, whose metrics `sweep/AXIS_success` are curves with the axis as their step. **Model
-registry**, on the left, has the trained policies: a model for each group, a version for each training.
+A row of **Results** is a run folder, without those that failed or were interrupted: its page begins with
+its metrics and holds the resolved settings (Parameters), commit and host (Tags), and tables and films
+(Artifacts). Of a **sweep**, the page shows the plots with 95 % intervals; below it lie a run for each
+condition and group, named `axis=value group`, and a run for each group, whose metrics `sweep/AXIS_success`
+are curves with the axis as their step. **Model registry**, on the left, has the trained policies: a model
+for each group, a version for each training.
 
 Success is the fraction of episodes that reach the goal at 100 m, distance the way without a
 collision. `sim/event_error` is how far the simulated events are from exact ones, `fidelity.tolerance`
@@ -108,7 +111,7 @@ def usual_views() -> Iterator[tuple[str, str, dict[str, object]]]:
     """Key, name and state of the views that every store has."""
     for key, (name, search, columns) in COLUMNS.items():
         yield key, name, table_view(search, columns)
-    yield "charts-learning", "Learning curves", chart_view("tags.kind = 'run'", CURVES)
+    yield "charts-learning", "Learning curves", chart_view(f"tags.kind = 'run' and {NOT_ENDED_EARLY}", CURVES)
 
 
 def packed_view(name: str, state: Mapping[str, object], now_ms: int) -> str:

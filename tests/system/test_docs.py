@@ -1,23 +1,48 @@
-"""Commands and names on the pages are those of the code."""
+"""Commands, names, links and code on the pages are those of the code."""
 
 import importlib
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
+import imageio_ffmpeg
+import nbformat
+import numpy as np
+import pydantic
 import pytest
 
-from jobs.config.config import parse
+from docs.keys import HEAD, kinds, row, tables
+from docs.run_notebooks import execute
+from envs.events import EVENT
+from envs.recordings import write_events
+from jobs.config.config import known_keys, parse
+from jobs.rollout.policies import PRETRAINED
 from tests.support.configs import compose
+from tests.support.filled_store import fill
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 # `+exp=NAME` and words behind it, up to what ends a command on a page.
 WORD = r"(?:'[^']*'|\"[^\"]*\"|[^\s`#|;)'\"])+"
 LAUNCHED = re.compile(rf"(?<!\w)(\+exp=[a-z_]+(?:[ \t]+(?=[\w.~'\"]+[=.]){WORD})*)")
 MADE = {"bytestream": "+exp=bytestream", "sweep-robustness": "+exp=robustness", "demo": "+exp=demo"}
 ARGS = re.compile(r"make (bytestream|sweep-robustness|demo)(?: train=true)? ARGS=\"([^\"]*)\"")
 NAMES = re.compile(r"`((?:envs|models|jobs)(?:\.\w+)+)`")
+LINKS = re.compile(r"\]\((?!https?:)([^)\s#]*)(?:#([^)\s]+))?\)")
+FILES = re.compile(r"`((?:tests|envs|models|jobs|conf|docker|platform)/[\w/.]+\.(?:py|yaml|json|csv))`")
+BLOCKS = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+# What a page takes for granted: its blocks run one after the other, in a folder as `folder` makes it.
+GRANTED = {
+    "dashboard.md": "import numpy, pandas\n"
+    "events = pandas.DataFrame(numpy.array([[100, 1, 2, 1], [9000, 3, 4, -1]]), columns=list('txyp'))",
+    "recordings.md": "from envs.recordings import read_events\n"
+    "events, width, height = read_events('street.raw').events, 1280, 720",
+}
+LIMITS = (("at least", True, -1), ("above", False, -1), ("at most", True, 1), ("below", False, 1))
+NUMBER = r"([-\d.,e]*\d)"
 
 
 def commands() -> list[str]:
@@ -47,6 +72,12 @@ def exists(name: str) -> bool:
     return False
 
 
+def anchors(page: Path) -> set[str]:
+    """The names of a page's headings, as GitHub and MyST make them."""
+    headings = re.findall(r"^#{1,4} (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("command", commands())
 def test_a_command_on_a_page_makes_a_checked_configuration(command):
     words = [word for word in shlex.split(command) if not word.startswith(("runs_dir=", "resume="))]
@@ -61,3 +92,131 @@ def test_names_on_the_pages_are_in_the_code():
     names = {name for page in PAGES for name in NAMES.findall(page.read_text())}
     assert len(names) > 20
     assert sorted(name for name in names if not exists(name)) == []
+
+
+def test_every_link_leads_to_a_file_and_a_heading_that_are_there():
+    generated = set(kinds())  # sections of docs/keys.md, which the schema gives
+    broken, count = [], 0
+    for page in [*PAGES, ROOT / "SECURITY.md", ROOT / "CHANGELOG.md"]:
+        for target, anchor in LINKS.findall(page.read_text()):
+            file, count = (page.parent / target if target else page), count + 1
+            known = (
+                not anchor or anchor in (anchors(file) if file.suffix == ".md" else ()) or anchor in generated
+            )
+            if not (file.exists() and known):
+                broken.append((page.name, target, anchor))
+    assert broken == []
+    assert count > 150
+
+
+def test_the_files_that_pages_name_are_there():
+    named = {path for page in PAGES for path in FILES.findall(page.read_text()) if "NAME" not in path}
+    assert len(named) > 60
+    assert sorted(path for path in named if not (ROOT / path).exists()) == []
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 100
+
+
+def test_every_key_has_a_row_that_says_what_it_is():
+    said = {key: row(key, *about) for keys in kinds().values() for key, about in keys.items()}
+    groups = {name for key in said for name in [key.partition(".")[0]] if "." in key}
+    models = {key for key in known_keys() if key.startswith("model.")}
+    assert set(known_keys()) - groups - models == set(said) - {
+        key for key in said if key.startswith("model.")
+    }
+    assert [key for key, cells in said.items() if not (cells.meaning and cells.allowed)] == []
+    assert {len(line.split(" | ")) for line in tables().splitlines() if line.startswith("| `")} == {len(HEAD)}
+
+
+def test_the_bounds_of_a_key_are_those_that_the_schema_enforces():
+    def taken(kind: object, value: float) -> bool:
+        try:
+            pydantic.TypeAdapter(kind).validate_python(value)
+        except pydantic.ValidationError:
+            return False
+        return True
+
+    count = 0
+    for keys in kinds().values():
+        for key, (kind, _) in keys.items():
+            cells, whole = row(key, kind), "whole number" in row(key, kind).allowed
+            if cells.allowed.startswith("list"):
+                continue
+            for word, inside, way in (
+                ("at least", True, -1),
+                ("above", False, -1),
+                ("at most", True, 1),
+                ("below", False, 1),
+            ):
+                for text in re.findall(f"{word} {NUMBER}", cells.allowed):
+                    bound = int(text.replace(",", "")) if whole else float(text.replace(",", ""))
+                    beyond = bound + way if whole else bound + way * max(abs(bound), 1e-9) * 1e-3
+                    assert (taken(kind, bound), taken(kind, beyond)) == (inside, False), (key, text)
+                    count += 1
+    assert count > 60
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the files that the pages name: a run, recordings, a video, results."""
+    place = tmp_path_factory.mktemp("pages")
+    fill(place)
+    (place / "runs" / "NAME").mkdir()
+    (place / "runs" / "NAME" / "policy").symlink_to(PRETRAINED / "bytestream_hold-s0")
+    rng, count = np.random.default_rng(0), 60_000
+    events = np.zeros(count, EVENT)
+    events["t"], events["p"] = np.sort(rng.integers(0, 50_000, count)), 1
+    events["x"], events["y"] = rng.integers(0, 240, count), rng.integers(0, 180, count)
+    rows = [f"{one['t'] * 1e-6:.6f} {one['x']} {one['y']} {one['p']}" for one in events[:1000]]
+    (place / "events.txt").write_text("\n".join(rows) + "\n")
+    events["x"] += 520  # in the middle of a larger sensor
+    events["y"] += 270
+    write_events(place / "street.raw", events, 1280, 720)
+    film = imageio_ffmpeg.write_frames(str(place / "ride.mp4"), (64, 64), fps=25)
+    film.send(None)
+    for _ in range(8):
+        film.send(rng.integers(0, 255, (64, 64, 3), np.uint8).tobytes())
+    film.close()
+    return place
+
+
+@pytest.mark.system
+@pytest.mark.xdist_group("pages")
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if BLOCKS.search(page.read_text())], ids=lambda page: page.name
+)
+def test_the_python_on_a_page_runs(page, folder):
+    code = "\n".join([GRANTED.get(page.name, ""), *BLOCKS.findall(page.read_text())])
+    ran = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_and_draws_what_it_shows(path):
+    def drawn(book: nbformat.NotebookNode) -> list[int]:
+        outputs = [cell.outputs for cell in book.cells if cell.cell_type == "code"]
+        return [sum("image/png" in one.get("data", {}) for one in own) for own in outputs]
+
+    assert drawn(execute(path)) == drawn(nbformat.read(path, nbformat.NO_CONVERT))
+
+
+@pytest.mark.system
+def test_the_site_builds_without_a_warning(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-b",
+        "html",
+        "docs",
+        str(tmp_path / "html"),
+    ]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert (built.returncode, built.stderr) == (0, "")
+    assert (tmp_path / "html" / "replay.html").read_bytes() == (ROOT / "docs" / "replay.html").read_bytes()

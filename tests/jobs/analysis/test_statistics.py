@@ -1,17 +1,20 @@
 import numpy as np
 import pytest
-from scipy.stats import ttest_ind
+from scipy.stats import ttest_1samp, ttest_ind
 
 from jobs.analysis.statistics import (
     bootstrap_interval,
+    crossed_difference,
+    crossed_mean,
+    exact_pair_p,
     half_width,
-    interquartile_mean,
-    mean_difference,
-    paired_difference,
+    holm,
     paired_rate_difference,
-    two_stage_estimate,
+    rate_estimate,
+    trainings_needed,
     wilson_interval,
 )
+from jobs.bench.coverage import coverage
 
 
 @pytest.mark.parametrize(
@@ -65,102 +68,153 @@ def studies(number, trainings, corridors, rng, spread=(1.0, 1.0, 1.0)):
         yield of_training + of_corridor + noise
 
 
-@pytest.mark.parametrize(("trainings", "least"), [(1, 0.88), (3, 0.75), (8, 0.88)])
-def test_two_stage_intervals_hold_the_true_mean_about_as_often_as_they_say(trainings, least):
+@pytest.mark.parametrize(
+    ("trainings", "spread", "corridors"),
+    [(1, 0.0, 1.0), (3, 0.5, 1.0), (8, 0.5, 1.0), (3, 3.0, 1.0), (3, 0.0, 3.0), (8, 0.5, 3.0), (3, 0.0, 0.0)],
+)
+def test_crossed_means_hold_the_truth_about_as_often_as_they_say(trainings, spread, corridors):
     rng = np.random.default_rng(2)
-    spread = (0.0 if trainings == 1 else 0.5, 1.0, 1.0)  # one training says nothing of others
-    hits = 0
-    for values in studies(120, trainings, 20, rng, spread):
-        low, high = two_stage_estimate(values, rng).interval
-        hits += low <= 0.0 <= high
-    assert least <= hits / 120 <= 1.0
+    found = [crossed_mean(values) for values in studies(300, trainings, 20, rng, (spread, corridors, 1.0))]
+    held = np.mean([low <= 0.0 <= high for _, (low, high), _ in found])
+    assert 0.92 <= held <= 1.0
+    assert all((p < 0.05) == (not low <= 0.0 <= high) for _, (low, high), p in found)
 
 
-def test_trainings_that_differ_widen_the_interval_as_their_own_scatter_says():
+@pytest.mark.parametrize("spread", [0.0, 0.5, 3.0])
+def test_crossed_differences_hold_the_truth_whatever_trainings_and_corridors_add(spread):
+    rng, held = np.random.default_rng(7), []
+    pairs = zip(*(studies(300, trainings, 20, rng, (spread, 0.0, 1.0)) for trainings in (4, 3)), strict=True)
+    for ours, theirs in pairs:
+        shared = rng.normal(0.0, 5.0, size=(1, 20))
+        low, high = crossed_difference(ours + shared + 1.0, theirs + shared).interval
+        held.append(low <= 1.0 <= high)
+    assert 0.92 <= np.mean(held) <= 1.0
+
+
+def test_without_corridors_a_crossed_mean_is_students_and_a_difference_is_welchs():
     rng = np.random.default_rng(3)
-    values = np.repeat(rng.normal(size=(6, 1)), 20, axis=1)
-    low, high = two_stage_estimate(values, rng).interval
-    expected = 2 * 1.96 * values[:, 0].std(ddof=1) / np.sqrt(6)
-    assert high - low == pytest.approx(expected, rel=0.2)
+    ours, theirs = rng.normal(size=(6, 1)), rng.normal(2.0, 3.0, size=(4, 1))
+    mean, difference = crossed_mean(ours), crossed_difference(ours, theirs)
+    student, welch = ttest_1samp(ours[:, 0], 0.0), ttest_ind(ours[:, 0], theirs[:, 0], equal_var=False)
+    for found, known in ((mean, student), (difference, welch)):
+        assert found.p == pytest.approx(known.pvalue)
+        assert found.interval == pytest.approx(known.confidence_interval(0.95))
 
 
-def test_one_training_is_resampled_over_its_corridors_as_a_plain_bootstrap_does():
+def test_where_corridors_add_nothing_an_interval_is_hardly_wider_than_students_of_the_training_means():
     rng = np.random.default_rng(4)
-    values = rng.normal(size=60)
-    one = two_stage_estimate(values[None], rng)
-    assert one.value == pytest.approx(values.mean())
-    assert one.interval == pytest.approx(bootstrap_interval(values, rng), abs=0.04)
+    both = [
+        (crossed_mean(values).interval, ttest_1samp(values.mean(axis=1), 0.0).confidence_interval(0.95))
+        for values in studies(200, 5, 20, rng, (0.0, 0.0, 1.0))
+    ]
+    crossed, student = (np.mean([high - low for low, high in side]) for side in zip(*both, strict=True))
+    assert 0.8 * student <= crossed <= 1.15 * student
 
 
-def test_a_single_flight_has_no_interval():
+def test_a_rate_near_all_may_be_farther_from_it_than_the_scatter_of_its_trainings_says():
+    won = np.ones((3, 100))
+    won[0, :3] = 0.0
+    low, student = rate_estimate(won).interval[0], crossed_mean(won)
+    assert low < min(student.interval[0], wilson_interval(297, 300)[0])
+
+
+def test_a_single_episode_has_no_interval():
     one = np.array([[3.0]])
-    assert two_stage_estimate(one, np.random.default_rng(0)) == (3.0, None)
-    assert paired_difference(one, one - 1.0, np.random.default_rng(0)) == (1.0, None)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 7, 8, 20, 101])
-def test_the_interquartile_mean_is_the_mean_of_the_sorted_middle_half(size):
-    values = np.random.default_rng(size).normal(size=(3, size))
-    for row, found in zip(values, interquartile_mean(values), strict=True):
-        cut = size // 4
-        middle = sorted(row.tolist())[cut : size - cut]
-        assert found == pytest.approx(sum(middle) / len(middle))
-
-
-def test_the_interquartile_mean_does_not_heed_a_few_flights_far_off():
-    values = np.full((2, 20), 50.0)
-    values[:, :2] = 0.0
-    assert two_stage_estimate(values, np.random.default_rng(0), interquartile_mean).value == 50.0
+    assert crossed_mean(one) == (3.0, None, None)
+    assert crossed_difference(one, one - 1.0) == (1.0, None, None)
+    assert rate_estimate(np.array([[1.0]])).interval == wilson_interval(1, 1)
 
 
 def test_a_difference_that_is_the_same_in_every_corridor_is_exact_however_corridors_differ():
     corridors = np.random.default_rng(5).normal(50.0, 30.0, size=(1, 20))
     ours, theirs = np.repeat(corridors + 7.0, 3, axis=0), np.repeat(corridors, 2, axis=0)
-    found = paired_difference(ours, theirs, np.random.default_rng(0))
+    found = crossed_difference(ours, theirs)
     assert found.value == pytest.approx(7.0)
     assert found.interval == pytest.approx((7.0, 7.0))
-    back = paired_difference(theirs, ours, np.random.default_rng(0))
-    assert back.interval == pytest.approx((-7.0, -7.0))
+    assert found.p == pytest.approx(0.0)
+    assert crossed_difference(theirs, ours).interval == pytest.approx((-7.0, -7.0))
 
 
-def test_a_paired_difference_is_narrower_than_one_of_other_corridors():
+def test_a_difference_in_the_same_corridors_is_narrower_than_in_others():
     rng = np.random.default_rng(6)
     corridors = rng.normal(0.0, 10.0, size=(1, 20))
     ours, theirs = (corridors + rng.normal(size=(3, 20)) for _ in range(2))
-    paired, apart = (
-        np.ptp(paired_difference(ours, other, rng).interval)
-        for other in (theirs, rng.permuted(theirs, axis=1))
+    same, others = (
+        np.ptp(crossed_difference(ours, other).interval) for other in (theirs, rng.permuted(theirs, axis=1))
     )
-    assert paired < 0.5 * apart
+    assert same < 0.5 * others
 
 
-def test_paired_intervals_hold_the_true_difference_about_as_often_as_they_say():
-    rng, hits = np.random.default_rng(7), 0
-    for ours, theirs in zip(*(studies(100, 8, 20, rng, (0.5, 0.0, 1.0)) for _ in range(2)), strict=True):
-        shared = rng.normal(0.0, 5.0, size=(1, 20))
-        low, high = paired_difference(ours + shared + 1.0, theirs + shared, rng).interval
-        hits += low <= 1.0 <= high
-    assert hits >= 88
+def test_rates_that_agree_leave_a_doubt_that_shrinks_with_the_episodes():
+    widths = []
+    for corridors in (5, 20, 80):
+        ones = np.ones((3, corridors))
+        found = crossed_difference(ones, ones, (0.0, 1.0))
+        assert found.value == 0.0
+        assert found.p == 1.0
+        widths.append(np.ptp(found.interval))
+        low, high = rate_estimate(ones).interval
+        assert low < 1.0 == high
+        assert low <= wilson_interval(3 * corridors, 3 * corridors)[0]
+    assert widths[0] > 2 * widths[1] > 4 * widths[2] > 0
 
 
-def test_the_same_generator_gives_the_same_interval():
-    values = np.random.default_rng(8).normal(size=(3, 20))
-    first, again = (two_stage_estimate(values, np.random.default_rng(0)) for _ in range(2))
-    assert first == again
+@pytest.mark.parametrize("rate", [0.0, 0.3, 1.0])
+def test_intervals_of_rates_stay_between_none_and_all_and_mirror(rate):
+    rng = np.random.default_rng(8)
+    won = (rng.random((4, 15)) < rate).astype(float)
+    (low, high), (low_lost, high_lost) = rate_estimate(won).interval, rate_estimate(1.0 - won).interval
+    assert 0.0 <= low <= won.mean() <= high <= 1.0
+    assert (low, high) == pytest.approx((1.0 - high_lost, 1.0 - low_lost))
+
+
+@pytest.mark.parametrize(("spread", "least"), [(0.0, 0.95), (1.0, 0.92), (2.0, 0.85)])
+def test_intervals_of_rates_hold_the_true_one_also_where_trainings_disagree(spread, least):
+    share, *_ = coverage(3, 14, 1.5, spread)
+    assert least <= share <= 1.0
 
 
 @pytest.mark.parametrize(
     "values", [np.zeros((0, 3)), np.zeros(3), np.array([[np.nan]]), np.array([[np.inf]])]
 )
-def test_flights_that_are_no_table_of_numbers_are_refused(values):
-    for refuse in (two_stage_estimate, lambda bad, rng: paired_difference(bad, np.zeros((1, 3)), rng)):
+def test_episodes_that_are_no_table_of_numbers_are_refused(values):
+    for refuse in (rate_estimate, crossed_mean, lambda bad: crossed_difference(bad, np.zeros((1, 3)))):
         with pytest.raises(ValueError, match=r"must be finite numbers of shape \(trainings, corridors\)"):
-            refuse(values, np.random.default_rng(0))
+            refuse(values)
 
 
-def test_flights_of_other_corridors_are_not_compared():
+def test_episodes_of_other_corridors_are_not_compared():
     with pytest.raises(ValueError, match="the same corridors, got 3 and 4"):
-        paired_difference(np.zeros((1, 3)), np.zeros((1, 4)), np.random.default_rng(0))
+        crossed_difference(np.zeros((1, 3)), np.zeros((1, 4)))
+
+
+def test_pairs_are_tested_exactly():
+    ours, theirs = paired_flights(5, 4, 0, 5)
+    assert exact_pair_p(ours, theirs) == pytest.approx(2 * 0.5**4)
+    assert exact_pair_p(theirs, ours) == pytest.approx(2 * 0.5**4)
+    assert exact_pair_p(ours, ours) == 1.0
+
+
+def test_holms_adjustment_has_its_known_values_and_keeps_the_order():
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+    rng, wrong = np.random.default_rng(9), 0
+    for _ in range(2000):
+        wrong += min(holm(rng.random(10))) < 0.05
+    assert 0.03 <= wrong / 2000 <= 0.065
+
+
+def test_as_many_trainings_as_are_needed_show_the_difference_in_four_of_five_studies():
+    rng = np.random.default_rng(10)
+    ours, theirs = np.array([0.0, 2.0, 4.0]), np.array([1.0, 2.0, 3.0])  # variances 4 and 1
+    count = trainings_needed(ours, theirs, 2.0)
+    shown = [
+        ttest_ind(rng.normal(2.0, 2.0, count), rng.normal(0.0, 1.0, count), equal_var=False).pvalue < 0.05
+        for _ in range(2000)
+    ]
+    assert 0.72 <= np.mean(shown) <= 0.88
+    assert trainings_needed(ours[:1], theirs, 2.0) is None
 
 
 def paired_flights(both, ours, theirs, neither):
@@ -210,27 +264,6 @@ def test_paired_rate_differences_hold_the_true_one_about_as_often_as_they_say():
 def test_pairs_that_are_none_are_refused(ours, theirs):
     with pytest.raises(ValueError, match="same corridors"):
         paired_rate_difference(np.array(ours, bool), np.array(theirs, bool))
-
-
-def test_the_difference_of_trainings_that_share_nothing_holds_the_truth_as_often_as_it_says():
-    rng, held, repeats = np.random.default_rng(0), 0, 600
-    for _ in range(repeats):
-        ours, theirs = rng.normal(0.7, 0.05, 3), rng.normal(0.6, 0.02, 3)
-        low, high = mean_difference(ours, theirs).interval
-        held += low <= 0.1 <= high
-    assert 0.93 <= held / repeats <= 0.985
-
-
-def test_the_difference_of_trainings_changes_its_sign_with_the_sides_and_needs_two_of_each():
-    ours, theirs = [0.7, 0.8, 0.75], [0.5, 0.65]
-    there, back = mean_difference(ours, theirs), mean_difference(theirs, ours)
-    assert there.value == pytest.approx(-back.value)
-    assert there.interval == pytest.approx((-back.interval[1], -back.interval[0]))
-    known = ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
-    assert there.interval == pytest.approx((known.low, known.high))
-    assert mean_difference([0.7, 0.7, 0.7], [0.5, 0.6, 0.7]).interval[0] > -0.2  # equal on one side
-    assert mean_difference([0.7], theirs).interval is None
-    assert mean_difference([0.7, 0.7], [0.5, 0.5]) == (pytest.approx(0.2), None)
 
 
 def test_the_interval_over_trainings_holds_the_true_mean_as_often_as_it_says_and_needs_two():

@@ -10,7 +10,7 @@ from jobs.config.config import ConfigError, parse
 from jobs.evaluation import demo
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.executors import Part, evaluate_part
-from jobs.rollout.policies import find_policies
+from jobs.rollout.policies import find_policies, with_own_filter
 from jobs.rollout.recorded import record_episode
 from jobs.rollout.tasks import make_task
 from jobs.run.folder import locate_run
@@ -29,7 +29,7 @@ def frames_of(film):
     return about, [np.frombuffer(frame, np.uint8).reshape(*about["size"][::-1], 3) for frame in frames]
 
 
-@pytest.mark.parametrize("name", ["bytestream_robust-s1", "rgb-s0"])
+@pytest.mark.parametrize("name", ["bytestream_hold-s0", "rgb-s0"])
 def test_the_printed_line_is_the_evaluations_own_row_and_the_film_has_a_frame_for_each_step(
     tmp_path, capsys, name
 ):
@@ -38,7 +38,8 @@ def test_the_printed_line_is_the_evaluations_own_row_and_the_film_has_a_frame_fo
     demo.run(config)
     printed = capsys.readouterr().out
     (policy,) = find_policies("demo.policy", name, config, locate_run(config))
-    env = dataclasses.replace(config.env, split="eval")
+    env = with_own_filter(policy, dataclasses.replace(config.env, split="eval"))
+    assert env.filter_support == (1 if name == "bytestream_hold-s0" else 0)
     task = make_task(("poles_eval", "raycast"), policy, config.evaluate.action, env, 4)
     row = evaluate_part(Part(task)).episodes[3]
     assert row["seed"] == 3

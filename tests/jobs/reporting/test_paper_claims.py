@@ -1,75 +1,125 @@
+import numpy as np
 import pytest
 
-from jobs.reporting.paper_claims import CLAIMS, LEARNT, Claim, judge, judge_learning
+from jobs.analysis.statistics import Difference
+from jobs.evaluation.sweep_plan import NOMINAL
+from jobs.reporting.paper_claims import (
+    CLAIMS,
+    LEARNT,
+    Claim,
+    compare,
+    compare_learning,
+    judge_all,
+    verdict_of,
+)
 from tests.support.episodes import flights
 
-AT = (("world", "a"), ("world", "b"))
-CLAIM = Claim("it is better", "D.3", "ours", "theirs", "success", AT)
+BEFORE, AT = (NOMINAL, "poles"), (("world", "a"), ("world", "b"))
+BASELINES = dict.fromkeys((BEFORE, *AT), BEFORE)
 
 
-def found(*pairs):
-    """Flights of ours and theirs in each condition, by their successes."""
-    table = {(at, group): {0: flights(won)} for at, pair in zip(AT, pairs, strict=False)
+def found(*pairs, before=(20, 20)):
+    """Episodes of two trainings of ours and theirs in each condition, by their successes."""
+    table = {(at, group): {0: flights(won), 1: flights(won)}
+             for at, pair in zip((BEFORE, *AT), (before, *pairs), strict=False)
              for group, won in zip(("ours", "theirs"), pair, strict=True)}  # fmt: skip
     return lambda at, group: table.get((at, group), {})
 
 
+def claim(change=False, measure="success"):
+    return Claim("it is better", "D.3", "ours", "theirs", measure, AT, change)
+
+
 @pytest.mark.parametrize(
-    ("pairs", "verdict"),
+    ("value", "interval", "p", "verdict"),
     [
-        (((18, 4), (18, 6)), "holds"),
-        (((18, 4), (10, 10)), "holds"),
-        (((19, 2), (4, 16)), "holds partly"),
-        (((20, 0), (6, 12)), "holds partly"),
-        (((11, 10), (11, 10)), "undecided"),
-        (((10, 10), (12, 12)), "does not hold"),
-        (((8, 10), (10, 12)), "does not hold"),
-        (((4, 18), (6, 18)), "does not hold"),
-        (((18, 4),), "holds"),
-        ((), "not tested"),
+        (0.3, (0.2, 0.4), 0.001, "holds"),
+        (-0.3, (-0.4, -0.2), 0.001, "reversed"),
+        (0.3, (0.01, 0.6), 0.2, "undecided"),  # certain alone, not within its family
+        (0.01, (-0.05, 0.08), 0.7, "equivalent"),
+        (-0.2, (-0.45, 0.05), 0.1, "does not hold"),
+        (0.0, (-0.3, 0.3), 1.0, "undecided"),
+        (0.2, None, None, "undecided"),
     ],
 )
-def test_a_claim_is_judged_by_its_differences(pairs, verdict):
-    assert judge(CLAIM, found(*pairs)).verdict == verdict
+def test_a_claim_is_judged_by_its_difference(value, interval, p, verdict):
+    assert verdict_of(Difference(value, interval, p), p, 0.1) == verdict
+    assert verdict_of(None, None, 0.1) == "not tested"
 
 
 def test_the_difference_over_all_conditions_is_their_mean_with_each_beside_it():
-    finding = judge(CLAIM, found((18, 4), (10, 6)))
+    finding = compare(claim(), found((18, 4), (10, 6)), BASELINES)
     assert finding.overall.value == pytest.approx((14 + 4) / 40)
-    assert [estimate.value for estimate in finding.conditions.values()] == pytest.approx([0.7, 0.2])
+    assert [one.value for one in finding.conditions.values()] == pytest.approx([0.7, 0.2])
+
+
+def test_robustness_is_what_a_condition_changes_and_not_who_is_better():
+    episodes = found((16, 8), (16, 8), before=(20, 12))
+    assert compare(claim(), episodes, BASELINES).overall.value == pytest.approx(0.4)
+    assert compare(claim(change=True), episodes, BASELINES).overall.value == pytest.approx(0.0)
+    finding = compare(claim(change=True), found((10, 12), before=(20, 12)), BASELINES)
+    assert finding.overall.value == pytest.approx(-0.5)
+    assert finding.overall.p < 0.05
+
+
+def test_what_was_not_evaluated_is_not_tested():
+    assert compare(claim(), found(), BASELINES).overall is None
+    assert len(compare(claim(), found((18, 4)), BASELINES).conditions) == 1
+
+
+def test_of_one_training_nothing_follows_for_others():
+    table = {(AT[0], "ours"): {0: flights(18)}, (AT[0], "theirs"): {0: flights(3), 1: flights(4)}}
+    finding = compare(claim(), lambda at, group: table.get((at, group), {}), BASELINES)
+    assert finding.overall.p is finding.needed is None
+    assert finding.overall.value > 0.5
 
 
 def test_a_condition_with_a_training_less_is_still_compared():
     table = {(AT[0], "ours"): {0: flights(18), 1: flights(16)}, (AT[1], "ours"): {1: flights(14)},
              (AT[0], "theirs"): {0: flights(3)}, (AT[1], "theirs"): {0: flights(3)}}  # fmt: skip
-    finding = judge(CLAIM, lambda at, group: table.get((at, group), {}))
+    finding = compare(claim(), lambda at, group: table.get((at, group), {}), BASELINES)
     assert finding.overall.value == pytest.approx((17 / 20 + 14 / 20) / 2 - 3 / 20)
 
 
-def test_the_papers_claims_are_about_conditions_that_the_default_sweep_flies(tmp_path):
+def test_all_claims_are_one_family():
+    rates = {
+        LEARNT[0].ours: (0.7, 0.72, 0.71),
+        LEARNT[1].ours: (0.5, 0.4, 0.6),
+        LEARNT[0].theirs: (0.4, 0.42, 0.38),
+    }
+    alone = compare_learning(LEARNT[0], rates).overall.p
+    findings = judge_all(lambda at, group: {}, {}, rates)
+    assert set(findings) == {*CLAIMS, *LEARNT}
+    assert findings[LEARNT[0]].adjusted_p == pytest.approx(2 * alone)
+    assert findings[LEARNT[0]].verdict == "holds"
+    assert {findings[one].verdict for one in CLAIMS} == {"not tested"}
+
+
+def test_the_papers_claims_are_about_conditions_of_the_default_sweep_and_their_baselines(tmp_path):
     from tests.support.configs import small_config, sweep_config
     from tests.support.runs import planned
 
     axes = small_config(tmp_path, job="sweep").sweep.axes
-    conditions = planned(sweep_config(tmp_path, axes=axes), "straight").conditions
-    assert {at for claim in CLAIMS for at in claim.conditions} <= set(conditions)
-    assert {claim.measure for claim in CLAIMS} == {"success", "distance_m"}
+    sweep = planned(sweep_config(tmp_path, axes=axes), "straight")
+    assert {at for claim in CLAIMS for at in claim.conditions} <= set(sweep.conditions)
+    nominal = (NOMINAL, "poles_eval")
+    dense = {at: base for at, base in sweep.baselines.items() if at[0] == "control_hz_dense"}
+    assert set(dense.values()) == {("control_hz_dense", "200")}
+    assert sweep.baselines["memory_400hz", "frame"] == ("control_hz", "400")
+    assert {base for at, base in sweep.baselines.items() if at[0] in ("world", "sensor_noise")} == {nominal}
+    assert sweep.same_as["world", "poles_dense"] == ("control_hz_dense", "200")
+    assert sweep.same_as["sparsity", "0"] == nominal
+    assert sweep.same_as["sparsity", "0.5"] == ("sparsity", "0.5")
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs", "verdict"),
-    [
-        ((0.7, 0.72, 0.71), (0.4, 0.42, 0.38), "holds"),
-        ((0.4, 0.42, 0.38), (0.7, 0.72, 0.71), "does not hold"),
-        ((0.7, 0.72, 0.71), (0.69, 0.71, 0.7), "does not hold"),
-        ((0.9, 0.3, 0.6), (0.4, 0.5, 0.2), "undecided"),
-        ((0.9,), (0.4,), "undecided"),
-        ((), (0.4, 0.5), "not tested"),
-    ],
+    ("ours", "theirs", "low", "high"),
+    [((0.7, 0.72, 0.71), (0.4, 0.42, 0.38), 0, 0.001), ((0.9, 0.3, 0.6), (0.4, 0.5, 0.2), 0.05, 1)],
 )
-def test_who_learns_faster_is_judged_by_the_means_of_all_trainings(ours, theirs, verdict):
-    claim = LEARNT[0]
-    finding = judge_learning(claim, {claim.ours: ours, claim.theirs: theirs})
-    assert finding.verdict == verdict
-    if ours:
-        assert finding.overall.value == pytest.approx(sum(ours) / len(ours) - sum(theirs) / len(theirs))
+def test_who_learns_faster_is_judged_by_the_means_of_all_trainings(ours, theirs, low, high):
+    one = LEARNT[0]
+    finding = compare_learning(one, {one.ours: ours, one.theirs: theirs})
+    assert low <= finding.overall.p <= high
+    assert finding.overall.value == pytest.approx(np.mean(ours) - np.mean(theirs))
+    assert compare_learning(one, {one.ours: ours[:1], one.theirs: theirs}).overall.p is None
+    assert compare_learning(one, {one.theirs: theirs}).overall is None

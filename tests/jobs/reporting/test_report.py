@@ -1,4 +1,6 @@
+import csv
 import dataclasses
+import gzip
 import json
 import os
 import re
@@ -11,6 +13,7 @@ from jobs.analysis.plots import Curve
 from jobs.config.config import ConfigError
 from jobs.evaluation.group_stats import LABELS
 from jobs.reporting import report as results
+from jobs.reporting.breaks import changes_of
 from jobs.reporting.learning_curves import as_csv
 from jobs.reporting.report import breaks_table, find_study, read_sweep_episodes, write_results, write_trade
 from jobs.rollout.episodes import write_episodes
@@ -30,11 +33,15 @@ ABOUT = {
     "trials": 20,
     "reference": "event_columns",
     "action": "stochastic",
-    "groups": {"bytestream": [0, 1], "event_image": [0], "oracle": [None]},
+    "groups": {"bytestream": [0, 1, 2], "event_image": [0], "oracle": [None]},
     "exactness": [
         {"condition": ["sparsity", "0.5"], "asked": 0.05, "event_error": 0.0163, "renders_per_step": 5.0}
     ],
     "axes": {"nominal": {"poles_eval": {}}, "sparsity": {"0.2": {}, "0.5": {}}},
+    "compared": [
+        {"condition": at, "baseline": ["nominal", "poles_eval"], "same_as": at}
+        for at in (["nominal", "poles_eval"], ["sparsity", "0.2"], ["sparsity", "0.5"])
+    ],
 }
 
 
@@ -70,30 +77,56 @@ def shipped(tmp_path):
 
 
 def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_path):
-    text = write_results(sweep, tmp_path / "docs", shipped(tmp_path)).read_text()
+    page = write_results(sweep, tmp_path / "docs", shipped(tmp_path))
+    text, tables = page.read_text(), (tmp_path / "docs" / "results_tables.md").read_text()
     for fact in ("2026-01-02", "`python -m platform.launch +exp=robustness`", "commit c0ffee", "sweep `abc`"):
         assert fact in text
-    assert "\n\n\n" not in text
-    assert "bytestream (2), event_image (1), oracle (1)" in text
-    assert "| sparsity | 0.5 | 5 | 1.6 | 5.0 |" in text
-    assert text.index("(images/results_sparsity.png)") < text.index("## Success [%]")
-    assert "| `bytestream`: tolerates dead pixels | D.3 | `event_image` | holds |" in text
-    assert (
-        "| `bytestream`: adapts to other control rates | abstract, D.3 | `event_image` | not tested |" in text
+    assert "\n\n\n" not in text + tables
+    assert "bytestream (3), event_image (1), oracle (1)" in text
+    assert "| sparsity | 0.5 | 5 | 1.6 | 5.0 |" in tables
+    assert tables.index("(images/results_sparsity.png)") < tables.index("## Success [%]")
+    assert re.search(
+        r"\| `bytestream`: tolerates dead pixels \| D.3 \| `event_image` \| undecided \| \S+ m", text
     )
+    assert re.search(r"adapts to other control rates \| abstract, D.3 \| `event_image` \| not tested", text)
     assert "| `bytestream`: learns faster | abstract | `event_image` | holds | +20 [" in text
     assert "| `bytestream_xy`: learns faster | abstract | `event_image` | not tested |" in text
-    assert "| nominal | poles_eval | 80 [" in text
-    assert text.count("(images/results_") == 2
+    assert "| nominal | poles_eval | 80 [" in tables
+    assert tables.count("(images/results_") == 2
     assert {path.name for path in (tmp_path / "docs" / "images").iterdir()} == {
-        "results_sparsity.png", "results_contacts.png"
-    }  # fmt: skip
-    assert str(tmp_path) not in text
+        f"results_{name}.png" for name in ("sparsity", "contacts", "map", "claims")
+    }
+    assert str(tmp_path) not in text + tables
+
+
+def test_every_episode_and_training_is_there_to_be_analysed_again(sweep, tmp_path):
+    write_results(sweep, tmp_path / "docs", shipped(tmp_path))
+    data = tmp_path / "docs" / "data"
+    with gzip.open(data / "robustness_episodes.csv.gz", "rt") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * 5 * 20
+    with (data / "robustness_trainings.csv").open() as file:
+        trainings = list(csv.DictReader(file))
+    for one in trainings:
+        own = [row for row in rows if all(row[name] == one[name] for name in LABELS)]
+        assert float(one["success_rate"]) == np.mean([row["success"] == "True" for row in own])
+        assert float(one["distance_m"]) == pytest.approx(np.mean([float(row["distance_m"]) for row in own]))
+        assert int(one["episodes"]) == len(own) == 20
+    assert len(trainings) == 3 * 5
+    before = (data / "robustness_episodes.csv.gz").read_bytes()
+    write_results(sweep, tmp_path / "docs", shipped(tmp_path))
+    assert before == (data / "robustness_episodes.csv.gz").read_bytes()
+
+
+def test_a_sweep_of_an_earlier_version_is_refused_with_the_remedy(sweep, tmp_path):
+    write_json(sweep / "about.json", {name: value for name, value in ABOUT.items() if name != "compared"})
+    with pytest.raises(ConfigError, match="earlier version; give its command again"):
+        write_results(sweep, tmp_path / "docs")
 
 
 def test_flights_survive_their_file(sweep):
     found = read_sweep_episodes(sweep / "episodes.csv")
-    assert set(found[("sparsity", "0.2"), "bytestream"]) == {0, 1}
+    assert set(found[("sparsity", "0.2"), "bytestream"]) == {0, 1, 2}
     np.testing.assert_array_equal(found[("sparsity", "0.5"), "oracle"][None], flights(20))
 
 
@@ -126,7 +159,7 @@ def test_the_page_of_a_trade_is_copied_with_its_picture(trade, tmp_path):
     assert text == (trade / "trade.md").read_text()
     copy, whole = (folder / "images" / "trade.png" for folder in (tmp_path / "docs", trade))
     one, other = (np.asarray(Image.open(path).convert("RGB"), int) for path in (copy, whole))
-    assert np.abs(one - other).max() <= 2
+    np.testing.assert_array_equal(one, other)
 
 
 def test_what_there_is_is_written_and_nothing_else(trade, tmp_path, monkeypatch):
@@ -143,18 +176,34 @@ def test_nothing_finished_is_refused_with_the_remedy(tmp_path):
 
 
 def test_a_condition_breaks_a_policy_where_its_own_loss_is_certain(sweep, tmp_path):
-    flown = read_sweep_episodes(sweep / "episodes.csv")
-    for seed in (0, 1):
-        flown[("sparsity", "0.5"), "bytestream"][seed]["success"][:10] = False
-        flown[("sparsity", "0.2"), "bytestream"][seed]["success"][:1] = False
-    flown[("sparsity", "0.5"), "event_image"][0]["success"] = True
-    text = breaks_table(ABOUT, flown)
+    swept = read_sweep_episodes(sweep / "episodes.csv")
+    for seed in (0, 1, 2):
+        swept[("sparsity", "0.5"), "bytestream"][seed]["success"][:10] = False
+        swept[("sparsity", "0.2"), "bytestream"][seed]["success"][:1] = False
+    swept[("sparsity", "0.5"), "event_image"][0]["success"] = True
+    changes = changes_of(ABOUT, swept)
+    assert {(change.condition[1], change.group, change.certain) for change in changes} == {
+        ("0.2", "bytestream", False), ("0.5", "bytestream", True),
+        ("0.2", "event_image", False), ("0.5", "event_image", True),
+    }  # fmt: skip
+    text = breaks_table(ABOUT, changes)
     assert re.search(r"\| `bytestream` \| 80 \| sparsity 0.5: -50 \[-\d+, -\d+\] \|", text)
-    assert "| `event_image` | 20 | none is certain |" in text
+    assert "| `event_image` (1 training) | 20 | none is certain |" in text
     assert "oracle" not in text
 
 
-def test_the_figure_of_a_trade_is_shown_where_there_is_one(sweep, trade, tmp_path):
-    assert "Success against cost" not in write_results(sweep, tmp_path / "docs").read_text()
+def test_a_simulation_that_two_axes_have_is_tested_once_and_a_baseline_never(sweep):
+    swept = read_sweep_episodes(sweep / "episodes.csv")
+    same = [*ABOUT["compared"][:2], {**ABOUT["compared"][2], "same_as": ["sparsity", "0.2"]}]
+    found = changes_of({**ABOUT, "compared": same}, swept)
+    assert {change.condition for change in found} == {("sparsity", "0.2")}
+    own = [*ABOUT["compared"][:2], {**ABOUT["compared"][2], "baseline": ["sparsity", "0.5"]}]
+    assert {change.condition for change in changes_of({**ABOUT, "compared": own}, swept)} == {
+        ("sparsity", "0.2")
+    }
+
+
+def test_the_page_of_a_trade_is_linked_where_there_is_one(sweep, trade, tmp_path):
+    assert "(trade.md)" not in write_results(sweep, tmp_path / "docs").read_text()
     write_trade(trade, tmp_path / "docs")
-    assert "![Success against cost](images/trade.png)" in write_results(sweep, tmp_path / "docs").read_text()
+    assert "(trade.md)" in write_results(sweep, tmp_path / "docs").read_text()

@@ -2,15 +2,9 @@ import dataclasses
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from docs.browser import CHROMIUM, Browser, served
-from jobs import pipeline
-from jobs.evaluation.sweep import run as run_sweep
-from jobs.rollout.episodes import EPISODE
-from jobs.rollout.store import PartResult, SimulationAccuracy
-from jobs.run.folder import Run, finish, open_run
 from jobs.run.provenance import REPOSITORY
 from jobs.tracking.pages import (
     MAX_CHARACTERS,
@@ -22,13 +16,12 @@ from jobs.tracking.pages import (
     preview,
     run_address,
     run_note,
+    usual_views,
     view_address,
 )
 from jobs.tracking.store import dashboard_command, server_command
 from jobs.tracking.tracker import open_store
-from tests.support.configs import sweep_config
-from tests.support.fake_executor import FakeExecutor
-from tests.support.policies import save_training
+from tests.support.filled_store import fill
 
 PAGE = Page(
     experiment_id="1",
@@ -75,6 +68,18 @@ def test_the_experiments_first_line_leads_to_the_newest_sweep():
     assert "charts-1" not in first
 
 
+def test_runs_that_ended_early_do_not_stand_among_results(tmp_path):
+    client, experiment = open_store(f"sqlite:///{tmp_path / 'mlflow.db'}", "evade")
+    for status in ("RUNNING", "FINISHED", "FAILED", "KILLED"):
+        for kind in ("run", "sweep"):
+            run = client.create_run(experiment, tags={"kind": kind}, run_name=f"{kind} {status}")
+            client.update_run(run.info.run_id, status=status)
+    for key, name, state in usual_views():
+        found = {run.info.run_name for run in client.search_runs([experiment], state["searchFilter"])}
+        kind = "sweep" if key == "sweeps" else "run"
+        assert found == {f"{kind} RUNNING", f"{kind} FINISHED"}, name
+
+
 @pytest.mark.parametrize(("given", "kept"), [((2000, 500), (PAGE_WIDTH, 215)), ((400, 300), (400, 300))])
 def test_pictures_of_a_page_are_narrowed_and_never_enlarged(tmp_path, given, kept):
     from PIL import Image
@@ -83,36 +88,11 @@ def test_pictures_of_a_page_are_narrowed_and_never_enlarged(tmp_path, given, kep
     assert preview((tmp_path / "large.png").read_bytes()).size == kept
 
 
-def crashed(part):
-    """The policy hits something everywhere, a baseline nowhere."""
-    episodes = np.zeros(len(part.task.seeds), EPISODE)
-    episodes["seed"], episodes["distance_m"] = part.task.seeds, 50.0
-    episodes["collision"] = part.task.policy.training is not None
-    episodes["success"] = ~episodes["collision"]
-    return PartResult(episodes, {}, SimulationAccuracy(0.01, 3.0))
-
-
-def evaluated_training(config) -> Run:
-    """A pipeline whose training is done, evaluated and registered by its job."""
-    evaluation = dataclasses.replace(config.evaluate, episodes=2, renderers=["raycast"])
-    config = dataclasses.replace(config, job="pipeline", exp="bytestream", evaluate=evaluation)
-    folder = open_run(config)
-    save_training(folder.policy, "bytestream", 0, config.env, "bytestream")
-    for stage in ("collect", "pretrain", "train"):
-        finish(folder, stage, {"train/success_rate": 0.5} if stage == "train" else {})
-    pipeline.run(config)
-    return folder
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     """A store with an evaluated training and a sweep; the addresses of their pages by name."""
     place = tmp_path_factory.mktemp("dashboard")
-    axes = {"control_hz": {"env.control_hz": [100, 200]}, "sparsity": {"faults.sparsity": [0.0, 0.5]}}
-    config = sweep_config(place, policies=["straight"], reference="straight", axes=axes)
-    folder = evaluated_training(config)
-    settings = dataclasses.replace(config.sweep, policies=[str(folder.policy), "straight"])
-    run_sweep(dataclasses.replace(config, sweep=settings), FakeExecutor(crashed))
+    config, _ = fill(place)
     uri = f"sqlite:///{place / 'mlflow.db'}"
     client, experiment = open_store(uri, config.tracking.experiment)
     (training,) = client.search_runs([experiment], "tags.kind = 'run'")

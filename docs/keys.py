@@ -1,0 +1,173 @@
+"""Every key of a configuration, as the tables of docs/keys.md.
+
+What a key may be comes from the schema; its default, unit, meaning and source from conf/ and its comments.
+"""
+
+import dataclasses
+import inspect
+import re
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+
+import hydra
+from omegaconf import OmegaConf
+
+from jobs.config.config import Config
+from jobs.config.env_keys import ENV_KEYS, fields_of
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+FILES = {  # where the comments stand: the section that a file begins in
+    "config.yaml": "", "budget/short.yaml": "", "env/corridor.yaml": "env", "camera/paper.yaml": "camera",
+    "faults/none.yaml": "faults", "fidelity/tolerance.yaml": "fidelity", "model/bytestream.yaml": "model",
+    "algo/ppo.yaml": "algo", "algo/imitation.yaml": "algo", "sweep/robustness.yaml": "sweep",
+    "cluster/local.yaml": "cluster", "tracking/local.yaml": "tracking",
+}  # fmt: skip
+LINE = re.compile(r"^(\s*)(\w+):\s*(.*?)(?:(?:^|\s+)# (.*))?$")
+UNIT = re.compile(r"\s*\[([^\]]*[a-zA-Z][^\]]*)\]")
+SOURCE = re.compile(
+    r"\s*\(((?:appendi|equation|eq\.|the paper|AirSim|Stable|N_max|DAgger|not stated)[^()]*)\)"
+)
+WORDS = {int: "whole number", float: "number", str: "text", bool: "true or false", type(None): "null"}
+HEAD = ("key", "default", "allowed", "unit", "meaning", "source")
+BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+
+
+class Row(typing.NamedTuple):
+    """One key as texts."""
+
+    key: str
+    default: str
+    allowed: str
+    unit: str
+    meaning: str
+    source: str
+
+
+def allowed(kind: object) -> str:
+    """What values a type takes, in words: "whole number, at least 1, or null"."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        limits = [limit for part in inner[1:] for limit in _limits(part)]
+        return ", ".join([allowed(inner[0]), *limits])
+    if origin is typing.Literal:
+        return " or ".join(f"`{value}`" for value in inner)
+    if origin in (typing.Union, types.UnionType):
+        return ", or ".join(dict.fromkeys(allowed(part) for part in inner))
+    if origin is list:
+        return f"list: each {allowed(inner[0])}"
+    if origin is dict or dataclasses.is_dataclass(kind):
+        return "mapping"
+    return WORDS.get(kind, "any value")  # type: ignore[call-overload, no-any-return]
+
+
+def _limits(part: object) -> Iterator[str]:
+    """The bounds that a pydantic field sets; others say nothing."""
+    for rule in getattr(part, "metadata", None) or ([part] if not hasattr(part, "metadata") else []):
+        for name, text in BOUNDS.items():
+            if (bound := getattr(rule, name, None)) is not None:
+                yield f"{text} {bound:,.0f}" if bound == int(bound) else f"{text} {bound:g}"
+
+
+def comments(file: Path, section: str) -> dict[str, str]:
+    """The comment behind each key of a YAML file."""
+    found, path = {}, [(-1, section)]
+    for line in file.read_text().splitlines():
+        match = LINE.match(line)
+        if match is None or line.lstrip().startswith("#"):
+            continue
+        indent = len(match[1])
+        path = [step for step in path if step[0] < indent]
+        path.append((indent, match[2]))
+        found[".".join(name for _, name in path if name)] = match[4] or ""
+    return {key: text for key, text in found.items() if text}
+
+
+def documented(cls: type) -> dict[str, str]:
+    """What the docstring of a dataclass says of its fields."""
+    listed = inspect.cleandoc(cls.__doc__ or "").partition("Attributes:\n")[2]
+    entries = re.findall(r"^    (\w[\w, ]*): (.*(?:\n {8}.*)*)", listed, re.MULTILINE)
+    return {name: " ".join(text.split()) for names, text in entries for name in names.split(", ")}
+
+
+@cache
+def _said() -> Mapping[str, str]:
+    """What is said of each key: the first comment in conf/."""
+    found: dict[str, str] = {}
+    for name, section in FILES.items():
+        found = comments(CONF / name, section) | found
+    return found
+
+
+@cache
+def _defaults() -> Mapping[str, object]:
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        composed = OmegaConf.to_container(hydra.compose("config", ["+exp=bytestream"]), resolve=True)
+    flat: dict[str, object] = {}
+    for name, value in typing.cast(Mapping[str, object], composed).items():
+        inner = value.items() if isinstance(value, Mapping) else ()
+        flat |= {f"{name}.{key}": own for key, own in inner} or {name: value}
+    return flat
+
+
+def row(key: str, kind: object, fallback: str = "") -> Row:
+    """What there is to say about a key; `fallback`: its meaning if conf/ has no comment on it."""
+    said = _said().get(key, "")
+    unit, source = (", ".join(rule.findall(said)) for rule in (UNIT, SOURCE))
+    meaning = SOURCE.sub("", UNIT.sub("", said)).strip(" ;,") or fallback
+    value = _defaults().get(key, "")
+    default = "conditions of D.3, F.1" if key == "sweep.axes" else _as_yaml(value)
+    return Row(f"`{key}`", f"`{default}`" if default else "", allowed(kind), unit, meaning, source)
+
+
+def _as_yaml(value: object) -> str:
+    """A value as one writes it on the command line."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value).replace("'", "")
+
+
+def kinds() -> dict[str, dict[str, tuple[object, str]]]:
+    """Type and documentation of all keys, by section; the one without a name holds what is in none."""
+    hints = typing.get_type_hints(Config, include_extras=True)
+    found: dict[str, dict[str, tuple[object, str]]] = {
+        "": {},
+        "env": {},
+        "camera": {},
+        "faults": {},
+        "fidelity": {},
+    }
+    for key, path in ENV_KEYS.items():
+        owner = hints["env"]
+        for field in path[:-1]:
+            owner = typing.get_type_hints(owner, include_extras=True)[field]
+        found[key.rpartition(".")[0]][key] = _field(owner, path[-1])
+    for name, kind in hints.items():
+        owner = typing.get_args(kind)[0] if name == "model" else kind  # of a policy with an encoder
+        if name != "env" and dataclasses.is_dataclass(owner):
+            found[name] = {f"{name}.{field}": _field(owner, field) for field in fields_of(owner)}  # type: ignore[arg-type]
+        elif name != "env":
+            found[""][name] = kind, ""
+    return found
+
+
+def _field(owner: typing.Any, name: str) -> tuple[object, str]:
+    return typing.get_type_hints(owner, include_extras=True)[name], documented(owner).get(name, "")
+
+
+def tables() -> str:
+    """All tables as Markdown."""
+    text = []
+    for section, keys in kinds().items():
+        text += [
+            f"## {section or 'Outside of any section'}",
+            "",
+            f"| {' | '.join(HEAD)} |",
+            "|---" * len(HEAD) + "|",
+        ]
+        rows = (row(key, *about) for key, about in keys.items())
+        text += [f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |" for cells in rows]
+        text.append("")
+    return "\n".join(text)

@@ -1,0 +1,75 @@
+"""How often 95 % intervals over trainings and corridors hold the truth: python -m jobs.bench.coverage.
+
+Studies are simulated: the logit of success is a mean, plus a normal effect of each training and of each
+corridor, and episodes are drawn from it. Printed are the share of intervals that hold the true rate (of
+`rate_estimate`) or the true difference, which is 0 (of `crossed_difference`, two groups), and the mean width.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jobs.analysis.statistics import crossed_difference, rate_estimate
+from jobs.analysis.tables import show_table
+
+STUDIES = 300
+TRAININGS = ((3, 14), (4, 25), (10, 14))
+SPREADS = (0.0, 1.0, 2.0, 3.0)  # of the trainings' logits; the shipped policies under noise: about 2
+MEANS = (0.0, 1.5, 3.0)  # logits: a rate of 50, 80 and 94 % if trainings agree
+CORRIDORS = 0.7  # spread of the corridors' logits
+RATE = (0.0, 1.0)
+
+
+def studies(
+    rng: np.random.Generator, trainings: int, corridors: int, mean: float, spread: float
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Successes of two groups of trainings in the same corridors, (trainings, corridors) each."""
+    for _ in range(STUDIES):
+        hard = rng.normal(0.0, CORRIDORS, (1, corridors))
+        logits = mean + rng.normal(0.0, spread, (2, trainings, 1)) + hard
+        first, second = (rng.random(logits.shape) < 1 / (1 + np.exp(-logits))).astype(np.float64)
+        yield first, second
+
+
+def true_rate(mean: float, spread: float) -> float:
+    """The expected success of a new training in a new corridor."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(80)
+    rates = 1 / (1 + np.exp(-(mean + np.hypot(spread, CORRIDORS) * nodes)))
+    return float((weights * rates).sum() / weights.sum())
+
+
+def coverage(trainings: int, corridors: int, mean: float, spread: float) -> tuple[float, float, float, float]:
+    """Shares of intervals of a rate and of a difference that hold the truth, and the mean width of each."""
+    rng, truth = np.random.default_rng(0), true_rate(mean, spread)
+    held, widths = np.zeros((STUDIES, 2)), np.zeros((STUDIES, 2))
+    for study, (ours, theirs) in enumerate(studies(rng, trainings, corridors, mean, spread)):
+        intervals = rate_estimate(ours).interval, crossed_difference(ours, theirs, RATE).interval
+        for place, (found, true) in enumerate(zip(intervals, (truth, 0.0), strict=True)):
+            low, high = found or (true, true)
+            held[study, place], widths[study, place] = low <= true <= high, high - low
+    return *held.mean(axis=0), *widths.mean(axis=0)
+
+
+def coverage_text(trainings: int, corridors: int) -> str:
+    """How often the intervals of such a study hold a true rate near 80 %, in words."""
+    shares = [coverage(trainings, corridors, 1.5, spread)[0] for spread in SPREADS]
+    named = [f"{100 * share:.0f} % at {spread:g}" for share, spread in zip(shares, SPREADS, strict=True)]
+    return ", ".join(named)
+
+
+def main() -> None:
+    """Print the table."""
+    rows = []
+    for trainings, corridors in TRAININGS:
+        for mean in MEANS:
+            for spread in SPREADS:
+                found = coverage(trainings, corridors, mean, spread)
+                shares = [f"{100 * share:.0f}" for share in (true_rate(mean, spread), *found)]
+                rows.append((f"{trainings} x {corridors}", f"{spread:g}", *shares))
+    held = "Rate held [%]", "Difference held [%]", "Rate's width", "Difference's"
+    head = ("Trainings x corridors", "Spread", "True rate [%]", *held)
+    show_table("Coverage of 95 % intervals", head, rows, 1, None)
+
+
+if __name__ == "__main__":
+    main()

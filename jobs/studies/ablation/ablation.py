@@ -1,0 +1,187 @@
+"""What each part of a recipe contributes: trainings with one part changed, in the same corridors.
+
+Run: python -m platform.launch +exp=ablation
+Expect: by estimate six hours on two idle cores. Each training has a run folder of its own, and is read from
+it once it is finished; in this run's folder under `ablation/`, and in MLflow, every episode, a table and
+a plot. A stopped job continues when the same command is given again.
+"""
+
+import dataclasses
+import itertools
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jobs.config.config import Config, ConfigError, as_dict, parse
+from jobs.evaluation.group_stats import LABELS, episode_values
+from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep
+from jobs.evaluation.sweep_report import SweepResults, training_text
+from jobs.rollout.episodes import write_episodes
+from jobs.rollout.executors import Executor
+from jobs.rollout.policies import EvaluatedPolicy, read_policy
+from jobs.rollout.scheduler import default_executor, evaluate_tasks
+from jobs.rollout.store import EpisodeStore
+from jobs.run.files import read_json_lines
+from jobs.run.folder import Run, finish, finished, locate_run, open_run
+from jobs.run.progress import console
+from jobs.run.provenance import command, provenance, today
+from jobs.studies.ablation.page import AblationFacts, variant_result, write_page
+from jobs.tracking.tracker import open_tracker
+from jobs.training import train
+
+ENCODER_FILES = (
+    "encoder/encoder.safetensors",
+    "encoder/encoder.json",
+    "stages/collect.json",
+    "stages/pretrain.json",
+)
+# Settings by which a variant needs no encoder of its own, but sees by that of the first variant.
+SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden")
+INIT = "train.init"
+Variant = Mapping[str, Any]  # key -> value
+
+
+def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
+    """Train and evaluate every variant with every seed, and compare each with the first; return its success.
+
+    Args:
+        config: The experiment.
+        executor: Computes the missing episodes; None: on all cores.
+
+    Raises:
+        ConfigError: A variant has a wrong key or value.
+    """
+    variants = config.ablation.variants
+    first = next(iter(variants))
+    for name in variants:
+        variant_config(config, name, config.ablation.seeds[0])
+    folder = open_run(config)
+    config = folder.config
+    trained: dict[tuple[str, int], Run] = {}
+    for seed in config.ablation.seeds:
+        for name in variants:
+            trained[name, seed] = train_variant(config, name, seed, trained.get((first, seed)))
+    policies = [
+        dataclasses.replace(read_policy(str(run.policy)), group=name, training=seed)
+        for (name, seed), run in sorted(trained.items(), key=lambda item: list(variants).index(item[0][0]))
+    ]
+    return compare(config, folder, trained, policies, executor)
+
+
+def variant_config(config: Config, name: str, seed: int) -> Config:
+    """The experiment of one training.
+
+    Raises:
+        ConfigError: It has a wrong key or value.
+    """
+    changes, first = config.ablation.variants[name], next(iter(config.ablation.variants))
+    values = as_dict(config) | {"job": "train", "exp": f"{config.exp}_{name}", "seed": seed}
+    try:
+        for key, value in changes.items():
+            _set(values, key, value)
+        if changes.get(INIT) is not None:
+            if changes[INIT] != first or name == first:
+                raise ConfigError(f"{INIT}: must be {first}, the first variant, got {changes[INIT]!r}")
+            _set(values, INIT, str(locate_run(variant_config(config, first, seed)).path))
+        parsed = parse(values)
+    except ConfigError as error:
+        raise ConfigError(f"ablation.variants.{name}: {error}") from None
+    return dataclasses.replace(parsed, tracking=config.tracking)  # with its password
+
+
+def _set(values: Any, key: str, value: Any) -> None:
+    """Replace one value in nested containers; `parse` checks that its key is one."""
+    *path, last = [int(word) if word.isdigit() else word for word in key.split(".")]
+    try:
+        for name in path:
+            values = values[name]
+        values[last] = value
+    except (KeyError, IndexError, TypeError):
+        raise ConfigError(f"{key}: no such key, got {value!r}") from None
+
+
+def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Run:
+    """Train a variant unless that is done, on the encoder of the first one where it may; return its run."""
+    own = open_run(variant_config(config, name, seed))
+    changes = config.ablation.variants[name]
+    if finished(own, "train") is None:
+        console.print(f"Train {name}, seed {seed}", markup=False)
+        shares = changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
+        if first is not None and shares and finished(own, "pretrain") is None:
+            for file in ENCODER_FILES:  # the marks of the finished stages last
+                (own.path / file).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(first.path / file, own.path / file)
+        train.run(own.config)
+    return own
+
+
+def compare(
+    config: Config,
+    folder: Run,
+    trained: Mapping[tuple[str, int], Run],
+    policies: Sequence[EvaluatedPolicy],
+    executor: Executor | None,
+) -> dict[str, float]:
+    """Evaluate all trainings in the same corridors, and write table and plot."""
+    sweep = plan_sweep(config, policies)
+    place = folder.path / "ablation"
+    store, executor = EpisodeStore(place), executor or default_executor(config.cluster, place)
+    with open_tracker(config, folder, key=f"ablation {sweep.identity[:8]}") as tracker:
+        tracker.tags({"kind": "ablation"})
+        found = SweepResults(sweep, store, *evaluate_tasks(sweep.tasks, store, executor, "Ablation"))
+        if found.failed:
+            raise RuntimeError(
+                f"not evaluated: {next(iter(found.failed.values()))}; the same command tries again"
+            )
+        success = {name: by_condition(found, name) for name in config.ablation.variants}
+        times = {name: [minutes(trained[name, seed]) for seed in config.ablation.seeds] for name in success}
+        first = next(iter(success))
+        results = [variant_result(name, success[name], success[first], times[name]) for name in success]
+        write_all_episodes(place, found)
+        write_page(folder, tracker, results, facts_of(config, folder))
+        metrics = {f"eval/{result.name}_success": result.mean.value for result in results}
+        tracker.log(0, metrics)
+        console.print(tracker.dashboard(), markup=False)
+    return finish(folder, "ablation", metrics)
+
+
+def by_condition(found: SweepResults, name: str) -> dict[str, Any]:
+    """Condition as text -> success of a variant, bool (trainings, corridors)."""
+    return {
+        value if axis == NOMINAL else f"{axis}={value}": episode_values(
+            found.trainings((axis, value), name), "success"
+        )
+        for axis, value in found.sweep.conditions
+    }
+
+
+def minutes(training: Run) -> float:
+    """How long a policy was trained, without its encoder [min]."""
+    rows = read_json_lines(training.train / "results.jsonl")
+    ends = [0, *(row["env_steps"] for row in rows)]
+    steps = [end - begin for begin, end in itertools.pairwise(ends)]
+    return sum(step / row["perf/env_steps_per_second"] for step, row in zip(steps, rows, strict=True)) / 60
+
+
+def write_all_episodes(place: Path, found: SweepResults) -> None:
+    """Write every episode as a row of a CSV file."""
+    episodes = {
+        (*task.condition, task.policy.group, training_text(task)): found.results[task.key].episodes
+        for task in found.sweep.tasks
+    }
+    write_episodes(place / "episodes.csv", LABELS, episodes)
+
+
+def facts_of(config: Config, folder: Run) -> AblationFacts:
+    """What made the numbers."""
+    return {
+        "run": folder.path.name,
+        "command": command(),
+        "date": today(),
+        **provenance(),
+        "seeds": config.ablation.seeds,
+        "trials": config.sweep.trials,
+        "env_steps": config.train.env_steps,
+        "variants": {name: dict(changes) for name, changes in config.ablation.variants.items()},
+    }

@@ -1,0 +1,136 @@
+"""The page of an ablation: success of each variant, what it changes, and a plot of both."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.analysis.plots import BLUE, INK, MUTED, tidy
+from jobs.analysis.statistics import Estimate, half_width
+from jobs.analysis.tables import estimate_text, markdown_table, publish_plot, show_table
+from jobs.run.files import write_atomic, write_json
+from jobs.run.folder import Run
+from jobs.run.provenance import Provenance
+from jobs.tracking.tracker import Tracker
+
+TITLE = "Success [%] with one part of the recipe changed"
+
+
+class AblationFacts(Provenance):
+    """What made an ablation, as its about.json says it."""
+
+    run: str
+    command: str
+    date: str
+    seeds: list[int]
+    trials: int
+    env_steps: int
+    variants: dict[str, dict[str, Any]]
+
+
+class VariantResult(NamedTuple):
+    """How the trainings of one variant do.
+
+    Attributes:
+        name: Of the variant.
+        success: Condition -> mean success of each training (n,).
+        mean: Over conditions and trainings, interval by trainings (Student).
+        difference: Of that to the first variant, by pairs of trainings of a seed; None: it is the first.
+        differences: The difference of each pair (n,).
+        minutes: Of the policy's training, the mean [min].
+    """
+
+    name: str
+    success: dict[str, np.ndarray]
+    mean: Estimate
+    difference: Estimate | None
+    differences: np.ndarray
+    minutes: float
+
+
+def variant_result(
+    name: str, success: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray], minutes: Sequence[float]
+) -> VariantResult:
+    """Compare a variant with the first one; trainings are the unit, each the mean of all conditions.
+
+    Args:
+        name: Of the variant.
+        success: Condition -> success (trainings, corridors).
+        first: The same of the first variant, trained with the same seeds.
+        minutes: Of each training [min].
+
+    Raises:
+        ValueError: There is only one training.
+    """
+    own, theirs = (
+        np.mean([values.mean(axis=1) for values in every.values()], axis=0) for every in (success, first)
+    )
+    difference = None if success is first else _estimate(own - theirs)
+    per_training = {condition: values.mean(axis=1) for condition, values in success.items()}
+    return VariantResult(
+        name, per_training, _estimate(own), difference, own - theirs, float(np.mean(minutes))
+    )
+
+
+def _estimate(values: np.ndarray) -> Estimate:
+    """The mean over trainings (n,) with its 95 % interval."""
+    value, half = float(values.mean()), float(half_width(values[:, None])[0])
+    return Estimate(value, (value - half, value + half))
+
+
+def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], facts: AblationFacts) -> None:
+    """Print the table; write table, plot and facts into the run folder and the tracker."""
+    head = ("Variant", *results[0].success, "Mean", "Change [points]", "Minutes")
+    rows = [table_row(result) for result in results]
+    show_table(TITLE, head, rows, 1, None)
+    said = (
+        f"{len(facts['seeds'])} trainings each, {facts['env_steps']:,} environment steps, {facts['trials']} "
+        "corridors for each training and condition. Mean: over the conditions, 95 % interval by trainings "
+        "(Student). Change: to the first variant, by pairs of trainings with the same seed. Minutes: of the "
+        "policy's training, without the encoder's."
+    )
+    table = markdown_table(head, rows, 1)
+    text = f"`{facts['command']}`, {facts['date']}, commit {facts['commit']}.\n\n{table}\n{said}\n"
+    write_atomic(folder.path / "ablation" / "ablation.md", text)
+    tracker.text("ablation/ablation.md", text)
+    publish_plot(folder, tracker, "ablation/ablation", plot_variants(results))
+    write_json(folder.path / "ablation" / "about.json", facts)  # the last: it says that the rest is there
+
+
+def table_row(result: VariantResult) -> tuple[str, ...]:
+    """One line of the table."""
+    return (
+        result.name,
+        *(f"{100 * values.mean():.0f}" for values in result.success.values()),
+        estimate_text(result.mean, 100, ".0f"),
+        estimate_text(result.difference, 100, "+.0f"),
+        f"{result.minutes:.1f}",
+    )
+
+
+def plot_variants(results: Sequence[VariantResult]) -> Figure:
+    """Draw success by variant and condition as a map, and the change of the mean, a dot for each training."""
+    conditions = list(results[0].success)
+    values = np.array([[100 * one.success[name].mean() for name in conditions] for one in results])
+    figure = Figure(figsize=(4.6 + 0.72 * len(conditions), 1.6 + 0.42 * len(results)), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
+    left.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+    for row, column in np.ndindex(values.shape):
+        colour = "black" if values[row, column] > 55 else "white"
+        left.text(
+            column, row, f"{values[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=9
+        )
+    left.set_xticks(range(len(conditions)), conditions, rotation=35, ha="right")
+    left.set_yticks(range(len(results)), [one.name for one in results])
+    left.set_title("Success [%]", loc="left", fontsize=10)
+    right.axvline(0, color=MUTED, lw=0.8)
+    for row, one in enumerate(results):
+        if one.difference is not None and one.difference.interval is not None:
+            ends = [100 * end for end in one.difference.interval]
+            right.plot(ends, [row, row], color=INK, lw=1.2)
+            right.plot(100 * one.difference.value, row, "|", color=INK, ms=12)
+            right.plot(100 * one.differences, [row] * len(one.differences), "o", color=BLUE, ms=4, alpha=0.8)
+    right.set_title(f"Change of the mean against {results[0].name} [points]", loc="left", fontsize=10)
+    tidy(right, "x")
+    return figure

@@ -1,0 +1,1 @@
+"""What the numbers do at the ends of their ranges."""

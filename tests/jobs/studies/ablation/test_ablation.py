@@ -1,0 +1,140 @@
+import csv
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from jobs.config.config import ConfigError, parse
+from jobs.run.files import read_json
+from jobs.run.folder import locate_run
+from jobs.studies.ablation import ablation
+from jobs.studies.ablation.ablation import variant_config
+from jobs.studies.ablation.page import plot_variants, table_row, variant_result
+from tests.support.configs import SHORT, compose
+
+
+def of(first, *changes):
+    """Success of three trainings in four corridors under two conditions, with shares of each training."""
+    corridors = np.arange(4)
+    return {
+        "nominal": np.array([corridors < 4 * share for share in first]),
+        "night": np.array(
+            [corridors < 4 * (share + change) for share, change in zip(first, changes, strict=True)]
+        ),
+    }
+
+
+def test_a_variant_is_compared_by_pairs_of_trainings_of_one_seed():
+    recipe, variant = of((1.0, 0.75, 0.5), 0, 0, 0), of((0.75, 0.5, 0.25), 0, 0, 0)
+    first = variant_result("recipe", recipe, recipe, (1, 2, 3))
+    result = variant_result("less", variant, recipe, (2, 2, 2))
+    assert first.difference is None
+    assert (first.mean.value, first.minutes) == (0.75, 2.0)
+    low, high = first.mean.interval
+    assert high - 0.75 == pytest.approx(0.75 - low) == pytest.approx(4.303 * 0.25 / 3**0.5, rel=1e-3)
+    # Trainings differ much among themselves, and pairs of them always by the same.
+    assert result.difference.value == pytest.approx(-0.25)
+    assert result.difference.interval == pytest.approx((-0.25, -0.25))
+    assert table_row(result)[1:3] == ("50", "50")
+    assert table_row(result)[4] == "-25 [-25, -25]"
+
+
+def test_a_condition_counts_as_much_as_another_however_many_corridors_it_has():
+    many = {"a": np.ones((2, 100)), "b": np.zeros((2, 4))}
+    assert variant_result("x", many, many, (1, 1)).mean.value == 0.5
+
+
+def test_the_plot_has_a_dot_for_each_training_and_a_number_for_each_cell():
+    recipe, variant = of((1.0, 0.75, 0.5), 0, 0, 0), of((0.75, 0.5, 0.25), 0, 0.25, 0)
+    rows = [
+        variant_result(name, one, recipe, (1, 1, 1)) for name, one in (("recipe", recipe), ("less", variant))
+    ]
+    left, right = plot_variants(rows).axes
+    assert sorted(text.get_text() for text in left.texts) == sorted(["75", "75", "50", "58"])
+    dots = [line for line in right.lines if line.get_marker() == "o"]
+    assert [list(dots[0].get_xdata())] == [pytest.approx([-25.0, -12.5, -25.0])]
+
+
+def test_the_experiment_names_variants_that_can_be_trained():
+    config = ablation_config()
+    configs = {name: variant_config(config, name, 1) for name in config.ablation.variants}
+    settings = {
+        name: (changed.env, changed.model, changed.algo, changed.train, changed.collect, changed.pretrain)
+        for name, changed in configs.items()
+    }
+    first, *others = settings.values()
+    assert config.train.env_steps == 400_000
+    assert ablation_config("budget=smoke").train.env_steps == 4_096
+    assert all(other != first for other in others)
+    assert {changed.seed for changed in configs.values()} == {1}
+    assert configs["ppo"].algo.imitation is None
+    assert configs["no_textures"].train.conditions[3]["weight"] < 1e-6
+    assert configs["no_textures"].train.conditions[2]["weight"] == config.train.conditions[2]["weight"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("{recipe: {}, other: {algo.lrr: 1}}", "algo.lrr"),
+        ("{recipe: {}, other: {train.conditions.9.weight: 1}}", "train.conditions.9.weight"),
+        ("{recipe: {}, other: {train.conditions.x: 1}}", "train.conditions.x"),
+        ("{recipe: {}, other: {algo.lr.what: 1}}", "algo.lr.what"),
+        ("{recipe: {}, other: {train.init: another}}", "train.init"),
+        ("{recipe: {train.init: recipe}}", "train.init"),
+    ],
+)
+def test_a_wrong_variant_is_refused_before_anything_is_trained(tmp_path, change, message):
+    config = ablation_config(
+        runs_dir=str(tmp_path), ablation={"seeds": [0, 1], "variants": yaml.safe_load(change)}
+    )
+    with pytest.raises(ConfigError, match=rf"ablation\.variants.*{re.escape(message)}"):
+        ablation.run(config)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_every_variant_is_trained_and_evaluated_once(tmp_path):
+    words = "budget=smoke", "sweep.trials=1", *SHORT
+    variants = {
+        "recipe": {},
+        "ppo": {"algo.imitation": None, "train.init": "recipe"},
+        "bare": {"env.filter_support": 0},
+    }
+    config = ablation_config(*words, runs_dir=str(tmp_path), ablation={"seeds": [0, 1], "variants": variants})
+    sweep = dataclasses.replace(config.sweep, axes={"sparsity": {"faults.sparsity": [0.5]}})
+    config = dataclasses.replace(config, sweep=sweep)
+    metrics = ablation.run(config)
+    folder = locate_run(config).path / "ablation"
+    assert metrics == {f"eval/{name}_success": 0.0 for name in variants}
+    with (folder / "episodes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["Axis"], row["Group"], row["Training"]) for row in rows} == {
+        (axis, name, seed) for axis in ("nominal", "sparsity") for name in variants for seed in "01"
+    }
+    assert len({row["seed"] for row in rows}) == 1
+    assert (folder / "ablation.png").stat().st_size > 10_000
+    assert len((folder / "ablation.md").read_text().splitlines()) > len(variants)
+    encoders = {
+        name: [read_json(one.encoder / "encoder.json")["sha256"] for one in runs_of(config, name)]
+        for name in ("recipe", "bare")
+    }
+    assert len({*encoders["recipe"], *encoders["bare"]}) == 4
+    begun = [read_json(one.policy / "policy.json") for one in runs_of(config, "ppo")]
+    assert [manifest["sha256"]["encoder.safetensors"] for manifest in begun] == encoders["recipe"]
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/policy/*")}
+    ablation.run(config)
+    assert before == {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/policy/*")}
+    assert len(before) > 6
+
+
+def runs_of(config, name):
+    """The runs of a variant, by seed."""
+    return [locate_run(variant_config(config, name, seed)) for seed in config.ablation.seeds]
+
+
+def ablation_config(*words, **changes):
+    """The composed experiment."""
+    return parse({**compose("+exp=ablation", *words), **changes})
