@@ -126,5 +126,6 @@ def write_film(path: Path, choices: list[Choice], shape: tuple[int, int], title:
             for place, action in enumerate((1, 0, 2)):  # left, forward, right, as a person looks
                 height, width = round(choice.probabilities[action] * shape[0]), shape[1] // 3
                 bars[shape[0] - height :, place * width + 1 : (place + 1) * width - 1] = (245, 158, 11)
-            film.add(frame([(title, panel), ("left, forward, right", bars)], f"{choice.end_us / 1e6:.2f} s   {odds}"))
+            panels = [(title, panel), ("left, forward, right", bars)]
+            film.add(frame(panels, f"{choice.end_us / 1e6:.2f} s   {odds}"))
     return path
