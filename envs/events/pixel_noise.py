@@ -339,8 +339,8 @@ def _wait(pixels, span, noisy, room):
         room.after[j] = (left <= 0.0 or due) and not pending
         if not room.after[j]:
             noise.budget[i] = left
-            noise.light[i] = room.lights[j]
-            _schedule(i, span.end_us, low, high, noise.leak[i] * on * 1e-6, rate, noisy)
+            fall = noise.leak[i] * on * 1e-6
+            _schedule(i, room.lights[j], span.end_us, low, high, fall, rate, noisy)
 
 
 @inlined
@@ -359,11 +359,12 @@ def _free_us(i, memory, noise):
 
 
 @inlined
-def _schedule(i, now_us, low, high, fall, rate, noisy):
+def _schedule(i, light, now_us, low, high, fall, rate, noisy):
     """When a pixel is to be looked at again, if its light rests: at an event at the latest."""
     memory, noise, process = noisy.memory, noisy.noise, noisy.process
     begin_us = max(np.float64(now_us), _free_us(i, memory, noise))
-    noise.pace[i], noise.from_us[i], noise.band[i] = rate, begin_us, memory.quiet_low[i]
+    noise.pace[i], noise.from_us[i] = rate, begin_us
+    noise.light[i], noise.band[i] = light, memory.quiet_low[i]
     due_us = begin_us + noise.budget[i] / rate if rate > 0.0 else np.inf
     if fall > 0.0:
         due_us = min(due_us, max(begin_us, now_us + high / fall), now_us + process.slice_us)
@@ -437,8 +438,7 @@ def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
     if refractory_us == 0 or memory.refractory_end_us[i] <= now_us:
         spare.levels[0], spare.exponents[1] = level_of(memory, i, on, off), i
         set_quiet_bands(spare.exponents[1:2], spare.levels, model, memory, spare)
-    noise.light[i] = still.light
-    _schedule(i, span.end_us, low, high, fall, rate, noisy)
+    _schedule(i, still.light, span.end_us, low, high, fall, rate, noisy)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -31,6 +31,7 @@ from jobs.config.schema import (
     Name,
     PretrainConfig,
     ProbeConfig,
+    ReplayConfig,
     ReplayPageConfig,
     SweepConfig,
     TrackingConfig,
@@ -69,6 +70,7 @@ class Config:
     model: Model
     algo: AlgoConfig
     demo: DemoConfig
+    replay: ReplayConfig
     replay_page: ReplayPageConfig
     collect: CollectConfig
     pretrain: PretrainConfig

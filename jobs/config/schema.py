@@ -86,6 +86,19 @@ class DemoConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class ReplayConfig:
+    """Which recording which policy looks at.
+
+    Attributes:
+        recording: An event file, of any format that `envs.recordings.read_events` knows.
+        policy: A name in models/pretrained, "newest", or a path.
+    """
+
+    recording: Name
+    policy: Name
+
+
+@dataclass(frozen=True, config=STRICT)
 class ReplayPageConfig:
     """The episodes of the replay page: each policy in each scene, at each rate, with each noise.
 

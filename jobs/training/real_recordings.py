@@ -47,6 +47,25 @@ def read_recorded(path: str | Path, env: EnvConfig, validation_share: float) -> 
         ValueError: The file is refused, does not say its size, has fewer pixels than the camera, or
             is too short for a control step of either part.
     """
+    events, begin_us, steps = _fitted(path, env)
+    kept = round(steps * (1.0 - validation_share))
+    if not 0 < kept < steps:
+        least = 1 / env.control_hz / min(validation_share, 1.0 - validation_share)
+        raise ValueError(f"{path}: must last at least {least:.3g} s, got {steps / env.control_hz:.3g} s")
+    spans = {"train": (0, kept), "validation": (kept, steps)}
+    return {split: _part(Path(path).name, events, begin_us, span, env) for split, span in spans.items()}
+
+
+def read_whole(path: str | Path, env: EnvConfig) -> Recorded:
+    """As `read_recorded`, all of it; ValueError also if it is shorter than a control step."""
+    events, begin_us, steps = _fitted(path, env)
+    if steps == 0:
+        raise ValueError(f"{path}: must last at least a control step, {1 / env.control_hz:.3g} s")
+    return _part(Path(path).name, events, begin_us, (0, steps), env)
+
+
+def _fitted(path: str | Path, env: EnvConfig) -> tuple[np.ndarray, int, int]:
+    """The events of a file as the camera's, the time before the first [us], and their whole control steps."""
     file = read_events(path)
     if file.width is None or file.height is None:
         raise ValueError(
@@ -56,13 +75,7 @@ def read_recorded(path: str | Path, env: EnvConfig, validation_share: float) -> 
     events = downscale_events(events, shape, (env.camera.height, env.camera.width))
     begin_us = int(file.events["t"][0]) - 1 if file.events.size else 0
     duration_us = int(file.events["t"][-1]) - begin_us if file.events.size else 0
-    steps = int(duration_us * env.control_hz / 1e6)
-    kept = round(steps * (1.0 - validation_share))
-    if not 0 < kept < steps:
-        least = 1 / env.control_hz / min(validation_share, 1.0 - validation_share)
-        raise ValueError(f"{path}: must last at least {least:.3g} s, got {duration_us / 1e6:.3g} s")
-    spans = {"train": (0, kept), "validation": (kept, steps)}
-    return {split: _part(Path(path).name, events, begin_us, span, env) for split, span in spans.items()}
+    return events, begin_us, int(duration_us * env.control_hz / 1e6)
 
 
 def cropped(

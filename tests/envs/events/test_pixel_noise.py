@@ -79,6 +79,23 @@ def test_shot_noise_has_its_rate_alternates_and_does_not_drift(step_us):
     assert changes.mean() > 0.995
 
 
+def test_waiting_goes_on_while_the_light_trembles():
+    eye = EventCamera(64, 64, cutoff_hz=1e5)
+    lights = [np.full((64, 64), value, np.float32) for value in (0.05, 0.05004)]
+    eye.reset(lights[0], 0)
+    faults, state = FaultsConfig(shot_noise_hz=50.0), (eye.state, eye.pixels)
+    counts = []
+    for step_us in (100, 20_000):
+        eye.reset(lights[0], 0)
+        real, count = RealSensor(eye.config, faults, state, np.random.default_rng(0), 0), 0
+        for k in range(SECOND // 10 // step_us):
+            t = k * step_us
+            count += real.events(eye.step(lights[(k + 1) % 2], t + step_us), t, t + step_us).size
+        counts.append(count / 4096 / 0.1)
+    assert counts[0] == pytest.approx(counts[1], rel=0.05)
+    assert counts[0] == pytest.approx(50.0 * (1 - 0.75 * 0.05), rel=0.2)
+
+
 def test_intervals_do_not_depend_on_the_step():
     gaps = []
     for step_us in (1000, 100_000):

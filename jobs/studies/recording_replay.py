@@ -1,0 +1,131 @@
+"""A policy looks at a real camera's recording: what it would have done at each control step, and how fast.
+
+Run: python -m platform.launch +exp=replay replay.recording=street.raw replay.policy=bytestream_hold-s0
+Expect: seconds. A line of numbers; `replay/choices.csv` and a film of the events and the choices in the run
+folder. Nothing moves: the recording is what it is, whatever the policy chooses (docs/camera.md).
+"""
+
+import csv
+import io
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.config import EnvConfig
+from jobs.analysis.tables import show_table
+from jobs.analysis.video import coloured, frame, last_polarity, open_film
+from jobs.config.config import Config, ConfigError
+from jobs.rollout.policies import find_one_policy
+from jobs.run.files import write_atomic
+from jobs.run.folder import locate_run, open_run
+from jobs.run.progress import console
+from jobs.training.real_recordings import Recorded, read_whole
+from models.policy import Policy, load_policy
+
+ACTIONS = ("forward", "left", "right")
+HEADINGS = ("Recording", "Policy", "Steps", "Events/step", "Forward", "Left", "Right", "p50", "p95", "p99")
+FILM_FPS, SLOWEST_FPS = 50.0, 5.0
+
+
+class Choice(NamedTuple):
+    """What a policy made of one control step.
+
+    Attributes:
+        start_us, end_us: The step [us].
+        events: EVENT of it.
+        probabilities: Of the actions, float64 (3,).
+        seconds: What the choice took.
+    """
+
+    start_us: int
+    end_us: int
+    events: np.ndarray
+    probabilities: np.ndarray
+    seconds: float
+
+
+def run(config: Config) -> list[Choice]:
+    """Replay `replay.recording` to `replay.policy`; return what it chose.
+
+    Raises:
+        ConfigError: There is no such policy, or it sees no events; or the recording is refused.
+    """
+    found = find_one_policy("replay.policy", config.replay.policy, config, locate_run(config))
+    policy = load_policy(found.agent)
+    if policy.feature.from_events is None:
+        raise ConfigError(f"replay.policy: must see events, got {config.replay.policy!r}")
+    env = EnvConfig(**policy.env_fields)
+    try:
+        recorded = read_whole(config.replay.recording, env)
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"replay.recording: {error}") from error
+    choices, name = choose(policy, recorded), f"{found.group}-s{found.training}"
+    show_table("A policy looks at a recording", HEADINGS, [line(recorded.name, name, choices)], words=2)
+    console.print(
+        "Latency from events to action [ms]; actions by the likeliest, in % of the steps.", markup=False
+    )
+    folder = open_run(config).path / "replay"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(folder / "choices.csv", table_text(choices))
+    shape = env.camera.height, env.camera.width
+    path = write_film(folder / "replay.mp4", choices, shape, f"{recorded.name}   {name}", env.control_hz)
+    console.print(f"Film: {path}", markup=False)
+    return choices
+
+
+def choose(policy: Policy, recorded: Recorded) -> list[Choice]:
+    """What a policy makes of each control step of a recording, from its own memory of those before."""
+    policy.reset()
+    policy.event_logits(recorded.events[:1], int(recorded.events["t"][0]) - 1, 1)  # compiles
+    policy.reset()
+    starts_us = np.concatenate(([0], recorded.ends_us[:-1]))
+    cuts = np.searchsorted(recorded.events["t"], np.append(starts_us, recorded.ends_us[-1]), side="right")
+    choices = []
+    for step, (start_us, end_us) in enumerate(
+        zip(starts_us.tolist(), recorded.ends_us.tolist(), strict=True)
+    ):
+        events = recorded.events[cuts[step] : cuts[step + 1]]
+        begun = time.perf_counter()
+        logits = policy.event_logits(events, start_us, end_us - start_us).astype(np.float64)
+        seconds = time.perf_counter() - begun
+        odds = np.exp(logits - logits.max())
+        choices.append(Choice(start_us, end_us, events, odds / odds.sum(), seconds))
+    return choices
+
+
+def line(recording: str, policy: str, choices: list[Choice]) -> tuple[str, ...]:
+    """A text for each of `HEADINGS`."""
+    likeliest = np.array([choice.probabilities.argmax() for choice in choices])
+    shares = [f"{100 * (likeliest == action).mean():.0f}" for action in range(len(ACTIONS))]
+    latency = np.percentile([1e3 * choice.seconds for choice in choices], (50, 95, 99))
+    per_step = np.mean([choice.events.size for choice in choices])
+    return recording, policy, str(len(choices)), f"{per_step:.0f}", *shares, *(f"{ms:.2f}" for ms in latency)
+
+
+def table_text(choices: list[Choice]) -> str:
+    """CSV with a row for each control step: its end [us], its events, and the actions' probabilities."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("end_us", "events", *ACTIONS))
+    for choice in choices:
+        writer.writerow((choice.end_us, choice.events.size, *(f"{p:.4f}" for p in choice.probabilities)))
+    return text.getvalue()
+
+
+def write_film(path: Path, choices: list[Choice], shape: tuple[int, int], title: str, hz: float) -> Path:
+    """Write an MP4 file with a frame for each control step: its events, and the choice; return it."""
+    with open_film(path, hz, None, float(np.clip(hz / 4, SLOWEST_FPS, FILM_FPS))) as film:
+        for choice in choices:
+            odds = "   ".join(
+                f"{name} {p:.2f}" for name, p in zip(ACTIONS, choice.probabilities, strict=True)
+            )
+            panel = coloured(last_polarity(choice.events, shape))
+            bars = np.zeros((*shape, 3), np.uint8)
+            for place, action in enumerate((1, 0, 2)):  # left, forward, right, as a person looks
+                height, width = round(choice.probabilities[action] * shape[0]), shape[1] // 3
+                bars[shape[0] - height :, place * width + 1 : (place + 1) * width - 1] = (245, 158, 11)
+            panels = [(title, panel), ("left, forward, right", bars)]
+            film.add(frame(panels, f"{choice.end_us / 1e6:.2f} s   {odds}"))
+    return path
