@@ -150,6 +150,7 @@ def kinds() -> dict[str, dict[str, tuple[object, str]]]:
             found[name] = {f"{name}.{field}": _field(owner, field) for field in fields_of(owner)}  # type: ignore[arg-type]
         elif name != "env":
             found[""][name] = kind, ""
+    found[""]["name"] = str | None, ""
     return found
 
 

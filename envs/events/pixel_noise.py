@@ -418,9 +418,8 @@ def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
         event_us = np.int64(min(max(np.ceil(coming), span.start_us + 1), span.end_us))
         rises = high <= low if due else rng.random() * (up + down) < up
         fired.append((event_us, i, np.int64(2 * rises - 1)))
-        displaced = 0.0
+        displaced = 0.0 if due else max(high, 0.0) if rises else -max(low, 0.0)
         if not due:
-            displaced = max(high, 0.0) if rises else -max(low, 0.0)
             noise.budget[i] = rng.standard_exponential()
         elif rises and fall > 0.0:
             noise.leak[i] = noise.leak_mean[i] / max(1.0 + process.jitter * rng.standard_normal(), 0.1)

@@ -239,7 +239,7 @@ def test_faults_leave_the_corridor_and_the_spawn_alone():
     faulty.reset(seed=4)
     assert clean.camera_pose() == faulty.camera_pose()
     assert clean.scene.obstacles.tobytes() == faulty.scene.obstacles.tobytes()
-    dead = faulty._sensor._pixels.dead
+    dead = faulty._sensor._real._pixels.dead
     assert dead.sum() == round(0.3 * 256)
     silenced = 0
     for _ in range(20):

@@ -135,9 +135,7 @@ def test_a_refused_command_line_ends_with_status_2_and_one_message(launch, job, 
 def test_without_an_experiment_the_message_lists_them(launch, words):
     status, _, err = launch(*words)
     assert status == 2
-    assert (
-        "name an experiment with +exp=NAME, one of bytestream, bytestream_finetuned, bytestream_hold, " in err
-    )
+    assert "name an experiment with +exp=NAME, one of ablation, bytestream, bytestream_finetuned, " in err
     assert len(err.splitlines()) == 1
 
 
