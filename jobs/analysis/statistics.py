@@ -113,7 +113,7 @@ def crossed_mean(values: np.ndarray, bounds: Interval | None = None) -> Differen
     """
     values = _checked(values, "values")
     parts = [(_by_trainings(values), len(values) - 1), (_by_corridors([values]), values.shape[1] - 1)]
-    return _tested(values.mean(), parts, _least(values, bounds))
+    return _within(_tested(values.mean(), parts, _least(values, bounds)), bounds)
 
 
 def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | None = None) -> Difference:
@@ -136,7 +136,17 @@ def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | 
     parts = [(_by_corridors([ours, -theirs]), ours.shape[1] - 1)]
     if min(len(ours), len(theirs)) > 1:
         parts += [(_by_trainings(side), len(side) - 1) for side in (ours, theirs)]
-    return _tested(ours.mean() - theirs.mean(), parts, _least(ours, bounds) + _least(theirs, bounds))
+    least = _least(ours, bounds) + _least(theirs, bounds)
+    span = None if bounds is None else (bounds[0] - bounds[1], bounds[1] - bounds[0])
+    return _within(_tested(ours.mean() - theirs.mean(), parts, least), span)
+
+
+def _within(found: Difference, bounds: Interval | None) -> Difference:
+    """With an interval that ends at the bounds, if there are any."""
+    if bounds is None or found.interval is None:
+        return found
+    low, high = found.interval
+    return found._replace(interval=(max(low, bounds[0]), min(high, bounds[1])))
 
 
 def _by_trainings(values: np.ndarray) -> float:

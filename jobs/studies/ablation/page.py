@@ -131,6 +131,6 @@ def plot_variants(results: Sequence[VariantResult]) -> Figure:
             right.plot(ends, [row, row], color=INK, lw=1.2)
             right.plot(100 * one.difference.value, row, "|", color=INK, ms=12)
             right.plot(100 * one.differences, [row] * len(one.differences), "o", color=BLUE, ms=4, alpha=0.8)
-    right.set_title(f"Change of the mean against {results[0].name} [points]", loc="left", fontsize=10)
+    right.set_title("Change of the mean [points]", loc="left", fontsize=10)
     tidy(right, "x")
     return figure

@@ -188,6 +188,14 @@ def test_episodes_of_other_corridors_are_not_compared():
         crossed_difference(np.zeros((1, 3)), np.zeros((1, 4)))
 
 
+def test_an_interval_ends_at_what_is_possible():
+    lost = np.array([[-1.0] * 5, [0.0] * 5, [-1.0] * 5])
+    assert crossed_mean(lost, (-1.0, 1.0)).interval[0] == -1.0
+    assert crossed_mean(lost).interval[0] < -1.0
+    ones = np.ones((2, 5))
+    assert crossed_difference(ones, lost + 1.0, (0.0, 1.0)).interval[1] == 1.0
+
+
 def test_pairs_are_tested_exactly():
     ours, theirs = paired_flights(5, 4, 0, 5)
     assert exact_pair_p(ours, theirs) == pytest.approx(2 * 0.5**4)
