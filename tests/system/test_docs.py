@@ -194,7 +194,11 @@ def test_the_python_on_a_page_runs(page, folder):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [path if path.stem == "events" else pytest.param(path, marks=pytest.mark.slow) for path in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_a_notebook_runs_and_draws_what_it_shows(path):
     def drawn(book: nbformat.NotebookNode) -> list[int]:
         outputs = [cell.outputs for cell in book.cells if cell.cell_type == "code"]

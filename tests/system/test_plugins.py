@@ -89,6 +89,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", BROKEN)
 def test_an_error_in_a_worker_names_it(tmp_path, what):
     before, after, message = BROKEN[what]
