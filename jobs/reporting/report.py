@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from jobs.analysis.coverage import coverage_text
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot
-from jobs.bench.coverage import coverage_text
 from jobs.config.config import Config, ConfigError
 from jobs.evaluation.group_stats import (
     LABELS,

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, ttest_ind
 
+from jobs.analysis.coverage import coverage
 from jobs.analysis.statistics import (
     bootstrap_interval,
     crossed_difference,
@@ -14,7 +15,6 @@ from jobs.analysis.statistics import (
     trainings_needed,
     wilson_interval,
 )
-from jobs.bench.coverage import coverage
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""How often 95 % intervals over trainings and corridors hold the truth: python -m jobs.bench.coverage.
+"""How often 95 % intervals over trainings and corridors hold the truth: python -m jobs.analysis.coverage.
 
 Studies are simulated: the logit of success is a mean, plus a normal effect of each training and of each
 corridor, and episodes are drawn from it. Printed are the share of intervals that hold the true rate (of
