@@ -50,6 +50,7 @@ AddedFault = Annotated[str, AfterValidator(_of_a_fault)]
 Setting = float | int | str | None  # of the sensor
 Observation = Literal["window", "event_image", "luminance", "events", "none"]
 Split = Literal["train", "validation", "eval"]
+LUMINANCE_FLOOR = 1e-3  # of luminance that is rendered, or has no steps for other reasons
 WITHOUT_EVENTS = ("luminance", "none")  # observations for which no event camera is simulated
 
 
@@ -68,7 +69,9 @@ class CameraConfig:
             which forgets what stayed below the threshold. "legacy": the paper's published
             code, see `envs.events.camera`.
         luminance_floor: Added to luminance before the logarithm, so that black is defined;
-            with response "lin_log" the luminance below which a pixel responds linearly.
+            with response "lin_log" the luminance below which a pixel responds linearly. None: right
+            for what the camera is shown, `LUMINANCE_FLOOR` but for frames of few grey levels
+            (`envs.recordings.light.usual_floor`).
         max_events_per_pixel: Most events of one pixel between two renders, the earliest.
         response: "log": log(luminance + floor). "lin_log": log(luminance) from the floor
             upwards, and below it its tangent, as photoreceptors in the dark.
@@ -99,7 +102,7 @@ class CameraConfig:
     contrast_threshold: Annotated[float, Field(ge=1e-6, le=10)] = 0.2
     contrast_threshold_off: Annotated[float, Field(ge=1e-6, le=10)] | None = None
     memory: Literal["reference", "frame", "legacy"] = "reference"
-    luminance_floor: Annotated[float, Field(ge=1e-9, le=1)] = 1e-3
+    luminance_floor: Annotated[float, Field(ge=1e-9, le=1)] | None = None
     max_events_per_pixel: Annotated[int, Field(ge=1, le=100_000)] = 100
     response: Literal["log", "lin_log"] = "log"
     threshold_mismatch: Fraction = 0.0
@@ -127,6 +130,13 @@ class CameraConfig:
         if value == "carry" and forgets:
             raise ValueError("'carry' needs memory 'reference' and refractory_us 0; use 'drop'")
         return value
+
+
+def with_floor(camera: CameraConfig, floor: float = LUMINANCE_FLOOR) -> CameraConfig:
+    """The camera with this luminance floor, unless it has one."""
+    if camera.luminance_floor is not None:
+        return camera
+    return dataclasses.replace(camera, luminance_floor=floor)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -232,7 +242,7 @@ class EnvConfig:
     filter_tau_us: Annotated[int, Field(ge=0, le=10**9)] = 5_000
     split: Split = "train"
     renderer: Literal["auto", "raycast", "pyrender"] = "auto"
-    camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
+    camera: CameraConfig = dataclasses.field(default_factory=lambda: with_floor(CameraConfig()))
     faults: FaultsConfig = dataclasses.field(default_factory=FaultsConfig)
     fidelity: FidelityConfig = dataclasses.field(default_factory=FidelityConfig)
 
@@ -241,6 +251,11 @@ class EnvConfig:
     def _by_name(cls, value: Any, info: ValidationInfo) -> Any:
         """A section by its fields' names, as a policy's manifest holds them."""
         return SECTIONS[str(info.field_name)](**value) if isinstance(value, Mapping) else value
+
+    @field_validator("camera")
+    @classmethod
+    def _rendered(cls, value: CameraConfig) -> CameraConfig:
+        return with_floor(value)
 
 
 def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:

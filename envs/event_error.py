@@ -71,6 +71,34 @@ def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, se
     )
 
 
+def error_between(config: EnvConfig, other: EnvConfig, flights: int = 6, steps: int = 12) -> float:
+    """Event error between two sensors on the same short flights, such as one with faults and one without.
+
+    The flights are those of `measure_event_error`, the partners those of `event_error`, at most a twentieth
+    of a control step apart.
+
+    Args:
+        config: One simulation, with its faults.
+        other: Another one, of the same scene, rate and speed.
+        flights: How many.
+        steps: Control steps of each.
+
+    Raises:
+        ValueError: Scene, rate or speed differ.
+    """
+    way = ("scene", "layout", "control_hz", "speed_mps")
+    if any(getattr(config, name) != getattr(other, name) for name in way):
+        raise ValueError(f"both must have the same {', '.join(way)}; got {config!r} and {other!r}")
+    streams = []
+    for i in range(flights):
+        scene, places = _flight(config, steps, np.random.default_rng([ENTROPY, 0, i]))
+        streams.append([_events_along(Sensor(one), one, scene, places)[0] for one in (config, other)])
+    tolerance_us = TIME_SHARE * 1e6 / config.control_hz
+    weights = [ours.size + theirs.size for ours, theirs in streams]
+    errors = [event_error(ours, theirs, tolerance_us) for ours, theirs in streams]
+    return float(np.average(errors, weights=weights)) if sum(weights) else 0.0
+
+
 def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
     """The settings of the same simulation without any error of rendering, see `measure_event_error`."""
     renderer: Literal["raycast", "pyrender"] = "raycast" if scene.mesh is None else "pyrender"
@@ -89,8 +117,7 @@ def _measure_flight(
     config: EnvConfig, steps: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Events of one flight as `config` has it and converged, and the renders of the first."""
-    scene = make_scene(config.scene, rng, config.vehicle_radius_m, config.camera_height_m, **config.layout)
-    way = _free_way(config, scene, steps, rng)
+    scene, way = _flight(config, steps, rng)
     config = dataclasses.replace(config, faults=FaultsConfig())
     events, renders = _events_along(Sensor(config), config, scene, way)
     exact = converged(config, scene)
@@ -100,6 +127,12 @@ def _measure_flight(
             _CONVERGED.clear()
         _CONVERGED[key] = _events_along(Sensor(exact), config, scene, way)[0]
     return events, _CONVERGED[key], renders
+
+
+def _flight(config: EnvConfig, steps: int, rng: np.random.Generator) -> tuple[Scene, list[Point]]:
+    """A corridor, and a way through it."""
+    scene = make_scene(config.scene, rng, config.vehicle_radius_m, config.camera_height_m, **config.layout)
+    return scene, _free_way(config, scene, steps, rng)
 
 
 def _free_way(config: EnvConfig, scene: Scene, steps: int, rng: np.random.Generator) -> list[Point]:

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.config import CameraConfig
+from envs.config import LUMINANCE_FLOOR, CameraConfig, with_floor
 from envs.events import crossings
 from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME
 from envs.events.lowpass import filter_frames, filter_rates, low_pass, start_filter
@@ -83,7 +83,7 @@ class EventCamera:
             config = dataclasses.replace(width, **fields)
         else:
             config = CameraConfig(width=width, height=height, **fields)
-        self.config = config
+        self.config = config = with_floor(config)
         self.dropped = 0
         self.t_us: int | None = None
         self._shape = (config.height, config.width)
@@ -95,7 +95,7 @@ class EventCamera:
             forgets=config.memory != "reference",
             legacy=config.memory == "legacy",
         )
-        curve = response_curve(config.response, config.luminance_floor)
+        curve = response_curve(config.response, config.luminance_floor or LUMINANCE_FLOOR)
         thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if rule.legacy else 1)
         self._model = tuple(rule), tuple(curve), thresholds
         self._low_pass = low_pass(config) if config.cutoff_hz > 0.0 else None

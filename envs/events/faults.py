@@ -22,6 +22,7 @@ from envs.events.emission import EVENT
 from envs.events.pixel_noise import PixelNoise
 from envs.events.readout import Readout
 
+LABELLED = np.dtype([*EVENT.descr, ("is_noise", "?")])
 Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
 
 
@@ -63,10 +64,19 @@ class RealSensor:
 
     Attributes:
         lost: Events of the last interval that the readout lost.
+        is_noise: bool (N,), which events of the last interval no change of the light fired; empty unless
+            asked for. A displaced or flipped event is none.
     """
 
     def __init__(
-        self, camera: CameraConfig, faults: FaultsConfig, state: tuple, rng: np.random.Generator, t_us: int
+        self,
+        camera: CameraConfig,
+        faults: FaultsConfig,
+        state: tuple,
+        rng: np.random.Generator,
+        t_us: int,
+        *,
+        labels: bool = False,
     ) -> None:
         """Draw the faults of a camera that has just seen its first frame.
 
@@ -76,11 +86,13 @@ class RealSensor:
             state: Its `state`, and the flat pixel y * W + x of each pixel of its memory, int64.
             rng: Source of all draws.
             t_us: The time of that frame [us].
+            labels: Whether `is_noise` is wanted.
 
         Raises:
             ValueError: The pixels are too slow for the rate of shot noise.
         """
         self._faults, self._rng, self.lost = faults, rng, 0
+        self._labels, self.is_noise = labels, np.empty(0, bool)
         shape = camera.height, camera.width
         self._pixels = draw_pixel_faults(shape, faults, rng)
         self._noise = self._readout = None
@@ -89,7 +101,7 @@ class RealSensor:
             alive = np.where(self._pixels.dead.flat[numbers], -1, numbers)
             self._noise = PixelNoise(camera, faults, own, alive, t_us, rng)
         if has_readout(camera):
-            self._readout = Readout(camera, t_us, rng)
+            self._readout = Readout(camera, t_us, rng, LABELLED if labels else EVENT)
         amounts = sorted(faults.added.items())
         self._added = {
             name: ADDED_FAULTS[name](amount, shape, rng) for name, amount in amounts if amount > 0.0
@@ -101,13 +113,34 @@ class RealSensor:
         The camera has seen the light of t1_us. As `apply_faults`, which also says what is raised.
         """
         noise = self._noise.events(t0_us, t1_us) if self._noise is not None else None
-        events = apply_faults(events, t0_us, t1_us, self._faults, self._pixels, self._rng, noise)
+        events, is_noise = _with_faults(events, (t0_us, t1_us), self._faults, self._pixels, self._rng, noise)
         for name, apply in self._added.items():
-            events = apply(events, t0_us, t1_us)
+            before, events = events, apply(events, t0_us, t1_us)
             _check_added(name, events, (t0_us, t1_us), self._pixels.dead.shape)
+            if self._labels:
+                is_noise = ~np.isin(events, before[~is_noise])
+        if not self._labels:
+            return events if self._readout is None else self._sent(events, t1_us)
+        self.is_noise = is_noise
         if self._readout is not None:
-            events, self.lost = self._readout.send(events, t1_us)
+            sent = self._sent(labelled(events, is_noise), t1_us)
+            events, self.is_noise = sent[list(EVENT.names or ())].astype(EVENT), sent["is_noise"]
         return events
+
+    def _sent(self, events: np.ndarray, t1_us: int) -> np.ndarray:
+        """What the readout sends until a time [us]."""
+        assert self._readout is not None  # noqa: S101  for the type checker
+        sent, self.lost = self._readout.send(events, t1_us)
+        return sent
+
+
+def labelled(events: np.ndarray, is_noise: np.ndarray) -> np.ndarray:
+    """`LABELLED` (N,) of EVENT (N,) and bool (N,)."""
+    rows = np.empty(events.size, LABELLED)
+    for name in EVENT.names or ():
+        rows[name] = events[name]
+    rows["is_noise"] = is_noise
+    return rows
 
 
 def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, ...]) -> None:
@@ -163,6 +196,19 @@ def apply_faults(
     Raises:
         ValueError: The interval is empty, or more than 2**24 false events are to be expected.
     """
+    return _with_faults(events, (t0_us, t1_us), faults, pixels, rng, noise)[0]
+
+
+def _with_faults(
+    events: np.ndarray,
+    span_us: tuple[int, int],
+    faults: FaultsConfig,
+    pixels: PixelFaults,
+    rng: np.random.Generator,
+    noise: Noise | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`apply_faults`, and which of the events are false, bool (N,)."""
+    t0_us, t1_us = span_us
     if t1_us <= t0_us:
         raise ValueError(f"faults need t1_us > t0_us; got {t0_us} and {t1_us}.")
     if faults.sparsity > 0.0:
@@ -180,10 +226,10 @@ def apply_faults(
     drawn = [where[rng.integers(0, where.size, int(rng.poisson(mean)))] for where, mean in kinds]
     false = [_at_any_time(where, (t0_us, t1_us), rng) for where in drawn] + ([noise] if noise else [])
     if not false:
-        return events
+        return events, np.zeros(events.size, bool)
     times, places, polarities = (np.concatenate(parts) for parts in zip(*false, strict=True))
     if times.size == 0:
-        return events
+        return events, np.zeros(events.size, bool)
     return _merged(events, times, places, polarities, t0_us, pixels.dead.shape)
 
 
@@ -215,12 +261,16 @@ def _merged(
     polarities: np.ndarray,
     t0_us: int,
     shape: tuple[int, int],
-) -> np.ndarray:
-    """EVENT sorted by (t, y, x) of events, which are, and noise; of equal ones the true events come first."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """EVENT sorted by (t, y, x) of events, which are, and noise; of equal ones the true events come first.
+
+    And which of them are the noise, bool (N,).
+    """
     width = shape[1]
     order = np.argsort((times - t0_us) * (shape[0] * width) + places, kind="mergesort")
     times, places, polarities = times[order], places[order], polarities[order]
     both = np.empty(events.size + times.size, events.dtype)
+    is_noise = np.zeros(both.size, np.bool_)
     true = false = 0
     for k in range(both.size):
         first = false == times.size
@@ -231,7 +281,8 @@ def _merged(
             both[k] = events[true]
             true += 1
         else:
+            is_noise[k] = True
             both[k]["t"], both[k]["p"] = times[false], polarities[false]
             both[k]["y"], both[k]["x"] = places[false] // width, places[false] % width
             false += 1
-    return both
+    return both, is_noise

@@ -15,21 +15,26 @@ class Readout:
     waits fires no other event.
     """
 
-    def __init__(self, camera: CameraConfig, t_us: int, rng: np.random.Generator) -> None:
-        """Make the readout of a camera that starts at a time [us]; `rng` draws the jitter."""
+    def __init__(
+        self, camera: CameraConfig, t_us: int, rng: np.random.Generator, dtype: np.dtype = EVENT
+    ) -> None:
+        """Make the readout of a camera that starts at a time [us]; `rng` draws the jitter.
+
+        Its events are of `dtype`: EVENT, or EVENT with more fields, which stay with their event.
+        """
         self._camera, self._rng = camera, rng
-        self._waiting = np.empty(0, EVENT)
+        self._waiting = np.empty(0, dtype)
         self._free_us, self._row = float(t_us), 0
 
     def send(self, events: np.ndarray, t1_us: int) -> tuple[np.ndarray, int]:
         """What leaves the sensor until a time; the rest waits for the next call.
 
         Args:
-            events: EVENT of the pixels since the last call, sorted by t, at most `t1_us`.
+            events: Events of the pixels since the last call, sorted by t, at most `t1_us`.
             t1_us: The time [us].
 
         Returns:
-            EVENT sorted by (t, y, x), and how many were lost because their pixel was waiting.
+            Events sorted by (t, y, x), and how many were lost because their pixel was waiting.
         """
         camera = self._camera
         if camera.latency_us > 0 or camera.latency_jitter_us > 0.0:

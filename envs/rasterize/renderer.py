@@ -14,6 +14,7 @@ and the outlines of ellipsoids. `raycast` says what is seen from where.
 import contextlib
 import math
 import os
+import sys
 from typing import Any
 
 import numpy as np
@@ -191,7 +192,8 @@ def _start(width: int, height: int, antialias: bool) -> tuple[Any, Any]:
     except Exception as error:  # every missing library fails in its own way: ImportError, AttributeError, ...
         reason = " ".join(str(error).split())[:200]
         cause = f"{type(error).__name__}: {reason}"
-        raise RuntimeError(f"pyrender cannot use EGL ({cause}); try: {PACKAGES}") from None
+        remedy = f"try: {PACKAGES}" if sys.platform == "linux" else "EGL is for Linux; use renderer=raycast"
+        raise RuntimeError(f"pyrender cannot use EGL ({cause}); {remedy}") from None
 
 
 def _distances(bodies: np.ndarray, eye_m: np.ndarray) -> np.ndarray:

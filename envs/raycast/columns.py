@@ -81,7 +81,7 @@ def render_way(
     stacks: np.ndarray,
     scene_frame: np.ndarray,
     poses: np.ndarray,
-    images: np.ndarray,
+    columns: np.ndarray,
     cull: float,
     room: Workspace,
 ) -> int:
@@ -92,7 +92,7 @@ def render_way(
         stacks: Float32, the filtered tiles of all noise.
         scene_frame: (1,) FRAME, which lacks what a pose determines.
         poses: (K, 5) float64 x, y, z [m], yaw [rad], time [s].
-        images: (K, H, W) float32.
+        columns: (K, W, H) float32, column after column, as cameras that look at columns keep an image.
         cull: Bodies farther than this are not drawn [m].
         room: A `Workspace` for N bodies and H rows.
 
@@ -106,7 +106,7 @@ def render_way(
         if not (near and abs(yaw) < np.inf and abs(time) <= LIMIT_S):
             return k
         aim(room.frames[0], x, y, z, yaw, time)
-        paint_columns(bodies, stacks, images[k], 0, images.shape[2], cull, room)
+        paint_columns(bodies, stacks, columns[k].T, 0, columns.shape[1], cull, room)
     return -1
 
 

@@ -162,12 +162,12 @@ class RaycastRenderer:
         Raises:
             ValueError: As `render`, for the first pose that is refused.
         """
-        images = np.empty((len(poses), self.height, self.width), np.float32)
-        bad = render_way(self.bodies, self.stacks, self.frame, poses, images, self.cull_m, self.room)
+        columns = np.empty((len(poses), self.width, self.height), np.float32)
+        bad = render_way(self.bodies, self.stacks, self.frame, poses, columns, self.cull_m, self.room)
         if bad >= 0:
             x_m, y_m, z_m, yaw_rad, t_s = poses[bad].tolist()
             check_pose((x_m, y_m, z_m, yaw_rad), t_s)
-        return images
+        return np.ascontiguousarray(columns.swapaxes(1, 2))
 
 
 def sample_luminance(

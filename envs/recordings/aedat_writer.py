@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from envs.checks import replaced
 from envs.recordings.aedat import EVENT_PACKET, MAGIC_4, PACKED_EVENT, PACKET_TABLE
-from envs.recordings.event_file import replaced
 
 MAX_PIXELS = 1 << 15  # a coordinate is a signed 16-bit integer
 PACKET_EVENTS = 1 << 14

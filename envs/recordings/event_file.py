@@ -5,11 +5,8 @@ the same rules to every format. What breaks a rule raises one ValueError that na
 rule and the remedy.
 """
 
-import contextlib
 import dataclasses
-import os
 import stat
-from collections.abc import Iterator
 from pathlib import Path
 
 import numba
@@ -41,6 +38,9 @@ class EventFile:
         dropped: Events that the simulated sensor lost to its limit (videos only).
         strays: Times of an EVT stream that damage moved by more than a second, left out; the
             events after one keep the time before it, until the next.
+        is_noise: bool (N,), which events no change of the light fired; None: nobody knows.
+        missed: About which share of a scene's events its frames miss (videos and images only); None: too
+            few frames or events to tell.
     """
 
     events: np.ndarray
@@ -51,6 +51,8 @@ class EventFile:
     skipped: int = 0
     dropped: int = 0
     strays: int = 0
+    is_noise: np.ndarray | None = None
+    missed: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +187,14 @@ def assemble(request: Request, t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p
     return events
 
 
-def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0, strays: int = 0) -> EventFile:
+def finish(
+    request: Request,
+    format: str,
+    events: np.ndarray,
+    skipped: int = 0,
+    strays: int = 0,
+    is_noise: np.ndarray | None = None,
+) -> EventFile:
     """Check the rules that hold for every format, and put the events in time order.
 
     Times that go back by at most one second are sorted in (stable: ties keep the order of
@@ -198,11 +207,13 @@ def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0, 
         events: EVENT array in the order of the file.
         skipped: Entries that were left out.
         strays: Times that were left out.
+        is_noise: Labels of the events, 0 or 1 of any type, or None.
 
     Raises:
-        ValueError: A coordinate is outside the sensor, a time is outside [0, 2**52), or the
-            times go back by more than a second.
+        ValueError: A coordinate is outside the sensor, a time is outside [0, 2**52), the
+            times go back by more than a second, or labels are others or not one for each event.
     """
+    labels = None if is_noise is None else _checked_labels(request, is_noise, len(events))
     x_max, y_max, t_min, t_max, late, back_us = _extremes(events)
     for name, size, largest in (("x", request.width, x_max), ("y", request.height, y_max)):
         if size is not None and largest >= size:
@@ -221,8 +232,18 @@ def finish(request: Request, format: str, events: np.ndarray, skipped: int = 0, 
             "are sorted, more is a reset clock or damage: cut the file there"
         )
     if late:
-        events = events[np.argsort(events["t"], kind="stable")]
-    return EventFile(events, request.width, request.height, format, late, skipped, strays=strays)
+        order = np.argsort(events["t"], kind="stable")
+        events, labels = events[order], labels if labels is None else labels[order]
+    return EventFile(
+        events, request.width, request.height, format, late, skipped, strays=strays, is_noise=labels
+    )
+
+
+def _checked_labels(request: Request, is_noise: np.ndarray, count: int) -> np.ndarray:
+    """The labels as bool (count,)."""
+    if len(is_noise) != count or not np.isin(is_noise, (0, 1)).all():
+        raise request.refusal("must have one is_noise of 0 or 1 for each event; repair or remove it")
+    return is_noise.astype(bool)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -300,25 +321,3 @@ def check_order(events: np.ndarray) -> None:
     if back.any():
         first = int(np.argmax(back)) + 1
         raise ValueError(f"events must be sorted by t; event {first} is older than the one before it")
-
-
-@contextlib.contextmanager
-def replaced(path: Path) -> Iterator[Path]:
-    """A path beside the final one to write to: it takes the final name only when all went well.
-
-    Yields:
-        The path of the unfinished file; after an error it is removed and `path` is as it was.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        yield part
-        with part.open("rb") as file:
-            os.fsync(file.fileno())  # the content before its name
-        part.replace(path)
-    except OSError as error:
-        if error.errno is not None and error.filename is None:  # that of a write names no file
-            error.filename = str(path)
-        raise
-    finally:
-        part.unlink(missing_ok=True)

@@ -39,6 +39,11 @@ WRITERS: dict[str, Callable[[Path, np.ndarray, int, int], None]] = {
     "txt": write_text,
 }
 
+LABELLED: dict[str, Callable[[Path, np.ndarray, int, int, np.ndarray], None]] = {
+    "hdf5": write_hdf5,
+    "npz": write_npz,
+}
+
 # How a file begins; the first that fits names the format.
 BEGINNINGS = (
     (MAGIC_2, "aedat2"),
@@ -119,7 +124,13 @@ def read_events(
 
 
 def write_events(
-    path: str | Path, events: np.ndarray, width: int, height: int, format: str | None = None
+    path: str | Path,
+    events: np.ndarray,
+    width: int,
+    height: int,
+    format: str | None = None,
+    *,
+    is_noise: np.ndarray | None = None,
 ) -> None:
     """Write events to a file, which appears whole or not at all; `read_events` gives the same events.
 
@@ -132,9 +143,10 @@ def write_events(
         width: Columns of the sensor [px].
         height: Its rows [px].
         format: One of the above; None: by the suffix (`.raw` is "evt3").
+        is_noise: bool (N,), which events are noise, as `video_to_events` labels them; for "npz" and "hdf5".
 
     Raises:
-        ValueError: The format is unknown, the events are not valid, or the format cannot hold
+        ValueError: The format is unknown, the events or labels are not valid, or the format cannot hold
             them: its clock ends before the last event (dat 2**32 us, evt2 2**34 us), or before
             the first (evt3 2**24 us), or it has fewer pixels.
     """
@@ -143,7 +155,14 @@ def write_events(
     if kind not in WRITERS:
         raise ValueError(f"{path}: format must be one of {', '.join(WRITERS)}, got {format or path.suffix!r}")
     check_events(events, width, height)
-    WRITERS[kind](path, events, width, height)
+    if is_noise is None:
+        WRITERS[kind](path, events, width, height)
+        return
+    if kind not in LABELLED:
+        raise ValueError(f"{path}: {kind} holds no labels of noise; choose {' or '.join(LABELLED)}")
+    if getattr(is_noise, "dtype", None) != np.dtype(bool) or is_noise.shape != events.shape:
+        raise ValueError(f"{path}: is_noise must be bool {events.shape}, got {is_noise!r:.80}")
+    LABELLED[kind](path, events, width, height, is_noise)
 
 
 def _guessed(path: Path) -> str:

@@ -21,6 +21,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 
+from envs.checks import replaced
 from envs.events import EVENT
 from envs.recordings.ecf import FILTER_ECF, MAX_CHUNK_EVENTS, decode_ecf
 from envs.recordings.event_file import (
@@ -32,7 +33,6 @@ from envs.recordings.event_file import (
     check_file,
     check_order,
     finish,
-    replaced,
 )
 
 MAX_EVENTS = 2_000_000_000
@@ -43,6 +43,7 @@ MAX_CHUNK_BYTES = 1 << 28
 # bitshuffle) crashed on damaged files, or (lz4, zstd) take the memory that the data declare.
 FILTERS = (1, 2, 3, 32000, 32001, 32026)
 BLOSC = (32001, 32026)
+NOISE = "events/is_noise"  # labels, where there are any
 HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
 # How data sets are compressed, and given a checksum, so that a flipped bit is noticed.
 PACKING = {**hdf5plugin.Blosc2(cname="zstd", clevel=3), "fletcher32": True}
@@ -108,10 +109,14 @@ def read_recording(path: Path) -> Recording:
     return Recording(events, index, about)
 
 
-def write_hdf5(path: Path, events: np.ndarray, width: int, height: int) -> None:
-    """Write checked events in the layout of DSEC, with the sensor's size as attributes."""
+def write_hdf5(
+    path: Path, events: np.ndarray, width: int, height: int, is_noise: np.ndarray | None = None
+) -> None:
+    """Write checked events in the layout of DSEC, with the sensor's size as attributes, and labels if any."""
     with _written(path, events) as file:
         file.attrs["width"], file.attrs["height"] = width, height
+        if is_noise is not None:
+            file.create_dataset(NOISE, data=is_noise.astype(np.uint8), **PACKING)
 
 
 def read_hdf5(request: Request) -> EventFile:
@@ -126,11 +131,12 @@ def read_hdf5(request: Request) -> EventFile:
         with h5py.File(request.path, "r") as file:
             request = request.sized(*_sensor(file))
             events = (_metavision if "CD" in file else _columns)(request, file)
+            is_noise = _labels(request, file)
     except (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError) as error:
         if str(error).startswith(str(request.path)):
             raise
         raise request.refusal(f"is no readable HDF5 event file ({error}); copy or record it again") from None
-    return finish(request, "hdf5", events)
+    return finish(request, "hdf5", events, is_noise=is_noise)
 
 
 def milliseconds_to_index(t_us: np.ndarray) -> np.ndarray:
@@ -197,6 +203,14 @@ def _columns(request: Request, file: h5py.File) -> np.ndarray:
     if t.dtype.kind not in "iu" or (len(t) and not 0 <= int(t.max()) + abs(offset) < 1 << 62):
         raise ValueError("events/t are no whole microseconds")
     return assemble(request, t.astype(np.int64) + offset, x, y, p)
+
+
+def _labels(request: Request, file: h5py.File) -> np.ndarray | None:
+    """Which events are noise, as they are stored, if the file says it."""
+    if "CD" in file or file.get(NOISE, getlink=True) is None:
+        return None
+    _declared_length(file, NOISE, request.max_events)
+    return np.asarray(file[NOISE][:])
 
 
 def _metavision(request: Request, file: h5py.File) -> np.ndarray:

@@ -9,7 +9,8 @@ from typing import IO
 
 import numpy as np
 
-from envs.recordings.event_file import EventFile, Request, assemble, finish, replaced, unwrap
+from envs.checks import replaced
+from envs.recordings.event_file import EventFile, Request, assemble, finish, unwrap
 
 US_PER = {"s": 1_000_000.0, "ms": 1000.0, "us": 1.0, "ns": 0.001}
 COLUMNS = ("t", "x", "y", "p")
@@ -28,6 +29,7 @@ MAX_HEADER_LINES = 1000
 CHUNK_BYTES = 1 << 20
 MAX_NPY_HEADER_BYTES = 1 << 16
 NMNIST_SIZE = (34, 34)
+NOISE = "is_noise"  # an array that labels each event, if there is one
 OVERFLOW_ROW, OVERFLOW_US = 240, 1 << 13
 
 
@@ -48,6 +50,7 @@ def read_npz(request: Request) -> EventFile:
             if missing:
                 raise request.refusal(f"has no array {missing[0]!r}; save t, x, y and p by these names")
             columns = [_array(request, archive, name, 1) for name in COLUMNS]
+            is_noise = _array(request, archive, NOISE, 1) if f"{NOISE}.npy" in names else None
             width, height = (
                 int(_array(request, archive, name, 0)) if f"{name}.npy" in names else None
                 for name in ("width", "height")
@@ -63,7 +66,7 @@ def read_npz(request: Request) -> EventFile:
     if t.dtype.kind != "f" and not (unit or request.time_unit):
         unit = "us"
     events = assemble(request, _microseconds(request, t, unit), x, y, p)
-    return finish(request.sized(width, height), "npz", events)
+    return finish(request.sized(width, height), "npz", events, is_noise=is_noise)
 
 
 def _array(request: Request, archive: zipfile.ZipFile, name: str, ndim: int) -> np.ndarray:
@@ -235,10 +238,13 @@ def read_nmnist(request: Request) -> EventFile:
     return finish(request, "nmnist", events, int(np.count_nonzero(overflows)))
 
 
-def write_npz(path: Path, events: np.ndarray, width: int, height: int) -> None:
-    """Write checked events as compressed arrays t (int64 us), x, y (uint16), p (int8, -1 or 1)."""
+def write_npz(
+    path: Path, events: np.ndarray, width: int, height: int, is_noise: np.ndarray | None = None
+) -> None:
+    """Write checked events as compressed arrays t (int64 us), x, y (uint16), p (int8, -1, 1), and labels."""
     with replaced(path) as part, part.open("wb") as file:
         columns = {name: np.ascontiguousarray(events[name]) for name in COLUMNS}
+        columns |= {} if is_noise is None else {NOISE: is_noise}
         np.savez_compressed(file, **columns, width=width, height=height, time_unit="us")  # type: ignore[arg-type]
 
 

@@ -1,36 +1,36 @@
-"""Events that an event camera would have seen while a video was taken.
+"""Events that an event camera would have seen while a video, or a sequence of images, was taken.
 
-Frames are decoded by the ffmpeg program that imageio-ffmpeg brings, in a process of its own:
-a damaged video cannot take the interpreter with it, and only one frame is held at a time.
-Times are the video's own presentation times. Between two frames the camera model takes
-log luminance as linear, so what is faster than the frames is not in the events.
+Times are the video's own presentation times, or those of the images. Between two frames the camera model
+takes log luminance as linear, so what is faster than the frames is not in the events; how much that may be
+is estimated from the frames (`envs.recordings.frame_rate`).
 """
 
 import dataclasses
-import queue
-import re
-import subprocess
-import threading
-from collections.abc import Callable, Iterator
-from fractions import Fraction
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Literal
+from typing import Any, Literal
 
-import imageio_ffmpeg
 import numpy as np
 
-from envs.config import CameraConfig
-from envs.events import EVENT, EventCamera
+from envs.config import LUMINANCE_FLOOR, CameraConfig, FaultsConfig, with_floor
+from envs.events import EVENT, EventCamera, RealSensor
+from envs.events.faults import has_readout
+from envs.recordings.decoder import decoded_images, decoded_video
 from envs.recordings.event_file import MAX_BYTES, MAX_EVENTS, EventFile, Request, check_file
+from envs.recordings.frame_rate import FrameLoss
+from envs.recordings.image_folder import LIST_NAME, check_fps, even_time_us, find_images
+from envs.recordings.in_between import frames_between, open_cv
+from envs.recordings.light import (
+    TRANSFERS,
+    Transfer,
+    area_average,
+    luminance,
+    usual_floor,
+    usual_transfer,
+)
 
-# Containers of one video; playlists are left out, because they can name other files.
-CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,ogg,flv,nut,gif"
-MAX_PIXELS = 1 << 26
-FRAME_TIMEOUT_S = 60.0
-LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709: luminance of linear R, G, B
-FRAME_LINE = re.compile(r"\[Parsed_showinfo\S* @ \w+\] n:\s*\d+ pts:\s*(\S+) .*? s:(\d+)x(\d+) ")
-TIME_BASE_LINE = re.compile(r"\[Parsed_showinfo\S* @ \w+\] config in time_base: (\d+)/(\d+)")
-DAMAGE_LINE = re.compile(r"\[.*(error|corrupt|mismatch|invalid|ended prematurely)", re.IGNORECASE)
+MUCH_LOST = 0.05  # of the events, from which on a warning is given
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,228 +40,226 @@ class VideoStep:
     Attributes:
         t_us: Time of the later frame [us], by the video's clock.
         events: EVENT array, sorted by t, none later than `t_us`.
-        dropped: Events lost to the camera's `max_events_per_pixel`.
+        is_noise: bool (N,), which of them no change of the light fired.
+        dropped: Events lost to the camera's `max_events_per_pixel` and its readout.
         width, height: Pixels of the event camera.
+        missed: About which share of the scene's events all frames until now miss, because nothing is seen
+            between them; None: too few to tell.
     """
 
     t_us: int
     events: np.ndarray
+    is_noise: np.ndarray
     dropped: int
     width: int
     height: int
+    missed: float | None
 
 
-def video_to_events(
+def video_to_events(  # noqa: PLR0913 - each is a choice of its own
     path: str | Path,
     camera: CameraConfig | None = None,
+    faults: FaultsConfig | None = None,
     *,
-    transfer: Literal["srgb", "linear"] = "srgb",
+    transfer: Transfer | None = None,
+    fps: float | None = None,
+    interpolate: Literal["linear", "flow"] = "linear",
+    rng: np.random.Generator | None = None,
     max_events: int = MAX_EVENTS,
     max_bytes: int = MAX_BYTES,
 ) -> EventFile:
-    """All events of a video at once; `video_steps` gives them frame by frame.
+    """All events of a video or of a folder of images at once; `video_steps` gives them frame by frame.
 
     Args:
-        path: The video file.
+        path: The video file, or the folder.
         camera: The event camera; None: one with the video's own size and the default settings.
             A video of another size is averaged onto its pixels.
+        faults: What its sensor adds; None: nothing.
         transfer: As in `video_steps`.
+        fps: As in `video_steps`.
+        interpolate: As in `video_steps`.
+        rng: As in `video_steps`.
         max_events: Most events that are kept.
-        max_bytes: Largest file that is opened [bytes].
+        max_bytes: Most bytes that are opened.
 
     Returns:
-        Events from the second frame on, and how many the camera dropped.
+        Events from the second frame on, which of them are noise, how many the camera dropped, and about
+        which share the frames miss.
 
     Raises:
         ValueError: As `video_steps`, or there are more than `max_events` events.
     """
     request = Request(Path(path), max_events=max_events)
-    parts = [np.empty(0, EVENT)]
+    parts, noise = [np.empty(0, EVENT)], [np.empty(0, bool)]
     count, dropped = 0, 0
-    width = height = None
-    for step in video_steps(path, camera, transfer=transfer, max_bytes=max_bytes):
+    options: dict[str, Any] = {"transfer": transfer, "fps": fps, "interpolate": interpolate, "rng": rng}
+    for step in video_steps(path, camera, faults, max_bytes=max_bytes, **options):
         parts.append(step.events)
+        noise.append(step.is_noise)
         count = request.check_count(count + len(step.events))
         dropped += step.dropped
-        width, height = step.width, step.height
-    return EventFile(np.concatenate(parts), width, height, "video", dropped=dropped)
+    events = np.concatenate(parts)
+    return EventFile(
+        events,
+        step.width,
+        step.height,
+        "video",
+        dropped=dropped,
+        is_noise=np.concatenate(noise),
+        missed=step.missed,
+    )
 
 
 def video_steps(
     path: str | Path,
     camera: CameraConfig | None = None,
+    faults: FaultsConfig | None = None,
     *,
-    transfer: Literal["srgb", "linear"] = "srgb",
+    transfer: Transfer | None = None,
+    fps: float | None = None,
+    interpolate: Literal["linear", "flow"] = "linear",
+    rng: np.random.Generator | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Iterator[VideoStep]:
-    """Events of a video from frame to frame, in the memory of one frame.
+    """Events of a video or of a folder of images from frame to frame, in the memory of one frame.
+
+    A folder has an `images.txt` with a line "time [s] name" for each image, or needs `fps`. Values of 8 and
+    16 bits and floating point are read as they are.
 
     Args:
-        path: The video file.
+        path: The video file, or the folder.
         camera: The event camera; None: one with the video's own size and the default settings.
             A video of another size is averaged onto its pixels, by area and in linear light;
             the whole picture is used, so another aspect ratio is stretched.
-        transfer: How 8-bit values become light. "srgb": IEC 61966-2-1, right for most videos;
-            "linear": value / 255.
-        max_bytes: Largest file that is opened [bytes].
+        faults: What its sensor adds; None: nothing.
+        transfer: How values become light. "srgb": IEC 61966-2-1, right for most videos and photographs;
+            "linear": in proportion. None: floating point is linear, whole numbers are sRGB.
+        fps: Frames per second, in place of the times that the video or the folder has.
+        interpolate: "linear": log luminance changes linearly from frame to frame. "flow": what moves is
+            led from one to the other (`envs.recordings.in_between`); needs OpenCV.
+        rng: Source of all draws of the noise; None: `np.random.default_rng(0)`.
+        max_bytes: Most bytes that are opened.
 
     Yields:
         One `VideoStep` for every frame but the first.
 
     Raises:
         ValueError: The file is no video, has fewer than two frames, frames of several sizes,
-            frames above 2**26 pixels, or times that are missing or do not increase.
+            frames above 2**26 pixels, values that are not finite, or times that are missing or do not
+            increase; or as `find_images`.
+
+    Warns:
+        UserWarning: Once, at the end, if the frames seem to miss 5 % of the events or more, and nothing but
+            a line is drawn between them.
     """
     path = Path(path)
-    if transfer not in ("srgb", "linear"):
-        raise ValueError(f"transfer must be 'srgb' or 'linear', got {transfer!r}")
-    check_file(path, max_bytes)
-    light = light_of_grey(transfer)
-    eye: EventCamera | None = None
-    average: Callable[[np.ndarray], np.ndarray] | None = None
+    _check_options(transfer, fps, interpolate)
+    eye: Eye | None = None
     frames, last_us = 0, None
-    for t_us, frame in _frames(path):
+    for t_us, values in _frames(path, fps, max_bytes):
         if last_us is not None and t_us <= last_us:
             raise ValueError(
                 f"{path}: frame {frames} has the time {t_us} us and the one before it {last_us} us; "
-                "times must increase: encode the video again at a constant frame rate"
+                "times must increase: encode the video again at a constant frame rate, or give fps"
             )
-        if eye is None or average is None:
-            rows, columns = frame.shape[:2]
-            eye = EventCamera(camera or CameraConfig(width=columns, height=rows))
-            average = area_average((rows, columns), (eye.config.height, eye.config.width))
-            eye.reset(average(light[frame] @ LUMA), t_us)
+        used = transfer or usual_transfer(values.dtype)
+        light = luminance(values, used)
+        if not np.isfinite(light).all():
+            raise ValueError(f"{path}: frame {frames} has values that are not finite; replace them")
+        if eye is None:
+            config = camera or CameraConfig(width=light.shape[1], height=light.shape[0])
+            config = with_floor(config, usual_floor(values.dtype, used))
+            eye = Eye(
+                config, faults or FaultsConfig(), rng or np.random.default_rng(0), interpolate == "flow"
+            )
+            eye.reset(light, t_us)
         else:
-            events = eye.step(average(light[frame] @ LUMA), t_us)
-            yield VideoStep(t_us, events, eye.dropped, eye.config.width, eye.config.height)
+            yield eye.step(light, t_us)
         last_us = t_us
         frames += 1
-    if frames < 2:
+    if eye is None or frames < 2:
         raise ValueError(f"{path}: has {frames} frame; events need at least two")
+    eye.warn(path)
 
 
-def area_average(
-    from_shape: tuple[int, int], to_shape: tuple[int, int]
-) -> Callable[[np.ndarray], np.ndarray]:
-    """A function that averages a picture onto larger (or finer) pixels by the area they share.
-
-    Args:
-        from_shape: Rows and columns of the picture.
-        to_shape: Rows and columns of the result.
-
-    Returns:
-        A function from float32 `from_shape` to float32 `to_shape`. It keeps the mean, and a
-        picture of `to_shape` as it is.
-    """
-    if from_shape == to_shape:
-        return np.ascontiguousarray
-    rows, columns = (
-        _overlap(old, new).astype(np.float32) for old, new in zip(from_shape, to_shape, strict=True)
-    )
-    return lambda picture: np.clip(rows @ picture @ columns.T, 0.0, None)
+def _check_options(transfer: str | None, fps: float | None, interpolate: str) -> None:
+    """Raise ValueError for an option of `video_steps` that is none."""
+    if transfer is not None and transfer not in TRANSFERS:
+        raise ValueError(f"transfer must be 'srgb' or 'linear', got {transfer!r}")
+    if interpolate not in ("linear", "flow"):
+        raise ValueError(f"interpolate must be 'linear' or 'flow', got {interpolate!r}")
+    if interpolate == "flow":
+        open_cv()
+    check_fps(fps)
 
 
-def _overlap(old: int, new: int) -> np.ndarray:
-    """Weights (new, old): the share of each old pixel in each new one; rows sum to 1."""
-    edges = np.arange(new + 1)[:, None] * (old / new)
-    filled = np.clip(edges - np.arange(old)[None, :], 0.0, 1.0)  # how much of each lies before an edge
-    weights = np.diff(filled, axis=0)
-    return weights / weights.sum(axis=1, keepdims=True)
+class Eye:
+    """An event camera and its sensor, which are shown frames of any size."""
+
+    def __init__(
+        self, config: CameraConfig, faults: FaultsConfig, rng: np.random.Generator, by_flow: bool
+    ) -> None:
+        """Make it; `rng` draws the noise."""
+        self._camera, self._faults, self._rng, self._by_flow = EventCamera(config), faults, rng, by_flow
+        self._loss = FrameLoss(self._camera.config)
+        self._real: RealSensor | None = None
+
+    def reset(self, light: np.ndarray, t_us: int) -> None:
+        """See a first frame, float32, linear."""
+        config = self._camera.config
+        self._average = area_average(light.shape, (config.height, config.width))
+        self._last = light
+        seen = self._average(light)
+        self._camera.reset(seen, t_us)
+        self._loss.see(seen, t_us)
+        if self._faults != FaultsConfig() or has_readout(config):
+            state = self._camera.state, self._camera.pixels
+            self._real = RealSensor(config, self._faults, state, self._rng, t_us, labels=True)
+
+    def step(self, light: np.ndarray, t_us: int) -> VideoStep:
+        """What it fires until the next frame."""
+        config, last_us, seen = self._camera.config, self._camera.t_us, self._average(light)
+        assert last_us is not None  # noqa: S101  for the type checker
+        parts, dropped = [], 0
+        for at_us, picture in [*self._between(light, last_us, t_us), (t_us, seen)]:
+            parts.append(self._camera.step(picture, at_us))
+            dropped += self._camera.dropped
+        events = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        is_noise, self._last = np.zeros(events.size, bool), light
+        self._loss.see(seen, t_us)
+        if self._real is not None:
+            events = self._real.events(events, last_us, t_us)
+            is_noise, dropped = self._real.is_noise, dropped + self._real.lost
+        return VideoStep(t_us, events, is_noise, dropped, config.width, config.height, self._loss.share)
+
+    def _between(self, light: np.ndarray, last_us: int, t_us: int) -> Iterator[tuple[int, np.ndarray]]:
+        """Times [us] and pictures, on the camera's pixels, between the last frame and this one."""
+        if self._by_flow:
+            floor = self._camera.config.luminance_floor
+            for share, picture in frames_between(self._last, light, floor or LUMINANCE_FLOOR, t_us - last_us):
+                yield last_us + round(share * (t_us - last_us)), self._average(picture)
+
+    def warn(self, path: Path) -> None:
+        """Warn if the frames seem to miss much."""
+        share, half = self._loss.share, self._loss.at_half_rate
+        if share is not None and half is not None and share >= MUCH_LOST and not self._by_flow:
+            warnings.warn(
+                f"{path}: about {share:.0%} of the scene's events are missing, because nothing is seen "
+                f"between two frames (every other frame alone has {half:.0%} fewer events); "
+                "record at a higher frame rate, or read docs/recordings.md",
+                stacklevel=3,
+            )
 
 
-def light_of_grey(transfer: Literal["srgb", "linear"]) -> np.ndarray:
-    """Linear light in [0, 1], float32, of each 8-bit value."""
-    value = np.arange(256) / 255.0
-    if transfer == "srgb":
-        value = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return value.astype(np.float32)
-
-
-def _frames(path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """Time [us] and RGB picture, uint8 (H, W, 3), of every frame.
-
-    ffmpeg writes pictures to one pipe, and one line with time and size for each to another.
-    """
-    # fmt: off
-    command = [
-        imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-nostats", "-hide_banner", "-threads", "1", "-xerror",
-        "-protocol_whitelist", "file", "-format_whitelist", CONTAINERS, "-max_pixels", str(MAX_PIXELS),
-        "-i", f"file:{path.resolve()}", "-map", "0:v:0", "-fps_mode", "passthrough",
-        "-vf", "format=rgb24,showinfo=checksum=0", "-f", "rawvideo", "pipe:1",
-    ]
-    # fmt: on
-    with subprocess.Popen(  # noqa: S603  no shell, and the path begins with file:/
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as program:
-        assert program.stdout is not None  # noqa: S101  it is a pipe; for the type checker
-        assert program.stderr is not None  # noqa: S101  the same
-        lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        thread = threading.Thread(target=_read_lines, args=(program.stderr, lines), daemon=True)
-        thread.start()
-        try:
-            yield from _paired(path, program.stdout, lines)
-            if program.wait(FRAME_TIMEOUT_S) != 0:
-                raise ValueError(f"{path}: is damaged or truncated; copy or encode it again")
-        finally:
-            program.kill()  # nothing more is wanted of it; it has ended unless the caller stops early
-            thread.join()
-
-
-def _read_lines(pipe: IO[bytes], lines: queue.SimpleQueue) -> None:
-    """Hand on what ffmpeg says, line by line, and None at its end."""
-    is_begun = False
-    while line := pipe.readline(1 << 16):
-        if not is_begun:  # the rest of a long line could look like any other
-            lines.put(line.decode("latin-1").rstrip())
-        is_begun = not line.endswith(b"\n")
-    lines.put(None)
-
-
-def _paired(path: Path, pictures: IO[bytes], lines: queue.SimpleQueue) -> Iterator[tuple[int, np.ndarray]]:
-    """Put the two pipes together again."""
-    second: Fraction | None = None
-    shape: tuple[int, int] | None = None
-    said = ""
-    while (line := _next_line(path, lines)) is not None:
-        base = TIME_BASE_LINE.match(line)
-        frame = FRAME_LINE.match(line)
-        if base:
-            second = Fraction(int(base[1]), int(base[2]) or 1)
-        elif frame:
-            if shape not in (None, (int(frame[3]), int(frame[2]))):
-                raise ValueError(f"{path}: its frames change their size; encode it again with one size")
-            shape = (int(frame[3]), int(frame[2]))
-            yield _time_us(path, frame[1], second), _picture(path, pictures, shape)
-        elif DAMAGE_LINE.match(line):
-            said = said or line
-    if shape is None:
-        raise ValueError(
-            f"{path}: is no video that can be read ({said or 'no frames'}); encode it again as mp4"
-        )
-    if said:
-        raise ValueError(f"{path}: is damaged or truncated ({said}); copy or encode it again")
-
-
-def _next_line(path: Path, lines: queue.SimpleQueue) -> str | None:
-    """The next thing that ffmpeg says."""
-    try:
-        line: str | None = lines.get(timeout=FRAME_TIMEOUT_S)
-    except queue.Empty:
-        raise ValueError(f"{path}: no frame came in {FRAME_TIMEOUT_S:.0f} s; encode it again") from None
-    return line
-
-
-def _time_us(path: Path, ticks: str, second: Fraction | None) -> int:
-    """A presentation time in whole microseconds."""
-    if second is None or not re.fullmatch(r"-?\d+", ticks):
-        raise ValueError(f"{path}: a frame has no time; encode it again at a constant frame rate")
-    return round(int(ticks) * second * 1_000_000)
-
-
-def _picture(path: Path, pictures: IO[bytes], shape: tuple[int, int]) -> np.ndarray:
-    """The next picture."""
-    size = 3 * shape[0] * shape[1]
-    raw = pictures.read(size)
-    if len(raw) != size:
-        raise ValueError(f"{path}: its last frame is not whole; encode it again")
-    return np.frombuffer(raw, np.uint8).reshape(*shape, 3)
+def _frames(path: Path, fps: float | None, max_bytes: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Times [us] and values of the frames of a file or a folder."""
+    if path.is_dir():
+        paths, times_us = find_images(path, fps, max_bytes)
+        for t_us, picture in zip(times_us, decoded_images(paths), strict=True):
+            yield t_us, picture.values
+        return
+    if path.name == LIST_NAME:
+        raise ValueError(f"{path}: lists images; give its folder")
+    check_file(path, max_bytes)
+    for number, picture in enumerate(decoded_video(path)):
+        yield picture.t_us if fps is None else even_time_us(number, fps), picture.values

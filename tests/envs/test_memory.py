@@ -11,13 +11,14 @@ from envs.config import CameraConfig
 from envs.corridor import CorridorEnv
 from envs.scene import make_scene
 
-pytestmark = pytest.mark.slow
+STATM = Path("/proc/self/statm")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not STATM.exists(), reason="reads /proc, so Linux alone")]
 SMALL = CameraConfig(width=32, height=32)
 
 
 def resident_mb():
     gc.collect()
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    pages = int(STATM.read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
 
 

@@ -69,6 +69,7 @@ def is_read(path: Path, arguments: dict[str, Any]) -> bool:
     events = file.events
     assert np.all(np.diff(events["t"]) >= 0)
     assert np.isin(events["p"], (-1, 1)).all()
+    assert file.is_noise is None or (file.is_noise.dtype, file.is_noise.shape) == (bool, events.shape)
     for name, size in (("x", file.width), ("y", file.height)):
         assert size is None or not events.size or events[name].max() < size
     return True

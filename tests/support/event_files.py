@@ -47,6 +47,16 @@ METAVISION_ROW = np.dtype(
 )
 
 
+def some_events(seed: int, count: int, width: int, height: int, until_us: int) -> np.ndarray:
+    """Events at random places and times below `until_us`, sorted by time."""
+    rng = np.random.default_rng(seed)
+    events = np.empty(count, EVENT)
+    events["t"] = np.sort(rng.integers(0, until_us, count))
+    events["x"], events["y"] = rng.integers(0, width, count), rng.integers(0, height, count)
+    events["p"] = rng.choice([-1, 1], count)
+    return events
+
+
 def ecf_chunk(way: int) -> bytes:
     return zlib.decompress(base64.b85decode(ECF_CHUNKS[way]))
 

@@ -22,9 +22,15 @@ ABOUT = {**SENSOR, "figures": {"return": 1.5}}
 TRAINED = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
 
 
+# Kinds that share their networks with rgb, or their encoder with bytestream.
+ALIKE = ("event_image", "event_image_vae")
+
+
 def kinds(names, quick=("bytestream", "rgb")):
-    """Parameters of a test: the quick suite takes two kinds of policy, `make check` all."""
-    return [pytest.param(name, marks=() if name in quick else pytest.mark.system) for name in names]
+    """Parameters of a test: the quick suite takes two kinds of policy, `make check` all but those alike."""
+    others = [pytest.mark.system]
+    marks = {name: [*others, pytest.mark.slow] if name in ALIKE else others for name in names}
+    return [pytest.param(name, marks=() if name in quick else marks[name]) for name in names]
 
 
 def save_untrained(path, env_config=HELD_OUT, name="bytestream"):

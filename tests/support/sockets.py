@@ -24,6 +24,14 @@ def beyond_loopback(sockets: set[tuple[str, str, int]]) -> list[tuple[str, str, 
     return sorted(entry for entry in sockets if not _is_loopback(entry[1]))
 
 
+def check_ray(sockets: set[tuple[str, str, int]]) -> None:
+    """Ray and its workers are among those of `listening`, and all of them on loopback."""
+    programs = {name for name, _, _ in sockets}
+    assert {"gcs_server", "raylet"} <= programs, sockets
+    assert any(name.startswith("ray::") for name in programs), sockets
+    assert beyond_loopback(sockets) == []
+
+
 def _is_loopback(address: str) -> bool:
     found = ip_address(address)
     return (getattr(found, "ipv4_mapped", None) or found).is_loopback

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from envs.config import CameraConfig
+from envs.config import CameraConfig, with_floor
 from envs.events import EVENT, EventCamera
 
 FLOOR = 1e-9  # small enough to leave log(luminance) alone where luminance is about 1
@@ -231,8 +231,10 @@ def test_settings_out_of_range_are_refused(name, value):
 
 def test_a_camera_can_be_made_from_its_config():
     config = CameraConfig(width=3, height=2)
-    assert EventCamera(config).config == config
-    assert EventCamera(config, memory="frame").config == dataclasses.replace(config, memory="frame")
+    assert EventCamera(config).config == with_floor(config)
+    assert EventCamera(config, memory="frame").config == with_floor(
+        dataclasses.replace(config, memory="frame")
+    )
 
 
 def test_the_cap_drops_the_latest_events_of_each_pixel_and_counts_them():

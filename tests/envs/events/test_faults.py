@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from envs.config import FaultsConfig
-from envs.events import EVENT, apply_faults, draw_pixel_faults
+from envs.config import ADDED_FAULTS, CameraConfig, FaultsConfig
+from envs.events import EVENT, EventCamera, RealSensor, apply_faults, draw_pixel_faults
 
 SHAPE = (8, 12)
 SIZE = 96
@@ -171,3 +171,58 @@ def test_rates_that_would_fill_the_memory_are_refused_with_the_number():
 def test_faults_out_of_range_are_refused(name, value):
     with pytest.raises(ValueError, match=name):
         FaultsConfig(**{name: value})
+
+
+def sensed(labels, faults, **fields):
+    """Batches of a sensor's events, and their labels, of some events a step."""
+    config = CameraConfig(width=SHAPE[1], height=SHAPE[0], **fields)
+    camera = EventCamera(config)
+    camera.reset(np.ones(SHAPE, np.float32), 0)
+    state = camera.state, camera.pixels
+    sensor = RealSensor(config, faults, state, np.random.default_rng(0), 0, labels=labels)
+    batches, is_noise = [], []
+    for step in range(4):
+        events = some_events(300, seed=step)
+        events["t"] += 5000 * step
+        batches.append(sensor.events(events, 5000 * step, 5000 * (step + 1)))
+        is_noise.append(sensor.is_noise)
+    return np.concatenate(batches), np.concatenate(is_noise)
+
+
+@pytest.mark.parametrize("fields", [{}, {"latency_us": 900, "latency_jitter_us": 50.0}, {"readout_hz": 1e5}])
+def test_labels_change_no_event_and_mark_every_one_that_was_added(fields):
+    """A readout delays, reorders and loses events; each keeps its label."""
+    faults = FaultsConfig(**ALL_NOISE, event_dropout=0.3)
+    plain, none = sensed(False, faults, **fields)
+    events, is_noise = sensed(True, faults, **fields)
+    assert none.size == 0
+    assert events.dtype == EVENT
+    assert events.tobytes() == plain.tobytes()
+    assert is_noise.shape == events.shape
+    assert 0 < is_noise.sum() < is_noise.size
+    if not fields:
+        true = np.concatenate([some_events(300, seed=step) for step in range(4)])
+        true["t"] += np.repeat(np.arange(4) * 5000, 300)
+        assert np.isin(events[~is_noise], true).all()
+        assert np.isin(events[is_noise], true).mean() < 0.05  # by chance
+    clean, unlabelled = sensed(True, FaultsConfig(), **fields)
+    assert not unlabelled.any()
+    assert near((~is_noise).sum(), 0.7 * len(clean)) or "readout_hz" in fields
+
+
+def test_what_a_fault_of_a_plug_in_adds_is_noise_and_what_it_keeps_is_as_it_was(monkeypatch):
+    def make(amount, shape, rng):
+        def apply(events, t0_us, t1_us):
+            added = np.array([(t1_us, 3, 2, 1)], EVENT)
+            return np.concatenate((events[::2], added))
+
+        return apply
+
+    monkeypatch.setitem(ADDED_FAULTS, "halve", make)
+    events, is_noise = sensed(True, FaultsConfig(background_activity_hz=1000.0, added={"halve": 1.0}))
+    before, was_noise = sensed(True, FaultsConfig(background_activity_hz=1000.0))
+    ends = np.isin(events["t"], [5000, 10_000, 15_000, 20_000]) & (events["x"] == 3) & (events["y"] == 2)
+    assert ends.sum() >= 4
+    assert is_noise[ends].sum() >= 4
+    assert np.isin(events[~is_noise], before[~was_noise]).all()
+    assert np.isin(events[is_noise & ~ends], before[was_noise]).all()

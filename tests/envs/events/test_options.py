@@ -1,5 +1,6 @@
 """What the camera's options do: memory, response, thresholds, refractory period, excess, encoding."""
 
+import dataclasses
 import hashlib
 import itertools
 import math
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from envs.config import CameraConfig
+from envs.config import CameraConfig, EnvConfig, sensor_settings
 from envs.events import EVENT, EventCamera
 from envs.events.camera import pixel_thresholds
 
@@ -329,3 +330,16 @@ def test_of_several_frames_none_is_taken_if_one_is_refused(encoding):
         with pytest.raises(ValueError, match="float32"):
             camera.steps(wrong, [10, 20, 30][: len(wrong)])
     assert camera.steps(frames[1:], [10, 20, 30]).tobytes() == other.steps(frames[1:], [10, 20, 30]).tobytes()
+
+
+def test_an_environment_has_the_floor_of_rendered_luminance_where_none_is_given():
+    envs = (
+        EnvConfig(),
+        EnvConfig(camera=CameraConfig(width=9)),
+        EnvConfig(camera={"width": 9}),
+        dataclasses.replace(EnvConfig(), camera=CameraConfig()),
+    )
+    assert [env.camera.luminance_floor for env in envs] == [1e-3] * 4
+    assert {sensor_settings(env)["luminance_floor"] for env in envs} == {1e-3}
+    assert EventCamera(CameraConfig()).config.luminance_floor == 1e-3
+    assert EnvConfig(camera=CameraConfig(luminance_floor=0.5)).camera.luminance_floor == 0.5

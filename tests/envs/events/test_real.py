@@ -1,5 +1,6 @@
 import itertools
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from envs.config import CameraConfig
 from envs.events import EventCamera
-from envs.recordings.video import light_of_grey
+from envs.recordings import video_to_events
 
 ROOT = Path(__file__).resolve().parents[3]
 FOLDER = Path(os.environ.get("EVADE_DATA", ROOT.parent / "shared" / "data")) / "rpg_slider_depth"
@@ -65,26 +67,35 @@ def likeness(recording, events):
     return np.mean(figures, axis=0)
 
 
-def matched(recording):
+def matched(recording, folder):
     """Events of the default camera, of which only the thresholds are fitted, to the real numbers."""
-    frames, times, real = recording[:3]
-    light = light_of_grey("srgb")
-    decoded = [light[np.rint(frame * 255).astype(int)] for frame in frames], times, real
+    times, real = recording[1:3]
     wanted = {sign: sum(np.abs(image[image * sign > 0]).sum() for image in real) for sign in (1, -1)}
     on = off = 0.5
     for _ in range(20):
-        events = simulated(decoded, contrast_threshold=on, contrast_threshold_off=off)
-        images = [net(part["x"], part["y"], part["p"]) for part in events]
+        camera = CameraConfig(
+            width=SHAPE[1], height=SHAPE[0], contrast_threshold=on, contrast_threshold_off=off
+        )
+        events = video_to_events(folder, camera).events
+        cuts = np.searchsorted(events["t"], times, side="right")
+        parts = [events[a:b] for a, b in itertools.pairwise(cuts)]
+        images = [net(part["x"], part["y"], part["p"]) for part in parts]
         made = {sign: sum(np.abs(image[image * sign > 0]).sum() for image in images) for sign in (1, -1)}
         on, off = on * (made[1] / wanted[1]) ** 0.5, off * (made[-1] / wanted[-1]) ** 0.5
-    return events
+    return parts
 
 
+@pytest.mark.filterwarnings("ignore:.*events are missing:UserWarning")  # 26 frames per second
 @pytest.mark.parametrize("exposed_us", [4000, 8000])
-def test_simulated_events_are_like_those_of_a_real_sensor(recording, exposed_us):
-    """With the default camera; a frame is of the middle of its exposure, some milliseconds after its time."""
+def test_simulated_events_are_like_those_of_a_real_sensor(recording, exposed_us, tmp_path):
+    """With all defaults; a frame is of the middle of its exposure, some milliseconds after its time."""
+    lines = (FOLDER / "images.txt").read_text().splitlines()[1:5]
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    for line in lines:
+        shutil.copy(FOLDER / line.split()[1], tmp_path / "images")
     later = (*recording[:2], between(recording[3], [t + exposed_us for t in recording[1]]))
-    _, blurred, signs, shared = likeness(later, matched(later))
+    _, blurred, signs, shared = likeness(later, matched(later, tmp_path))
     assert blurred >= 0.90
     assert signs >= 0.97
     assert shared >= 0.45

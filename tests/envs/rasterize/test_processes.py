@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from envs.rasterize import PyrenderRenderer
+from envs.rasterize.renderer import PACKAGES
 from envs.scene import make_scene
 from tests.support.rendering import POSE, picture
 
@@ -31,10 +32,13 @@ def test_importing_the_renderer_loads_no_opengl():
     assert run_python(code).returncode == 0
 
 
-@pytest.mark.parametrize("library", ["EGL", "GL"])
-def test_a_missing_system_library_is_one_line_that_names_the_packages(library):
+@pytest.mark.parametrize(
+    ("library", "system", "remedy"),
+    [("EGL", "linux", PACKAGES), ("GL", "linux", PACKAGES), ("EGL", "darwin", "use renderer=raycast")],
+)
+def test_a_missing_system_library_is_one_line_that_names_the_remedy(library, system, remedy):
     code = f"""
-import ctypes, ctypes.util
+import ctypes, ctypes.util, sys
 import numpy as np
 load, find = ctypes.CDLL.__init__, ctypes.util.find_library
 def blocked(self, name, *args, **keywords):
@@ -44,15 +48,14 @@ def blocked(self, name, *args, **keywords):
 ctypes.CDLL.__init__ = blocked
 from envs.rasterize import PyrenderRenderer
 from envs.scene import OBSTACLE, Scene
+sys.platform = '{system}'
 try:
     PyrenderRenderer(Scene('empty', np.zeros(0, OBSTACLE)), 8, 8)
 except RuntimeError as error:
     print(error)
 """
     result = run_python(code)
-    assert "apt-get install --no-install-recommends libegl1 libgl1 libgl1-mesa-dri" in result.stdout, (
-        result.stderr
-    )
+    assert remedy in result.stdout, result.stderr
     assert len(result.stdout.strip().splitlines()) == 1
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from envs.events import EVENT
 from envs.recordings import read_events, write_events
-from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2
+from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, some_events
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 CHECKERBOARDS = DATA / "dvs128_checkerboard"
@@ -224,18 +224,15 @@ def test_a_table_of_packets_that_is_not_where_the_header_says_is_refused(tmp_pat
             read_events(tmp_path / "a.aedat4")
 
 
-def some_events(count: int) -> np.ndarray:
-    rng = np.random.default_rng(count)
-    events = np.empty(count, EVENT)
-    events["t"] = 1_700_000_000_000_000 + np.sort(rng.integers(0, 10 * count + 1, count))
-    events["x"], events["y"] = rng.integers(0, 346, count), rng.integers(0, 260, count)
-    events["p"] = rng.choice([-1, 1], count)
+def dated_events(count: int) -> np.ndarray:
+    events = some_events(count, count, 346, 260, 10 * count + 1)
+    events["t"] += 1_700_000_000_000_000
     return events
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, (1 << 14) - 1, 1 << 14, 40_000])
 def test_what_is_written_is_read(count, tmp_path):
-    events = some_events(count)
+    events = dated_events(count)
     write_events(tmp_path / "a.aedat4", events, 346, 260)
     back = read_events(tmp_path / "a.aedat4")
     assert back.events.tobytes() == events.tobytes()
@@ -244,14 +241,14 @@ def test_what_is_written_is_read(count, tmp_path):
 
 def test_a_sensor_that_signed_16_bits_cannot_address_is_refused(tmp_path):
     with pytest.raises(ValueError, match="at most 32768 pixels"):
-        write_events(tmp_path / "a.aedat4", some_events(1), 32769, 260)
+        write_events(tmp_path / "a.aedat4", dated_events(1), 32769, 260)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("count", [0, 1, 40_000])
 def test_the_makers_library_reads_what_is_written(count, tmp_path):
     dv = pytest.importorskip("dv_processing", reason="the package dv-processing is the maker's reader")
-    events = some_events(count)
+    events = dated_events(count)
     write_events(tmp_path / "a.aedat4", events, 346, 260)
     reader = dv.io.MonoCameraRecording(str(tmp_path / "a.aedat4"))
     assert tuple(reader.getEventResolution()) == (346, 260)
@@ -269,7 +266,7 @@ def test_another_reader_gives_the_same_events(written_here, tmp_path):
     aedat = pytest.importorskip("aedat", reason="the package aedat reads AEDAT 4.0 independently")
     path = tmp_path / "a.aedat4"
     if written_here:
-        write_events(path, some_events(40_000), 346, 260)
+        write_events(path, dated_events(40_000), 346, 260)
     else:
         path.write_bytes(zlib.decompress(base64.b85decode(LZ4_FILE)))
     theirs = np.concatenate([part["events"] for part in aedat.Decoder(path) if "events" in part])

@@ -14,9 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
-from envs.events import EVENT
 from envs.recordings import FORMATS, WRITERS, read_events, write_events
-from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, ecf_chunk, es, metavision
+from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, ecf_chunk, es, metavision, some_events
 
 ROOT = Path(__file__).resolve().parents[3]
 # Each runs in a process of its own: a crash or a hang of a library must fail the test, not end it.
@@ -34,22 +33,17 @@ def run_child(paths: list[Path], rounds: int = 0, seed: int = 0) -> dict[str, di
     return json.loads(child.stdout)
 
 
-def some_events() -> np.ndarray:
-    rng = np.random.default_rng(0)
-    events = np.empty(300, EVENT)
-    events["t"] = np.sort(rng.integers(0, 100_000, 300))
-    events["x"], events["y"] = rng.integers(0, 34, (2, 300))
-    events["p"] = rng.choice([-1, 1], 300)
-    return events
+EVENTS = some_events(0, 300, 34, 34, 100_000)
 
 
 def one_of_each(folder: Path) -> list[Path]:
     """A good file of every format."""
-    events, paths = some_events(), []
+    events, paths = EVENTS, []
     for format in ("npz", "hdf5", "txt", "csv", "dat", "evt2", "evt3", "aedat4"):
         suffix = {"txt": ".txt", "csv": ".csv", "hdf5": ".h5"}.get(format, "")
         paths.append(folder / f"{format}{suffix}")
-        write_events(paths[-1], events, 34, 34, format)
+        labels = {"is_noise": events["x"] < 9} if format in ("npz", "hdf5") else {}
+        write_events(paths[-1], events, 34, 34, format, **labels)
     for name, text in (("aedat4_lz4", LZ4_FILE), ("aedat4_zstd", ZSTD_FILE)):
         paths.append(folder / name)
         paths[-1].write_bytes(zlib.decompress(base64.b85decode(text)))
@@ -129,7 +123,7 @@ def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
 
 @pytest.mark.parametrize("format", ["es", "floats", *WRITERS])
 def test_reading_takes_no_more_memory_than_stated(format, tmp_path):
-    events, path = np.tile(some_events(), 200), tmp_path / f"a.{format}"
+    events, path = np.tile(EVENTS, 200), tmp_path / f"a.{format}"
     events["t"] = np.arange(len(events)) ^ 1  # half of them late
     ordered = events[np.argsort(events["t"])]
     if format == "es":
@@ -187,14 +181,14 @@ def test_random_bytes_are_refused_in_every_format_that_can_tell(format, tmp_path
 
 
 def test_a_file_larger_than_allowed_is_not_opened(tmp_path):
-    write_events(tmp_path / "a.npz", some_events(), 34, 34)
+    write_events(tmp_path / "a.npz", EVENTS, 34, 34)
     with pytest.raises(ValueError, match="at most max_bytes=100 are read"):
         read_events(tmp_path / "a.npz", max_bytes=100)
 
 
 def test_a_flipped_bit_in_stored_events_is_noticed_where_the_format_has_checksums(tmp_path):
     for name in ("a.npz", "a.h5"):
-        write_events(tmp_path / name, some_events(), 34, 34)
+        write_events(tmp_path / name, EVENTS, 34, 34)
         good = (tmp_path / name).read_bytes()
         first, size = packed_x(tmp_path / name)
         for place in range(first, first + size, 7):

@@ -10,32 +10,23 @@ from hypothesis import strategies as st
 
 from envs.events import EVENT
 from envs.recordings import read_events
-from tests.support.event_files import es
-
-
-def some_events(seed: int, count: int, until_us: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    events = np.empty(count, EVENT)
-    events["t"] = np.sort(rng.integers(0, until_us, count))
-    events["x"], events["y"] = rng.integers(0, 640, count), rng.integers(0, 480, count)
-    events["p"] = rng.choice([-1, 1], count)
-    return events
+from tests.support.event_files import es, some_events
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 200), until_us=st.sampled_from([5, 200, 10**6]))
 @settings(max_examples=25)
 def test_events_are_decoded_as_by_the_description(tmp_path_factory, seed, count, until_us):
-    events = some_events(seed, count, until_us)
+    events = some_events(seed, count, 640, 480, until_us)
     file = read_events(es(tmp_path_factory.mktemp("a") / "a.es", events, 640, 480))
     assert file.events.tobytes() == events.tobytes()
     assert (file.format, file.width, file.height, file.skipped) == ("es", 640, 480, 0)
 
 
 def test_resets_are_nothing_and_exposures_of_an_atis_are_passed_over(tmp_path):
-    path = es(tmp_path / "a.es", some_events(0, 0, 5), 8, 6)
+    path = es(tmp_path / "a.es", some_events(0, 0, 640, 480, 5), 8, 6)
     path.write_bytes(path.read_bytes() + b"\xfe\xfe\xfe" + struct.pack("<BHH", 3 << 1 | 1, 7, 5))
     assert read_events(path).events.tolist() == [(3, 7, 0, 1)]
-    assert read_events(es(tmp_path / "none.es", some_events(0, 0, 5), 0, 0)).events.size == 0
+    assert read_events(es(tmp_path / "none.es", some_events(0, 0, 640, 480, 5), 0, 0)).events.size == 0
     head = b"Event Stream" + bytes((2, 0, 0, 2)) + struct.pack("<HH", 8, 6)
     rows = [(5 << 2 | 2, 1, 0), (1 << 2 | 3, 1, 1), (1 << 2 | 0, 2, 5)]
     path.write_bytes(head + b"\xfe" + b"".join(struct.pack("<BHH", *row) for row in rows))
@@ -69,7 +60,7 @@ def test_a_file_that_breaks_a_rule_is_refused_by_name(change, rule, tmp_path):
 @pytest.mark.parametrize("kind", ["dvs", "atis"])
 def test_the_authors_library_writes_what_is_read(kind, tmp_path):
     library = pytest.importorskip("event_stream", reason="the package event_stream is the authors' writer")
-    events = some_events(1, 5000, 10**6)
+    events = some_events(1, 5000, 640, 480, 10**6)
     dtype = {"dvs": library.dvs_dtype, "atis": library.atis_dtype}[kind]
     theirs = np.zeros(len(events), dtype)
     theirs["t"], theirs["x"], theirs["y"] = events["t"], events["x"], 479 - events["y"]

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.events import EVENT
 from envs.recordings import read_events, write_events
 from envs.recordings.plain import CHUNK_BYTES
+from tests.support.event_files import some_events
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 SLIDER = DATA / "rpg_slider_depth" / "events_chunk.txt"
@@ -19,15 +19,6 @@ NMNIST = DATA / "nmnist" / "sample_nmnist.bin"
 needs_slider = pytest.mark.skipif(not SLIDER.is_file(), reason=f"no {SLIDER}; set EVADE_DATA")
 needs_nmnist = pytest.mark.skipif(not NMNIST.is_file(), reason=f"no {NMNIST}; set EVADE_DATA")
 TXYP = ("t", "x", "y", "p")
-
-
-def some_events(seed: int, count: int, until_us: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    events = np.empty(count, EVENT)
-    events["t"] = np.sort(rng.integers(0, until_us, count))
-    events["x"], events["y"] = rng.integers(0, 346, count), rng.integers(0, 260, count)
-    events["p"] = rng.choice([-1, 1], count)
-    return events
 
 
 def save(path: Path, **arrays: object) -> Path:
@@ -85,7 +76,7 @@ def test_what_is_written_is_read(tmp_path_factory, suffix, seed, count, until_us
     if suffix == "h5":
         until_us = min(until_us, 10**9)  # its index has an entry per millisecond
     path = tmp_path_factory.mktemp("a") / f"events.{suffix}"
-    events = some_events(seed, count, until_us)
+    events = some_events(seed, count, 346, 260, until_us)
     write_events(path, events, 346, 260)
     size = {"width": 346, "height": 260} if suffix == "csv" else {}  # the only one that does not say
     back = read_events(path, **size)
@@ -97,8 +88,45 @@ def test_what_is_written_is_read(tmp_path_factory, suffix, seed, count, until_us
     assert list(path.parent.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("suffix", ["npz", "h5"])
+def test_labels_of_noise_that_are_written_are_read(suffix, tmp_path):
+    events, path = some_events(0, 200, 346, 260, 10**6), tmp_path / f"a.{suffix}"
+    is_noise = np.random.default_rng(1).random(200) < 0.3
+    write_events(path, events, 346, 260, is_noise=is_noise)
+    back = read_events(path)
+    assert back.events.tobytes() == events.tobytes()
+    assert back.is_noise.dtype == bool
+    assert np.array_equal(back.is_noise, is_noise)
+    write_events(path, events, 346, 260)
+    assert read_events(path).is_noise is None
+    for wrong in (is_noise[:-1], is_noise.astype(int), is_noise.tolist()):
+        with pytest.raises(ValueError, match="is_noise must be bool"):
+            write_events(path, events, 346, 260, is_noise=wrong)
+
+
+def test_labels_stay_with_events_that_are_sorted_in_and_bad_ones_are_refused(tmp_path):
+    columns = {"t": [5, 3, 4], "x": [1, 2, 3], "y": [0, 0, 0], "p": [1, 0, 1]}
+    np.savez(tmp_path / "a.npz", **columns, is_noise=[1, 0, 0])
+    file = read_events(tmp_path / "a.npz")
+    assert file.events["t"].tolist() == [3, 4, 5]
+    assert file.is_noise.tolist() == [False, False, True]
+    for wrong in ([1, 0], [0, 1, 2], [0.0, np.nan, 1.0], [[0, 1, 0]]):
+        np.savez(tmp_path / "a.npz", **columns, is_noise=wrong)
+        with pytest.raises(ValueError, match=r"a\.npz: .*is_noise"):
+            read_events(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("format", ["txt", "csv", "dat", "evt2", "evt3", "aedat4"])
+def test_a_format_without_labels_does_not_lose_them_in_silence(format, tmp_path):
+    with pytest.raises(ValueError, match="holds no labels of noise; choose hdf5 or npz"):
+        write_events(
+            tmp_path / "a", some_events(0, 3, 346, 260, 9), 346, 260, format, is_noise=np.zeros(3, bool)
+        )
+    assert not list(tmp_path.iterdir())
+
+
 def test_numpy_reads_what_is_written(tmp_path):
-    events = some_events(0, 100, 10**6)
+    events = some_events(0, 100, 346, 260, 10**6)
     write_events(tmp_path / "a.npz", events, 346, 260)
     write_events(tmp_path / "a.txt", events, 346, 260)
     stored = np.load(tmp_path / "a.npz")
@@ -111,7 +139,7 @@ def test_numpy_reads_what_is_written(tmp_path):
 
 def test_pandas_reads_csv_without_options(tmp_path):
     pandas = pytest.importorskip("pandas")
-    events = some_events(0, 100, 10**6)
+    events = some_events(0, 100, 346, 260, 10**6)
     write_events(tmp_path / "a.csv", events, 346, 260)
     table = pandas.read_csv(tmp_path / "a.csv")
     assert list(table.columns) == ["t_us", "x", "y", "p"]

@@ -10,6 +10,7 @@ from envs.events import EVENT
 from envs.recordings import read_events, write_events
 from envs.recordings.event_file import Request, finish, unwrap, usual_events
 from envs.recordings.evt_decoders import decode_dat, decode_evt3
+from tests.support.event_files import some_events
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 EVT3_SAMPLE = DATA / "expelliarmus_evt" / "evt3_sample.raw"
@@ -111,15 +112,6 @@ EVT21_BEYOND = b"% format EVT21;\n" + np.array([0, 8 << 28, 1 << 31, 1 << 28 | 2
 
 def tuples(events: np.ndarray) -> list[tuple[int, int, int, int]]:
     return events.tolist()
-
-
-def some_events(seed: int, count: int, width: int, height: int, until_us: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    events = np.empty(count, EVENT)
-    events["t"] = np.sort(rng.integers(0, until_us, count))
-    events["x"], events["y"] = rng.integers(0, width, count), rng.integers(0, height, count)
-    events["p"] = rng.choice([-1, 1], count)
-    return events
 
 
 @needs_sample

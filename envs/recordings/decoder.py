@@ -1,0 +1,206 @@
+"""Pictures of a video file or of image files, decoded by the ffmpeg program that imageio-ffmpeg brings.
+
+It runs in a process of its own: a damaged file cannot take the interpreter with it, and only one picture is
+held at a time. Pictures of 8 bits are handed on with 8, deeper ones with 16, and floating point as it is.
+"""
+
+import queue
+import re
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import imageio_ffmpeg
+import numpy as np
+
+# Containers of one video; playlists are left out, because they can name other files.
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,ogg,flv,nut,gif"
+MAX_PIXELS = 1 << 26
+FRAME_TIMEOUT_S = 60.0
+FRAME_LINE = re.compile(
+    r"\[Parsed_showinfo\S* @ \w+\] n:\s*\d+ pts:\s*(\S+) .*? fmt:(\w+) .*? s:(\d+)x(\d+) "
+)
+TIME_BASE_LINE = re.compile(r"\[Parsed_showinfo\S* @ \w+\] config in time_base: (\d+)/(\d+)")
+DAMAGE_LINE = re.compile(r"\[.*(error|corrupt|mismatch|invalid|ended prematurely)", re.IGNORECASE)
+
+
+class Layout(NamedTuple):
+    """How ffmpeg lays out a picture of one of its pixel formats.
+
+    Attributes:
+        dtype: Of a value.
+        channels: Their names, in order; "y" is grey and "a" opacity.
+        is_planar: Whether each channel is a plane of its own.
+    """
+
+    dtype: np.dtype
+    channels: str
+    is_planar: bool
+
+
+# What ffmpeg may hand on: it chooses the one that loses nothing. Floating point is never converted, since
+# that clips it to [0, 1].
+LAYOUTS = {
+    "rgb24": Layout(np.dtype(np.uint8), "rgb", False),
+    "rgba": Layout(np.dtype(np.uint8), "rgba", False),
+    "rgb48le": Layout(np.dtype("<u2"), "rgb", False),
+    "rgba64le": Layout(np.dtype("<u2"), "rgba", False),
+} | {
+    name + suffix: Layout(np.dtype(dtype), channels, name.startswith("gbr"))
+    for suffix, dtype in (("f32le", "<f4"), ("f16le", "<f2"))
+    for name, channels in (
+        *(("gbrp", "gbr"), ("gbrap", "gbra"), ("rgb", "rgb"), ("rgba", "rgba")),
+        *(("gray", "y"), ("ya", "ya")),
+    )
+}
+
+
+class Picture(NamedTuple):
+    """One decoded picture.
+
+    Attributes:
+        t_us: Its time in the file [us].
+        values: (H, W, 3) of R, G and B, or (H, W) of grey; uint8, uint16 or float32.
+    """
+
+    t_us: int
+    values: np.ndarray
+
+
+def decoded_video(path: Path) -> Iterator[Picture]:
+    """The pictures of a video file, in turn.
+
+    Raises:
+        ValueError: It is no video, is damaged, has a frame without time, or above 2**26 pixels.
+    """
+    options = ["-format_whitelist", CONTAINERS, "-i", f"file:{path.resolve()}"]
+    return _decoded(path, options, None)
+
+
+def decoded_images(paths: Sequence[Path]) -> Iterator[Picture]:
+    """The pictures of image files, in turn; their times are those of 25 pictures a second.
+
+    Raises:
+        ValueError: One is no image of the kind that its suffix names, is damaged, or above 2**26 pixels, or
+            they are of several kinds or sizes.
+    """
+    kinds = sorted({path.suffix.lower() for path in paths})
+    if len(kinds) != 1:
+        raise ValueError(f"{paths[0].parent}: images must be of one kind, got {' '.join(kinds)}; convert one")
+    return _decoded_links(paths, kinds[0])
+
+
+def _decoded_links(paths: Sequence[Path], suffix: str) -> Iterator[Picture]:
+    """The pictures, by links with numbers for names, which ffmpeg reads one after the other as one stream."""
+    with tempfile.TemporaryDirectory() as folder:
+        for number, path in enumerate(paths):
+            (Path(folder) / f"{number}{suffix}").symlink_to(path.resolve())
+        options = ["-format_whitelist", "image2", "-f", "image2", "-start_number", "0", "-i", f"%d{suffix}"]
+        count = 0
+        for picture in _decoded(paths[0].parent, options, folder):
+            yield picture
+            count += 1
+        if count != len(paths):
+            raise ValueError(f"{paths[count]}: is no image that can be read; copy or convert it again")
+
+
+def _decoded(path: Path, options: list[str], folder: str | None) -> Iterator[Picture]:
+    """What ffmpeg decodes in a folder, as it writes pictures to one pipe and a line for each to another."""
+    # fmt: off
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-nostats", "-hide_banner", "-threads", "1", "-xerror",
+        "-protocol_whitelist", "file", "-max_pixels", str(MAX_PIXELS), *options,
+        "-map", "0:v:0", "-fps_mode", "passthrough",
+        "-vf", f"format={'|'.join(LAYOUTS)},showinfo=checksum=0", "-f", "rawvideo", "pipe:1",
+    ]
+    # fmt: on
+    with subprocess.Popen(  # noqa: S603  no shell, and every path is a plain file's
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=folder
+    ) as program:
+        assert program.stdout is not None  # noqa: S101  it is a pipe; for the type checker
+        assert program.stderr is not None  # noqa: S101  the same
+        lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        thread = threading.Thread(target=_read_lines, args=(program.stderr, lines), daemon=True)
+        thread.start()
+        try:
+            yield from _paired(path, program.stdout, lines)
+            if program.wait(FRAME_TIMEOUT_S) != 0:
+                raise ValueError(f"{path}: is damaged or truncated; copy or encode it again")
+        finally:
+            program.kill()  # nothing more is wanted of it; it has ended unless the caller stops early
+            thread.join()
+
+
+def _read_lines(pipe: IO[bytes], lines: queue.SimpleQueue) -> None:
+    """Hand on what ffmpeg says, line by line, and None at its end."""
+    is_begun = False
+    while line := pipe.readline(1 << 16):
+        if not is_begun:  # the rest of a long line could look like any other
+            lines.put(line.decode("latin-1").rstrip())
+        is_begun = not line.endswith(b"\n")
+    lines.put(None)
+
+
+def _paired(path: Path, pictures: IO[bytes], lines: queue.SimpleQueue) -> Iterator[Picture]:
+    """Put the two pipes together again."""
+    second: Fraction | None = None
+    first: tuple[str, ...] | None = None
+    said = ""
+    while (line := _next_line(path, lines)) is not None:
+        base = TIME_BASE_LINE.match(line)
+        frame = FRAME_LINE.match(line)
+        if base:
+            second = Fraction(int(base[1]), int(base[2]) or 1)
+        elif frame:
+            first = first or frame.groups()[1:]
+            if frame.groups()[1:] != first:
+                raise ValueError(f"{path}: its frames change their size or depth; convert them to one")
+            yield Picture(_time_us(path, frame[1], second), _picture(path, pictures, *first))
+        elif DAMAGE_LINE.match(line):
+            said = said or line
+    if first is None:
+        raise ValueError(
+            f"{path}: is no video that can be read ({said or 'no frames'}); encode it again as mp4, "
+            "or as images that are named in docs/recordings.md"
+        )
+    if said:
+        raise ValueError(f"{path}: is damaged or truncated ({said}); copy or encode it again")
+
+
+def _next_line(path: Path, lines: queue.SimpleQueue) -> str | None:
+    """The next thing that ffmpeg says."""
+    try:
+        line: str | None = lines.get(timeout=FRAME_TIMEOUT_S)
+    except queue.Empty:
+        raise ValueError(f"{path}: no frame came in {FRAME_TIMEOUT_S:.0f} s; encode it again") from None
+    return line
+
+
+def _time_us(path: Path, ticks: str, second: Fraction | None) -> int:
+    """A presentation time in whole microseconds."""
+    if second is None or not re.fullmatch(r"-?\d+", ticks):
+        raise ValueError(f"{path}: a frame has no time; encode it again at a constant frame rate")
+    return round(int(ticks) * second * 1_000_000)
+
+
+def _picture(path: Path, pictures: IO[bytes], name: str, width: str, height: str) -> np.ndarray:
+    """The next picture, as `Picture.values`."""
+    layout, shape = LAYOUTS[name], (int(height), int(width))
+    size = shape[0] * shape[1] * len(layout.channels) * layout.dtype.itemsize
+    raw = pictures.read(size)
+    if len(raw) != size:
+        raise ValueError(f"{path}: its last frame is not whole; encode it again")
+    values = np.frombuffer(raw, layout.dtype)
+    if layout.is_planar:
+        values = values.reshape(len(layout.channels), *shape).transpose(1, 2, 0)
+    else:
+        values = values.reshape(*shape, len(layout.channels))
+    if layout.channels[0] == "y":
+        values = values[..., 0]
+    elif layout.channels != "rgb":
+        values = values[..., [layout.channels.index(name) for name in "rgb"]]
+    return values.astype(np.float32) if layout.dtype.kind == "f" else values

@@ -1,0 +1,100 @@
+"""Folders that sweeps leave, and published trainings, made of constructed episodes and curves."""
+
+import json
+
+import numpy as np
+
+from jobs.analysis.plots import Curve
+from jobs.evaluation.group_stats import LABELS
+from jobs.reporting.learning_curves import as_csv
+from jobs.rollout.episodes import EPISODE, write_episodes
+from jobs.run.files import write_json
+from models.policy.policy import MANIFEST
+from tests.support.episodes import flights
+
+ABOUT = {
+    "run": "robustness-short-s0-1",
+    "identity": "abc",
+    "command": "python -m platform.launch +exp=robustness",
+    "commit": "c0ffee",
+    "evaluated_at": ["c0ffee"],
+    "date": "2026-01-02",
+    "scene": "poles_eval",
+    "trials": 20,
+    "reference": "event_columns",
+    "action": "stochastic",
+    "groups": {"bytestream": [0, 1, 2], "event_image": [0], "oracle": [None]},
+    "exactness": [
+        {"condition": ["sparsity", "0.5"], "asked": 0.05, "event_error": 0.0163, "renders_per_step": 5.0}
+    ],
+    "axes": {
+        "nominal": {"poles_eval": {}},
+        "sparsity": {"0.2": {"faults.sparsity": 0.2}, "0.5": {"faults.sparsity": 0.5}},
+    },
+    "compared": [
+        {"condition": at, "baseline": ["nominal", "poles_eval"], "same_as": at}
+        for at in (["nominal", "poles_eval"], ["sparsity", "0.2"], ["sparsity", "0.5"])
+    ],
+    "met": [["sparsity", "0.5", "bytestream"]],
+}
+KINDS = {
+    "lost": "faults.event_dropout",
+    "displaced": "faults.displaced",
+    "flipped": "faults.flipped",
+    "invented": "faults.background_activity",
+    "jittered": "camera.latency_jitter_us",
+}
+
+
+def write_sweep(folder):
+    """Leave a sweep of three groups in `folder`; returns it."""
+    won = {"bytestream": 16, "event_image": 4, "oracle": 20}
+    flown = {
+        (axis, value, group, "" if seed is None else str(seed)): flights(won[group])
+        for axis, points in ABOUT["axes"].items()
+        for value in points
+        for group, seeds in ABOUT["groups"].items()
+        for seed in seeds
+    }
+    write_episodes(folder / "episodes.csv", LABELS, flown)
+    (folder / "about.json").write_text(json.dumps(ABOUT))
+    return folder
+
+
+def write_shipped(folder):
+    """Leave learning curves, of policies that are there, in `folder`; returns it."""
+    ends = {"bytestream": (0.8, 0.81), "event_image": (0.4, 0.41)}
+    steps = np.array([0.0, 500_000.0])
+    curves = [Curve(exp, seed, steps, np.array([0.0, end]), steps)
+              for exp, both in ends.items() for seed, end in enumerate(both)]  # fmt: skip
+    for curve in curves:
+        write_json(folder / f"{curve.exp}-s{curve.seed}" / MANIFEST, {})
+    (folder / "curves.csv").write_text(as_csv(curves))
+    return folder
+
+
+def write_study(folder):
+    """Leave a dose response of two groups: one fails under invented events, one never; returns the folder."""
+    axes = {"nominal": {"poles_eval": {}}}
+    axes |= {kind: {str(one): {key: one} for one in (0.1, 0.2)} for kind, key in KINDS.items()}
+    places = [[axis, value] for axis, points in axes.items() for value in points]
+    nominal = places[0]
+    about = {
+        "run": "dose_response-short-s0-1", "exp": "dose_response", "identity": "abc", "command": "command",
+        "commit": "c0ffee", "evaluated_at": ["c0ffee"], "date": "2026-01-02", "scene": "poles_eval",
+        "trials": 14, "reference": "steady", "action": "stochastic", "axes": axes,
+        "groups": {"weak": [0, 1, 2], "steady": [0, 1, 2]},
+        "compared": [{"condition": at, "baseline": nominal, "same_as": at} for at in places],
+        "met": [],
+    }  # fmt: skip
+    rows = {}
+    for axis, value in places:
+        for group, seed in ((group, seed) for group, seeds in about["groups"].items() for seed in seeds):
+            episodes = np.zeros(14, EPISODE)
+            episodes["seed"] = np.arange(14)
+            lost = 12 if (axis, group) == ("invented", "weak") else 1
+            episodes["success"] = (np.arange(14) + 3 * seed) % 14 >= lost
+            rows[axis, value, group, str(seed)] = episodes
+    write_episodes(folder / "episodes.csv", LABELS, rows)
+    (folder / "about.json").write_text(json.dumps(about))
+    return folder
