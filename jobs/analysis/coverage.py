@@ -6,6 +6,7 @@ corridor, and episodes are drawn from it. Printed are the share of intervals tha
 """
 
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 
@@ -50,6 +51,7 @@ def coverage(trainings: int, corridors: int, mean: float, spread: float) -> tupl
     return *held.mean(axis=0), *widths.mean(axis=0)
 
 
+@cache
 def coverage_text(trainings: int, corridors: int) -> str:
     """How often the intervals of such a study hold a true rate near 80 %, in words."""
     shares = [coverage(trainings, corridors, 1.5, spread)[0] for spread in SPREADS]

@@ -1,5 +1,7 @@
 """Numbers with their intervals as text and as tables: Markdown for files, rich for a terminal."""
 
+import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +11,9 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from envs.checks import replaced
 from jobs.analysis.statistics import Difference, Estimate, bootstrap_interval, wilson_interval
-from jobs.run.files import replaced, write_atomic
+from jobs.run.files import write_atomic
 from jobs.run.folder import Run
 from jobs.run.progress import console
 
@@ -172,6 +175,13 @@ def publish_table(
     text = markdown_table(head, rows, words)
     write_atomic(folder.path / f"{name}.md", text)
     tracker.text(f"{name}.md", text)
+
+
+def write_csv(file: Path, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write rows below their headings as a CSV file; None is nothing."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([head, *rows])
+    write_atomic(file, text.getvalue())
 
 
 def publish_plot(folder: Run, tracker: "Tracker", name: str, plot: "Figure") -> None:

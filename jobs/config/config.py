@@ -24,6 +24,7 @@ from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
     AblationConfig,
     AlgoConfig,
+    CalibrateConfig,
     ClusterConfig,
     CollectConfig,
     DemoConfig,
@@ -33,6 +34,7 @@ from jobs.config.schema import (
     ProbeConfig,
     ReplayConfig,
     ReplayPageConfig,
+    SlidingConfig,
     SweepConfig,
     TrackingConfig,
     TradeConfig,
@@ -71,6 +73,8 @@ class Config:
     algo: AlgoConfig
     demo: DemoConfig
     replay: ReplayConfig
+    calibrate: CalibrateConfig
+    sliding: SlidingConfig
     replay_page: ReplayPageConfig
     collect: CollectConfig
     pretrain: PretrainConfig

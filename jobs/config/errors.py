@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 SET_BY_JOBS = ("observation", "split")  # of `env`: training must never see the corridors of evaluation
 HIDDEN = "***"
@@ -15,6 +15,12 @@ SECRET_PARAMETER = re.compile(
 
 class ConfigError(ValueError):
     """A configuration that cannot be used; each line of the message names a key, the rule and the value."""
+
+
+def differences(there: Mapping[str, object], here: Mapping[str, object]) -> str:
+    """Where two settings differ, such as "stack: 3 there, 2 here"; empty if nowhere."""
+    names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
+    return ", ".join(f"{name}: {there.get(name)!r} there, {here.get(name)!r} here" for name in names)
 
 
 def redacted(text: str) -> str:

@@ -1,12 +1,13 @@
 """Plug-ins: Python files outside this repository that add scenes, faults and kinds of policy.
 
-A plug-in is a file or the folder of a package. Importing it adds rows to `LAYOUTS`, `ADDED_FAULTS` and
-`KINDS`, in which every job looks names up. The key `plugins` names them; Ray ships their code to each worker,
-which imports them before it does anything else (docs/plugins.md).
+A plug-in is a file, the folder of a package, or an installed module. Importing it adds rows to `LAYOUTS`,
+`ADDED_FAULTS` and `KINDS`, in which every job looks names up. The key `plugins` names them; Ray ships their
+code to each worker, which imports them before it does anything else (docs/plugins.md).
 """
 
 import hashlib
 import importlib
+import importlib.metadata
 import importlib.util
 import os
 import re
@@ -22,6 +23,7 @@ from envs.scene.layouts import LAYOUTS
 from jobs.config.errors import ConfigError
 from models.kinds import KINDS, resolve
 
+GROUP = "evade.plugins"  # of the entry points of installed packages
 VARIABLE = "EVADE_PLUGINS"  # of a Ray worker: the names of its plug-ins
 ROWS: dict[str, dict[str, Any]] = {"scene": LAYOUTS, "fault": ADDED_FAULTS, "kind of policy": KINDS}
 
@@ -32,7 +34,8 @@ def load_plugins(names: object) -> None:
     """Import the plug-ins that a configuration names, each once, and check what they add.
 
     Args:
-        names: Each a module that Python finds, or the path of a file or of a package's folder.
+        names: Each the path of a file or of a package's folder, the name of an entry point of `GROUP`,
+            or a module that Python finds.
 
     Raises:
         ConfigError: One cannot be imported, takes a name that is taken, or adds what cannot be used.
@@ -47,18 +50,19 @@ def load_plugins(names: object) -> None:
                 rows.clear()
                 rows.update(before[what])
             for stem in _loaded.keys() - known:
-                del _loaded[stem], sys.modules[stem]
+                del _loaded[stem]
+                sys.modules.pop(stem, None)
             raise ConfigError(f"plugins: {name}: {said}") from error
 
 
 def _load(name: str, before: Mapping[str, Mapping[str, Any]]) -> None:
     """Import one, unless it is there, and check what is new since `before`."""
     path = Path(name).resolve() if name.endswith(".py") or os.sep in name else None
-    stem = path.stem if path else name
+    stem = path.stem if path else _module_of(name)
     if stem in _loaded and (path is None or path in _files(_loaded[stem])):
         return
     if path is None:
-        _loaded[stem] = importlib.import_module(stem)
+        _import_module(stem)
     else:
         _import_file(stem, path)
     for what, rows in before.items():
@@ -71,6 +75,29 @@ def _load(name: str, before: Mapping[str, Mapping[str, Any]]) -> None:
                 _check(what, row, rows[row])
             except (ValueError, ImportError, AttributeError) as error:
                 raise ValueError(f"its {what} {row!r}: {error}") from error
+
+
+def _module_of(name: str) -> str:
+    """The module that an installed package's entry point of this name leads to, else the name itself.
+
+    Raises:
+        ValueError: It leads to no one module, or there is neither an entry point nor a module of the name.
+    """
+    points = importlib.metadata.entry_points(group=GROUP)
+    modules = {point.value for point in points if point.name == name} or {name}
+    if len(modules) > 1 or ":" in "".join(modules):
+        raise ValueError(f"entry points {GROUP} must name one module, got {', '.join(sorted(modules))}")
+    if name not in points.names and importlib.util.find_spec(name.partition(".")[0]) is None:
+        known = ", ".join(sorted(points.names)) or "none"
+        raise ValueError(f"must be a path, a module or an entry point {GROUP} (installed: {known})")
+    return modules.pop()
+
+
+def _import_module(name: str) -> None:
+    """Import what Python finds; an empty module stands for it meanwhile, so that errors name its line."""
+    if spec := importlib.util.find_spec(name):
+        _loaded[name] = importlib.util.module_from_spec(spec)
+    _loaded[name] = importlib.import_module(name)
 
 
 def _import_file(stem: str, path: Path) -> None:

@@ -99,6 +99,45 @@ class ReplayConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class CalibrateConfig:
+    """Which recording a camera is calibrated against.
+
+    Attributes:
+        recording: An event file, of any format that `envs.recordings.read_events` knows.
+        frames: Text file with a line "seconds picture" for each frame of the same sensor, on the clock of the
+            events; None: the scene was still and uniform.
+        frame_delay_us: From the time of a frame to the middle of its exposure [us].
+        luminance: Of a still scene, white = 1.
+        camera: Name of the file in conf/camera that is written; None: only that in the run folder.
+    """
+
+    recording: Name
+    frames: Name | None
+    frame_delay_us: Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
+    luminance: Annotated[float, Field(gt=0, le=1)]
+    camera: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] | None
+
+
+@dataclass(frozen=True, config=STRICT)
+class SlidingConfig:
+    """Which recording of a sliding camera is read, and by a probe of which encoder.
+
+    Attributes:
+        folder: Holds images.txt, calib.txt, groundtruth.txt, as Mueggler et al. (IJRR 2017) made them.
+        events: The event file in it.
+        frame_delay_us: From the time of a frame to the middle of its exposure [us].
+        policy: A name in models/pretrained, "newest", or a path.
+        episodes: Simulated, to fit the probe to.
+    """
+
+    folder: Name
+    events: Name
+    frame_delay_us: Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
+    policy: Name
+    episodes: Annotated[int, Field(ge=8)]
+
+
+@dataclass(frozen=True, config=STRICT)
 class ReplayPageConfig:
     """The episodes of the replay page: each policy in each scene, at each rate, with each noise.
 

@@ -73,6 +73,7 @@ class SweepFacts(TypedDict):
     """What made a sweep, as its about.json says it."""
 
     run: str
+    exp: NotRequired[str]  # older sweeps have none
     identity: str
     command: str
     commit: str
@@ -87,6 +88,7 @@ class SweepFacts(TypedDict):
     axes: Axes
     exactness: list[Exactness]
     compared: NotRequired[list[Compared]]  # older sweeps have none
+    met: NotRequired[list[tuple[str, str, str]]]  # of the sweep, sorted; older sweeps have none
     episodes_sha256: NotRequired[str]  # older sweeps have none
 
 
@@ -224,6 +226,7 @@ def about(config: Config, folder: Run, found: SweepResults) -> SweepFacts:
     sweep = found.sweep
     return {
         "run": folder.path.name,
+        "exp": config.exp,
         "identity": sweep.identity,
         "command": command(),
         "commit": git_commit(),
@@ -241,6 +244,7 @@ def about(config: Config, folder: Run, found: SweepResults) -> SweepFacts:
             Compared(condition=at, baseline=sweep.baselines[at], same_as=sweep.same_as[at])
             for at in sweep.conditions
         ],
+        "met": sorted(sweep.met),
     }
 
 

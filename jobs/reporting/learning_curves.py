@@ -5,11 +5,14 @@ import io
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from jobs.analysis.plots import Curve
-from models.policy.policy import MANIFEST
+from jobs.run.files import read_json
+from jobs.run.folder import COMPARED_STEPS
+from models.policy.policy import ENCODER, MANIFEST
 
 COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
 
@@ -39,19 +42,79 @@ def as_csv(curves: Sequence[Curve]) -> str:
     return text.getvalue()
 
 
-def mean_success(curve: Curve, env_steps: int) -> float:
+class PublishedTraining(NamedTuple):
+    """How a published training learnt, and what its encoder had taken before; no manifest says its minutes.
+
+    Attributes:
+        group, seed: Which one.
+        env_steps: Of the policy's training, without those of its encoder.
+        encoder_env_steps: Recorded for its encoder; 0 without one.
+        encoder_iterations: Of the encoder's pretraining.
+        mean_success: Of the policy's first `COMPARED_STEPS`, see `mean_success`; None: it took fewer.
+        mean_success_with_encoder: The same, with the encoder's steps as the first.
+    """
+
+    group: str
+    seed: int
+    env_steps: int
+    encoder_env_steps: int
+    encoder_iterations: int
+    mean_success: float | None
+    mean_success_with_encoder: float | None
+
+
+def published_trainings(folder: Path) -> list[PublishedTraining]:
+    """What the manifests and the learning curves of the published policies say, by group and seed."""
+    return [_published(folder, curve) for _, curve in sorted(read_curves(folder).items())]
+
+
+def _published(folder: Path, curve: Curve) -> PublishedTraining:
+    place = folder / f"{curve.exp}-s{curve.seed}"
+    manifest = read_json(place / MANIFEST)
+    steps, iterations = 0, 0
+    if (place / ENCODER).is_file():
+        collect = manifest.get("collect", {})
+        steps = int(collect.get("num_steps", 0)) + int(collect.get("num_validation_steps", 0))
+        iterations = int(manifest.get("pretrain", {}).get("iterations", 0))
+    last = int(curve.env_steps[-1])
+    long = last >= COMPARED_STEPS
+    return PublishedTraining(
+        curve.exp, curve.seed, last, steps, iterations,
+        mean_success(curve, COMPARED_STEPS) if long else None,
+        mean_success(curve, COMPARED_STEPS, steps) if long else None,
+    )  # fmt: skip
+
+
+def read_trainings(file: Path) -> list[PublishedTraining]:
+    """The published table of the trainings, as `published_trainings` found them."""
+    with file.open() as stream:
+        rows = list(csv.DictReader(stream))
+    whole = ("seed", "env_steps", "encoder_env_steps", "encoder_iterations")
+    return [
+        PublishedTraining(
+            row["group"],
+            *(int(row[name]) for name in whole),
+            *(float(row[name]) if row[name] else None for name in PublishedTraining._fields[-2:]),
+        )
+        for row in rows
+    ]
+
+
+def mean_success(curve: Curve, env_steps: int, before: int = 0) -> float:
     """Success rate, 0..1, averaged over a training's first steps: high if it learns early and well.
 
-    A curve is linear between its points, and 0 at step 0.
+    A curve is linear between its points, and 0 until its training begins.
 
     Args:
         curve: With a point at `env_steps` or later.
         env_steps: How many first steps [-].
+        before: Steps among these that were taken before its training, for its encoder [-].
 
     Raises:
         ValueError: The curve ends before.
     """
-    steps, success = (np.concatenate([[0.0], part]) for part in (curve.env_steps, curve.success_rate))
+    steps = np.concatenate([[0.0, before], curve.env_steps + before])
+    success = np.concatenate([[0.0, 0.0], curve.success_rate])
     if steps[-1] < env_steps:
         rule = f"a curve must reach {env_steps} environment steps"
         raise ValueError(f"{rule}, got {steps[-1]:.0f} for {curve.exp} with seed {curve.seed}; train on")

@@ -1,64 +1,47 @@
-"""Copy finished studies into docs/ of this folder: results.md, trade.md, replay.html.
+"""Copy finished studies into docs/ of this folder: results.md, dose_response.md, trade.md, replay.html.
 
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
-docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page; with `resume` of what
-that run folder holds.
+docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page, the results in
+docs/dose_response.md of the newest sweep of that experiment; with `resume` of what that run folder holds.
 """
 
-import csv
-import gzip
-import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from jobs.analysis.coverage import coverage_text
-from jobs.analysis.tables import estimate_text, markdown_table, save_plot
+from jobs.analysis.tables import estimate_text, markdown_table, save_plot, write_csv
 from jobs.config.config import Config, ConfigError
 from jobs.evaluation.group_stats import (
-    LABELS,
     Condition,
     details_table,
     episode_values,
     success_table,
-    summarise_group,
 )
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
-from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, place
-from jobs.reporting.learning_curves import mean_success, read_curves
-from jobs.reporting.paper_claims import GAIN, Claim, Finding, judge_all
+from jobs.reporting.breaks import Change, SweptEpisodes, changes_of
+from jobs.reporting.dose_response import DOSES, write_dose_response
+from jobs.reporting.figures import TITLES, condition_text, group_results, judge_claims, results_figures
+from jobs.reporting.headline import headline_table, write_headline
+from jobs.reporting.learning_curves import PublishedTraining, published_trainings
+from jobs.reporting.paper_claims import GAIN, Claim, Finding
 from jobs.reporting.replay_page import PAGE
-from jobs.reporting.summary_plots import change_map, claims_plot
-from jobs.rollout.episodes import EPISODE
+from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, write_data
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.checkpoints import sha256
-from jobs.run.files import RunError, read_json, replaced, write_atomic
+from jobs.run.files import read_json, write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
 from jobs.run.templates import render
 
 TEMPLATES = Path(__file__).parent / "templates"
 UNITS = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
-TITLES = {
-    "control_hz": "Control rate",
-    "control_hz_dense": "Control rate among more poles",
-    "contrast_threshold": "Contrast threshold",
-    "sparsity": "Dead pixels",
-    "background_activity": "Background activity",
-    "sensor_noise": "Noise of a real sensor: none, by day, by night",
-    "world": "Other worlds",
-    "memory": "Memory of the pixels",
-    "memory_400hz": "Memory of the pixels at 400 Hz",
-    "speed": "Speed",
-    "worst": "Several at once",
-    "contacts": "Where episodes end in contact",
-}
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -72,6 +55,7 @@ def run(config: Config) -> dict[str, Any]:
         "trade": write_trade,
         "sweep": write_results,
         "replay": write_replay,
+        DOSES: partial(write_dose_response, env=config.env),
     }
     found = {name: find_study(config, name) for name in writers}
     if not any(found.values()):
@@ -85,30 +69,37 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def find_study(config: Config, name: str) -> Path | None:
-    """The folder `name` in the run folder `resume`, else the newest of all run folders; None: there is none.
+    """The folder of a study in the run folder `resume`, else the newest of all; None: there is none.
 
     Args:
         config: The experiment.
-        name: "sweep", "trade" or "replay".
+        name: "sweep", "trade" or "replay", as its folder is called; `DOSES` is the sweep of that experiment,
+            "sweep" that of any other.
     """
     where = Path(config.runs_dir).glob("*") if config.resume is None else [Path(config.resume)]
-    found = [path for path in (run / name / "about.json" for run in where) if path.is_file()]
+    folder = "sweep" if name == DOSES else name
+    found = [path for path in (run / folder / "about.json" for run in where) if path.is_file()]
+    if folder == "sweep":
+        found = [path for path in found if (read_json(path).get("exp") == DOSES) == (name == DOSES)]
     newest = max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
     return newest and newest.parent
 
 
 def write_trade(trade: Path, docs: Path) -> Path:
-    """Copy the page of a trade and its plot.
+    """Copy the page of a trade, its plot and its settings.
 
     Args:
         trade: The folder that the job has left in its run folder.
-        docs: Where trade.md goes, its plot into `images`.
+        docs: Where trade.md goes, its plot into `images`, its settings into `data`.
 
     Returns:
         The file.
     """
     (docs / "images").mkdir(parents=True, exist_ok=True)
     copy_plot(trade / "images" / "trade.png", docs / "images" / "trade.png")
+    if (trade / "settings.csv").is_file():  # trades of earlier versions have none
+        (docs / "data").mkdir(exist_ok=True)
+        write_atomic(docs / "data" / "trade_settings.csv", (trade / "settings.csv").read_text())
     write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
     return docs / "trade.md"
 
@@ -120,7 +111,7 @@ def write_replay(replay: Path, docs: Path) -> Path:
 
 
 def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Path:
-    """Write results.md and copy the plots.
+    """Write results.md with its tables, figures and data.
 
     Args:
         sweep: The folder that a sweep has left in its run folder.
@@ -134,36 +125,33 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
         ConfigError: If an earlier version wrote the sweep.
         RunError: If a file of the sweep is damaged.
     """
-    about: SweepFacts = read_json(sweep / "about.json")
-    if "compared" not in about:
-        raise ConfigError(f"resume: {sweep} is a sweep of an earlier version; give its command again")
-    plots = [name for name in (*about["axes"], "contacts") if (sweep / f"{name}.png").is_file()]
-    (docs / "images").mkdir(parents=True, exist_ok=True)
-    for name in plots:
-        copy_plot(sweep / f"{name}.png", docs / "images" / f"results_{name}.png")
-    if about.get("episodes_sha256") not in (None, sha256(sweep / "episodes.csv")):
-        raise RunError(f"{sweep / 'episodes.csv'}: damaged; give the command of the sweep again")
-    episodes = read_sweep_episodes(sweep / "episodes.csv")
-    write_data(docs / "data", sweep, episodes)
-    values = page_values(about, episodes, docs, pretrained)
-    shown = [(name, TITLES.get(name, name)) for name in plots]
+    about, episodes = read_sweep(sweep)
+    trainings = published_trainings(pretrained)
+    write_data(docs / "data", SWEEP, sweep, episodes)
+    write_csv(docs / "data" / TRAININGS, PublishedTraining._fields, trainings)
+    figures = results_figures(about, episodes, trainings)
+    for name, figure in figures.items():
+        picture = docs / "images" / f"{name}.png"
+        save_plot(picture, figure)
+        copy_plot(picture, picture)
+    values = page_values(about, episodes, trainings, docs, pretrained)
+    names = [name.removeprefix("results_") for name in figures]
+    shown = [(name, TITLES.get(name, name)) for name in names if name not in ("map", "claims", "survival")]
     for name in ("results", "results_tables"):
         write_atomic(docs / f"{name}.md", render(TEMPLATES / f"{name}.md.j2", plots=shown, **values))
+    write_headline(docs / "robustness.md", headline_table(about["groups"], episodes, met_places(about)))
     return docs / "results.md"
 
 
 def page_values(
-    about: SweepFacts, episodes: SweptEpisodes, docs: Path, pretrained: Path
+    about: SweepFacts,
+    episodes: SweptEpisodes,
+    trainings: Sequence[PublishedTraining],
+    docs: Path,
+    pretrained: Path,
 ) -> dict[str, object]:
-    """What the templates name, after the map and the plot of the claims have been drawn."""
-    changes = changes_of(about, episodes)
-    baselines = {place(one["condition"]): place(one["baseline"]) for one in about["compared"]}
-    findings = judge_all(
-        lambda condition, group: episodes.get((condition, group), {}), baselines, learning_success(pretrained)
-    )
-    labels = {at: condition_text(*at) for at in baselines}
-    save_plot(docs / "images" / "results_map.png", change_map(changes, list(about["groups"]), labels))
-    save_plot(docs / "images" / "results_claims.png", claims_plot(findings))
+    """What the templates name."""
+    changes, findings = changes_of(about, episodes), judge_claims(about, episodes, trainings)
     success, every = estimate_tables(about, episodes)
     most = max(map(len, about["groups"].values()))
     return {
@@ -185,28 +173,6 @@ def page_values(
         "details": every,
         "exactness": exactness_table(about.get("exactness", [])),
     }
-
-
-def condition_text(axis: str, value: str) -> str:
-    """A condition in words."""
-    return f"{TITLES.get(axis, axis)}: {value}"
-
-
-def write_data(folder: Path, sweep: Path, episodes: SweptEpisodes) -> None:
-    """Write every episode, packed, and a table of each training under each condition."""
-    folder.mkdir(parents=True, exist_ok=True)
-    packed = gzip.compress((sweep / "episodes.csv").read_bytes(), mtime=0)
-    write_atomic(folder / "robustness_episodes.csv.gz", packed)
-    rows = [
-        (axis, value, group, "" if seed is None else seed, len(own),
-         f"{own['success'].mean():.4f}", f"{own['distance_m'].mean():.2f}")
-        for ((axis, value), group), trainings in episodes.items()
-        for seed, own in trainings.items()
-    ]  # fmt: skip
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([(*LABELS, "episodes", "success_rate", "distance_m"), *rows])
-    write_atomic(folder / "robustness_trainings.csv", text.getvalue())
 
 
 def in_short(
@@ -237,12 +203,17 @@ def in_short(
             f"Take `{best}`: {unchanged:.0f} % with nothing changed, {100 * mean[best]:.0f} % as the mean "
             f'of all conditions, least in "{at}" with {worst_of_best:.0f} %.'
         )
-    losses = [change for change in changes if change.certain and change.difference.value < 0]
-    breakers = Counter(change.condition for change in losses)
-    worst = [
-        f'"{condition_text(*at)}" ({count} of {len(trained)} groups)' for at, count in breakers.most_common(3)
-    ]
-    sentences.append(f"What breaks most groups for certain: {', '.join(worst) or 'nothing'}.")
+    broken: Counter[Condition] = Counter()
+    for change in changes:
+        broken[change.condition] += int(change.broken.sum())
+    every = sum(len(about["groups"][group]) for group in trained)
+    worst = [f'"{condition_text(*at)}" ({count} of {every})' for at, count in broken.most_common(3) if count]
+    sentences.append(f"What breaks most of the published trainings: {', '.join(worst) or 'nothing'}.")
+    certain = sum(change.certain and change.difference.value < 0 for change in changes)
+    sentences.append(
+        f"Of {len(changes)} changes of groups {certain} are losses that are certain for further trainings "
+        "too: with three trainings a group only losses on which all agree can be."
+    )
     verdicts = Counter(one.verdict for one in findings.values())
     counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
     return [*sentences, f"Of the paper's {len(findings)} claims: {counted}."]
@@ -259,66 +230,34 @@ def shared_encoders(about: SweepFacts, pretrained: Path) -> str:
     return "; ".join(" and ".join(same) for same in names.values() if len(same) > 1)
 
 
-def copy_plot(picture: Path, target: Path) -> None:
-    """Copy a plot, packed as small as it can be without changing a colour.
-
-    Raises:
-        RunError: The plot is damaged.
-    """
-    try:
-        with Image.open(picture) as whole:
-            colours = whole.convert("RGB")
-    except (OSError, SyntaxError, ValueError) as error:
-        raise RunError(f"{picture}: damaged ({error}); give the command that drew it again") from None
-    with replaced(target) as part:
-        colours.save(part, "png", optimize=True)
-
-
-def read_sweep_episodes(file: Path) -> SweptEpisodes:
-    """EPISODE by condition, group and training seed, from the sweep's episodes.csv."""
-    rows: dict[tuple[Condition, str], dict[int | None, list[tuple[object, ...]]]] = {}
-    with file.open() as stream:
-        for row in csv.DictReader(stream):
-            axis, value, group, training = (row[name] for name in LABELS)
-            place = rows.setdefault(((axis, value), group), {})
-            place.setdefault(int(training) if training else None, []).append(_episode(row))
-    return {key: {seed: np.array(own, EPISODE) for seed, own in parts.items()} for key, parts in rows.items()}
-
-
-def _episode(row: Mapping[str, str]) -> tuple[object, ...]:
-    kinds: dict[str, Callable[[str], object]] = {"b": "True".__eq__, "i": int, "f": float}
-    return tuple(kinds[EPISODE[name].kind](row[name]) for name in EPISODE.names or ())
-
-
 def breaks_table(about: SweepFacts, changes: Sequence[Change]) -> str:
-    """The conditions that certainly take success from each trained group."""
+    """The conditions that take success from published trainings, of each group the worst first."""
     (nominal,) = about["axes"][NOMINAL]
     lines = []
     for group, seeds in about["groups"].items():
         own = [change for change in changes if change.group == group]
-        lost = sorted(
-            (change for change in own if change.certain and change.difference.value < 0),
-            key=lambda change: change.difference.value,
-        )
-        texts = [
-            f"{' '.join(change.condition)}: {estimate_text(change.difference, 100, '+.0f')}"
-            for change in lost
-        ]
+        lost = [change for change in own if change.broken.any() or (change.certain and _loses(change))]
+        lost.sort(key=lambda change: (-change.broken.mean(), change.difference.value))
         if own:
             before = next((one.before for one in own if one.baseline == (NOMINAL, nominal)), own[0].before)
             name = f"`{group}`" + (" (1 training)" if len(seeds) == 1 else "")
+            texts = [_loss_text(change) for change in lost]
             lines.append((name, f"{100 * before.mean():.0f}", "; ".join(texts) or "none is certain"))
     head = ("Group", "Nothing changed [%]", "Breaks under")
     return markdown_table(head, lines, len(head))
 
 
-def learning_success(pretrained: Path) -> dict[str, list[float]]:
-    """Group -> success averaged over the compared steps, of each published training that took so many."""
-    found: dict[str, list[float]] = {}
-    for curve in read_curves(pretrained).values():
-        if curve.env_steps[-1] >= COMPARED_STEPS:
-            found.setdefault(curve.exp, []).append(mean_success(curve, COMPARED_STEPS))
-    return found
+def _loses(change: Change) -> bool:
+    return change.difference.value < 0
+
+
+def _loss_text(change: Change) -> str:
+    """A loss with its interval, and how many trainings break; bold where it is certain for others too."""
+    text = (
+        f"{' '.join(change.condition)}: {estimate_text(change.difference, 100, '+.0f')}, "
+        f"{change.broken.sum()} of {len(change.broken)}"
+    )
+    return f"**{text}**" if change.certain else text
 
 
 def claims_table(findings: Mapping[Claim, Finding]) -> str:
@@ -347,16 +286,14 @@ def estimate_tables(about: SweepFacts, episodes: SweptEpisodes) -> tuple[str, st
     """Success of all groups under all conditions, and every estimate."""
     conditions = [(axis, value) for axis, points in about["axes"].items() for value in points]
     groups, reference = list(about["groups"]), about["reference"]
-    rows = [
-        summarise_group(
-            at, group, episodes[at, group], episodes.get((at, reference)) if group != reference else None
-        )
-        for at in conditions
-        for group in groups
-        if (at, group) in episodes
-    ]
-    head, lines = success_table(rows, conditions, groups, {})
+    rows = group_results(about, episodes)
+    head, lines = success_table(rows, conditions, groups, {}, met_places(about))
     return markdown_table(head, lines, 2), details_table(rows, reference)
+
+
+def met_places(about: SweepFacts) -> set[tuple[str, str, str]]:
+    """Axis, value and group of what lies within what the group's training drew."""
+    return {(axis, value, group) for axis, value, group in about["met"]}
 
 
 def exactness_table(found: Sequence[Exactness]) -> str:

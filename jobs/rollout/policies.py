@@ -12,7 +12,14 @@ from jobs.config.env_keys import ENV_KEYS, env_with
 from jobs.rollout.agents import BASELINES
 from jobs.run.folder import Run, latest_policies, named_policy
 from models.kinds import find_kind, needed_plugins
-from models.policy.policy import MANIFEST, PRETRAINED, PolicyFileError, read_policy_manifest
+from models.policy.policy import (
+    MANIFEST,
+    PRETRAINED,
+    Policy,
+    PolicyFileError,
+    load_policy,
+    read_policy_manifest,
+)
 
 SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
 FILTER = ("filter_support", "filter_tau_us")
@@ -69,7 +76,9 @@ def read_policy(agent: str) -> EvaluatedPolicy:
         identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
     except ValueError as error:
         raise ConfigError(f"policy: {agent!r}: {error}{needed_plugins(manifest)}") from None
-    seed, met = int(manifest["seed"]), (manifest.get("world", {}), manifest.get("conditions", ()))
+    # Policies of earlier versions name their conditions among the settings of their training.
+    conditions = manifest.get("conditions") or manifest.get("train", {}).get("conditions", ())
+    seed, met = int(manifest["seed"]), (manifest.get("world", {}), conditions)
     return EvaluatedPolicy(agent, group, seed, identity, manifest["sensor"], observation, *met)
 
 
@@ -171,6 +180,23 @@ def find_sweep_policies(
             )
     order = list(dict.fromkeys(policy.group for policy in policies))
     return tuple(sorted(policies, key=lambda policy: (order.index(policy.group), policy.training or 0)))
+
+
+def load_trained(key: str, name: str, env: EnvConfig) -> tuple[Path, Policy]:
+    """The folder of the policy that a key of the configuration names, and the policy.
+
+    Raises:
+        ConfigError: There is none, it is damaged, or it was trained with another sensor.
+    """
+    path = named_policy(name)
+    if path is None:
+        raise ConfigError(f"{key}: must be a run folder or a policy folder, got {name!r}")
+    try:
+        policy = load_policy(path)
+        check_sensor(policy.manifest["sensor"], env)
+    except ValueError as error:
+        raise ConfigError(f"{key}: {error}") from error
+    return path, policy
 
 
 def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:

@@ -1,8 +1,8 @@
 """Compiles the kernels into numba's cache, by using each once: python -m jobs.run.compile.
 
 What is compiled already is only loaded, and nothing is done while no source file has changed. One
-process compiles, others that are started meanwhile wait for it. The rooms are imported only where there is
-something to compile, because that takes seconds.
+job compiles, in two processes; others that are started meanwhile wait for it. The rooms are imported only
+where there is something to compile, because that takes seconds.
 """
 
 import hashlib
@@ -11,8 +11,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -40,11 +44,10 @@ def main() -> None:
         if _is_current():
             return
         now = _digest()
-        console.print("Compiling the kernels (a minute at the first time) ...")
+        console.print("Compiling the kernels (a minute and a half at the first time) ...")
         start = time.perf_counter()
-        simulate()
-        encode()
-        learn()
+        side_by_side((draw, respond))
+        side_by_side((simulate, learn))  # a compiled step is made of what was drawn and responded by
         console.print(f"Compiled the kernels in {time.perf_counter() - start:.0f} s.")
         write_atomic(CACHE / "compiled", now)
 
@@ -64,14 +67,52 @@ def _digest() -> str:
     return whole.hexdigest()
 
 
+def side_by_side(parts: Sequence[Callable[[], None]]) -> None:
+    """Call functions of modules, each in a process of its own."""
+    with ProcessPoolExecutor(len(parts), get_context("spawn")) as pool:
+        for done in [pool.submit(part) for part in parts]:
+            done.result()
+
+
+def draw() -> None:
+    """Draw a scene."""
+    from envs.raycast.renderer import RaycastRenderer
+    from envs.scene import make_scene
+
+    RaycastRenderer(make_scene("poles", np.random.default_rng(0)), 16, 16).render(0.0, 0.0, 2.0)
+
+
+def respond() -> None:
+    """Let pixels see light change, in whole images and in columns; encode events, and write and read them."""
+    from envs.config import CameraConfig, FaultsConfig
+    from envs.events import EventCamera, RealSensor
+    from envs.events.crossings import make_room, named
+    from envs.events.emission import Span
+    from envs.events.ramps import ColumnCamera, Watch, events_of_ramps, look_at, make_ramps
+
+    light, config = np.ones((16, 16), np.float32), CameraConfig(width=16, height=16)
+    faults = FaultsConfig(background_activity=0.1, shot_noise_hz=10.0, leak_hz=1.0)
+    for changed in ({"memory": "frame"}, {"refractory_us": 100}, {"cutoff_hz": 100.0, "readout_hz": 1e6}):
+        camera = EventCamera(replace(config, **changed))
+        camera.reset(light, 0)
+        camera.step(0.5 * light, 1000)
+    columns = ColumnCamera(config)
+    columns.reset(light)
+    state, ramps, (model, memory) = columns.state, make_ramps(1000), named(*columns.state[:2])
+    watch = Watch(model, memory, np.zeros(16, np.int64), state[2], ramps, make_room())
+    _, kept, _ = look_at(0.5 * light, 0, 16, 1000, watch, 0)
+    rng = np.random.default_rng(0)
+    sensor = RealSensor(config, faults, (state, columns.pixels), rng, 0)
+    sensor.events(events_of_ramps(watch, kept, Span(0, 1000)), 0, 1000)
+    record()
+    encode()
+
+
 def simulate() -> None:
-    """Move through a few corridors, and write and read a recording."""
+    """Move through a few corridors."""
     from envs.config import CameraConfig, EnvConfig, FaultsConfig
     from envs.corridor import CorridorEnv, CorridorVectorEnv
     from envs.event_error import measure_event_error
-    from envs.recordings import read_events, write_events
-    from envs.recordings.ecf import decode_ecf
-    from envs.recordings.event_stream import MAGIC_ES
     from envs.scene.planning import cost_to_go
 
     small = partial(CameraConfig, width=16, height=16)
@@ -91,6 +132,14 @@ def simulate() -> None:
     several.step(np.zeros(2, np.int64))
     cost_to_go(several.envs[0].scene, 0.3).of_actions(0.0, 0.0)
     measure_event_error(EnvConfig(camera=small()), flights=1, steps=1)
+
+
+def record() -> None:
+    """Write and read recordings."""
+    from envs.recordings import read_events, write_events
+    from envs.recordings.ecf import decode_ecf
+    from envs.recordings.event_stream import MAGIC_ES
+
     with tempfile.TemporaryDirectory() as folder:
         for name in ("dat", "evt2", "evt3"):
             write_events(Path(folder) / name, some_events(), 16, 16, name)

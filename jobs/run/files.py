@@ -4,13 +4,12 @@ A power failure, a full disk or an interrupted copy can change a file in a way t
 JSON, such as in one digit of a result: the checksum tells.
 """
 
-import contextlib
 import json
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from envs.checks import replaced
 from envs.config import settings_hash
 
 CHECKSUM = "checksum"  # of the other values of a JSON object; files of older versions have none
@@ -94,32 +93,3 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader sees the old content or the new one, never a part."""
     with replaced(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
-
-
-@contextlib.contextmanager
-def replaced(path: Path) -> Iterator[Path]:
-    """Yield a path to write to; the file takes its final name when the block ends without an error.
-
-    This holds on the disk too: the content is stored before its name, and a full disk leaves the old file.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with naming(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            yield part
-            with part.open("rb") as file:
-                os.fsync(file.fileno())
-            part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Let an error of the operating system name the file: that of a write alone does not."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = str(path)
-        raise

@@ -25,7 +25,7 @@ from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
 NOT_IN_RUN_NAME = (
     "job", "resume", "runs_dir", "plugins", "cluster", "tracking",
     "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "tune", "ablation",
-    "demo", "replay_page",
+    "demo", "replay_page", "calibrate", "sliding",
 )  # fmt: skip
 # Settings that older run folders lack, each with the value that does what was done before it existed.
 ADDED_SETTINGS: dict[str, dict[str, object]] = {

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from jobs.run.files import RunError, naming
+from envs.checks import naming
+from jobs.run.files import RunError
 from jobs.run.progress import console
 
 

@@ -22,10 +22,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+from envs.checks import replaced
 from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
 from jobs.config.errors import redacted
-from jobs.run.files import read_json, replaced, write_json
+from jobs.run.files import read_json, write_json
 from jobs.run.folder import Run
 from jobs.run.locks import held_alone, locked, private_folder
 from jobs.run.progress import console

@@ -25,13 +25,12 @@ from jobs.config.conditions import episode_draw
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.agents import Agent, make_agent
 from jobs.rollout.diagnostics import report_event_error
-from jobs.rollout.policies import check_sensor
+from jobs.rollout.policies import load_trained
 from jobs.run.checkpoints import seal
-from jobs.run.folder import Run, finish, finished, locate_run, named_policy, open_run
+from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.real_recordings import Recorded, no_episodes, read_recorded, with_recorded
-from models.policy import load_policy
 
 EPISODE_GAP_US = 1_000_000
 MEAN_HOLD_M = 2.0
@@ -117,14 +116,7 @@ def check_policy(folder: Run) -> Path | None:
     named = folder.config.collect.policy
     if named is None or finished(folder, "collect") is not None:
         return None
-    path = named_policy(named)
-    if path is None:
-        raise ConfigError(f"collect.policy: must be a run folder or a policy folder, got {named!r}")
-    try:
-        check_sensor(load_policy(path).manifest["sensor"], folder.config.env)
-    except ValueError as error:
-        raise ConfigError(f"collect.policy: {error}") from error
-    return path
+    return load_trained("collect.policy", named, folder.config.env)[0]
 
 
 def record(

@@ -7,13 +7,13 @@ the original is gone; the encoder is the policy's, so that nothing is collected 
 from pathlib import Path
 
 from jobs.config.config import Config, ConfigError
-from jobs.rollout.policies import check_sensor
+from jobs.config.errors import differences
+from jobs.rollout.policies import load_trained
 from jobs.run.files import read_json, write_atomic
 from jobs.run.folder import Run, finished, locate_run, named_policy
 from jobs.tracking.tracker import Tracker
 from jobs.training.ppo import policy_spec
 from jobs.training.pretrain import check_sources, encoder_file, prepare_encoder
-from models.policy import load_policy
 from models.policy.policy import ENCODER, ENCODER_FILES, MANIFEST, NETWORKS, Policy
 
 
@@ -50,21 +50,13 @@ def check_init(folder: Run) -> tuple[Path, Policy]:
     Raises:
         ConfigError: `train.init` names none, or one of other settings, of another sensor or encoder.
     """
-    named, config = str(folder.config.train.init), folder.config
-    path = named_policy(str(folder.init)) or named_policy(named)
-    if path is None:
-        raise ConfigError(f"train.init: must be a run folder or a policy folder, got {named!r}")
-    try:
-        policy = load_policy(path)
-        check_sensor(policy.manifest["sensor"], config.env)
-    except ValueError as error:
-        raise ConfigError(f"train.init: {error}") from error
-    there, here = policy.spec.manifest(), policy_spec(config).manifest()
-    differ = [key for key in {**there, **here} if there.get(key) != here.get(key)]
+    config, kept = folder.config, str(folder.init)
+    name = kept if named_policy(kept) else str(config.train.init)
+    path, policy = load_trained("train.init", name, config.env)
+    differ = differences(policy.spec.manifest(), policy_spec(config).manifest())
     if differ:
-        got = ", ".join(f"{key}: {there.get(key)!r} there, {here.get(key)!r} here" for key in differ)
         remedy = "set model as it is there, or begin from another"
-        raise ConfigError(f"train.init: must be a policy of the same model, got {got}; {remedy}")
+        raise ConfigError(f"train.init: must be a policy of the same model, got {differ}; {remedy}")
     if policy.spec.frozen and finished(folder, "pretrain") is not None:
         files = path / ENCODER, encoder_file(folder)
         theirs, own = (read_json(file.with_suffix(".json"))["sha256"] for file in files)

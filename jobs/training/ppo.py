@@ -13,11 +13,12 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
 
-from envs.config import Observation, sensor_differences, sensor_settings, settings_hash
+from envs.config import Observation, sensor_settings, settings_hash
 from envs.corridor import CorridorVectorEnv
 from envs.kinematics import NUM_ACTIONS
 from jobs.config.conditions import episode_draw
 from jobs.config.config import Config, ConfigError
+from jobs.config.errors import differences
 from jobs.config.plugins import plugin_digests
 from jobs.rollout.diagnostics import drift_metrics
 from jobs.run.files import RunError
@@ -305,13 +306,10 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
     except EncoderFileError as error:
         marker = Path(path).parent.parent / "stages" / "pretrain.json"
         raise RunError(f"{error}; delete {marker}, and the same command makes the encoder anew") from None
-    differ = sensor_differences(about["sensor"], config.env)
+    differ = differences(about["sensor"], sensor_settings(config.env))
     if differ:
-        values = ", ".join(
-            f"{name}: {there!r} there, {here!r} here" for name, (there, here) in differ.items()
-        )
         remedy = "use its settings, or pretrain an encoder for these"
-        raise ConfigError(f"encoder: was made for another sensor: {values}; {remedy}")
+        raise ConfigError(f"encoder: was made for another sensor: {differ}; {remedy}")
     spec = policy_spec(config)
     if spec.finetuned and spec.evae != about["model"]:
         raise ConfigError(f"encoder: must be one of {spec.evae} to be fine-tuned, got {about['model']}")

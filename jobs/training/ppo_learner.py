@@ -220,9 +220,19 @@ class PlainPPOLearner(PPOTorchLearner):
         config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
         adam = optimizer.param_groups[0]
-        of_loss = config.clip_param, config.vf_loss_coeff, config.vf_clip_param, self._entropy_coeff
-        of_adam = self._grad_clip, adam["lr"], *adam["betas"], adam["eps"]
-        settings = Settings(minibatch_size, *map(float, (*of_loss, *of_adam)))
+        beta1, beta2 = adam["betas"]
+        settings = Settings(
+            minibatch_size,
+            clip_param=float(config.clip_param),
+            vf_loss_coeff=float(config.vf_loss_coeff),
+            vf_clip_param=float(config.vf_clip_param),
+            entropy_coeff=float(self._entropy_coeff),
+            grad_clip=float(self._grad_clip),
+            lr=float(adam["lr"]),
+            beta1=float(beta1),
+            beta2=float(beta2),
+            eps=float(adam["eps"]),
+        )
         read = Rows(*(rows[name].numpy() for name in READ))
         read = read._replace(stacks=rows[Columns.OBS].flatten(1).numpy())
         means = update_dense((module.pi, module.vf), optimizer, read, orders.numpy(), settings)

@@ -18,6 +18,7 @@ import torch
 from envs.recordings import Recording, read_recording
 from jobs.analysis.plots import plot_reconstructions
 from jobs.config.config import Config, ConfigError
+from jobs.config.errors import differences
 from jobs.config.schema import PretrainConfig
 from jobs.run.checkpoints import UNSEALED, damage
 from jobs.run.files import RunError, write_atomic
@@ -99,14 +100,9 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
     except EncoderFileError as error:
         rule = f"must be a run folder with an encoder, or an encoder file, got {named!r}"
         raise ConfigError(f"pretrain.encoder: {rule}: {error}") from error
-    there, here = (dataclasses.asdict(part) for part in (evae.settings, evae_settings(config)))
-    differ = [
-        f"{name}: {there[name]!r} there, {value!r} here"
-        for name, value in here.items()
-        if there[name] != value
-    ]
+    differ = differences(dataclasses.asdict(evae.settings), dataclasses.asdict(evae_settings(config)))
     if differ:
-        raise ConfigError(f"pretrain.encoder: must have the settings of the model, got {', '.join(differ)}")
+        raise ConfigError(f"pretrain.encoder: must have the settings of the model, got {differ}")
     if evae.decoder is None:
         rule = "must have a decoder to learn on; a shipped policy's has none, its run folder's has"
         raise ConfigError(f"pretrain.encoder: {rule}, got {named!r}")

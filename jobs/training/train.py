@@ -22,11 +22,12 @@ import torch
 from ray import tune
 from ray.rllib.core.rl_module.rl_module import RLModule
 
+from envs.checks import naming
 from jobs.config.config import Config, ConfigError
 from jobs.config.plugins import with_culprit
 from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
-from jobs.run.files import json_lines, naming, read_json_lines, whole_lines
+from jobs.run.files import json_lines, read_json_lines, whole_lines
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage

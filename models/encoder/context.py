@@ -21,7 +21,7 @@ sums differs; `tests/models/encoder/test_context.py` states the bounds for float
 """
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -75,7 +75,7 @@ class EventContextNetwork(nn.Module):
         present, multiplicity, rank = distinct(cell)
         share = self._share(multiplicity, len(cell))
         h, weight, bias = self._last_layer(self._inputs(present), share, len(cell))
-        events, squash = (rank, bins, batch.offsets, embedding), self.coding == "eventnet"
+        events, squash = Events(rank, bins, batch.offsets, embedding), self.coding == "eventnet"
         ordered = newest_first(events) if squash else events
         context, winning_bin = MaxContext.apply(h, weight, bias, ordered, squash)
         return self._rotated(context, winning_bin) if squash else context
@@ -206,12 +206,20 @@ def folded(
     return h, layer.weight * (norm.weight / torch.sqrt(variance + norm.eps))[:, None], norm.bias
 
 
-def newest_first(events: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Events (cell, bin, offsets, codes), each window's by falling bin: of equals the newest wins."""
-    cell, bins, offsets, codes = events
-    window = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    order = np.lexsort((-bins, window))
-    return cell[order], bins[order], offsets, codes
+class Events(NamedTuple):
+    """Cell and time bin of each event, `offsets` as of `EventBatch`, and the code of each time bin."""
+
+    cell: np.ndarray
+    bin: np.ndarray
+    offsets: np.ndarray
+    codes: np.ndarray
+
+
+def newest_first(events: Events) -> Events:
+    """Each window's events by falling bin: of equals the newest wins."""
+    window = np.repeat(np.arange(len(events.offsets) - 1), np.diff(events.offsets))
+    order = np.lexsort((-events.bin, window))
+    return events._replace(cell=events.cell[order], bin=events.bin[order])
 
 
 class MaxContext(torch.autograd.Function):
@@ -222,19 +230,15 @@ class MaxContext(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: tuple[np.ndarray, ...], squash: bool
+        ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool
     ) -> tuple[Tensor, Tensor]:
-        """Context (B, D) and the bin (B, D) of the event it is from, 0 without one.
-
-        `events` is (cell, bin, offsets, codes).
-        """
-        cell, bins, offsets, codes = events
+        """Context (B, D) and the bin (B, D) of the event it is from, 0 without one."""
         activation = torch.addmm(bias, h, weight.T).relu_()
         features = (activation.tanh_() if squash else activation).numpy()
-        context = np.zeros((len(offsets) - 1, len(bias)), features.dtype)
+        context = np.zeros((len(events.offsets) - 1, len(bias)), features.dtype)
         winner = np.full(context.shape, -1, np.int32)
         winning_bin = np.zeros(context.shape, np.int32)
-        _maximum((features, codes), (cell, bins, offsets), context, winner, winning_bin)
+        _maximum(features, events, context, winner, winning_bin)
         ctx.slope = _tanh_slope(features, winner) if squash else None
         ctx.save_for_backward(h, weight, torch.from_numpy(winner))
         found = torch.from_numpy(context), torch.from_numpy(winning_bin)
@@ -261,13 +265,12 @@ def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _maximum(tables, events, context, winner, winning_bin) -> None:  # type: ignore[no-untyped-def]
+def _maximum(features, events, context, winner, winning_bin) -> None:  # type: ignore[no-untyped-def]
     """Raise `context` (B, D) to the events' maximum, the first of equals.
 
     `winner` becomes its cell, -1 where it has no gradient; `winning_bin` its bin.
     """
-    features, codes = tables
-    cell, bins, offsets = events
+    cell, bins, offsets, codes = events.cell, events.bin, events.offsets, events.codes
     for b in range(context.shape[0]):
         best, who = context[b], winner[b]
         for n in range(offsets[b], offsets[b + 1]):

@@ -26,6 +26,13 @@ class Grid(NamedTuple):
     time_bins: int
 
 
+class Span(NamedTuple):
+    """When a window begins on the clock of its events, and how long it is [us]."""
+
+    start_us: int
+    window_us: int
+
+
 @dataclass(frozen=True)
 class EventBatch:
     """Windows of events as addresses; empty windows and mixed sizes are welcome.
@@ -107,7 +114,7 @@ def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, 
     if not 1 <= window_us <= MAX_WINDOW_US:
         raise ValueError(f"window_us must be in 1..{MAX_WINDOW_US}, got {window_us}")
     address = np.empty((2, len(fields[0])), np.int32)
-    bad = _index(*fields, (int(start_us), int(window_us)), (grid.width, grid.height, grid.time_bins), address)
+    bad = _index(*fields, Span(int(start_us), int(window_us)), grid, address)
     if bad >= 0:
         x, y, p = (int(values[bad]) for values in fields[1:])
         rule = f"need 0 <= x < {grid.width}, 0 <= y < {grid.height}, p = -1 or 1; crop before encoding"
@@ -118,13 +125,13 @@ def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, 
 @numba.njit(cache=True, error_model="numpy")
 def _index(t, x, y, p, span, grid, address) -> int:  # type: ignore[no-untyped-def]
     """Fill `address` (2, N); the index of the first refused event, or -1."""
-    width, height, time_bins = grid
+    width, height = grid.width, grid.height
     for n in range(len(t)):
         column, row, sign = np.int64(x[n]), np.int64(y[n]), np.int64(p[n])
         if column < 0 or column >= width or row < 0 or row >= height or sign * sign != 1:
             return n
         address[0, n] = ((sign + 1) // 2 * height + row) * width + column
-        address[1, n] = time_bin(np.int64(t[n]), span[0], span[1], time_bins)
+        address[1, n] = time_bin(np.int64(t[n]), span.start_us, span.window_us, grid.time_bins)
     return -1
 
 
@@ -181,7 +188,7 @@ def _index_packed(rows, starts, grid):  # type: ignore[no-untyped-def]
     for b in range(len(starts) - 1):
         first, count = starts[b] + 1, offsets[b + 1] - offsets[b]
         events = rows[first : first + count]
-        span = (np.int64(0), np.int64(rows[first - 1, 2]))
+        span = Span(np.int64(0), np.int64(rows[first - 1, 2]))  # type: ignore[arg-type]
         own = address[:, offsets[b] : offsets[b + 1]]
         if _index(events[:, 0], events[:, 1], events[:, 2], events[:, 3], span, grid, own) >= 0:
             return address, offsets, b
@@ -234,7 +241,7 @@ def event_rows(batch: EventBatch, size: int) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _roll(code, bins, offsets, grid, rows) -> None:  # type: ignore[no-untyped-def]
-    width, height, _ = grid
+    width, height = grid.width, grid.height
     for b in range(len(rows)):
         for k in range(offsets[b + 1] - offsets[b]):
             cell, row = code[offsets[b] + k], rows[b, k]
@@ -251,7 +258,7 @@ def batch_rows(rows: np.ndarray, grid: Grid) -> EventBatch:
     """
     address = np.empty((2, rows.shape[0] * rows.shape[1]), np.int32)
     offsets = np.zeros(len(rows) + 1, np.int64)
-    bad = _unroll(rows, (grid.width, grid.height, grid.time_bins), address, offsets)
+    bad = _unroll(rows, grid, address, offsets)
     if bad >= 0:
         kind, time, x, y = rows.reshape(-1, 4)[bad].tolist()
         rule = f"need kind 0, 1 or 2, time < {grid.time_bins}, x < {grid.width}, y < {grid.height}"
@@ -263,7 +270,7 @@ def batch_rows(rows: np.ndarray, grid: Grid) -> EventBatch:
 @numba.njit(cache=True, error_model="numpy")
 def _unroll(rows, grid, address, offsets) -> int:  # type: ignore[no-untyped-def]
     """Fill `address` and `offsets`; the index of the first refused row, or -1."""
-    width, height, time_bins = grid
+    width, height = grid.width, grid.height
     found = 0
     for b in range(rows.shape[0]):
         for k in range(rows.shape[1]):
@@ -271,7 +278,7 @@ def _unroll(rows, grid, address, offsets) -> int:  # type: ignore[no-untyped-def
             x, y = np.int64(rows[b, k, 2]), np.int64(rows[b, k, 3])
             if kind == ROW_EMPTY:
                 continue
-            inside = 0 <= x < width and 0 <= y < height and 0 <= time < time_bins
+            inside = 0 <= x < width and 0 <= y < height and 0 <= time < grid.time_bins
             if not inside or (kind != ROW_ON and kind != ROW_OFF):
                 return b * rows.shape[1] + k
             address[0, found] = ((kind == ROW_ON) * height + y) * width + x

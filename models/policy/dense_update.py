@@ -8,6 +8,7 @@ with; sums run in another order, and a tanh errs by at most 4e-7 of its value.
 
 import math
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numba
@@ -23,6 +24,19 @@ P6, P5, P4 = F32(-2.76076847742355e-16), F32(2.00018790482477e-13), F32(-8.60467
 P3, P2, P1 = F32(5.12229709037114e-08), F32(1.48572235717979e-05), F32(6.37261928875436e-04)
 Q3, Q2, Q1 = F32(1.19825839466702e-06), F32(1.18534705686654e-04), F32(2.26843463243900e-03)
 P0, Q0 = F32(4.89352455891786e-03), F32(4.89352518554385e-03)
+
+
+class Figure(IntEnum):
+    """What is reported of a minibatch."""
+
+    POLICY_LOSS = 0
+    VALUE_LOSS = 1
+    ENTROPY = 2
+    TOTAL_LOSS = 3
+    NORM = 4
+
+
+NUM_FIGURES = len(Figure)
 
 
 class Rows(NamedTuple):
@@ -100,8 +114,8 @@ def update_dense(
         settings: Of loss and optimiser.
 
     Returns:
-        Means over the minibatches of the last epoch: policy loss, value loss, entropy, total loss and
-        the gradient's norm before the clip; float64.
+        Means over the minibatches of the last epoch, float64, each at its `Figure`; the norm is that of the
+        gradient before the clip.
 
     Raises:
         RuntimeError: A gradient is not finite; the weights are those before it.
@@ -119,7 +133,7 @@ def update_dense(
             part.detach().copy_(torch.from_numpy(new).view_as(part))
     for state in states:
         state["step"].fill_(taken)
-    if not math.isfinite(figures[-1]):
+    if not math.isfinite(figures[Figure.NORM]):
         raise RuntimeError(f"gradients must be finite, got a non-finite norm after {taken:.0f} steps")
     return figures
 
@@ -154,7 +168,7 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
     seen, more = rows.stacks.shape[1], rows.privileged.shape[1]
     inputs = np.empty((size, seen), np.float32)
     judged = np.empty((size, seen + more), np.float32)
-    figures = np.zeros(5)
+    figures = np.zeros(NUM_FIGURES)
     for epoch in range(epochs):
         figures[:] = 0.0
         for begin in range(0, count, size):
@@ -169,14 +183,14 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
                     told[b, seen:] = rows.privileged[picked[b]]
             logits, of_logits = _forward(shown, pi)
             values, of_values = _forward(told, vf)
-            _add_losses((logits, values), (of_logits, of_values), rows, picked, settings, figures)
+            _add_losses(logits, values, of_logits, of_values, rows, picked, settings, figures)
             _backward(shown, pi)
             _backward(told, vf)
             norm = math.sqrt(np.dot(adam.gradient, adam.gradient))
             if not math.isfinite(norm):
-                figures[4] = np.nan
+                figures[Figure.NORM] = np.nan
                 return figures, taken
-            figures[4] += norm
+            figures[Figure.NORM] += norm
             taken += 1.0
             _step(adam, settings, min(1.0, settings.grad_clip / (norm + 1e-6)), taken)
     return figures / ((count + size - 1) // size), taken
@@ -224,10 +238,10 @@ def tanh(values):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_losses(outputs, of_outputs, rows, picked, settings, figures):  # type: ignore[no-untyped-def]
+def _add_losses(  # type: ignore[no-untyped-def]
+    logits, values, of_logits, of_values, rows, picked, settings, figures
+):
     """Add the losses of a minibatch to the figures; fill the gradients of logits and values."""
-    logits, values = outputs
-    of_logits, of_values = of_outputs
     count, actions = logits.shape
     logps = np.empty(actions)
     policy_loss = value_loss = entropy = 0.0
@@ -253,12 +267,11 @@ def _add_losses(outputs, of_outputs, rows, picked, settings, figures):  # type: 
         value_loss += settings.vf_clip_param if beyond else error * error
         of_values[b, 0] = 0.0 if beyond else 2.0 * settings.vf_loss_coeff * error / count
         entropy += own_entropy
-    figures[0] += policy_loss / count
-    figures[1] += value_loss / count
-    figures[2] += entropy / count
-    figures[3] += (
-        policy_loss + settings.vf_loss_coeff * value_loss - settings.entropy_coeff * entropy
-    ) / count
+    total_loss = policy_loss + settings.vf_loss_coeff * value_loss - settings.entropy_coeff * entropy
+    figures[Figure.POLICY_LOSS] += policy_loss / count
+    figures[Figure.VALUE_LOSS] += value_loss / count
+    figures[Figure.ENTROPY] += entropy / count
+    figures[Figure.TOTAL_LOSS] += total_loss / count
 
 
 @compiled
@@ -295,7 +308,7 @@ def _step(adam, settings, scale, taken):  # type: ignore[no-untyped-def]
     size = F32(settings.lr / (1.0 - settings.beta1**taken))
     keep1, keep2 = F32(settings.beta1), F32(settings.beta2)
     new1, new2 = F32(1.0 - settings.beta1), F32(1.0 - settings.beta2)
-    values, gradient, first, second = adam
+    values, gradient, first, second = adam.values, adam.gradient, adam.first, adam.second
     for j in range(len(values)):
         slope = scale * gradient[j]
         first[j] = keep1 * first[j] + new1 * slope

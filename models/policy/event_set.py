@@ -13,7 +13,7 @@ value in the batch, and the products are pooled as they are made. Only the order
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -78,7 +78,7 @@ class EventSet(nn.Module):
             torch.cat(_inputs(sides[0][cells % width], sides[1][cells // width % height], on), dim=-1)
         )
         gates = self.gate(torch.from_numpy(times).to(weight)[:, None] / TIMES)
-        return GatedPool.apply(places, gates, (cell, time, batch.offsets))
+        return GatedPool.apply(places, gates, Events(cell, time, batch.offsets))
 
     def _joined(self, pooled: tuple[Tensor, Tensor, Tensor], shape: Sequence[int]) -> Tensor:
         """The trunk's outputs (B, OUTPUTS) of maxima, sums and numbers of all windows."""
@@ -101,18 +101,32 @@ def _inputs(x: Tensor, y: Tensor, on: Tensor) -> list[Tensor]:
     return [place_x, place_y, on, sin_x, sin_y, cos_x, cos_y]
 
 
+class Events(NamedTuple):
+    """Of each event its place among the cells and the times that occur; `offsets` as of `EventBatch`."""
+
+    cell: np.ndarray
+    time: np.ndarray
+    offsets: np.ndarray
+
+
+class Factors(NamedTuple):
+    """What the feature of an event is the product of: a row for each cell, and one for each time."""
+
+    places: np.ndarray
+    gates: np.ndarray
+
+
 class GatedPool(torch.autograd.Function):
     """Maximum and sum over each window's events of places[cell] * gates[time], both at least 0."""
 
     @staticmethod
-    def forward(
-        ctx: Any, places: Tensor, gates: Tensor, events: tuple[np.ndarray, ...]
-    ) -> tuple[Tensor, Tensor]:
-        """Two tensors (B, F); `events` is (cell, time, offsets)."""
-        shape = len(events[-1]) - 1, places.shape[1]
-        largest, total = (np.zeros(shape, places.detach().numpy().dtype) for _ in range(2))
+    def forward(ctx: Any, places: Tensor, gates: Tensor, events: Events) -> tuple[Tensor, Tensor]:
+        """Two tensors (B, F)."""
+        factors = Factors(places.detach().numpy(), gates.detach().numpy())
+        shape = len(events.offsets) - 1, places.shape[1]
+        largest, total = (np.zeros(shape, factors.places.dtype) for _ in range(2))
         winner = np.full(shape, -1, np.int32)
-        _pool((places.detach().numpy(), gates.detach().numpy()), events, largest, total, winner)
+        _pool(factors, events, largest, total, winner)
         ctx.save_for_backward(places, gates)
         ctx.events, ctx.winner = events, winner
         return torch.from_numpy(largest), torch.from_numpy(total)
@@ -120,21 +134,20 @@ class GatedPool(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_largest: Tensor, of_total: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of places and gates: every event has that of the sum, a winner that of the maximum."""
-        factors = tuple(value.detach().numpy() for value in ctx.saved_tensors)
-        found = tuple(np.zeros_like(factor) for factor in factors)
+        factors = Factors(*(value.detach().numpy() for value in ctx.saved_tensors))
+        found = Factors(*map(np.zeros_like, factors))
         gradients = of_largest.contiguous().numpy(), of_total.contiguous().numpy()
-        _spread(gradients, factors, ctx.events, ctx.winner, found)
+        _spread(*gradients, factors, ctx.events, ctx.winner, found)
         return *(torch.from_numpy(value) for value in found), None
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _pool(factors, events, largest, total, winner) -> None:  # type: ignore[no-untyped-def]
-    places, gates = factors
-    cell, time, offsets = events
+    cell, time, offsets = events.cell, events.time, events.offsets
     for b in range(len(offsets) - 1):
         best, sums, who = largest[b], total[b], winner[b]
         for n in range(offsets[b], offsets[b + 1]):
-            place, gate, event = places[cell[n]], gates[time[n]], np.int32(n)
+            place, gate, event = factors.places[cell[n]], factors.gates[time[n]], np.int32(n)
             for j in range(len(best)):
                 value = place[j] * gate[j]
                 better = value > best[j]
@@ -144,11 +157,9 @@ def _pool(factors, events, largest, total, winner) -> None:  # type: ignore[no-u
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _spread(gradients, factors, events, winner, found) -> None:  # type: ignore[no-untyped-def]
-    of_largest, of_total = gradients
-    places, gates = factors
-    cell, time, offsets = events
-    of_places, of_gates = found
+def _spread(of_largest, of_total, factors, events, winner, found) -> None:  # type: ignore[no-untyped-def]
+    places, gates, of_places, of_gates = factors.places, factors.gates, found.places, found.gates
+    cell, time, offsets = events.cell, events.time, events.offsets
     for b in range(len(offsets) - 1):
         gradient = of_total[b]
         for n in range(offsets[b], offsets[b + 1]):

@@ -20,11 +20,12 @@ from ray import tune
 from ray.tune.schedulers import ASHAScheduler
 from ray.tune.search.optuna import OptunaSearch
 
+from envs.checks import naming
 from envs.config import settings_hash
 from jobs.analysis.plots import BLUE, GREYS, INK, tidy
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.config import Config, ConfigError, as_dict
-from jobs.run.files import json_lines, naming, read_json_lines, whole_lines
+from jobs.run.files import json_lines, read_json_lines, whole_lines
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from matplotlib.figure import Figure
+
 from jobs.analysis.statistics import Estimate
 from jobs.analysis.tables import (
     Summary,
@@ -16,7 +18,7 @@ from jobs.analysis.tables import (
 )
 from jobs.run.provenance import Provenance
 from jobs.run.templates import render
-from jobs.studies.front_plots import Panel, pareto
+from jobs.studies.front_plots import Panel, pareto, plot_choices
 from jobs.studies.replays import Measured
 
 TEMPLATE = Path(__file__).with_name("page.md.j2")  # it also states the rule of the verdicts
@@ -27,6 +29,11 @@ MARGIN = 0.1  # of success: what may be lost
 HEADINGS = (
     "Knob", "Setting", "Steps/s", "Event error [%]", "Latent error [% of sd]", "Other action [%]", "Episodes",
     "Success [%]", "Success - default [points]", "Distance [m]", "Verdict", "Front",
+)  # fmt: skip
+SETTING_FIELDS = (
+    "knob", "setting", "steps_per_s", "event_error", "latent_error", "other_action", "episodes",
+    "success_rate", "success_low", "success_high", "difference", "difference_low", "difference_high",
+    "distance_m", "verdict", "front",
 )  # fmt: skip
 Verdict = Literal["default", "as good", "worse", "undecided"]
 
@@ -108,18 +115,45 @@ def fronts(rows: Sequence[TradedSetting]) -> dict[str, list[int]]:
     return {"e": [known[place] for place in by_error], "a": pareto(others), "s": pareto(failures)}
 
 
-def panels(rows: Sequence[TradedSetting]) -> list[Panel]:
-    """What the plot shows over the cost: event error, other actions, success."""
+def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
+    """What is published of each setting, by `SETTING_FIELDS`; all that the plot shows."""
     front = fronts(rows)
-    errors = [float("nan") if row.event_error is None else 100 * row.event_error for row in rows]
-    others = [100 * row.measured.other_action for row in rows]
-    success = [100 * row.summary.success.value for row in rows]
-    ends = [row.summary.success.interval or (0.0, 1.0) for row in rows]
-    intervals = [(100 * low, 100 * high) for low, high in ends]
+    found = []
+    for place, row in enumerate(rows):
+        ends = [row.summary.success.interval or (0.0, 1.0), row.difference.interval or (-1.0, 1.0)]
+        numbers = (
+            row.steps_per_s, row.event_error, row.measured.latent_error, row.measured.other_action,
+            row.summary.episodes, row.summary.success.value, *ends[0], row.difference.value, *ends[1],
+            row.summary.distance_m.value,
+        )  # fmt: skip
+        words = ["" if number is None else f"{float(number):.10g}" for number in numbers]
+        letters = "".join(name for name, places in front.items() if place in places)
+        values = (row.knob, row.setting, *words, row.verdict, letters)
+        found.append(dict(zip(SETTING_FIELDS, values, strict=True)))
+    return found
+
+
+def draw_settings(settings: Sequence[Mapping[str, str]]) -> Figure:
+    """Draw what settings cost and give, from their published values (`setting_values`)."""
+    named = [(one["knob"], one["setting"], float(one["steps_per_s"])) for one in settings]
+    return plot_choices(named, panels(settings))
+
+
+def panels(settings: Sequence[Mapping[str, str]]) -> list[Panel]:
+    """What the plot shows over the cost: event error, other actions, success."""
+
+    def percent(name: str) -> list[float]:
+        return [100 * float(one[name] or "nan") for one in settings]
+
+    def front(letter: str) -> list[int]:
+        own = [place for place, one in enumerate(settings) if letter in one["front"]]
+        return sorted(own, key=lambda place: -float(settings[place]["steps_per_s"]))
+
+    intervals = list(zip(percent("success_low"), percent("success_high"), strict=True))
     return [
-        Panel("Events that differ [%]", errors, None, front["e"]),
-        Panel("Steps with another action [%]", others, None, front["a"]),
-        Panel("Episodes that reach the goal [%]", success, intervals, front["s"]),
+        Panel("Events that differ [%]", percent("event_error"), None, front("e")),
+        Panel("Steps with another action [%]", percent("other_action"), None, front("a")),
+        Panel("Episodes that reach the goal [%]", percent("success_rate"), intervals, front("s")),
     ]
 
 

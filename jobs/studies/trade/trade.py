@@ -21,7 +21,7 @@ from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from envs.event_error import converged
 from jobs.analysis.statistics import paired_rate_difference
-from jobs.analysis.tables import publish_plot, publish_table, summarise
+from jobs.analysis.tables import publish_plot, publish_table, summarise, write_csv
 from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError
 from jobs.rollout.agents import PolicyAgent, make_agent
 from jobs.rollout.executors import Executor
@@ -35,16 +35,17 @@ from jobs.run.progress import console, progress
 from jobs.run.provenance import command, provenance, today
 from jobs.studies.encoder.costs import CAPS, TIME_BINS
 from jobs.studies.encoder.trade import EVENT_ENCODERS
-from jobs.studies.front_plots import plot_choices
 from jobs.studies.replays import Measured, measure_settings
 from jobs.studies.simulator import KNOBS, Setting, changed, setting_text
 from jobs.studies.trade.page import (
     DEFAULT,
     EXACT,
     HEADINGS,
+    SETTING_FIELDS,
     TradedSetting,
     TradeFacts,
-    panels,
+    draw_settings,
+    setting_values,
     trade_lines,
     trade_metrics,
     trade_page,
@@ -228,8 +229,9 @@ def write_trade(folder: Run, tracker: Tracker, rows: Sequence[TradedSetting], fa
     (place / "images").mkdir(parents=True, exist_ok=True)
     title = "What each setting costs and gives"
     publish_table(folder, tracker, "trade/table", title, HEADINGS, trade_lines(rows))
-    named = [(row.knob, row.setting, row.steps_per_s) for row in rows]
-    publish_plot(folder, tracker, "trade/images/trade", plot_choices(named, panels(rows)))
+    settings = setting_values(rows)
+    write_csv(place / "settings.csv", SETTING_FIELDS, [list(one.values()) for one in settings])
+    publish_plot(folder, tracker, "trade/images/trade", draw_settings(settings))
     text = trade_page(facts, rows)
     write_atomic(place / "trade.md", text)
     tracker.text("trade/trade.md", text)

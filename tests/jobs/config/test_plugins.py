@@ -79,6 +79,53 @@ def test_a_mesh_beside_its_package_is_the_scene_of_its_path(write, tmp_path):
     assert named.width_m == by_path.width_m == 40
 
 
+@pytest.fixture
+def install(write, tmp_path, monkeypatch):
+    """Install a distribution with one module and its entry points, as pip leaves it on disk."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def install(distribution: str, module: str, text: str, **points: str) -> None:
+        write(text, f"{module}.py")
+        folder = f"{distribution}-1.0.dist-info"
+        write(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n", f"{folder}/METADATA")
+        lines = [f"{name} = {value}" for name, value in points.items()]
+        write("\n".join([f"[{plugins.GROUP}]", *lines]), f"{folder}/entry_points.txt")
+
+    return install
+
+
+def test_an_installed_package_is_named_by_its_entry_point(install, tmp_path):
+    install("own_dist", "own_module", HEAD + LOSE + GROVE, groves="own_module")
+    values = compose("+exp=train", "env.scene=grove", "+faults.added.lose=0.5")
+    runs = set()
+    for name in ("groves", "own_module", str(tmp_path / "own_module.py")):  # all the same plug-in
+        config = parse({**values, "plugins": [name]})
+        assert config.env.faults.added == {"lose": 0.5}
+        runs.add(run_name(config))
+        assert list(plugins.plugin_digests()) == ["own_module"]
+    assert len(runs) == 1
+    told = plugins.with_plugins({})
+    assert told["env_vars"] == {plugins.VARIABLE: "own_module"}
+    assert told["py_modules"] == [str(tmp_path / "own_module.py")]
+
+
+def test_an_entry_point_that_leads_nowhere_is_refused_by_its_name(install):
+    install("own_one", "own_module", HEAD + GROVE, twice="own_module", good="own_module")
+    install("own_two", "own_other", "1 / 0\n", twice="own_other", called="own_other:main", broken="own_other")
+    said = {
+        "twice": r"must name one module, got own_module, own_other$",
+        "called": r"must name one module, got own_other:main$",
+        "broken": r"ZeroDivisionError: division by zero \(plug-in own_other, line 1\)$",
+        "own_absent": r"must be a path, a module or an entry point .*: .*broken, called, good, twice",
+    }
+    for name, message in said.items():
+        with pytest.raises(ConfigError, match=rf"^plugins: {name}: .*{message}"):
+            plugins.load_plugins([name])
+        assert plugins.plugin_digests() == {}
+    plugins.load_plugins(["good"])
+    assert "grove" in LAYOUTS
+
+
 REFUSED = {
     "no such file": (None, "must be a module, a .py file or the folder of a package"),
     "what Python refuses": ("1 / 0\n", r"ZeroDivisionError: division by zero \(plug-in own_plugin, line 1\)"),

@@ -290,6 +290,7 @@ def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_sto
         evaluate_all(tasks, EpisodeStore(tmp_path / "others"), executor)
 
 
+@pytest.mark.system
 def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path):
     config = small_config(tmp_path)
     settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)

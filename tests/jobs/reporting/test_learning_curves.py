@@ -25,3 +25,12 @@ def test_more_points_on_the_same_line_change_nothing():
 def test_a_curve_that_ends_before_is_refused():
     with pytest.raises(ValueError, match=r"must reach 101 environment steps, got 100 for a with seed 0"):
         mean_success(a_curve([50, 100], [0.4, 0.8]), 101)
+
+
+def test_the_steps_of_an_encoder_come_before_those_of_its_policy():
+    curve = a_curve([50, 100, 200], [0.4, 0.8, 0.8])
+    assert mean_success(curve, 100, 0) == mean_success(curve, 100)
+    assert mean_success(curve, 150, 50) == pytest.approx(mean_success(curve, 100) * 100 / 150)
+    assert mean_success(curve, 100, 100) == 0.0
+    with pytest.raises(ValueError, match="must reach"):
+        mean_success(curve, 301, 100)

@@ -1,7 +1,6 @@
 import csv
 import dataclasses
 import gzip
-import json
 import os
 import re
 
@@ -9,71 +8,28 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jobs.analysis.plots import Curve
 from jobs.config.config import ConfigError
 from jobs.evaluation.group_stats import LABELS
 from jobs.reporting import report as results
 from jobs.reporting.breaks import changes_of
-from jobs.reporting.learning_curves import as_csv
-from jobs.reporting.report import breaks_table, find_study, read_sweep_episodes, write_results, write_trade
-from jobs.rollout.episodes import write_episodes
+from jobs.reporting.report import breaks_table, find_study, write_results, write_trade
+from jobs.reporting.sweep_data import read_sweep_episodes
 from jobs.run.files import write_json
-from models.policy.policy import MANIFEST
 from tests.support.configs import small_config
 from tests.support.episodes import flights
-
-ABOUT = {
-    "run": "robustness-short-s0-1",
-    "identity": "abc",
-    "command": "python -m platform.launch +exp=robustness",
-    "commit": "c0ffee",
-    "evaluated_at": ["c0ffee"],
-    "date": "2026-01-02",
-    "scene": "poles_eval",
-    "trials": 20,
-    "reference": "event_columns",
-    "action": "stochastic",
-    "groups": {"bytestream": [0, 1, 2], "event_image": [0], "oracle": [None]},
-    "exactness": [
-        {"condition": ["sparsity", "0.5"], "asked": 0.05, "event_error": 0.0163, "renders_per_step": 5.0}
-    ],
-    "axes": {"nominal": {"poles_eval": {}}, "sparsity": {"0.2": {}, "0.5": {}}},
-    "compared": [
-        {"condition": at, "baseline": ["nominal", "poles_eval"], "same_as": at}
-        for at in (["nominal", "poles_eval"], ["sparsity", "0.2"], ["sparsity", "0.5"])
-    ],
-}
+from tests.support.sweep_folders import ABOUT, write_shipped, write_sweep
 
 
 @pytest.fixture
-def sweep(tmp_path):
-    """The folder that a sweep leaves, made of constructed episodes."""
-    folder = tmp_path / "runs" / "robustness-short-s0-1" / "sweep"
-    won = {"bytestream": 16, "event_image": 4, "oracle": 20}
-    flown = {
-        (axis, value, group, "" if seed is None else str(seed)): flights(won[group])
-        for axis, points in ABOUT["axes"].items()
-        for value in points
-        for group, seeds in ABOUT["groups"].items()
-        for seed in seeds
-    }
-    write_episodes(folder / "episodes.csv", LABELS, flown)
-    (folder / "about.json").write_text(json.dumps(ABOUT))
-    for name in ("sparsity", "contacts", "left_over"):
-        Image.new("RGB", (4, 4)).save(folder / f"{name}.png")
-    return folder
+def sweep(tmp_path, monkeypatch):
+    """The folder that a sweep leaves, made of constructed episodes; coverage is simulated elsewhere."""
+    monkeypatch.setattr(results, "coverage_text", lambda trainings, corridors: "95 % at 0")
+    return write_sweep(tmp_path / "runs" / "robustness-short-s0-1" / "sweep")
 
 
 def shipped(tmp_path):
     """A folder with learning curves, of policies that are there."""
-    ends = {"bytestream": (0.8, 0.81), "event_image": (0.4, 0.41)}
-    steps = np.array([0.0, 500_000.0])
-    curves = [Curve(exp, seed, steps, np.array([0.0, end]), steps)
-              for exp, both in ends.items() for seed, end in enumerate(both)]  # fmt: skip
-    for curve in curves:
-        write_json(tmp_path / "shipped" / f"{curve.exp}-s{curve.seed}" / MANIFEST, {})
-    (tmp_path / "shipped" / "curves.csv").write_text(as_csv(curves))
-    return tmp_path / "shipped"
+    return write_shipped(tmp_path / "shipped")
 
 
 def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_path):
@@ -92,9 +48,9 @@ def test_the_page_tells_what_made_it_and_what_it_says_of_the_paper(sweep, tmp_pa
     assert "| `bytestream`: learns faster | abstract | `event_image` | holds | +20 [" in text
     assert "| `bytestream_xy`: learns faster | abstract | `event_image` | not tested |" in text
     assert "| nominal | poles_eval | 80 [" in tables
-    assert tables.count("(images/results_") == 2
+    assert tables.count("(images/results_") == 3
     assert {path.name for path in (tmp_path / "docs" / "images").iterdir()} == {
-        f"results_{name}.png" for name in ("sparsity", "contacts", "map", "claims")
+        f"results_{name}.png" for name in ("sparsity", "axes", "contacts", "survival", "map", "claims")
     }
     assert str(tmp_path) not in text + tables
 
@@ -119,7 +75,7 @@ def test_every_episode_and_training_is_there_to_be_analysed_again(sweep, tmp_pat
 
 
 def test_a_sweep_of_an_earlier_version_is_refused_with_the_remedy(sweep, tmp_path):
-    write_json(sweep / "about.json", {name: value for name, value in ABOUT.items() if name != "compared"})
+    write_json(sweep / "about.json", {name: value for name, value in ABOUT.items() if name != "met"})
     with pytest.raises(ConfigError, match="earlier version; give its command again"):
         write_results(sweep, tmp_path / "docs")
 
@@ -187,9 +143,22 @@ def test_a_condition_breaks_a_policy_where_its_own_loss_is_certain(sweep, tmp_pa
         ("0.2", "event_image", False), ("0.5", "event_image", True),
     }  # fmt: skip
     text = breaks_table(ABOUT, changes)
-    assert re.search(r"\| `bytestream` \| 80 \| sparsity 0.5: -50 \[-\d+, -\d+\] \|", text)
+    assert re.search(r"\| `bytestream` \| 80 \| \*\*sparsity 0.5: -50 \[-\d+, -\d+\], 3 of 3\*\* \|", text)
     assert "| `event_image` (1 training) | 20 | none is certain |" in text
     assert "oracle" not in text
+
+
+def test_one_training_that_breaks_is_told_and_says_nothing_of_others(sweep):
+    swept = read_sweep_episodes(sweep / "episodes.csv")
+    swept[("sparsity", "0.5"), "bytestream"][1]["success"] = False
+    swept[("sparsity", "0.2"), "bytestream"][2]["success"] = True  # a certain gain is no loss
+    found = {
+        change.condition[1]: change for change in changes_of(ABOUT, swept) if change.group == "bytestream"
+    }
+    assert found["0.5"].broken.tolist() == [False, True, False]
+    assert not found["0.5"].certain
+    assert not found["0.2"].broken.any()
+    assert ", 1 of 3" in breaks_table(ABOUT, list(found.values()))
 
 
 def test_a_simulation_that_two_axes_have_is_tested_once_and_a_baseline_never(sweep):

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[3]
 WATCHED = """
 import time
 from jobs.run import head_watch
-head_watch.ASK_EVERY_S, head_watch.SILENCE_S, head_watch.LEAVE_S = 0.05, 1.0, 1.0
+head_watch.ASK_EVERY_S, head_watch.SILENCE_S, head_watch.LEAVE_S = 0.05, 1.0, 3.0
 answers = {answers}
 def ask(seconds):
     assert seconds == 0.5
@@ -65,7 +65,7 @@ def test_what_closes_forever_after_a_lost_head_is_ended_without_a_second_reason(
 
 def test_a_head_that_answers_or_answers_late_ends_nothing():
     for answers in ([], [False], [True, False, True, False]):
-        ended = watched("time.sleep(3)", answers, then=True)
+        ended = watched("time.sleep(1.5)", answers, then=True)
         assert (ended.stdout, ended.stderr, ended.returncode) == ("done\n", "", 0)
 
 

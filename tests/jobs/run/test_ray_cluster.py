@@ -137,20 +137,25 @@ def test_a_cluster_is_joined_without_a_token_only_when_that_is_said(monkeypatch,
         check_mode(JOINED)
 
 
-# Serves until its standard input ends; the first line it prints is the address.
+# Serves until its standard input ends; the first line it prints is the address, the second its folders.
 HEAD = """
+import os
 import sys
 from pathlib import Path
-from jobs.run.ray_cluster import start_ray
+from jobs.run.ray_cluster import logs_folder, start_ray
 from jobs.config.schema import ClusterConfig
 start_ray(ClusterConfig(name="local", address=None, num_cpus=1, storage=None), Path(sys.argv[1]))
 import ray
+from ray.air._internal.filelock import TempFileLock
+from ray.train.constants import _get_ray_train_session_dir
 @ray.remote
 def whoami():
-    import os
     return os.environ["RAY_AUTH_MODE"]
 assert ray.get(whoami.remote()) == "token"
-print(ray.get_runtime_context().gcs_address, flush=True)
+with TempFileLock("something"):
+    pass
+print(ray.get_runtime_context().gcs_address)
+print(logs_folder(), _get_ray_train_session_dir(), sep=os.pathsep, flush=True)
 sys.stdin.read()
 """
 CLIENT = """
@@ -161,72 +166,52 @@ print("joined")
 """
 
 
+def join(address: str, environment: dict[str, str], **more: str) -> str:
+    """What a process says that joins a Ray."""
+    client = subprocess.run(
+        [sys.executable, "-c", CLIENT, address],
+        env=environment | more,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    return client.stdout.strip() or client.stderr
+
+
 @pytest.mark.system
-def test_who_has_no_token_or_another_one_is_refused_by_a_local_ray(tmp_path, no_token):
+def test_a_local_ray_is_reached_from_here_alone_by_who_has_its_token_and_keeps_its_files_private(
+    tmp_path, no_token
+):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
     environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # of joining; Ray's own 20 take as many seconds
     environment["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # else it asks another address than 127.0.0.1
-
-    def join(**more: str) -> str:
-        command = [sys.executable, "-c", CLIENT, address]
-        client = subprocess.run(
-            command, env=environment | more, capture_output=True, text=True, timeout=100, check=False
-        )
-        return client.stdout.strip() or client.stderr
-
-    command = [sys.executable, "-c", HEAD, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as head:
-        address = head.stdout.readline().strip()
-        token = (tmp_path / ".ray" / "token").read_text()
-        assert "joined" not in (without := join(RAY_AUTH_MODE="disabled"))
-        assert "joined" not in (wrong := join(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64))
-        assert join(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=token) == "joined"
-        head.stdin.close()
-        assert head.wait(60) == 0
-    assert "uthenticat" in without
-    assert "uthenticat" in wrong
-
-
-@pytest.mark.system
-def test_a_local_ray_listens_on_loopback_alone(tmp_path, no_token):
-    command = [sys.executable, "-c", HEAD, str(tmp_path)]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, **pipes) as head:
-        address = head.stdout.readline().strip()
-        found = listening(head.pid)
-        head.stdin.close()
-        assert head.wait(60) == 0
-    assert address.startswith("127.0.0.1:")
-    programs = [name for name, _, _ in found]
-    assert {"gcs_server", "raylet"} <= set(programs), found
-    assert len(found) >= 6, found  # gcs_server, raylet (2), its agent, the driver, a worker
-    assert beyond_loopback(found) == []
-
-
-@pytest.mark.system
-def test_a_local_ray_keeps_its_files_where_no_other_user_can_enter(tmp_path, no_token):
-    script = """
-import sys
-from pathlib import Path
-from jobs.run.ray_cluster import logs_folder, start_ray
-from jobs.config.schema import ClusterConfig
-start_ray(ClusterConfig(name="local", address=None, num_cpus=1, storage=None), Path(sys.argv[1]))
-from ray.air._internal.filelock import TempFileLock
-from ray.train.constants import _get_ray_train_session_dir
-with TempFileLock("something"):
-    pass
-print(logs_folder(), _get_ray_train_session_dir(), sep="\\n")
-"""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as shared:
         Path(shared).chmod(0o1777)
-        command = [sys.executable, "-c", script, str(tmp_path)]
-        said = subprocess.check_output(command, cwd=ROOT, text=True, env=os.environ | {"TMPDIR": shared})
+        command = [sys.executable, "-c", HEAD, str(tmp_path)]
+        with subprocess.Popen(command, cwd=ROOT, env=environment | {"TMPDIR": shared}, **pipes) as head:
+            address, folders = (head.stdout.readline().strip() for _ in range(2))
+            found = listening(head.pid)
+            token = (tmp_path / ".ray" / "token").read_text()
+            without = join(address, environment, RAY_AUTH_MODE="disabled")
+            wrong = join(address, environment, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64)
+            right = join(address, environment, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=token)
+            head.stdin.close()
+            assert head.wait(60) == 0
         private = Path(shared, f"evade-{os.getuid()}")
-        assert all(Path(folder).is_relative_to(private / "ray") for folder in said.split())
+        assert all(Path(folder).is_relative_to(private / "ray") for folder in folders.split(os.pathsep))
         assert (private / "ray" / "session_latest" / "logs" / "raylet.out").exists()
         assert stat.S_IMODE(private.stat().st_mode) == 0o700
         assert list(Path(shared).iterdir()) == [private]
+    assert right == "joined"
+    for refused in (without, wrong):
+        assert "joined" not in refused
+        assert "uthenticat" in refused
+    assert address.startswith("127.0.0.1:")
+    assert {"gcs_server", "raylet"} <= {name for name, _, _ in found}, found
+    assert len(found) >= 6, found  # gcs_server, raylet (2), its agent, the driver, a worker
+    assert beyond_loopback(found) == []
 
 
 def test_rays_folder_leaves_room_for_the_names_of_sockets(tmp_path, monkeypatch):

@@ -1,7 +1,5 @@
 import json
-import os
 import shutil
-import signal
 
 import numpy as np
 import pytest
@@ -17,11 +15,10 @@ from jobs.training.snapshots import FOLDER, generators, set_generators
 from jobs.training.train import METRICS, export_policy, read_metrics
 from models.kinds import KINDS
 from tests.support.configs import make_config
-from tests.support.faults import FINE, TRAIN, check_complete, launch, outcome, start
+from tests.support.policies import ALIKE, TRAINED
 from tests.support.runs import write_encoder, write_networks
 
 pytestmark = pytest.mark.system
-TRAINED = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
 # Episodes of 40 steps in rounds of 32: at any time some are under way, and others have ended.
 SMALL = (
     "env.time_limit_s=0.2",
@@ -87,7 +84,7 @@ def assert_same(mine, other):
 @pytest.mark.parametrize(
     ("name", "runners"),
     [
-        *((name, 0) for name in TRAINED),
+        *(pytest.param(name, 0, marks=pytest.mark.slow if name in ALIKE else ()) for name in TRAINED),
         ("finetuned", 1),
         ("bytestream", 2),
         ("imitation", 2),
@@ -99,13 +96,15 @@ def test_a_training_goes_on_from_its_checkpoint_with_the_same_bytes(name, runner
     words = CONDITIONS, "algo.lr_schedule=linear", f"algo.num_env_runners={runners}"
     config, encoder, make = built(tmp_path, name, *words)
     whole = make()
-    whole_rows = [rows(whole, 7)]  # the next round has a drift to measure soon, of windows met before
+    # A drift is measured soon after seven, of windows met before, and the value's warm-up ends after eight.
+    first, then = (7, 5) if encoder or config.train.init else (2, 2)
+    rows(whole, first)
     checkpoint = saved(whole, tmp_path / "checkpoint")
-    whole_rows.append(rows(whole, 5))
+    expected = rows(whole, then)
     again = make()
     torch.manual_seed(123)
     again.load_checkpoint(str(checkpoint))
-    assert rows(again, 5) == whole_rows[1]
+    assert rows(again, then) == expected
     assert_same(whole, again)
     exported = [tmp_path / "one", tmp_path / "other"]
     for algorithm, target in zip((whole, again), exported, strict=True):
@@ -228,28 +227,3 @@ def test_generators_go_on():
     set_generators(kept)
     again = [(torch.rand(3).tolist(), np.random.normal(size=3).tolist()) for _ in "ab"]  # noqa: NPY002
     assert again == drawn
-
-
-@pytest.mark.faults
-def test_a_training_that_is_disturbed_ends_with_the_bytes_of_one_that_is_not(tmp_path):
-    words = *TRAIN, *FINE, "algo.num_env_runners=2", "train.checkpoint_every=3", "env.time_limit_s=0.2"
-    whole = launch(tmp_path / "whole", *words)
-    check_complete(whole)
-    job = launch(tmp_path / "disturbed", *words)
-    job.wait(lambda: job.steps() >= 128)
-    os.kill(job.workers("ray::PlainEnvRunner")[0], signal.SIGKILL)
-    before = job.steps()
-    job.wait(lambda: job.steps() > before + 64)
-    assert job.rows()[-1]["perf/env_runner_restarts"] == 1
-    job.kill()
-    again = start(tmp_path / "disturbed", job.printed_command())
-    check_complete(again)
-    assert "new episodes" not in again.said
-    told = [
-        [{name: row[name] for name in ("env_steps", *SAME)} for row in one.rows()] for one in (whole, again)
-    ]
-    assert told[0] == told[1]
-    policies = [sorted((one.run / "policy").glob("*.safetensors")) for one in (whole, again)]
-    assert [path.read_bytes() for path in policies[0]] == [path.read_bytes() for path in policies[1]]
-    assert policies[0]
-    outcome("env runner and driver killed", "the same bytes as undisturbed", "nothing")

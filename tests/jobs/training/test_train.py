@@ -18,6 +18,7 @@ from jobs.training.ppo import EpisodeMetrics
 from jobs.training.train import TrainingError, read_metrics, reported_so_far
 from models.policy import load_policy
 from tests.support.configs import TINY, make_config
+from tests.support.sockets import check_ray, listening
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -149,7 +150,7 @@ train(config, open_run(config), Path(sys.argv[2]), lambda step, metrics: None)
 
 
 @pytest.mark.system
-def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
+def test_a_training_listens_on_loopback_alone_and_after_a_kill_goes_on_to_a_policy(tmp_path, encoder):
     command = [sys.executable, "-c", SCRIPT, str(tmp_path), str(encoder)]
     config = make_config(*TINY, f"runs_dir={tmp_path}")
     folder = open_run(config)
@@ -157,8 +158,10 @@ def test_a_killed_training_continues_and_its_policy_flies(tmp_path, encoder):
     killed = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"HOME": "/nowhere"})
     while reported_so_far(results)[0] < 256 and killed.poll() is None:
         time.sleep(0.05)
+    found = listening(killed.pid)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
+    check_ray(found)
     before = reported_so_far(results)[0]
     assert 256 <= before < 1600
     subprocess.run(command, cwd=ROOT, check=True, timeout=200)

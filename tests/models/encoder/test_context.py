@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from models.encoder.context import EventContextNetwork, newest_first
+from models.encoder.context import EventContextNetwork, Events, newest_first
 from models.encoder.event_batch import EventBatch, Grid
 
 GRID = Grid(width=12, height=9, time_bins=32)
@@ -95,7 +95,7 @@ def test_eventnet_forgets_an_event_older_than_its_feature_is_large(form):
 
 
 def test_of_equals_the_newest_comes_first_and_windows_stay_together():
-    events = (np.arange(5), np.array([3, 7, 5, 0, 2]), np.array([0, 3, 3, 5]), None)
+    events = Events(np.arange(5), np.array([3, 7, 5, 0, 2]), np.array([0, 3, 3, 5]), np.empty((0, 0)))
     cell, bins, offsets, _ = newest_first(events)
     assert cell.tolist() == [1, 2, 0, 4, 3]
     assert bins.tolist() == [7, 5, 3, 2, 0]

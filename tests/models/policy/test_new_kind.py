@@ -1,15 +1,14 @@
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
 
 from models.kinds import KINDS, DenseModel, Kind, PolicySpec, read_model
 from models.policy import load_policy, save_policy
 from models.policy.networks import build_networks
 from models.policy.onnx import export_onnx
+from tests.support.configs import compose
 
 MODULE = '''
 """The number of events in each half of the image, and a linear network: a kind of its own."""
@@ -83,6 +82,5 @@ def test_a_kind_without_an_onnx_form_says_so(spec, tmp_path):
 
 
 def test_every_kind_has_a_configuration_file_of_its_settings():
-    conf = Path(__file__).resolve().parents[3] / "conf" / "model"
     for name in KINDS:
-        assert read_model(**yaml.safe_load((conf / f"{name}.yaml").read_text())).name == name
+        assert read_model(**compose("+exp=train", f"model={name}")["model"]).name == name

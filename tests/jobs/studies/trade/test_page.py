@@ -2,14 +2,15 @@ import pytest
 
 from jobs.analysis.statistics import Estimate
 from jobs.analysis.tables import summarise
-from jobs.studies.front_plots import plot_choices
 from jobs.studies.replays import Measured
 from jobs.studies.trade.page import (
     HEADINGS,
     TradedSetting,
     advise,
+    draw_settings,
     fronts,
     panels,
+    setting_values,
     trade_lines,
     trade_metrics,
     trade_page,
@@ -66,7 +67,7 @@ def test_a_verdict_follows_the_interval_of_the_difference(low, high, expected):
 def test_fronts_hold_what_is_not_beaten_and_know_no_event_error_of_an_encoder():
     found = fronts(ROWS)
     assert found == {"e": [2, 1, 0, 5], "a": [2, 1, 4, 5], "s": [2, 1]}
-    assert [panel.front for panel in panels(ROWS)] == list(found.values())
+    assert [panel.front for panel in panels(setting_values(ROWS))] == list(found.values())
 
 
 def test_every_line_has_a_word_for_each_heading():
@@ -133,8 +134,8 @@ def test_metrics_leave_out_what_was_not_measured():
 
 
 def test_the_figure_has_a_panel_for_each_measure_and_a_point_for_each_setting():
-    named = [(row.knob, row.setting, row.steps_per_s) for row in ROWS]
-    figure = plot_choices(named, panels(ROWS))
-    assert [axes.get_ylabel() for axes in figure.axes] == [panel.label for panel in panels(ROWS)]
+    settings = setting_values(ROWS)
+    figure = draw_settings(settings)
+    assert [axes.get_ylabel() for axes in figure.axes] == [panel.label for panel in panels(settings)]
     drawn = [sum(len(points.get_offsets()) for points in axes.collections[-6:]) for axes in figure.axes]
     assert drawn == [len(ROWS)] * 3

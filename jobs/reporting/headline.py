@@ -1,0 +1,69 @@
+"""The table that readers see first: success of each policy when one thing changes."""
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jobs.analysis.tables import markdown_table
+from jobs.evaluation.group_stats import MET, Condition, episode_values
+from jobs.evaluation.sweep_plan import NOMINAL
+from jobs.reporting.breaks import SweptEpisodes
+from jobs.run.files import RunError, write_atomic
+
+COLUMNS: dict[str, Condition] = {
+    "nothing changed": (NOMINAL, "poles_eval"),
+    "45 Hz": ("control_hz", "45"),
+    "threshold 0.05": ("contrast_threshold", "0.05"),
+    "half of the pixels dead": ("sparsity", "0.5"),
+    "10 % false events": ("background_activity", "0.1"),
+    "noise by night": ("sensor_noise", "5"),
+    "other shapes": ("world", "shape_change"),
+    "other textures": ("world", "texture_change"),
+    "40 m/s": ("speed", "40"),
+}
+BEGIN, END = "<!-- headline: +exp=report writes this table -->\n", "<!-- end of the headline -->\n"
+
+
+def headline_table(
+    groups: Mapping[str, Sequence[int | None]],
+    episodes: SweptEpisodes,
+    met: Collection[tuple[str, str, str]],
+) -> str:
+    """Success [%] of each group under `COLUMNS`, best mean of the row first; "-" where nothing was evaluated.
+
+    Args:
+        groups: Group -> its training seeds.
+        episodes: Every episode of a sweep.
+        met: Axis, value and group of what lies within what the group's training drew.
+    """
+    lines: list[tuple[float, tuple[str, ...]]] = []
+    for group, seeds in groups.items():
+        rates = {
+            at: float(episode_values(episodes[at, group], "success").mean())
+            for at in COLUMNS.values()
+            if (at, group) in episodes
+        }
+        cells = [
+            f"{100 * rates[at]:.0f}{MET if (*at, group) in met else ''}" if at in rates else "-"
+            for at in COLUMNS.values()
+        ]
+        count = "" if None in seeds else f" ({len(seeds)})"
+        lines.append((float(np.mean(list(rates.values()) or [0.0])), (f"`{group}`{count}", *cells)))
+    lines.sort(key=lambda line: -line[0])
+    return markdown_table(("policy (trainings)", *COLUMNS), [cells for _, cells in lines], 1)
+
+
+def write_headline(page: Path, table: str) -> None:
+    """Put the table between the marks of a page; a page that does not exist is left so.
+
+    Raises:
+        RunError: The page has no such marks.
+    """
+    if not page.is_file():
+        return
+    before, begin, rest = page.read_text().partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise RunError(f"{page}: the lines {BEGIN.strip()!r} and {END.strip()!r} must enclose its table")
+    write_atomic(page, "".join((before, BEGIN, "\n", table, "\n", END, after)))

@@ -1,0 +1,97 @@
+"""The data of a sweep: read from its folder, and published as CSV with its plots."""
+
+import csv
+import gzip
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from envs.checks import replaced
+from jobs.analysis.tables import write_csv
+from jobs.config.errors import ConfigError
+from jobs.evaluation.group_stats import LABELS, Condition
+from jobs.evaluation.sweep_report import SweepFacts
+from jobs.reporting.breaks import SweptEpisodes
+from jobs.rollout.episodes import EPISODE
+from jobs.run.checkpoints import sha256
+from jobs.run.files import RunError, read_json, write_atomic
+
+SWEEP = "robustness"  # name of the published data of the sweep that docs/results.md is about
+TRAININGS = "trainings.csv"  # of every published training, how it learnt
+
+
+def read_sweep(sweep: Path) -> tuple[SweepFacts, SweptEpisodes]:
+    """What made a sweep, and all of its episodes, from the folder that it has left in its run folder.
+
+    Raises:
+        ConfigError: If an earlier version wrote the sweep.
+        RunError: If a file of the sweep is damaged.
+    """
+    about: SweepFacts = read_json(sweep / "about.json")
+    if "met" not in about:
+        raise ConfigError(f"resume: {sweep} is a sweep of an earlier version; give its command again")
+    if about.get("episodes_sha256") not in (None, sha256(sweep / "episodes.csv")):
+        raise RunError(f"{sweep / 'episodes.csv'}: damaged; give the command of the sweep again")
+    return about, read_sweep_episodes(sweep / "episodes.csv")
+
+
+def read_sweep_episodes(file: Path) -> SweptEpisodes:
+    """EPISODE by condition, group and training seed, from a sweep's episodes.csv, plain or packed (.gz)."""
+    rows: dict[tuple[Condition, str], dict[int | None, list[tuple[object, ...]]]] = {}
+    packed = file.suffix == ".gz"
+    with gzip.open(file, "rt") if packed else file.open() as stream:
+        for row in csv.DictReader(stream):
+            axis, value, group, training = (row[name] for name in LABELS)
+            place = rows.setdefault(((axis, value), group), {})
+            place.setdefault(int(training) if training else None, []).append(_episode(row))
+    return {key: {seed: np.array(own, EPISODE) for seed, own in parts.items()} for key, parts in rows.items()}
+
+
+def _episode(row: Mapping[str, str]) -> tuple[object, ...]:
+    kinds: dict[str, Callable[[str], object]] = {"b": "True".__eq__, "i": int, "f": float}
+    return tuple(kinds[EPISODE[name].kind](row[name]) for name in EPISODE.names or ())
+
+
+def write_data(folder: Path, name: str, sweep: Path, episodes: SweptEpisodes) -> None:
+    """Write every episode, packed, what made them, and a table of each training under each condition.
+
+    Args:
+        folder: Where `<name>_episodes.csv.gz`, `<name>_about.json` and `<name>_trainings.csv` go.
+        name: Of the sweep.
+        sweep: The folder that it has left.
+        episodes: All of them.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    packed = gzip.compress((sweep / "episodes.csv").read_bytes(), mtime=0)
+    write_atomic(folder / f"{name}_episodes.csv.gz", packed)
+    write_atomic(folder / f"{name}_about.json", (sweep / "about.json").read_bytes())
+    rows = [
+        (axis, value, group, "" if seed is None else seed, len(own),
+         f"{own['success'].mean():.4f}", f"{own['distance_m'].mean():.2f}")
+        for ((axis, value), group), trainings in episodes.items()
+        for seed, own in trainings.items()
+    ]  # fmt: skip
+    write_csv(folder / f"{name}_trainings.csv", (*LABELS, "episodes", "success_rate", "distance_m"), rows)
+
+
+def read_data(folder: Path, name: str) -> tuple[SweepFacts, SweptEpisodes]:
+    """What `write_data` has written: what made a sweep, and its episodes."""
+    about: SweepFacts = read_json(folder / f"{name}_about.json")
+    return about, read_sweep_episodes(folder / f"{name}_episodes.csv.gz")
+
+
+def copy_plot(picture: Path, target: Path) -> None:
+    """Copy a plot, packed as small as it can be without changing a colour.
+
+    Raises:
+        RunError: The plot is damaged.
+    """
+    try:
+        with Image.open(picture) as whole:
+            colours = whole.convert("RGB")
+    except (OSError, SyntaxError, ValueError) as error:
+        raise RunError(f"{picture}: damaged ({error}); give the command that drew it again") from None
+    with replaced(target) as part:
+        colours.save(part, "png", optimize=True)

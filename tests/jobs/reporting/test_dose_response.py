@@ -1,0 +1,182 @@
+import csv
+import dataclasses
+import gzip
+import json
+import os
+
+import numpy as np
+import pytest
+
+from envs.config import EnvConfig, FaultsConfig
+from envs.event_error import error_between, event_error
+from envs.events import EVENT
+from envs.events.faults import PixelFaults, apply_faults
+from jobs.config.config import parse
+from jobs.reporting import dose_response
+from jobs.reporting.breaks import changes_of
+from jobs.reporting.dose_response import (
+    RESULTS,
+    asked_error,
+    compare_kinds,
+    doses_of,
+    drawn_conditions,
+    largest_drawn,
+    over_doses,
+    write_dose_response,
+)
+from jobs.reporting.report import find_study
+from jobs.reporting.sweep_data import read_sweep, read_sweep_episodes
+from jobs.rollout.policies import PRETRAINED
+from tests.support.configs import compose, small_config
+from tests.support.sweep_folders import KINDS, write_study
+
+ERRORS = (0.05, 0.1, 0.2, 0.4)
+PLAN = "# A plan\n\n- **Rule.** As it was.\n"
+
+
+def composed():
+    """The composed study."""
+    return parse(compose("+exp=dose_response"))
+
+
+def test_the_doses_are_those_of_the_plan():
+    config = composed()
+    axes = config.sweep.axes
+    assert {kind: list(axis) for kind, axis in axes.items()} == {kind: [key] for kind, key in KINDS.items()}
+    for kind, key in KINDS.items():
+        if kind != "jittered":
+            assert [asked_error(kind, one) for one in axes[kind][key]] == pytest.approx(ERRORS, abs=1e-5)
+    assert axes["jittered"][KINDS["jittered"]] == [50, 100, 200, 400]
+    assert (config.job, config.sweep.scene, config.sweep.trials) == ("sweep", "poles_eval", 14)
+    assert config.evaluate.action == "stochastic"
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "jittered"])
+def test_streams_with_a_dose_differ_by_the_error_that_it_stands_for(kind):
+    rng = np.random.default_rng(3)
+    shape, count, span_us = (400, 500), 20_000, 1_000_000  # so sparse that hardly any partner is chance
+    true = np.zeros(count, EVENT)
+    true["t"] = rng.integers(1, span_us, count)
+    true["x"], true["y"] = rng.integers(0, shape[1], count), rng.integers(0, shape[0], count)
+    true["p"] = rng.choice([-1, 1], count)
+    true = true[np.lexsort((true["x"], true["y"], true["t"]))]
+    pixels = PixelFaults(np.zeros(shape, bool), np.arange(shape[0] * shape[1]), np.empty(0, int))
+    for asked, amount in zip(ERRORS, composed().sweep.axes[kind][KINDS[kind]], strict=True):
+        faults = FaultsConfig(**{KINDS[kind].removeprefix("faults."): amount})
+        wrong = apply_faults(true, 0, span_us, faults, pixels, rng)
+        spread = (asked * (1 - asked) / count) ** 0.5
+        assert event_error(wrong, true, 250.0) == pytest.approx(asked, abs=5 * spread)
+
+
+def test_a_sensor_differs_from_itself_by_nothing_and_from_a_faulty_one_by_its_faults():
+    clean = EnvConfig(scene="poles")
+    turned = dataclasses.replace(clean, faults=FaultsConfig(flipped=1.0))
+    assert error_between(clean, clean, 1, 4) == 0.0
+    assert error_between(clean, turned, 1, 4) == error_between(turned, clean, 1, 4) > 0.9
+    with pytest.raises(ValueError, match="same scene"):
+        error_between(clean, dataclasses.replace(clean, control_hz=100.0))
+
+
+def test_what_a_training_met_is_known_from_its_manifest():
+    env = EnvConfig(scene="poles_eval")
+    groups = {"bytestream": [0], "bytestream_robust": [0], "bytestream_hold": [0], "unknown": [0]}
+    drawn = drawn_conditions(groups, PRETRAINED)
+    assert [largest_drawn("invented", drawn[group]) for group in groups] == [0.0, 0.3, 0.35, 0.0]
+    assert [largest_drawn("lost", drawn[group]) for group in groups] == [0.0, 0.3, 0.7, 0.0]
+    axes = {"nominal": {"poles_eval": {}}, "invented": {"0.3": {KINDS["invented"]: 0.3}}}
+    (dose,) = doses_of(axes, dataclasses.replace(env), drawn)
+    assert dose.met_by == ("bytestream_robust", "bytestream_hold")
+    assert dose.asked == pytest.approx(0.3 / 2.3)
+    assert dose.measured == pytest.approx(dose.asked, abs=0.01)
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch):
+    """The folder that a dose response of constructed episodes leaves."""
+    monkeypatch.setattr(dose_response, "error_between", lambda one, other: 0.125)
+    return write_study(tmp_path / "runs" / "dose_response-short-s0-1" / "sweep")
+
+
+def test_invented_events_are_worse_where_they_are_and_nowhere_else(study):
+    about, swept = read_sweep(study)
+    doses = doses_of(about["axes"], EnvConfig(scene="poles_eval"), {})
+    means = over_doses(changes_of(about, swept), doses, swept)
+    found = {(one.group, one.kind): one for one in compare_kinds(means)}
+    assert set(found) == {(group, kind) for group in about["groups"] for kind in KINDS if kind != "invented"}
+    assert {place: one.verdict for place, one in found.items()} == {
+        (group, kind): "worse" if group == "weak" else "undecided" for group, kind in found
+    }
+    weak = found["weak", "lost"]
+    assert weak.difference.value == pytest.approx(-11 / 14)
+    assert weak.adjusted_p >= weak.difference.p
+    assert found["steady", "lost"].difference.value == 0.0
+
+
+def test_only_a_difference_that_is_certain_in_its_family_and_by_its_interval_is_a_verdict():
+    values = np.full((3, 14), -0.5) + np.array([[-0.03], [0.0], [0.03]])
+    few = compare_kinds({("a", "invented"): values, ("a", "lost"): 0 * values})
+    many = compare_kinds({("a", "invented"): values, **{("a", str(k)): 0 * values for k in range(40)}})
+    assert [one.verdict for one in few] == ["worse"]
+    assert {one.verdict for one in many} == {"undecided"}
+    assert {one.difference for one in many} == {few[0].difference}
+    turned = np.full((3, 14), 0.5) + np.array([[-0.01], [0.0], [0.01]])
+    assert compare_kinds({("a", "invented"): turned, ("a", "lost"): 0 * turned})[0].verdict == "better"
+
+
+def test_the_plan_stays_as_it_is_and_the_results_are_written_below_it(study, tmp_path):
+    docs = tmp_path / "docs"
+    (docs / "data").mkdir(parents=True)
+    (docs / "dose_response.md").write_text(PLAN)
+    page = write_dose_response(study, docs, EnvConfig())
+    text = page.read_text()
+    assert text.startswith(f"{PLAN}\n{RESULTS}")
+    assert "| `weak` | **worse**: -79 [" in text
+    assert "4 are *worse* and 0 *better*" in text
+    assert "Of 8 comparisons" in text
+    assert text.count("\n| invented | 12.5 |") == 2
+    assert "\n\n\n" not in text
+    write_dose_response(study, docs, EnvConfig())
+    assert page.read_text() == text
+    assert (docs / "images" / "dose_response.png").stat().st_size > 10_000
+    with (docs / "data" / "dose_response_doses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["Axis"], row["asked_event_error"]) for row in rows][-2:] == [("jittered", "")] * 2
+    assert {row["measured_event_error"] for row in rows} == {"0.1250"}
+    packed = docs / "data" / "dose_response_episodes.csv.gz"
+    assert gzip.decompress(packed.read_bytes()) == (study / "episodes.csv").read_bytes()
+    one, other = read_sweep_episodes(packed), read_sweep_episodes(study / "episodes.csv")
+    assert one.keys() == other.keys()
+
+
+def test_markers_are_hollow_where_training_met_as_much(study):
+    about, swept = read_sweep(study)
+    drawn = {
+        "steady": [{KINDS["invented"]: [0.0, 0.15]}],
+        "weak": [{KINDS["flipped"]: {"low": 0.0, "high": 1.0}}],
+    }
+    doses = doses_of(about["axes"], EnvConfig(), drawn)
+    figure = dose_response.draw(doses, changes_of(about, swept))
+    panels = {
+        panel.get_title(loc="left").split(",")[0]: panel for panel in figure.axes if panel.get_visible()
+    }
+    hollow = {
+        name: sum(line.get_markerfacecolor() == "white" for line in panel.lines)
+        for name, panel in panels.items()
+    }
+    assert hollow == {"steady": 1, "weak": 2}
+    markers = [line for line in panels["weak"].lines if line.get_marker() not in ("None", "")]
+    assert len(markers) == 2 * len(KINDS)
+
+
+def test_each_sweep_is_found_by_its_own_page_whichever_ran_last(study, tmp_path):
+    other = tmp_path / "runs" / "robustness-short-s0-1" / "sweep"
+    other.mkdir(parents=True)
+    config = small_config(tmp_path, job="report")
+    for about, time in (({"exp": "robustness"}, 1), ({}, 1), ({"exp": "robustness"}, 2**31)):
+        (other / "about.json").write_text(json.dumps(about))
+        os.utime(other / "about.json", (time, time))
+        assert find_study(config, "sweep") == other
+        assert find_study(config, "dose_response") == study
+    named = dataclasses.replace(config, resume=str(study.parent))
+    assert find_study(named, "sweep") is None
+    assert find_study(named, "dose_response") == study

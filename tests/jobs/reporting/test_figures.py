@@ -1,0 +1,98 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from docs.draw_figures import STUDIES, figures
+from envs.config import EnvConfig
+from jobs.analysis.tables import save_plot
+from jobs.reporting import dose_response
+from jobs.reporting.breaks import changes_of
+from jobs.reporting.dose_response import write_dose_response
+from jobs.reporting.figures import contacts, survivals
+from jobs.reporting.learning_curves import published_trainings, read_curves, read_trainings
+from jobs.reporting.report import write_results
+from jobs.reporting.summary_plots import still_going
+from jobs.reporting.sweep_data import read_sweep
+from jobs.rollout.policies import PRETRAINED
+from tests.support.episodes import flights
+from tests.support.sweep_folders import write_shipped, write_study, write_sweep
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+
+
+def pixels(path):
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+@pytest.mark.slow
+def test_the_figures_of_a_report_are_drawn_again_from_its_data_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(dose_response, "error_between", lambda one, other: 1 / 7)
+    docs, again = tmp_path / "docs", tmp_path / "again.png"
+    write_results(write_sweep(tmp_path / "sweep"), docs, write_shipped(tmp_path / "shipped"))
+    write_dose_response(write_study(tmp_path / "study"), docs, EnvConfig())
+    drawn = figures(docs / "data")
+    assert {f"{name}.png" for name in drawn} == {path.name for path in (docs / "images").iterdir()}
+    for name, figure in drawn.items():
+        save_plot(again, figure)
+        np.testing.assert_array_equal(pixels(again), pixels(docs / "images" / f"{name}.png"))
+
+
+@pytest.mark.slow
+def test_every_published_study_with_data_is_drawn_again(tmp_path):
+    data = DOCS / "data"
+    there = [study for study, files in STUDIES.items() if all((data / name).is_file() for name in files)]
+    drawn = figures(data)
+    assert set(drawn) >= {study.__name__ for study in there if study.__name__ in ("ablation", "trade")}
+    assert len(there) >= 2
+    save_plot(tmp_path / "ablation.png", drawn["ablation"])
+    np.testing.assert_array_equal(pixels(tmp_path / "ablation.png"), pixels(DOCS / "images" / "ablation.png"))
+    for name, figure in drawn.items():
+        save_plot(tmp_path / f"{name}.png", figure)
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+def test_the_published_table_of_trainings_is_that_of_the_published_policies():
+    assert read_trainings(DOCS / "data" / "trainings.csv") == published_trainings(PRETRAINED)
+
+
+def test_no_published_curve_falls_by_more_than_its_episodes_allow():
+    """Success is a mean over the last 100 episodes, few of which end between two points of a curve."""
+    for curve in read_curves(PRETRAINED).values():
+        assert (np.diff(curve.success_rate) > -0.25).all()
+
+
+def test_episodes_go_on_until_they_end():
+    episodes = flights(5, trials=20)
+    x, share = still_going(episodes, 100.0)
+    assert (x[0], x[-1], share[0], share[-1]) == (0.0, 100.0, 1.0, 5 / 20)
+    assert (np.diff(x) >= 0).all()
+    assert (np.diff(share) <= 1e-12).all()
+    for at in (10.0, 47.5, 52.5, 99.0):
+        assert share[x <= at][-1] == pytest.approx(
+            np.mean(episodes["success"] | (episodes["distance_m"] > at))
+        )
+    alone = still_going(flights(20), 100.0)
+    assert [list(part) for part in alone] == [[0.0, 100.0], [1.0, 1.0]]
+
+
+def test_the_worst_condition_of_a_group_is_the_one_it_succeeds_least_in(tmp_path):
+    about, episodes = read_sweep(write_sweep(tmp_path))
+    for one in episodes[("sparsity", "0.2"), "bytestream"].values():
+        one["success"][:] = False
+    found = survivals(about, episodes, changes_of(about, episodes))
+    assert found["bytestream"].worst == "Dead pixels: 0.2"
+    assert len(found["bytestream"].there) == 3
+    assert not np.concatenate(found["bytestream"].there)["success"].any()
+
+
+def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(tmp_path):
+    about, episodes = read_sweep(write_sweep(tmp_path))
+    usual, changed = contacts(about, episodes)["bytestream"]
+    assert (len(usual), len(changed)) == (3 * 20, 2 * 3 * 20)
+    about["axes"]["sparsity"]["0.5"]["env.scene"] = "poles_dense"
+    about["compared"][1]["same_as"] = about["compared"][0]["condition"]
+    usual, changed = contacts(about, episodes)["bytestream"]
+    assert (len(usual), len(changed)) == (3 * 20, 0)

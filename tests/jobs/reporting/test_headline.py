@@ -1,0 +1,74 @@
+import csv
+import re
+
+import pytest
+
+from jobs.reporting.headline import BEGIN, COLUMNS, END, headline_table, write_headline
+from jobs.run.files import RunError
+from jobs.run.provenance import REPOSITORY
+from tests.support.episodes import flights
+
+TRAININGS = REPOSITORY / "docs" / "data" / "robustness_trainings.csv"
+
+
+def cells_of(text):
+    """Group -> heading -> cell, of the first Markdown table whose headings are those of the headline."""
+    rows = [
+        [cell.strip() for cell in line.strip("| ").split("|")] for line in text.splitlines() if "|" in line
+    ]
+    first = next(k for k, row in enumerate(rows) if "nothing changed" in row)
+    named = {}
+    for row in rows[first + 2 :]:
+        if len(row) != len(rows[first]):
+            break
+        named[re.match(r"`(\w+)`", row[0])[1]] = dict(zip(rows[first][1:], row[1:], strict=True))
+    return named
+
+
+def test_a_cell_is_the_mean_of_the_trainings_and_marked_where_training_met_the_condition():
+    at, dead = COLUMNS["nothing changed"], COLUMNS["half of the pixels dead"]
+    episodes = {
+        (at, "bytestream"): {0: flights(20), 1: flights(10)},
+        (dead, "bytestream"): {0: flights(5), 1: flights(0)},
+        (at, "oracle"): {None: flights(20)},
+    }
+    table = headline_table({"bytestream": [0, 1], "oracle": [None]}, episodes, {(*dead, "bytestream")})
+    cells, total = cells_of(table), len(flights(0))
+    assert cells["bytestream"]["nothing changed"] == f"{100 * 15 / total:.0f}"
+    assert cells["bytestream"]["half of the pixels dead"] == f"{100 * 2.5 / total:.0f}°"
+    assert cells["oracle"]["45 Hz"] == "-"
+    assert list(cells) == ["oracle", "bytestream"]  # the best mean first
+
+
+def test_writing_it_changes_nothing_else_of_a_page_and_twice_is_once(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}\nold\n\n{END}after\n")
+    write_headline(page, "| new |\n")
+    once = page.read_text()
+    assert once == f"before\n{BEGIN}\n| new |\n\n{END}after\n"
+    write_headline(page, "| new |\n")
+    assert page.read_text() == once
+
+
+def test_a_page_without_its_marks_is_refused_and_left_as_it_is(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}after\n")
+    with pytest.raises(RunError, match="enclose"):
+        write_headline(page, "| new |\n")
+    assert page.read_text() == f"before\n{BEGIN}after\n"
+    write_headline(tmp_path / "none.md", "| new |\n")
+    assert not (tmp_path / "none.md").exists()
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/robustness.md"])
+def test_published_rows_are_those_of_the_published_data(page):
+    rates = {}
+    with TRAININGS.open() as file:
+        for row in csv.DictReader(file):
+            rates.setdefault((row["Axis"], row["Value"], row["Group"]), []).append(float(row["success_rate"]))
+    published = cells_of((REPOSITORY / page).read_text())
+    assert len(published) >= 4
+    for group, cells in published.items():
+        for heading, cell in cells.items():
+            values = rates[(*COLUMNS[heading], group)]
+            assert abs(float(cell.strip("*°")) - 100 * sum(values) / len(values)) <= 0.51, (group, heading)
