@@ -1,0 +1,80 @@
+"""Redraw the figures of the result pages from docs/data alone: no run folder and no store is needed.
+
+Run from the repository root: python -m docs.draw_figures [FOLDER]
+Writes each figure whose data are there into FOLDER, by default docs/images; docs/data.md explains the data.
+"""
+
+import csv
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.analysis.tables import save_plot
+from jobs.evaluation.group_stats import episode_values
+from jobs.evaluation.sweep_plan import NOMINAL
+from jobs.reporting.breaks import changes_of
+from jobs.reporting.dose_response import DOSES, draw, read_doses
+from jobs.reporting.figures import results_figures
+from jobs.reporting.learning_curves import read_trainings
+from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_episodes
+from jobs.studies.ablation.page import plot_variants, variant_result
+from jobs.studies.trade.page import draw_settings
+
+DOCS = Path(__file__).resolve().parent
+
+
+def results(data: Path) -> dict[str, Figure]:
+    """Those of results.md and results_tables.md."""
+    return results_figures(*read_data(data, SWEEP), read_trainings(data / TRAININGS))
+
+
+def dose_response(data: Path) -> dict[str, Figure]:
+    """That of dose_response.md."""
+    return {DOSES: draw(read_doses(data / f"{DOSES}_doses.csv"), changes_of(*read_data(data, DOSES)))}
+
+
+def ablation(data: Path) -> dict[str, Figure]:
+    """That of ablation.md; the first variant is the one that others are compared with."""
+    success: dict[str, dict[str, np.ndarray]] = {}
+    for ((axis, value), name), trainings in read_sweep_episodes(data / "ablation_episodes.csv.gz").items():
+        condition = value if axis == NOMINAL else f"{axis}={value}"
+        success.setdefault(name, {})[condition] = episode_values(trainings, "success")
+    first = next(iter(success.values()))
+    return {
+        "ablation": plot_variants([variant_result(name, own, first, (0.0,)) for name, own in success.items()])
+    }
+
+
+def trade(data: Path) -> dict[str, Figure]:
+    """That of trade.md."""
+    with (data / "trade_settings.csv").open() as file:
+        return {"trade": draw_settings(list(csv.DictReader(file)))}
+
+
+# What draws the figures of a study -> the files that it needs.
+STUDIES = {
+    results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
+    dose_response: (f"{DOSES}_episodes.csv.gz", f"{DOSES}_about.json", f"{DOSES}_doses.csv"),
+    ablation: ("ablation_episodes.csv.gz",),
+    trade: ("trade_settings.csv",),
+}
+
+
+def figures(data: Path) -> Mapping[str, Figure]:
+    """Name of each figure whose data are in a folder -> the figure."""
+    found: dict[str, Figure] = {}
+    for study, files in STUDIES.items():
+        if all((data / name).is_file() for name in files):
+            found |= study(data)
+    return found
+
+
+if __name__ == "__main__":
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS / "images"
+    target.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures(DOCS / "data").items():
+        save_plot(target / f"{name}.png", figure)
+        sys.stdout.write(f"{target / name}.png\n")
