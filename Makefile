@@ -1,6 +1,7 @@
 # Evade's commands; `make` or `make help` lists them.
 
-PYTHON ?= python3.11
+# The first that runs; pyenv leaves a python3.12 that does not.
+PYTHON ?= $(shell for version in 3.11 3.12 3.13; do python$$version -c '' 2>/dev/null && echo python$$version && break; done)
 VENV ?= .venv
 ARGS ?=
 
@@ -33,19 +34,23 @@ help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-17s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: system-libraries $(INSTALLED) ## create .venv with the pinned packages and this package, and compile the kernels
+setup: $(INSTALLED) system-libraries ## create .venv with the pinned packages and this package, and compile the kernels
 	@$(BIN)/python -m jobs.run.compile
 
 $(INSTALLED): requirements.lock pyproject.toml
+	@test -x $(BIN)/python -o -n "$(PYTHON)" || { echo "Evade needs Python 3.11, 3.12 or 3.13: see docs/install.md"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --requirement requirements.lock
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true # pip would compile on one core
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	touch $@
 
-system-libraries: # OpenGL without a screen, for renderer=pyrender
-	@$(PYTHON) -c 'import ctypes; ctypes.CDLL("libEGL.so.1"); ctypes.CDLL("libGL.so.1")' 2>/dev/null \
+system-libraries: $(INSTALLED) # OpenGL without a screen, for renderer=pyrender
+	@$(BIN)/python -c 'import ctypes; ctypes.CDLL("libEGL.so.1"); ctypes.CDLL("libGL.so.1")' 2>/dev/null \
 	&& ls /usr/lib/*/dri/*swrast_dri.so /usr/lib/*/libgallium*.so 2>/dev/null | grep -q . \
-	|| if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	|| if [ "$$(uname)" != Linux ]; then \
+	    echo "renderer=pyrender, and so mesh files, need EGL, which is for Linux; the rest does not"; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	    { apt-get update && apt-get install --yes --no-install-recommends $(GL_PACKAGES); } \
 	    || echo "warning: no OpenGL, so renderer=pyrender will not run; renderer=raycast does not need it"; \
 	else \
@@ -107,13 +112,15 @@ test-pythons: ## the quick tests on each supported Python, in .venv-3.X (PYTHONS
 test-image: ## build the image by debootstrap and buildah, as root, and run its commands (ARGS="--build-arg ...")
 	docker/test_image.sh $(ARGS)
 
-lint: setup ## check style, format, types, and who imports whom
+lint: $(INSTALLED) ## check style, format, types, and who imports whom
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: lint test test-system ## what must pass before a change is merged
+check: ## what must pass before a change is merged
+	$(MAKE) --jobs 2 lint setup
+	$(MAKE) test test-system
 
 bench: setup ## measure the speed of the parts, and what accuracy of the simulator costs
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done

@@ -35,7 +35,7 @@ try() { # name, command: run a command of the image, and remember how it ended
     buildah "${STORE[@]}" run "${ALONE[@]}" "$container" -- bash -c "$2" || ended=FAILED
     results+="$1: $ended, $((SECONDS - began)) s"$'\n'
 }
-SMOKE="python -m platform.launch budget=smoke runs_dir=/runs/smoke"
+SMOKE="python -m platform.launch budget=smoke runs_dir=/runs/smoke tracking.uri=sqlite:////runs/mlflow.db"
 try "user is not root" 'test "$(id -u)" = 1000 && test ! -w /etc && test -w /runs'
 try "help" 'python -m platform.launch --help'
 try "health" 'python -c "import envs, jobs, models"'
@@ -43,9 +43,11 @@ try "training" "$SMOKE +exp=event_columns job=train env.time_limit_s=1.0 train.e
 try "sweep" "$SMOKE +exp=robustness sweep.policies=[newest,oracle] model=event_columns env.time_limit_s=0.5 \
     ~sweep.axes '+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}'"
 try "OpenGL" 'python -c "from envs.corridor import CorridorEnv; CorridorEnv(renderer=\"pyrender\").reset(seed=0)"'
+# The server of the jobs above must answer by HTTP with the experiment that they wrote.
 try "dashboard" 'mlflow server --workers 1 --host 127.0.0.1 --port 5055 --backend-store-uri sqlite:////runs/mlflow.db &
     for _ in $(seq 60); do sleep 2; python -c "
-import urllib.request; print(urllib.request.urlopen(\"http://127.0.0.1:5055/health\").read())" 2>/dev/null && break; done
+import urllib.request as r; place = \"http://127.0.0.1:5055/api/2.0/mlflow/experiments/get-by-name\"
+assert b\"evade\" in r.urlopen(place + \"?experiment_name=evade\").read()" 2>/dev/null && break; done
     result=$?; kill %1; exit $result'
 try "tests" "make test VENV=/opt/venv ARGS='${TESTS:-}'"
 printf '%s' "$results"

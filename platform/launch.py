@@ -8,6 +8,7 @@ when the job fails, 130 after Ctrl+C.
 import contextlib
 import errno
 import importlib
+import importlib.util
 import io
 import os
 import re
@@ -24,6 +25,7 @@ from jobs.run.threads import ONE_THREAD
 
 CONF = ROOT / "conf"
 
+ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
 OPEN_GROUPS = (
     "env.layout",
@@ -38,6 +40,11 @@ def main() -> int:
     """Run the command line; return the exit status."""
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
+    if importlib.util.find_spec("hydra") is None:
+        print(
+            f"evade: failed: {sys.executable} has not the packages of Evade; {ENVIRONMENT}", file=sys.stderr
+        )
+        return FAILED
     try:
         values = compose(sys.argv[1:])
         if values is not None:

@@ -9,9 +9,11 @@ import tempfile
 
 import pytest
 
+from jobs.training.train import METRICS
 from tests.support.faults import FINE, TRAIN, check_complete, launch, outcome, start
 
 pytestmark = pytest.mark.faults
+SAME = ["env_steps", *(name for name in METRICS if not name.startswith("perf/"))]
 
 
 def checkpoints(job):
@@ -237,3 +239,25 @@ def fill(file):
                     stream.write(b"\0" * size)
             except OSError:
                 continue
+
+
+def test_a_training_that_is_disturbed_ends_with_the_bytes_of_one_that_is_not(tmp_path):
+    words = *TRAIN, *FINE, "algo.num_env_runners=2", "train.checkpoint_every=3", "env.time_limit_s=0.2"
+    whole = launch(tmp_path / "whole", *words)
+    check_complete(whole)
+    job = launch(tmp_path / "disturbed", *words)
+    job.wait(lambda: job.steps() >= 128)
+    os.kill(job.workers("ray::PlainEnvRunner")[0], signal.SIGKILL)
+    before = job.steps()
+    job.wait(lambda: job.steps() > before + 64)
+    assert job.rows()[-1]["perf/env_runner_restarts"] == 1
+    job.kill()
+    again = start(tmp_path / "disturbed", job.printed_command())
+    check_complete(again)
+    assert "new episodes" not in again.said
+    told = [[{name: row[name] for name in SAME} for row in one.rows()] for one in (whole, again)]
+    assert told[0] == told[1]
+    policies = [sorted((one.run / "policy").glob("*.safetensors")) for one in (whole, again)]
+    assert [path.read_bytes() for path in policies[0]] == [path.read_bytes() for path in policies[1]]
+    assert policies[0]
+    outcome("env runner and driver killed", "the same bytes as undisturbed", "nothing")

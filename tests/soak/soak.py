@@ -368,6 +368,8 @@ def close(soak: Soak, out: Path, given: dict[str, str]) -> int:
 
 
 if __name__ == "__main__":
+    if sys.platform != "linux":
+        sys.exit("the soak reads /proc and adopts processes by prctl, so it runs on Linux alone")
     try:
         sys.exit(main(sys.argv[1:]))
     except KeyboardInterrupt:

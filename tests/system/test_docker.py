@@ -1,5 +1,6 @@
 """The files of docker/, read as the programs that they are for read them; no engine is needed."""
 
+import importlib.metadata
 import importlib.util
 import json
 import re
@@ -227,5 +228,22 @@ def test_every_command_is_one_that_its_program_takes(compose_configuration):
         else:
             assert words in (["cd", "/evade"], ["python", "-m", "platform.launch", "--help"])
     assert seen == {"ray", "mlflow", "python -m", "python -c", "cd"}
+    scripts = {
+        point.name: point.dist.name for point in importlib.metadata.entry_points(group="console_scripts")
+    }
+    assert {scripts["ray"], scripts["mlflow"]} <= set(LOCK)  # so that the image has these programs
     with pytest.raises(click.UsageError):
         ray.commands["start"].make_context("start", ["--haed"])
+
+
+def test_the_jobs_that_try_the_image_are_configurations_of_one_store(compose_configuration):
+    script = (DOCKER / "test_image.sh").read_text().replace("\\\n", " ")
+    (smoke,) = re.findall(r'^SMOKE="(.+)"$', script, re.MULTILINE)
+    tried = dict(re.findall(r'^try "(.+?)" "\$SMOKE (.+)"$', script, re.MULTILINE))
+    configs = {what: compose_configuration(shlex.split(f"{smoke} {tried[what]}")[3:]) for what in tried}
+    assert [config.job for config in configs.values()] == ["train", "sweep"]
+    assert {config.runs_dir for config in configs.values()} == {"/runs/smoke"}
+    (store,) = {config.tracking.uri for config in configs.values()}
+    assert f"--backend-store-uri {store} " in script
+    (step,) = [text for name, text in instructions() if "useradd" in text]
+    assert "--owner=evade /runs " in step

@@ -12,6 +12,7 @@ import nbformat
 import numpy as np
 import pydantic
 import pytest
+from PIL import Image
 
 from docs.keys import HEAD, kinds, row, tables
 from docs.run_notebooks import execute
@@ -160,7 +161,7 @@ def test_the_bounds_of_a_key_are_those_that_the_schema_enforces():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with the files that the pages name: a run, recordings, a video, results."""
+    """A folder with the files that the pages name: a run, recordings, a video, images, results."""
     place = tmp_path_factory.mktemp("pages")
     fill(place)
     (place / "runs" / "NAME").mkdir()
@@ -179,6 +180,11 @@ def folder(tmp_path_factory):
     for _ in range(8):
         film.send(rng.integers(0, 255, (64, 64, 3), np.uint8).tobytes())
     film.close()
+    for name in ("slider_depth", "renders"):
+        (place / name).mkdir()
+        for n in range(3):
+            Image.fromarray(rng.integers(0, 255, (64, 64), np.uint8)).save(place / name / f"{n}.png")
+    (place / "slider_depth" / "images.txt").write_text("".join(f"{n * 0.04} {n}.png\n" for n in range(3)))
     return place
 
 

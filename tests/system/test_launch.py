@@ -1,5 +1,6 @@
 import importlib.util
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -71,6 +72,13 @@ def test_the_module_refuses_with_one_message_and_no_traceback(tmp_path):
 
 @pytest.mark.system
 @pytest.mark.skipif(not EVADE.exists(), reason="the command is not installed; run `pip install -e .`")
+def test_a_python_without_the_packages_is_told_the_environment_in_one_line():
+    command = [sys.executable, "-S", "-m", "platform.launch", "+exp=demo"]  # -S: without site-packages
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert re.fullmatch(r"evade: failed: .*`make setup`.*`source \.venv/bin/activate`.*\n", done.stderr)
+
+
 def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
     words = ("+exp=bytestream", "seed=five")
     here, there = shell(sys.executable, "-m", "platform.launch", *words), shell(EVADE, *words, cwd=tmp_path)

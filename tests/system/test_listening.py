@@ -1,4 +1,7 @@
-"""Nothing that a user starts can be reached from another machine: every socket is counted while it runs."""
+"""Nothing that a user starts can be reached from another machine: every socket is counted while it runs.
+
+A training's are counted in tests/jobs/training/test_train.py, a sweep's in tests/system/test_pipeline.py.
+"""
 
 import os
 import shlex
@@ -11,39 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.faults import FINE, SWEEP, TRAIN, launch
 from tests.support.sockets import beyond_loopback, listening
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 ROOT = Path(__file__).resolve().parents[2]
-POLICY = ROOT / "models" / "pretrained" / "event_set-s0"
-# Twelve episodes, which is more than the driver evaluates itself.
-AXIS = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.1,0.2,0.3,0.4,0.5]}"
-
-
-def check(found):
-    """Ray and its workers are there, and all of them on loopback."""
-    programs = [name for name, _, _ in found]
-    assert {"gcs_server", "raylet"} <= set(programs), found
-    assert any(name.startswith("ray::") for name in programs), found
-    assert beyond_loopback(found) == []
-
-
-def test_a_sweep_listens_on_loopback_alone(tmp_path):
-    words = (*SWEEP, "~sweep.axes", AXIS, f"sweep.policies=[{POLICY}]")
-    job = launch(tmp_path, *words)
-    job.wait(job.kept)
-    found = listening(job.process.pid)
-    assert job.end() == 0, job.said
-    check(found)
-
-
-def test_a_training_listens_on_loopback_alone(tmp_path):
-    job = launch(tmp_path, *TRAIN, *FINE)
-    job.wait(job.steps)
-    found = listening(job.process.pid)
-    assert job.end() == 0, job.said
-    check(found)
 
 
 def test_the_dashboard_listens_on_loopback_alone(tmp_path):

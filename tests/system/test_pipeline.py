@@ -13,6 +13,8 @@ from mlflow import MlflowClient
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from models.policy import load_policy
+from tests.support.faults import launch as start_job
+from tests.support.sockets import check_ray, listening
 
 # One run serves most tests of this file, so one worker takes them all.
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(900)]
@@ -68,10 +70,11 @@ FEW_STEPS = (
     ("exp", "words"),
     [
         ("event_columns", FEW_STEPS),
-        pytest.param("event_image", (), marks=pytest.mark.slow),
-        pytest.param("rgb", (), marks=pytest.mark.slow),
+        ("event_image", ()),
+        ("rgb", ()),
     ],
 )
+@pytest.mark.slow  # that of a plug-in, of tests/system/test_plugins.py, goes through the same stages
 def test_a_policy_without_an_event_vae_trains_and_evaluates_at_once(tmp_path, exp, words):
     printed = launch(tmp_path, f"+exp={exp}", *words)
     assert re.search(r"policy stochastic\s+│ poles_eval\s+│ raycast\s+│\s+\d+ │\s+\d+ \[\d+, \d+\]", printed)
@@ -183,10 +186,14 @@ def test_the_same_command_again_repeats_nothing(flown):
     stored_run(flown[0])
 
 
-def test_a_sweep_flies_the_policy_just_trained_and_a_rerun_flies_nothing(flown):
-    printed = launch(flown[0], *SWEEP)
+def test_a_sweep_evaluates_the_policy_just_trained_on_loopback_alone_and_a_rerun_evaluates_nothing(flown):
+    job = start_job(flown[0], *SWEEP, "budget=smoke")
+    job.wait(job.kept)
+    found = listening(job.process.pid)
+    assert job.end() == 0, job.said
+    check_ray(found)
     for axis in ("control_hz", "contrast_threshold", "sparsity", "background_activity"):
-        assert axis in printed
+        assert axis in job.said
     again = launch(flown[0], *SWEEP)
     assert "Sweep:" not in again
     client = MlflowClient(f"sqlite:///{flown[0] / 'mlflow.db'}")

@@ -17,9 +17,10 @@ ROOT = Path(__file__).resolve().parents[2]
 EVADE = Path(sys.executable).parent / "evade"
 PLUGIN = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL)[1]
 TRAIN = (
-    *("+exp=event_columns", "job=train", "name=halves", "model.name=halves", "model.hidden=[]"),
+    *("+exp=event_columns", "name=halves", "model.name=halves", "model.hidden=[]"),
     *("env.scene=forest", "+faults.added.blind_spot=0.3", "env.time_limit_s=1.0"),
     *("algo.train_batch_size_per_learner=256", "train.env_steps=512"),
+    *("evaluate.episodes=2", "evaluate.renderers=[raycast]", "evaluate.video=false"),
 )
 SWEEP = (
     *("+exp=robustness", "sweep.policies=[newest]", "model=event_columns", "model.name=halves"),
@@ -30,10 +31,11 @@ SWEEP = (
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A folder with the plug-in, in which it has been trained."""
+    """A folder with the plug-in, in which it has been trained and evaluated."""
     folder = tmp_path_factory.mktemp("outside")
     (folder / "forest.py").write_text(PLUGIN)
-    evade(folder, *TRAIN)
+    said = evade(folder, *TRAIN)
+    assert re.search(r"policy stochastic\s+│ forest\s+│ raycast\s+│\s+2 │\s+\d+ \[\d+, \d+\]", said), said
     return folder
 
 
@@ -50,8 +52,10 @@ def test_it_is_a_file_of_thirty_lines():
     assert len([line for line in PLUGIN.splitlines() if line.strip()]) <= 30
 
 
-def test_its_policy_trains_in_its_world(trained):
+def test_its_policy_trains_in_its_world_and_without_an_event_vae_at_once(trained):
     (run,) = (trained / "runs").glob("halves-*")
+    assert {path.stem for path in (run / "stages").iterdir()} == {"train", "evaluate"}
+    assert not {"data", "encoder"} & {path.name for path in run.iterdir()}
     manifest = json.loads((run / "policy" / "policy.json").read_text())
     assert (manifest["name"], manifest["world"]["scene"], manifest["stack"]) == ("halves", "forest", 3)
     assert list(manifest["plugins"]) == ["forest"]

@@ -127,6 +127,31 @@ def test_a_sweep_trains_and_ships_its_policies_first_only_if_told_to():
     assert sorted(map(told.index, parts)) == list(map(told.index, parts))
 
 
+def test_make_takes_the_first_python_that_runs_and_says_so_if_none_does(tmp_path):
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for name, status in {"python3.11": 1, "python3.12": 0, "python3.13": 0}.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\necho $0 $* >&2\nexit {status}\n")
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / "requirements.lock").touch()
+    (tmp_path / "pyproject.toml").touch()
+
+    def made() -> str:
+        command = [shutil.which("make"), ".venv/.installed"]
+        environment = {"PATH": str(tmp_path)}
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode != 0  # these make no environment
+        return done.stdout + done.stderr
+
+    assert "python3.12 -m venv .venv" in made()
+    for name in ("python3.12", "python3.13"):
+        (tmp_path / name).unlink()
+    said = made()
+    assert "needs Python 3.11, 3.12 or 3.13" in said
+    assert "-m venv" not in said
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_the_continuous_integration_script_is_valid():
     subprocess.run(["bash", "-n", ".ci/run"], cwd=ROOT, check=True)
@@ -216,3 +241,9 @@ def test_few_values_are_of_any_type():
     untyped = re.compile(r"\b(?:dict|Mapping)\[str, Any\]")
     texts = [path.read_text() for room in ROOMS for path in (ROOT / room).rglob("*.py")]
     assert sum(len(untyped.findall(text)) for text in texts) < 80
+
+
+def test_both_rooms_forget_stale_kernels_in_the_same_way():
+    envs, models = ((ROOT / room / "__init__.py").read_text().splitlines() for room in ("envs", "models"))
+    assert envs[1:] == models[1:]
+    assert "_forget_stale_kernels()" in envs
