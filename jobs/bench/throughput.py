@@ -154,11 +154,16 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
 
 
 def composed(*words: str) -> Config:
-    """A training by the paper's PPO with some words of the command line, as the launcher composes it."""
-    algo = [] if any(word.startswith("algo=") for word in words) else ["algo=ppo"]
-    command = [sys.executable, "-m", "platform.launch", "+exp=train", *algo, *words, "--cfg", "job"]
+    """Words of the command line as the launcher composes them; without any, a training by PPO."""
+    given = {_key(word) for word in words}
+    usual = [word for word in ("+exp=train", "algo=ppo") if _key(word) not in given]
+    command = [sys.executable, "-m", "platform.launch", *usual, *words, "--cfg", "job"]
     said = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  own words, no shell
     return parse(yaml.safe_load(said.stdout))
+
+
+def _key(word: str) -> str:
+    return word.partition("=")[0]
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import FrameType
 
 # Ray waits 60 s for a head that is gone, and then ends the process in the middle of what it does.
 SILENCE_S = 40.0
@@ -37,7 +38,8 @@ def watching_head(
     watch = _Watch(ask or head_answers, ended or ended_process)
     threading.Thread(target=watch.run, name="head-watch", daemon=True).start()
     try:
-        yield
+        with _heard(watch.lost):
+            yield
     except KeyboardInterrupt:
         if not watch.lost.is_set():
             raise
@@ -45,6 +47,27 @@ def watching_head(
         raise HeadLostError(watch.reason) from None
     finally:
         watch.over.set()
+
+
+@contextlib.contextmanager
+def _heard(lost: threading.Event) -> Iterator[None]:
+    """Let SIGINT interrupt the block once the head is lost, even where it is ignored.
+
+    A shell that starts a command in the background of a script has it ignore SIGINT; so it stays until then.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if lost.is_set():
+            signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def head_answers(seconds: float) -> bool:

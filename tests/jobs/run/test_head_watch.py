@@ -1,3 +1,4 @@
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -35,11 +36,15 @@ while True:
 pytestmark = pytest.mark.system
 
 
-def watched(work=FOREVER, answers=(), then=False, closing=0, ended=""):
+def watched(work=FOREVER, answers=(), then=False, closing=0, ended="", sigint=signal.default_int_handler):
     indented = "\n".join(f"        {line}" for line in work.strip().splitlines())
     script = WATCHED.format(answers=list(answers), then=then, work=indented, closing=closing, ended=ended)
     command = [sys.executable, "-c", script]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=50)
+    before = signal.signal(signal.SIGINT, sigint)  # what is ignored here is ignored in the process too
+    try:
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=50)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_work_whose_head_is_silent_ends_with_the_reason():
@@ -48,6 +53,14 @@ def test_work_whose_head_is_silent_ends_with_the_reason():
     assert ended.stdout.endswith("the same command continues\nclosed\n")
     assert ended.stderr == ""
     assert ended.returncode == 0
+
+
+def test_work_in_the_background_of_a_script_is_told_too_and_goes_on_ignoring_ctrl_c_until_then():
+    signals = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nprint('ignored')\n"
+    ended = watched(signals + FOREVER, sigint=signal.SIG_IGN)
+    assert ended.stdout.startswith("ignored\ntold Ray's head has not answered for 1 s: ")
+    assert ended.stdout.endswith("closed\n")
+    assert (ended.stderr, ended.returncode) == ("", 0)
 
 
 def test_work_that_waits_forever_for_a_lost_head_is_ended_with_the_same_reason():
