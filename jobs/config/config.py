@@ -42,6 +42,7 @@ from jobs.config.schema import (
     TradeSimulatorConfig,
     TrainConfig,
     TuneConfig,
+    VideoConfig,
 )
 from models.kinds import KINDS, Model, model_keys, read_model
 
@@ -73,6 +74,7 @@ class Config:
     algo: AlgoConfig
     demo: DemoConfig
     replay: ReplayConfig
+    video: VideoConfig
     calibrate: CalibrateConfig
     sliding: SlidingConfig
     replay_page: ReplayPageConfig

@@ -28,6 +28,7 @@ JOBS = {
     "report": Job("jobs.reporting.report", "The page of results, written from the newest sweep"),
     "demo": Job("jobs.evaluation.demo", "A film of one episode of a policy"),
     "replay": Job("jobs.studies.recording_replay", "What a policy makes of a real camera's recording"),
+    "video_events": Job("jobs.studies.video_events", "The events of a video, as a camera would report them"),
     "calibrate": Job("jobs.studies.calibrate.calibrate", "The settings of the camera that made a recording"),
     "sliding": Job("jobs.studies.sliding.sliding", "What a probe of the simulation reads of a recording"),
     "replay_page": Job("jobs.reporting.replay_page", "A page to scrub through recorded episodes"),

@@ -99,6 +99,25 @@ class ReplayConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
+class VideoConfig:
+    """Which video becomes events. The camera is that of the environment, and so are its size and its faults.
+
+    Attributes:
+        path: A video, or a folder of images, as `envs.recordings.video_steps` reads them.
+        output: The event file, of the format that its suffix names; None: events.npz in the run folder.
+        fps: Frames per second, in place of the times that the video or the folder has [Hz].
+        transfer: How values become light; None: floating point is linear, whole numbers are sRGB.
+        interpolate: What is taken to be between two frames.
+    """
+
+    path: Name
+    output: Name | None
+    fps: Annotated[float, Field(gt=0)] | None
+    transfer: Literal["srgb", "linear"] | None
+    interpolate: Literal["linear", "flow"]
+
+
+@dataclass(frozen=True, config=STRICT)
 class CalibrateConfig:
     """Which recording a camera is calibrated against.
 
