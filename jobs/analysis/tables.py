@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from jobs.tracking.tracker import Tracker
 
-FILE_WIDTH = 140
+FILE_WIDTH = 180
 CAPTION = "In brackets 95 % intervals: Wilson for success, bootstrap for distance"
 SUMMARY_HEADINGS = ("Episodes", "Success [%]", "Distance [m]", "Events/step", "Dropped")
 
