@@ -9,11 +9,12 @@ ones.
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs.config import CameraConfig, FaultsConfig
+from envs.config import LUMINANCE_FLOOR, CameraConfig, FaultsConfig, with_floor
 from envs.recordings.event_file import EventFile
 from jobs.analysis.plots import AMBER, BLUE, GREEN, INK, tidy
 from jobs.analysis.tables import save_plot, show_table
@@ -54,7 +55,8 @@ def run(config: Config) -> Calibration:
         file = read_recording(chosen.recording, frames)
         footage = frames or _still(file, chosen.luminance)
         footage = within(footage, file.events)
-        calibration = estimate(file.events, footage, camera, config.seed)
+        taken = assumed(camera, footage.is_still)
+        calibration = estimate(file.events, footage, taken, config.seed)
     except (ValueError, OSError) as error:
         raise ConfigError(f"calibrate.recording: {chosen.recording}: {error}") from error
     name = Path(chosen.recording).name
@@ -63,13 +65,13 @@ def run(config: Config) -> Calibration:
     )
     folder = open_run(config).path / "calibrate"
     folder.mkdir(parents=True, exist_ok=True)
-    text = camera_text(calibration, name)
+    text = camera_text(calibration, name, taken)
     write_atomic(folder / "camera.yaml", text)
     y, x = np.nonzero(calibration.hot)
     write_atomic(
         folder / "hot_pixels.csv", "x,y\n" + "".join(f"{a},{b}\n" for a, b in zip(x, y, strict=True))
     )
-    if frames is not None:
+    if frames is not None and len(footage.times_us) > 2:
         _compare(config, calibration, footage, file.events, folder)
     if chosen.camera is not None:
         write_atomic(REPOSITORY / "conf" / "camera" / f"{chosen.camera}.yaml", text)
@@ -109,15 +111,31 @@ def within(footage: Footage, events: np.ndarray) -> Footage:
     return Footage(footage.luminance[kept], footage.times_us[kept])
 
 
+def assumed(camera: CameraConfig, still: bool) -> CameraConfig:
+    """What of the configured camera is taken as it is; all else is found, or is that of an ideal camera.
+
+    That is how light becomes a response, and of a still scene the thresholds and the refractory period.
+    """
+    taken: dict[str, Any] = {"response": camera.response, "luminance_floor": camera.luminance_floor}
+    if still:
+        taken |= {
+            "contrast_threshold": camera.contrast_threshold,
+            "contrast_threshold_off": camera.contrast_threshold_off,
+            "refractory_us": camera.refractory_us,
+        }
+    return CameraConfig(**taken)
+
+
 def compared(calibration: Calibration, camera: CameraConfig, faults: FaultsConfig) -> dict[str, tuple]:
     """Name -> camera and faults of the sensors that are simulated: ideal, as configured, calibrated."""
     height, width = calibration.hot.shape
     size = {"height": height, "width": width}
-    sensors = {"ideal": (CameraConfig(**size), FaultsConfig())}
+    sensors = {"ideal": (with_floor(CameraConfig(**size), LUMINANCE_FLOOR), FaultsConfig())}
     configured = dataclasses.replace(camera, **size), faults
     if configured != sensors["ideal"]:
         sensors["as configured"] = configured
-    return {**sensors, "calibrated": settings(dataclasses.replace(camera, **size), calibration.found)}
+    taken = dataclasses.replace(assumed(camera, still=False), **size)
+    return {**sensors, "calibrated": settings(taken, calibration.found)}
 
 
 def _compare(

@@ -1,17 +1,19 @@
 """What was found, as a file of conf/camera."""
 
-from jobs.studies.calibrate.estimate import DEAD, Calibration
+from envs.config import CameraConfig
+from jobs.studies.calibrate.estimate import DEAD, OFF, ON, Calibration
 from jobs.studies.calibrate.found import Found
 
 UNITS = {"hz": " [Hz]", "us": " [us]"}
 
 
-def camera_text(calibration: Calibration, source: str) -> str:
+def camera_text(calibration: Calibration, source: str, taken: CameraConfig) -> str:
     """A file that `camera=NAME` takes from conf/camera; what was not found is named, and keeps its default.
 
     Args:
         calibration: What was found.
         source: Of what, for the file's first line.
+        taken: The camera that was assumed.
     """
     height, width = calibration.hot.shape
     absent = [
@@ -23,6 +25,7 @@ def camera_text(calibration: Calibration, source: str) -> str:
         "camera": [f"  width: {width}  # [pixels]", f"  height: {height}  # [pixels]"],
         "faults": [],
     }
+    groups["camera"] += [f"  {key}: {value}  # assumed" for key, value in assumptions(calibration, taken)]
     for name, part in calibration.found.items():
         if part.value is not None:
             group, key = name.split(".")
@@ -34,6 +37,17 @@ def camera_text(calibration: Calibration, source: str) -> str:
     for group, rows in groups.items():
         lines += [f"{group}:", *rows] if rows else []
     return "\n".join(lines) + "\n"
+
+
+def assumptions(calibration: Calibration, taken: CameraConfig) -> list[tuple[str, object]]:
+    """Keys and values of what was assumed and not found."""
+    keys = ["response", "luminance_floor"]
+    if calibration.found[ON].value is None:
+        keys += [
+            name.removeprefix("camera.") for name in (ON, OFF, DEAD) if calibration.found[name].value is None
+        ]
+    values = [(key, getattr(taken, key)) for key in keys]
+    return [(key, "null" if value is None else value) for key, value in values]
 
 
 def value_text(name: str, part: Found) -> str:

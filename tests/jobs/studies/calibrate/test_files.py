@@ -1,3 +1,4 @@
+import dataclasses
 import shutil
 
 import hydra
@@ -7,6 +8,7 @@ import yaml
 from omegaconf import OmegaConf
 from PIL import Image
 
+from envs.config import CameraConfig, FaultsConfig
 from envs.events import EVENT
 from envs.recordings import write_events
 from envs.recordings.light import light_of_grey
@@ -30,17 +32,50 @@ def composed(conf, *words):
 WITHOUT_MEMORY = ("~sweep.axes.memory", "~sweep.axes.memory_400hz")
 
 
+# Of which a calibration takes how light becomes a response, and nothing else.
+CONFIGURED = CameraConfig(
+    response="lin_log", luminance_floor=0.02, cutoff_hz=300.0, threshold_mismatch=0.15, readout_hz=3000.0
+)
+
+
+def test_a_still_scene_takes_its_thresholds_and_refractory_period_from_the_command_line():
+    camera = dataclasses.replace(CONFIGURED, contrast_threshold=0.3, refractory_us=500)
+    moving, still = (calibrate.assumed(camera, still) for still in (False, True))
+    usual = CameraConfig(response="lin_log", luminance_floor=0.02)
+    assert moving == usual
+    assert still == dataclasses.replace(usual, contrast_threshold=0.3, refractory_us=500)
+    nothing = Calibration({name: missing("still") for name in NAMES}, np.zeros((36, 48), bool))
+    written = yaml.safe_load(camera_text(nothing, "x.raw", still))["camera"]
+    assert written == {
+        **{"width": 48, "height": 36, "response": "lin_log", "luminance_floor": 0.02},
+        **{"contrast_threshold": 0.3, "contrast_threshold_off": None, "refractory_us": 500},
+    }
+
+
+def test_only_an_ideal_camera_that_is_not_configured_is_shown_beside_the_configured_one():
+    calibration = Calibration({name: missing("still") for name in NAMES}, np.zeros((64, 64), bool))
+    configured = parse(compose("+exp=calibrate")).env
+    assert set(calibrate.compared(calibration, configured.camera, configured.faults)) == {
+        "ideal",
+        "calibrated",
+    }
+    assert "as configured" in calibrate.compared(calibration, CONFIGURED, configured.faults)
+
+
 def test_what_was_found_is_a_camera_that_others_can_take(tmp_path):
     conf = shutil.copytree(CONF, tmp_path / "conf")
     found = {name: missing("nothing told it") for name in NAMES}
     found |= {ON: Found(0.31, 0.3, 0.32), DEAD: Found(499.7, 480.0, 510.0), LEAK: Found(0.125, 0.1, 0.2)}
-    text = camera_text(Calibration(found, np.zeros((36, 48), bool)), "x.raw")
+    calibration = Calibration(found, np.zeros((36, 48), bool))
+    text = camera_text(calibration, "x.raw", calibrate.assumed(CONFIGURED, still=False))
     (conf / "camera" / "mine.yaml").write_text(text)
     config = parse(composed(conf, "+exp=train", *WITHOUT_MEMORY, "camera=mine"))
     assert (config.env.camera.width, config.env.camera.height) == (48, 36)
     assert config.env.camera.contrast_threshold == 0.31
     assert config.env.camera.refractory_us == 500
     assert config.env.faults.leak_hz == 0.125
+    compared = calibrate.compared(calibration, CONFIGURED, FaultsConfig())
+    assert (config.env.camera, config.env.faults) == compared["calibrated"]
     absent = {name for name in NAMES if name not in (ON, DEAD, LEAK)}
     groups = {name: keys for name, keys in yaml.safe_load(text).items() if name != "defaults"}
     assert not absent & {f"{group}.{key}" for group, keys in groups.items() for key in keys}
