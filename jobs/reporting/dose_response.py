@@ -21,6 +21,7 @@ from jobs.evaluation.group_stats import MET, Condition, TrainingEpisodes, episod
 from jobs.evaluation.sweep_plan import NOMINAL, Axes
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of
+from jobs.reporting.dose_plan import PLAN, check_planned, read_plan
 from jobs.reporting.dose_plot import dose_plot
 from jobs.reporting.sweep_data import read_sweep, write_data
 from jobs.rollout.policies import PRETRAINED
@@ -149,10 +150,9 @@ def over_doses(changes: Sequence[Change], doses: Sequence[Dose], swept: SweptEpi
     for group in dict.fromkeys(change.group for change in changes):
         for kind in dict.fromkeys(dose.kind for dose in doses):
             own = [one for one in changes if (one.group, one.condition[0]) == (group, kind)]
-            if len(own) == sum(dose.kind == kind for dose in doses):
-                each = [_success(swept[one.condition, group]) - _success(swept[one.baseline, group])
-                        for one in own]  # fmt: skip
-                found[group, kind] = np.mean(each, axis=0)
+            each = [_success(swept[one.condition, group]) - _success(swept[one.baseline, group])
+                    for one in own]  # fmt: skip
+            found[group, kind] = np.mean(each, axis=0)
     return found
 
 
@@ -182,23 +182,27 @@ def _verdict(difference: Difference, adjusted_p: float) -> Literal["worse", "bet
     return "worse" if high < 0.0 else "better"
 
 
-def write_dose_response(sweep: Path, docs: Path, env: EnvConfig, pretrained: Path = PRETRAINED) -> Path:
+def write_dose_response(
+    sweep: Path, docs: Path, env: EnvConfig, pretrained: Path = PRETRAINED, plan: Path = PLAN
+) -> Path:
     """Write the results below the plan, the plot and the data.
 
     Args:
         sweep: The folder that the sweep has left in its run folder.
         docs: Where the page is, or goes; plot and data into `images` and `data`.
-        env: The simulation of the sweep, in which event errors are measured.
+        env: The simulation in which event errors are measured; it must be that of the sweep.
         pretrained: Where the published policies are, which say what they met in training.
+        plan: The settings of the planned sweep.
 
     Returns:
         The page.
 
     Raises:
-        ConfigError: If an earlier version wrote the sweep.
+        ConfigError: If an earlier version wrote the sweep, or it is not the planned one, complete.
         RunError: If a file of the sweep is damaged.
     """
     about, swept = read_sweep(sweep)
+    check_planned(sweep, env, about, swept, read_plan(plan), pretrained)
     env = dataclasses.replace(env, scene=about["scene"], split="eval")
     doses = doses_of(about["axes"], env, drawn_conditions(about["groups"], pretrained))
     write_data(docs / "data", DOSES, sweep, swept)
@@ -212,8 +216,8 @@ def write_dose_response(sweep: Path, docs: Path, env: EnvConfig, pretrained: Pat
     doses, changes = read_doses(table), changes_of(about, swept)
     save_plot(docs / "images" / f"{DOSES}.png", draw(doses, changes))
     page = docs / f"{DOSES}.md"
-    plan = page.read_text().split(RESULTS)[0] if page.is_file() else ""
-    write_atomic(page, plan.rstrip("\n") + f"\n\n{RESULTS}" + results_text(about, swept, doses, changes))
+    above = page.read_text().split(RESULTS)[0] if page.is_file() else ""
+    write_atomic(page, above.rstrip("\n") + f"\n\n{RESULTS}" + results_text(about, swept, doses, changes))
     return page
 
 
