@@ -6,7 +6,7 @@ The plan stands on the page and is left as it is; what is below it is written fr
 import csv
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -31,6 +31,7 @@ from models.policy.policy import MANIFEST
 
 DOSES = "dose_response"  # name of the experiment, and of what is published of it
 WORST = "invented"  # the kind that the plan compares with the others
+CLOSE = 1.5  # ratio of two measured event errors up to which doses of two kinds are shown side by side
 RESULTS = "## Results\n"  # what stands above it is the plan
 TEMPLATE = Path(__file__).parent / "templates" / f"{DOSES}.md.j2"
 DATA = ("Axis", "Value", "asked_event_error", "measured_event_error", "met_by")
@@ -65,6 +66,14 @@ class Dose(NamedTuple):
     def condition(self) -> Condition:
         """Axis and value."""
         return self.kind, self.value
+
+
+class Verdicts(NamedTuple):
+    """Of comparisons of invented events with some kinds: how many, and how many are worse and better."""
+
+    tests: int
+    worse: int
+    better: int
 
 
 class Compared(NamedTuple):
@@ -175,6 +184,31 @@ def compare_kinds(means: Mapping[tuple[str, str], np.ndarray]) -> list[Compared]
     ]
 
 
+def count_verdicts(compared: Sequence[Compared], kinds: Collection[str]) -> Verdicts:
+    """Count the verdicts against some kinds."""
+    own = [one.verdict for one in compared if one.kind in kinds]
+    return Verdicts(len(own), own.count("worse"), own.count("better"))
+
+
+def mean_errors(doses: Sequence[Dose]) -> dict[str, float]:
+    """Kind -> measured event error, mean over its doses."""
+    kinds = dict.fromkeys(dose.kind for dose in doses)
+    return {kind: float(np.mean([one.measured for one in doses if one.kind == kind])) for kind in kinds}
+
+
+def close_pairs(doses: Sequence[Dose]) -> list[tuple[Dose, Dose]]:
+    """Doses that stand for no asked error, each with the nearest one of invented events if that is close."""
+    worst = [dose for dose in doses if dose.kind == WORST]
+    others = [dose for dose in doses if dose.asked is None] if worst else []
+    pairs = [(one, min(worst, key=lambda dose: abs(dose.measured - one.measured))) for one in others]
+    return [pair for pair in pairs if _ratio(*pair) <= CLOSE]
+
+
+def _ratio(one: Dose, other: Dose) -> float:
+    low, high = sorted((one.measured, other.measured))
+    return high / low if low else math.inf
+
+
 def _verdict(difference: Difference, adjusted_p: float) -> Literal["worse", "better", "undecided"]:
     low, high = difference.interval or (-1.0, 1.0)
     if adjusted_p >= 1 - CONFIDENCE or low <= 0.0 <= high:
@@ -249,6 +283,8 @@ def results_text(
     compared = compare_kinds(means)
     kinds = list(dict.fromkeys(dose.kind for dose in doses))
     groups = list(dict.fromkeys(change.group for change in changes))
+    apart = list(dict.fromkeys(dose.kind for dose in doses if dose.asked is None))
+    same = [kind for kind in kinds if kind not in (*apart, WORST)]
     return render(
         TEMPLATE,
         about=about,
@@ -257,8 +293,12 @@ def results_text(
         episodes=sum(len(own) for trainings in swept.values() for own in trainings.values()),
         means=means_table(means, groups, kinds),
         verdicts=verdict_table(compared, groups, kinds),
-        worse=sum(one.verdict == "worse" for one in compared),
-        better=sum(one.verdict == "better" for one in compared),
+        worst=WORST,
+        same=same,
+        at_dose=count_verdicts(compared, same),
+        apart=[(kind, count_verdicts(compared, [kind])) for kind in apart],
+        errors={kind: f"{100 * error:.1f}" for kind, error in mean_errors(doses).items()},
+        pairs=pair_table(changes, close_pairs(doses), groups),
         family=len(compared),
         losses={kind: sum(_loss(one) for one in changes if one.condition[0] == kind) for kind in kinds},
         tests=len(changes),
@@ -330,6 +370,21 @@ def _change_text(change: Change | None, met: bool) -> str:
         return "-"
     text = estimate_text(change.difference, 100, "+.0f")
     return (f"**{text}**" if change.certain else text) + (MET if met else "")
+
+
+def pair_table(changes: Sequence[Change], pairs: Sequence[tuple[Dose, Dose]], groups: Sequence[str]) -> str:
+    """Changes of success [points] at pairs of doses, side by side; "" if there are none."""
+    found = {(one.condition, one.group): one for one in changes}
+    every = [dose for pair in pairs for dose in pair]
+    head = ("Group", *(f"{dose.kind}, {100 * dose.measured:.1f} %" for dose in every))
+    lines = [
+        (
+            f"`{group}`",
+            *(_change_text(found.get((dose.condition, group)), group in dose.met_by) for dose in every),
+        )
+        for group in groups
+    ]
+    return markdown_table(head, lines) if pairs else ""
 
 
 def dose_table(doses: Sequence[Dose]) -> str:

@@ -20,7 +20,9 @@ from jobs.reporting.breaks import changes_of
 from jobs.reporting.dose_plan import check_planned, read_plan
 from jobs.reporting.dose_response import (
     RESULTS,
+    Dose,
     asked_error,
+    close_pairs,
     compare_kinds,
     doses_of,
     drawn_conditions,
@@ -135,8 +137,7 @@ def test_the_plan_stays_as_it_is_and_the_results_are_written_below_it(study, tmp
     text = page.read_text()
     assert text.startswith(f"{PLAN}\n{RESULTS}")
     assert "| `weak` | **worse**: -79 [" in text
-    assert "4 are *worse* and 0 *better*" in text
-    assert "Of 8 comparisons" in text
+    assert "(lost, displaced, flipped): of 6 comparisons 3 are *worse* and 0 *better*" in text
     assert text.count("\n| invented | 12.5 |") == 2
     assert "\n\n\n" not in text
     write_dose_response(study, docs, EnvConfig(), **study_places(study))
@@ -182,6 +183,35 @@ def test_another_sweep_is_not_published_as_the_planned_one(study, tmp_path, said
     with pytest.raises(ConfigError, match=rf"not the planned study: its {said}.*\+exp=dose_response. as it"):
         write_dose_response(study, tmp_path / "docs", EnvConfig(), **study_places(study))
     assert not (tmp_path / "docs").exists()
+
+
+def test_jitter_is_counted_apart_and_shown_where_its_event_error_is_close(study, tmp_path, monkeypatch):
+    measured = {"jittered 0.1": 0.006, "jittered 0.2": 0.105, "invented 0.1": 0.1, "invented 0.2": 0.2}
+
+    def error(env, clean):
+        keys = {"jittered": env.camera.latency_jitter_us, "invented": env.faults.background_activity}
+        return next((measured[f"{kind} {amount}"] for kind, amount in keys.items() if amount), 0.15)
+
+    monkeypatch.setattr(dose_response, "error_between", error)
+    page = write_dose_response(study, tmp_path / "docs", EnvConfig(), **study_places(study))
+    text = page.read_text()
+    said = (
+        "(jittered: 5.5 % in the mean over the doses, invented: 15.0 %): of 2 comparisons 1 is *worse* and 0"
+    )
+    assert f"**Not at the same event errors** {said} *better*" in text
+    assert "\n| Group | jittered, 10.5 % | invented, 10.0 % |\n" in text
+    assert "\n\n\n" not in text
+
+
+def test_doses_are_close_up_to_half_as_much_again():
+    def dose(kind, measured, asked=None):
+        return Dose(kind, str(measured), asked, measured, ())
+
+    worst = [dose("invented", error, error) for error in (0.1, 0.2)]
+    jitter = [dose("jittered", error) for error in (0.0, 0.066, 0.067, 0.257, 0.31)]
+    same = dose("lost", 0.1, 0.1)
+    assert close_pairs([*worst, same, *jitter]) == [(jitter[2], worst[0]), (jitter[3], worst[1])]
+    assert close_pairs(jitter) == []
 
 
 @pytest.mark.parametrize("kept", [0, 9])
