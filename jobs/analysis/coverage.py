@@ -53,7 +53,7 @@ def coverage(trainings: int, corridors: int, mean: float, spread: float) -> tupl
 
 @cache
 def coverage_text(trainings: int, corridors: int) -> str:
-    """How often the intervals of such a study hold a true rate near 80 %, in words."""
+    """How often the intervals of such a study hold the true rate, at a mean logit of 1.5, in words."""
     shares = [coverage(trainings, corridors, 1.5, spread)[0] for spread in SPREADS]
     named = [f"{100 * share:.0f} % at {spread:g}" for share, spread in zip(shares, SPREADS, strict=True)]
     return ", ".join(named)

@@ -15,7 +15,7 @@ from jobs.analysis.coverage import CORRIDORS, RATE, STUDIES
 from jobs.analysis.statistics import CONFIDENCE, crossed_difference
 from jobs.analysis.tables import show_table
 
-MEAN = 1.5  # logit of the better group: a rate of 80 %
+MEAN = 1.5  # logit of the better group: a rate of 80 % if its trainings agree
 LOOKS = (5, 10, 14)  # corridors
 DESIGNS = ((3, LOOKS), (3, (25, 50, 100)), (10, LOOKS))
 SPREADS = (0.0, 1.0, 2.0)  # of the trainings' logits

@@ -94,10 +94,21 @@ def _module_of(name: str) -> str:
 
 
 def _import_module(name: str) -> None:
-    """Import what Python finds; an empty module stands for it meanwhile, so that errors name its line."""
+    """Import what Python finds; an empty module stands for it meanwhile, so that errors name its line.
+
+    Raises:
+        ValueError: It has no file, as a folder without __init__.py: nothing could be shipped or digested.
+    """
     if spec := importlib.util.find_spec(name):
         _loaded[name] = importlib.util.module_from_spec(spec)
-    _loaded[name] = importlib.import_module(name)
+    module = _loaded[name] = importlib.import_module(name)
+    top = sys.modules[name.partition(".")[0]]  # what is shipped to workers
+    for one in (top, module):
+        if getattr(one, "__file__", None) is None:
+            rule = "must be a module or a package of Python files"
+            raise ValueError(
+                f"{rule}, got {one.__name__!r}, which has none; add an __init__.py to its folder"
+            )
 
 
 def _import_file(stem: str, path: Path) -> None:

@@ -10,6 +10,7 @@ from envs.config import EnvConfig, settings_hash
 from jobs.config.conditions import Condition, Setting, axis_points, moving_settings
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import env_with
+from jobs.config.schema import SweepConfig
 from jobs.evaluation.met import met
 from jobs.rollout.policies import Differences, EvaluatedPolicy, own_sensor_differences, with_sensor
 from jobs.rollout.tasks import EvaluationTask, make_task
@@ -68,9 +69,7 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
         ConfigError: If a policy's own sensor and a changed setting exclude each other.
     """
     configured = dataclasses.replace(config.env, scene=config.sweep.scene, split="eval")
-    axes: Axes = {NOMINAL: {config.sweep.scene: {}}}
-    for axis, settings in config.sweep.axes.items():
-        axes[axis] = {value_text(next(iter(point.values()))): point for point in axis_points(settings)}
+    axes = axes_of(config.sweep)
     tasks = [
         make_task(
             (axis, value),
@@ -93,6 +92,14 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
     own = {agent: found for agent, found in differences.items() if found}
     same = same_simulations(configured, axes)
     return Sweep(tuple(policies), own, axes, tuple(tasks), within, baselines_of(configured, axes), same)
+
+
+def axes_of(settings: SweepConfig) -> Axes:
+    """The axes of a sweep; the first is `NOMINAL`."""
+    axes: Axes = {NOMINAL: {settings.scene: {}}}
+    for name, axis in settings.axes.items():
+        axes[name] = {value_text(next(iter(point.values()))): point for point in axis_points(axis)}
+    return axes
 
 
 def same_simulations(configured: EnvConfig, axes: Axes) -> dict[Place, Place]:

@@ -52,7 +52,7 @@ def dose_plot(
     if met:
         keys.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="met in training"))
     figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), frameon=False, fontsize=9)
-    figure.supxlabel("Measured event error [%], on a scale of roots", fontsize=9)
+    figure.supxlabel("Measured event error [%], square-root scale", fontsize=9)
     figure.supylabel("Change of success [points]", fontsize=9)
     return figure
 

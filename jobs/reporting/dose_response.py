@@ -6,7 +6,7 @@ The plan stands on the page and is left as it is; what is below it is written fr
 import csv
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -21,6 +21,7 @@ from jobs.evaluation.group_stats import MET, Condition, TrainingEpisodes, episod
 from jobs.evaluation.sweep_plan import NOMINAL, Axes
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of
+from jobs.reporting.dose_plan import PLAN, check_planned, read_plan
 from jobs.reporting.dose_plot import dose_plot
 from jobs.reporting.sweep_data import read_sweep, write_data
 from jobs.rollout.policies import PRETRAINED
@@ -30,6 +31,7 @@ from models.policy.policy import MANIFEST
 
 DOSES = "dose_response"  # name of the experiment, and of what is published of it
 WORST = "invented"  # the kind that the plan compares with the others
+CLOSE = 1.5  # ratio of two measured event errors up to which doses of two kinds are shown side by side
 RESULTS = "## Results\n"  # what stands above it is the plan
 TEMPLATE = Path(__file__).parent / "templates" / f"{DOSES}.md.j2"
 DATA = ("Axis", "Value", "asked_event_error", "measured_event_error", "met_by")
@@ -64,6 +66,14 @@ class Dose(NamedTuple):
     def condition(self) -> Condition:
         """Axis and value."""
         return self.kind, self.value
+
+
+class Verdicts(NamedTuple):
+    """Of comparisons of invented events with some kinds: how many, and how many are worse and better."""
+
+    tests: int
+    worse: int
+    better: int
 
 
 class Compared(NamedTuple):
@@ -149,10 +159,9 @@ def over_doses(changes: Sequence[Change], doses: Sequence[Dose], swept: SweptEpi
     for group in dict.fromkeys(change.group for change in changes):
         for kind in dict.fromkeys(dose.kind for dose in doses):
             own = [one for one in changes if (one.group, one.condition[0]) == (group, kind)]
-            if len(own) == sum(dose.kind == kind for dose in doses):
-                each = [_success(swept[one.condition, group]) - _success(swept[one.baseline, group])
-                        for one in own]  # fmt: skip
-                found[group, kind] = np.mean(each, axis=0)
+            each = [_success(swept[one.condition, group]) - _success(swept[one.baseline, group])
+                    for one in own]  # fmt: skip
+            found[group, kind] = np.mean(each, axis=0)
     return found
 
 
@@ -175,6 +184,31 @@ def compare_kinds(means: Mapping[tuple[str, str], np.ndarray]) -> list[Compared]
     ]
 
 
+def count_verdicts(compared: Sequence[Compared], kinds: Collection[str]) -> Verdicts:
+    """Count the verdicts against some kinds."""
+    own = [one.verdict for one in compared if one.kind in kinds]
+    return Verdicts(len(own), own.count("worse"), own.count("better"))
+
+
+def mean_errors(doses: Sequence[Dose]) -> dict[str, float]:
+    """Kind -> measured event error, mean over its doses."""
+    kinds = dict.fromkeys(dose.kind for dose in doses)
+    return {kind: float(np.mean([one.measured for one in doses if one.kind == kind])) for kind in kinds}
+
+
+def close_pairs(doses: Sequence[Dose]) -> list[tuple[Dose, Dose]]:
+    """Doses that stand for no asked error, each with the nearest one of invented events if that is close."""
+    worst = [dose for dose in doses if dose.kind == WORST]
+    others = [dose for dose in doses if dose.asked is None] if worst else []
+    pairs = [(one, min(worst, key=lambda dose: abs(dose.measured - one.measured))) for one in others]
+    return [pair for pair in pairs if _ratio(*pair) <= CLOSE]
+
+
+def _ratio(one: Dose, other: Dose) -> float:
+    low, high = sorted((one.measured, other.measured))
+    return high / low if low else math.inf
+
+
 def _verdict(difference: Difference, adjusted_p: float) -> Literal["worse", "better", "undecided"]:
     low, high = difference.interval or (-1.0, 1.0)
     if adjusted_p >= 1 - CONFIDENCE or low <= 0.0 <= high:
@@ -182,23 +216,27 @@ def _verdict(difference: Difference, adjusted_p: float) -> Literal["worse", "bet
     return "worse" if high < 0.0 else "better"
 
 
-def write_dose_response(sweep: Path, docs: Path, env: EnvConfig, pretrained: Path = PRETRAINED) -> Path:
+def write_dose_response(
+    sweep: Path, docs: Path, env: EnvConfig, pretrained: Path = PRETRAINED, plan: Path = PLAN
+) -> Path:
     """Write the results below the plan, the plot and the data.
 
     Args:
         sweep: The folder that the sweep has left in its run folder.
         docs: Where the page is, or goes; plot and data into `images` and `data`.
-        env: The simulation of the sweep, in which event errors are measured.
+        env: The simulation in which event errors are measured; it must be that of the sweep.
         pretrained: Where the published policies are, which say what they met in training.
+        plan: The settings of the planned sweep.
 
     Returns:
         The page.
 
     Raises:
-        ConfigError: If an earlier version wrote the sweep.
+        ConfigError: If an earlier version wrote the sweep, or it is not the planned one, complete.
         RunError: If a file of the sweep is damaged.
     """
     about, swept = read_sweep(sweep)
+    check_planned(sweep, env, about, swept, read_plan(plan), pretrained)
     env = dataclasses.replace(env, scene=about["scene"], split="eval")
     doses = doses_of(about["axes"], env, drawn_conditions(about["groups"], pretrained))
     write_data(docs / "data", DOSES, sweep, swept)
@@ -212,8 +250,8 @@ def write_dose_response(sweep: Path, docs: Path, env: EnvConfig, pretrained: Pat
     doses, changes = read_doses(table), changes_of(about, swept)
     save_plot(docs / "images" / f"{DOSES}.png", draw(doses, changes))
     page = docs / f"{DOSES}.md"
-    plan = page.read_text().split(RESULTS)[0] if page.is_file() else ""
-    write_atomic(page, plan.rstrip("\n") + f"\n\n{RESULTS}" + results_text(about, swept, doses, changes))
+    above = page.read_text().split(RESULTS)[0] if page.is_file() else ""
+    write_atomic(page, above.rstrip("\n") + f"\n\n{RESULTS}" + results_text(about, swept, doses, changes))
     return page
 
 
@@ -245,6 +283,8 @@ def results_text(
     compared = compare_kinds(means)
     kinds = list(dict.fromkeys(dose.kind for dose in doses))
     groups = list(dict.fromkeys(change.group for change in changes))
+    apart = list(dict.fromkeys(dose.kind for dose in doses if dose.asked is None))
+    same = [kind for kind in kinds if kind not in (*apart, WORST)]
     return render(
         TEMPLATE,
         about=about,
@@ -253,8 +293,12 @@ def results_text(
         episodes=sum(len(own) for trainings in swept.values() for own in trainings.values()),
         means=means_table(means, groups, kinds),
         verdicts=verdict_table(compared, groups, kinds),
-        worse=sum(one.verdict == "worse" for one in compared),
-        better=sum(one.verdict == "better" for one in compared),
+        worst=WORST,
+        same=same,
+        at_dose=count_verdicts(compared, same),
+        apart=[(kind, count_verdicts(compared, [kind])) for kind in apart],
+        errors={kind: f"{100 * error:.1f}" for kind, error in mean_errors(doses).items()},
+        pairs=pair_table(changes, close_pairs(doses), groups),
         family=len(compared),
         losses={kind: sum(_loss(one) for one in changes if one.condition[0] == kind) for kind in kinds},
         tests=len(changes),
@@ -326,6 +370,21 @@ def _change_text(change: Change | None, met: bool) -> str:
         return "-"
     text = estimate_text(change.difference, 100, "+.0f")
     return (f"**{text}**" if change.certain else text) + (MET if met else "")
+
+
+def pair_table(changes: Sequence[Change], pairs: Sequence[tuple[Dose, Dose]], groups: Sequence[str]) -> str:
+    """Changes of success [points] at pairs of doses, side by side; "" if there are none."""
+    found = {(one.condition, one.group): one for one in changes}
+    every = [dose for pair in pairs for dose in pair]
+    head = ("Group", *(f"{dose.kind}, {100 * dose.measured:.1f} %" for dose in every))
+    lines = [
+        (
+            f"`{group}`",
+            *(_change_text(found.get((dose.condition, group)), group in dose.met_by) for dose in every),
+        )
+        for group in groups
+    ]
+    return markdown_table(head, lines) if pairs else ""
 
 
 def dose_table(doses: Sequence[Dose]) -> str:

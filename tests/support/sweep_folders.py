@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 
+from envs.config import EnvConfig
 from jobs.analysis.plots import Curve
+from jobs.config.env_keys import flat_env
 from jobs.evaluation.group_stats import LABELS
 from jobs.reporting.learning_curves import as_csv
 from jobs.rollout.episodes import EPISODE, write_episodes
@@ -74,7 +76,10 @@ def write_shipped(folder):
 
 
 def write_study(folder):
-    """Leave a dose response of two groups: one fails under invented events, one never; returns the folder."""
+    """Leave a dose response of two groups: one fails under invented events, one never; returns the folder.
+
+    Beside it are its plan, its simulation, and what is published of its groups, see `study_places`.
+    """
     axes = {"nominal": {"poles_eval": {}}}
     axes |= {kind: {str(one): {key: one} for one in (0.1, 0.2)} for kind, key in KINDS.items()}
     places = [[axis, value] for axis, points in axes.items() for value in points]
@@ -97,4 +102,22 @@ def write_study(folder):
             rows[axis, value, group, str(seed)] = episodes
     write_episodes(folder / "episodes.csv", LABELS, rows)
     (folder / "about.json").write_text(json.dumps(about))
+    write_plan(folder.parent, about)
     return folder
+
+
+def write_plan(run, about):
+    """Leave the plan of a dose response, its published policies and its simulation in a run folder."""
+    axes = {kind: {key: [0.1, 0.2]} for kind, key in KINDS.items()}
+    plan = {name: about[name] for name in ("scene", "trials", "reference")}
+    plan |= {"policies": list(about["groups"]), "axes": axes}
+    (run / "plan.yaml").write_text(json.dumps(plan))  # JSON is YAML
+    write_json(run / "config.json", flat_env(EnvConfig()))
+    for group, seeds in about["groups"].items():
+        for seed in seeds:
+            write_json(run / "published" / f"{group}-s{seed}" / MANIFEST, {})
+
+
+def study_places(study):
+    """Arguments of `write_dose_response` that name what lies beside a study."""
+    return {"pretrained": study.parent / "published", "plan": study.parent / "plan.yaml"}

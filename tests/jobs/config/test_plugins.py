@@ -1,3 +1,4 @@
+import importlib
 import sys
 from types import SimpleNamespace
 
@@ -123,6 +124,23 @@ def test_an_entry_point_that_leads_nowhere_is_refused_by_its_name(install):
             plugins.load_plugins([name])
         assert plugins.plugin_digests() == {}
     plugins.load_plugins(["good"])
+    assert "grove" in LAYOUTS
+
+
+@pytest.mark.parametrize("name", ["own_folder", "own_folder.own_module"])
+def test_a_folder_without_init_is_refused_as_nothing_of_it_could_be_shipped(
+    write, tmp_path, monkeypatch, name
+):
+    write(HEAD + GROVE, "own_folder/own_module.py")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ConfigError, match=rf"^plugins: {name}: .*'own_folder'.*add an __init__\.py"):
+        plugins.load_plugins([name])
+    assert plugins.with_plugins({}) == {}
+    write("", "own_folder/__init__.py")
+    for known in [known for known in sys.modules if known.startswith("own_folder")]:
+        monkeypatch.delitem(sys.modules, known)
+    importlib.invalidate_caches()
+    plugins.load_plugins(["own_folder.own_module"])
     assert "grove" in LAYOUTS
 
 

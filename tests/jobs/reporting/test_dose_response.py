@@ -3,20 +3,26 @@ import dataclasses
 import gzip
 import json
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from envs.config import EnvConfig, FaultsConfig
+from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from envs.event_error import error_between, event_error
 from envs.events import EVENT
 from envs.events.faults import PixelFaults, apply_faults
-from jobs.config.config import parse
+from jobs.config.config import ConfigError, parse
+from jobs.config.env_keys import flat_env
+from jobs.evaluation.sweep_plan import axes_of
 from jobs.reporting import dose_response
 from jobs.reporting.breaks import changes_of
+from jobs.reporting.dose_plan import check_planned, read_plan
 from jobs.reporting.dose_response import (
     RESULTS,
+    Dose,
     asked_error,
+    close_pairs,
     compare_kinds,
     doses_of,
     drawn_conditions,
@@ -28,7 +34,7 @@ from jobs.reporting.report import find_study
 from jobs.reporting.sweep_data import read_sweep, read_sweep_episodes
 from jobs.rollout.policies import PRETRAINED
 from tests.support.configs import compose, small_config
-from tests.support.sweep_folders import KINDS, write_study
+from tests.support.sweep_folders import KINDS, study_places, write_study
 
 ERRORS = (0.05, 0.1, 0.2, 0.4)
 PLAN = "# A plan\n\n- **Rule.** As it was.\n"
@@ -127,15 +133,14 @@ def test_the_plan_stays_as_it_is_and_the_results_are_written_below_it(study, tmp
     docs = tmp_path / "docs"
     (docs / "data").mkdir(parents=True)
     (docs / "dose_response.md").write_text(PLAN)
-    page = write_dose_response(study, docs, EnvConfig())
+    page = write_dose_response(study, docs, EnvConfig(), **study_places(study))
     text = page.read_text()
     assert text.startswith(f"{PLAN}\n{RESULTS}")
     assert "| `weak` | **worse**: -79 [" in text
-    assert "4 are *worse* and 0 *better*" in text
-    assert "Of 8 comparisons" in text
+    assert "(lost, displaced, flipped): of 6 comparisons 3 are *worse* and 0 *better*" in text
     assert text.count("\n| invented | 12.5 |") == 2
     assert "\n\n\n" not in text
-    write_dose_response(study, docs, EnvConfig())
+    write_dose_response(study, docs, EnvConfig(), **study_places(study))
     assert page.read_text() == text
     assert (docs / "images" / "dose_response.png").stat().st_size > 10_000
     with (docs / "data" / "dose_response_doses.csv").open() as file:
@@ -146,6 +151,91 @@ def test_the_plan_stays_as_it_is_and_the_results_are_written_below_it(study, tmp
     assert gzip.decompress(packed.read_bytes()) == (study / "episodes.csv").read_bytes()
     one, other = read_sweep_episodes(packed), read_sweep_episodes(study / "episodes.csv")
     assert one.keys() == other.keys()
+
+
+def test_the_plan_that_sweeps_are_checked_against_is_the_composed_one():
+    config = composed()
+    assert read_plan() == config.sweep
+    groups = {group: [0, 1, 2] for group in config.sweep.policies} | {"bytestream_hold": [0, 1, 2, 3]}
+    about = {"scene": "poles_eval", "trials": 14, "action": "stochastic", "groups": groups}
+    about["axes"] = axes_of(config.sweep)
+    with pytest.raises(ConfigError, match=r"must be a run folder .*, got 'absent'"):
+        check_planned(Path("absent/sweep"), config.env, about, {}, read_plan(), PRETRAINED)
+
+
+OTHERS = {
+    "trials must be 14, got 2": lambda about: about.update(trials=2),
+    "scene must be 'poles_eval', got 'poles'": lambda about: about.update(scene="poles"),
+    "action must be 'stochastic', got 'deterministic'": lambda about: about.update(action="deterministic"),
+    r"groups.steady must be \[0, 1, 2\], got nothing": lambda about: about["groups"].pop("steady"),
+    r"groups.weak must be \[0, 1, 2\], got \[0\]": lambda about: about["groups"].update(weak=[0]),
+    "groups.rgb must be nothing, got": lambda about: about["groups"].update(rgb=[0]),
+    "axes.flipped.0.2 must be {.*}, got nothing": lambda about: about["axes"]["flipped"].pop("0.2"),
+    "axes.lost.0.3 must be nothing, got": lambda about: about["axes"]["lost"].update({"0.3": {"a.b": 0.3}}),
+}
+
+
+@pytest.mark.parametrize("said", OTHERS)
+def test_another_sweep_is_not_published_as_the_planned_one(study, tmp_path, said):
+    about = json.loads((study / "about.json").read_text())
+    OTHERS[said](about)
+    (study / "about.json").write_text(json.dumps(about))
+    with pytest.raises(ConfigError, match=rf"not the planned study: its {said}.*\+exp=dose_response. as it"):
+        write_dose_response(study, tmp_path / "docs", EnvConfig(), **study_places(study))
+    assert not (tmp_path / "docs").exists()
+
+
+def test_jitter_is_counted_apart_and_shown_where_its_event_error_is_close(study, tmp_path, monkeypatch):
+    measured = {"jittered 0.1": 0.006, "jittered 0.2": 0.105, "invented 0.1": 0.1, "invented 0.2": 0.2}
+
+    def error(env, clean):
+        keys = {"jittered": env.camera.latency_jitter_us, "invented": env.faults.background_activity}
+        return next((measured[f"{kind} {amount}"] for kind, amount in keys.items() if amount), 0.15)
+
+    monkeypatch.setattr(dose_response, "error_between", error)
+    page = write_dose_response(study, tmp_path / "docs", EnvConfig(), **study_places(study))
+    text = page.read_text()
+    said = (
+        "(jittered: 5.5 % in the mean over the doses, invented: 15.0 %): of 2 comparisons 1 is *worse* and 0"
+    )
+    assert f"**Not at the same event errors** {said} *better*" in text
+    assert "\n| Group | jittered, 10.5 % | invented, 10.0 % |\n" in text
+    assert "\n\n\n" not in text
+
+
+def test_doses_are_close_up_to_half_as_much_again():
+    def dose(kind, measured, asked=None):
+        return Dose(kind, str(measured), asked, measured, ())
+
+    worst = [dose("invented", error, error) for error in (0.1, 0.2)]
+    jitter = [dose("jittered", error) for error in (0.0, 0.066, 0.067, 0.257, 0.31)]
+    same = dose("lost", 0.1, 0.1)
+    assert close_pairs([*worst, same, *jitter]) == [(jitter[2], worst[0]), (jitter[3], worst[1])]
+    assert close_pairs(jitter) == []
+
+
+@pytest.mark.parametrize("kept", [0, 9])
+def test_a_sweep_that_lacks_episodes_is_not_published(study, tmp_path, kept):
+    lines = (study / "episodes.csv").read_text().splitlines(keepends=True)
+    own = [line for line in lines if line.startswith("flipped,0.2,steady,1,")]
+    assert len(own) == 14
+    rest = [line for line in lines if line not in own[kept:]]
+    (study / "episodes.csv").write_text("".join(rest))
+    said = f"not complete: flipped 0.2 of steady s1 must have 14 episodes, got {kept}; give its command again"
+    with pytest.raises(ConfigError, match=said):
+        write_dose_response(study, tmp_path / "docs", EnvConfig(), **study_places(study))
+    assert not (tmp_path / "docs").exists()
+
+
+def test_event_errors_are_measured_in_the_simulation_of_the_sweep_or_not_at_all(study, tmp_path):
+    finer = EnvConfig(camera=CameraConfig(contrast_threshold=0.1))
+    said = "simulation of this command: its camera.contrast_threshold must be 0.1, got 0.2; leave"
+    with pytest.raises(ConfigError, match=said):
+        write_dose_response(study, tmp_path / "docs", finer, **study_places(study))
+    stored = flat_env(EnvConfig())
+    del stored["faults"]["flipped"]  # as an earlier version wrote it, which had none
+    (study.parent / "config.json").write_text(json.dumps(stored))
+    write_dose_response(study, tmp_path / "docs", EnvConfig(), **study_places(study))
 
 
 def test_markers_are_hollow_where_training_met_as_much(study):

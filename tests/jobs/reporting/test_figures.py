@@ -17,7 +17,7 @@ from jobs.reporting.summary_plots import still_going
 from jobs.reporting.sweep_data import read_sweep
 from jobs.rollout.policies import PRETRAINED
 from tests.support.episodes import flights
-from tests.support.sweep_folders import write_shipped, write_study, write_sweep
+from tests.support.sweep_folders import study_places, write_shipped, write_study, write_sweep
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 
@@ -32,7 +32,8 @@ def test_the_figures_of_a_report_are_drawn_again_from_its_data_alone(tmp_path, m
     monkeypatch.setattr(dose_response, "error_between", lambda one, other: 1 / 7)
     docs, again = tmp_path / "docs", tmp_path / "again.png"
     write_results(write_sweep(tmp_path / "sweep"), docs, write_shipped(tmp_path / "shipped"))
-    write_dose_response(write_study(tmp_path / "study"), docs, EnvConfig())
+    study = write_study(tmp_path / "study")
+    write_dose_response(study, docs, EnvConfig(), **study_places(study))
     drawn = figures(docs / "data")
     assert {f"{name}.png" for name in drawn} == {path.name for path in (docs / "images").iterdir()}
     for name, figure in drawn.items():

@@ -1,0 +1,30 @@
+import re
+from pathlib import Path
+
+from jobs.analysis.coverage import SPREADS, true_rate
+from jobs.analysis.stopping import EFFECTS, MEAN
+
+PAGE = (Path(__file__).parents[3] / "docs" / "statistics.md").read_text()
+
+
+def percent(mean, spread):
+    """A true rate as the page says it."""
+    return f"{100 * true_rate(mean, spread):.0f}"
+
+
+def test_the_page_says_the_true_rates_at_each_spread():
+    *first, last = (percent(1.5, spread) for spread in SPREADS)
+    assert f"the true rates are {', '.join(first)} and {last} %" in PAGE
+    assert f"a true rate of {percent(3, 0)} % where trainings agree, of {percent(3, 3)} % at a spread" in PAGE
+    ours, theirs = ([percent(MEAN - effect, spread) for spread in (0, 2)] for effect in EFFECTS)
+    said = f"true rates of {ours[0]} and {theirs[0]} % where trainings agree, of {ours[1]} and {theirs[1]} %"
+    assert said in PAGE
+
+
+def test_the_page_says_what_looking_early_costs_as_its_rows_do():
+    rows = re.findall(r"^\| \d+ \| \d+ \| \d \| (\d+) % \| (\d+) % \|", PAGE, re.MULTILINE)
+    losses = [1 - int(shared) / int(once) for once, shared in rows]
+    assert len(losses) == 4
+    assert 0.3 < min(losses) < 0.34
+    assert 0.4 < max(losses) < 0.5
+    assert "costs a third to nearly half of the decisions" in PAGE
