@@ -65,7 +65,8 @@ class RealSensor:
     Attributes:
         lost: Events of the last interval that the readout lost.
         is_noise: bool (N,), which events of the last interval no change of the light fired; empty unless
-            asked for. A displaced or flipped event is none.
+            asked for. A displaced or flipped event is none; but all that a plug-in returns otherwise than it
+            got it, be it only later, is one.
     """
 
     def __init__(

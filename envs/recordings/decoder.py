@@ -63,7 +63,7 @@ class Picture(NamedTuple):
     """One decoded picture.
 
     Attributes:
-        t_us: Its time in the file [us].
+        t_us: Its time in the file, less the time at which the file begins [us].
         values: (H, W, 3) of R, G and B, or (H, W) of grey; uint8, uint16 or float32.
     """
 

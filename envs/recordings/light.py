@@ -43,7 +43,7 @@ def luminance(values: np.ndarray, transfer: Transfer) -> np.ndarray:
     if values.dtype.kind == "u":
         light = light_of_grey(transfer, values.dtype.itemsize * 8)[values]
     else:
-        light = np.maximum(values, np.float32(0.0))
+        light = np.where(np.isneginf(values), np.float32(np.nan), np.maximum(values, np.float32(0.0)))
         light = light if transfer == "linear" else _undo_srgb(light).astype(np.float32)
     return light @ LUMA if values.ndim == 3 else light
 

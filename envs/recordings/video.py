@@ -1,8 +1,8 @@
 """Events that an event camera would have seen while a video, or a sequence of images, was taken.
 
-Times are the video's own presentation times, or those of the images. Between two frames the camera model
-takes log luminance as linear, so what is faster than the frames is not in the events; how much that may be
-is estimated from the frames (`envs.recordings.frame_rate`).
+Times are the video's own presentation times, less the time at which the file begins, or those of the images.
+Between two frames the camera model takes log luminance as linear, so what is faster than the frames is not in
+the events; how much that may be is estimated from the frames (`envs.recordings.frame_rate`).
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ class VideoStep:
     """What the camera saw from one frame of a video to the next.
 
     Attributes:
-        t_us: Time of the later frame [us], by the video's clock.
+        t_us: Time of the later frame [us], by the video's clock, less the time at which the file begins.
         events: EVENT array, sorted by t, none later than `t_us`.
         is_noise: bool (N,), which of them no change of the light fired.
         dropped: Events lost to the camera's `max_events_per_pixel` and its readout.

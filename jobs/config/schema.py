@@ -108,6 +108,8 @@ class VideoConfig:
         fps: Frames per second, in place of the times that the video or the folder has [Hz].
         transfer: How values become light; None: floating point is linear, whole numbers are sRGB.
         interpolate: What is taken to be between two frames.
+        luminance_floor: Of the camera, in place of its own, white = 1; None: what is right for the frames
+            (`envs.recordings.light.usual_floor`).
     """
 
     path: Name
@@ -115,6 +117,7 @@ class VideoConfig:
     fps: Annotated[float, Field(gt=0)] | None
     transfer: Literal["srgb", "linear"] | None
     interpolate: Literal["linear", "flow"]
+    luminance_floor: Annotated[float, Field(ge=1e-9, le=1)] | None
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -4,6 +4,7 @@ Run: python -m platform.launch +exp=video_events video.path=ride.mp4 camera=davi
 Expect: seconds to minutes. A line of numbers and the file, with labels of noise where its format holds them.
 """
 
+import dataclasses
 import warnings
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def seen(chosen: VideoConfig, env: EnvConfig, rng: np.random.Generator) -> Event
             warnings.simplefilter("always", UserWarning)
             file = video_to_events(
                 chosen.path,
-                env.camera,
+                dataclasses.replace(env.camera, luminance_floor=chosen.luminance_floor),
                 env.faults,
                 transfer=chosen.transfer,
                 fps=chosen.fps,

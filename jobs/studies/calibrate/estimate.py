@@ -24,11 +24,11 @@ from jobs.studies.calibrate.footage import (
     trains_of,
     with_bandwidth,
 )
-from jobs.studies.calibrate.found import Found, missing
+from jobs.studies.calibrate.found import Found, at_most, missing
 from jobs.studies.calibrate.hot_pixels import hot_pixels, hot_settings, unexplained
 from jobs.studies.calibrate.likeness import net_images
 from jobs.studies.calibrate.noise import FEWEST_PIXELS, noise_rates, still_rates
-from jobs.studies.calibrate.thresholds import equations, mismatch, thresholds
+from jobs.studies.calibrate.thresholds import NEGLIGIBLE, equations, mismatch, thresholds
 
 STILL = 1 / 3  # of a threshold: a pixel whose response changes by less rests
 FEWEST_EVENTS = 1000
@@ -218,7 +218,7 @@ def corrected(found: dict[str, Found], again: dict[str, Found]) -> dict[str, Fou
     """What was found, times what it should have been over what it was in the simulated recording.
 
     The simulated recording is as uncertain as the recorded one, so the intervals grow by the root of two; and
-    they reach half as far as the correction at least.
+    they reach half as far as the correction at least. What no camera can have is not taken.
     """
     better = {}
     for name in BY_LIGHT:
@@ -227,5 +227,20 @@ def corrected(found: dict[str, Found], again: dict[str, Found]) -> dict[str, Fou
             share, least = first.value / second.value, 0.5 * abs(first.value - second.value)
             below, above = (max(2**0.5 * abs(end - first.value), least) for end in (first.low, first.high))
             value = share * first.value
-            better[name] = Found(value, max(value - share * below, 0.0), value + share * above)
+            better[name] = possible(
+                name, Found(value, max(value - share * below, 0.0), value + share * above)
+            )
+        elif first.value and name == MISMATCH:
+            better[name] = at_most(first.value + 2**0.5 * (first.high - first.value))
     return better
+
+
+def possible(name: str, part: Found) -> Found:
+    """A setting as it was found, if a camera can have that value; a mismatch only if it is not 0 as well."""
+    if name == MISMATCH and part.low < NEGLIGIBLE:
+        return at_most(part.high)
+    try:
+        with_found(CameraConfig(), {name: part})
+    except ValueError:
+        return missing(f"frames and events do not fit each other: corrected it is {part.value:.3g}")
+    return part

@@ -30,6 +30,11 @@ def missing(reason: str) -> Found:
     return Found(None, reason=reason)
 
 
+def at_most(value: float) -> Found:
+    """A setting that may as well be 0."""
+    return missing(f"at most {value:.2g}")
+
+
 def resampled(pixels: int, rng: np.random.Generator) -> np.ndarray:
     """How often each of so many pixels is drawn, in `DRAWS` draws of as many with replacement; (DRAWS, P)."""
     return rng.multinomial(pixels, np.full(pixels, 1.0 / pixels), DRAWS).astype(np.float64)

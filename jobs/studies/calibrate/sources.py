@@ -1,10 +1,11 @@
 """A recording and the frames beside it, as files have them."""
 
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from envs.recordings import read_events
 from envs.recordings.event_file import EventFile
@@ -12,6 +13,9 @@ from envs.recordings.light import light_of_grey
 from jobs.studies.calibrate.estimate import Footage
 
 MAX_PIXELS = 1 << 28  # of all frames together: 1 GiB
+EIGHT_BITS = ("L", "LA", "P", "RGB", "RGBA")  # of Pillow's modes
+# What Pillow raises of files that are damaged, or too large to be decoded.
+BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
 BARE_ROW = re.compile(rb"\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")  # of the data set of Mueggler et al. (IJRR 2017)
 
 
@@ -33,12 +37,12 @@ def read_frames(path: str | Path, delay_us: int) -> Footage:
 
 def read_greys(path: str | Path) -> np.ndarray:
     """The pictures of such a text file, uint8 (K, H, W); raises as `read_frames`."""
-    path = Path(path)
-    pictures = [_picture(path.parent / name) for name in _frame_rows(path)[1]]
+    path, left, pictures = Path(path), MAX_PIXELS, []
+    for name in _frame_rows(path)[1]:
+        pictures.append(_picture(path.parent / name, left))
+        left -= pictures[-1].size
     if len({picture.shape for picture in pictures}) > 1:
         raise ValueError(f"{path}: pictures must all have one size")
-    if sum(picture.size for picture in pictures) > MAX_PIXELS:
-        raise ValueError(f"{path}: must have at most {MAX_PIXELS} pixels in all pictures; leave lines out")
     return np.stack(pictures)
 
 
@@ -56,13 +60,32 @@ def _frame_rows(path: Path) -> tuple[np.ndarray, list[str]]:
     return times_us, [row[1] for row in rows]
 
 
-def _picture(path: Path) -> np.ndarray:
-    """Greys of a picture, uint8 (H, W)."""
+def _picture(path: Path, left: int) -> np.ndarray:
+    """Greys of a picture of so many pixels at most, uint8 (H, W)."""
     try:
         with Image.open(path) as picture:
-            return np.asarray(picture.convert("L"))
-    except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path}: is no picture that can be read ({error})") from None
+            unfit = _unfit(picture, left)
+            grey = np.empty(0, np.uint8) if unfit else np.asarray(picture.convert("L"))
+    except BROKEN as error:
+        raise ValueError(
+            f"{path}: is no picture that can be read ({error}); save it again, as a PNG of 8 bits"
+        ) from None
+    if unfit:
+        raise ValueError(f"{path}: {unfit}")
+    return grey
+
+
+def _unfit(picture: Image.Image, left: int) -> str:
+    """Why a picture is refused by its header, before it takes memory; empty: it is not."""
+    if picture.mode not in EIGHT_BITS:
+        return f"must have 8 bits a value, got mode {picture.mode}; convert it to a grey picture of 8 bits"
+    width, height = picture.size
+    if width * height > left:
+        return (
+            f"must leave all pictures at {MAX_PIXELS} pixels or fewer together, got {width}x{height} after "
+            f"{MAX_PIXELS - left}; leave lines out"
+        )
+    return ""
 
 
 def read_recording(path: str | Path, frames: Footage | None) -> EventFile:
@@ -87,4 +110,4 @@ def read_recording(path: str | Path, frames: Footage | None) -> EventFile:
         raise ValueError(
             f"{path}: has {shape} pixels and its frames {frames.luminance.shape[1:]}; (H, W) must agree"
         )
-    return found
+    return found if shape else read_events(path, **size)  # which refuses events beside the frames

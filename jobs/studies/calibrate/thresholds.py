@@ -11,12 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jobs.analysis.statistics import CONFIDENCE
 from jobs.studies.calibrate.footage import Light, Trains, looked_up
-from jobs.studies.calibrate.found import Found, missing, resampled, with_interval
+from jobs.studies.calibrate.found import TAILS, Found, at_most, missing, resampled, with_interval
 
 RUN = 16  # events of a pixel that are compared with each other
 FEWEST_EVENTS = 200  # in all runs of three or more
 FEWEST_IN_HALF = 24  # of a pixel, for its own thresholds
+HIGHEST = 10.0  # that a camera may have (envs.config.CameraConfig)
+NEGLIGIBLE = 1e-3  # mismatch, that of rounding and less
+WIDEST = 1.0  # interval, as a share of the value: four standard errors
 
 
 class Stairs(NamedTuple):
@@ -91,25 +95,38 @@ def thresholds(found: Equations, rng: np.random.Generator) -> tuple[Found, Found
     if found.events.sum() < FEWEST_EVENTS:
         reason = f"fewer than {FEWEST_EVENTS} events between the frames"
         return missing(reason), missing(reason)
-    whole = matrix.sum(axis=0)
-    if abs(np.linalg.det(whole)) < 1e-9 * np.square(whole).sum():
+    if is_singular(matrix.sum(axis=0)):
         reason = "frames that never change the light of a pixel by a threshold"
         return missing(reason), missing(reason)
-    value = np.linalg.solve(whole, right.sum(axis=0))
+    value = np.linalg.solve(matrix.sum(axis=0), right.sum(axis=0))
     weights = resampled(len(right), rng)
-    drawn = np.linalg.solve(np.tensordot(weights, matrix, 1), (weights @ right)[..., None])[..., 0]
+    drawn, sums = np.tensordot(weights, matrix, 1), weights @ right
+    sound = ~is_singular(drawn)
+    if sound.mean() < CONFIDENCE:
+        reason = "too few pixels whose light changes"
+        return missing(reason), missing(reason)
+    drawn = np.linalg.solve(drawn[sound], sums[sound][..., None])[..., 0]
     on, off = (with_interval(value[k], drawn[:, k]) for k in range(2))
-    if not min(value) > 0.0:
+    # Frames of another scene tell nothing of the counts: the solution is anything, and its interval wide.
+    width = np.max((on.high - on.low, off.high - off.low) / value)
+    if not (np.min((on.low, off.low)) > 0.0 and max(value) <= HIGHEST and width < WIDEST):
         reason = "frames and events do not fit each other: check the clock and `calibrate.frame_delay_us`"
         return missing(reason), missing(reason)
     return on, off
+
+
+def is_singular(matrix: np.ndarray) -> np.ndarray:
+    """Which of the equations, (..., 2, 2), have no solution of their own; bool (...)."""
+    determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
+    return ~(np.abs(determinant) > 1e-9 * np.square(matrix).sum(axis=(-2, -1)))
 
 
 def mismatch(found: Equations, values: tuple[float, float], rng: np.random.Generator) -> Found:
     """Standard deviation of the thresholds over pixels, as a share of the mean.
 
     A pixel's thresholds are found twice, from halves of its runs. What is the same in both is the pixel,
-    what differs is chance: the covariance of the two is the variance over pixels.
+    what differs is chance: the covariance of the two is the variance over pixels. Where that may as well be
+    none, only the most that it can be is said.
     """
     good = (found.events >= FEWEST_IN_HALF).all(axis=0)
     matrix = found.matrix[:, good]
@@ -124,5 +141,10 @@ def mismatch(found: Equations, values: tuple[float, float], rng: np.random.Gener
     product = np.tensordot(weights, share[0] * share[1], 1) / weights.shape[1]
     drawn = (product - mean[:, 0] * mean[:, 1]).mean(axis=1)
     deviations = share - share.mean(axis=1, keepdims=True)
-    variance = (deviations[0] * deviations[1]).mean()
-    return with_interval(np.sqrt(max(variance, 0.0)), np.sqrt(np.maximum(drawn, 0.0)))
+    variance = float((deviations[0] * deviations[1]).mean())
+    low, high = np.quantile(drawn, TAILS)
+    if not low > NEGLIGIBLE**2:  # widened as a value that is corrected would be
+        return at_most(float(np.sqrt(max(variance, 0.0) + 2**0.5 * (high - variance))))
+    if variance > 1.0:
+        return missing("frames and events do not fit each other: thresholds differ by more than their mean")
+    return Found(variance**0.5, float(low**0.5), float(high**0.5))

@@ -133,12 +133,14 @@ def read_folder(folder: Path, events: str, delay_us: int) -> tuple[Truth, Footag
     Raises:
         ValueError: A file is refused, or the camera did more than move sideways.
     """
-    lens = Lens(*(float(word) for word in (folder / "calib.txt").read_text().split()))
+    lens = read_lens(folder / "calib.txt")
     poses = np.loadtxt(folder / "groundtruth.txt")
     if poses.shape[1:] != (8,) or np.abs(poses[:, 2:7] - poses[0, 2:7]).max() > 1e-3:
         raise ValueError(f"{folder / 'groundtruth.txt'}: must be of a camera that moves along x alone")
     footage = read_frames(folder / "images.txt", delay_us)
     recorded = read_recording(folder / events, footage).events
+    if not recorded.size:
+        raise ValueError(f"{folder / events}: must have events, got 0; name another file by `sliding.events`")
     inside = (footage.times_us >= recorded["t"][0]) & (footage.times_us <= recorded["t"][-1])
     if inside.sum() < 2:
         raise ValueError(f"{folder / events}: must last for two frames or more")
@@ -146,6 +148,25 @@ def read_folder(folder: Path, events: str, delay_us: int) -> tuple[Truth, Footag
     footage = Footage(footage.luminance[inside], footage.times_us[inside])
     span = (recorded["t"] > footage.times_us[0]) & (recorded["t"] <= footage.times_us[-1])
     return truth, footage, recorded[span]
+
+
+def read_lens(path: Path) -> Lens:
+    """The lens of a text file of 4 to 9 numbers.
+
+    Raises:
+        ValueError: It has others.
+    """
+    text = path.read_text()
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if not 4 <= len(numbers) <= len(Lens._fields) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"{path}: must have 4 to {len(Lens._fields)} numbers, {' '.join(Lens._fields)}; "
+            f"got {len(text.split())} words, {text[:60]!r}"
+        )
+    return Lens(*numbers)
 
 
 def find_depth(

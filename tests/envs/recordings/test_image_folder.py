@@ -280,7 +280,7 @@ def test_images_that_are_damaged_or_differ_are_refused(tmp_path):
     Image.fromarray(np.zeros(SHAPE, np.uint16)).save(folder / "frame_2.png")
     with pytest.raises(ValueError, match="change their size or depth"):
         quietly(folder, fps=10.0)
-    for bad in (np.nan, np.inf):
+    for bad in (np.nan, np.inf, -np.inf):
         frames = np.ones((3, *SHAPE, 3), np.float32)
         frames[1, 5, 5] = bad
         for camera in (None, CameraConfig(width=4, height=3)):

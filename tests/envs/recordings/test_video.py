@@ -92,6 +92,11 @@ def test_times_are_those_of_the_video_also_when_frames_are_not_evenly_spaced(tmp
     assert [step.t_us for step in video_steps(path)] == [round(n * 1_001_000 / 30) for n in range(1, 31)]
 
 
+def test_times_are_less_the_time_at_which_the_file_begins(tmp_path):
+    path = encode(tmp_path / "late.mkv", some_frames(4), "-output_ts_offset", "5")
+    assert [step.t_us for step in video_steps(path)] == [40_000, 80_000, 120_000]
+
+
 def test_without_a_camera_the_sensor_has_the_size_of_the_video(tmp_path):
     file = video_to_events(encode(tmp_path / "a.mkv", some_frames()))
     assert (file.width, file.height, file.format, file.dropped) == (16, 12, "video", 0)

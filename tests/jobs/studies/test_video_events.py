@@ -45,6 +45,19 @@ def test_a_format_without_labels_is_written_and_the_job_says_so(tmp_path, folder
     assert written.is_noise is None
 
 
+def test_a_grey_step_in_black_fires_no_event_unless_the_floor_of_the_video_is_low(tmp_path):
+    """Frames of 8 bits that are linear in light, where grey 1 may be noise."""
+    black = np.zeros((2, 12, 16, 3), np.uint8)
+    black[1] = 1
+    words = (f"video.path={save(tmp_path / 'black', black, '.png')}", "video.fps=50", "video.transfer=linear")
+    _, usual = converted(
+        tmp_path, *words, "camera.luminance_floor=1e-4", f"video.output={tmp_path / 'a.npz'}"
+    )
+    low = ("video.luminance_floor=1e-3", f"video.output={tmp_path / 'b.npz'}")
+    assert read_events(usual).events.size == 0
+    assert read_events(converted(tmp_path, *words, *low)[1]).events.size == 7 * 12 * 16
+
+
 @pytest.mark.parametrize(
     ("words", "key"),
     [

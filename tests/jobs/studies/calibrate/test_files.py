@@ -13,7 +13,7 @@ from envs.events import EVENT
 from envs.recordings import write_events
 from envs.recordings.light import light_of_grey
 from jobs.config.config import ConfigError, parse
-from jobs.studies.calibrate import calibrate
+from jobs.studies.calibrate import calibrate, sources
 from jobs.studies.calibrate.camera_file import camera_text
 from jobs.studies.calibrate.estimate import DEAD, LEAK, NAMES, OFF, ON, Calibration, Footage
 from jobs.studies.calibrate.found import Found, missing
@@ -131,6 +131,44 @@ def test_frames_that_are_none_are_refused(tmp_path, text, rule):
     (tmp_path / "images.txt").write_text(text)
     with pytest.raises(ValueError, match=rule):
         read_frames(tmp_path / "images.txt", 0)
+
+
+def test_pictures_that_cannot_be_decoded_to_eight_bits_are_refused(tmp_path, monkeypatch):
+    grey = Image.fromarray(np.arange(16, dtype=np.uint8).reshape(4, 4))
+    grey.save(tmp_path / "a.png")
+    (tmp_path / "images.txt").write_text("0.0 a.png\n0.1 b.png\n")
+    whole = (tmp_path / "a.png").read_bytes()
+    for broken in (whole[:33] + b"\xff" * 40, whole[:20], whole[:33] + b"\0\0\0\4IDAT" + bytes(8)):
+        (tmp_path / "b.png").write_bytes(broken)
+        with pytest.raises(ValueError, match=r"b.png: is no picture .*; save it again"):
+            read_frames(tmp_path / "images.txt", 0)
+    Image.fromarray(np.full((4, 4), 300, np.uint16)).save(tmp_path / "b.png")
+    with pytest.raises(ValueError, match=r"b\.png: must have 8 bits a value, got mode I;16"):
+        read_frames(tmp_path / "images.txt", 0)
+    grey.save(tmp_path / "b.png")
+    with monkeypatch.context() as patch:
+        patch.setattr(sources, "MAX_PIXELS", 31)
+        with pytest.raises(ValueError, match=r"b\.png: must leave all pictures at 31 pixels .* 4x4 after 16"):
+            read_frames(tmp_path / "images.txt", 0)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4)
+    with pytest.raises(ValueError, match=r"a\.png: is no picture .*exceeds limit"):
+        read_frames(tmp_path / "images.txt", 0)
+
+
+@pytest.mark.parametrize("suffix", ["npz", "csv"])
+def test_events_beside_the_frames_are_refused_where_the_recording_names_no_size(tmp_path, suffix):
+    frames = Footage(np.zeros((2, 4, 6), np.float32), np.array([0, 1000]))
+    for x, is_inside in ((5, True), (6, False)):
+        path = tmp_path / f"{x}.{suffix}"
+        if suffix == "npz":
+            np.savez(path, t=np.array([10]), x=np.array([x]), y=np.array([3]), p=np.array([1]), unit="us")
+        else:
+            path.write_text(f"t_us,x,y,p\n10,{x},3,1\n")
+        if is_inside:
+            assert (read_recording(path, frames).width, read_recording(path, frames).height) == (6, 4)
+        else:
+            with pytest.raises(ValueError, match=str(path)):
+                read_recording(path, frames)
 
 
 def run(tmp_path, *words):

@@ -1,11 +1,21 @@
 import numpy as np
 import pytest
+from PIL import Image
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
+from envs.events import EVENT
+from envs.recordings import write_events
 from jobs.studies.calibrate.estimate import Footage
 from jobs.studies.probe.dataset import SECTORS, ProbeData
 from jobs.studies.sliding.depth import Lens, distorted, inverse_depth, straightened
-from jobs.studies.sliding.sliding import Truth, score, undistorted, windows_of
+from jobs.studies.sliding.sliding import (
+    Truth,
+    read_folder,
+    read_lens,
+    score,
+    undistorted,
+    windows_of,
+)
 from jobs.studies.sliding.world import Slide, record_slides
 from tests.support.configs import compose
 
@@ -44,6 +54,29 @@ def test_a_lens_without_distortion_leaves_a_picture_and_one_with_it_is_undone():
     row, column = undistorted(LENS, (180, 240))
     back = np.hypot(down[row, column] - np.arange(180)[:, None], across[row, column] - np.arange(240))
     assert back[5:-5, 5:-5].max() < 2.0
+
+
+@pytest.mark.parametrize("words", ["1 2 3", "1 2 3 4 5 6 7 8 9 10", "1 2 3 four", "1 2 3 nan", ""])
+def test_a_lens_of_other_than_four_to_nine_numbers_is_refused(tmp_path, words):
+    path = tmp_path / "calib.txt"
+    path.write_text("335.4 335.4 129.9 99.2\n")
+    assert read_lens(path) == Lens(335.4, 335.4, 129.9, 99.2)
+    path.write_text(words)
+    with pytest.raises(
+        ValueError, match=rf"calib\.txt: must have 4 to 9 numbers, .*got {len(words.split())} "
+    ):
+        read_folder(tmp_path, "events.h5", 0)
+
+
+def test_a_recording_without_events_is_refused(tmp_path):
+    (tmp_path / "calib.txt").write_text("20 20 8 6")
+    np.savetxt(tmp_path / "groundtruth.txt", np.zeros((2, 8)))
+    for name in "ab":
+        Image.fromarray(np.zeros((12, 16), np.uint8)).save(tmp_path / f"{name}.png")
+    (tmp_path / "images.txt").write_text("0.0 a.png\n0.1 b.png\n")
+    write_events(tmp_path / "events.h5", np.zeros(0, EVENT), 16, 12)
+    with pytest.raises(ValueError, match=r"events\.h5: must have events, got 0"):
+        read_folder(tmp_path, "events.h5", 0)
 
 
 def test_a_nearer_pole_moves_faster_and_makes_more_events():
