@@ -14,7 +14,7 @@ from jobs.run.folder import run_name
 from models.kinds import KINDS, model_keys
 from tests.support.configs import CONF, compose
 
-SWEEPS = {"robustness": "sweep", "dose_response": "sweep"}
+JOBS = {"robustness": "sweep", "dose_response": "sweep", "calibrated_camera": "ablation"}
 POLICIES = {
     "bytestream": "bytestream",
     "bytestream_finetuned": "bytestream",
@@ -56,7 +56,7 @@ def changed(values: dict, key: str, value: object) -> dict:
 def test_every_experiment_is_accepted_with_every_budget(exp, budget):
     config = parse(compose(f"+exp={exp}", f"budget={budget}"))
     assert config.budget == budget
-    assert config.job == SWEEPS.get(exp, "pipeline" if exp in POLICIES else exp)
+    assert config.job == JOBS.get(exp, "pipeline" if exp in POLICIES else exp)
 
 
 @pytest.mark.parametrize("choice", CHOICES)
