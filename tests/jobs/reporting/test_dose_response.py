@@ -140,6 +140,8 @@ def test_the_plan_stays_as_it_is_and_the_results_are_written_below_it(study, tmp
     assert "(lost, displaced, flipped): of 6 comparisons 3 are *worse* and 0 *better*" in text
     assert text.count("\n| invented | 12.5 |") == 2
     assert "\n\n\n" not in text
+    for said in ("Hollow: a training", "false events per true event", "standard deviation of the delay [us]"):
+        assert said in text
     write_dose_response(study, docs, EnvConfig(), **study_places(study))
     assert page.read_text() == text
     assert (docs / "images" / "dose_response.png").stat().st_size > 10_000
