@@ -20,7 +20,7 @@ from jobs.config.env_keys import env_with
 from jobs.evaluation.group_stats import MET, Condition, TrainingEpisodes, episode_values
 from jobs.evaluation.sweep_plan import NOMINAL, Axes
 from jobs.evaluation.sweep_report import SweepFacts
-from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of
+from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of, replicated
 from jobs.reporting.dose_plot import dose_plot
 from jobs.reporting.sweep_data import read_sweep, write_data
 from jobs.rollout.policies import PRETRAINED
@@ -209,7 +209,7 @@ def write_dose_response(sweep: Path, docs: Path, env: EnvConfig, pretrained: Pat
     ]  # fmt: skip
     table = docs / "data" / f"{DOSES}_doses.csv"
     write_csv(table, DATA, rows)
-    doses, changes = read_doses(table), changes_of(about, swept)
+    doses, changes = read_doses(table), changes_of(about, swept, every=True)  # the plan names all of them
     save_plot(docs / "images" / f"{DOSES}.png", draw(doses, changes))
     page = docs / f"{DOSES}.md"
     plan = page.read_text().split(RESULTS)[0] if page.is_file() else ""
@@ -257,7 +257,7 @@ def results_text(
         better=sum(one.verdict == "better" for one in compared),
         family=len(compared),
         losses={kind: sum(_loss(one) for one in changes if one.condition[0] == kind) for kind in kinds},
-        tests=len(changes),
+        tests=len(replicated(changes)),
         changes=change_table(changes, doses, groups),
         doses=dose_table(doses),
         met=MET,

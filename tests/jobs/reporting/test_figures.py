@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from docs.draw_figures import STUDIES, figures
+from docs.from_data import STUDIES, figures
 from envs.config import EnvConfig
 from jobs.analysis.tables import save_plot
 from jobs.reporting import dose_response
@@ -90,9 +90,19 @@ def test_the_worst_condition_of_a_group_is_the_one_it_succeeds_least_in(tmp_path
 
 def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(tmp_path):
     about, episodes = read_sweep(write_sweep(tmp_path))
-    usual, changed = contacts(about, episodes)["bytestream"]
-    assert (len(usual), len(changed)) == (3 * 20, 2 * 3 * 20)
+    found = contacts(about, episodes)
+    assert [len(part) for part in found["bytestream"]] == [3 * 20, 2 * 3 * 20]
+    assert [len(part) for part in found["oracle"]] == [20, 0]  # sees no events: dead pixels change nothing
     about["axes"]["sparsity"]["0.5"]["env.scene"] = "poles_dense"
-    about["compared"][1]["same_as"] = about["compared"][0]["condition"]
-    usual, changed = contacts(about, episodes)["bytestream"]
-    assert (len(usual), len(changed)) == (3 * 20, 0)
+    episodes[("sparsity", "0.2"), "bytestream"] = episodes[("nominal", "poles_eval"), "bytestream"]
+    about["compared"].reverse()  # nothing changed stays nothing changed wherever it stands
+    assert [len(part) for part in contacts(about, episodes)["bytestream"]] == [3 * 20, 0]
+
+
+def test_a_group_that_was_not_evaluated_unchanged_is_left_out_of_how_far_episodes_get(tmp_path):
+    about, episodes = read_sweep(write_sweep(tmp_path))
+    about["compared"][2]["baseline"] = ["sparsity", "0.2"]
+    del episodes[("nominal", "poles_eval"), "bytestream"]
+    changes = changes_of(about, episodes)
+    assert {change.group for change in changes} == {"bytestream", "event_image"}
+    assert set(survivals(about, episodes, changes)) == {"event_image"}
