@@ -34,9 +34,17 @@ TITLES = {
 }
 
 
+# Conditions whose values say little, in words.
+WORDS = {
+    ("sensor_noise", "0"): "No noise of a real sensor",
+    ("sensor_noise", "0.1"): "Noise of a real sensor by day",
+    ("sensor_noise", "5"): "Noise of a real sensor by night",
+}
+
+
 def condition_text(axis: str, value: str) -> str:
     """A condition in words."""
-    return f"{TITLES.get(axis, axis)}: {value}"
+    return WORDS.get((axis, value)) or f"{TITLES.get(axis, axis)}: {value}"
 
 
 def results_figures(

@@ -47,7 +47,7 @@ KINDS = {
 
 
 def write_sweep(folder):
-    """Leave a sweep of three groups in `folder`; dead pixels fire none, and `oracle` sees none; returns it."""
+    """Leave a sweep of three groups in `folder`; dead pixels fire none, `oracle` sees none; returns it."""
     won = {"bytestream": 16, "event_image": 4, "oracle": 20}
     flown = {
         (axis, value, group, "" if seed is None else str(seed)): flights(won[group])

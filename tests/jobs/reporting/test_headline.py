@@ -3,7 +3,10 @@ import re
 
 import pytest
 
+from jobs.evaluation.group_stats import episode_values
+from jobs.reporting.breaks import changes_of
 from jobs.reporting.headline import BEGIN, COLUMNS, END, headline_table, with_headline
+from jobs.reporting.sweep_data import read_data
 from jobs.run.files import RunError
 from jobs.run.provenance import REPOSITORY
 from tests.support.episodes import flights
@@ -68,3 +71,60 @@ def test_published_rows_are_those_of_the_published_data(page):
         for heading, cell in cells.items():
             values = rates[(*COLUMNS[heading], group)]
             assert abs(float(cell.strip("*°")) - 100 * sum(values) / len(values)) <= 0.51, (group, heading)
+
+
+@pytest.fixture(scope="module")
+def sweep():
+    """The published sweep: what made it, and its episodes."""
+    return read_data(TRAININGS.parent, "robustness")
+
+
+def success(sweep, at, group):
+    return float(episode_values(sweep[1][at, group], "success").mean())
+
+
+def trained(about):
+    return {group for group, seeds in about["groups"].items() if None not in seeds}
+
+
+def test_what_the_readme_says_below_its_table_is_what_the_data_say(sweep):
+    """Noise costs the five groups that never met it; ten of eleven fail on textures; one holds."""
+    about, _ = sweep
+    groups = trained(about)
+    faults = {"sparsity", "background_activity", "sensor_noise"}
+    met = {group for axis, _, group in about["met"] if axis in faults}
+    unprepared = {one for one in groups - met if one.startswith("bytestream") or one == "event_set"}
+    assert len(unprepared) == 5
+    for group in unprepared:
+        noisy = [success(sweep, COLUMNS[name], group) for name in ("10 % false events", "noise by night")]
+        assert min(noisy) < success(sweep, COLUMNS["nothing changed"], group) / 2, group
+    below = [success(sweep, COLUMNS["other textures"], group) < 0.5 for group in groups]
+    assert (sum(below), len(below)) == (10, 11)
+    assert min(success(sweep, at, "bytestream_hold") for at in COLUMNS.values()) > 0.95
+
+
+def test_what_is_left_to_the_policy_that_holds_is_what_the_data_say(sweep):
+    about, _ = sweep
+    rates = {
+        (axis, value): success(sweep, (axis, value), "bytestream_hold")
+        for axis, points in about["axes"].items()
+        for value in points
+    }
+    dense = {("control_hz_dense", rate) for rate in ("25", "45", "100", "400", "800")}
+    assert {at for at, rate in rates.items() if round(100 * rate) < 95} == {
+        *dense,
+        ("memory_400hz", "legacy"),
+    }
+    shown = {rate: round(100 * rates["control_hz_dense", rate]) for rate in ("25", "45", "200", "800")}
+    assert shown == {"25": 59, "45": 70, "200": 95, "800": 77}
+    assert round(100 * rates["memory_400hz", "legacy"]) == 77
+
+
+def test_the_losses_that_the_page_calls_certain_are_those_of_the_data(sweep):
+    found = {(one.group, one.condition): one for one in changes_of(*sweep) if one.certain}
+    assert set(found) == {
+        ("bytestream", ("world", "poles_dense")),
+        ("event_set", ("world", "texture_change")),
+    }
+    ends = [[round(100 * part.mean()) for part in (one.before, one.success)] for one in found.values()]
+    assert sorted(ends) == [[90, 10], [93, 52]]
