@@ -54,8 +54,8 @@ def change_map(changes: Sequence[Change], groups: Sequence[str], labels: Mapping
     bar = figure.colorbar(picture, ax=panel, shrink=0.5, pad=0.01)
     bar.set_label("Change against the baseline [points]", fontsize=8)
     note = (
-        "Numbers: success [%], bold where the change is certain. Dots: each training, from 0 (left) to 100 %. "
-        "Empty: for this policy the same simulation as another row or the baseline."
+        "Numbers: success [%], bold where the change is certain. Dots: each training, from 0 (left) to 100 %."
+        " Empty: for this policy the same simulation as another row or the baseline."
     )
     figure.supxlabel(note, fontsize=8, color=MUTED)
     return figure
