@@ -4,7 +4,7 @@ Two questions are told apart. Would another training of the same kind break? Few
 `Change.certain`. Does this published training break? That its corridors tell: `Change.broken`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +27,9 @@ class Change(NamedTuple):
         group: What was trained.
         success: Rate under the condition, of each training (n,).
         before: Rate at the baseline (n,).
-        difference: Of the rates, of the same trainings in the same corridors; of one training the p is exact.
-        certain: Whether the change of the group is told apart from chance, among all tests of its family.
+        difference: Of the rates, of the same trainings in the same corridors; of one training over corridors.
+        certain: Whether the change of the group is told apart from chance, among all tests of its family; of
+            one training never.
         broken: bool (n,), whether each of these trainings loses for certain, among all tests of trainings.
     """
 
@@ -42,36 +43,84 @@ class Change(NamedTuple):
     broken: np.ndarray
 
 
-def changes_of(about: SweepFacts, episodes: SweptEpisodes) -> list[Change]:
-    """What each condition changes for each trained group; no simulation twice, and no baseline.
+def changes_of(about: SweepFacts, episodes: SweptEpisodes, every: bool = False) -> list[Change]:
+    """What each condition changes for each trained group; no simulation twice, and none against itself.
 
-    The tests of groups are one family, those of single trainings (McNemar's exact test) another: of the
-    changes called certain in one, at most one in twenty is expected to be due to chance (Benjamini and
-    Hochberg 1995).
+    The tests of groups with several trainings are one family, those of single trainings (McNemar's exact
+    test) another: of the changes called certain in one, at most one in twenty is expected to be due to chance
+    (Benjamini and Hochberg 1995). Of a group with a single training nothing follows for others: it is in the
+    second family alone.
+
+    Args:
+        about: What made the sweep.
+        episodes: All of its episodes.
+        every: Keep also what is the same simulation for a group alone, as event noise is for one that sees no
+            events: a plan that was written before names all of its conditions.
     """
-    found, alone = [], []
-    for one in about["compared"]:
-        at, baseline = place(one["condition"]), place(one["baseline"])
-        if at != place(one["same_as"]) or at == baseline:
-            continue
-        for group in about["groups"]:
-            here, there = episodes.get((at, group), {}), episodes.get((baseline, group), {})
-            if here and here.keys() == there.keys() and None not in here:
-                change, p_values = _change(at, baseline, group, here, there)
-                found.append(change)
-                alone.append(p_values)
+    found = [
+        _change(at, baseline, group, episodes[at, group], episodes[baseline, group])
+        for at, baseline, group in _told_apart(about, episodes, every)
+    ]
     if not found:
         return []
-    groups = _is_certain([1.0 if change.difference.p is None else change.difference.p for change in found])
+    changes, alone = [change for change, _ in found], [p_values for _, p_values in found]
     trainings = np.split(_is_certain(np.concatenate(alone)), np.cumsum([len(p) for p in alone])[:-1])
+    several = np.array([len(change.success) > 1 for change in changes])
+    certain = np.zeros(len(changes), bool)
+    certain[several] = _is_certain(np.array([_p(change) for change in changes])[several])
     return [
-        change._replace(certain=bool(certain), broken=own & (change.success < change.before))
-        for change, certain, own in zip(found, groups, trainings, strict=True)
+        change._replace(certain=bool(group), broken=own & (change.success < change.before))
+        for change, group, own in zip(changes, certain, trainings, strict=True)
     ]
 
 
-def _is_certain(p_values: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Which tests of a family are told apart from chance, bool (n,)."""
+def replicated(changes: Sequence[Change]) -> list[Change]:
+    """The changes of groups with several trainings, which can say something of others."""
+    return [change for change in changes if len(change.success) > 1]
+
+
+def content(trainings: TrainingEpisodes) -> bytes:
+    """All episodes of a group under a condition: equal under two that are the same simulation for it."""
+    return b"".join(own.tobytes() for own in trainings.values())
+
+
+def compared_pairs(about: SweepFacts) -> list[tuple[Condition, Condition]]:
+    """Condition and baseline of each change; of those that are the same at both ends the first."""
+    same = {place(one["condition"]): place(one["same_as"]) for one in about["compared"]}
+    found: dict[tuple[Condition, Condition], tuple[Condition, Condition]] = {}
+    for one in about["compared"]:
+        at, baseline = place(one["condition"]), place(one["baseline"])
+        ends = same[at], same.get(baseline, baseline)
+        if ends[0] != ends[1]:
+            found.setdefault(ends, (at, baseline))
+    return list(found.values())
+
+
+def _told_apart(
+    about: SweepFacts, episodes: SweptEpisodes, every: bool
+) -> Iterator[tuple[Condition, Condition, str]]:
+    """Condition, baseline and group of each change whose both ends were evaluated, see `changes_of`."""
+    seen = set()
+    for at, baseline in compared_pairs(about):
+        for group in about["groups"]:
+            here, there = episodes.get((at, group), {}), episodes.get((baseline, group), {})
+            if not here or here.keys() != there.keys() or None in here:
+                continue
+            ends = group, content(here), content(there)
+            if every or (ends[1] != ends[2] and ends not in seen):
+                seen.add(ends)
+                yield at, baseline, group
+
+
+def _p(change: Change) -> float:
+    """Of the group's test; 1 where a single episode leaves nothing to test."""
+    return 1.0 if change.difference.p is None else change.difference.p
+
+
+def _is_certain(p_values: np.ndarray) -> np.ndarray:
+    """Which tests of a family are told apart from chance, bool (n,); the family may be empty."""
+    if not p_values.size:
+        return np.zeros(0, bool)
     return np.asarray(false_discovery_control(p_values)) < 1 - CONFIDENCE
 
 
@@ -84,8 +133,6 @@ def _change(
         [exact_pair_p(ours > 0, theirs > 0) for ours, theirs in zip(success, before, strict=True)]
     )
     difference = crossed_mean(success - before, CHANGE)
-    if len(success) == 1:
-        difference = difference._replace(p=float(alone[0]))
     rates = success.mean(axis=1), before.mean(axis=1)
     return Change(at, baseline, group, *rates, difference, False, np.zeros(len(success), bool)), alone
 

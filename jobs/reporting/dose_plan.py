@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -70,7 +69,7 @@ def _published(group: str, pretrained: Path) -> list[int]:
     return sorted(int(name.rpartition("-s")[2]) for name in names if re.search(r"-s\d+$", name))
 
 
-def _stored_env(run: Path) -> dict[str, Any]:
+def _stored_env(run: Path) -> dict[str, object]:
     """The simulation of a run folder, in the groups of conf/."""
     stored = run / "config.json"
     if not stored.is_file():

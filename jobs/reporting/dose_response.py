@@ -20,7 +20,7 @@ from jobs.config.env_keys import env_with
 from jobs.evaluation.group_stats import MET, Condition, TrainingEpisodes, episode_values
 from jobs.evaluation.sweep_plan import NOMINAL, Axes
 from jobs.evaluation.sweep_report import SweepFacts
-from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of
+from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of, replicated
 from jobs.reporting.dose_plan import PLAN, check_planned, read_plan
 from jobs.reporting.dose_plot import dose_plot
 from jobs.reporting.sweep_data import read_sweep, write_data
@@ -247,7 +247,7 @@ def write_dose_response(
     ]  # fmt: skip
     table = docs / "data" / f"{DOSES}_doses.csv"
     write_csv(table, DATA, rows)
-    doses, changes = read_doses(table), changes_of(about, swept)
+    doses, changes = read_doses(table), changes_of(about, swept, every=True)  # the plan names all of them
     save_plot(docs / "images" / f"{DOSES}.png", draw(doses, changes))
     page = docs / f"{DOSES}.md"
     above = page.read_text().split(RESULTS)[0] if page.is_file() else ""
@@ -301,7 +301,9 @@ def results_text(
         pairs=pair_table(changes, close_pairs(doses), groups),
         family=len(compared),
         losses={kind: sum(_loss(one) for one in changes if one.condition[0] == kind) for kind in kinds},
-        tests=len(changes),
+        tests=len(replicated(changes)),
+        alone=sum(len(change.broken) for change in changes),
+        broken=broken_table(changes, groups, kinds),
         changes=change_table(changes, doses, groups),
         doses=dose_table(doses),
         met=MET,
@@ -316,6 +318,17 @@ def _loss(change: Change) -> bool:
 def _beyond(dose: Dose) -> bool:
     """Whether what was measured differs from what was asked by more than a tenth of it."""
     return not math.isclose(dose.measured, dose.asked or 0.0, rel_tol=0.1)
+
+
+def broken_table(changes: Sequence[Change], groups: Sequence[str], kinds: Sequence[str]) -> str:
+    """How often a training loses for certain, of all of its group at all doses of a kind."""
+
+    def cell(group: str, kind: str) -> str:
+        own = [one.broken for one in changes if one.group == group and one.condition[0] == kind]
+        return f"{sum(int(broken.sum()) for broken in own)} of {sum(map(len, own))}"
+
+    lines = [(f"`{group}`", *(cell(group, kind) for kind in kinds)) for group in groups]
+    return markdown_table(("Group", *kinds), lines)
 
 
 def means_table(

@@ -11,7 +11,7 @@ from jobs.evaluation.group_stats import Condition, GroupResult, summarise_group
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_plots import axis_figure, collision_figure
 from jobs.evaluation.sweep_report import SweepFacts
-from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, place
+from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, content, place
 from jobs.reporting.learning_curves import PublishedTraining
 from jobs.reporting.paper_claims import Claim, Finding, judge_all
 from jobs.reporting.summary_plots import Survival, axes_map, change_map, claims_plot, survival_plot
@@ -34,9 +34,17 @@ TITLES = {
 }
 
 
+# Conditions whose values say little, in words.
+WORDS = {
+    ("sensor_noise", "0"): "No noise of a real sensor",
+    ("sensor_noise", "0.1"): "Noise of a real sensor by day",
+    ("sensor_noise", "5"): "Noise of a real sensor by night",
+}
+
+
 def condition_text(axis: str, value: str) -> str:
     """A condition in words."""
-    return f"{TITLES.get(axis, axis)}: {value}"
+    return WORDS.get((axis, value)) or f"{TITLES.get(axis, axis)}: {value}"
 
 
 def results_figures(
@@ -105,17 +113,21 @@ def numeric_axes(about: SweepFacts, results: Sequence[GroupResult]) -> dict[str,
 
 
 def contacts(about: SweepFacts, episodes: SweptEpisodes) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Group -> EPISODE without any change, and under all changes in the same scene, no simulation twice."""
-    here = [
-        place(one["condition"])
-        for one in about["compared"]
-        if place(one["condition"]) == place(one["same_as"])
-        and _scene(about, one["condition"]) == about["scene"]
-    ]
+    """Group -> EPISODE without any change, and under all changes in the same scene, no simulation twice.
+
+    What is the same simulation depends on the group: one that sees no events is not changed by sensor faults.
+    """
+    every = [place(one["condition"]) for one in about["compared"]]
+    here = sorted(
+        (at for at in every if _scene(about, at) == about["scene"]), key=lambda at: at[0] != NOMINAL
+    )
     found = {}
     for group in about["groups"]:
-        usual = [at for at in here if at[0] == NOMINAL]
-        others = [at for at in here if at[0] != NOMINAL]
+        first: dict[bytes, Condition] = {}
+        for at in here:
+            first.setdefault(content(episodes.get((at, group), {})), at)
+        usual = [at for at in first.values() if at[0] == NOMINAL]
+        others = [at for at in first.values() if at[0] != NOMINAL]
         found[group] = _all_episodes(episodes, usual, group), _all_episodes(episodes, others, group)
     return found
 
@@ -133,10 +145,15 @@ def _all_episodes(episodes: SweptEpisodes, conditions: Sequence[Condition], grou
 def survivals(
     about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[Change]
 ) -> Mapping[str, Survival]:
-    """Group -> its episodes with nothing changed, and under the condition in which it succeeds least."""
+    """Group -> its episodes with nothing changed, and under the condition in which it succeeds least.
+
+    A group of which nothing was evaluated unchanged, as its task failed, is left out.
+    """
     (value,) = about["axes"][NOMINAL]
     found = {}
     for group in dict.fromkeys(change.group for change in changes):
+        if ((NOMINAL, value), group) not in episodes:
+            continue
         own = (change for change in changes if change.group == group)
         worst = min(own, key=lambda one: one.success.mean()).condition
         found[group] = Survival(

@@ -9,7 +9,7 @@ from jobs.analysis.tables import markdown_table
 from jobs.evaluation.group_stats import MET, Condition, episode_values
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.reporting.breaks import SweptEpisodes
-from jobs.run.files import RunError, write_atomic
+from jobs.run.files import RunError
 
 COLUMNS: dict[str, Condition] = {
     "nothing changed": (NOMINAL, "poles_eval"),
@@ -54,16 +54,14 @@ def headline_table(
     return markdown_table(("policy (trainings)", *COLUMNS), [cells for _, cells in lines], 1)
 
 
-def write_headline(page: Path, table: str) -> None:
-    """Put the table between the marks of a page; a page that does not exist is left so.
+def with_headline(page: Path, table: str) -> str:
+    """The text of a page with the table between its marks.
 
     Raises:
         RunError: The page has no such marks.
     """
-    if not page.is_file():
-        return
     before, begin, rest = page.read_text().partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise RunError(f"{page}: the lines {BEGIN.strip()!r} and {END.strip()!r} must enclose its table")
-    write_atomic(page, "".join((before, BEGIN, "\n", table, "\n", END, after)))
+    return "".join((before, BEGIN, "\n", table, "\n", END, after))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from jobs.analysis.coverage import coverage_text
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot, write_csv
@@ -25,10 +26,10 @@ from jobs.evaluation.group_stats import (
 )
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
-from jobs.reporting.breaks import Change, SweptEpisodes, changes_of
+from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, replicated
 from jobs.reporting.dose_response import DOSES, write_dose_response
 from jobs.reporting.figures import TITLES, condition_text, group_results, judge_claims, results_figures
-from jobs.reporting.headline import headline_table, write_headline
+from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
 from jobs.reporting.paper_claims import GAIN, Claim, Finding
 from jobs.reporting.replay_page import PAGE
@@ -127,20 +128,58 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
     """
     about, episodes = read_sweep(sweep)
     trainings = published_trainings(pretrained)
+    # All of it before anything is replaced: what cannot be drawn must leave data, figures and pages in step.
+    figures = results_figures(about, episodes, trainings)
+    pages = results_pages(about, episodes, trainings, list(figures), docs, pretrained)
     write_data(docs / "data", SWEEP, sweep, episodes)
     write_csv(docs / "data" / TRAININGS, PublishedTraining._fields, trainings)
-    figures = results_figures(about, episodes, trainings)
+    write_figures(docs / "images", figures)
+    for name, text in pages.items():
+        write_atomic(docs / name, text)
+    return docs / "results.md"
+
+
+def write_figures(images: Path, figures: Mapping[str, Figure]) -> None:
+    """Save figures by their names, packed."""
     for name, figure in figures.items():
-        picture = docs / "images" / f"{name}.png"
+        picture = images / f"{name}.png"
         save_plot(picture, figure)
         copy_plot(picture, picture)
+
+
+def results_pages(
+    about: SweepFacts,
+    episodes: SweptEpisodes,
+    trainings: Sequence[PublishedTraining],
+    figures: Sequence[str],
+    docs: Path,
+    pretrained: Path,
+) -> dict[str, str]:
+    """Name of each page of the results -> its text.
+
+    Args:
+        about: What made the sweep.
+        episodes: All of its episodes.
+        trainings: The published trainings, for the claims about learning.
+        figures: Names of those of the results.
+        docs: Where pages are: results.md links to trade.md, and robustness.md gets its table, if it is there.
+        pretrained: Where the published policies are, of which some share an encoder.
+
+    Raises:
+        RunError: If robustness.md has no marks around its table.
+    """
     values = page_values(about, episodes, trainings, docs, pretrained)
     names = [name.removeprefix("results_") for name in figures]
     shown = [(name, TITLES.get(name, name)) for name in names if name not in ("map", "claims", "survival")]
-    for name in ("results", "results_tables"):
-        write_atomic(docs / f"{name}.md", render(TEMPLATES / f"{name}.md.j2", plots=shown, **values))
-    write_headline(docs / "robustness.md", headline_table(about["groups"], episodes, met_places(about)))
-    return docs / "results.md"
+    pages = {
+        f"{name}.md": render(TEMPLATES / f"{name}.md.j2", plots=shown, **values)
+        for name in ("results", "results_tables")
+    }
+    headline = docs / "robustness.md"
+    if headline.is_file():
+        table = headline_table(about["groups"], episodes, met_places(about))
+        pages[headline.name] = with_headline(headline, table)
+    return pages
 
 
 def page_values(
@@ -160,7 +199,7 @@ def page_values(
         "groups": ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
         "short": in_short(about, episodes, changes, findings),
         "breaks": breaks_table(about, changes),
-        "tests": len(changes),
+        "tests": len(replicated(changes)),
         "claims": claims_table(findings),
         "family": sum(one.adjusted_p is not None for one in findings.values()),
         "gain": GAIN,
@@ -182,41 +221,43 @@ def in_short(
     findings: Mapping[Claim, Finding],
 ) -> list[str]:
     """What a reader wants to know first: which policy to take, what breaks most, what the paper had right."""
-    (nominal,) = [(NOMINAL, value) for value in about["axes"][NOMINAL]]
     trained = [group for group in about["groups"] if any(change.group == group for change in changes)]
-    mean = {
-        group: np.mean([change.success.mean() for change in changes if change.group == group])
-        for group in trained
-    }
-    least = {
-        group: min(
-            (change for change in changes if change.group == group), key=lambda one: one.success.mean()
-        )
-        for group in trained
-    }
-    sentences = []
-    if trained:
-        best = max(mean, key=lambda group: mean[group])
-        at, worst_of_best = condition_text(*least[best].condition), 100 * least[best].success.mean()
-        unchanged = 100 * episode_values(episodes[nominal, best], "success").mean()
-        sentences.append(
-            f"Take `{best}`: {unchanged:.0f} % with nothing changed, {100 * mean[best]:.0f} % as the mean "
-            f'of all conditions, least in "{at}" with {worst_of_best:.0f} %.'
-        )
+    sentences = _best_policy(about, episodes, changes)
     broken: Counter[Condition] = Counter()
     for change in changes:
         broken[change.condition] += int(change.broken.sum())
     every = sum(len(about["groups"][group]) for group in trained)
     worst = [f'"{condition_text(*at)}" ({count} of {every})' for at, count in broken.most_common(3) if count]
     sentences.append(f"What breaks most of the published trainings: {', '.join(worst) or 'nothing'}.")
-    certain = sum(change.certain and change.difference.value < 0 for change in changes)
+    certain = sum(change.certain and _loses(change) for change in changes)
     sentences.append(
-        f"Of {len(changes)} changes of groups {certain} are losses that are certain for further trainings "
-        "too: with three trainings a group only losses on which all agree can be."
+        f"Of {len(replicated(changes))} changes of groups with several trainings {certain} are losses that "
+        "are certain for further trainings too: with three trainings a group only losses on which all agree "
+        "can be."
     )
     verdicts = Counter(one.verdict for one in findings.values())
     counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
     return [*sentences, f"Of the paper's {len(findings)} claims: {counted}."]
+
+
+def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[Change]) -> list[str]:
+    """The sentence on the group that succeeds most; none if nothing was evaluated unchanged of any."""
+    (value,) = about["axes"][NOMINAL]
+    own = {
+        group: [change for change in changes if change.group == group]
+        for group in about["groups"]
+        if ((NOMINAL, value), group) in episodes
+    }
+    mean = {group: np.mean([one.success.mean() for one in of]) for group, of in own.items() if of}
+    if not mean:
+        return []
+    best = max(mean, key=lambda group: mean[group])
+    least = min(own[best], key=lambda one: one.success.mean())
+    unchanged = 100 * episode_values(episodes[(NOMINAL, value), best], "success").mean()
+    return [
+        f"Take `{best}`: {unchanged:.0f} % with nothing changed, {100 * mean[best]:.0f} % as the mean of all "
+        f'conditions, least in "{condition_text(*least.condition)}" with {100 * least.success.mean():.0f} %.'
+    ]
 
 
 def shared_encoders(about: SweepFacts, pretrained: Path) -> str:
@@ -239,10 +280,11 @@ def breaks_table(about: SweepFacts, changes: Sequence[Change]) -> str:
         lost = [change for change in own if change.broken.any() or (change.certain and _loses(change))]
         lost.sort(key=lambda change: (-change.broken.mean(), change.difference.value))
         if own:
-            before = next((one.before for one in own if one.baseline == (NOMINAL, nominal)), own[0].before)
+            before = next((one.before for one in own if one.baseline == (NOMINAL, nominal)), None)
             name = f"`{group}`" + (" (1 training)" if len(seeds) == 1 else "")
             texts = [_loss_text(change) for change in lost]
-            lines.append((name, f"{100 * before.mean():.0f}", "; ".join(texts) or "none is certain"))
+            unchanged = "-" if before is None else f"{100 * before.mean():.0f}"
+            lines.append((name, unchanged, "; ".join(texts) or "none is certain"))
     head = ("Group", "Nothing changed [%]", "Breaks under")
     return markdown_table(head, lines, len(head))
 

@@ -55,6 +55,7 @@ def change_map(changes: Sequence[Change], groups: Sequence[str], labels: Mapping
     bar.set_label("Change against the baseline [points]", fontsize=8)
     note = (
         "Numbers: success [%], bold where the change is certain. Dots: each training, from 0 (left) to 100 %."
+        " Empty: for this policy the same simulation as another row or the baseline."
     )
     figure.supxlabel(note, fontsize=8, color=MUTED)
     return figure
@@ -131,8 +132,8 @@ def survival_plot(groups: Mapping[str, Survival], length_m: float) -> Figure:
                 panel.step(x, 100 * share, where="post", color=colour, lw=0.7, alpha=0.45)
             x, share = still_going(np.concatenate(trainings), length_m)
             panel.step(x, 100 * share, where="post", color=colour, lw=2.0)
-        panel.set_title(group, loc="left", fontsize=9, color=INK)
-        panel.text(0.03, 0.05, own.worst, transform=panel.transAxes, fontsize=6.5, color=RED)
+        panel.set_title(group, loc="left", fontsize=9, color=INK, pad=15)
+        panel.text(0.0, 1.04, own.worst, transform=panel.transAxes, fontsize=7, color=RED)
         panel.set(xlim=(0, length_m), ylim=(0, 103))
         panel.tick_params(labelsize=8, labelbottom=True)
         tidy(panel)

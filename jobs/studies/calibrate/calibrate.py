@@ -9,7 +9,6 @@ ones.
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -116,14 +115,15 @@ def assumed(camera: CameraConfig, still: bool) -> CameraConfig:
 
     That is how light becomes a response, and of a still scene the thresholds and the refractory period.
     """
-    taken: dict[str, Any] = {"response": camera.response, "luminance_floor": camera.luminance_floor}
-    if still:
-        taken |= {
-            "contrast_threshold": camera.contrast_threshold,
-            "contrast_threshold_off": camera.contrast_threshold_off,
-            "refractory_us": camera.refractory_us,
-        }
-    return CameraConfig(**taken)
+    usual = CameraConfig(response=camera.response, luminance_floor=camera.luminance_floor)
+    if not still:
+        return usual
+    return dataclasses.replace(
+        usual,
+        contrast_threshold=camera.contrast_threshold,
+        contrast_threshold_off=camera.contrast_threshold_off,
+        refractory_us=camera.refractory_us,
+    )
 
 
 def compared(calibration: Calibration, camera: CameraConfig, faults: FaultsConfig) -> dict[str, tuple]:

@@ -106,7 +106,7 @@ def study(tmp_path, monkeypatch):
 def test_invented_events_are_worse_where_they_are_and_nowhere_else(study):
     about, swept = read_sweep(study)
     doses = doses_of(about["axes"], EnvConfig(scene="poles_eval"), {})
-    means = over_doses(changes_of(about, swept), doses, swept)
+    means = over_doses(changes_of(about, swept, every=True), doses, swept)
     found = {(one.group, one.kind): one for one in compare_kinds(means)}
     assert set(found) == {(group, kind) for group in about["groups"] for kind in KINDS if kind != "invented"}
     assert {place: one.verdict for place, one in found.items()} == {
@@ -247,7 +247,7 @@ def test_markers_are_hollow_where_training_met_as_much(study):
         "weak": [{KINDS["flipped"]: {"low": 0.0, "high": 1.0}}],
     }
     doses = doses_of(about["axes"], EnvConfig(), drawn)
-    figure = dose_response.draw(doses, changes_of(about, swept))
+    figure = dose_response.draw(doses, changes_of(about, swept, every=True))
     panels = {
         panel.get_title(loc="left").split(",")[0]: panel for panel in figure.axes if panel.get_visible()
     }

@@ -1,20 +1,24 @@
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
-from docs.draw_figures import STUDIES, figures
+from docs import from_data
+from docs.from_data import STUDIES, figures, main, pages
 from envs.config import EnvConfig
-from jobs.analysis.tables import save_plot
-from jobs.reporting import dose_response
+from jobs.analysis.tables import save_plot, write_csv
+from jobs.reporting import dose_response, report
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.dose_response import write_dose_response
-from jobs.reporting.figures import contacts, survivals
-from jobs.reporting.learning_curves import published_trainings, read_curves, read_trainings
+from jobs.reporting.figures import condition_text, contacts, survivals
+from jobs.reporting.headline import BEGIN, END
+from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_curves, read_trainings
 from jobs.reporting.report import write_results
 from jobs.reporting.summary_plots import still_going
-from jobs.reporting.sweep_data import read_sweep
+from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_sweep, write_data
 from jobs.rollout.policies import PRETRAINED
 from tests.support.episodes import flights
 from tests.support.sweep_folders import study_places, write_shipped, write_study, write_sweep
@@ -39,6 +43,39 @@ def test_the_figures_of_a_report_are_drawn_again_from_its_data_alone(tmp_path, m
     for name, figure in drawn.items():
         save_plot(again, figure)
         np.testing.assert_array_equal(pixels(again), pixels(docs / "images" / f"{name}.png"))
+
+
+@pytest.mark.slow
+def test_the_published_pages_are_those_of_the_published_data(monkeypatch):
+    """`python -m docs.from_data` changes nothing; coverage is simulated elsewhere."""
+    was = (DOCS / "results.md").read_text()
+    (coverage,) = re.findall(r"between trainings, (.*) do\.", was)
+    monkeypatch.setattr(report, "coverage_text", lambda trainings, corridors: coverage)
+    drawn = sorted((DOCS / "images").glob("results_*.png"))
+    shown = re.findall(r"images/(results_\w+)\.png", was + (DOCS / "results_tables.md").read_text())
+    assert sorted(shown) == [path.stem for path in drawn]
+    found = pages(DOCS, shown)
+    assert list(found) == ["results.md", "results_tables.md", "robustness.md"]
+    for name, text in found.items():
+        assert text == (DOCS / name).read_text(), f"{name}: renew it by python -m docs.from_data"
+
+
+def test_pages_and_figures_are_written_from_the_data_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "coverage_text", lambda trainings, corridors: "95 % at 0")
+    docs, again = tmp_path / "docs", tmp_path / "again"
+    docs.mkdir()
+    (docs / "robustness.md").write_text(f"before\n{BEGIN}{END}")
+    write_data(docs / "data", SWEEP, write_sweep(tmp_path / "sweep"), read_sweep(tmp_path / "sweep")[1])
+    trainings = published_trainings(write_shipped(tmp_path / "shipped"))
+    write_csv(docs / "data" / TRAININGS, PublishedTraining._fields, trainings)
+    monkeypatch.setattr(from_data, "results_figures", lambda *data: {"results_map": Figure()})
+    main(docs, again)
+    written = {str(path.relative_to(again)) for path in again.rglob("*") if path.is_file()}
+    assert written == {"results.md", "results_tables.md", "robustness.md", "images/results_map.png"}
+    assert "| `bytestream` (3) | 80 |" in (again / "robustness.md").read_text()
+    assert (docs / "robustness.md").read_text() == f"before\n{BEGIN}{END}"
+    main(docs, docs)
+    assert (docs / "robustness.md").read_text() == (again / "robustness.md").read_text()
 
 
 @pytest.mark.slow
@@ -91,9 +128,24 @@ def test_the_worst_condition_of_a_group_is_the_one_it_succeeds_least_in(tmp_path
 
 def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(tmp_path):
     about, episodes = read_sweep(write_sweep(tmp_path))
-    usual, changed = contacts(about, episodes)["bytestream"]
-    assert (len(usual), len(changed)) == (3 * 20, 2 * 3 * 20)
+    found = contacts(about, episodes)
+    assert [len(part) for part in found["bytestream"]] == [3 * 20, 2 * 3 * 20]
+    assert [len(part) for part in found["oracle"]] == [20, 0]  # sees no events: dead pixels change nothing
     about["axes"]["sparsity"]["0.5"]["env.scene"] = "poles_dense"
-    about["compared"][1]["same_as"] = about["compared"][0]["condition"]
-    usual, changed = contacts(about, episodes)["bytestream"]
-    assert (len(usual), len(changed)) == (3 * 20, 0)
+    episodes[("sparsity", "0.2"), "bytestream"] = episodes[("nominal", "poles_eval"), "bytestream"]
+    about["compared"].reverse()  # nothing changed stays nothing changed wherever it stands
+    assert [len(part) for part in contacts(about, episodes)["bytestream"]] == [3 * 20, 0]
+
+
+def test_a_condition_is_told_in_words():
+    assert condition_text("sensor_noise", "5") == "Noise of a real sensor by night"
+    assert condition_text("speed", "40") == "Speed: 40"
+
+
+def test_a_group_that_was_not_evaluated_unchanged_is_left_out_of_how_far_episodes_get(tmp_path):
+    about, episodes = read_sweep(write_sweep(tmp_path))
+    about["compared"][2]["baseline"] = ["sparsity", "0.2"]
+    del episodes[("nominal", "poles_eval"), "bytestream"]
+    changes = changes_of(about, episodes)
+    assert {change.group for change in changes} == {"bytestream", "event_image"}
+    assert set(survivals(about, episodes, changes)) == {"event_image"}

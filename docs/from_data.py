@@ -1,25 +1,28 @@
-"""Redraw the figures of the result pages from docs/data alone: no run folder and no store is needed.
+"""Make the result pages and their figures again from docs/data alone: no run folder and no store is needed.
 
-Run from the repository root: python -m docs.draw_figures [FOLDER]
-Writes each figure whose data are there into FOLDER, by default docs/images; docs/data.md explains the data.
+Run from the repository root: python -m docs.from_data [FOLDER]
+Writes results.md, results_tables.md, the table of robustness.md, and each figure whose data are there, as
+`+exp=report` does, into FOLDER and FOLDER/images; by default docs. docs/data.md explains the data.
 """
 
 import csv
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from jobs.analysis.tables import save_plot
 from jobs.evaluation.group_stats import episode_values
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.dose_response import DOSES, draw, read_doses
 from jobs.reporting.figures import results_figures
 from jobs.reporting.learning_curves import read_trainings
+from jobs.reporting.report import results_pages, write_figures
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_episodes
+from jobs.rollout.policies import PRETRAINED
+from jobs.run.files import write_atomic
 from jobs.studies.ablation.page import plot_variants, variant_result
 from jobs.studies.trade.page import draw_settings
 
@@ -33,7 +36,9 @@ def results(data: Path) -> dict[str, Figure]:
 
 def dose_response(data: Path) -> dict[str, Figure]:
     """That of dose_response.md."""
-    return {DOSES: draw(read_doses(data / f"{DOSES}_doses.csv"), changes_of(*read_data(data, DOSES)))}
+    return {
+        DOSES: draw(read_doses(data / f"{DOSES}_doses.csv"), changes_of(*read_data(data, DOSES), every=True))
+    }
 
 
 def ablation(data: Path) -> dict[str, Figure]:
@@ -72,9 +77,36 @@ def figures(data: Path) -> Mapping[str, Figure]:
     return found
 
 
+def pages(docs: Path, drawn: Collection[str]) -> dict[str, str]:
+    """Name of each page of the results -> its text; none without their data.
+
+    Args:
+        docs: Where the data and the pages are.
+        drawn: Names of the figures that there are.
+    """
+    data = docs / "data"
+    if not all((data / name).is_file() for name in STUDIES[results]):
+        return {}
+    names = [name for name in drawn if name.startswith("results_")]
+    return results_pages(*read_data(data, SWEEP), read_trainings(data / TRAININGS), names, docs, PRETRAINED)
+
+
+def main(docs: Path, target: Path) -> None:
+    """Write pages and figures.
+
+    Args:
+        docs: Where the data and the pages are.
+        target: Where pages go, figures into `images`.
+    """
+    drawn = figures(docs / "data")
+    texts = pages(docs, drawn)
+    (target / "images").mkdir(parents=True, exist_ok=True)
+    write_figures(target / "images", drawn)
+    for name, text in texts.items():
+        write_atomic(target / name, text)
+    for name in (*texts, *(f"images/{name}.png" for name in drawn)):
+        sys.stdout.write(f"{target / name}\n")
+
+
 if __name__ == "__main__":
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS / "images"
-    target.mkdir(parents=True, exist_ok=True)
-    for name, figure in figures(DOCS / "data").items():
-        save_plot(target / f"{name}.png", figure)
-        sys.stdout.write(f"{target / name}.png\n")
+    main(DOCS, Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS)
