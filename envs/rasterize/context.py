@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from OpenGL import GL
 from OpenGL.error import Error
+from OpenGL.plugins import FormatHandler
 from pyrender.camera import PerspectiveCamera
 from pyrender.platforms import egl
 from pyrender.renderer import Renderer
@@ -24,6 +25,8 @@ from pyrender.shader_program import ShaderProgram
 from envs.rasterize.shaders import FRAGMENT, VERTEX, source
 from envs.scene.textures import noise_tile
 
+# From Python 3.12 on the type of ctypes.byref has a name that PyOpenGL 3.1.0, which pyrender pins, lacks.
+FormatHandler("byref", "OpenGL.arrays.ctypesparameters.CtypesParameterHandler", ["_ctypes.CArgObject"])
 EGL = egl.egl  # imported before pyrender, OpenGL.EGL breaks the import of OpenGL.GL.shaders
 MULTISAMPLES = 4
 
