@@ -76,6 +76,7 @@ def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_reru
     assert len(json.loads(Path(table).read_text())["data"]) == len(figures)
 
 
+@pytest.mark.system  # four seconds of MLflow's store
 def test_a_failed_task_stands_in_the_table_and_its_child_comes_when_it_is_evaluated(tmp_path):
     config = in_store(sweep_config(tmp_path), tmp_path)
     executor = FakeExecutor()
@@ -92,6 +93,7 @@ def test_a_failed_task_stands_in_the_table_and_its_child_comes_when_it_is_evalua
     assert len(children) == 5
 
 
+@pytest.mark.system  # four seconds of MLflow's store
 def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differs_from_training(
     tmp_path,
 ):
