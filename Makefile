@@ -81,11 +81,11 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine on
 	$(MLFLOW_ENV) $(BIN)/mlflow server --workers 1 --host 127.0.0.1 --port 5000 \
 	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
 
-test: setup ## the quick tests (3 minutes on two cores)
+test: setup ## the quick tests (4 minutes on two cores)
 	$(PYTEST) --dist worksteal $(ARGS)
 
-test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the site, the notebooks (7 minutes)
-	$(PYTEST) -m "system and not slow" --numprocesses 3 --dist loadgroup $(ARGS) # they mostly wait
+test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the site, the notebooks (8 minutes)
+	$(PYTEST) -m "system and not slow" --dist loadgroup $(ARGS)
 
 test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
 	$(PYTEST) -m slow --dist loadgroup $(ARGS)
@@ -122,7 +122,9 @@ lint: $(INSTALLED) ## check style, format, types, and who imports whom
 
 check: ## what must pass before a change is merged
 	$(MAKE) --jobs 2 lint setup
-	for tests in test test-system; do $(MAKE) $$tests || $(MAKE) $$tests PYTEST='$(ALONE)' ARGS='--numprocesses 0 $(ARGS)' || exit 1; done
+	for tests in test test-system; do \
+	    $(MAKE) $$tests || $(MAKE) $$tests PYTEST='$(ALONE)' ARGS='--numprocesses 0 $(ARGS)' || exit 1; \
+	done
 
 bench: setup ## measure the speed of the parts, and what accuracy of the simulator costs
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done

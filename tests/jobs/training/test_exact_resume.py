@@ -85,11 +85,11 @@ def assert_same(mine, other):
     ("name", "runners"),
     [
         *(pytest.param(name, 0, marks=pytest.mark.slow if name in ALIKE else ()) for name in TRAINED),
-        ("finetuned", 1),
+        pytest.param("finetuned", 1, marks=pytest.mark.slow),
         ("bytestream", 2),
         ("imitation", 2),
         ("begun", 0),
-        ("privileged", 2),
+        pytest.param("privileged", 2, marks=pytest.mark.slow),
     ],
 )
 def test_a_training_goes_on_from_its_checkpoint_with_the_same_bytes(name, runners, tmp_path):
