@@ -5,6 +5,7 @@ from hypothesis import given, settings, strategies
 from envs.events import EVENT
 from envs.events.neighbour_filter import filter_all, filter_neighbours, quiet_sensor
 from models.policy.event_filter import EventFilter
+from tests.support.event_files import some_events
 
 WIDTH, HEIGHT, TAU_US = 7, 5, 300
 
@@ -13,12 +14,7 @@ supports = strategies.integers(1, 8)
 
 
 def make_stream(seed, count, end_us=3000):
-    rng = np.random.default_rng(seed)
-    events = np.zeros(count, EVENT)
-    events["t"] = np.sort(rng.integers(0, end_us, count))
-    events["x"], events["y"] = rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count)
-    events["p"] = rng.choice([-1, 1], count)
-    return events
+    return some_events(seed, count, WIDTH, HEIGHT, end_us)
 
 
 def passing(events, support, tau_us=TAU_US):
