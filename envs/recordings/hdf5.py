@@ -103,7 +103,7 @@ def read_recording(path: Path) -> Recording:
             for name in file["index"]:
                 _declared_length(file, f"index/{name}", MAX_INDEX)
                 index[name] = file[f"index/{name}"][:]
-            about = json.loads(file.attrs["about"])
+            about = json.loads(_attribute(file, "about"))
     except (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError) as error:
         raise ValueError(f"{path} is no readable event recording ({error}); collect it again") from error
     return Recording(events, index, about)
@@ -173,16 +173,27 @@ def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
 
 def _sensor(file: h5py.File) -> tuple[int | None, int | None]:
     """Width and height by the attributes, or by the sensor settings of a recording."""
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", str(file.attrs.get("geometry", "")), re.ASCII)
-    if found:
+    given = file.attrs
+    geometry = str(_attribute(file, "geometry")) if "geometry" in given else ""
+    if found := re.fullmatch(r"(\d{1,5})x(\d{1,5})", geometry, re.ASCII):
         return int(found[1]), int(found[2])
-    if "width" in file.attrs and "height" in file.attrs:
-        return int(file.attrs["width"]), int(file.attrs["height"])
-    about = json.loads(file.attrs.get("about", "{}"))
+    if "width" in given and "height" in given:
+        return int(_attribute(file, "width")), int(_attribute(file, "height"))
+    about = json.loads(_attribute(file, "about")) if "about" in given else {}
     sensor = about.get("sensor") if isinstance(about, dict) else None
     if not isinstance(sensor, dict) or not all(type(sensor.get(name)) is int for name in ("width", "height")):
         return None, None
     return sensor["width"], sensor["height"]
+
+
+def _attribute(file: h5py.File, name: str) -> Any:
+    """One number or text; anything else that a damaged type declares, such as a list, can crash HDF5."""
+    stored = file.attrs.get_id(name)
+    if stored.shape != () or not isinstance(
+        stored.get_type(), (h5py.h5t.TypeIntegerID, h5py.h5t.TypeStringID)
+    ):
+        raise ValueError(f"the attribute {name} is no single number or text")
+    return file.attrs[name]
 
 
 def _columns(request: Request, file: h5py.File) -> np.ndarray:
