@@ -43,6 +43,7 @@ MAX_CHUNK_BYTES = 1 << 28
 # bitshuffle) crashed on damaged files, or (lz4, zstd) take the memory that the data declare.
 FILTERS = (1, 2, 3, 32000, 32001, 32026)
 BLOSC = (32001, 32026)
+FLETCHER32, CHECKSUM_BYTES = 3, 4
 NOISE = "events/is_noise"  # labels, where there are any
 HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
 # How data sets are compressed, and given a checksum, so that a flipped bit is noticed.
@@ -308,13 +309,21 @@ def _check_chunks(data: h5py.Dataset, name: str) -> None:
     """Refuse huge chunks, and filters that are unknown or are told another size of elements or chunks."""
     if data.chunks and int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize > MAX_CHUNK_BYTES:
         raise ValueError(f"{name} has chunks of more than {MAX_CHUNK_BYTES} bytes")
-    pipeline = data.id.get_create_plist()
-    for number, code in enumerate(_filters(data)):
+    pipeline, filters = data.id.get_create_plist(), _filters(data)
+    for number, code in enumerate(filters):
         if code not in FILTERS:
             raise ValueError(f"{name} is packed with the filter {code}; write it again with blosc or gzip")
         sizes = (data.dtype.itemsize, data.dtype.itemsize * data.chunks[0]) if data.chunks else ()
         if code in BLOSC and pipeline.get_filter(number)[2][2:4] != sizes:
             raise ValueError(f"{name} describes its packing wrongly")
+    if FLETCHER32 in filters:  # HDF5 looks for the checksum in front of a chunk that is too short for it
+        stored: list[int] = []
+        data.id.chunk_iter(lambda chunk: stored.append(chunk.size))
+        if (
+            filters.index(FLETCHER32) < len(filters) - 1
+            or min(stored, default=CHECKSUM_BYTES) < CHECKSUM_BYTES
+        ):
+            raise ValueError(f"{name} has a chunk without its checksum")
 
 
 def _filters(data: h5py.Dataset) -> list[int]:

@@ -102,6 +102,16 @@ def test_an_attribute_that_is_no_single_number_or_text_is_refused_unread(kind, n
         read_events(path)
 
 
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_chunk_that_is_shorter_than_its_checksum_is_refused_unread(size, tmp_path):
+    path = tmp_path / "a.h5"
+    write_events(path, EVENTS, 34, 34)
+    with h5py.File(path, "a") as file:
+        file["events/x"].id.write_direct_chunk((0,), bytes(size))
+    with pytest.raises(ValueError, match="events/x has a chunk without its checksum"):
+        read_events(path)
+
+
 @pytest.mark.system
 def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
     bomb = tmp_path / "bomb.npz"
