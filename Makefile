@@ -91,7 +91,7 @@ test-slow: setup ## what continuous integration leaves out for its length (an ho
 	$(PYTEST) -m slow --dist loadgroup $(ARGS)
 
 test-faults: setup ## inject faults into running jobs and print what was lost (18 minutes)
-	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 2 --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 3 --dist worksteal $(ARGS)
 
 test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (10 minutes)
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 \

@@ -142,7 +142,7 @@ def test_a_bug_in_the_simulation_stops_at_once_with_its_reason(tmp_path, runners
 
 
 NO_WORLD = """
-def refuse(self, *values):
+def refuse(self, *values, **named):
     raise TypeError("there is no such world")
 CorridorVectorEnv.__init__ = refuse
 """
