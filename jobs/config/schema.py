@@ -328,7 +328,7 @@ class AblationConfig:
     """
 
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]
-    variants: Annotated[dict[AxisName, dict[str, Any]], Field(min_length=1)]
+    variants: dict[AxisName, dict[str, Any]]
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -50,9 +50,11 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
         executor: Computes the missing episodes; None: on all cores.
 
     Raises:
-        ConfigError: A variant has a wrong key or value.
+        ConfigError: There is no variant, or one has a wrong key or value.
     """
     variants = config.ablation.variants
+    if not variants:
+        raise ConfigError("ablation.variants: must name at least one, got none; +exp=ablation names ten")
     first = next(iter(variants))
     for name in variants:
         variant_config(config, name, config.ablation.seeds[0])
