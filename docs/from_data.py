@@ -21,6 +21,7 @@ from jobs.reporting.figures import results_figures
 from jobs.reporting.learning_curves import read_trainings
 from jobs.reporting.report import results_pages, write_figures
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_episodes
+from jobs.reporting.taught_claims import TAUGHT, draw_taught
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_atomic
 from jobs.studies.ablation.page import plot_variants, variant_result
@@ -39,6 +40,11 @@ def dose_response(data: Path) -> dict[str, Figure]:
     return {
         DOSES: draw(read_doses(data / f"{DOSES}_doses.csv"), changes_of(*read_data(data, DOSES), every=True))
     }
+
+
+def taught_claims(data: Path) -> dict[str, Figure]:
+    """That of taught_claims.md."""
+    return {TAUGHT: draw_taught(*read_data(data, TAUGHT))}
 
 
 def ablation(data: Path) -> dict[str, Figure]:
@@ -63,6 +69,7 @@ def trade(data: Path) -> dict[str, Figure]:
 STUDIES = {
     results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
     dose_response: (f"{DOSES}_episodes.csv.gz", f"{DOSES}_about.json", f"{DOSES}_doses.csv"),
+    taught_claims: (f"{TAUGHT}_episodes.csv.gz", f"{TAUGHT}_about.json"),
     ablation: ("ablation_episodes.csv.gz",),
     trade: ("trade_settings.csv",),
 }

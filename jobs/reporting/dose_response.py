@@ -23,16 +23,16 @@ from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of, replicated
 from jobs.reporting.dose_plan import PLAN, check_planned, read_plan
 from jobs.reporting.dose_plot import dose_plot
+from jobs.reporting.planned_page import write_below_plan
 from jobs.reporting.sweep_data import read_sweep, write_data
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.files import read_json, write_atomic
+from jobs.run.files import read_json
 from jobs.run.templates import render
 from models.policy.policy import MANIFEST
 
 DOSES = "dose_response"  # name of the experiment, and of what is published of it
 WORST = "invented"  # the kind that the plan compares with the others
 CLOSE = 1.5  # ratio of two measured event errors up to which doses of two kinds are shown side by side
-RESULTS = "## Results\n"  # what stands above it is the plan
 TEMPLATE = Path(__file__).parent / "templates" / f"{DOSES}.md.j2"
 DATA = ("Axis", "Value", "asked_event_error", "measured_event_error", "met_by")
 # Settings that make errors of a kind in a training: their shares are comparable with those of the sweep.
@@ -249,10 +249,7 @@ def write_dose_response(
     write_csv(table, DATA, rows)
     doses, changes = read_doses(table), changes_of(about, swept, every=True)  # the plan names all of them
     save_plot(docs / "images" / f"{DOSES}.png", draw(doses, changes))
-    page = docs / f"{DOSES}.md"
-    above = page.read_text().split(RESULTS)[0] if page.is_file() else ""
-    write_atomic(page, above.rstrip("\n") + f"\n\n{RESULTS}" + results_text(about, swept, doses, changes))
-    return page
+    return write_below_plan(docs / f"{DOSES}.md", results_text(about, swept, doses, changes))
 
 
 def read_doses(file: Path) -> list[Dose]:

@@ -10,6 +10,8 @@ from jobs.evaluation.group_stats import RATE, Condition, TrainingEpisodes, episo
 from jobs.reporting.breaks import CHANGE
 
 GAIN = {"success": 0.1, "distance_m": 10.0}  # the smallest difference that matters
+# Factor, format and unit in which a measure is shown.
+UNITS = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
 Verdict = Literal["holds", "reversed", "equivalent", "does not hold", "undecided", "not tested"]
 Measure = Literal["success", "distance_m"]
 Find = Callable[[Condition, str], TrainingEpisodes]  # of a group under a condition; empty if there are none

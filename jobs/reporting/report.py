@@ -3,7 +3,8 @@
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
 docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page, the results in
-docs/dose_response.md of the newest sweep of that experiment; with `resume` of what that run folder holds.
+docs/dose_response.md and docs/taught_claims.md of the newest studies of these names; with `resume` of what
+that run folder holds.
 """
 
 from collections import Counter
@@ -31,9 +32,10 @@ from jobs.reporting.dose_response import DOSES, write_dose_response
 from jobs.reporting.figures import TITLES, condition_text, group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
-from jobs.reporting.paper_claims import GAIN, Claim, Finding
+from jobs.reporting.paper_claims import GAIN, UNITS, Claim, Finding
 from jobs.reporting.replay_page import PAGE
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, write_data
+from jobs.reporting.taught_claims import TAUGHT, write_taught_claims
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.checkpoints import sha256
 from jobs.run.files import read_json, write_atomic
@@ -42,7 +44,6 @@ from jobs.run.progress import console
 from jobs.run.templates import render
 
 TEMPLATES = Path(__file__).parent / "templates"
-UNITS = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -57,6 +58,7 @@ def run(config: Config) -> dict[str, Any]:
         "sweep": write_results,
         "replay": write_replay,
         DOSES: partial(write_dose_response, env=config.env),
+        TAUGHT: write_taught_claims,
     }
     found = {name: find_study(config, name) for name in writers}
     if not any(found.values()):
@@ -75,13 +77,15 @@ def find_study(config: Config, name: str) -> Path | None:
     Args:
         config: The experiment.
         name: "sweep", "trade" or "replay", as its folder is called; `DOSES` is the sweep of that experiment,
-            "sweep" that of any other.
+            "sweep" that of any other, `TAUGHT` the ablation of that experiment.
     """
     where = Path(config.runs_dir).glob("*") if config.resume is None else [Path(config.resume)]
-    folder = "sweep" if name == DOSES else name
+    folder = {DOSES: "sweep", TAUGHT: "ablation"}.get(name, name)
     found = [path for path in (run / folder / "about.json" for run in where) if path.is_file()]
     if folder == "sweep":
         found = [path for path in found if (read_json(path).get("exp") == DOSES) == (name == DOSES)]
+    if folder == "ablation":
+        found = [path for path in found if read_json(path).get("exp") == name]
     newest = max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
     return newest and newest.parent
 

@@ -1,17 +1,22 @@
 """Folders that sweeps leave, and published trainings, made of constructed episodes and curves."""
 
+import dataclasses
+import itertools
 import json
 
 import numpy as np
 
 from envs.config import EnvConfig
 from jobs.analysis.plots import Curve
+from jobs.config.config import parse
 from jobs.config.env_keys import flat_env
 from jobs.evaluation.group_stats import LABELS
+from jobs.evaluation.sweep_plan import axes_of, baselines_of, same_simulations
 from jobs.reporting.learning_curves import as_csv
 from jobs.rollout.episodes import EPISODE, write_episodes
 from jobs.run.files import write_json
 from models.policy.policy import MANIFEST
+from tests.support.configs import compose
 from tests.support.episodes import flights
 
 ABOUT = {
@@ -106,6 +111,37 @@ def write_study(folder):
     write_episodes(folder / "episodes.csv", LABELS, rows)
     (folder / "about.json").write_text(json.dumps(about))
     write_plan(folder.parent, about)
+    return folder
+
+
+def write_taught(folder, lost=()):
+    """Leave a study of taught policies in `folder`, whose trainings lose none or one of 14; returns it.
+
+    Args:
+        folder: Where.
+        lost: Group, axis, value and how many episodes more each training loses there.
+    """
+    config = parse(compose("+exp=taught_claims"))
+    axes, env = axes_of(config.sweep), dataclasses.replace(config.env, scene="poles_eval", split="eval")
+    groups = dict.fromkeys(config.ablation.variants, config.ablation.seeds)
+    baselines, same = baselines_of(env, axes), same_simulations(env, axes)
+    about = {
+        **ABOUT, "run": "taught_claims-short-s0-1", "exp": "taught_claims", "axes": axes, "groups": groups,
+        "trials": 14, "met": [], "exactness": [],
+        "compared": [{"condition": at, "baseline": baselines[at], "same_as": same[at]} for at in baselines],
+    }  # fmt: skip
+    rows, more = {}, {tuple(place): count for *place, count in lost}
+    for (axis, value), (group, seeds) in itertools.product(baselines, groups.items()):
+        for seed in seeds:
+            episodes = np.zeros(14, EPISODE)
+            episodes["seed"] = np.arange(14)
+            failed = seed % 2 + more.get((group, axis, value), 0)
+            episodes["success"] = (np.arange(14) + 3 * seed) % 14 >= failed
+            episodes["distance_m"] = np.where(episodes["success"], 100.0, 40.0)
+            rows[axis, value, group, str(seed)] = episodes
+    folder.mkdir(parents=True, exist_ok=True)
+    write_episodes(folder / "episodes.csv", LABELS, rows)
+    (folder / "about.json").write_text(json.dumps(about))
     return folder
 
 

@@ -16,16 +16,16 @@ from typing import Any
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.evaluation.group_stats import LABELS, episode_values
 from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep
-from jobs.evaluation.sweep_report import SweepResults, training_text
+from jobs.evaluation.sweep_report import SweepResults, about, training_text
 from jobs.rollout.episodes import write_episodes
 from jobs.rollout.executors import Executor
 from jobs.rollout.policies import EvaluatedPolicy, read_policy
 from jobs.rollout.scheduler import default_executor, evaluate_tasks
 from jobs.rollout.store import EpisodeStore
+from jobs.run.checkpoints import sha256
 from jobs.run.files import read_json_lines
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console
-from jobs.run.provenance import command, provenance, today
 from jobs.studies.ablation.page import AblationFacts, variant_result, write_page
 from jobs.tracking.tracker import open_tracker
 from jobs.training import train
@@ -141,7 +141,7 @@ def compare(
         first = next(iter(success))
         results = [variant_result(name, success[name], success[first], times[name]) for name in success]
         write_all_episodes(place, found)
-        write_page(folder, tracker, results, facts_of(config, folder))
+        write_page(folder, tracker, results, facts_of(config, folder, found))
         metrics = {f"eval/{result.name}_success": result.mean.value for result in results}
         tracker.log(0, metrics)
         console.print(tracker.dashboard(), markup=False)
@@ -175,15 +175,12 @@ def write_all_episodes(place: Path, found: SweepResults) -> None:
     write_episodes(place / "episodes.csv", LABELS, episodes)
 
 
-def facts_of(config: Config, folder: Run) -> AblationFacts:
+def facts_of(config: Config, folder: Run, found: SweepResults) -> AblationFacts:
     """What made the numbers."""
     return {
-        "run": folder.path.name,
-        "command": command(),
-        "date": today(),
-        **provenance(),
+        **about(config, folder, found),
+        "episodes_sha256": sha256(folder.path / "ablation" / "episodes.csv"),
         "seeds": config.ablation.seeds,
-        "trials": config.sweep.trials,
         "env_steps": config.train.env_steps,
         "variants": {name: dict(changes) for name, changes in config.ablation.variants.items()},
     }

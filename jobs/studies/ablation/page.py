@@ -9,22 +9,18 @@ from matplotlib.figure import Figure
 from jobs.analysis.plots import BLUE, INK, MUTED, tidy
 from jobs.analysis.statistics import Estimate, half_width
 from jobs.analysis.tables import estimate_text, markdown_table, publish_plot, show_table
+from jobs.evaluation.sweep_report import SweepFacts
 from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run
-from jobs.run.provenance import Provenance
 from jobs.tracking.tracker import Tracker
 
 TITLE = "Success [%] with one part of the recipe changed"
 
 
-class AblationFacts(Provenance):
-    """What made an ablation, as its about.json says it."""
+class AblationFacts(SweepFacts):
+    """What made an ablation, as its about.json says it: a sweep over what it has trained."""
 
-    run: str
-    command: str
-    date: str
     seeds: list[int]
-    trials: int
     env_steps: int
     variants: dict[str, dict[str, Any]]
 

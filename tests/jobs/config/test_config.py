@@ -14,7 +14,12 @@ from jobs.run.folder import run_name
 from models.kinds import KINDS, model_keys
 from tests.support.configs import CONF, compose
 
-JOBS = {"robustness": "sweep", "dose_response": "sweep", "calibrated_camera": "ablation"}
+JOBS = {
+    "robustness": "sweep",
+    "dose_response": "sweep",
+    "calibrated_camera": "ablation",
+    "taught_claims": "ablation",
+}
 POLICIES = {
     "bytestream": "bytestream",
     "bytestream_finetuned": "bytestream",
@@ -139,7 +144,10 @@ def test_ppo_is_the_papers():
     }
 
 
-@pytest.mark.parametrize("length", [name for name in options("length") if not name.endswith("_ablation")])
+STUDIES = "_ablation", "_claims"  # lengths of studies, which name an algorithm no more
+
+
+@pytest.mark.parametrize("length", [name for name in options("length") if not name.endswith(STUDIES)])
 def test_an_algorithm_trains_as_long_as_it_needs_in_each_budget(length):
     budget, _, algo = length.partition("_")
     told = compose("+exp=bytestream", f"budget={budget}", f"algo={algo}")

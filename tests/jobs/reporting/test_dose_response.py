@@ -19,7 +19,6 @@ from jobs.reporting import dose_response
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.dose_plan import check_planned, read_plan
 from jobs.reporting.dose_response import (
-    RESULTS,
     Dose,
     asked_error,
     close_pairs,
@@ -30,6 +29,7 @@ from jobs.reporting.dose_response import (
     over_doses,
     write_dose_response,
 )
+from jobs.reporting.planned_page import RESULTS
 from jobs.reporting.report import find_study
 from jobs.reporting.sweep_data import read_sweep, read_sweep_episodes
 from jobs.rollout.policies import PRETRAINED

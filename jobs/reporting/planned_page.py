@@ -1,0 +1,14 @@
+"""Pages of planned studies: the plan stands above and is left as it is, what is below it is written anew."""
+
+from pathlib import Path
+
+from jobs.run.files import write_atomic
+
+RESULTS = "## Results\n"  # what stands above it is the plan
+
+
+def write_below_plan(page: Path, text: str) -> Path:
+    """Write results below the plan of a page, in place of earlier ones; return the page."""
+    above = page.read_text().split(RESULTS)[0] if page.is_file() else ""
+    write_atomic(page, above.rstrip("\n") + f"\n\n{RESULTS}" + text)
+    return page

@@ -1,0 +1,80 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from docs.from_data import figures
+from jobs.config.config import parse
+from jobs.evaluation.sweep_plan import axes_of
+from jobs.reporting.paper_claims import CLAIMS
+from jobs.reporting.planned_page import RESULTS
+from jobs.reporting.report import find_study
+from jobs.reporting.sweep_data import read_sweep
+from jobs.reporting.taught_claims import TAUGHT, taught_findings, write_taught_claims
+from jobs.studies.ablation.ablation import variant_config
+from tests.support.configs import compose, small_config
+from tests.support.sweep_folders import write_taught
+
+TEXTURES = "generalises to other textures"
+PLAN = "# A plan\n\n- **Rule.** As it was.\n"
+
+
+def test_the_study_trains_the_groups_of_the_claims_alike_and_evaluates_their_conditions():
+    config = parse(compose("+exp=taught_claims"))
+    axes, groups = axes_of(config.sweep), list(config.ablation.variants)
+    own = [claim for claim in CLAIMS if {claim.ours, claim.theirs} <= set(groups)]
+    assert len(own) == 15
+    assert all(value in axes[axis] for claim in own for axis, value in claim.conditions)
+    trained = {name: variant_config(config, name, 1) for name in groups}
+    assert {name: one.model.name for name, one in trained.items()} == {name: name for name in groups}
+    assert {one.model.stack for one in trained.values()} == {3}
+    assert not any(getattr(one.model, "memory_ms", ()) for one in trained.values())
+    assert len({json.dumps(dataclasses.asdict(one.env), sort_keys=True) for one in trained.values()}) == 1
+    algos = {str(dataclasses.asdict(one.algo) | {"lr": None}) for one in trained.values()}
+    assert len(algos) == len({str(dataclasses.asdict(one.train)) for one in trained.values()}) == 1
+
+
+def test_a_loss_of_the_rival_alone_shows_in_the_claims_about_it_and_in_no_other(tmp_path):
+    even = taught_findings(*read_sweep(write_taught(tmp_path / "even")))
+    assert len(even) == 15
+    assert {one.overall.value for one in even.values()} == {0.0}
+    lost = [("event_image", "world", "texture_change", 9)]
+    findings = taught_findings(*read_sweep(write_taught(tmp_path / "lost", lost)))
+    changed = {claim.ours: one for claim, one in findings.items() if claim.text == TEXTURES}
+    assert set(changed) == {"bytestream", "bytestream_xy"}
+    for one in changed.values():
+        assert (one.verdict, one.overall.value) == ("holds", pytest.approx(9 / 14))
+    assert all(
+        one.overall == even[claim].overall for claim, one in findings.items() if claim.text != TEXTURES
+    )
+
+
+def test_the_page_keeps_its_plan_and_is_written_again_the_same(tmp_path):
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    (docs / f"{TAUGHT}.md").write_text(PLAN)
+    study = write_taught(tmp_path / "run" / "ablation", [("event_image", "world", "dynamic", 9)])
+    page = write_taught_claims(study, docs)
+    first = page.read_text()
+    assert first.startswith(PLAN)
+    assert first.count(RESULTS) == 1
+    assert first.count("| `bytestream") >= 15
+    assert write_taught_claims(study, docs).read_text() == first
+    assert set(figures(docs / "data")) == {TAUGHT}
+
+
+def test_only_a_study_of_this_name_is_reported(tmp_path):
+    study = write_taught(tmp_path / "a" / "ablation")
+    config = dataclasses.replace(small_config(tmp_path), runs_dir=str(tmp_path))
+    assert find_study(config, TAUGHT) == study
+    about = json.loads((study / "about.json").read_text())
+    (study / "about.json").write_text(json.dumps(about | {"exp": "ablation"}))
+    assert find_study(config, TAUGHT) is None
+
+
+def test_the_constructed_study_loses_what_it_is_told_to(tmp_path):
+    _, episodes = read_sweep(write_taught(tmp_path, [("bytestream", "sparsity", "0.5", 4)]))
+    rates = {place: np.mean([own["success"].sum() for own in of.values()]) for place, of in episodes.items()}
+    assert rates[("sparsity", "0.5"), "bytestream"] == 14 - 0.5 - 4
+    assert rates[("sparsity", "0.2"), "bytestream"] == rates[("sparsity", "0.5"), "event_image"] == 13.5
