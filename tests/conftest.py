@@ -2,6 +2,7 @@ import os
 
 for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # threads of a pretraining beside other tests
 
 import platform  # noqa: E402
 import subprocess  # noqa: E402

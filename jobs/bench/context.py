@@ -1,10 +1,11 @@
-"""Training step of the event VAE: fused context network against the plain formula.
+"""Training step of the event VAE: fused context network against the plain formula, and two threads.
 
-Run `OMP_NUM_THREADS=1 python -m jobs.bench.context [repeats]` from the repository root; it prints
-CPU seconds per training step of both forms, measured in turn in one process, and their ratio, as
-JSON. The plain form's tensors of 400 MB are otherwise fetched page by page from the system in
-every step, which doubles its time; to give it reused memory, set also `MALLOC_MMAP_MAX_=0
-MALLOC_TRIM_THRESHOLD_=100000000000 MALLOC_TOP_PAD_=1000000000` (glibc).
+Run `OMP_NUM_THREADS=1 python -m jobs.bench.context [repeats]` from the repository root; it prints as JSON
+CPU seconds per training step of both forms, measured in turn in one process, and their ratio; then seconds
+per step with one thread and with two, in turn, which need two idle cores. The plain form's tensors of
+400 MB are otherwise fetched page by page from the system in every step, which doubles its time; to give it
+reused memory, set also `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000 MALLOC_TOP_PAD_=1000000000`
+(glibc).
 """
 
 import json
@@ -65,6 +66,29 @@ def compare(variant: str, windows: int = 50, events: int = 2000, repeats: int = 
     }
 
 
+def compare_threads(windows: int = 50, events: int = 2000, repeats: int = 20) -> dict[str, float]:
+    """Seconds of one update of the fused form with one thread and with two; arguments as in `compare`.
+
+    Returns:
+        one_s, two_s (medians), ratio of the medians.
+    """
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    evae = EventVAE(context=256, latent=32, target="occupancy")
+    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3, fused=True)
+    batch = random_batch(evae, windows, events, rng)
+    targets = event_targets(batch, evae.target)
+    found: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(repeats + 1):  # the first round warms up
+        for threads, times in found.items():
+            torch.set_num_threads(threads)
+            start = time.perf_counter()
+            train_step(evae, optimizer, batch, targets, 1e-5, rng)
+            times.append(time.perf_counter() - start)
+    one, two = (float(np.median(times[1:])) for times in found.values())
+    return {"one_s": one, "two_s": two, "ratio": one / two}
+
+
 def seconds(call: Callable[[], None]) -> float:
     """CPU time of one call (user and system), which other processes disturb least."""
     start = time.process_time()
@@ -75,4 +99,5 @@ def seconds(call: Callable[[], None]) -> float:
 if __name__ == "__main__":
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 3
     found = {variant: compare(variant, repeats=repeats) for variant in ("bytestream", "bytestream_xy")}
+    found["threads"] = compare_threads()
     sys.stdout.write(json.dumps(found, indent=2) + "\n")

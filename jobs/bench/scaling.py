@@ -33,7 +33,8 @@ from jobs.config.config import HELD_OUT_SCENE
 from jobs.rollout.episodes import roll_out
 from jobs.rollout.executors import cached_agent
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.ray_cluster import QUIET, WORKER_THREADS, on_loopback, ray_folder, use_token
+from jobs.run.ray_cluster import QUIET, on_loopback, ray_folder, use_token
+from jobs.run.threads import ONE_THREAD
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
 
@@ -244,7 +245,7 @@ def simulated(nodes: int, cores: int) -> Iterator[None]:
         try:
             for _ in range(nodes - 1):
                 cluster.add_node(num_cpus=cores, object_store_memory=OBJECT_STORE)
-            ray.init(cluster.address, runtime_env={"env_vars": WORKER_THREADS}, log_to_driver=False)
+            ray.init(cluster.address, runtime_env={"env_vars": ONE_THREAD}, log_to_driver=False)
             yield
         finally:
             ray.shutdown()

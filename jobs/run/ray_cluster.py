@@ -20,9 +20,6 @@ from jobs.run.ray_sessions import forget_sessions
 from jobs.run.same_code import check_machines
 from jobs.run.threads import ONE_THREAD
 
-# A learner of a large network takes more threads (`training.ppo_learner`); those that wait must sleep:
-# spinning beside one busy program made a gradient three times slower.
-WORKER_THREADS = {**ONE_THREAD, "OMP_WAIT_POLICY": "PASSIVE"}
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -83,7 +80,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     # It logs the traceback of a trial's error, which it also writes beside the trial and jobs report.
     logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
-        "runtime_env": with_plugins({"env_vars": WORKER_THREADS}),
+        "runtime_env": with_plugins({"env_vars": ONE_THREAD}),
         "log_to_driver": False,
         "logging_level": logging.ERROR,
         "configure_logging": True,

@@ -1,6 +1,8 @@
 """One thread for each process: what numerical libraries read from the environment when they load.
 
-Two threads beside other busy processes ran ten times slower than one. Nothing is imported here,
+Two threads beside other busy processes ran ten times slower than one. Parts that take more set their number
+(pretraining, a learner of a large network); those that wait must sleep: spinning beside one busy program made
+a gradient three times slower. Nothing is imported here,
 because the launcher sets these variables before it imports anything that reads them.
 """
 
@@ -10,4 +12,5 @@ ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
     "LP_NUM_THREADS": "0",
+    "OMP_WAIT_POLICY": "PASSIVE",
 }
