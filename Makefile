@@ -122,9 +122,11 @@ lint: $(INSTALLED) ## check style, format, types, and who imports whom
 
 check: ## what must pass before a change is merged
 	$(MAKE) --jobs 2 lint setup
-	for tests in test test-system; do \
-	    $(MAKE) $$tests || $(MAKE) $$tests PYTEST='$(ALONE)' ARGS='--numprocesses 0 $(ARGS)' || exit 1; \
-	done
+	$(MAKE) test-again
+	$(MAKE) test-system-again
+
+%-again: # a suite, and what failed of it once more by itself
+	$(MAKE) $* || $(MAKE) $* PYTEST='$(ALONE)' ARGS='--numprocesses 0 $(ARGS)'
 
 bench: setup ## measure the speed of the parts, and what accuracy of the simulator costs
 	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done

@@ -49,6 +49,6 @@ try "dashboard" 'mlflow server --workers 1 --host 127.0.0.1 --port 5055 --backen
 import urllib.request as r; place = \"http://127.0.0.1:5055/api/2.0/mlflow/experiments/get-by-name\"
 assert b\"evade\" in r.urlopen(place + \"?experiment_name=evade\").read()" 2>/dev/null && break; done
     result=$?; kill %1; exit $result'
-try "tests" "make test VENV=/opt/venv ARGS='${TESTS:-}'"
+try "tests" "make test-again VENV=/opt/venv ARGS='${TESTS:-}'"
 printf '%s' "$results"
 [[ $results != *FAILED* ]]
