@@ -44,6 +44,7 @@ MAX_CHUNK_BYTES = 1 << 28
 FILTERS = (1, 2, 3, 32000, 32001, 32026)
 BLOSC = (32001, 32026)
 FLETCHER32, CHECKSUM_BYTES = 3, 4
+SIMPLE = (h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeStringID)  # types of attributes
 NOISE = "events/is_noise"  # labels, where there are any
 HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
 # How data sets are compressed, and given a checksum, so that a flipped bit is noticed.
@@ -175,11 +176,11 @@ def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
 def _sensor(file: h5py.File) -> tuple[int | None, int | None]:
     """Width and height by the attributes, or by the sensor settings of a recording."""
     given = file.attrs
+    if "width" in given and "height" in given:
+        return int(_attribute(file, "width")), int(_attribute(file, "height"))
     geometry = str(_attribute(file, "geometry")) if "geometry" in given else ""
     if found := re.fullmatch(r"(\d{1,5})x(\d{1,5})", geometry, re.ASCII):
         return int(found[1]), int(found[2])
-    if "width" in given and "height" in given:
-        return int(_attribute(file, "width")), int(_attribute(file, "height"))
     about = json.loads(_attribute(file, "about")) if "about" in given else {}
     sensor = about.get("sensor") if isinstance(about, dict) else None
     if not isinstance(sensor, dict) or not all(type(sensor.get(name)) is int for name in ("width", "height")):
@@ -190,11 +191,10 @@ def _sensor(file: h5py.File) -> tuple[int | None, int | None]:
 def _attribute(file: h5py.File, name: str) -> Any:
     """One number or text; anything else that a damaged type declares, such as a list, can crash HDF5."""
     stored = file.attrs.get_id(name)
-    if stored.shape != () or not isinstance(
-        stored.get_type(), (h5py.h5t.TypeIntegerID, h5py.h5t.TypeStringID)
-    ):
+    if stored.shape != () or not isinstance(stored.get_type(), SIMPLE):
         raise ValueError(f"the attribute {name} is no single number or text")
-    return file.attrs[name]
+    value = file.attrs[name]
+    return value.decode() if isinstance(value, bytes) else value
 
 
 def _columns(request: Request, file: h5py.File) -> np.ndarray:
@@ -316,14 +316,15 @@ def _check_chunks(data: h5py.Dataset, name: str) -> None:
         sizes = (data.dtype.itemsize, data.dtype.itemsize * data.chunks[0]) if data.chunks else ()
         if code in BLOSC and pipeline.get_filter(number)[2][2:4] != sizes:
             raise ValueError(f"{name} describes its packing wrongly")
-    if FLETCHER32 in filters:  # HDF5 looks for the checksum in front of a chunk that is too short for it
-        stored: list[int] = []
-        data.id.chunk_iter(lambda chunk: stored.append(chunk.size))
-        if (
-            filters.index(FLETCHER32) < len(filters) - 1
-            or min(stored, default=CHECKSUM_BYTES) < CHECKSUM_BYTES
-        ):
-            raise ValueError(f"{name} has a chunk without its checksum")
+    if FLETCHER32 in filters[:-1]:  # what decompression leaves may be too short for it
+        raise ValueError(f"{name} has its checksum within its compression; write it again without fletcher32")
+    if FLETCHER32 in filters and data.id.chunk_iter(_too_short):
+        raise ValueError(f"{name} has a chunk without its checksum")
+
+
+def _too_short(chunk: Any) -> bool | None:
+    """Whether a stored chunk has no room for its checksum, in front of which HDF5 would look for it."""
+    return chunk.size < CHECKSUM_BYTES or None
 
 
 def _filters(data: h5py.Dataset) -> list[int]:

@@ -1,11 +1,11 @@
 """Training step of the event VAE: fused context network against the plain formula, and two threads.
 
-Run `OMP_NUM_THREADS=1 python -m jobs.bench.context [repeats]` from the repository root; it prints as JSON
-CPU seconds per training step of both forms, measured in turn in one process, and their ratio; then seconds
-per step with one thread and with two, in turn, which need two idle cores. The plain form's tensors of
-400 MB are otherwise fetched page by page from the system in every step, which doubles its time; to give it
-reused memory, set also `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000 MALLOC_TOP_PAD_=1000000000`
-(glibc).
+Run `OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m jobs.bench.context [repeats]` from the repository
+root; it prints as JSON CPU seconds per training step of both forms, measured in turn in one process, and
+their ratio; then seconds per step with one thread and with two, in turn, which need two idle cores. The plain
+form's tensors of 400 MB are otherwise fetched page by page from the system in every step, which doubles its
+time; to give it reused memory, set also `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000
+MALLOC_TOP_PAD_=1000000000` (glibc).
 """
 
 import json

@@ -10,6 +10,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot
+from jobs.config.errors import ConfigError
 from jobs.evaluation.group_stats import episode_values, success_table
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import SweepFacts
@@ -50,11 +51,13 @@ def write_taught_claims(study: Path, docs: Path) -> Path:
         The page.
 
     Raises:
-        ConfigError: If an earlier version wrote the study.
+        ConfigError: If an earlier version wrote the study, or it has groups of no claim.
         RunError: If a file of the study is damaged.
     """
     about, episodes = read_sweep(study)
     findings = taught_findings(about, episodes)
+    if not findings:
+        raise ConfigError(f"resume: {study} has no two groups that a claim compares; train them all")
     text = results_text(about, episodes, findings, published_findings(docs / "data"))
     figure = claims_plot(findings)
     write_data(docs / "data", TAUGHT, study, episodes)

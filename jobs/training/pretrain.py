@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import hashlib
 import io
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -46,7 +45,9 @@ Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
 HeldOut = dict[str, tuple[EventBatch, EventBatch]]  # windows by their length, and what is decoded from each
 
 ENCODER, CHECKPOINTS = "encoder.safetensors", "checkpoint-*.pt"
-THREADS = 2  # with which the weights have the same bytes as with one
+THREADS = (
+    2  # on any machine, so that its cores change no byte; encoders of bytestreams have those of one thread
+)
 CHECKPOINTS_KEPT = 2  # should the newest be damaged
 MIN_STEPS, MAX_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
@@ -163,9 +164,9 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
 
 @contextlib.contextmanager
 def threads() -> Iterator[None]:
-    """Let torch take `THREADS` cores, as far as there are any: nothing else of a job runs meanwhile."""
+    """Let torch take `THREADS` threads: nothing else of a job runs meanwhile."""
     before = torch.get_num_threads()
-    torch.set_num_threads(min(THREADS, os.cpu_count() or 1))
+    torch.set_num_threads(THREADS)
     try:
         yield
     finally:

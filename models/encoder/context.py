@@ -277,15 +277,15 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _parts(size: int) -> list[Part]:
-    """0 .. size in as many ranges as torch has threads."""
-    count = torch.get_num_threads()
+    """0 .. size in as many ranges as torch has threads, or fewer: none is empty, but for a size of 0."""
+    count = max(1, min(size, torch.get_num_threads()))
     return list(itertools.pairwise(size * part // count for part in range(count + 1)))
 
 
 def _parts_of_windows(offsets: np.ndarray) -> list[Part]:
     """The windows in as many ranges as torch has threads, with about as many events each."""
-    cuts = [int(np.searchsorted(offsets, first)) for first, _ in _parts(int(offsets[-1]))]
-    return list(itertools.pairwise([*cuts, len(offsets) - 1]))
+    cuts = {int(np.searchsorted(offsets, first)) for first, _ in _parts(int(offsets[-1]))}
+    return list(itertools.pairwise(sorted({0, *cuts, len(offsets) - 1}))) or [(0, 0)]
 
 
 def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:

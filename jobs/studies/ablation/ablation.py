@@ -26,6 +26,7 @@ from jobs.run.checkpoints import sha256
 from jobs.run.files import read_json_lines
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console
+from jobs.run.provenance import provenance
 from jobs.studies.ablation.page import AblationFacts, variant_result, write_page
 from jobs.tracking.tracker import open_tracker
 from jobs.training import train
@@ -179,6 +180,7 @@ def facts_of(config: Config, folder: Run, found: SweepResults) -> AblationFacts:
     """What made the numbers."""
     return {
         **about(config, folder, found),
+        **provenance(),
         "episodes_sha256": sha256(folder.path / "ablation" / "episodes.csv"),
         "seeds": config.ablation.seeds,
         "env_steps": config.train.env_steps,

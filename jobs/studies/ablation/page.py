@@ -12,13 +12,14 @@ from jobs.analysis.tables import estimate_text, markdown_table, publish_plot, sh
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run
+from jobs.run.provenance import Provenance
 from jobs.tracking.tracker import Tracker
 
 TITLE = "Success [%] with one part of the recipe changed"
 
 
-class AblationFacts(SweepFacts):
-    """What made an ablation, as its about.json says it: a sweep over what it has trained."""
+class AblationFacts(SweepFacts, Provenance):
+    """What made an ablation, as its about.json says it: a sweep over what it has trained, on a machine."""
 
     seeds: list[int]
     env_steps: int

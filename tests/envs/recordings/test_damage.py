@@ -85,19 +85,19 @@ def test_a_million_damaged_files_are_read_or_refused_by_name(part, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["geometry", "width", "about"])
-@pytest.mark.parametrize("kind", ["array", "float", "list"])
+@pytest.mark.parametrize("kind", ["array", "truth", "list"])
 def test_an_attribute_that_is_no_single_number_or_text_is_refused_unread(kind, name, tmp_path):
     path = tmp_path / "a.h5"
     write_events(path, EVENTS, 34, 34)
     with h5py.File(path, "a") as file:
-        if name == "about":
+        if name != "width":
             del file.attrs["width"]
         if kind == "list":  # of numbers, whose length is declared beside them
             data = np.empty((), object)
             data[()] = np.arange(3, dtype="u1")
             file.attrs.create(name, data, dtype=h5py.vlen_dtype("u1"))
         else:
-            file.attrs[name] = {"array": np.arange(3), "float": 3.5}[kind]
+            file.attrs[name] = {"array": np.arange(3), "truth": True}[kind]
     with pytest.raises(ValueError, match=f"the attribute {name} is no single number or text"):
         read_events(path)
 
@@ -110,6 +110,40 @@ def test_a_chunk_that_is_shorter_than_its_checksum_is_refused_unread(size, tmp_p
         file["events/x"].id.write_direct_chunk((0,), bytes(size))
     with pytest.raises(ValueError, match="events/x has a chunk without its checksum"):
         read_events(path)
+
+
+def test_a_checksum_within_a_compression_is_refused_with_the_remedy(tmp_path):
+    path = tmp_path / "a.h5"
+    write_events(path, EVENTS, 34, 34)
+    with h5py.File(path, "a") as file:
+        values = file["events/x"][:]
+        del file["events/x"]
+        packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        packing.set_chunk(values.shape)
+        packing.set_fletcher32()
+        packing.set_deflate(4)
+        kind, space = h5py.h5t.py_create(values.dtype), h5py.h5s.create_simple(values.shape)
+        h5py.h5d.create(file["events"].id, b"x", kind, space, packing)
+        file["events/x"][:] = values
+    with pytest.raises(ValueError, match="events/x has its checksum within its compression; write it again"):
+        read_events(path)
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [{"width": 34.0, "height": 34.0}, {"geometry": "34x34"}, {"geometry": np.bytes_("34x34")},
+     {"width": 34, "height": 34, "geometry": [1, 2]}],
+)  # fmt: skip
+def test_a_size_is_read_as_other_programs_write_it(attributes, tmp_path):
+    path = tmp_path / "a.h5"
+    write_events(path, EVENTS, 34, 34)
+    with h5py.File(path, "a") as file:
+        for name in ("width", "height"):
+            del file.attrs[name]
+        for name, value in attributes.items():
+            file.attrs[name] = value
+    found = read_events(path)
+    assert (found.width, found.height) == (34, 34)
 
 
 @pytest.mark.system

@@ -31,7 +31,13 @@ def test_the_study_trains_the_groups_of_the_claims_alike_and_evaluates_their_con
     assert {one.model.stack for one in trained.values()} == {3}
     assert not any(getattr(one.model, "memory_ms", ()) for one in trained.values())
     assert len({json.dumps(dataclasses.asdict(one.env), sort_keys=True) for one in trained.values()}) == 1
-    algos = {str(dataclasses.asdict(one.algo) | {"lr": None}) for one in trained.values()}
+    memory = {name: one.algo.imitation.keep_mb for name, one in trained.items()}
+    assert memory["event_image"] * 1e6 > config.train.env_steps * (3 * 64 * 64 + 100)  # all of its pictures
+    alike = [dataclasses.replace(one.algo.imitation, keep_mb=1) for one in trained.values()]
+    algos = {
+        str(dataclasses.asdict(dataclasses.replace(one.algo, lr=1.0, imitation=same)))
+        for one, same in zip(trained.values(), alike, strict=True)
+    }
     assert len(algos) == len({str(dataclasses.asdict(one.train)) for one in trained.values()}) == 1
 
 
@@ -76,5 +82,6 @@ def test_only_a_study_of_this_name_is_reported(tmp_path):
 def test_the_constructed_study_loses_what_it_is_told_to(tmp_path):
     _, episodes = read_sweep(write_taught(tmp_path, [("bytestream", "sparsity", "0.5", 4)]))
     rates = {place: np.mean([own["success"].sum() for own in of.values()]) for place, of in episodes.items()}
-    assert rates[("sparsity", "0.5"), "bytestream"] == 14 - 0.5 - 4
-    assert rates[("sparsity", "0.2"), "bytestream"] == rates[("sparsity", "0.5"), "event_image"] == 13.5
+    usual = rates[("sparsity", "0.2"), "bytestream"]
+    assert rates[("sparsity", "0.5"), "event_image"] == usual > 13
+    assert rates[("sparsity", "0.5"), "bytestream"] == pytest.approx(usual - 4)

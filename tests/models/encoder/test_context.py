@@ -233,11 +233,11 @@ def test_a_single_pixel_sensor_is_at_the_origin():
     assert torch.allclose(network(batch), network.plain(batch), atol=1e-6)
 
 
-@pytest.mark.parametrize("threads", [2, 3, 7])
+@pytest.mark.parametrize("threads", [2, 3, 7, 32])
 def test_threads_that_share_the_maximum_change_no_byte(threads):
     """The maximum and its gradient alone: of the matrix products only torch's library knows."""
     events, features, cells = 500, 33, 90
-    found = {}
+    found, before = {}, torch.get_num_threads()
     for count in (1, threads):
         given = np.random.default_rng(4)
         h, weight, bias = (
@@ -254,7 +254,7 @@ def test_threads_that_share_the_maximum_change_no_byte(threads):
             context, _ = MaxContext.apply(h, weight, bias, batch, False)
             context.backward(torch.from_numpy(given.standard_normal(context.shape).astype(np.float32)))
         finally:
-            torch.set_num_threads(1)
+            torch.set_num_threads(before)
         values = (context.detach(), h.grad, weight.grad, bias.grad)
         found[count] = [value.numpy().tobytes() for value in values]
     assert found[1] == found[threads]
