@@ -20,10 +20,7 @@ per distinct value, with batch statistics weighted by how often each occurs. Onl
 sums differs; `tests/models/encoder/test_context.py` states the bounds for float64 and float32.
 """
 
-import functools
 import itertools
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numba
@@ -36,7 +33,6 @@ from models.encoder.embedding import embedding_table, eventnet_phase
 from models.encoder.event_batch import EventBatch, Grid, distinct
 
 DTYPES = (torch.float32, torch.float64)
-Part = tuple[int, int]  # a range, its end excluded
 
 
 class EventContextNetwork(nn.Module):
@@ -242,8 +238,7 @@ class MaxContext(torch.autograd.Function):
         context = np.zeros((len(events.offsets) - 1, len(bias)), features.dtype)
         winner = np.full(context.shape, -1, np.int32)
         winning_bin = np.zeros(context.shape, np.int32)
-        raise_to = functools.partial(_maximum, features, events, context, winner, winning_bin)
-        side_by_side(raise_to, _parts_of_windows(events.offsets))
+        _maximum(features, events, context, winner, winning_bin)
         ctx.slope = _tanh_slope(features, winner) if squash else None
         ctx.save_for_backward(h, weight, torch.from_numpy(winner))
         found = torch.from_numpy(context), torch.from_numpy(winning_bin)
@@ -258,34 +253,8 @@ class MaxContext(torch.autograd.Function):
             gradient = gradient * torch.from_numpy(ctx.slope)
         outputs = torch.zeros_like(h), torch.zeros_like(weight), weight.new_zeros(len(weight))
         arrays = [tensor.detach().contiguous().numpy() for tensor in (gradient, winner, h, weight)]
-        add = functools.partial(_scatter, *arrays, *(tensor.numpy() for tensor in outputs))
-        side_by_side(add, _parts(h.shape[1]))
+        _scatter(*arrays, *(tensor.numpy() for tensor in outputs))
         return *outputs, None, None
-
-
-def side_by_side(kernel: Callable[[Part], None], parts: list[Part]) -> None:
-    """Run a kernel that lets go of Python's lock on parts that do not touch each other, a thread for each."""
-    if len(parts) == 1:
-        kernel(parts[0])
-    else:
-        list(_pool().map(kernel, parts))
-
-
-@functools.cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor()
-
-
-def _parts(size: int) -> list[Part]:
-    """0 .. size in as many ranges as torch has threads, or fewer: none is empty, but for a size of 0."""
-    count = max(1, min(size, torch.get_num_threads()))
-    return list(itertools.pairwise(size * part // count for part in range(count + 1)))
-
-
-def _parts_of_windows(offsets: np.ndarray) -> list[Part]:
-    """The windows in as many ranges as torch has threads, with about as many events each."""
-    cuts = {int(np.searchsorted(offsets, first)) for first, _ in _parts(int(offsets[-1]))}
-    return list(itertools.pairwise(sorted({0, *cuts, len(offsets) - 1}))) or [(0, 0)]
 
 
 def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
@@ -295,14 +264,14 @@ def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
     return 1.0 - features[np.maximum(winner, 0), np.arange(winner.shape[1])] ** 2
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
-def _maximum(features, events, context, winner, winning_bin, part) -> None:  # type: ignore[no-untyped-def]
-    """Raise rows of `context` (B, D) to the events' maximum, the first of equals.
+@numba.njit(cache=True, error_model="numpy")
+def _maximum(features, events, context, winner, winning_bin) -> None:  # type: ignore[no-untyped-def]
+    """Raise `context` (B, D) to the events' maximum, the first of equals.
 
     `winner` becomes its cell, -1 where it has no gradient; `winning_bin` its bin.
     """
     cell, bins, offsets, codes = events.cell, events.bin, events.offsets, events.codes
-    for b in range(part[0], part[1]):
+    for b in range(context.shape[0]):
         best, who = context[b], winner[b]
         for n in range(offsets[b], offsets[b + 1]):
             feature, code = features[cell[n]], codes[bins[n]]
@@ -319,19 +288,15 @@ def _maximum(features, events, context, winner, winning_bin, part) -> None:  # t
                 who[j] = u if features[u, j] > 0 else -1
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
-def _scatter(gradient, winner, h, weight, grad_h, grad_weight, grad_bias, part) -> None:  # type: ignore[no-untyped-def]
-    """Add each winner's gradient to some columns of its row of h and of the weight, and to the bias.
-
-    Each number is summed in the same order however the columns are divided.
-    """
+@numba.njit(cache=True, error_model="numpy")
+def _scatter(gradient, winner, h, weight, grad_h, grad_weight, grad_bias) -> None:  # type: ignore[no-untyped-def]
+    """Add each winner's gradient to its row of h, its row of the weight, and the bias."""
     for b in range(gradient.shape[0]):
         for j in range(gradient.shape[1]):
             u = winner[b, j]
             if u >= 0:
                 g = gradient[b, j]
-                if part[0] == 0:
-                    grad_bias[j] += g
-                for k in range(part[0], part[1]):
+                grad_bias[j] += g
+                for k in range(h.shape[1]):
                     grad_weight[j, k] += g * h[u, k]
                     grad_h[u, k] += g * weight[j, k]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from models.encoder.context import EventContextNetwork, Events, MaxContext, newest_first
+from models.encoder.context import EventContextNetwork, Events, newest_first
 from models.encoder.event_batch import EventBatch, Grid
 
 GRID = Grid(width=12, height=9, time_bins=32)
@@ -231,31 +231,3 @@ def test_a_single_pixel_sensor_is_at_the_origin():
     network = EventContextNetwork(grid, "bytestream", 8, "none")
     batch = make_batch(0, [5], grid)
     assert torch.allclose(network(batch), network.plain(batch), atol=1e-6)
-
-
-@pytest.mark.parametrize("threads", [2, 3, 7, 32])
-def test_threads_that_share_the_maximum_change_no_byte(threads):
-    """The maximum and its gradient alone: of the matrix products only torch's library knows."""
-    events, features, cells = 500, 33, 90
-    found, before = {}, torch.get_num_threads()
-    for count in (1, threads):
-        given = np.random.default_rng(4)
-        h, weight, bias = (
-            torch.from_numpy(given.standard_normal(shape).astype(np.float32)).requires_grad_()
-            for shape in ((cells, 20), (features, 20), (features,))
-        )
-        sizes = [0, 200, 0, 1, events - 201, 0]
-        batch = Events(
-            given.integers(0, cells, events), given.integers(0, 8, events).astype(np.int32),
-            np.concatenate([[0], np.cumsum(sizes)]), given.standard_normal((8, features)).astype(np.float32),
-        )  # fmt: skip
-        torch.set_num_threads(count)
-        try:
-            context, _ = MaxContext.apply(h, weight, bias, batch, False)
-            context.backward(torch.from_numpy(given.standard_normal(context.shape).astype(np.float32)))
-        finally:
-            torch.set_num_threads(before)
-        values = (context.detach(), h.grad, weight.grad, bias.grad)
-        found[count] = [value.numpy().tobytes() for value in values]
-    assert found[1] == found[threads]
-    assert context.abs().sum() > 0
