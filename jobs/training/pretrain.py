@@ -1,7 +1,7 @@
 """Train the event VAE on recorded episodes and freeze its encoder (appendix B).
 
 Run: python -m platform.launch +exp=pretrain
-Expect: about 0.04 s per iteration of 50 windows on two cores; `encoder/encoder.safetensors`
+Expect: about 0.05 s per iteration of 50 windows on two cores; `encoder/encoder.safetensors`
 with its manifest, and `encoder/reconstructions.png`, in the run folder. A killed run
 continues from its last checkpoint.
 """
