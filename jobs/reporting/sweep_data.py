@@ -16,7 +16,7 @@ from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import SweptEpisodes
 from jobs.rollout.episodes import EPISODE
 from jobs.run.checkpoints import sha256
-from jobs.run.files import RunError, read_json, write_atomic
+from jobs.run.files import RunError, read_json, write_atomic, write_json
 
 SWEEP = "robustness"  # name of the published data of the sweep that docs/results.md is about
 TRAININGS = "trainings.csv"  # of every published training, how it learnt
@@ -66,7 +66,9 @@ def write_data(folder: Path, name: str, sweep: Path, episodes: SweptEpisodes) ->
     folder.mkdir(parents=True, exist_ok=True)
     packed = gzip.compress((sweep / "episodes.csv").read_bytes(), mtime=0)
     write_atomic(folder / f"{name}_episodes.csv.gz", packed)
-    write_atomic(folder / f"{name}_about.json", (sweep / "about.json").read_bytes())
+    about = read_json(sweep / "about.json")
+    about.pop("host", None)  # whose name says nothing to others
+    write_json(folder / f"{name}_about.json", about)
     rows = [
         (axis, value, group, "" if seed is None else seed, len(own),
          f"{own['success'].mean():.4f}", f"{own['distance_m'].mean():.2f}")
