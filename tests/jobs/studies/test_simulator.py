@@ -52,6 +52,7 @@ def test_a_row_becomes_columns_under_their_names():
     }
 
 
+@pytest.mark.system  # for its length
 def test_the_job_leaves_tables_and_figures_and_a_second_run_replaces_them(tmp_path, monkeypatch):
     knobs = {"renders": [{"renders": 1}, {"renders": 3}], "encoding": [{"camera.encoding": "linear8"}]}
     monkeypatch.setattr(trade_simulator, "KNOBS", knobs)
