@@ -90,10 +90,10 @@ test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the s
 test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
 	$(PYTEST) -m slow --dist loadgroup $(ARGS)
 
-test-faults: setup ## inject faults into running jobs and print what was lost (18 minutes)
+test-faults: setup ## inject faults into running jobs and print what was lost (23 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 3 --dist worksteal $(ARGS)
 
-test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (10 minutes)
+test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (18 minutes)
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 \
 	|| { [ "$$(id -u)" = 0 ] && apt-get update && apt-get install --yes --no-install-recommends postgresql; } \
 	|| echo "warning: no PostgreSQL, so its test is skipped; apt-get install postgresql"

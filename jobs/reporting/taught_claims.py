@@ -4,7 +4,7 @@ The plan stands on the page and is left as it is; what is below it is written fr
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -92,8 +92,9 @@ def results_text(
         commits=", ".join(commit[:7] for commit in about["evaluated_at"]),
         groups=", ".join(f"`{group}` ({len(seeds)})" for group, seeds in about["groups"].items()),
         count=sum(len(own) for trainings in episodes.values() for own in trainings.values()),
-        verdicts=", ".join(f"{count} {verdict}" for verdict, count in _verdicts(findings)),
-        verdicts_ppo=", ".join(f"{count} {verdict}" for verdict, count in _verdicts(by_ppo, findings)),
+        tests=len(findings),
+        verdicts=counted(findings.values()),
+        verdicts_ppo=counted(by_ppo[claim] for claim in by_ppo if claim in findings),
         claims=markdown_table(HEAD, [claim_line(at, one, by_ppo) for at, one in findings.items()], 3),
         gain=GAIN,
         each={group: ", ".join(f"{100 * rate:.0f}" for rate in rates) for group, rates in each.items()},
@@ -101,13 +102,10 @@ def results_text(
     )
 
 
-def _verdicts(
-    findings: Mapping[Claim, Finding], among: Mapping[Claim, Finding] | None = None
-) -> list[tuple[str, int]]:
-    own = findings if among is None else {claim: findings[claim] for claim in among if claim in findings}
-    return [
-        (str(verdict), count) for verdict, count in Counter(one.verdict for one in own.values()).most_common()
-    ]
+def counted(findings: Iterable[Finding]) -> str:
+    """How many findings have each verdict, the most frequent first."""
+    verdicts = Counter(one.verdict for one in findings)
+    return ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
 
 
 def claim_line(claim: Claim, finding: Finding, by_ppo: Mapping[Claim, Finding]) -> tuple[str, ...]:
