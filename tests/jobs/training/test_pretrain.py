@@ -150,6 +150,7 @@ class Listener:
     figure = artifact
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("weight", "dead"), [(100.0, 1.0), (1e-5, 0.0)])
 def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_path, capsys, weight, dead):
     config = small_config(tmp_path)
