@@ -8,6 +8,7 @@ ValueError) that names the key, the value and the rule; an unknown key does too.
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, cast
 
@@ -215,6 +216,8 @@ class EnvConfig:
             "ground_texture": {"pattern": "rings"}}; keys are the layout's fields.
         control_hz: Actions (and event windows) per second [Hz].
         speed_mps: Constant speed [m/s]; the way of one step is speed_mps / control_hz.
+        action_delay_ms: From what is observed to the action that it leads to [ms]: that of the first control
+            step that begins so much later. Before the first one the vehicle moves straight ahead.
         vehicle_radius_m: The vehicle is a disc of this radius [m].
         camera_height_m: Height of the camera above the ground [m].
         time_limit_s: Flight time after which the episode is truncated [s].
@@ -233,6 +236,7 @@ class EnvConfig:
     layout: dict[str, Value] = dataclasses.field(default_factory=dict)
     control_hz: Annotated[float, Field(ge=0.1, le=1e6)] = 200.0
     speed_mps: Annotated[float, Field(gt=0, le=1e6)] = 20.0
+    action_delay_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     vehicle_radius_m: Annotated[float, Field(ge=0, le=10)] = 0.3
     camera_height_m: Annotated[float, Field(ge=0, le=1000)] = 2.0
     time_limit_s: Positive = 10.0
@@ -245,6 +249,12 @@ class EnvConfig:
     camera: CameraConfig = dataclasses.field(default_factory=lambda: with_floor(CameraConfig()))
     faults: FaultsConfig = dataclasses.field(default_factory=FaultsConfig)
     fidelity: FidelityConfig = dataclasses.field(default_factory=FidelityConfig)
+
+    @property
+    def delay_steps(self) -> int:
+        """Control steps from an observation to its action."""
+        steps = 1e-3 * self.action_delay_ms * self.control_hz
+        return math.ceil(steps * (1 - 1e-12))  # 3 * 1e-3 * 1000 is above 3
 
     @field_validator("camera", "faults", "fidelity", mode="before")
     @classmethod

@@ -209,6 +209,20 @@ class CorridorEnv(gymnasium.Env):
         vehicle = self._vehicles.rows[self._row]
         return float(vehicle["x_m"]), float(vehicle["y_m"]), self.config.camera_height_m, 0.0
 
+    def place_of_action(self) -> tuple[float, float]:
+        """Where the next decision takes effect, if nothing is in the way: x, y [m].
+
+        That is where the vehicle is, but for `action_delay_ms`: what was decided before moves it until then.
+        """
+        vehicle = self._vehicles.rows[self._row]
+        if not vehicle["delay"]:
+            return self.camera_pose()[:2]
+        left, right = ((self._vehicles.decided(self._row) == action).sum() for action in (1, 2))
+        forward = vehicle["delay"] - left - right
+        moves = vehicle["forward"] + forward, vehicle["left"] + left, vehicle["right"] + right
+        way = self.config.speed_mps, self.config.control_hz
+        return kinematics.planned_position(vehicle["spawn_x_m"], moves, way)
+
     def name_step(self) -> str:
         """Episode, step and seed, for an error."""
         vehicle, (seed, number) = self._vehicles.rows[self._row], self.series

@@ -25,6 +25,7 @@ _FLOATS = (
 )
 _WHOLE = (
     *("forward", "left", "right"),  # how often each action was taken
+    "delay",  # steps from a decision to its action
     *("start_us", "t_us"),  # when the last step began and ended
     "window_us",  # its length; before the first step, the length of that
     *("num_events", "dropped"),  # events of it, and those that the camera lost in it

@@ -40,6 +40,7 @@ class Vehicles:
         self._sensors: list[Sensor | None] = [None] * count
         self._in_python: set[int] = set()
         self._corridors: Any = None
+        self._decided = np.zeros((count, 0), np.int64)  # actions not yet taken, the delay's steps in turn
         self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
         self._support, self._tau_us = np.zeros((2, count), np.int64)
         self.forget_events()
@@ -55,6 +56,7 @@ class Vehicles:
         vehicle["limit_us"], vehicle["by_looks"] = config.time_limit_s * 1e6, sensor.sees_by_looks
         vehicle["max_step_m"] = sensor.plan.max_step_m if sensor.sees_by_looks else np.inf
         vehicle["window_us"], vehicle["problem"] = clock_us(1, config.control_hz), GOOD
+        self._set_delay(row, config.delay_steps)
         self._sensors[row] = sensor
         corridor = scene.sections(config.camera_height_m), sensor.view()
         if self._corridors is None:
@@ -71,14 +73,15 @@ class Vehicles:
         """One control step of the active vehicles; `rows`, `events` and `ends` tell what it brought.
 
         Args:
-            actions: int64 (B,), valid.
+            actions: int64 (B,), valid; decided now, and taken when the delay of each vehicle is over.
             active: bool (B,); others stay as they are, without events. At least one vehicle has started.
 
         Raises:
             StepError: A number became NaN or infinite; the vehicle's episode is over.
         """
         rows = self.rows
-        self.events, self.ends = step_all(rows, self._corridors, actions, active)
+        taken = self._exchange(actions, active)
+        self.events, self.ends = step_all(rows, self._corridors, taken, active)
         wrong = active & (rows["problem"] != GOOD)
         if wrong.any():
             self._refuse(int(wrong.argmax()))
@@ -114,10 +117,34 @@ class Vehicles:
             return self.events_of(row)
         return sensor.true_events
 
+    def decided(self, row: int) -> np.ndarray:
+        """Actions that a vehicle has decided and not yet taken, int64 (its delay in steps,), in any order."""
+        return self._decided[row, : self.rows["delay"][row]].copy()
+
     def forget_events(self) -> None:
         """Begin anew with a step that had no events."""
         self.events, self.ends = np.empty(0, EVENT), np.zeros(len(self.rows) + 1, np.int64)
         self.seen, self.seen_ends = self.events, self.ends
+
+    def _set_delay(self, row: int, steps: int) -> None:
+        """Begin an episode with decisions to move straight ahead, as many as are under way."""
+        self.rows["delay"][row] = steps
+        missing = steps - self._decided.shape[1]
+        if missing > 0:
+            self._decided = np.pad(self._decided, ((0, 0), (0, missing)))
+        self._decided[row] = 0
+
+    def _exchange(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """Keep what is decided now, and take what was decided when each vehicle's delay began."""
+        rows = self.rows
+        late = np.flatnonzero(active & (rows["delay"] > 0))
+        if not late.size:
+            return actions
+        steps = rows["forward"][late] + rows["left"][late] + rows["right"][late]
+        turn, taken = steps % rows["delay"][late], actions.copy()
+        taken[late] = self._decided[late, turn]
+        self._decided[late, turn] = actions[late]
+        return taken
 
     def _set_filter(self, row: int, config: EnvConfig) -> None:
         """Begin the episode's neighbour filter, if it has one."""

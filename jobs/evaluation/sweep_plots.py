@@ -15,6 +15,7 @@ from jobs.rollout.agents import BASELINES
 SCALES = {
     "env.control_hz": ("Control rate [Hz]", "log"),
     "env.speed_mps": ("Speed [m/s]", "linear"),
+    "env.action_delay_ms": ("Delay of actions [ms]", "linear"),
     "env.scene": ("Scene", "linear"),
     "camera.contrast_threshold": ("Contrast threshold [log intensity]", "log"),
     "camera.memory": ("Memory of the pixels", "linear"),

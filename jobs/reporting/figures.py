@@ -27,7 +27,7 @@ TITLES = {
     "world": "Other worlds",
     "memory": "Memory of the pixels",
     "memory_400hz": "Memory of the pixels at 400 Hz",
-    "speed": "Speed",
+    "action_delay": "Delay of actions [ms]",
     "worst": "Several at once",
     "axes": "Success along every axis of numbers, one policy a row",
     "contacts": "Where episodes end in contact",

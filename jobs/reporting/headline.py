@@ -20,7 +20,7 @@ COLUMNS: dict[str, Condition] = {
     "noise by night": ("sensor_noise", "5"),
     "other shapes": ("world", "shape_change"),
     "other textures": ("world", "texture_change"),
-    "40 m/s": ("speed", "40"),
+    "actions 100 ms late": ("action_delay", "100"),
 }
 BEGIN, END = "<!-- headline: +exp=report writes this table -->\n", "<!-- end of the headline -->\n"
 

@@ -126,7 +126,7 @@ class OracleAgent:
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Plan one path per episode."""
-        self._plans = []
+        self._envs, self._plans = envs, []
         for env in envs:
             step_m = env.config.speed_mps / env.config.control_hz
             vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
@@ -134,9 +134,9 @@ class OracleAgent:
             self._plans.append((plan, MOVES * step_m))
 
     def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
-        """For each episode the action that ends closest to its plan."""
-        pairs = zip(self._plans, infos, strict=True)
-        return np.array([follow(*plan, info["x_m"], info["y_m"]) for plan, info in pairs])
+        """For each episode the action that ends closest to its plan, where it will be taken."""
+        pairs = zip(self._plans, self._envs, strict=True)
+        return np.array([follow(*plan, *env.place_of_action()) for plan, env in pairs])
 
 
 def episode_streams(seeds: Sequence[int]) -> list[np.random.Generator]:

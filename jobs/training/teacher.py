@@ -21,7 +21,7 @@ class TeacherEnvRunner(PlainEnvRunner):
         super().__init__(**settings)
 
     def costs(self) -> np.ndarray:
-        """What each action costs where each environment is now, float64 (N, actions)."""
+        """What each action costs where it is taken, float64 (N, actions): now, but for a delay of actions."""
         return np.stack([self._costs(row) for row in range(self.env.num_envs)])
 
     def _costs(self, row: int) -> np.ndarray:
@@ -30,7 +30,7 @@ class TeacherEnvRunner(PlainEnvRunner):
         if plan is None or scene is not env.scene:
             plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
             self._plans[row] = env.scene, plan
-        return plan.of_actions(*env.camera_pose()[:2])
+        return plan.of_actions(*env.place_of_action())
 
 
 class PricedEnvRunner(TeacherEnvRunner):

@@ -94,6 +94,11 @@ def test_the_oracle_also_comes_through_at_the_slowest_control():
     assert roll_out(make_agent("oracle"), slow, range(10), num_envs=10)["success"].mean() >= 0.9
 
 
+def test_the_oracle_foresees_what_it_has_decided():
+    late = dataclasses.replace(HELD_OUT, action_delay_ms=250.0)
+    assert roll_out(make_agent("oracle"), late, range(10), num_envs=10)["success"].mean() >= 0.9
+
+
 def test_an_episode_ends_as_success_collision_or_truncation_and_counts_its_way():
     short = dataclasses.replace(HELD_OUT, time_limit_s=0.5)
     episodes = roll_out(make_agent("straight"), short, range(4))

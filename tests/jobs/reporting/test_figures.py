@@ -139,7 +139,7 @@ def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(tmp_pat
 
 def test_a_condition_is_told_in_words():
     assert condition_text("sensor_noise", "5") == "Noise of a real sensor by night"
-    assert condition_text("speed", "40") == "Speed: 40"
+    assert condition_text("action_delay", "50") == "Delay of actions [ms]: 50"
 
 
 def test_a_group_that_was_not_evaluated_unchanged_is_left_out_of_how_far_episodes_get(tmp_path):
