@@ -90,7 +90,7 @@ test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the s
 test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
 	$(PYTEST) -m slow --dist loadgroup $(ARGS)
 
-test-faults: setup ## inject faults into running jobs and print what was lost (23 minutes)
+test-faults: setup ## inject faults into running jobs and print what was lost (19 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 3 --dist worksteal $(ARGS)
 
 test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (18 minutes)
