@@ -2,7 +2,8 @@
 
 Studies are simulated: the logit of success is a mean, plus a normal effect of each training and of each
 corridor, and episodes are drawn from it. Printed are the share of intervals that hold the true rate (of
-`rate_estimate`) or the true difference, which is 0 (of `crossed_difference`, two groups), and the mean width.
+`rate_estimate`) or the true difference, which is 0 (of `crossed_difference`, two groups, and of `crossed_mean`,
+the same trainings once more), and the mean width.
 """
 
 from collections.abc import Iterator
@@ -10,11 +11,11 @@ from functools import cache
 
 import numpy as np
 
-from jobs.analysis.statistics import crossed_difference, rate_estimate
+from jobs.analysis.statistics import crossed_difference, crossed_mean, rate_estimate
 from jobs.analysis.tables import show_table
 
 STUDIES = 300
-TRAININGS = ((3, 14), (4, 25), (10, 14))
+TRAININGS = ((3, 14), (4, 25), (8, 10), (10, 14))
 SPREADS = (0.0, 1.0, 2.0, 3.0)  # of the trainings' logits; the shipped policies under noise: about 2
 MEANS = (0.0, 1.5, 3.0)  # logits: a rate of 50, 80 and 94 % if trainings agree
 CORRIDORS = 0.7  # spread of the corridors' logits
@@ -51,6 +52,17 @@ def coverage(trainings: int, corridors: int, mean: float, spread: float) -> tupl
     return *held.mean(axis=0), *widths.mean(axis=0)
 
 
+def change_coverage(trainings: int, corridors: int, mean: float, spread: float) -> float:
+    """Share of intervals that hold 0, of what changes where nothing does: trainings are evaluated twice."""
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(STUDIES):
+        logits = mean + rng.normal(0.0, spread, (trainings, 1)) + rng.normal(0.0, CORRIDORS, (1, corridors))
+        once, again = (rng.random((2, *logits.shape)) < 1 / (1 + np.exp(-logits))).astype(np.float64)
+        low, high = crossed_mean(once - again, (-1.0, 1.0)).interval or (0.0, 0.0)
+        held += low <= 0.0 <= high
+    return held / STUDIES
+
+
 @cache
 def coverage_text(trainings: int, corridors: int) -> str:
     """How often the intervals of such a study hold the true rate, at a mean logit of 1.5, in words."""
@@ -66,9 +78,10 @@ def main() -> None:
         for mean in MEANS:
             for spread in SPREADS:
                 found = coverage(trainings, corridors, mean, spread)
-                shares = [f"{100 * share:.0f}" for share in (true_rate(mean, spread), *found)]
+                change = change_coverage(trainings, corridors, mean, spread)
+                shares = [f"{100 * share:.0f}" for share in (true_rate(mean, spread), *found, change)]
                 rows.append((f"{trainings} x {corridors}", f"{spread:g}", *shares))
-    held = "Rate held [%]", "Difference held [%]", "Rate's width", "Difference's"
+    held = "Rate held [%]", "Difference held [%]", "Rate's width", "Difference's", "Change held [%]"
     head = ("Trainings x corridors", "Spread", "True rate [%]", *held)
     show_table("Coverage of 95 % intervals", head, rows, 1, None)
 

@@ -205,12 +205,8 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
     yield "env.scene", config.env.scene
     yield "sweep.scene", config.sweep.scene
     yield "evaluate", HELD_OUT_SCENE
-    for name in config.trade_simulator.scenes:
-        yield "trade_simulator.scenes", name
-    for name in config.replay_page.scenes:
-        yield "replay_page.scenes", name
-    for name in config.collect.scenes:
-        yield "collect.scenes", name
+    for job in ("trade", "trade_simulator", "replay_page", "collect"):
+        yield from ((f"{job}.scenes", name) for name in getattr(config, job).scenes)
     for key, conditions in (
         ("train.conditions", config.train.conditions),
         ("collect.conditions", config.collect.conditions),

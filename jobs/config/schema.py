@@ -275,16 +275,18 @@ class SweepConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TradeConfig:
-    """Which policy is evaluated under every setting of simulator and encoder, and in how many corridors.
+    """Which policies are evaluated under every setting of simulator and encoder, and in how many corridors.
 
     Attributes:
-        policy: A name in models/pretrained, "newest", or a path.
-        trials: Corridors under each setting.
+        policies: Groups and names in models/pretrained, "newest", or paths.
+        scenes: Where.
+        trials: Corridors of each training under each setting.
         pyrender_trials: Corridors under the settings that pyrender draws.
-        replays: Episodes on which costs and errors are measured.
+        replays: Episodes of each training on which costs and errors are measured.
     """
 
-    policy: Name
+    policies: Annotated[list[Name], Field(min_length=1)]
+    scenes: Annotated[list[Name], Field(min_length=1)]
     trials: Count
     pyrender_trials: Count
     replays: Count

@@ -47,16 +47,21 @@ class Measured(NamedTuple):
     """Cost and errors of a setting over all recorded episodes.
 
     Attributes:
-        step_us: Process time of a step, median over episodes [us].
+        steps_us: Process time of a step in each episode [us].
         event_error: Against the reference's events, see `envs.event_error`.
         latent_error: Against the exact latents of the reference's events, see `latent_error`.
         other_action: Share of steps at which the policy chooses another action than the reference.
     """
 
-    step_us: float
+    steps_us: tuple[float, ...]
     event_error: float
     latent_error: float
     other_action: float
+
+    @property
+    def step_us(self) -> float:
+        """Process time of a step, median over episodes [us]."""
+        return float(np.median(self.steps_us))
 
 
 class _Comparison(NamedTuple):
@@ -107,7 +112,7 @@ def _mean(found: Sequence[_Comparison], exact: np.ndarray) -> Measured:
     weights = [one.events for one in found]
     errors = [one.event_error for one in found]
     return Measured(
-        step_us=float(np.median([one.step_us for one in found])),
+        steps_us=tuple(one.step_us for one in found),
         event_error=float(np.average(errors, weights=weights)) if sum(weights) else 0.0,
         latent_error=latent_error(np.concatenate([one.latents for one in found]), exact),
         other_action=float(np.concatenate([one.others for one in found]).mean()),

@@ -1,21 +1,23 @@
 import pytest
+from matplotlib.collections import PathCollection
 
-from jobs.analysis.statistics import Estimate
-from jobs.analysis.tables import summarise
-from jobs.studies.replays import Measured
+from jobs.analysis.statistics import Difference, Estimate
 from jobs.studies.trade.page import (
-    HEADINGS,
+    ALL,
+    SETTING_FIELDS,
+    Outcome,
     TradedSetting,
     advise,
+    choices,
     draw_settings,
-    fronts,
-    panels,
+    headings,
+    on_front,
     setting_values,
     trade_lines,
     trade_metrics,
     trade_page,
+    verdicts,
 )
-from tests.support.episodes import flights
 
 ABOUT = {
     "run": "trade-short-s0-1",
@@ -24,88 +26,120 @@ ABOUT = {
     "date": "2026-01-02",
     "host": "somewhere",
     "cpus": 2,
-    "policy": "bytestream-s0",
-    "scene": "poles_eval",
+    "policies": {"bytestream": 3, "bytestream_hold": 5},
+    "scenes": ["poles_eval", "shape_change"],
     "action": "stochastic",
     "trials": 20,
-    "replays": 8,
-    "failed": {"pyrender samples 1": "RuntimeError: no OpenGL"},
+    "pyrender_trials": 4,
+    "replays": 2,
+    "failed": {"pyrender samples 1 of bytestream s0": "RuntimeError: no OpenGL"},
 }
 
 
-def make_row(knob, setting="", step_us=250.0, error=0.02, low=-0.05, high=0.05, won=18, other=0.01):
-    summary = summarise((knob, setting), flights(won))
-    measured = Measured(step_us, error, 0.1, other)
-    return TradedSetting(knob, setting, measured, summary, Estimate((low + high) / 2, (low, high)))
+def outcome(change, half=0.05, p=0.5, other=0.01, success=0.9):
+    difference = Difference(change, (change - half, change + half), p)
+    return Outcome(3, 60, Estimate(success + change, (0.7, 0.99)), difference, other)
 
 
-DEFAULT = make_row("default")
-COARSE = make_row("tolerance", "tolerance 0.5", 125.0, 0.11, other=0.03)
-FORGETFUL = make_row("memory", "memory legacy", 100.0, 0.8, low=-0.7, high=-0.6, won=4, other=0.4)
-FEW = make_row("pyrender", "samples 1", 2000.0, 0.9, low=-0.2, high=0.1)
-ROUNDED = make_row("precision", "int8", 200.0, 0.02)
-EXACT = make_row("most exact", "", 2500.0, 0.0, other=0.0)
-ROWS = [DEFAULT, COARSE, FORGETFUL, FEW, ROUNDED, EXACT]
+def make_row(
+    knob, setting="", scene="poles_eval", speed=1.0, error=0.02, change=0.0, groups=(0.0, 0.0), **given
+):
+    outcomes = dict(zip(ABOUT["policies"], (outcome(one) for one in groups), strict=True))
+    ratio = Estimate(speed, (0.95 * speed, 1.05 * speed))
+    outcomes[ALL] = outcome(change, **given)
+    return TradedSetting(scene, knob, setting, 250.0 / speed, ratio, error, 0.1, outcomes)
+
+
+def rows_of(scene):
+    return [
+        make_row("default", scene=scene),
+        make_row("tolerance", "tolerance 0.5", scene, 2.0, 0.11, 0.01),
+        make_row("memory", "memory legacy", scene, 2.5, 0.8, -0.5, p=1e-9),
+        make_row("pyrender", "samples 1", scene, 0.1, 0.9, -0.05, half=0.2),
+        make_row("renders", "renders 1", scene, 1.5, 0.3, -0.3, p=1e-9),
+        make_row("precision", "int8", scene, 1.2, 0.02),
+        make_row("most exact", "", scene, 0.1, 0.0),
+    ]
+
+
+ROWS = [row for scene in ABOUT["scenes"] for row in rows_of(scene)]
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "expected"),
+    ("change", "half", "p", "groups", "expected"),
     [
-        (-0.09, 0.01, "as good"),
-        (-0.09, -0.01, "as good"),
-        (-0.11, 0.01, "undecided"),
-        (-0.30, -0.01, "worse"),
+        (-0.04, 0.05, 0.5, (0.0, -0.08), "as good"),
+        (-0.04, 0.05, 1e-9, (0.0, -0.08), "as good"),
+        (-0.04, 0.05, 0.5, (0.0, -0.12), "undecided"),  # one group loses more than the margin
+        (-0.06, 0.05, 0.5, (-0.06, -0.06), "undecided"),
+        (-0.20, 0.05, 0.03, (-0.2, -0.2), "undecided"),  # one of several tests
+        (-0.20, 0.05, 1e-4, (-0.2, -0.2), "worse"),
+        (0.30, 0.45, 1e-4, (0.3, 0.3), "undecided"),
     ],
 )
-def test_a_verdict_follows_the_interval_of_the_difference(low, high, expected):
-    row = make_row("tolerance")._replace(difference=Estimate(0.0, (low, high)))
-    assert row.verdict == expected
-    assert row._replace(knob="default").verdict == "default"
+def test_a_verdict_follows_the_interval_the_groups_and_a_test_for_all_rows(change, half, p, groups, expected):
+    row = make_row("tolerance", change=change, half=half, p=p, groups=groups)
+    found = verdicts([make_row("default"), row, *[make_row("encoding", str(k)) for k in range(5)]])
+    assert found[:2] == ["default", expected]
     assert "-10 points" in trade_page(ABOUT, ROWS)
 
 
-def test_fronts_hold_what_is_not_beaten_and_know_no_event_error_of_an_encoder():
-    found = fronts(ROWS)
-    assert found == {"e": [2, 1, 0, 5], "a": [2, 1, 4, 5], "s": [2, 1]}
-    assert [panel.front for panel in panels(setting_values(ROWS))] == list(found.values())
+def test_no_setting_on_the_front_is_beaten_beyond_doubt_and_an_encoder_has_no_event_error():
+    own = rows_of("poles_eval")
+    assert on_front(own) == [True, True, True, False, False, False, True]
+    noisy = [make_row("a", speed=1.0, error=0.02), make_row("b", speed=1.04, error=0.02)]
+    assert on_front(noisy) == [True, True]
 
 
-def test_every_line_has_a_word_for_each_heading():
-    text = trade_lines(ROWS)
-    assert {len(line) for line in text} == {len(HEADINGS)}
-    assert text[0][:6] == ("default", "", "4,000", "2", "10", "1")
-    assert text[0][8] == ""
-    assert text[4][3] == "-"
-    assert [line[10] for line in text] == ["default", "as good", "worse", "undecided", "as good", "as good"]
+def test_every_line_has_a_word_for_each_heading_and_each_scene_its_own():
+    groups = list(ABOUT["policies"])
+    text = trade_lines(ROWS, groups)
+    assert {len(line) for line in text} == {len(headings(groups))}
+    assert text[0][:6] == ("default", "", "4,000", "1.00 [0.95, 1.05]", "2", "10")
+    assert text[0][-2:] == ("", "default")
+    assert text[5][4] == "-"
+    words = ["default", "as good", "worse", "undecided", "worse", "as good", "as good"]
+    assert [line[-1] for line in text] == 2 * words
 
 
-def test_advice_is_the_fastest_of_the_good_and_what_to_avoid():
+def test_advice_is_the_fastest_that_is_as_good_in_each_scene_and_what_to_avoid():
     found = advise(ROWS)
-    assert found.fastest is found.coarsest is COARSE
-    assert found.encoder is ROUNDED
-    assert (found.worse, found.undecided) == ([FORGETFUL], [FEW])
+    assert found.fastest.name == found.coarsest.name == "tolerance 0.5"
+    assert found.encoder.name == "precision int8"
+    assert [one.name for one in found.worse] == ["memory legacy", "renders 1"]
+    assert [one.name for one in found.undecided] == ["pyrender samples 1"]
     text = trade_page(ABOUT, ROWS)
     assert "choose tolerance 0.5" in text
-    assert "8,000 steps/s, 2 times" in text
-    assert "memory legacy (-65 [-70, -60])" in text
+    assert "renders 1 (-30 [-35, -25] points in" in text
+
+
+def test_what_is_not_as_good_in_one_scene_is_not_advised():
+    rows = [*rows_of("poles_eval"), *rows_of("shape_change")]
+    rows[8] = rows[8]._replace(outcomes={**rows[8].outcomes, ALL: outcome(-0.4, p=1e-9)})
+    assert advise(rows).fastest.name == "precision int8"
+    assert {one.name: one.verdict for one in choices(rows)}["tolerance 0.5"] == "worse"
+    only_here = [make_row("culling", "cull_m 20"), *rows_of("shape_change")]
+    assert "culling cull_m 20" not in {
+        one.name for one in choices([*rows_of("poles_eval"), *only_here[:1], *only_here[1:]])
+    }
 
 
 def test_another_camera_is_reported_and_never_advised():
-    as_good = make_row("memory", "memory legacy", 100.0, 0.8)
-    found = advise([DEFAULT, COARSE, as_good, EXACT])
-    assert found.fastest is found.coarsest is COARSE
-    assert found.cameras == [as_good]
-    assert "memory legacy: 80 %" in trade_page(ABOUT, [DEFAULT, COARSE, as_good, EXACT])
+    as_good = [make_row("memory", "memory legacy", scene, 3.0, 0.8) for scene in ABOUT["scenes"]]
+    first, second = rows_of("poles_eval"), rows_of("shape_change")
+    found = advise([*first[:2], as_good[0], *second[:2], as_good[1]])
+    assert found.fastest.name == found.coarsest.name == "tolerance 0.5"
+    assert [one.name for one in found.cameras] == ["memory legacy"]
 
 
 def test_where_nothing_faster_is_as_good_the_default_stays():
-    found = advise([DEFAULT, FORGETFUL, EXACT])
-    assert found.fastest is DEFAULT
-    assert found.encoder is None
-    text = trade_page(ABOUT, [DEFAULT, FORGETFUL, EXACT])
+    slower = make_row("anti-aliasing", "samples 8", speed=0.7, error=0.01)
+    hardly = make_row("tolerance", "tolerance 0.1", speed=1.03)  # within the scatter of the timings
+    found = advise([make_row("default"), slower, hardly, make_row("most exact", error=0.0)])
+    assert found.fastest is found.encoder is None
+    text = trade_page(ABOUT, [make_row("default"), slower, hardly, make_row("most exact", error=0.0)])
     assert "keep the default" in text
     assert "Undecided" not in text
-    assert "\n\n-" not in text.split("## What to choose")[1].split("- **For speed**")[1], "one list"
 
 
 def test_the_page_says_what_made_it_and_what_could_not_be_evaluated():
@@ -113,29 +147,38 @@ def test_the_page_says_what_made_it_and_what_could_not_be_evaluated():
     assert (
         "Made on 2026-01-02 by `python -m platform.launch +exp=trade` at commit c0ffee on `somewhere`" in text
     )
-    assert "pyrender samples 1: RuntimeError: no OpenGL." in text
+    assert "pyrender samples 1 of bytestream s0: RuntimeError: no OpenGL." in text
     assert text.count("(images/trade.png)") == 1
-    assert text.count("\n| ") == len(ROWS) + 2
+    assert text.count("\n| ") == len(ROWS) + 4
+    assert [line for line in text.splitlines() if line.startswith("## Every")] == [
+        "## Every setting in `poles_eval`", "## Every setting in `shape_change`",
+    ]  # fmt: skip
 
 
-def test_every_number_of_the_advice_is_in_the_table():
-    text = trade_page(ABOUT, ROWS)
-    advised, table = text.split("## Every setting")
-    for word in ("8,000", "11", "-65 [-70, -60]"):
-        assert word in advised
-        assert word in table
+def test_published_settings_hold_all_that_the_plot_shows():
+    settings = setting_values(ROWS)
+    assert len(settings) == 3 * len(ROWS)
+    assert all(tuple(one) == SETTING_FIELDS for one in settings)
+    figure = draw_settings(settings)
+    assert len(figure.axes) == 4
+    assert sorted({axes.get_ylabel() for axes in figure.axes}) == [
+        "Events that differ [%]", "Success minus the default's [points]",
+    ]  # fmt: skip
+    changes = [axes for axes in figure.axes if "Success" in axes.get_ylabel()]
+    for axes, own in zip(changes, (ROWS[:7], ROWS[7:]), strict=True):
+        dots = [part for part in axes.collections if isinstance(part, PathCollection)]
+        drawn = sorted(float(part.get_offsets()[0][1]) for part in dots)
+        expected = sorted(100 * row.outcomes[ALL].difference.value for row in own)
+        assert drawn == pytest.approx(expected)
 
 
 def test_metrics_leave_out_what_was_not_measured():
-    assert trade_metrics(DEFAULT)["perf/env_steps_per_second"] == 4000.0
-    assert trade_metrics(DEFAULT)["sim/event_error"] == 0.02
-    assert "sim/event_error" not in trade_metrics(ROUNDED)
-    assert all(value == value for row in ROWS for value in trade_metrics(row).values())
-
-
-def test_the_figure_has_a_panel_for_each_measure_and_a_point_for_each_setting():
-    settings = setting_values(ROWS)
-    figure = draw_settings(settings)
-    assert [axes.get_ylabel() for axes in figure.axes] == [panel.label for panel in panels(settings)]
-    drawn = [sum(len(points.get_offsets()) for points in axes.collections[-6:]) for axes in figure.axes]
-    assert drawn == [len(ROWS)] * 3
+    assert trade_metrics(ROWS[0])["perf/env_steps_per_second"] == 4000.0
+    assert trade_metrics(ROWS[0])["sim/event_error"] == 0.02
+    assert "sim/event_error" not in trade_metrics(ROWS[5])
+    assert all(
+        value == value
+        for row in ROWS
+        for group in row.outcomes
+        for value in trade_metrics(row, group).values()
+    )

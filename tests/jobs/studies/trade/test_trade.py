@@ -8,12 +8,11 @@ from envs.event_error import NO_CULLING_M
 from jobs.config.config import ConfigError
 from jobs.rollout.executors import evaluate_part
 from jobs.rollout.policies import read_policy
+from jobs.rollout.store import TaskResult
 from jobs.run.folder import locate_run
 from jobs.studies.replays import Measured
 from jobs.studies.trade import trade
 from jobs.tracking.store import check_metrics
-from models.encoder.weights import load_encoder
-from models.policy.policy import ENCODER
 from tests.support.configs import small_config
 from tests.support.episodes import flights
 from tests.support.fake_executor import FakeExecutor
@@ -21,17 +20,17 @@ from tests.support.policies import save_training
 from tests.support.runs import in_store, tracked_sweeps
 
 
-def trade_config(tmp_path, policy="bytestream-s0", **changes):
+def trade_config(tmp_path, *policies, **changes):
     config = small_config(tmp_path, job="trade", exp="trade")
-    settings = dataclasses.replace(config.trade, policy=policy, **changes)
+    settings = dataclasses.replace(config.trade, policies=list(policies or ["bytestream-s0"]), **changes)
     return in_store(
         dataclasses.replace(config, trade=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)),
         tmp_path,
     )
 
 
-def planned(config, policy):
-    return trade.plan(config, read_policy(policy), load_encoder(f"{policy}/{ENCODER}")[0])
+def planned(config, policy, scene="poles_eval"):
+    return trade.plan(config, read_policy(policy), scene).tasks
 
 
 @pytest.fixture
@@ -69,11 +68,9 @@ def test_another_table_is_another_cell_and_none_is_as_before_there_were_tables(t
 
 def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(tmp_path):
     for name in ("event_columns-s0", "pretrained", "oracle"):
-        with pytest.raises(
-            ConfigError, match=f"^trade.policy: must be one policy with a frozen.*got '{name}'"
-        ):
+        with pytest.raises(ConfigError, match=f"^trade.policies: must have a frozen encoder.*got '{name}'"):
             trade.run(trade_config(tmp_path, name))
-    with pytest.raises(ConfigError, match=r"^trade.policy: must be 'pretrained', .*got 'nobody'"):
+    with pytest.raises(ConfigError, match=r"^trade.policies: must be 'pretrained', .*got 'nobody'"):
         trade.run(trade_config(tmp_path, "nobody"))
     assert not list(tmp_path.iterdir())
 
@@ -96,15 +93,16 @@ def test_the_job_leaves_table_figure_and_page_and_a_second_run_evaluates_only_wh
     assert not executor.measured
     place = locate_run(config).path / "trade"
     table = (place / "table.md").read_text().splitlines()[2:]
-    knobs = [line.split("|")[1].strip() for line in table]
+    knobs = [line.split("|")[2].strip() for line in table]
     encoder = ["precision"] * 2 + ["time bins"] * 3 + ["newest events"] * 2
     assert knobs == ["default", "tolerance", *encoder, "together", "together", "most exact"]
     assert (place / "images" / "trade.png").is_file()
     assert (
-        "pyrender renderer pyrender, samples 1: RuntimeError: no OpenGL." in (place / "trade.md").read_text()
+        "pyrender renderer pyrender, samples 1 of a s0: RuntimeError: no OpenGL."
+        in (place / "trade.md").read_text()
     )
     assert str(tmp_path) not in (place / "trade.md").read_text()
-    assert json.loads((place / "about.json").read_text())["policy"] == "a-s0"
+    assert json.loads((place / "about.json").read_text())["policies"] == {"a": 1}
     assert check_metrics(metrics)["perf/env_steps_per_second"] > 0
     assert 0 < metrics["sim/event_error"] < 1
     executor.evaluated.clear()
@@ -112,22 +110,59 @@ def test_the_job_leaves_table_figure_and_page_and_a_second_run_evaluates_only_wh
     assert executor.evaluated == []
     _, runs = tracked_sweeps(config, "setting", "trade")
     ((_, children),) = runs.items()
-    assert len(children) == len(table)
-    assert children["most exact"].data.metrics["sim/event_error"] == 0.0
-    assert children["most exact"].data.tags["verdict"] in ("as good", "undecided", "worse")
+    assert len(children) == 2 * len(table)  # of the group, and of all
+    assert children["poles_eval most exact all"].data.metrics["sim/event_error"] == 0.0
+    assert children["poles_eval most exact all"].data.tags["verdict"] in ("as good", "undecided", "worse")
 
 
 @pytest.mark.system
 def test_without_the_default_there_is_nothing_to_compare(tmp_path, policy, executor):
     executor.broken = {"default": "RuntimeError: no OpenGL"}
-    with pytest.raises(RuntimeError, match=r"^default: .*RuntimeError: no OpenGL"):
+    with pytest.raises(RuntimeError, match=r"^default of a s0: .*RuntimeError: no OpenGL"):
         trade.run(trade_config(tmp_path, policy), executor)
 
 
-def test_a_difference_is_taken_on_the_corridors_that_both_flew(tmp_path, policy):
-    task = planned(trade_config(tmp_path), policy)[0]
-    usual, few = flights(18), flights(5)[:10]
-    row = trade.traded_setting(task, Measured(1.0, 0.0, 0.0, 0.0), few, usual)
-    assert row.difference.value == pytest.approx(-0.5)
-    assert row.summary.episodes == 10
-    assert np.isfinite(row.difference.interval).all()
+def measured(*steps_us):
+    return Measured(steps_us, 0.1, 0.2, 0.05)
+
+
+def result(won, trials=20):
+    return TaskResult(flights(won)[:trials], {}, ("c0ffee",), 0)
+
+
+def test_trainings_are_compared_with_their_own_default_in_the_corridors_that_both_saw(tmp_path):
+    """Two trainings whose default reaches 18 and 9 of 20; the setting loses 0 and 3 of the first 10."""
+    config = trade_config(tmp_path)
+    plans = [
+        trade.plan(
+            config,
+            read_policy(save_training(tmp_path / name, "a", seed, config.env, "bytestream")),
+            "poles_eval",
+        )
+        for seed, name in enumerate(("one", "other"))
+    ]
+    condition = plans[0].tasks[1].condition
+    results = {
+        plans[0].tasks[0].key: result(18), plans[0].tasks[1].key: result(18, 10),
+        plans[1].tasks[0].key: result(9), plans[1].tasks[1].key: result(6, 10),
+    }  # fmt: skip
+    costs = [{("default", ""): measured(200.0, 100.0), condition: measured(50.0, 25.0)}] * 2
+    row = trade.traded_setting(condition, list(zip(plans, costs, strict=True)), results)
+    assert row.outcomes["a"] == row.outcomes["all"]
+    assert (row.together.trainings, row.together.episodes) == (2, 20)
+    assert row.together.difference.value == pytest.approx(-0.15)
+    assert row.together.success.value == pytest.approx(0.8)
+    assert row.speed.value == pytest.approx(4.0)
+    assert row.speed.interval == pytest.approx((4.0, 4.0))
+    usual = trade.traded_setting(("default", ""), list(zip(plans, costs, strict=True)), results)
+    assert usual.together.difference.value == 0.0
+    assert usual.speed.value == 1.0
+
+
+def test_repeated_ratios_have_an_interval_that_turns_round_with_them():
+    ratios = [1.8, 2.2, 2.0, 1.9]
+    found, back = trade.speed_ratio(ratios), trade.speed_ratio([1 / ratio for ratio in ratios])
+    assert found.value == pytest.approx(1 / back.value) == pytest.approx(np.exp(np.log(ratios).mean()))
+    assert found.interval[0] < found.value < found.interval[1]
+    assert found.interval[0] == pytest.approx(1 / back.interval[1], rel=0.02)
+    assert trade.speed_ratio([2.0]).interval is None
