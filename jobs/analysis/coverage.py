@@ -2,8 +2,8 @@
 
 Studies are simulated: the logit of success is a mean, plus a normal effect of each training and of each
 corridor, and episodes are drawn from it. Printed are the share of intervals that hold the true rate (of
-`rate_estimate`) or the true difference, which is 0 (of `crossed_difference`, two groups, and of `crossed_mean`,
-the same trainings once more), and the mean width.
+`rate_estimate`) or the true difference, which is 0 (of `crossed_difference`, two groups; of
+`crossed_mean`, the same trainings once more), and the mean width.
 """
 
 from collections.abc import Iterator

@@ -37,6 +37,7 @@ class TradeFacts(Provenance):
     date: str
     policies: Mapping[str, int]  # group -> trainings
     scenes: Sequence[str]
+    met: Mapping[str, Sequence[str]]  # group -> settings of fidelity that its trainings drew
     action: str
     trials: int
     pyrender_trials: int
@@ -108,8 +109,9 @@ class TradedSetting(NamedTuple):
 
 def verdicts(rows: Sequence[TradedSetting]) -> list[Verdict]:
     """A verdict for each row, by the rule that the page states; `rows` are the family of the tests."""
-    adjusted = holm([1.0 if row.together.difference.p is None else row.together.difference.p for row in rows])
-    return [_verdict(row, p) for row, p in zip(rows, adjusted, strict=True)]
+    tested = [row.together.difference.p for row in rows if row.knob != DEFAULT]
+    adjusted = iter(holm([1.0 if p is None else p for p in tested]))
+    return [_verdict(row, 1.0 if row.knob == DEFAULT else next(adjusted)) for row in rows]
 
 
 def _verdict(row: TradedSetting, p: float) -> Verdict:
@@ -137,12 +139,13 @@ def on_front(rows: Sequence[TradedSetting]) -> list[bool]:
     ]
 
 
-def _low(estimate: Estimate) -> float:
-    return (estimate.interval or (estimate.value,))[0]
+def _low(speed: Estimate) -> float:
+    """Lower end of a speed's interval; of a single timing nothing is known."""
+    return 0.0 if speed.interval is None else speed.interval[0]
 
 
-def _high(estimate: Estimate) -> float:
-    return (estimate.interval or (estimate.value,))[-1]
+def _high(speed: Estimate) -> float:
+    return float("inf") if speed.interval is None else speed.interval[1]
 
 
 def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:

@@ -57,10 +57,9 @@ def plot_trade(points: Sequence[TradePoint], margin: float) -> Figure:
 
 
 def _draw_errors(axes: Axes, points: Sequence[TradePoint]) -> None:
-    """Event error over speed, and the settings that none beats as a line."""
-    front = sorted((point for point in points if point.front), key=lambda point: point.speed)
-    line = np.array([(point.speed[0], point.error) for point in front]).T
-    axes.plot(*line, color=MUTED, lw=1.2, ls="--", zorder=1, label="beaten by none")
+    """Event error over speed; what no setting beats is ringed."""
+    front = [(point.speed[0], point.error) for point in points if point.front]
+    axes.plot(*np.array(front).T, "o", ms=12, mfc="none", mec=MUTED, zorder=1, label="beaten by none")
     _scatter(axes, points, [(point.error,) * 3 for point in points])
     axes.set_yscale("symlog", linthresh=1.0)
     axes.yaxis.set_major_formatter("{x:g}")

@@ -21,7 +21,7 @@ import torch
 from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from envs.event_error import converged
-from jobs.analysis.statistics import Estimate, bootstrap_interval, crossed_mean, rate_estimate
+from jobs.analysis.statistics import Estimate, crossed_mean, half_width, rate_estimate
 from jobs.analysis.tables import publish_plot, publish_table, write_csv
 from jobs.config.config import Config, ConfigError
 from jobs.rollout.agents import PolicyAgent, make_agent
@@ -94,7 +94,9 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     policies = find_encoder_policies(config)
     folder = open_run(config)
     config = folder.config
-    plans = [plan(config, policy, scene) for scene in config.trade.scenes for policy in policies]
+    plans = [
+        plan(config, policy, scene) for scene in dict.fromkeys(config.trade.scenes) for policy in policies
+    ]
     every = [task for own in plans for task in own.tasks]
     place = folder.path / "trade"
     store, executor = EpisodeStore(place), executor or default_executor(config.cluster, place)
@@ -103,16 +105,20 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
         tracker.tags({"kind": "trade", "policy": ", ".join(config.trade.policies)})
         slowest_first = sorted(every, key=lambda task: task.condition[0] not in (EXACT, "pyrender"))
         results, failed = evaluate_tasks(slowest_first, store, executor, "Trade", measure_accuracy=False)
-        for task in (task for own in plans for task in (own.tasks[0], own.tasks[-1])):
-            if task.key in failed:
-                what, reason = f"{task.condition[0]} of {task.policy.name}", failed[task.key]
-                raise RuntimeError(f"{what}: not evaluated: {reason}; the same command tries again")
-        traded = [row for own in measure_plans(config, plans, results) for row in own]
         reasons = {
-            f"{' '.join(task.condition)} of {task.policy.name}": failed[task.key]
-            for task in every
+            f"{' '.join(task.condition)} of {task.policy.name} in {own.scene}": failed[task.key]
+            for own in plans
+            for task in own.tasks
             if task.key in failed
         }
+        for own in plans:
+            for task in (own.tasks[0], own.tasks[-1]):
+                if task.key in failed:
+                    what = f"{task.condition[0]} of {task.policy.name} in {own.scene}"
+                    raise RuntimeError(
+                        f"{what}: not evaluated: {failed[task.key]}; the same command tries again"
+                    )
+        traded = [row for rows in measure_plans(config, plans, results) for row in rows]
         write_trade(folder, tracker, traded, facts_of(config, folder, policies, reasons))
         tracker.log(0, trade_metrics(traded[0]))
         console.print(tracker.dashboard(), markup=False)
@@ -222,7 +228,7 @@ def measure_plans(
     with progress("Replay", len(seeds) * sum(len(own.tasks) for own in able), "episodes") as advance:
         measured = [_measured(own, seeds, advance) for own in able]
     found = []
-    for scene in config.trade.scenes:
+    for scene in dict.fromkeys(config.trade.scenes):
         here = [(own, costs) for own, costs in zip(able, measured, strict=True) if own.scene == scene]
         conditions = dict.fromkeys(task.condition for own, _ in here for task in own.tasks)
         order = sorted(conditions, key=lambda condition: condition[0] == EXACT)  # that of a plan is the last
@@ -288,11 +294,12 @@ def _outcome(pairs: Sequence[tuple[np.ndarray, np.ndarray]], other_action: Seque
 
 
 def speed_ratio(ratios: Sequence[float]) -> Estimate:
-    """Geometric mean of repeated ratios of two times, with its bootstrap interval."""
+    """Geometric mean of repeated ratios of two times, with Student's interval of their logarithms."""
     logs = np.log(ratios)
-    interval = bootstrap_interval(logs, np.random.default_rng(0))
-    ends = None if interval is None else (float(np.exp(interval[0])), float(np.exp(interval[1])))
-    return Estimate(float(np.exp(logs.mean())), ends)
+    if len(logs) < 2:
+        return Estimate(float(np.exp(logs[0])), None)
+    centre, half = float(logs.mean()), float(half_width(logs[:, None])[0])
+    return Estimate(float(np.exp(centre)), (float(np.exp(centre - half)), float(np.exp(centre + half))))
 
 
 def facts_of(
@@ -306,13 +313,25 @@ def facts_of(
         "date": today(),
         **provenance(),
         "policies": dict(Counter(policy.group for policy in policies)),
-        "scenes": list(trade.scenes),
+        "scenes": list(dict.fromkeys(trade.scenes)),
+        "met": met_fidelity(policies),
         "action": config.evaluate.action,
         "trials": trade.trials,
         "pyrender_trials": min(trade.trials, trade.pyrender_trials),
         "replays": trade.replays,
         "failed": dict(failed),
     }
+
+
+def met_fidelity(policies: Sequence[EvaluatedPolicy]) -> dict[str, list[str]]:
+    """Group -> settings of `fidelity` that its trainings drew beside the default."""
+    found: dict[str, dict[str, None]] = {}
+    for policy in policies:
+        for condition in policy.conditions:
+            for key in (key for key in condition if key.startswith("fidelity.")):
+                name = f"{key.removeprefix('fidelity.')} {condition[key]}"
+                found.setdefault(policy.group, {})[name] = None
+    return {group: list(names) for group, names in found.items()}
 
 
 def write_trade(folder: Run, tracker: Tracker, rows: Sequence[TradedSetting], facts: TradeFacts) -> None:

@@ -10,6 +10,7 @@ from jobs.analysis.statistics import (
     exact_pair_p,
     half_width,
     holm,
+    paired_rate_difference,
     rate_estimate,
     trainings_needed,
     wilson_interval,
@@ -195,13 +196,6 @@ def test_an_interval_ends_at_what_is_possible():
     assert crossed_difference(ones, lost + 1.0, (0.0, 1.0)).interval[1] == 1.0
 
 
-def paired_flights(both, ours, theirs, neither):
-    """Successes of two sides by how often both, one of them, or none came through."""
-    first = [True] * (both + ours) + [False] * (theirs + neither)
-    second = [True] * both + [False] * ours + [True] * theirs + [False] * neither
-    return np.array(first), np.array(second)
-
-
 def test_pairs_are_tested_exactly():
     ours, theirs = paired_flights(5, 4, 0, 5)
     assert exact_pair_p(ours, theirs) == pytest.approx(2 * 0.5**4)
@@ -229,6 +223,55 @@ def test_as_many_trainings_as_are_needed_show_the_difference_in_four_of_five_stu
     ]
     assert 0.72 <= np.mean(shown) <= 0.88
     assert trainings_needed(ours[:1], theirs, 2.0) is None
+
+
+def paired_flights(both, ours, theirs, neither):
+    """Successes of two sides by how often both, one of them, or none came through."""
+    first = [True] * (both + ours) + [False] * (theirs + neither)
+    second = [True] * both + [False] * ours + [True] * theirs + [False] * neither
+    return np.array(first), np.array(second)
+
+
+def test_a_paired_rate_difference_turns_round_with_its_sides():
+    ours, theirs = paired_flights(60, 14, 5, 21)
+    there, back = paired_rate_difference(ours, theirs), paired_rate_difference(theirs, ours)
+    assert there.value == pytest.approx(0.09) == -back.value
+    assert there.interval == pytest.approx((-back.interval[1], -back.interval[0]))
+
+
+def test_without_correlation_a_paired_rate_difference_is_newcombes_of_two_samples():
+    ours, theirs = paired_flights(25, 25, 25, 25)
+    low, high = wilson_interval(50, 100)
+    half = np.hypot(0.5 - low, high - 0.5)
+    assert paired_rate_difference(ours, theirs).interval == pytest.approx((-half, half))
+
+
+def test_flights_that_all_agree_leave_a_doubt_that_shrinks_with_their_number():
+    widths = []
+    for count in (4, 20, 100):
+        same = np.arange(count) % 10 > 0
+        found = paired_rate_difference(same, same)
+        assert found.value == 0.0
+        assert found.interval[0] < 0.0 < found.interval[1]
+        widths.append(np.ptp(found.interval))
+    assert widths[0] > 2 * widths[1] > 4 * widths[2]
+
+
+def test_paired_rate_differences_hold_the_true_one_about_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(400):
+        hard = rng.random(60)
+        ours, theirs = (rng.random(60) < 0.95 - loss - 0.3 * hard for loss in (0.0, 0.1))
+        low, high = paired_rate_difference(ours, theirs).interval
+        hits += low <= 0.1 <= high
+    assert 0.92 <= hits / 400 <= 0.985
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [([], []), ([True], [True, False]), ([[True]], [[True]])])
+def test_pairs_that_are_none_are_refused(ours, theirs):
+    with pytest.raises(ValueError, match="same corridors"):
+        paired_rate_difference(np.array(ours, bool), np.array(theirs, bool))
 
 
 def test_the_interval_over_trainings_holds_the_true_mean_as_often_as_it_says_and_needs_two():

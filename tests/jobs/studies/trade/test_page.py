@@ -28,6 +28,7 @@ ABOUT = {
     "cpus": 2,
     "policies": {"bytestream": 3, "bytestream_hold": 5},
     "scenes": ["poles_eval", "shape_change"],
+    "met": {"bytestream_hold": ["tolerance 0.5", "samples 1"]},
     "action": "stochastic",
     "trials": 20,
     "pyrender_trials": 4,
@@ -142,6 +143,13 @@ def test_where_nothing_faster_is_as_good_the_default_stays():
     assert "Undecided" not in text
 
 
+def test_a_single_timing_says_nothing_of_speed():
+    once = make_row("tolerance", "tolerance 0.1", speed=2.0)._replace(speed=Estimate(2.0, None))
+    rows = [make_row("default"), once, make_row("most exact", error=0.0)]
+    assert advise(rows).fastest is None
+    assert on_front(rows) == [True, True, True]
+
+
 def test_the_page_says_what_made_it_and_what_could_not_be_evaluated():
     text = trade_page(ABOUT, ROWS)
     assert (
@@ -149,6 +157,7 @@ def test_the_page_says_what_made_it_and_what_could_not_be_evaluated():
     )
     assert "pyrender samples 1 of bytestream s0: RuntimeError: no OpenGL." in text
     assert text.count("(images/trade.png)") == 1
+    assert "`bytestream_hold` also met tolerance 0.5, samples 1." in text
     assert text.count("\n| ") == len(ROWS) + 4
     assert [line for line in text.splitlines() if line.startswith("## Every")] == [
         "## Every setting in `poles_eval`", "## Every setting in `shape_change`",
