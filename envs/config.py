@@ -216,8 +216,8 @@ class EnvConfig:
             "ground_texture": {"pattern": "rings"}}; keys are the layout's fields.
         control_hz: Actions (and event windows) per second [Hz].
         speed_mps: Constant speed [m/s]; the way of one step is speed_mps / control_hz.
-        action_delay_ms: From what is observed to the action that it leads to [ms]: that of the first control
-            step that begins so much later. Before the first one the vehicle moves straight ahead.
+        action_delay_ms: An action is taken in the first control step that begins so long after its choice
+            [ms]; until then the vehicle follows earlier choices, at first straight ahead.
         vehicle_radius_m: The vehicle is a disc of this radius [m].
         camera_height_m: Height of the camera above the ground [m].
         time_limit_s: Flight time after which the episode is truncated [s].

@@ -277,7 +277,8 @@ def policy_about(config: Config) -> dict[str, object]:
         "sensor": sensor,
         "sensor_hash": settings_hash(sensor),
         "world": {name: getattr(config.env, name) for name in ("scene", "layout")}
-        | {"faults": dataclasses.asdict(config.env.faults)},
+        | {"faults": dataclasses.asdict(config.env.faults)}
+        | ({"action_delay_ms": config.env.action_delay_ms} if config.env.action_delay_ms > 0 else {}),
         "conditions": config.train.conditions,
         "seed": config.seed,
         "algo": dataclasses.asdict(config.algo),

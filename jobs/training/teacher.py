@@ -10,7 +10,8 @@ from envs.scene.planning import CostToGo, cost_to_go
 from jobs.training.env_runner import PlainEnvRunner, Step
 from jobs.training.snapshots import Snapshot
 
-COST_TO_GO = "cost_to_go"  # in an info: of the cheapest way to the goal line, as `envs.scene.planning`
+# In an info: of the cheapest way (`envs.scene.planning`) to the goal line from where the next action is taken.
+COST_TO_GO = "cost_to_go"
 
 
 class TeacherEnvRunner(PlainEnvRunner):
@@ -55,7 +56,7 @@ class PricedEnvRunner(TeacherEnvRunner):
 
 
 def log_costs(episode: SingleAgentEpisode) -> np.ndarray:
-    """log(1 + `COST_TO_GO`) of the places of an episode, float64 (T + 1,).
+    """log(1 + `COST_TO_GO`) of the steps of an episode, float64 (T + 1,).
 
     Costs are about 1 where a way is free, and 1000 where none is left; logarithms are 0.7 and 7.
     """

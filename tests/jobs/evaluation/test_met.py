@@ -39,6 +39,12 @@ def test_a_cell_is_met_where_one_condition_may_draw_all_that_distinguishes_it(co
     assert was_met(conditions, changes) is expected
 
 
+@pytest.mark.parametrize(("delay_ms", "expected"), [(50.0, True), (25.0, False)])
+def test_what_a_training_always_had_it_has_met(delay_ms, expected):
+    trained = EnvConfig(action_delay_ms=50.0)
+    assert met([{}], trained, NOMINAL, env_with(NOMINAL, {"env.action_delay_ms": delay_ms})) is expected
+
+
 def test_what_two_conditions_meet_one_by_one_is_not_met_together():
     one, two = {"faults.sparsity": 0.5}, {"env.control_hz": 45.0}
     assert was_met([one, two], one)

@@ -119,6 +119,25 @@ def test_each_place_of_an_episode_has_its_cost_and_all_else_is_as_without_a_teac
     plain.stop()
 
 
+def test_with_a_delay_a_cost_is_that_of_the_place_where_the_next_action_is_taken():
+    config = make_config(*COLUMNS, "env.action_delay_ms=20")
+    assert policy_about(config)["world"]["action_delay_ms"] == 20.0
+    assert "action_delay_ms" not in policy_about(make_config(*COLUMNS))["world"]
+    runner, env = PricedEnvRunner(config=build_ppo(config), worker_index=0), CorridorEnv()
+    compared = 0
+    for episode in runner.sample(num_timesteps=64):
+        infos = episode.get_infos()
+        series = {"episode_number": int(infos[0]["episode_number"])}
+        env.reset(seed=int(infos[0]["episode_seed"]), options=series)
+        plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
+        for info, later in zip(infos[:-5], infos[4:-1], strict=True):  # four steps of 5 ms
+            assert info[COST_TO_GO] == plan.of_actions(later["x_m"], later["y_m"]).min()
+            assert later["y_m"] > info["y_m"] + 0.25
+            compared += 1
+    assert compared > 20
+    runner.stop()
+
+
 def test_shaping_lowers_what_values_are_taught_by_the_potential_and_leaves_returns(rolled_out, monkeypatch):
     env, (episodes, _) = rolled_out
     costs = np.concatenate([[info[COST_TO_GO] for info in one.get_infos()] for one in episodes])
