@@ -10,7 +10,7 @@ from envs.scene.planning import CostToGo, cost_to_go
 from jobs.training.env_runner import PlainEnvRunner, Step
 from jobs.training.snapshots import Snapshot
 
-# In an info: of the cheapest way (`envs.scene.planning`) to the goal line from where the next action is taken.
+# In an info: of the cheapest way (`envs.scene.planning`) to the goal line from where the next action acts.
 COST_TO_GO = "cost_to_go"
 
 
