@@ -43,12 +43,15 @@ def check_planned(
         about: What made the sweep.
         swept: Its episodes.
         plan: Of the study.
-        pretrained: Where the published policies are: all trainings of a group belong to the study.
+        pretrained: Where the published policies are: all trainings of a group that is named belong to the study.
 
     Raises:
         ConfigError: It has not; the message names the first difference.
     """
-    groups = {group: _published(group, pretrained) for group in plan.policies}
+    groups: dict[str, list[int]] = {}
+    for name in plan.policies:
+        group, seeds = _trainings(name, pretrained)
+        groups.setdefault(group, []).extend(seeds)
     planned = {"scene": plan.scene, "trials": plan.trials, "action": ACTION, "groups": groups}
     planned["axes"] = axes_of(plan)
     other = _difference("", planned, {name: about.get(name) for name in planned})
@@ -63,10 +66,12 @@ def check_planned(
         raise ConfigError(f"resume: {sweep} is not complete: {missing}; give its command again")
 
 
-def _published(group: str, pretrained: Path) -> list[int]:
-    """The seeds of the published trainings of a group."""
-    names = [path.parent.name for path in pretrained.glob(f"{group}-s*/{MANIFEST}")]
-    return sorted(int(name.rpartition("-s")[2]) for name in names if re.search(r"-s\d+$", name))
+def _trainings(name: str, pretrained: Path) -> tuple[str, list[int]]:
+    """Group and seeds of what a plan names: one training, such as bytestream-s0, or all published of a group."""
+    if one := re.fullmatch(r"(.+)-s(\d+)", name):
+        return one[1], [int(one[2])]
+    names = [path.parent.name for path in pretrained.glob(f"{name}-s*/{MANIFEST}")]
+    return name, sorted(int(own.rpartition("-s")[2]) for own in names if re.search(r"-s\d+$", own))
 
 
 def _stored_env(run: Path) -> dict[str, object]:
