@@ -43,7 +43,7 @@ def check_planned(
         about: What made the sweep.
         swept: Its episodes.
         plan: Of the study.
-        pretrained: Where the published policies are: all trainings of a group that is named belong to the study.
+        pretrained: Where the published policies are: of a group that is named, all belong to the study.
 
     Raises:
         ConfigError: It has not; the message names the first difference.
@@ -67,7 +67,7 @@ def check_planned(
 
 
 def _trainings(name: str, pretrained: Path) -> tuple[str, list[int]]:
-    """Group and seeds of what a plan names: one training, such as bytestream-s0, or all published of a group."""
+    """Group and seeds of what a plan names: one training, such as bytestream-s0, or all that are published."""
     if one := re.fullmatch(r"(.+)-s(\d+)", name):
         return one[1], [int(one[2])]
     names = [path.parent.name for path in pretrained.glob(f"{name}-s*/{MANIFEST}")]

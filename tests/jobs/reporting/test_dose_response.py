@@ -159,7 +159,7 @@ def test_the_plan_that_sweeps_are_checked_against_is_the_composed_one():
     config = composed()
     assert read_plan() == config.sweep
     named = [name for name in config.sweep.policies if "-s" not in name]
-    groups = dict.fromkeys(named, [0, 1, 2]) | {"bytestream_hold": [0, 1, 2, 3]}
+    groups = {name: [0, 1, 2] for name in named} | {"bytestream_hold": [0, 1, 2, 3]}
     about = {"scene": "poles_eval", "trials": 14, "action": "stochastic", "groups": groups}
     about["axes"] = axes_of(config.sweep)
     with pytest.raises(ConfigError, match=r"must be a run folder .*, got 'absent'"):
