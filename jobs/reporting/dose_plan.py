@@ -67,7 +67,7 @@ def check_planned(
 
 
 def _trainings(name: str, pretrained: Path) -> tuple[str, list[int]]:
-    """Group and seeds of what a plan names: one training, such as bytestream-s0, or all that are published."""
+    """Group and seeds of what a plan names: one training, such as bytestream-s0, or all of a group."""
     if one := re.fullmatch(r"(.+)-s(\d+)", name):
         return one[1], [int(one[2])]
     names = [path.parent.name for path in pretrained.glob(f"{name}-s*/{MANIFEST}")]
