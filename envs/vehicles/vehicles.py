@@ -137,9 +137,9 @@ class Vehicles:
     def _exchange(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Keep what is decided now, and take what was decided when each vehicle's delay began."""
         rows = self.rows
-        late = np.flatnonzero(active & (rows["delay"] > 0))
-        if not late.size:
+        if not self._decided.shape[1]:  # none has ever been delayed
             return actions
+        late = np.flatnonzero(active & (rows["delay"] > 0))
         steps = rows["forward"][late] + rows["left"][late] + rows["right"][late]
         turn, taken = steps % rows["delay"][late], actions.copy()
         taken[late] = self._decided[late, turn]
