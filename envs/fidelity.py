@@ -22,6 +22,7 @@ RENDERERS = ("auto", "raycast", "pyrender")
 
 CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the error
 RENDERS_TEXTURED = 1.3  # times those of a plain scene
+SHORT = 2.0  # time constants of a photoreceptor; in shorter control steps it needs no render of its own
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 # From which tolerance on how many samples do. Straight edges are exact whatever the samples;
 # the light and the arcs of cones and ellipsoids and the patterns of textures converge with them,
@@ -130,11 +131,14 @@ def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
     Between looks the light of a pixel is taken as linear in time, so an event is late or early
     within an interval; it may be so by 5 % of a control step. What a pixel sees changes faster the
     farther a step leads and the smaller the pixel. Of a high threshold fewer crossings are left,
-    and those are the uncertain ones.
+    and those are the uncertain ones. What is behind a photoreceptor of limited bandwidth changes
+    exponentially, so a step that is longer than two of its time constants takes two renders.
     """
     focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     step_m = config.speed_mps / config.control_hz
     renders = _renders_by_looks(step_m, scene) if by_looks else _renders_alone(step_m, scene)
+    if 2.0 * math.pi * config.camera.cutoff_hz / config.control_hz > SHORT:
+        renders = max(renders, 2.0)
     renders *= max(1.0, focal / FOCAL_PIXELS) ** 0.5
     renders *= max(1.0, config.camera.contrast_threshold / 0.2) ** 0.4
     renders *= (0.05 / config.fidelity.tolerance) ** (0.65 if config.fidelity.tolerance < 0.05 else 0.5)

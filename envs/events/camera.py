@@ -98,7 +98,7 @@ class EventCamera:
         curve = response_curve(config.response, config.luminance_floor or LUMINANCE_FLOOR)
         thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if rule.legacy else 1)
         self._model = tuple(rule), tuple(curve), thresholds
-        self._low_pass = low_pass(config) if config.cutoff_hz > 0.0 else None
+        self._low_pass = low_pass(config.width * config.height) if config.cutoff_hz > 0.0 else None
         num_pixels = config.width * config.height
         self._memory = crossings.memory_rows(num_pixels, config.refractory_us > 0)
         num_words = (num_pixels + 7) // 8

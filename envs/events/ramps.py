@@ -6,6 +6,8 @@ Between two looks the light of a pixel is taken as linear in time. So it is wher
 through the pixel at constant speed, because a pixel sees the mean over its area. The response to
 light then is not linear, and each crossing has a time of its own: when the light is what the
 crossed level responds to.
+Behind photoreceptors of limited bandwidth (`envs.events.lowpass`) the response goes along an
+exponential through what it was at the last look, half-way and now.
 
 Which levels are crossed is decided as in `envs.events.crossings`, for a camera that remembers
 ("reference") and has no refractory period.
@@ -24,6 +26,7 @@ from envs.events.crossings import (
     Memory,
     Model,
     Room,
+    first_invalid,
     level_of,
     remember,
     respond_at,
@@ -31,8 +34,11 @@ from envs.events.crossings import (
     set_quiet_bands,
 )
 from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME, sorted_events
-from envs.events.photoreceptor import light_of
+from envs.events.lowpass import ColumnFilter, column_filter, filter_columns, start_filter
+from envs.events.photoreceptor import Curve, light_of, natural_logarithm
 from envs.events.refractory import TOLERANCE
+
+STRAIGHT, STEEPEST = 1e-3, 1e6  # ratios of the halves of a way: no curve below it, as steep as any beyond
 
 
 class Ramps(NamedTuple):
@@ -44,8 +50,10 @@ class Ramps(NamedTuple):
         crossings: Levels crossed, negative if downwards, int64.
         sent: How many of them become events, int64.
         level, stride: The first level crossed, and from one to the next, float64.
-        light: Luminance at the first look, float64.
-        pace: Time that a change of luminance by 1 takes [us]; 0: all is due at once, float64.
+        base: Luminance at the first look, behind a filter the response, float64.
+        pace: Time that a change of that by 1 takes [us]; 0: all is due at once, float64.
+        ratio: Change in the second half of the time by that in the first; 1: on a line, otherwise
+            on an exponential, float64.
         start_us: Time of the first look, int64.
         length_us: Time between the looks, int64.
     """
@@ -56,8 +64,9 @@ class Ramps(NamedTuple):
     sent: np.ndarray
     level: np.ndarray
     stride: np.ndarray
-    light: np.ndarray
+    base: np.ndarray
     pace: np.ndarray
+    ratio: np.ndarray
     start_us: np.ndarray
     length_us: np.ndarray
 
@@ -72,6 +81,7 @@ class Watch(NamedTuple):
         scratch: As `crossings.steps` takes it.
         ramps: Room for the `Ramps` between two renders.
         room: `Room` for a block of pixels.
+        bandwidth: Of its photoreceptors.
     """
 
     model: Model
@@ -80,18 +90,19 @@ class Watch(NamedTuple):
     scratch: tuple
     ramps: Ramps
     room: Room
+    bandwidth: ColumnFilter
 
 
 def make_ramps(size: int) -> Ramps:
     """Room for `size` ramps."""
-    whole, real = np.empty((6, size), np.int64), np.empty((4, size))
+    whole, real = np.empty((6, size), np.int64), np.empty((5, size))
     return Ramps(*whole[:4], *real, *whole[4:])
 
 
 def can_look(camera: CameraConfig) -> bool:
     """Whether a camera follows the rules of this file; others need whole images."""
     events = camera.width * camera.height * camera.max_events_per_pixel
-    exact = camera.encoding == "linear32" and camera.refractory_us == 0 and camera.cutoff_hz == 0.0
+    exact = camera.encoding == "linear32" and camera.refractory_us == 0
     return camera.memory == "reference" and exact and events <= MAX_EVENTS_PER_FRAME
 
 
@@ -100,6 +111,7 @@ class ColumnCamera:
 
     Attributes:
         state: Model, memory and scratch as those of an `EventCamera`, with the pixels' numbers of this file.
+        bandwidth: Of its photoreceptors, `ColumnFilter`.
     """
 
     def __init__(self, config: CameraConfig) -> None:
@@ -109,6 +121,7 @@ class ColumnCamera:
         if limits.shape[1] > 1:
             limits = limits.reshape(-1, *self._shape).swapaxes(1, 2).reshape(limits.shape)
         self.state = (rule, curve, limits), memory, scratch
+        self.bandwidth = column_filter(config)
 
     @property
     def pixels(self) -> np.ndarray:
@@ -118,12 +131,16 @@ class ColumnCamera:
     @property
     def last_frame(self) -> np.ndarray:
         """The last frame, float32 (H, W), as the camera remembers it; not a copy."""
-        frame: np.ndarray = self.state[1][0][0]
+        limited = self.bandwidth.seen.size > 0
+        frame: np.ndarray = self.bandwidth.pixels.light if limited else self.state[1][0][0]
         return frame.reshape(self._shape[::-1]).T
 
     def reset(self, luminance: np.ndarray) -> None:
         """Remember a first frame, float32 (H, W), valid; it makes no events."""
-        remember(luminance.T.ravel(), *self.state[:2])
+        flat = luminance.T.ravel()
+        if self.bandwidth.seen.size:
+            start_filter(flat, Curve(*self.state[0][1]), self.bandwidth.pixels)
+        remember(flat, *self.state[:2])
 
 
 @kernel
@@ -144,11 +161,17 @@ def look_at(image, first, last, t_us, watch, kept):
     flat, (flags, outside) = image.reshape(image.size), watch.scratch
     model, memory, ramps = watch.model, watch.memory, watch.ramps
     begin, end = first * image.shape[1], last * image.shape[1]
+    if watch.bandwidth.seen.size > 0:
+        bad = first_invalid(flat[begin:end])
+        if bad >= 0:
+            return begin + bad, kept, 0
+        filter_columns(flat, first, last, t_us, watch.seen_us, model.curve, watch.bandwidth)
+        flat = watch.bandwidth.seen
     low, high = memory.quiet_low[begin:end], memory.quiet_high[begin:end]
     found = scan(flat[begin:end], low, high, flags, outside)
     for j in range(found):
         outside[j] += begin
-    begun, lost, room = kept, 0, watch.room
+    begun, room = kept, watch.room
     for start in range(0, found, BLOCK):
         pixels = outside[start : min(start + BLOCK, found)]
         bad = respond_at(pixels, flat, model.curve, room.after, room)
@@ -156,14 +179,22 @@ def look_at(image, first, last, t_us, watch, kept):
             return bad, begun, 0
         respond_at(pixels, memory.previous, model.curve, room.before, room)
         kept = _keep(pixels, flat, t_us, watch, kept)
-    for j in range(begun, kept):
-        lost += abs(ramps.crossings[j]) - ramps.sent[j]
+    lost = _lost(begun, kept, ramps)
     _advance(begun, kept, watch)
     for i in range(begin, end):
         memory.previous[i] = flat[i]
     for column in range(first, last):
         watch.seen_us[column] = t_us
     return -1, kept, 0 if model.rule.carries else lost
+
+
+@kernel
+def _lost(begun, kept, ramps):
+    """Levels that the newest ramps cross and send no event for."""
+    lost = 0
+    for j in range(begun, kept):
+        lost += abs(ramps.crossings[j]) - ramps.sent[j]
+    return lost
 
 
 @kernel
@@ -189,11 +220,34 @@ def _keep(pixels, flat, t_us, watch, kept):
         light, sign = np.float64(memory.previous[i]), np.int64(1) if change > 0.0 else np.int64(-1)
         ramps.pixels[kept], ramps.columns[kept] = i, column
         ramps.crossings[kept], ramps.sent[kept] = sign * count, min(count, rule.max_events)
-        ramps.level[kept], ramps.stride[kept], ramps.light[kept] = remembered + step, step, light
+        ramps.level[kept], ramps.stride[kept], ramps.base[kept] = remembered + step, step, light
         ramps.pace[kept] = length_us / (np.float64(flat[i]) - light) if way * change > 0.0 else 0.0
         ramps.start_us[kept], ramps.length_us[kept] = t_us - length_us, length_us
+        if watch.bandwidth.seen.size > 0:
+            _bend(kept, room.before[j], watch.bandwidth.half[i], room.after[j], ramps)
         kept += 1
     return kept
+
+
+@kernel
+def _bend(k, before, half, after, ramps):
+    """Lead ramp `k` through three responses at equal times.
+
+    Those are on an exponential if the two halves go the same way. Otherwise the levels are crossed
+    evenly, in the half that goes the way of the whole.
+    """
+    first, second, length = half - before, after - half, ramps.length_us[k]
+    ramps.base[k], ramps.ratio[k] = before, 1.0
+    if ramps.pace[k] == 0.0:
+        return
+    if first * second > 0.0:
+        ramps.pace[k], ramps.ratio[k] = length / (after - before), second / first
+    elif first * (after - before) > 0.0:
+        ramps.pace[k] = 0.5 * length / first
+    else:
+        ramps.base[k], ramps.pace[k] = half, 0.5 * length / second
+        ramps.start_us[k] += length // 2
+        ramps.length_us[k] = length - length // 2
 
 
 @kernel
@@ -226,26 +280,51 @@ def events_of_ramps(watch, kept, span):
     """
     ramps, height = watch.ramps, watch.memory.previous.size // watch.seen_us.size
     order, total = _row_after_row(ramps, kept, height), ramps.sent[:kept].sum()
-    lights, times, places = np.empty(total), np.empty(total, np.int64), np.empty(total, np.uint32)
+    after, times, places = np.empty(total), np.empty(total, np.int64), np.empty(total, np.uint32)
     event = 0
     for j in order:
         for k in range(ramps.sent[j]):
-            lights[event] = ramps.level[j] + k * ramps.stride[j]
+            after[event] = ramps.level[j] + k * ramps.stride[j]
             event += 1
-    light_of(watch.model.curve, lights, np.empty(total, np.int64))
+    if watch.bandwidth.seen.size > 0:
+        _straighten(ramps, order, after)
+    else:
+        light_of(watch.model.curve, after, np.empty(total, np.int64))
     event = 0
     for j in order:
         x = ramps.columns[j]
         place = np.uint32(((ramps.pixels[j] - x * height) << 13) | (x << 1) | (ramps.crossings[j] > 0))
         start, length = ramps.start_us[j] - span.start_us, np.float64(ramps.length_us[j])
         for _ in range(ramps.sent[j]):
-            after = np.rint((lights[event] - ramps.light[j]) * ramps.pace[j])
-            times[event] = start + np.int64(min(max(after, 1.0), length))
+            late = np.rint((after[event] - ramps.base[j]) * ramps.pace[j])
+            times[event] = start + np.int64(min(max(late, 1.0), length))
             places[event] = place
             event += 1
     events = sorted_events(times, places, span)
     _order_ties(events)
     return events
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _straighten(ramps, order, levels):
+    """Replace the levels of bent ramps by those that a line would cross at the same times."""
+    ratios, bent, event = np.empty(order.size), np.ones(levels.size), 0
+    for place, j in enumerate(order):
+        ratio = min(max(ramps.ratio[j], 1.0 / STEEPEST), STEEPEST)
+        ratios[place] = ratio if abs(ratio - 1.0) > STRAIGHT else 1.0
+        share = ramps.pace[j] / ramps.length_us[j] * (ratios[place] * ratios[place] - 1.0)
+        for _ in range(ramps.sent[j]):
+            bent[event] = max(1.0 + (levels[event] - ramps.base[j]) * share, 1.0 / STEEPEST**2)
+            event += 1
+    natural_logarithm(bent, np.empty(levels.size, np.int64))
+    natural_logarithm(ratios, np.empty(order.size, np.int64))
+    event = 0
+    for place, j in enumerate(order):
+        for _ in range(ramps.sent[j]):
+            if ratios[place] != 0.0:
+                late = 0.5 * ramps.length_us[j] * bent[event] / ratios[place]
+                levels[event] = ramps.base[j] + late / ramps.pace[j]
+            event += 1
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -15,6 +15,7 @@ from envs.checks import LIMIT_M, LIMIT_S
 from envs.compiled import kernel
 from envs.events.crossings import Room, make_room, named
 from envs.events.emission import EVENT, Span
+from envs.events.lowpass import ColumnFilter
 from envs.events.ramps import Ramps, Watch, events_of_ramps, look_at, make_ramps
 from envs.raycast.columns import Workspace, make_workspace, paint_columns
 from envs.raycast.silhouettes import (
@@ -62,6 +63,7 @@ class View(NamedTuple):
         model: The model of a `ColumnCamera`, as its `state` gives it.
         memory: Its memory; the last image is a part of it.
         seen_us: int64 (W,), when each column was looked at last [us].
+        bandwidth: Of its photoreceptors.
         scratch: Room for a step.
     """
 
@@ -72,6 +74,7 @@ class View(NamedTuple):
     model: tuple
     memory: tuple
     seen_us: np.ndarray
+    bandwidth: ColumnFilter
     scratch: Scratch
 
 
@@ -109,7 +112,7 @@ def sense_way(view, way, parts):
     bodies, stacks, cull, seen_us = view.bodies, view.stacks, view.cull_m, view.seen_us
     room, image, pixels, ramps, looks, block = view.scratch
     model, memory = named(view.model, view.memory)
-    watch = Watch(model, memory, seen_us, pixels, ramps, block)
+    watch = Watch(model, memory, seen_us, pixels, ramps, block, view.bandwidth)
     frame, width = room.frames[0], image.shape[1]
     room.frames[0] = view.frame[0]
     if not _is_near(way):

@@ -8,6 +8,7 @@ from envs.checks import check_pose
 from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, RealSensor
 from envs.events.faults import has_readout
+from envs.events.lowpass import UNLIMITED
 from envs.events.ramps import ColumnCamera
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
@@ -124,14 +125,14 @@ class Sensor:
 
     def view(self) -> View:
         """What a compiled step needs of this sensor; without a scene where it does not see by looks."""
-        scene = np.empty(0, BODY), NO_STACKS, np.zeros(1, FRAME), 0.0
+        scene, bandwidth = (np.empty(0, BODY), NO_STACKS, np.zeros(1, FRAME), 0.0), UNLIMITED
         if self.sees_by_looks:
-            renderer = self._renderer
+            renderer, bandwidth = self._renderer, self._camera.bandwidth
             scene = renderer.bodies, renderer.stacks, renderer.frame, renderer.cull_m
         model, memory, _ = self._camera.state
         camera = self._config.camera
         scratch = scratch_for(camera.width, camera.height, len(scene[0]))
-        return View(*scene, model, memory, self._seen_us, scratch)
+        return View(*scene, model, memory, self._seen_us, bandwidth, scratch)
 
     def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
         """The events of a step after the faults of this sensor."""

@@ -99,7 +99,7 @@ def respond() -> None:
     columns = ColumnCamera(config)
     columns.reset(light)
     state, ramps, (model, memory) = columns.state, make_ramps(1000), named(*columns.state[:2])
-    watch = Watch(model, memory, np.zeros(16, np.int64), state[2], ramps, make_room())
+    watch = Watch(model, memory, np.zeros(16, np.int64), state[2], ramps, make_room(), columns.bandwidth)
     _, kept, _ = look_at(0.5 * light, 0, 16, 1000, watch, 0)
     rng = np.random.default_rng(0)
     sensor = RealSensor(config, faults, (state, columns.pixels), rng, 0)

@@ -21,7 +21,7 @@ class Looker:
         values, rows, scratch = self.camera.state
         model, memory = named(values, rows)
         ramps = make_ramps(8 * WIDTH * HEIGHT)
-        self.watch = Watch(model, memory, self.seen_us, scratch, ramps, make_room())
+        self.watch = Watch(model, memory, self.seen_us, scratch, ramps, make_room(), self.camera.bandwidth)
 
     def look(self, *looks):
         """Events of looks (image, first column, column after the last, time [us]), and how many are lost."""

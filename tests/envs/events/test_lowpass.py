@@ -1,13 +1,17 @@
 """The bandwidth of the photoreceptors: what a first-order filter does to a ramp, a step and a sine."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
-from envs.config import CameraConfig, EnvConfig, sensor_settings
+from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
+from envs.corridor import CorridorEnv
+from envs.event_error import event_error
 from envs.events import EventCamera
-from envs.events.ramps import can_look
+from envs.events.ramps import can_look, look_at
+from tests.support.looks import HEIGHT, WIDTH, Looker
 
 FLOOR = 1e-9
 
@@ -27,6 +31,21 @@ def shown(values, times_us, **fields):
 
 def filtered(camera):
     return float(camera._low_pass.filtered[0])
+
+
+def events_of_flights(config):
+    """Events of a few corridors, one after the other in time, at most 12 steps of each."""
+    env, parts = CorridorEnv(config), []
+    for seed in range(3):
+        env.reset(seed=seed)
+        for step in range(12):
+            over = any(env.step(step % 3)[2:4])
+            events = env.events.copy()
+            events["t"] += seed * 10_000_000
+            parts.append(events)
+            if over:
+                break
+    return np.concatenate(parts)
 
 
 @pytest.mark.parametrize("cutoff_hz", [10.0, 30.0, 300.0])
@@ -100,9 +119,67 @@ def test_a_refused_frame_leaves_the_filter_as_it_was():
     assert after[0] == after[1] != b""
 
 
-def test_a_camera_with_a_cutoff_sees_whole_images_and_settings_that_are_off_leave_no_trace():
-    assert can_look(CameraConfig())
-    assert not can_look(CameraConfig(cutoff_hz=30.0))
+def test_by_columns_resting_light_is_followed_as_in_whole_images_whenever_one_looks():
+    first, last = np.random.default_rng(0).uniform(0.05, 0.9, (2, HEIGHT, WIDTH)).astype(np.float32)
+    camera, looker = EventCamera(WIDTH, HEIGHT, cutoff_hz=30.0), Looker(first, cutoff_hz=30.0)
+    camera.reset(first, 0)
+    camera.step(last, 1)
+    camera.step(last, 9000)
+    looker.look((last, 0, WIDTH, 1))
+    looker.look((last, 3, 9, 200), (last, 8, 9, 300), (last, 0, WIDTH, 9000))
+    seen = looker.camera.bandwidth.pixels
+    assert np.abs(seen.filtered.reshape(WIDTH, HEIGHT).T.ravel() - camera._low_pass.filtered).max() < 1e-4
+    assert looker.camera.last_frame.tobytes() == last.tobytes()
+
+
+@pytest.mark.parametrize("grows", [False, True])
+def test_by_columns_light_that_is_linear_in_time_is_followed_within_hundredths(grows):
+    """The same equation in 2,000 steps; a response that is linear instead is off by three times as much."""
+    fields = {"cutoff_hz": 100.0, "cutoff_grows_with_light": grows, "contrast_threshold": 0.05}
+    first, last = np.full((HEIGHT, WIDTH), 0.2, np.float32), np.full((HEIGHT, WIDTH), 0.8, np.float32)
+    looker, camera, once = Looker(first, **fields), EventCamera(1, 1, **fields), EventCamera(1, 1, **fields)
+    looker.look((last, 0, WIDTH, 2000))
+    for some in (camera, once):
+        some.reset(frame(0.2), 0)
+    for t in range(1, 2001):
+        camera.step(frame(0.2 + 0.6 * t / 2000), t)
+    once.step(frame(0.8), 2000)
+    found = looker.camera.bandwidth.pixels.filtered
+    assert np.ptp(found) == 0.0
+    assert found[0] == pytest.approx(filtered(camera), abs=0.03)
+    assert abs(filtered(once) - filtered(camera)) > 3 * abs(found[0] - filtered(camera))
+
+
+def test_by_columns_a_refused_value_leaves_filter_and_memory_as_they_were():
+    first, last = np.random.default_rng(1).uniform(0.05, 0.9, (2, HEIGHT, WIDTH)).astype(np.float32)
+    looker, other = Looker(first, cutoff_hz=50.0), Looker(first, cutoff_hz=50.0)
+    for value in (np.nan, -1.0, np.inf):
+        bad = last.copy()
+        bad[5, 7] = value
+        found = look_at(np.ascontiguousarray(bad.T), 6, 9, 10, looker.watch, 0)
+        assert found == (7 * HEIGHT + 5, 0, 0)
+    after = [some.look((last, 0, WIDTH, 4000))[0].tobytes() for some in (looker, other)]
+    assert after[0] == after[1] != b""
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("scene", "hz", "cutoff_hz"), [
+    ("poles", 200.0, 30.0), ("poles", 200.0, 300.0), ("poles", 400.0, 300.0), ("texture_change", 400.0, 30.0),
+    ("poles_dense", 45.0, 30.0), ("poles", 200.0, 3000.0),
+])  # fmt: skip
+def test_events_behind_a_filter_are_within_the_tolerance_of_whole_images(monkeypatch, scene, hz, cutoff_hz):
+    """32 whole images a step are another way to the same events, and as good as converged."""
+    config = EnvConfig(scene=scene, control_hz=hz, camera=CameraConfig(cutoff_hz=cutoff_hz))
+    ours = events_of_flights(config)
+    fidelity = FidelityConfig(max_step_m=config.speed_mps / hz / 32, samples=8, cull_m=1e6)
+    monkeypatch.setattr("envs.fidelity.can_look", lambda camera: False)
+    whole = events_of_flights(dataclasses.replace(config, fidelity=fidelity))
+    assert event_error(ours, whole, 0.05e6 / hz) <= config.fidelity.tolerance
+    assert ours.size > 100
+
+
+def test_a_camera_with_a_cutoff_is_looked_through_by_columns_and_settings_that_are_off_leave_no_trace():
+    assert can_look(CameraConfig(cutoff_hz=30.0))
     plain = sensor_settings(EnvConfig())
     assert "cutoff_hz" not in plain
     slow = sensor_settings(EnvConfig(camera=CameraConfig(cutoff_hz=30.0)))
