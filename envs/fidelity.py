@@ -132,7 +132,7 @@ def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
     within an interval; it may be so by 5 % of a control step. What a pixel sees changes faster the
     farther a step leads and the smaller the pixel. Of a high threshold fewer crossings are left,
     and those are the uncertain ones. What is behind a photoreceptor of limited bandwidth changes
-    exponentially, so a step that is longer than two of its time constants takes two renders.
+    exponentially, so at tolerance 0.05 a step of more than two time constants takes two renders.
     """
     focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     step_m = config.speed_mps / config.control_hz

@@ -19,14 +19,15 @@ from envs.events.photoreceptor import MAX_LUMINANCE, Curve, exponential, light_o
 # A photoreceptor is faster where it is brighter. v2e's filter: bandwidth ~ (grey + 20) / 275, of 255 greys.
 DARK_SHARE, WHITE_SHARE = 20.0 / 275.0, 255.0 / 275.0
 MOST_PERIODS = 60.0  # after which nothing is left of what was before
+LITTLE = 1e-6  # of a period; in less the first order is exact to 1e-12 of the response
 
 
 class LowPass(NamedTuple):
-    """What N filtered pixels remember, float64 (N,) each; changed in place.
+    """What N filtered pixels remember, (N,) each; changed in place.
 
     Attributes:
-        filtered: Response behind the filter.
-        response: Response before it, at the last frame.
+        filtered: Response behind the filter, float64.
+        response: Response before it, at the last frame, float64.
         light: Luminance of the last frame, float32.
     """
 
@@ -135,7 +136,9 @@ def _followed(filtered: float, slope: tuple, decay: float) -> float:
     """
     before, after, periods = slope
     lag = (after - before) / periods
-    return after - lag + (filtered - before + lag) * decay
+    followed = after - lag + (filtered - before + lag) * decay
+    little = filtered + (0.5 * (before + after) - filtered) * periods  # where that would be lost in rounding
+    return followed if periods > LITTLE else little
 
 
 @kernel

@@ -42,7 +42,7 @@ STRAIGHT, STEEPEST = 1e-3, 1e6  # ratios of the halves of a way: no curve below 
 
 
 class Ramps(NamedTuple):
-    """Light of pixels that fire, from one look at each to the next.
+    """The ways of pixels that fire, from one look at each to the next: light, behind a filter responses.
 
     Attributes:
         pixels: Their numbers, int64.
@@ -130,7 +130,7 @@ class ColumnCamera:
 
     @property
     def last_frame(self) -> np.ndarray:
-        """The last frame, float32 (H, W), as the camera remembers it; not a copy."""
+        """The last frame, float32 (H, W), as it was seen before any filter; not a copy."""
         limited = self.bandwidth.seen.size > 0
         frame: np.ndarray = self.bandwidth.pixels.light if limited else self.state[1][0][0]
         return frame.reshape(self._shape[::-1]).T
@@ -244,6 +244,8 @@ def _bend(k, before, half, after, ramps):
         ramps.pace[k], ramps.ratio[k] = length / (after - before), second / first
     elif first * (after - before) > 0.0:
         ramps.pace[k] = 0.5 * length / first
+    elif (ramps.level[k] - before) * (after - before) <= 0.0:  # one was due before
+        ramps.pace[k] = length / (after - before)
     else:
         ramps.base[k], ramps.pace[k] = half, 0.5 * length / second
         ramps.start_us[k] += length // 2

@@ -61,7 +61,7 @@ class View(NamedTuple):
         frame: (1,) FRAME without what a pose determines.
         cull_m: Obstacles farther than this are not drawn [m].
         model: The model of a `ColumnCamera`, as its `state` gives it.
-        memory: Its memory; the last image is a part of it.
+        memory: Its memory; the last image is a part of it, behind a filter as it is seen there.
         seen_us: int64 (W,), when each column was looked at last [us].
         bandwidth: Of its photoreceptors.
         scratch: Room for a step.
@@ -102,7 +102,7 @@ def sense_way(view, way, parts):
     """Events of a way.
 
     Args:
-        view: `View`, in whose memory the last image becomes that at the end.
+        view: `View`, whose last image becomes that at the end.
         way: `Way`.
         parts: In how many parts of equal time the way is cut; twice as many where something is near.
 

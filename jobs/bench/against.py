@@ -4,7 +4,8 @@ Run: python -m jobs.bench.against [COMMIT], the one before HEAD unless another i
 Expect: a table in about five minutes on one core. Two processes, one of each checkout, take turns
 at the same flights, 32 corridors side by side; a ratio is the median over the rounds of the other's
 time over this one's. The event error is that against the converged simulation of the same checkout,
-at tolerance 0.05. In the last row a shipped policy also encodes the windows and decides.
+at tolerance 0.05. By day and night the pixels have bandwidth and mismatch, but no noise. In the last row
+a shipped policy also encodes the windows and decides.
 """
 
 import inspect
@@ -24,12 +25,18 @@ ROUNDS = 15
 SCENES = ("poles", "poles_dense", "shape_change", "gates", "texture_change", "dynamic")
 ROOT = Path(__file__).resolve().parents[2]
 DECIDED = "poles models/pretrained/bytestream-s0"
+NAMES = {  # of rows that are not a scene alone
+    "poles 300 0.15": "poles, pixels of light=day",
+    "poles 30 0.25": "poles, pixels of light=night",
+    DECIDED: "poles, encoded and decided",
+}
 
 
 def worker() -> None:
     """Answer each line of the input by seconds a step and the event error, as JSON.
 
-    A line is the name of a scene, and the folder of a policy if one is to decide at each step.
+    A line is the name of a scene, bandwidth [Hz] and mismatch of the pixels, and the folder of a policy
+    if one is to decide at each step.
     It runs by its source alone in another checkout, so that it takes nothing from this file.
     """
     import json
@@ -39,7 +46,7 @@ def worker() -> None:
     import numpy as np
     import torch
 
-    from envs.config import EnvConfig
+    from envs.config import CameraConfig, EnvConfig
     from envs.corridor import CorridorVectorEnv
     from envs.event_error import measure_event_error
     from models.policy import load_policy
@@ -47,14 +54,17 @@ def worker() -> None:
     torch.set_num_threads(1)
     corridors, steps, known = 32, 12, {}
     for line in sys.stdin:
-        scene, *folder = line.split()
+        scene, *words = line.split()
+        slow = [float(word) for word in words if word[0].isdigit()]
+        folder = words[len(slow) :]
         if line not in known:
-            env = CorridorVectorEnv(corridors, EnvConfig(scene=scene, window_capacity=1024))
+            camera = CameraConfig(cutoff_hz=slow[0], threshold_mismatch=slow[1]) if slow else CameraConfig()
+            env = CorridorVectorEnv(corridors, EnvConfig(scene=scene, camera=camera, window_capacity=1024))
             env.reset(seed=0)
             policy = load_policy(folder[0]) if folder else None
             if policy is not None:
                 policy.reset(corridors)
-            known[line] = env, policy, measure_event_error(EnvConfig(scene=scene)).error
+            known[line] = env, policy, measure_event_error(EnvConfig(scene=scene, camera=camera)).error
         env, policy, error = known[line]
         rng, seconds = np.random.default_rng(0), []
         for _ in range(steps):
@@ -118,8 +128,7 @@ def compared(scene: str, here: Checkout, there: Checkout) -> tuple[str, ...]:
     micro = [f"{1e6 * statistics.median(pair[k][0] for pair in pairs):.0f}" for k in range(2)]
     errors = [f"{side[1]:.3f}" for side in pairs[0]]
     spread = f"{min(ratios):.2f} to {max(ratios):.2f}"
-    name = "poles, encoded and decided" if scene == DECIDED else scene
-    return name, *micro, f"{statistics.median(ratios):.2f}", spread, *errors
+    return NAMES.get(scene, scene), *micro, f"{statistics.median(ratios):.2f}", spread, *errors
 
 
 def main() -> None:
@@ -127,7 +136,7 @@ def main() -> None:
     commit = sys.argv[1] if len(sys.argv) > 1 else "HEAD^"
     with checked_out(commit) as place:
         here, there = Checkout(ROOT), Checkout(place)
-        rows = [compared(scene, here, there) for scene in (*SCENES, DECIDED)]
+        rows = [compared(scene, here, there) for scene in (*SCENES, *NAMES)]
         here.end()
         there.end()
     head = ("scene", "us here", "us there", "there / here", "all rounds", "error here", "error there")

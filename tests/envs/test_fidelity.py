@@ -71,6 +71,11 @@ def test_longer_steps_smaller_pixels_and_textures_take_more_renders():
     assert plan_renders(EnvConfig(), textured).max_step_m < plan_renders(EnvConfig(), SCENE).max_step_m
 
 
+def test_a_step_of_more_than_two_time_constants_of_a_slow_pixel_takes_two_renders():
+    for cutoff_hz, least in ((0.0, 1), (30.0, 1), (300.0, 2)):
+        assert renders(EnvConfig(camera=CameraConfig(cutoff_hz=cutoff_hz))) == least
+
+
 def test_a_short_lane_is_drawn_whole_and_a_long_one_as_far_as_the_tolerance_asks():
     lane = make_scene("poles", np.random.default_rng(0), last_y_m=400.0, num_obstacles=150)
     assert plan_renders(EnvConfig(), SCENE).cull_m == math.inf

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.config import LUMINANCE_FLOOR, CameraConfig
-from envs.events.lowpass import LowPass, filter_frames, filter_rates, start_filter
+from envs.events.lowpass import filter_frames, filter_rates, low_pass, start_filter
 from envs.events.photoreceptor import Curve, light_of, respond, response_curve
 
 
@@ -65,7 +65,7 @@ def light_behind(luminance: np.ndarray, times_us: np.ndarray, camera: CameraConf
     """
     curve = Curve(*response_curve(camera.response, camera.luminance_floor or LUMINANCE_FLOOR))
     if camera.cutoff_hz > 0.0:
-        pixels = LowPass(*np.zeros((3, luminance.shape[1])))
+        pixels = low_pass(luminance.shape[1])
         start_filter(np.ascontiguousarray(luminance[0]), curve, pixels)
         rest = np.ascontiguousarray(luminance[1:])
         rest = filter_frames(rest, times_us, curve, filter_rates(camera), pixels)

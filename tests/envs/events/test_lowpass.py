@@ -150,6 +150,76 @@ def test_by_columns_light_that_is_linear_in_time_is_followed_within_hundredths(g
     assert abs(filtered(once) - filtered(camera)) > 3 * abs(found[0] - filtered(camera))
 
 
+def test_by_columns_events_after_a_step_come_when_the_exponential_crosses_their_levels():
+    first, last = np.full((HEIGHT, WIDTH), 0.1, np.float32), np.full((HEIGHT, WIDTH), 0.8, np.float32)
+    fields = {"cutoff_hz": 30.0, "cutoff_grows_with_light": False, "luminance_floor": 1e-9}
+    tau_us, change = 1e6 / (2 * math.pi * 30.0), math.log(8.0)
+    for images in ((first, last), (last, first)):
+        events, _ = Looker(images[0], **fields).look((images[1], 0, WIDTH, 1), (images[1], 0, WIDTH, 9_001))
+        count = int(change * (1 - math.exp(-9_000 / tau_us)) / 0.2)
+        expected = -tau_us * np.log(1 - 0.2 * np.arange(1, count + 1) / change)
+        assert len(events) == count * WIDTH * HEIGHT > 5 * WIDTH * HEIGHT
+        assert np.abs(events["t"][:: WIDTH * HEIGHT] - expected).max() < 3
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{}, {"response": "lin_log"}, {"excess": "carry"}, {"threshold_mismatch": 0.05}, {"cutoff_hz": 900.0}],
+)
+def test_by_columns_light_that_comes_and_goes_fires_in_order_in_its_span_and_as_in_fine_steps(fields):
+    """In the end a pixel is as many levels away as in steps of 20 us, or one more or less."""
+    fields = {"cutoff_hz": 60.0, "contrast_threshold": 0.1} | fields
+    rng = np.random.default_rng(3)
+    frames = rng.uniform(0.3, 0.9, (40, HEIGHT, WIDTH)).astype(np.float32)
+    looker, camera = Looker(frames[0], **fields), EventCamera(WIDTH, HEIGHT, **fields)
+    camera.reset(frames[0], 0)
+    ours, fine, now = [], [], 0
+    for before, after, wait in zip(frames, frames[1:], [1, 2, 3, 1001] + 35 * [2000], strict=False):
+        found, _ = looker.look((after, 0, WIDTH, now + wait))
+        assert np.array_equal(np.argsort(found, order=("t", "y", "x"), kind="stable"), np.arange(found.size))
+        assert found.size == 0 or now < found["t"][0] <= found["t"][-1] <= now + wait
+        ours.append(found)
+        for t in range(min(20, wait), wait + 1, 20):
+            share = np.float32(t / wait)
+            fine.append(camera.step((1 - share) * before + share * after, now + t))
+        fine.append(camera.step(after, now + wait) if camera.t_us < now + wait else fine[-1][:0])
+        now += wait
+    sums = [np.zeros((HEIGHT, WIDTH)) for _ in range(2)]
+    for total, parts in zip(sums, (ours, fine), strict=True):
+        events = np.concatenate(parts)
+        np.add.at(total, (events["y"], events["x"]), events["p"])
+    assert np.abs(sums[0] - sums[1]).max() <= 1
+    assert np.abs(sums[0] - sums[1]).mean() < 0.2
+    assert sum(map(len, ours)) > 2000
+
+
+def test_by_columns_what_falls_and_then_rises_fires_while_it_rises_and_the_other_way_round():
+    fields = {"cutoff_hz": 100.0, "cutoff_grows_with_light": False, "contrast_threshold": 0.1}
+    for lights, half in (((0.45, 0.1, 0.9), slice(2001, 4001)), ((0.2, 0.9, 0.1), slice(1, 2000))):
+        first, second, third = (np.full((HEIGHT, WIDTH), light, np.float32) for light in lights)
+        looker = Looker(first, **fields)
+        assert looker.look((second, 0, WIDTH, 1))[0].size == 0
+        events, _ = looker.look((third, 0, WIDTH, 4001))
+        assert events.size > 0
+        assert half.start < events["t"][0] <= events["t"][-1] <= half.stop
+        assert (events["p"] == 1).all()
+
+
+@pytest.mark.parametrize("cutoff_hz", [1e-300, 1e-9, 1e-3, 1e6])
+def test_by_columns_the_slowest_photoreceptor_sees_nothing_and_the_fastest_all(cutoff_hz):
+    first, last = np.random.default_rng(5).uniform(0.05, 0.9, (2, HEIGHT, WIDTH)).astype(np.float32)
+    looker = Looker(first, cutoff_hz=cutoff_hz)
+    start = looker.camera.bandwidth.pixels.filtered.copy()
+    events, _ = looker.look((last, 0, WIDTH, 1), (first, 0, WIDTH, 2), (last, 0, WIDTH, 5000))
+    moved = np.abs(looker.camera.bandwidth.pixels.filtered - start)
+    if cutoff_hz < 1.0:
+        assert moved.max() < 1e-4
+        assert events.size == 0
+    else:
+        assert np.abs(moved - np.abs(np.log((last + 1e-3) / (first + 1e-3))).T.ravel()).max() < 1e-2
+        assert events.size > 500
+
+
 def test_by_columns_a_refused_value_leaves_filter_and_memory_as_they_were():
     first, last = np.random.default_rng(1).uniform(0.05, 0.9, (2, HEIGHT, WIDTH)).astype(np.float32)
     looker, other = Looker(first, cutoff_hz=50.0), Looker(first, cutoff_hz=50.0)
