@@ -1,7 +1,8 @@
 import re
 from pathlib import Path
 
-from jobs.analysis.coverage import SPREADS, true_rate
+from jobs.analysis import coverage
+from jobs.analysis.coverage import SPREADS, change_coverage, true_rate
 from jobs.analysis.stopping import EFFECTS, MEAN
 
 PAGE = (Path(__file__).parents[3] / "docs" / "statistics.md").read_text()
@@ -28,3 +29,18 @@ def test_the_page_says_what_looking_early_costs_as_its_rows_do():
     assert 0.3 < min(losses) < 0.34
     assert 0.4 < max(losses) < 0.5
     assert "costs a third to nearly half of the decisions" in PAGE
+
+
+def test_intervals_of_a_change_hold_zero_where_nothing_changes(monkeypatch):
+    """Of eight trainings and seven corridors, as of the trade; halved, they hold it in less than nine of ten."""
+    monkeypatch.setattr(coverage, "STUDIES", 200)
+    assert 0.95 <= change_coverage(8, 7, 1.5, 1.0) <= 1.0
+    whole = coverage.crossed_mean
+
+    def halved(values, limits):
+        found = whole(values, limits)
+        low, high = found.interval or (0.0, 0.0)
+        return type("Halved", (), {"interval": ((3 * low + high) / 4, (low + 3 * high) / 4)})
+
+    monkeypatch.setattr(coverage, "crossed_mean", halved)
+    assert change_coverage(8, 7, 1.5, 1.0) < 0.9
