@@ -32,7 +32,7 @@ def test_the_page_says_what_looking_early_costs_as_its_rows_do():
 
 
 def test_intervals_of_a_change_hold_zero_where_nothing_changes(monkeypatch):
-    """Of eight trainings and seven corridors, as of the trade; halved, they hold it in less than nine of ten."""
+    """Of eight trainings and seven corridors; halved intervals hold it in less than nine of ten."""
     monkeypatch.setattr(coverage, "STUDIES", 200)
     assert 0.95 <= change_coverage(8, 7, 1.5, 1.0) <= 1.0
     whole = coverage.crossed_mean
