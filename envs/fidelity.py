@@ -155,7 +155,9 @@ def _renders_by_looks(step_m: float, scene: Scene) -> float:
     share = step_m / 0.1
     if scene.kinds & {CONE, ELLIPSOID} or (scene.obstacles["z"] > scene.obstacles["rz"] + 1e-9).any():
         return 3.5 * share**0.5 * (1.0 if _plain(scene) else RENDERS_TEXTURED)
-    return 0.95 * share**1.1 if _plain(scene) else 1.3 * share**0.8
+    if scene.ground_texture.sharp:
+        return 4.7 * share**0.4 * max(1.0, 1.0 / scene.ground_texture.period_m) ** 0.4
+    return 0.95 * share**1.1 if _plain(scene) else max(1.3 * share**0.8, 1.4 * share**0.2)
 
 
 def _cull_m(tolerance: float, scene: Scene) -> float:

@@ -15,8 +15,9 @@ from envs.checks import LIMIT_M, LIMIT_S
 from envs.compiled import inlined, kernel
 from envs.raycast.bodies import MIN_DEPTH, corner, depths, is_before, outline, see_bodies
 from envs.raycast.coverage import LAYERS, PADDING, cover_ground, ends, put, resolve
-from envs.raycast.patterns import texture_cell
-from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Canvas, Ends, Record
+from envs.raycast.noise import make_mixing, turn_waves
+from envs.raycast.patterns import texture_cell, texture_column
+from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Canvas, Ends, Mixing, Noise, Record
 from envs.raycast.surfaces import enter_gap, show_body, show_walls, wall_depth
 from envs.scene import BOX, CONE, ELLIPSOID
 
@@ -51,6 +52,7 @@ class Workspace(NamedTuple):
         strips: (1,) STRIP.
         frames: (1,) FRAME, of the pose that is painted.
         accumulators: (LAYERS, height + PADDING) float64, zero between two columns.
+        mixing: For noise.
     """
 
     seen: np.ndarray
@@ -60,6 +62,7 @@ class Workspace(NamedTuple):
     strips: np.ndarray
     frames: np.ndarray
     accumulators: np.ndarray
+    mixing: Mixing
 
 
 def make_workspace(num_bodies: int, height: int) -> Workspace:
@@ -72,13 +75,14 @@ def make_workspace(num_bodies: int, height: int) -> Workspace:
         strips=np.zeros(1, STRIP),
         frames=np.zeros(1, FRAME),
         accumulators=np.zeros((LAYERS, height + PADDING)),
+        mixing=make_mixing(height),
     )
 
 
 @numba.njit(cache=True, error_model="numpy")
 def render_way(
     bodies: np.ndarray,
-    stacks: np.ndarray,
+    noise: Noise,
     scene_frame: np.ndarray,
     poses: np.ndarray,
     columns: np.ndarray,
@@ -89,7 +93,7 @@ def render_way(
 
     Args:
         bodies: (N,) BODY, what `envs.raycast.records` describes.
-        stacks: Float32, the filtered tiles of all noise.
+        noise: Of the scene.
         scene_frame: (1,) FRAME, which lacks what a pose determines.
         poses: (K, 5) float64 x, y, z [m], yaw [rad], time [s].
         columns: (K, W, H) float32, column after column, as cameras that look at columns keep an image.
@@ -106,14 +110,14 @@ def render_way(
         if not (near and abs(yaw) < np.inf and abs(time) <= LIMIT_S):
             return k
         aim(room.frames[0], x, y, z, yaw, time)
-        paint_columns(bodies, stacks, columns[k].T, 0, columns.shape[1], cull, room)
+        paint_columns(bodies, noise, columns[k].T, 0, columns.shape[1], cull, room)
     return -1
 
 
 @kernel
 def paint_columns(
     bodies: np.ndarray,
-    stacks: np.ndarray,
+    noise: Noise,
     image: np.ndarray,
     first: int,
     last: int,
@@ -129,7 +133,8 @@ def paint_columns(
     count = see_bodies(bodies, frame, low, high, cull, room.seen)
     size, total = _find_cuts(frame, room.seen[:count], Part(half, first, last), room.cuts, room.order)
     _sort_cuts(room.cuts, size)
-    canvas = Canvas(frame, room.strips[0], room.gaps, room.accumulators, stacks)
+    turn_waves(noise, frame, room.mixing)
+    canvas = Canvas(frame, room.strips[0], room.gaps, room.accumulators, noise, room.mixing)
     _sweep(canvas, room.seen, room.order, total, room.cuts[:size], image, first, last)
 
 
@@ -184,6 +189,7 @@ def _sweep(
                 passed += 1
         texture_cell(canvas, middle)
         if (cell + 1) % samples == 0:
+            texture_column(canvas, (cell // samples + 0.5 - half) / focal, cell // samples)
             resolve(frame, canvas.accumulators, image, cell // samples, first, last)
 
 

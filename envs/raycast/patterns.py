@@ -1,7 +1,7 @@
 """Kernels that average patterns over what a row of a strip shows of a surface.
 
 Checker, stripes and rings are averaged exactly where the footprint is a rectangle along
-their axes; noise is looked up in a stack of filtered tiles. Input is assumed valid.
+their axes, noise everywhere (`envs.raycast.noise`). Input is assumed valid.
 """
 
 import math
@@ -10,27 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.compiled import inlined, kernel
-from envs.raycast.bodies import box_slab, depths
+from envs.raycast.bodies import MIN_DEPTH, box_slab, depths
 from envs.raycast.coverage import Layer, share_below
+from envs.raycast.noise import Footprint, is_tabulated, mean_noise, mix_ground
 from envs.raycast.records import Canvas, Ends, Record
 from envs.scene import BOX, CONE
-from envs.scene.textures import LEVELS, NOISE, RINGS, STACK_TEXELS, STRIPES
+from envs.scene.textures import NOISE, RINGS, STRIPES, TILE_PERIODS
 
-TEXELS = STACK_TEXELS * STACK_TEXELS
 MIN_WIDTH = 1e-6  # [periods] a footprint below this is a point
+MIN_SIDE = 1e-4  # [periods] a side below this is left out beside another
 MIN_ROW = 1e-6  # [pixels] distance from the horizon up to which rows are told apart
-MAX_LOOKUPS = 8  # of noise along the longer axis of a footprint, per sample
-MIN_BLEND = 0.05  # weight below which a coarser level of noise is left out
+MAX_EDGES = 8  # of a pattern, at which a row is cut
 MIN_SHOWN = 1e-9  # [pixels] weight below which a surface is not textured
-
-
-class Footprint(NamedTuple):
-    """The parallelogram of a surface that is averaged, by its two sides along s and q [m]."""
-
-    one_s: float
-    one_q: float
-    other_s: float
-    other_q: float
 
 
 class Rows(NamedTuple):
@@ -38,6 +29,26 @@ class Rows(NamedTuple):
 
     first: float
     last: float
+
+
+class Upright(NamedTuple):
+    """What a strip shows of an upright surface [m].
+
+    Attributes:
+        s: Surface coordinate of its middle.
+        along: How much of s it shows.
+        swing: Mean of the pattern along s, if it is checker or stripes; no length.
+        q: The other coordinate, at the height of the eye.
+        depth: From the eye, on average.
+        lean: By how much its right end is deeper than its left.
+    """
+
+    s: float
+    along: float
+    swing: float
+    q: float
+    depth: float
+    lean: float
 
 
 class Quadric(NamedTuple):
@@ -75,45 +86,22 @@ def _wave(middle: float, wide: float) -> float:
 
 
 @inlined
-def _look_up(stacks: np.ndarray, level: int, blend: float, s: float, q: float) -> float:
-    """Periodic bilinear interpolation at (s, q) [tiles] in a level, and between it and the next one."""
-    x, y = (s - np.floor(s)) * STACK_TEXELS, (q - np.floor(q)) * STACK_TEXELS
-    i, j = int(x), int(y)
-    x, y = x - i, y - j
-    i, j = i & (STACK_TEXELS - 1), (j & (STACK_TEXELS - 1)) * STACK_TEXELS
-    right, below = (i + 1) & (STACK_TEXELS - 1), (j + STACK_TEXELS) & (TEXELS - 1)
-    here = level * TEXELS
-    upper = stacks[here + j + i] * (1.0 - x) + stacks[here + j + right] * x
-    lower = stacks[here + below + i] * (1.0 - x) + stacks[here + below + right] * x
-    value = upper + y * (lower - upper)
-    if blend > MIN_BLEND:
-        here += TEXELS
-        upper = stacks[here + j + i] * (1.0 - x) + stacks[here + j + right] * x
-        lower = stacks[here + below + i] * (1.0 - x) + stacks[here + below + right] * x
-        value += blend * (upper + y * (lower - upper) - value)
-    return value
+def _bow(x: float) -> float:
+    """A second integral of the square wave, of period 1."""
+    half = 2.0 * x - np.floor(2.0 * x)
+    sign = 1.0 if np.floor(2.0 * x) % 2.0 == 0.0 else -1.0
+    return 0.125 * sign * half * (half - 1.0)
 
 
 @kernel
-def _noise(stacks: np.ndarray, stack: int, s: float, q: float, sides: Footprint, max_lookups: int) -> float:
-    """Mean of noise over a parallelogram [tiles]: lookups along its longer side, each a filtered square."""
-    along_s, along_q = sides.other_s, sides.other_q
-    short = sides.one_s * sides.one_s + sides.one_q * sides.one_q
-    long = along_s * along_s + along_q * along_q
-    if short > long:
-        short, long, along_s, along_q = long, short, sides.one_s, sides.one_q
-    short, long = math.sqrt(short), math.sqrt(long)
-    # A sixteenth of a tile is a quarter of the shortest period, which one lookup resolves.
-    count = min(max_lookups, 1 + int(long / max(short, 0.0625)))
-    level = min(LEVELS - 1.0, max(short, long / count) * 2.0 * (LEVELS - 1))
-    low = min(int(level), LEVELS - 2)
-    # Filtering weakens a wave by the square of its width, to first order.
-    blend = (level * level - low * low) / (2.0 * low + 1.0)
-    total = 0.0
-    for j in range(count):
-        along = (j + 0.5) / count - 0.5
-        total += _look_up(stacks, stack * LEVELS + low, blend, s + along * along_s, q + along * along_q)
-    return total / count
+def _wave_between(middle: float, one: float, other: float) -> float:
+    """Mean of the square wave over a parallelogram whose sides span `one` and `other` [periods]; exact."""
+    one, other = abs(one), abs(other)
+    if min(one, other) < MIN_SIDE:
+        return _wave(middle, max(one, other))
+    far, near = 0.5 * (one + other), 0.5 * (one - other)
+    bend = _bow(middle + far) - _bow(middle + near) - _bow(middle - near) + _bow(middle - far)
+    return min(1.0, max(-1.0, bend / (one * other)))
 
 
 @inlined
@@ -123,51 +111,69 @@ def _scaled(sides: Footprint, scale: float) -> Footprint:
 
 
 @kernel
-def _pattern(
-    frame: Record, stacks: np.ndarray, look: Record, s: float, q: float, sides: Footprint, max_lookups: int
-) -> float:
+def _pattern(canvas: Canvas, look: Record, s: float, q: float, sides: Footprint) -> float:
     """Contrast times the mean of a texture over the parallelogram around (s, q) [m].
 
-    Exact for checker, stripes and rings if the footprint is a rectangle along s and q; else
-    each coordinate is averaged on its own, over a width of the same variance.
+    Exact for noise, stripes and rings. A checker's coordinates are averaged each on its own, which is exact
+    if the footprint is a rectangle along s and q, or shows no edge of one of them.
     """
-    scale = look.frequency
-    s = (s - look.speed_s * frame.time) * scale
-    q = (q - look.speed_q * frame.time) * scale
-    sides = _scaled(sides, scale)
+    time, scale = canvas.frame.time, look.frequency
+    s = (s - look.speed_s * time) * scale
+    q = (q - look.speed_q * time) * scale
     mean = look.contrast
     if look.pattern == NOISE:
-        return mean * _noise(stacks, look.stack, 0.25 * s, 0.25 * q, _scaled(sides, 0.25), max_lookups)
+        tiles = 1.0 / TILE_PERIODS
+        sides = _scaled(sides, tiles * scale)
+        waves = canvas.noise.waves[look.noise]
+        return mean * mean_noise(waves, canvas.mixing.terms, tiles * s, tiles * q, sides)
+    sides = _scaled(sides, scale)
     if look.pattern != RINGS:
-        mean *= _wave(s, math.sqrt(sides.one_s * sides.one_s + sides.other_s * sides.other_s))
+        mean *= _wave_between(s, sides.one_s, sides.other_s)
     if look.pattern != STRIPES:
-        mean *= _wave(q, math.sqrt(sides.one_q * sides.one_q + sides.other_q * sides.other_q))
+        mean *= _wave_between(q, sides.one_q, sides.other_q)
     return mean
 
 
 @kernel
-def _level_row(
-    frame: Record, stacks: np.ndarray, look: Record, rows: Rows, height: float, u: float, wide: float
-) -> float:
+def _level_row(canvas: Canvas, look: Record, rows: Rows, height: float, u: float, wide: float) -> float:
     """Contrast times the mean of a texture of a level face at `height` [m] over some rows.
 
-    `u` and `wide` are the slope of the strip's middle and its width in slopes. The footprint
-    is cut into parts of equal rows where it is long and neither along s nor along q.
+    `u` and `wide` are the slope of the strip's middle and its width in slopes. Rows are cut where q is at an
+    edge of the pattern, as far as there are few.
     """
+    frame = canvas.frame
     drop = frame.focal * (frame.eye_z - height)
+    side = math.copysign(1.0, drop)  # of the horizon on which the face is seen
+    low = side * max(MIN_ROW, side * (rows.first - frame.horizon))
+    high = side * max(MIN_ROW, side * (rows.last - frame.horizon))
+    steps = 2.0 * look.frequency * (u * frame.sin + frame.cos)  # edges of the pattern per depth
+    begun = 2.0 * look.frequency * (frame.eye_y - look.speed_q * frame.time)
+    one, other = begun + steps * drop / low, begun + steps * drop / high
+    first, last = math.ceil(min(one, other)), math.ceil(max(one, other))
+    if look.pattern == NOISE or look.pattern == STRIPES or not 0 < last - first <= MAX_EDGES:
+        return _level_part(canvas, look, drop, low, high, u, wide)
+    total, row = 0.0, low
+    for k in range(last - first):
+        edge = last - 1 - k if one > other else first + k
+        cut = min(max(drop * steps / (edge - begun), min(low, high)), max(low, high))
+        total += (cut - row) * _level_part(canvas, look, drop, row, cut, u, wide)
+        row = cut
+    total += (high - row) * _level_part(canvas, look, drop, row, high, u, wide)
+    return total / (high - low)
+
+
+@kernel
+def _level_part(
+    canvas: Canvas, look: Record, drop: float, low: float, high: float, u: float, wide: float
+) -> float:
+    """The same between two rows below the horizon, in parts of equal rows where much is seen between them."""
+    frame = canvas.frame
     along_s, along_q = u * frame.cos - frame.sin, u * frame.sin + frame.cos
-    low, high = rows.first - frame.horizon, rows.last - frame.horizon
-    if abs(low) < MIN_ROW:
-        low = math.copysign(MIN_ROW, drop)
-    if abs(high) < MIN_ROW:
-        high = math.copysign(MIN_ROW, drop)
     long = abs(drop / low - drop / high) * look.frequency
     if look.pattern == NOISE:
-        parts = 1 + int(min(3.0, 0.25 * long))
-        max_lookups = max(1, int(MAX_LOOKUPS * frame.samples) // parts)
+        parts = 1 + int(min(7.0, 0.5 * long))
     else:
-        slant = min(abs(along_s), abs(along_q))
-        max_lookups, parts = 1, 1 + int(min(8.0 * frame.samples - 1.0, 4.0 * frame.samples * slant * long))
+        parts = 1 + int(min(15.0, 8.0 * abs(along_s) * long))
     part, total, first = (high - low) / parts, 0.0, drop / low
     for j in range(parts):
         last = drop / (low + (j + 1) * part)
@@ -175,7 +181,7 @@ def _level_row(
         across = depth * wide
         sides = Footprint(across * frame.cos, across * frame.sin, long * along_s, long * along_q)
         s, q = frame.eye_x + depth * along_s, frame.eye_y + depth * along_q
-        total += _pattern(frame, stacks, look, s, q, sides, max_lookups)
+        total += _pattern(canvas, look, s, q, sides)
         first = last
     return total / parts
 
@@ -198,79 +204,191 @@ def texture_level(canvas: Canvas, top: Ends, bottom: Ends, height: float) -> Non
         if share > 0.0:
             start, end = _rows_between(row, top, bottom)
             rows = Rows(start, max(start, end))
-            mean = _level_row(frame, canvas.stacks, frame.body_texture, rows, height, strip.slope, wide)
+            mean = _level_row(canvas, frame.body_texture, rows, height, strip.slope, wide)
             canvas.accumulators[Layer.PAINT, row] += weight * share * mean
 
 
 @kernel
 def texture_side(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
     """Add the pattern of the side of a box or a pole between two edges."""
-    frame, strip = canvas.frame, canvas.strip
-    if body.kind == BOX:
-        left, right = _along_face(frame, body, strip)
-        foot = 0.0
-    else:
-        left, right = _around_pole(frame, body, strip)
-        foot = body.y
-    tall, weight = strip.entry / frame.focal, strip.weight * strip.light
-    middle, max_lookups = 0.5 * (left + right), int(MAX_LOOKUPS * frame.samples)
-    for row in range(int(min(top.left, top.right)), int(max(bottom.left, bottom.right)) + 1):
+    frame, strip, look = canvas.frame, canvas.strip, canvas.frame.body_texture
+    side = _along_face(frame, body, strip) if body.kind == BOX else _around_pole(frame, body, strip)
+    weight, end = strip.weight * strip.light, int(max(bottom.left, bottom.right)) + 1
+    whole, rest = math.ceil(max(top.left, top.right)), int(min(bottom.left, bottom.right))
+    if look.pattern == NOISE or rest <= whole:
+        whole = rest = end
+    for row in range(int(min(top.left, top.right)), end):
         share = share_below(row, top) - share_below(row, bottom)
-        if share > 0.0:
+        if share > 0.0 and not whole <= row < rest:
             start, end = _rows_between(row, top, bottom)
-            q = foot + frame.eye_z - (0.5 * (start + end) - frame.horizon) * tall
-            sides = Footprint(right - left, 0.0, 0.0, max(0.0, end - start) * tall)
-            mean = _pattern(frame, canvas.stacks, frame.body_texture, middle, q, sides, max_lookups)
+            mean = _upright_row(canvas, look, side, Rows(start, max(start, end)))
             canvas.accumulators[Layer.PAINT, row] += weight * share * mean
+    _add_upright_rows(canvas, look, side, whole, rest, weight)
+
+
+@kernel
+def _upright_row(canvas: Canvas, look: Record, side: Upright, rows: Rows) -> float:
+    """Contrast times the mean of a texture of an upright surface over some rows."""
+    frame, scale = canvas.frame, look.frequency
+    below = 0.5 * (rows.first + rows.last) - frame.horizon
+    tall = (rows.last - rows.first) * side.depth / frame.focal
+    lean, q = below * side.lean / frame.focal, side.q - below * side.depth / frame.focal
+    if look.pattern == NOISE:
+        return _pattern(canvas, look, side.s, q, Footprint(side.along, -lean, 0.0, tall))
+    mean = look.contrast
+    if look.pattern != RINGS:
+        mean *= side.swing
+    if look.pattern != STRIPES:
+        mean *= _wave_between((q - look.speed_q * frame.time) * scale, lean * scale, tall * scale)
+    return mean
+
+
+@kernel
+def _add_upright_rows(
+    canvas: Canvas, look: Record, side: Upright, first: int, last: int, weight: float
+) -> None:
+    """Add `weight` times the pattern of an upright surface to rows that show nothing else; not noise.
+
+    The same as `_upright_row` for each of them, in a loop without branches: where the surface leans, over
+    a width of the same variance.
+    """
+    frame, paint, scale = canvas.frame, canvas.accumulators[Layer.PAINT], look.frequency
+    weight *= look.contrast
+    if look.pattern != RINGS:
+        weight *= side.swing
+    if look.pattern == STRIPES:
+        for row in range(first, last):
+            paint[row] += weight
+        return
+    middle, per_row = (side.q - look.speed_q * frame.time) * scale, side.depth / frame.focal * scale
+    lean = side.lean / frame.focal * scale
+    for row in range(first, last):
+        below = row + 0.5 - frame.horizon
+        wide = max(MIN_WIDTH, math.sqrt(per_row * per_row + lean * lean * below * below))
+        start = middle - below * per_row - 0.5 * wide
+        end = start + wide
+        start, end = start - np.floor(start), end - np.floor(end)
+        mean = (min(end, 1.0 - end) - min(start, 1.0 - start)) / wide
+        paint[row] += weight * min(1.0, max(-1.0, mean))
+
+
+@inlined
+def _swing(frame: Record, look: Record, s: float, along: float) -> float:
+    """Mean of the square wave along s over a length around it [m]."""
+    return _wave((s - look.speed_s * frame.time) * look.frequency, abs(along) * look.frequency)
+
+
+@kernel
+def _swing_around(frame: Record, body: Record, strip: Record, s: float, along: float) -> float:
+    """The same around a pole, lit as the gap is, and cut at the pattern's edges as far as there are few."""
+    look, left, right = frame.body_texture, strip.gap_slopes.left, strip.gap_slopes.right
+    ahead = 2.0 * look.frequency
+    begun = (s - 0.5 * along - look.speed_s * frame.time) * ahead
+    ended = begun + along * ahead
+    first, last = math.ceil(min(begun, ended)), math.ceil(max(begun, ended))
+    if last - first > MAX_EDGES or not right > left:
+        return _swing(frame, look, s, along)
+    sign = 1.0 if math.floor(begun) % 2.0 == 0.0 else -1.0
+    start = math.atan2(frame.sin, frame.cos) + body.x / body.turn
+    u, total, middle = left, 0.0, strip.slope
+    for k in range(last - first + 1):
+        cut = right
+        if k < last - first:
+            edge = last - 1 - k if begun > ended else first + k
+            azimuth = (edge / ahead + look.speed_s * frame.time) / body.turn - start
+            beside, forward = body.rx * math.cos(azimuth), body.forward + body.rx * math.sin(azimuth)
+            cut = min(max((body.right + beside) / max(MIN_DEPTH, forward), u), right)
+        total += sign * (cut - u) * (1.0 + strip.tilt * (0.5 * (u + cut) - middle))
+        u, sign = cut, -sign
+    return total / (right - left)
 
 
 @kernel
 def texture_cell(canvas: Canvas, u: float) -> None:
-    """Add the patterns of ground and walls to what the cell of slope `u` shows of them."""
-    if canvas.frame.ground_texture.contrast > 0.0:
-        _texture_layer(canvas, Layer.GROUND, u)
-    if canvas.frame.wall_texture.contrast > 0.0:
-        _texture_layer(canvas, Layer.RIGHT_WALL, u)
-        _texture_layer(canvas, Layer.LEFT_WALL, u)
+    """Add the patterns of ground and walls to what the cell of slope `u` shows; not noise on the ground."""
+    frame = canvas.frame
+    whole = 1.0 / frame.samples
+    if frame.ground_texture.contrast > 0.0 and frame.ground_texture.pattern != NOISE:
+        _texture_ground(canvas, u, whole)
+    if frame.wall_texture.contrast > 0.0:
+        _texture_wall(canvas, Layer.RIGHT_WALL, u, whole)
+        _texture_wall(canvas, Layer.LEFT_WALL, u, whole)
 
 
 @kernel
-def _texture_layer(canvas: Canvas, layer: Layer, u: float) -> None:
-    """Add the pattern of the ground or a wall where the cell of slope `u` shows it; forget what it shows.
+def texture_column(canvas: Canvas, u: float, column: int) -> None:
+    """Add noise to the ground that a column of pixels around slope `u` shows."""
+    frame = canvas.frame
+    if frame.ground_texture.contrast > 0.0 and frame.ground_texture.pattern == NOISE:
+        if is_tabulated(canvas.noise, frame):
+            mix_ground(canvas.noise, canvas.mixing, column)
+        _texture_ground(canvas, u, 1.0)
 
-    What shows of a row is taken as a rectangle of its area around its middle.
-    """
-    frame, stacks = canvas.frame, canvas.stacks
-    layers, paint = canvas.accumulators[layer : layer + 3], canvas.accumulators[Layer.PAINT]
-    shown, across, whole = 0.0, 0.0, 1.0 / (frame.samples * frame.focal)
-    ground = layer == Layer.GROUND
-    side = 1.0 if layer == Layer.RIGHT_WALL else -1.0
-    facing = frame.lit_east if side * frame.wall_half < frame.eye_x else frame.lit_west
-    base = frame.floor if ground else frame.wall_albedo * facing
-    for row in range(int(frame.horizon) if ground else 0, int(2.0 * frame.horizon)):
-        shown += layers[0, row]
+
+@kernel
+def _texture_ground(canvas: Canvas, u: float, whole: float) -> None:
+    """Add the pattern of the ground where it shows in what is `whole` pixels wide, around slope `u`."""
+    frame, look, paint = canvas.frame, canvas.frame.ground_texture, canvas.accumulators[Layer.PAINT]
+    layers = canvas.accumulators[Layer.GROUND : Layer.GROUND + 3]
+    mixed = look.pattern == NOISE and is_tabulated(canvas.noise, frame)
+    share = across = 0.0
+    for row in range(int(frame.horizon), int(2.0 * frame.horizon)):
+        share += layers[0, row]
         across += layers[2, row]
-        if shown > MIN_SHOWN:
-            down = layers[1, row] / shown
-            tall = 1.0 - 2.0 * abs(down)
-            low = row + 0.5 + down - 0.5 * tall
-            # Where nothing hides a part of the row, the cell itself: sums have rounding errors.
-            part = min(1.0, shown * frame.samples / max(tall, MIN_SHOWN))
-            middle = (
-                u if part > 1.0 - MIN_SHOWN else min(max(across / shown, u - 0.5 * whole), u + 0.5 * whole)
-            )
-            rows = Rows(low, low + tall)
-            if ground:
-                mean = _level_row(frame, stacks, frame.ground_texture, rows, 0.0, middle, part * whole)
-            else:
-                mean = _wall_row(frame, stacks, rows, side, middle, part * whole)
-            paint[row] += shown * base * mean
+        if mixed and share > 1.0 - MIN_SHOWN:
+            paint[row] += frame.floor * look.contrast * canvas.mixing.means[row]
+        elif share > MIN_SHOWN:
+            rows, middle, wide = _part(frame, row, (share, layers[1, row], across), u, whole)
+            paint[row] += share * frame.floor * _level_row(canvas, look, rows, 0.0, middle, wide)
     layers[:] = 0.0
 
 
 @kernel
-def _wall_row(frame: Record, stacks: np.ndarray, rows: Rows, side: float, u: float, wide: float) -> float:
-    """Contrast times the mean of the wall at x = side * half width over some rows."""
+def _texture_wall(canvas: Canvas, layer: Layer, u: float, whole: float) -> None:
+    """Add the pattern of a wall where it shows in what is `whole` pixels wide, around slope `u`."""
+    frame, look, paint = canvas.frame, canvas.frame.wall_texture, canvas.accumulators[Layer.PAINT]
+    layers = canvas.accumulators[layer : layer + 3]
+    side = 1.0 if layer == Layer.RIGHT_WALL else -1.0
+    base = frame.wall_albedo * (frame.lit_east if side * frame.wall_half < frame.eye_x else frame.lit_west)
+    share = across = 0.0
+    first = last = -1  # of the rows that show nothing else
+    for row in range(int(2.0 * frame.horizon)):
+        share += layers[0, row]
+        across += layers[2, row]
+        if look.pattern != NOISE and share > whole - MIN_SHOWN and (last == row or last < 0):
+            first, last = row if last < 0 else first, row + 1
+        elif share > MIN_SHOWN:
+            rows, middle, wide = _part(frame, row, (share, layers[1, row], across), u, whole)
+            mean = _upright_row(canvas, look, _wall(frame, side, middle, wide), rows)
+            paint[row] += share * base * mean
+    if last > 0:
+        shown = _wall(frame, side, u, whole / frame.focal)
+        _add_upright_rows(canvas, look, shown, first, last, whole * base)
+    layers[:] = 0.0
+
+
+@inlined
+def _part(
+    frame: Record, row: int, shown: tuple[float, float, float], u: float, whole: float
+) -> tuple[Rows, float, float]:
+    """What shows of a row, as a rectangle of its area around its middle: its rows, middle slope, and width.
+
+    `shown` is the share of the row, and its moments down and across.
+    """
+    share, down, across = shown
+    down /= share
+    tall = 1.0 - 2.0 * abs(down)
+    low = row + 0.5 + down - 0.5 * tall
+    # Where nothing hides a part of the row, all of it: sums have rounding errors.
+    part, wide = min(1.0, share / max(whole * tall, MIN_SHOWN)), whole / frame.focal
+    if part > 1.0 - MIN_SHOWN:
+        return Rows(low, low + tall), u, wide
+    return Rows(low, low + tall), min(max(across / share, u - 0.5 * wide), u + 0.5 * wide), part * wide
+
+
+@inlined
+def _wall(frame: Record, side: float, u: float, wide: float) -> Upright:
+    """What slopes `wide` around `u` show of the wall at x = side * half width."""
     away = side * frame.wall_half - frame.eye_x
     left, right = u - 0.5 * wide, u + 0.5 * wide
     one = away / (left * frame.cos - frame.sin)
@@ -278,16 +396,14 @@ def _wall_row(frame: Record, stacks: np.ndarray, rows: Rows, side: float, u: flo
     # A cell may reach past the slope that is parallel to the wall.
     one, other = min(abs(one), 1e9), min(abs(other), 1e9)
     one, other = one * (left * frame.sin + frame.cos), other * (right * frame.sin + frame.cos)
-    tall = away / (u * frame.cos - frame.sin) / frame.focal
-    q = frame.eye_z - (0.5 * (rows.first + rows.last) - frame.horizon) * tall
-    sides = Footprint(other - one, 0.0, 0.0, (rows.last - rows.first) * tall)
-    s = frame.eye_y + 0.5 * (one + other)
-    return _pattern(frame, stacks, frame.wall_texture, s, q, sides, int(MAX_LOOKUPS * frame.samples))
+    depth, s = away / (u * frame.cos - frame.sin), frame.eye_y + 0.5 * (one + other)
+    swing = _swing(frame, frame.wall_texture, s, other - one)
+    return Upright(s, other - one, swing, frame.eye_z, depth, 0.0)
 
 
 @kernel
-def _along_face(frame: Record, body: Record, strip: Record) -> Ends:
-    """World y (x) where both ends of the gap meet the face of a box that looks along x (y) [m]."""
+def _along_face(frame: Record, body: Record, strip: Record) -> Upright:
+    """The face of a box that the gap shows: s is the world's y (x) where it looks along x (y)."""
     cos, sin, left, right = frame.cos, frame.sin, strip.gap_slopes.left, strip.gap_slopes.right
     along_x, along_y = strip.slope * cos - sin, strip.slope * sin + cos
     near_x, near_y, _ = box_slab(body, along_x, along_y)
@@ -295,28 +411,35 @@ def _along_face(frame: Record, body: Record, strip: Record) -> Ends:
         away = body.dx - math.copysign(body.rx, along_x)
         one = away / (left * cos - sin) * (left * sin + cos)
         other = away / (right * cos - sin) * (right * sin + cos)
-        return Ends(frame.eye_y + one, frame.eye_y + other)
-    away = body.dy - math.copysign(body.ry, along_y)
-    one = away / (left * sin + cos) * (left * cos - sin)
-    other = away / (right * sin + cos) * (right * cos - sin)
-    return Ends(frame.eye_x + one, frame.eye_x + other)
+        start = frame.eye_y
+    else:
+        away = body.dy - math.copysign(body.ry, along_y)
+        one = away / (left * sin + cos) * (left * cos - sin)
+        other = away / (right * sin + cos) * (right * cos - sin)
+        start = frame.eye_x
+    s = start + 0.5 * (one + other)
+    swing = _swing(frame, frame.body_texture, s, other - one)
+    return Upright(s, other - one, swing, frame.eye_z, strip.entry, 0.0)
 
 
 @kernel
-def _around_pole(frame: Record, body: Record, strip: Record) -> Ends:
-    """Surface coordinate s [m] where both ends of the gap meet a pole."""
-    one, other = _azimuth(frame, body, strip.gap_slopes.left), _azimuth(frame, body, strip.gap_slopes.right)
-    turn = other - one
-    turn -= 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
-    start = body.x + body.turn * (one + math.atan2(frame.sin, frame.cos))
-    return Ends(start, start + body.turn * turn)
-
-
-@inlined
-def _azimuth(frame: Record, body: Record, u: float) -> float:
-    """Direction from a pole's axis to where slope `u` enters it, in the camera's frame [rad]."""
-    entry, _ = depths(body, frame, u)
-    return math.atan2(entry - body.forward, entry * u - body.right)
+def _around_pole(frame: Record, body: Record, strip: Record) -> Upright:
+    """The side of a pole that the gap shows."""
+    left, right = strip.gap_slopes.left, strip.gap_slopes.right
+    near, _ = depths(body, frame, left)
+    middle, _ = depths(body, frame, strip.slope)
+    far, _ = depths(body, frame, right)
+    depth = max(MIN_DEPTH, (near + 4.0 * middle + far) / 6.0)
+    s = along = swing = 0.0
+    if frame.body_texture.pattern != RINGS:
+        one = math.atan2(near - body.forward, near * left - body.right)
+        other = math.atan2(far - body.forward, far * right - body.right)
+        turn = other - one
+        turn -= 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
+        along = body.turn * turn
+        s = body.x + body.turn * (one + math.atan2(frame.sin, frame.cos)) + 0.5 * along
+        swing = _swing_around(frame, body, strip, s, along)
+    return Upright(s, along, swing, body.y + frame.eye_z, depth, far - near)
 
 
 @inlined
@@ -380,4 +503,4 @@ def curved_pattern(
     s = body.x + body.turn * azimuth
     q = body.y + frame.eye_z - shapes[2].over + 0.5 * (upper.up + lower.up)
     sides = Footprint(body.turn * across, right.up - left.up, body.turn * down, lower.up - upper.up)
-    return _pattern(frame, canvas.stacks, frame.body_texture, s, q, sides, int(MAX_LOOKUPS * frame.samples))
+    return _pattern(canvas, frame.body_texture, s, q, sides)

@@ -35,7 +35,7 @@ TEXTURE = _record(
     [
         ("pattern", "i8"),  # place in `envs.scene.textures.PATTERNS`
         *_floats("frequency", "contrast", "speed_s", "speed_q"),  # [1/m], 0 if plain, [m/s]
-        ("stack", "i8"),  # of noise: its place among the stacks of filtered tiles
+        ("noise", "i8"),  # of noise: its place among the scene's waves
     ]
 )
 
@@ -85,6 +85,7 @@ STRIP = _record(
         # Of the gap that is being painted: slopes of its ends and of its middle, its width [pixels].
         ("gap_slopes", ENDS),
         *_floats("slope", "weight"),
+        ("tilt", "f8"),  # and how much brighter a pole is there to the right, by slope and as a share
     ]
 )
 
@@ -95,6 +96,35 @@ GAP = _record([(name, ENDS) for name in ("top", "bottom", "reach")])
 CUT = _record([("position", "f8"), ("body", "i8"), ("begins", "i8")])
 
 
+class Noise(NamedTuple):
+    """What a scene has of noise.
+
+    Attributes:
+        waves: float32 (T, 4, K), of each texture: cycles a tile along s and q, turn [cycles], amplitude.
+        ground: float32 (W, 2 * K, R), means of the waves' cosines and sines over the pixels of the
+            ground, seen from above the origin; empty where nothing is tabulated.
+        height: From which it is seen so [m].
+    """
+
+    waves: np.ndarray
+    ground: np.ndarray
+    height: float
+
+
+class Mixing(NamedTuple):
+    """Room for adding waves up.
+
+    Attributes:
+        terms: float32 (K,).
+        turned: float32 (2 * K,), the ground's waves where the eye is: cosines and sines.
+        means: float32 (H,), of the ground in one column.
+    """
+
+    terms: np.ndarray
+    turned: np.ndarray
+    means: np.ndarray
+
+
 class Canvas(NamedTuple):
     """All that painting a strip needs beside the body that is painted.
 
@@ -103,11 +133,13 @@ class Canvas(NamedTuple):
         strip: A STRIP record.
         gaps: GAP records; how many of them are in use is passed along.
         accumulators: (LAYERS, height + PADDING) float64, see `envs.raycast.coverage`.
-        stacks: Float32, the filtered tiles of all noise, one after the other.
+        noise: Of the scene.
+        mixing: Room for it.
     """
 
     frame: Record
     strip: Record
     gaps: np.ndarray
     accumulators: np.ndarray
-    stacks: np.ndarray
+    noise: Noise
+    mixing: Mixing

@@ -17,12 +17,11 @@ import numpy as np
 
 from envs.checks import check_image, check_pose
 from envs.raycast.columns import make_workspace, render_way
+from envs.raycast.noise import NO_NOISE, tabulate_ground, waves_of
 from envs.raycast.point_samples import shade_hits, trace_scene
-from envs.raycast.records import BODY, FRAME
+from envs.raycast.records import BODY, FRAME, Noise
 from envs.scene import CONE, ELLIPSOID, Scene, Texture
-from envs.scene.textures import PATTERNS, around, noise_stack
-
-NO_STACKS = np.zeros(1, np.float32)
+from envs.scene.textures import PATTERNS, around
 
 
 def _check_scene(scene: Scene) -> None:
@@ -48,7 +47,7 @@ def _make_bodies(scene: Scene) -> np.ndarray:
 
 
 def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """(1,) FRAME without what a pose determines, and float32 the filtered tiles of the scene's noise."""
+    """(1,) FRAME without what a pose determines, and the waves of the scene's noise."""
     frame = np.zeros(1, FRAME)
     faces = np.array([(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)], np.float64)
     lit = scene.shade(np.ones(6), faces).tolist()
@@ -61,19 +60,19 @@ def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[
     frame["sun_x"], frame["sun_y"], frame["sun_z"] = scene.sun
     for side, light in zip(("up", "down", "east", "west", "north", "south"), lit, strict=True):
         frame[f"lit_{side}"] = light
-    stacks: list[np.ndarray] = []
+    waves: list[np.ndarray] = []
     textures = {"ground": scene.ground_texture, "wall": scene.wall_texture, "body": scene.obstacle_texture}
     for name, texture in textures.items():
-        frame[f"{name}_texture"] = _texture_record(texture, len(stacks))
+        frame[f"{name}_texture"] = _texture_record(texture, len(waves))
         if texture.pattern == "noise" and not texture.plain:
-            stacks.append(noise_stack(texture.seed).ravel())
-    return frame, np.concatenate(stacks) if stacks else NO_STACKS
+            waves.append(waves_of(texture.seed))
+    return frame, np.stack(waves) if waves else NO_NOISE.waves
 
 
-def _texture_record(texture: Texture, stack: int) -> tuple[float, ...]:
-    """A TEXTURE record, of which `stack` tells where its filtered tiles are, if it is noise."""
+def _texture_record(texture: Texture, noise: int) -> tuple[float, ...]:
+    """A TEXTURE record, of which `noise` tells where its waves are, if it is noise."""
     kind = PATTERNS.index(texture.pattern)
-    return (kind, 1.0 / texture.period_m, texture.depth, *texture.velocity_mps, stack)
+    return (kind, 1.0 / texture.period_m, texture.depth, *texture.velocity_mps, noise)
 
 
 def focal_length(width: int, fov_deg: float) -> float:
@@ -87,7 +86,7 @@ class RaycastRenderer:
     Attributes:
         bodies: (N,) BODY, the obstacles, see `envs.raycast.records`.
         frame: (1,) FRAME without what a pose determines.
-        stacks: Float32, the filtered tiles of the scene's noise.
+        noise: Of the scene.
         room: `envs.raycast.columns.Workspace` of this scene.
     """
 
@@ -125,8 +124,21 @@ class RaycastRenderer:
         _check_scene(scene)
         self.bodies = _make_bodies(scene)
         focal = focal_length(self.width, self.fov_deg)
-        self.frame, self.stacks = _make_frame(scene, self.height, focal, self.samples)
+        self.frame, waves = _make_frame(scene, self.height, focal, self.samples)
+        self.noise, self._ground_texture = Noise(waves, NO_NOISE.ground, 0.0), scene.ground_texture
         self.room = make_workspace(len(self.bodies), self.height)
+
+    def expect_height(self, eye_m: float) -> None:
+        """Expect to look along +y from `eye_m` above the ground [m]: noise on the ground then costs little.
+
+        Images from elsewhere are the same as without, those from there to 0.01 of the noise.
+        """
+        texture = self._ground_texture
+        if texture.pattern == "noise" and not texture.plain:
+            table = tabulate_ground(
+                self.width, self.height, focal_length(self.width, self.fov_deg), eye_m, texture.period_m
+            )
+            self.noise = self.noise._replace(ground=table, height=eye_m)
 
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
@@ -163,7 +175,7 @@ class RaycastRenderer:
             ValueError: As `render`, for the first pose that is refused.
         """
         columns = np.empty((len(poses), self.width, self.height), np.float32)
-        bad = render_way(self.bodies, self.stacks, self.frame, poses, columns, self.cull_m, self.room)
+        bad = render_way(self.bodies, self.noise, self.frame, poses, columns, self.cull_m, self.room)
         if bad >= 0:
             x_m, y_m, z_m, yaw_rad, t_s = poses[bad].tolist()
             check_pose((x_m, y_m, z_m, yaw_rad), t_s)

@@ -219,17 +219,32 @@ def _paint_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: End
 
 
 @inlined
+def _light_gap(frame: Record, body: Record, strip: Record, mean: float) -> None:
+    """Note in the strip the light of a pole in the gap, and its tilt; `mean` is that of the whole strip."""
+    first, last = strip.slopes.left, strip.slopes.right
+    left = body.albedo * (frame.ambient + frame.diffuse * max(0.0, strip.cosine.left))
+    right = body.albedo * (frame.ambient + frame.diffuse * max(0.0, strip.cosine.right))
+    per_slope = (right - left) / max(MIN_DEPTH, last - first)
+    here = left + per_slope * (strip.slope - first)
+    strip.tilt = per_slope / here if here > 0.0 else 0.0
+    strip.light = mean * here / (0.5 * (left + right)) if here > 0.0 else mean
+
+
+@inlined
 def show_body(canvas: Canvas, body: Record, count: int) -> int:
     """Paint what the strip knows of a body into the gaps; their new number."""
     frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
     strip.light = 0.0 if _is_curved(body) else _side_light(frame, body, strip)
     strip.level_light = body.albedo * (frame.lit_up if frame.eye_z > body.top else frame.lit_down)
     count = _cut_for_body(canvas, body, count)
+    mean_light, varies = strip.light, frame.body_texture.contrast > 0.0 and body.kind == POLE
     for k in range(count - 1, -1, -1):
         top, bottom = _clip(gaps[k], strip.cap), _clip(gaps[k], strip.end)
         if is_open(top, bottom):
             first, last = _clip(gaps[k], strip.side), _clip(gaps[k], strip.under)
             enter_gap(frame, strip, gaps[k])
+            if varies:
+                _light_gap(frame, body, strip, mean_light)
             _paint_faces(canvas, body, top, first, last, bottom)
             # Under the belly of an ellipsoid more than the ground can be seen.
             standing = body.bottom <= MIN_DEPTH and body.kind != ELLIPSOID

@@ -20,7 +20,6 @@ PLAIN, CHECKER, STRIPES, RINGS, NOISE = range(5)
 PATTERNS = ("plain", "checker", "stripes", "rings", "noise")
 TILE_PERIODS = 4  # the noise repeats after so many periods along both axes
 TILE = 256  # texels of the noise along either axis of its tile
-STACK_TEXELS, LEVELS = 128, 9  # texels along either axis, and number, of its filtered tiles
 
 
 @dataclass(frozen=True)
@@ -67,6 +66,11 @@ class Texture:
         """Whether the surface looks the same everywhere."""
         return self.depth == 0.0
 
+    @property
+    def sharp(self) -> bool:
+        """Whether the surface shows edges."""
+        return not self.plain and self.pattern != "noise"
+
 
 def around(texture: Texture, radius_m: float) -> float:
     """Metres of surface coordinate per radian around a round body, so that the pattern closes.
@@ -101,19 +105,6 @@ def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndar
     turns = 2j * math.pi / size * np.arange(size)
     along_s, along_q = np.exp(np.outer(turns, cycles[:, 0])), np.exp(np.outer(turns, cycles[:, 1]))
     return ((along_q * amplitudes) @ along_s.T).real
-
-
-@functools.cache
-def noise_stack(seed: int) -> np.ndarray:
-    """(LEVELS, STACK_TEXELS, STACK_TEXELS) float32, the mean over squares 0, 1/16, .. 1/2 tile wide."""
-    cycles, amplitudes = noise_waves(seed)
-    levels = [
-        _sum_waves(cycles, amplitudes * np.sinc(cycles * wide).prod(axis=1), STACK_TEXELS)
-        for wide in np.linspace(0.0, 0.5, LEVELS)
-    ]
-    stack = np.stack(levels).astype(np.float32)
-    stack.flags.writeable = False
-    return stack
 
 
 @functools.cache

@@ -18,6 +18,7 @@ from envs.events.emission import EVENT, Span
 from envs.events.lowpass import ColumnFilter
 from envs.events.ramps import Ramps, Watch, events_of_ramps, look_at, make_ramps
 from envs.raycast.columns import Workspace, make_workspace, paint_columns
+from envs.raycast.records import Noise
 from envs.raycast.silhouettes import (
     Looks,
     Stretch,
@@ -57,7 +58,7 @@ class View(NamedTuple):
 
     Attributes:
         bodies: (N,) BODY, the obstacles.
-        stacks: Float32, the filtered tiles of the scene's noise.
+        noise: Of the scene.
         frame: (1,) FRAME without what a pose determines.
         cull_m: Obstacles farther than this are not drawn [m].
         model: The model of a `ColumnCamera`, as its `state` gives it.
@@ -68,7 +69,7 @@ class View(NamedTuple):
     """
 
     bodies: np.ndarray
-    stacks: np.ndarray
+    noise: Noise
     frame: np.ndarray
     cull_m: float
     model: tuple
@@ -109,7 +110,7 @@ def sense_way(view, way, parts):
     Returns:
         First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
     """
-    bodies, stacks, cull, seen_us = view.bodies, view.stacks, view.cull_m, view.seen_us
+    bodies, noise, cull, seen_us = view.bodies, view.noise, view.cull_m, view.seen_us
     room, image, pixels, ramps, looks, block = view.scratch
     model, memory = named(view.model, view.memory)
     watch = Watch(model, memory, seen_us, pixels, ramps, block, view.bandwidth)
@@ -139,7 +140,7 @@ def sense_way(view, way, parts):
                 if kept + 2 * image.size > ramps.pixels.size or _is_seen(seen_us, first, last, t_us):
                     continue
             aim_along(frame, way, t_us)
-            paint_columns(bodies, stacks, image, first, last, cull, room)
+            paint_columns(bodies, noise, image, first, last, cull, room)
             bad, kept, more = look_at(image.T, first, last, t_us, watch, kept)
             if bad >= 0:
                 return bad, 0, 0, np.empty(0, EVENT)

@@ -12,8 +12,8 @@ from envs.events.lowpass import UNLIMITED
 from envs.events.ramps import ColumnCamera
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
+from envs.raycast.noise import NO_NOISE
 from envs.raycast.records import BODY, FRAME
-from envs.raycast.renderer import NO_STACKS
 from envs.raycast.silhouettes import Way
 from envs.scene import Scene
 from envs.sensor.looks import BAD_POSE, View, scratch_for, sense_way
@@ -125,10 +125,10 @@ class Sensor:
 
     def view(self) -> View:
         """What a compiled step needs of this sensor; without a scene where it does not see by looks."""
-        scene, bandwidth = (np.empty(0, BODY), NO_STACKS, np.zeros(1, FRAME), 0.0), UNLIMITED
+        scene, bandwidth = (np.empty(0, BODY), NO_NOISE, np.zeros(1, FRAME), 0.0), UNLIMITED
         if self.sees_by_looks:
             renderer, bandwidth = self._renderer, self._camera.bandwidth
-            scene = renderer.bodies, renderer.stacks, renderer.frame, renderer.cull_m
+            scene = renderer.bodies, renderer.noise, renderer.frame, renderer.cull_m
         model, memory, _ = self._camera.state
         camera = self._config.camera
         scratch = scratch_for(camera.width, camera.height, len(scene[0]))
@@ -200,9 +200,11 @@ class Sensor:
         if same:
             self._renderer.set_scene(scene)
             self._renderer.cull_m = chosen.cull_m
-            return
-        self.close()
-        self._renderer = make_renderer(chosen, scene, camera.width, camera.height, camera.fov_deg)
+        else:
+            self.close()
+            self._renderer = make_renderer(chosen, scene, camera.width, camera.height, camera.fov_deg)
+        if chosen.renderer == "raycast":
+            self._renderer.expect_height(self._config.camera_height_m)
 
 
 def check_sensed(bad: int, way: Way, image: np.ndarray) -> None:

@@ -62,7 +62,7 @@ def test_each_pattern_on_each_surface_looks_as_many_point_samples_of_it(surface,
 def test_more_samples_come_closer_to_a_checkered_world():
     scene = world(ground="checker", walls="checker", obstacles="checker")
     one, four = errors(scene)
-    assert four < 0.6 * one
+    assert four < one < 0.02
 
 
 def test_a_wall_seen_at_right_angles_is_averaged_exactly():

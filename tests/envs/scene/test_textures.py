@@ -6,11 +6,9 @@ import pytest
 
 from envs.scene import Texture
 from envs.scene.textures import (
-    LEVELS,
     TILE,
     TILE_PERIODS,
     around,
-    noise_stack,
     noise_tile,
     noise_waves,
     pattern_points,
@@ -80,20 +78,6 @@ def test_points_of_the_noise_are_the_sum_of_its_waves_to_a_thousandth():
     np.testing.assert_allclose(
         pattern_points(Texture("noise", 2.0, 1.0, seed=5), s, q), (turns @ amplitudes).real, atol=1.5e-3
     )
-
-
-def test_a_level_of_the_stack_is_the_tile_averaged_over_squares():
-    stack, tile = noise_stack(2), noise_tile(2).astype(np.float64)
-    step = TILE // stack.shape[1]
-    np.testing.assert_allclose(stack[0], tile[::step, ::step], atol=1e-6)
-    for level in (1, 4, LEVELS - 1):
-        wide = level * TILE // 16
-        kernel = np.zeros(TILE)
-        kernel[: wide + 1] = 1.0
-        kernel[[0, wide]] = 0.5  # trapezoidal rule, around its middle
-        window = np.fft.fft(np.roll(kernel / wide, -(wide // 2)))
-        mean = np.fft.ifft2(np.fft.fft2(tile) * np.outer(window, window)).real
-        np.testing.assert_allclose(stack[level], mean[::step, ::step], atol=3e-3)
 
 
 @pytest.mark.parametrize("name", ["checker", "noise"])

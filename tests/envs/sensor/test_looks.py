@@ -50,7 +50,7 @@ def test_a_column_painted_alone_is_that_of_the_whole_image(name, samples):
         first, last = np.sort(rng.choice(41, 2, replace=False))
         renderer.room.frames[0] = renderer.frame[0]
         aim(renderer.room.frames[0], *pose)
-        paint_columns(renderer.bodies, renderer.stacks, part, first, last, renderer.cull_m, renderer.room)
+        paint_columns(renderer.bodies, renderer.noise, part, first, last, renderer.cull_m, renderer.room)
         assert part[:, first:last].tobytes() == whole[:, first:last].tobytes()
         assert (np.delete(part, np.s_[first:last], axis=1) == -1.0).all()
 

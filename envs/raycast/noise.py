@@ -1,0 +1,186 @@
+"""Noise, averaged exactly: a sum of waves, each of which has a known mean over a parallelogram.
+
+The waves are those of `envs.scene.textures.noise_waves`. From a given height a pixel always shows the
+same piece of the ground as seen from the camera; so the mean of each wave over each pixel of the
+ground is tabulated, and where the camera is only turns the waves. Numbers are float32, errors below
+1e-5 of the noise.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from envs.compiled import inlined, kernel
+from envs.raycast.records import Mixing, Noise, Record
+from envs.scene.textures import TILE_PERIODS, noise_waves
+
+WAVES = len(noise_waves(0)[0])
+PARTS = 64  # of a pixel of the ground, at most: beyond, waves cancel
+LONGEST = 1e6  # [tiles]
+MAX_TABLE = 2**22  # numbers in a table of the ground; larger images average each pixel anew
+
+REAL = np.float32
+PI, ONE, TWO, HALF = REAL(math.pi), REAL(1.0), REAL(2.0), REAL(0.5)
+# Taylor's series of sin(pi x), to 6e-8 for |x| <= 1/2.
+SINE = tuple(REAL((-1) ** k * math.pi ** (2 * k + 1) / math.factorial(2 * k + 1)) for k in range(6))
+
+
+class Footprint(NamedTuple):
+    """The parallelogram of a surface that is averaged, by its two sides along s and q."""
+
+    one_s: float
+    one_q: float
+    other_s: float
+    other_q: float
+
+
+def make_mixing(height: int) -> Mixing:
+    """Room for images of `height` rows."""
+    return Mixing(np.zeros(WAVES, REAL), np.zeros(2 * WAVES, REAL), np.zeros(height, REAL))
+
+
+def waves_of(seed: int) -> np.ndarray:
+    """(4, WAVES) float32 the waves of a seed, as `Noise` has them."""
+    cycles, amplitudes = noise_waves(seed)
+    turn = np.angle(amplitudes) / (2.0 * math.pi)
+    return np.stack([cycles[:, 0], cycles[:, 1], turn, np.abs(amplitudes)]).astype(REAL)
+
+
+NO_NOISE = Noise(np.zeros((1, 4, WAVES), REAL), np.zeros((0, 0, 0), REAL), 0.0)
+
+
+@inlined
+def _sine(x: np.float32) -> np.float32:
+    """The sine of pi * x, for |x| <= 1/2."""
+    y = x * x
+    return x * (SINE[0] + y * (SINE[1] + y * (SINE[2] + y * (SINE[3] + y * (SINE[4] + y * SINE[5])))))
+
+
+@inlined
+def _cosine_of_turn(turn: np.float32) -> np.float32:
+    """The cosine of 2 pi * turn."""
+    return _sine(HALF - TWO * abs(turn - np.rint(turn)))
+
+
+@inlined
+def _mean_over(cycles: np.float32) -> np.float32:
+    """By how much the mean over so many cycles weakens a wave: sin(pi x) / (pi x)."""
+    turn = cycles - TWO * np.rint(HALF * cycles)
+    size = abs(turn)
+    sine = np.copysign(_sine(min(size, ONE - size)), turn)
+    return sine / (PI * cycles) if abs(cycles) > REAL(1e-3) else ONE
+
+
+@inlined
+def _bounded(side: float) -> np.float32:
+    """A side [tiles] that float32 can hold; over a longer one nothing is left of a wave."""
+    return REAL(min(max(side, -LONGEST), LONGEST))
+
+
+@kernel
+def mean_noise(waves: np.ndarray, terms: np.ndarray, s: float, q: float, sides: Footprint) -> float:
+    """Mean of noise over the parallelogram around (s, q) [tiles]; `waves` are (4, WAVES)."""
+    left, down = REAL(s - np.floor(s)), REAL(q - np.floor(q))
+    one_s, one_q = _bounded(sides.one_s), _bounded(sides.one_q)
+    other_s, other_q = _bounded(sides.other_s), _bounded(sides.other_q)
+    for k in range(WAVES):
+        along_s, along_q = waves[0, k], waves[1, k]
+        weight = _mean_over(along_s * one_s + along_q * one_q)
+        weight *= _mean_over(along_s * other_s + along_q * other_q)
+        turn = along_s * left + along_q * down + waves[2, k]
+        terms[k] = waves[3, k] * weight * _cosine_of_turn(turn)
+    # Four sums that do not wait for each other.
+    first = second = third = fourth = REAL(0.0)
+    for k in range(0, WAVES, 4):
+        first += terms[k]
+        second += terms[k + 1]
+        third += terms[k + 2]
+        fourth += terms[k + 3]
+    return float((first + second) + (third + fourth))
+
+
+@inlined
+def is_tabulated(noise: Noise, frame: Record) -> bool:
+    """Whether the ground looks from here as it does in the table."""
+    ahead = frame.cos == 1.0 and frame.sin == 0.0
+    return ahead and noise.ground.size > 0 and noise.height == frame.eye_z
+
+
+@kernel
+def turn_waves(noise: Noise, frame: Record, mixing: Mixing) -> None:
+    """Turn the waves of the ground to where the eye is, if it is tabulated."""
+    if not is_tabulated(noise, frame):
+        return
+    look, turned = frame.ground_texture, mixing.turned
+    waves, scale = noise.waves[look.noise], look.frequency / TILE_PERIODS
+    s = (frame.eye_x - look.speed_s * frame.time) * scale
+    q = (frame.eye_y - look.speed_q * frame.time) * scale
+    s, q = REAL(s - np.floor(s)), REAL(q - np.floor(q))
+    for k in range(WAVES):
+        turn = waves[0, k] * s + waves[1, k] * q + waves[2, k]
+        turned[k] = waves[3, k] * _cosine_of_turn(turn)
+        turned[WAVES + k] = -waves[3, k] * _cosine_of_turn(turn - REAL(0.25))
+
+
+@kernel
+def mix_ground(noise: Noise, mixing: Mixing, column: int) -> None:
+    """Fill the end of `mixing.means` with the means of the noise over a column's pixels of the ground."""
+    table, turned = noise.ground[column], mixing.turned
+    rows = table.shape[1]
+    means = mixing.means[len(mixing.means) - rows :]
+    means[:] = REAL(0.0)
+    for k in range(2 * WAVES):
+        weight = turned[k]
+        for row in range(rows):
+            means[row] += weight * table[k, row]
+
+
+@lru_cache(maxsize=8)
+def tabulate_ground(width: int, height: int, focal: float, eye_m: float, period_m: float) -> np.ndarray:
+    """What `Noise.ground` has for a camera that looks along q from `eye_m` above the ground.
+
+    Empty where it would have more than `MAX_TABLE` numbers, or the eye is on the ground.
+    """
+    rows = height // 2
+    if eye_m <= 0.0 or width * rows * 2 * WAVES > MAX_TABLE:
+        return NO_NOISE.ground
+    table = np.empty((width, 2 * WAVES, rows), REAL)
+    _fill_ground(waves_of(0), focal, eye_m / (TILE_PERIODS * period_m), 0.5 * (height % 2), table)
+    return table
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill_ground(waves: np.ndarray, focal: float, eye: float, first: float, table: np.ndarray) -> None:
+    """Average each wave over each pixel, whose first row is `first` below the horizon; `eye` is in tiles.
+
+    A pixel is cut into parts of equal rows, on each of which depths are taken as evenly spread.
+    """
+    width, rows = table.shape[0], table.shape[2]
+    table[:] = 0.0
+    for row in range(rows):
+        low, drop = first + row, focal * eye
+        long = drop / max(low, 1.0 / PARTS) - drop / (low + 1.0)
+        parts = min(PARTS, 2 + int(8.0 * long))
+        for part in range(parts):
+            near = drop / (low + (part + 1.0) / parts)
+            far = drop / max(low + part / parts, 1e-6)
+            depth, long = 0.5 * (near + far), far - near
+            for column in range(width):
+                u = (column + 0.5 - 0.5 * width) / focal
+                _add_part(waves, depth, long, u, 1.0 / focal, table[column, :, row])
+        table[:, :, row] /= parts
+
+
+@kernel
+def _add_part(waves: np.ndarray, depth: float, long: float, u: float, wide: float, means: np.ndarray) -> None:
+    """Add the means of all waves over the ground around a depth, of slopes `wide` around `u`."""
+    for k in range(WAVES):
+        cycles = waves[0, k] * u + waves[1, k]
+        weight = _mean_over(REAL(waves[0, k] * depth * wide)) * _mean_over(REAL(cycles * long))
+        turn = cycles * depth
+        turn = REAL(turn - np.rint(turn))
+        means[k] += weight * _cosine_of_turn(turn)
+        means[WAVES + k] += weight * _cosine_of_turn(turn - REAL(0.25))
