@@ -15,9 +15,10 @@ from envs.checks import LIMIT_M, LIMIT_S
 from envs.compiled import inlined, kernel
 from envs.raycast.bodies import MIN_DEPTH, corner, depths, is_before, outline, see_bodies
 from envs.raycast.coverage import LAYERS, PADDING, cover_ground, ends, put, resolve
+from envs.raycast.curved import make_bends
 from envs.raycast.noise import make_mixing, turn_waves
 from envs.raycast.patterns import texture_cell, texture_column
-from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Canvas, Ends, Mixing, Noise, Record
+from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Bends, Canvas, Ends, Mixing, Noise, Record
 from envs.raycast.surfaces import enter_gap, show_body, show_walls, wall_depth
 from envs.scene import BOX, CONE, ELLIPSOID
 
@@ -53,6 +54,7 @@ class Workspace(NamedTuple):
         frames: (1,) FRAME, of the pose that is painted.
         accumulators: (LAYERS, height + PADDING) float64, zero between two columns.
         mixing: For noise.
+        bends: For bodies that bend.
     """
 
     seen: np.ndarray
@@ -63,6 +65,7 @@ class Workspace(NamedTuple):
     frames: np.ndarray
     accumulators: np.ndarray
     mixing: Mixing
+    bends: Bends
 
 
 def make_workspace(num_bodies: int, height: int) -> Workspace:
@@ -76,6 +79,7 @@ def make_workspace(num_bodies: int, height: int) -> Workspace:
         frames=np.zeros(1, FRAME),
         accumulators=np.zeros((LAYERS, height + PADDING)),
         mixing=make_mixing(height),
+        bends=make_bends(height),
     )
 
 
@@ -134,7 +138,7 @@ def paint_columns(
     size, total = _find_cuts(frame, room.seen[:count], Part(half, first, last), room.cuts, room.order)
     _sort_cuts(room.cuts, size)
     turn_waves(noise, frame, room.mixing)
-    canvas = Canvas(frame, room.strips[0], room.gaps, room.accumulators, noise, room.mixing)
+    canvas = Canvas(frame, room.strips[0], room.gaps, room.accumulators, noise, room.mixing, room.bends)
     _sweep(canvas, room.seen, room.order, total, room.cuts[:size], image, first, last)
 
 

@@ -148,7 +148,7 @@ def _sum_block(sky: float, waiting: np.ndarray, image: np.ndarray, first: int, c
 
 @kernel
 def cover(shown: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float) -> None:
-    """Note that a surface shows between two edges; `patterns.texture_cell` adds its pattern once per cell.
+    """Note that a surface shows between two edges; `envs.raycast.patterns` adds its pattern.
 
     Args:
         shown: The surface's three layers: the share of each row that shows it, and where in the

@@ -1,7 +1,8 @@
 """Kernels that average patterns over what a row of a strip shows of a surface.
 
-Checker, stripes and rings are averaged exactly where the footprint is a rectangle along
-their axes, noise everywhere (`envs.raycast.noise`). Input is assumed valid.
+What a row shows is taken as a parallelogram of the surface, of level faces as several. Over it noise,
+stripes and rings are averaged exactly, a checker where its sides lie along s and q. Input is
+assumed valid.
 """
 
 import math
@@ -14,7 +15,7 @@ from envs.raycast.bodies import MIN_DEPTH, box_slab, depths
 from envs.raycast.coverage import Layer, share_below
 from envs.raycast.noise import Footprint, is_tabulated, mean_noise, mix_ground
 from envs.raycast.records import Canvas, Ends, Record
-from envs.scene import BOX, CONE
+from envs.scene import BOX
 from envs.scene.textures import NOISE, RINGS, STRIPES, TILE_PERIODS
 
 MIN_WIDTH = 1e-6  # [periods] a footprint below this is a point
@@ -49,30 +50,6 @@ class Upright(NamedTuple):
     q: float
     depth: float
     lean: float
-
-
-class Quadric(NamedTuple):
-    """What `meet` needs of a cone or an ellipsoid and of a slope.
-
-    The surface is right^2 + forward^2 + ratio * up^2 = size around its middle, or its apex. The
-    ray of `fall` per depth is there at the roots of
-    (square + ratio * fall^2) * depth^2 - 2 * (middle + ratio * over * fall) * depth + rest.
-    """
-
-    square: float
-    middle: float
-    rest: float
-    ratio: float
-    over: float
-    size: float
-
-
-class Place(NamedTuple):
-    """Right and forward of a curved body's axis, and above its middle or apex [m]."""
-
-    right: float
-    forward: float
-    up: float
 
 
 @kernel
@@ -111,7 +88,7 @@ def _scaled(sides: Footprint, scale: float) -> Footprint:
 
 
 @kernel
-def _pattern(canvas: Canvas, look: Record, s: float, q: float, sides: Footprint) -> float:
+def mean_pattern(canvas: Canvas, look: Record, s: float, q: float, sides: Footprint) -> float:
     """Contrast times the mean of a texture over the parallelogram around (s, q) [m].
 
     Exact for noise, stripes and rings. A checker's coordinates are averaged each on its own, which is exact
@@ -171,7 +148,7 @@ def _level_part(
     along_s, along_q = u * frame.cos - frame.sin, u * frame.sin + frame.cos
     long = abs(drop / low - drop / high) * look.frequency
     if look.pattern == NOISE:
-        parts = 1 + int(min(7.0, 0.5 * long))
+        parts = 2 + int(min(14.0, 4.0 * long))
     else:
         parts = 1 + int(min(15.0, 8.0 * abs(along_s) * long))
     part, total, first = (high - low) / parts, 0.0, drop / low
@@ -181,7 +158,7 @@ def _level_part(
         across = depth * wide
         sides = Footprint(across * frame.cos, across * frame.sin, long * along_s, long * along_q)
         s, q = frame.eye_x + depth * along_s, frame.eye_y + depth * along_q
-        total += _pattern(canvas, look, s, q, sides)
+        total += mean_pattern(canvas, look, s, q, sides)
         first = last
     return total / parts
 
@@ -213,11 +190,11 @@ def texture_side(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
     """Add the pattern of the side of a box or a pole between two edges."""
     frame, strip, look = canvas.frame, canvas.strip, canvas.frame.body_texture
     side = _along_face(frame, body, strip) if body.kind == BOX else _around_pole(frame, body, strip)
-    weight, end = strip.weight * strip.light, int(max(bottom.left, bottom.right)) + 1
+    weight, beyond = strip.weight * strip.light, int(max(bottom.left, bottom.right)) + 1
     whole, rest = math.ceil(max(top.left, top.right)), int(min(bottom.left, bottom.right))
     if look.pattern == NOISE or rest <= whole:
-        whole = rest = end
-    for row in range(int(min(top.left, top.right)), end):
+        whole = rest = beyond
+    for row in range(int(min(top.left, top.right)), beyond):
         share = share_below(row, top) - share_below(row, bottom)
         if share > 0.0 and not whole <= row < rest:
             start, end = _rows_between(row, top, bottom)
@@ -234,7 +211,7 @@ def _upright_row(canvas: Canvas, look: Record, side: Upright, rows: Rows) -> flo
     tall = (rows.last - rows.first) * side.depth / frame.focal
     lean, q = below * side.lean / frame.focal, side.q - below * side.depth / frame.focal
     if look.pattern == NOISE:
-        return _pattern(canvas, look, side.s, q, Footprint(side.along, -lean, 0.0, tall))
+        return mean_pattern(canvas, look, side.s, q, Footprint(side.along, -lean, 0.0, tall))
     mean = look.contrast
     if look.pattern != RINGS:
         mean *= side.swing
@@ -285,17 +262,17 @@ def _swing_around(frame: Record, body: Record, strip: Record, s: float, along: f
     ahead = 2.0 * look.frequency
     begun = (s - 0.5 * along - look.speed_s * frame.time) * ahead
     ended = begun + along * ahead
-    first, last = math.ceil(min(begun, ended)), math.ceil(max(begun, ended))
-    if last - first > MAX_EDGES or not right > left:
+    # Edges within; one at the left end is passed already. Around a pole s rises from left to right.
+    first, count = math.floor(begun) + 1, max(0, math.ceil(ended) - math.floor(begun) - 1)
+    if count > MAX_EDGES or not right > left:
         return _swing(frame, look, s, along)
     sign = 1.0 if math.floor(begun) % 2.0 == 0.0 else -1.0
     start = math.atan2(frame.sin, frame.cos) + body.x / body.turn
     u, total, middle = left, 0.0, strip.slope
-    for k in range(last - first + 1):
+    for k in range(count + 1):
         cut = right
-        if k < last - first:
-            edge = last - 1 - k if begun > ended else first + k
-            azimuth = (edge / ahead + look.speed_s * frame.time) / body.turn - start
+        if k < count:
+            azimuth = ((first + k) / ahead + look.speed_s * frame.time) / body.turn - start
             beside, forward = body.rx * math.cos(azimuth), body.forward + body.rx * math.sin(azimuth)
             cut = min(max((body.right + beside) / max(MIN_DEPTH, forward), u), right)
         total += sign * (cut - u) * (1.0 + strip.tilt * (0.5 * (u + cut) - middle))
@@ -361,7 +338,7 @@ def _texture_wall(canvas: Canvas, layer: Layer, u: float, whole: float) -> None:
             rows, middle, wide = _part(frame, row, (share, layers[1, row], across), u, whole)
             mean = _upright_row(canvas, look, _wall(frame, side, middle, wide), rows)
             paint[row] += share * base * mean
-    if last > 0:
+    if last > first:
         shown = _wall(frame, side, u, whole / frame.focal)
         _add_upright_rows(canvas, look, shown, first, last, whole * base)
     layers[:] = 0.0
@@ -395,10 +372,11 @@ def _wall(frame: Record, side: float, u: float, wide: float) -> Upright:
     other = away / (right * frame.cos - frame.sin)
     # A cell may reach past the slope that is parallel to the wall.
     one, other = min(abs(one), 1e9), min(abs(other), 1e9)
+    lean = other - one
     one, other = one * (left * frame.sin + frame.cos), other * (right * frame.sin + frame.cos)
     depth, s = away / (u * frame.cos - frame.sin), frame.eye_y + 0.5 * (one + other)
     swing = _swing(frame, frame.wall_texture, s, other - one)
-    return Upright(s, other - one, swing, frame.eye_z, depth, 0.0)
+    return Upright(s, other - one, swing, frame.eye_z, depth, lean)
 
 
 @kernel
@@ -440,67 +418,3 @@ def _around_pole(frame: Record, body: Record, strip: Record) -> Upright:
         s = body.x + body.turn * (one + math.atan2(frame.sin, frame.cos)) + 0.5 * along
         swing = _swing_around(frame, body, strip, s, along)
     return Upright(s, along, swing, body.y + frame.eye_z, depth, far - near)
-
-
-@inlined
-def quadric(body: Record, frame: Record, u: float) -> Quadric:
-    """A cone's side or an ellipsoid, as slope `u` sees it."""
-    half, radius = 0.5 * (body.top - body.bottom), body.rx
-    ratio, over, size = (radius / half) ** 2, frame.eye_z - body.bottom - half, radius * radius
-    if body.kind == CONE:
-        ratio, over, size = -0.25 * ratio, frame.eye_z - body.top, 0.0
-    away = body.right * body.right + body.forward * body.forward
-    middle, rest = body.right * u + body.forward, away + ratio * over * over - size
-    return Quadric(1.0 + u * u, middle, rest, ratio, over, size)
-
-
-@inlined
-def meet(shape: Quadric, fall: float, nearest: float, farthest: float) -> tuple[float, float]:
-    """Depth, within limits, at which the ray of `fall` per depth meets a quadric, and its up there."""
-    a, b = shape.square + shape.ratio * fall * fall, shape.middle + shape.ratio * shape.over * fall
-    root = math.sqrt(max(0.0, b * b - a * shape.rest))
-    # Seen from inside the cone's continuation above its apex, the second crossing is the side.
-    depth = shape.rest / (b + root) if shape.rest > 0.0 else (b - root) / (a if a != 0.0 else -1e-300)
-    depth = min(max(depth, nearest), farthest)
-    return depth, shape.over - fall * depth
-
-
-@inlined
-def _place(body: Record, strip: Record, u: float, fall: float, shape: Quadric) -> Place:
-    """Where a ray meets a curved body."""
-    depth, up = meet(shape, fall, strip.entry, strip.leave)
-    return Place(depth * u - body.right, depth - body.forward, up)
-
-
-@inlined
-def _turn_between(one: Place, other: Place) -> float:
-    """Azimuth from one place around the axis to another, by the shorter way; to 1e-10."""
-    sine = one.right * other.forward - one.forward * other.right
-    cosine = one.right * other.right + one.forward * other.forward
-    if abs(sine) > 0.1 * cosine:
-        return math.atan2(sine, cosine)
-    x = sine / max(cosine, 1e-300)
-    return x * (1.0 - x * x * (1.0 / 3.0 - x * x * (0.2 - x * x / 7.0)))
-
-
-@kernel
-def curved_pattern(
-    canvas: Canvas, body: Record, shapes: tuple[Quadric, Quadric, Quadric], rows: Rows
-) -> float:
-    """Contrast times the pattern's mean over some rows of a cone's side or an ellipsoid.
-
-    `shapes` are `quadric` at the left end of the gap, at its right end and in its middle.
-    """
-    frame, strip, slopes = canvas.frame, canvas.strip, canvas.strip.gap_slopes
-    fall = (0.5 * (rows.first + rows.last) - frame.horizon) / frame.focal
-    tall = 0.5 * (rows.last - rows.first) / frame.focal
-    left = _place(body, strip, slopes.left, fall, shapes[0])
-    right = _place(body, strip, slopes.right, fall, shapes[1])
-    upper = _place(body, strip, strip.slope, fall - tall, shapes[2])
-    lower = _place(body, strip, strip.slope, fall + tall, shapes[2])
-    across, down = _turn_between(left, right), _turn_between(upper, lower)
-    azimuth = math.atan2(left.forward, left.right) + math.atan2(frame.sin, frame.cos) + 0.5 * across
-    s = body.x + body.turn * azimuth
-    q = body.y + frame.eye_z - shapes[2].over + 0.5 * (upper.up + lower.up)
-    sides = Footprint(body.turn * across, right.up - left.up, body.turn * down, lower.up - upper.up)
-    return _pattern(canvas, frame.body_texture, s, q, sides)

@@ -125,6 +125,20 @@ class Mixing(NamedTuple):
     means: np.ndarray
 
 
+class Bends(NamedTuple):
+    """Room for the rays by which a body that bends along a column is lit and textured, row by row.
+
+    Attributes:
+        lights: float64 (4 * R,), of the points of a row.
+        turns: float64 (8 * R,), angles around the axis, of the corners of a row's halves [rad].
+        ups: float64 (8 * R,), their heights [m].
+    """
+
+    lights: np.ndarray
+    turns: np.ndarray
+    ups: np.ndarray
+
+
 class Canvas(NamedTuple):
     """All that painting a strip needs beside the body that is painted.
 
@@ -135,6 +149,7 @@ class Canvas(NamedTuple):
         accumulators: (LAYERS, height + PADDING) float64, see `envs.raycast.coverage`.
         noise: Of the scene.
         mixing: Room for it.
+        bends: Room for bodies that bend.
     """
 
     frame: Record
@@ -143,3 +158,4 @@ class Canvas(NamedTuple):
     accumulators: np.ndarray
     noise: Noise
     mixing: Mixing
+    bends: Bends

@@ -4,7 +4,8 @@ The camera only yaws, so one image column is one horizontal direction and every 
 an interval of its rows, known in closed form. A column is therefore composed exactly, from
 near to far. Pixel columns are cut at each silhouette; the pixel is the mean over its area (a
 box filter), exact in v, and in u for straight edges and for the arcs of round outlines up to
-their curvature within a strip. Textures are averaged over the footprint of each row of a strip.
+their curvature within a strip. Textures are averaged over what a row shows of a surface: in a strip of a
+body, in a cell of the ground or a wall, in a whole column of the ground's noise.
 
 Rules where geometry leaves a choice: what is seen from behind is invisible (a body from its
 inside, a wall from within its plane); bodies do not overlap, though one may float over
@@ -131,9 +132,15 @@ class RaycastRenderer:
     def expect_height(self, eye_m: float) -> None:
         """Expect to look along +y from `eye_m` above the ground [m]: noise on the ground then costs little.
 
-        Images from elsewhere are the same as without, those from there to 0.01 of the noise.
+        Images from elsewhere are the same as without. Of both kinds the noise of the ground is right to a
+        fiftieth of its amplitude (tests/envs/raycast/test_noise.py).
+
+        Raises:
+            ValueError: The height is not finite or negative.
         """
-        texture = self._ground_texture
+        if not 0.0 <= eye_m < math.inf:
+            raise ValueError(f"eye_m must be finite and >= 0; got {eye_m!r}.")
+        eye_m, texture = float(eye_m), self._ground_texture  # another type would compile all again
         if texture.pattern == "noise" and not texture.plain:
             table = tabulate_ground(
                 self.width, self.height, focal_length(self.width, self.fov_deg), eye_m, texture.period_m

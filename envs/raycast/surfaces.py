@@ -9,15 +9,13 @@ import math
 import numpy as np
 
 from envs.compiled import inlined, kernel
-from envs.raycast import coverage, patterns
-from envs.raycast.bodies import MIN_DEPTH, box_slab, cosine, depths, mean_root, root
+from envs.raycast import coverage, curved, patterns
+from envs.raycast.bodies import MIN_DEPTH, box_slab, cosine, mean_root, root
 from envs.raycast.coverage import Layer, beyond, ends, is_open, put
-from envs.raycast.patterns import Quadric, Rows
 from envs.raycast.records import Canvas, Ends, Record
 from envs.scene import BOX, ELLIPSOID, POLE
 
 MIN_CROSSING = 0.02  # [rows] edges that cross by less are not cut there
-GAUSS = 0.5 / math.sqrt(3.0)  # how far from the middle two points stand that stand for a length of 1
 MAX_SHARE = 0.1  # [widths of a body] a strip wider than this is lit by two points
 
 
@@ -209,7 +207,7 @@ def _paint_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: End
     if is_open(first, last):
         coverage.fill(frame, accumulators, first, last, strip.light, strip.weight)
         if _is_curved(body):
-            _shade_rows(canvas, body, first, last)
+            curved.shade_rows(canvas, body, first, last)
     if is_open(top, first):
         coverage.fill(frame, accumulators, top, first, strip.level_light, strip.weight)
     if is_open(last, bottom):
@@ -261,75 +259,3 @@ def _texture_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: E
         patterns.texture_level(canvas, last, bottom, body.bottom)
     if is_open(first, last) and not _is_curved(body):
         patterns.texture_side(canvas, body, first, last)
-
-
-@inlined
-def _cosine(
-    frame: Record, body: Record, shape: Quadric, u: float, fall: float, nearest: float, farthest: float
-) -> float:
-    """Cosine between the sun and a quadric, at least 0, where the ray of `fall` per depth meets it."""
-    depth, up = patterns.meet(shape, fall, nearest, farthest)
-    length = math.sqrt(max(1e-300, shape.size + shape.ratio * (shape.ratio - 1.0) * up * up))
-    right, forward = depth * u - body.right, depth - body.forward
-    towards = right * frame.sun_right + forward * frame.sun_forward + shape.ratio * up * frame.sun_z
-    return min(1.0, max(0.0, towards / length))
-
-
-@kernel
-def _shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
-    """Light a cone's side or an ellipsoid between two edges, row by row."""
-    frame, strip, slopes = canvas.frame, canvas.strip, canvas.strip.gap_slopes
-    wide = slopes.right - slopes.left
-    broad = wide > MAX_SHARE * (body.high - body.low)
-    u, second = strip.slope - broad * GAUSS * wide, strip.slope + GAUSS * wide
-    shape, other = patterns.quadric(body, frame, u), patterns.quadric(body, frame, second)
-    ambient = strip.weight * body.albedo * frame.ambient
-    diffuse = strip.weight * body.albedo * frame.diffuse
-    textured = frame.body_texture.contrast > 0.0
-    left = right = middle = shape
-    if textured:
-        left, right = patterns.quadric(body, frame, slopes.left), patterns.quadric(body, frame, slopes.right)
-        middle = patterns.quadric(body, frame, strip.slope)
-    high, low = min(top.left, top.right), max(bottom.left, bottom.right)
-    per_row, whole, rest = 1.0 / frame.focal, max(top.left, top.right), min(bottom.left, bottom.right)
-    for row in range(int(high), math.ceil(low)):
-        start, end = max(high, row), min(low, row + 1.0)
-        if row >= whole and row + 1 <= rest:
-            fall = (0.5 * (start + end) - frame.horizon) * per_row
-            share, towards = 1.0, _cosine(frame, body, shape, u, fall, 0.0, math.inf)
-            if broad:
-                towards = 0.5 * (_cosine(frame, body, other, second, fall, 0.0, math.inf) + towards)
-        else:
-            share = coverage.share_below(row, top) - coverage.share_below(row, bottom)
-            towards = _cut_row(frame, body, strip, top, bottom, start, end)
-        light = ambient + diffuse * towards
-        if textured:
-            rows = Rows(start, max(start, end))
-            light *= 1.0 + patterns.curved_pattern(canvas, body, (left, right, middle), rows)
-        canvas.accumulators[Layer.PAINT, row] += share * light
-
-
-@kernel
-def _cut_row(
-    frame: Record, body: Record, strip: Record, top: Ends, bottom: Ends, start: float, end: float
-) -> float:
-    """Cosine between the sun and what the edges leave of a row of a curved body.
-
-    Luminance changes fastest next to the outline: four points of what is left, at each of
-    two slopes the quarters of the rows between the edges.
-    """
-    left, right = coverage.left_of_row(top, bottom, start, end)
-    total = tall = 0.0
-    for k in range(2):
-        x = left + (0.5 + (2 * k - 1) * GAUSS) * (right - left)
-        u = strip.gap_slopes.left + x * (strip.gap_slopes.right - strip.gap_slopes.left)
-        upper = max(start, top.left + x * (top.right - top.left))
-        lower = max(upper, min(end, bottom.left + x * (bottom.right - bottom.left)))
-        shape = patterns.quadric(body, frame, u)
-        entry, leave = depths(body, frame, u)
-        entry, leave = max(MIN_DEPTH, entry), max(MIN_DEPTH, leave)
-        for j in range(2):
-            fall = (upper + (0.5 + (2 * j - 1) * GAUSS) * (lower - upper) - frame.horizon) / frame.focal
-            total += 0.5 * (lower - upper) * _cosine(frame, body, shape, u, fall, entry, leave)
-        tall += lower - upper
-    return total / max(tall, 1e-9)

@@ -1,4 +1,4 @@
-"""Textures: patterns on surfaces, at a point and averaged over a rectangle, still or moving.
+"""Textures: patterns on surfaces, still or moving.
 
 A texture multiplies the albedo of its surface by 1 + contrast * P(s - vs t, q - vq t), where
 P is the pattern, in [-1, 1], and (s, q) are surface coordinates in metres:

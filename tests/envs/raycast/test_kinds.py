@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envs.raycast import RaycastRenderer, sample_luminance
-from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture
+from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture, make_scene
 
 KINDS = (POLE, CONE, ELLIPSOID, BOX)
 AHEAD = ((0.3, 0.0, 2.0, 0.0), (-4.0, 30.0, 2.0, 0.2), (6.0, 55.0, 1.0, -0.5), (0.0, 60.0, 2.0, 3.0))
@@ -199,6 +199,17 @@ def test_the_error_falls_faster_than_the_width_of_the_strips():
     ]
     assert found[0] < 2e-3
     assert all(fine < 0.5 * coarse for coarse, fine in itertools.pairwise(found)), found
+
+
+@pytest.mark.parametrize("name", ["cones", "shape_change"])
+def test_bent_bodies_are_lit_as_the_mean_of_a_much_finer_image(name):
+    scene, fine = make_scene(name, np.random.default_rng(3)), 8
+    poses = np.array([[x, y, 2.0, 0.0, 0.0] for y in (0.0, 20.0, 50.0) for x in (-3.0, 3.0)])
+    finer = np.array(RaycastRenderer(scene, 64 * fine, 64 * fine, samples=2).render_way(poses), np.float64)
+    truth = np.log(finer.reshape(-1, 64, fine, 64, fine).mean(axis=(2, 4)))
+    for samples, limit in ((2, 7e-4), (8, 2e-4)):
+        image = np.array(RaycastRenderer(scene, 64, 64, samples=samples).render_way(poses), np.float64)
+        assert np.sqrt(((np.log(image) - truth) ** 2).mean()) < limit
 
 
 def test_bodies_beyond_the_culling_distance_are_left_out_and_no_others():

@@ -1,4 +1,5 @@
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -43,5 +44,34 @@ def test_the_tabulated_ground_shows_the_mean_of_a_much_finer_image(period_m, siz
         ground = slice(height // 2 + 3, None)
         np.testing.assert_allclose(image[ground], mean[ground], atol=3e-2)
         np.testing.assert_allclose(image[ground], alone.render(*pose)[ground], atol=4e-2)
-    other = (1.3, 7.7, 2.5, 0.2, 0.3)
-    assert np.array_equal(known.render(*other), alone.render(*other))
+    for other in ((1.3, 7.7, 2.5, 0.0, 0.3), (1.3, 7.7, 2.0, 0.2, 0.3)):
+        assert np.array_equal(known.render(*other), alone.render(*other))
+
+
+@pytest.mark.parametrize("period_m", [0.5, 3.0, 30.0])
+def test_pixels_that_thin_poles_cut_show_the_mean_of_a_finer_image_too(period_m):
+    scene, fine = make_scene("poles", np.random.default_rng(0), radius_min_m=0.05, radius_max_m=0.05), 8
+    scene = dataclasses.replace(scene, ground_texture=Texture("noise", period_m, 0.9, seed=2))
+    pose = (0.7, 5.0, 2.0, 0.0, 0.0)
+    known = RaycastRenderer(scene, 64, 64)
+    known.expect_height(2.0)
+    finer = RaycastRenderer(scene, 64 * fine, 64 * fine).render(*pose).reshape(64, fine, 64, fine)
+    error = np.abs(known.render(*pose) - finer.mean(axis=(1, 3)))
+    assert error[33:].max() < 0.02
+
+
+@pytest.mark.parametrize("eye_m", [-1.0, math.nan, math.inf])
+def test_an_eye_that_is_nowhere_is_refused(eye_m):
+    renderer = RaycastRenderer(make_scene("poles", np.random.default_rng(0)), 16, 16)
+    with pytest.raises(ValueError, match="eye_m must be finite and >= 0"):
+        renderer.expect_height(eye_m)
+
+
+def test_the_type_of_a_height_compiles_nothing_again():
+    renderer = RaycastRenderer(make_scene("texture_change", np.random.default_rng(0)), 16, 16)
+    renderer.expect_height(2)
+    assert isinstance(renderer.noise.height, float)
+
+
+def test_waves_come_by_fours():
+    assert WAVES % 4 == 0

@@ -1,0 +1,264 @@
+"""Kernels that light and texture what bends along a column: the side of a cone, an ellipsoid.
+
+Each row of a strip has a light of its own. Input is assumed valid.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.compiled import inlined, kernel
+from envs.raycast.bodies import MIN_DEPTH
+from envs.raycast.coverage import MIN_RISE, Layer
+from envs.raycast.noise import Footprint
+from envs.raycast.patterns import mean_pattern
+from envs.raycast.records import Bends, Canvas, Ends, Record
+from envs.scene import CONE
+
+GAUSS = 0.5 / math.sqrt(3.0)  # how far from the middle two points stand that stand for a length of 1
+POINTS = 4  # of each row: two across, and at each of these two down
+LEAST = 1e-300  # instead of 0 in a denominator
+
+
+class Quadric(NamedTuple):
+    """A cone's side or an ellipsoid: right^2 + forward^2 + ratio * up^2 = size around its apex or middle [m].
+
+    Attributes:
+        right: Of its axis, from the eye.
+        forward: Of its axis, from the eye.
+        radius: Of its footprint.
+        ratio: No length.
+        over: Height of the eye over its apex or middle.
+        size: [m^2]
+        rest: The left side minus the right one at the eye [m^2].
+    """
+
+    right: float
+    forward: float
+    radius: float
+    ratio: float
+    over: float
+    size: float
+    rest: float
+
+
+class Light(NamedTuple):
+    """Where the sun stands, and what a body's light is made of.
+
+    Attributes:
+        right: Of the direction to the sun, which has length 1.
+        forward: The same.
+        up: The same.
+        ambient: Luminance where the sun does not shine.
+        diffuse: What is added where it shines at right angles.
+    """
+
+    right: float
+    forward: float
+    up: float
+    ambient: float
+    diffuse: float
+
+
+class Patch(NamedTuple):
+    """What shows of a body in a gap.
+
+    Attributes:
+        left: Slope of its left end.
+        wide: Its width in slopes.
+        top: Its upper edge [rows].
+        bottom: Its lower edge [rows].
+        first: The first row that it reaches into.
+        rows: How many rows it reaches into.
+        horizon: Row of the horizon.
+        per_row: Fall per depth and row.
+    """
+
+    left: float
+    wide: float
+    top: Ends
+    bottom: Ends
+    first: int
+    rows: int
+    horizon: float
+    per_row: float
+
+
+class Place(NamedTuple):
+    """Right and forward of a curved body's axis, and above its middle or apex [m]."""
+
+    right: float
+    forward: float
+    up: float
+
+
+def make_bends(height: int) -> Bends:
+    """Room for images of `height` rows."""
+    rows = height + 4  # one cut at either end, and as many as a vector holds
+    return Bends(*np.zeros((3, POINTS * rows)))
+
+
+@inlined
+def _quadric(body: Record, frame: Record) -> Quadric:
+    half, radius = 0.5 * (body.top - body.bottom), body.rx
+    ratio, over, size = (radius / half) ** 2, frame.eye_z - body.bottom - half, radius * radius
+    if body.kind == CONE:
+        ratio, over, size = -0.25 * ratio, frame.eye_z - body.top, 0.0
+    rest = body.right * body.right + body.forward * body.forward + ratio * over * over - size
+    return Quadric(body.right, body.forward, radius, ratio, over, size, rest)
+
+
+@inlined
+def _footprint(shape: Quadric, u: float) -> tuple[float, float]:
+    """Depths between which slope `u` is over the footprint [m]."""
+    square, beside = 1.0 + u * u, (shape.right - shape.forward * u) / shape.radius
+    half = shape.radius * math.sqrt(max(0.0, square - beside * beside))
+    middle, per_square = shape.right * u + shape.forward, 1.0 / square
+    return max(MIN_DEPTH, (middle - half) * per_square), max(MIN_DEPTH, (middle + half) * per_square)
+
+
+@inlined
+def _meet(shape: Quadric, u: float, fall: float, nearest: float, farthest: float) -> Place:
+    """Where the ray of slope `u` and of `fall` per depth meets a quadric, between two depths.
+
+    The depth is a root of a * depth^2 - 2 * b * depth + rest.
+    """
+    a = 1.0 + u * u + shape.ratio * fall * fall
+    b = shape.right * u + shape.forward + shape.ratio * shape.over * fall
+    root = math.sqrt(max(0.0, b * b - a * shape.rest))
+    # Seen from inside the cone's continuation above its apex, the second crossing is the side.
+    outside = shape.rest > 0.0
+    above, below = shape.rest if outside else b - root, b + root if outside else a
+    depth = min(max(above / (below if below != 0.0 else -LEAST), nearest), farthest)
+    return Place(depth * u - shape.right, depth - shape.forward, shape.over - fall * depth)
+
+
+@kernel
+def shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
+    """Light a cone's side or an ellipsoid between two edges in the gap, and add its pattern, row by row."""
+    frame, strip, lights = canvas.frame, canvas.strip, canvas.bends.lights
+    first, last = int(min(top.left, top.right)), math.ceil(max(bottom.left, bottom.right))
+    left, wide = strip.gap_slopes.left, strip.gap_slopes.right - strip.gap_slopes.left
+    patch = Patch(left, wide, top, bottom, first, last - first, frame.horizon, 1.0 / frame.focal)
+    base, shape = strip.weight * body.albedo, _quadric(body, frame)
+    light = Light(frame.sun_right, frame.sun_forward, frame.sun_z, base * frame.ambient, base * frame.diffuse)
+    _light_points(shape, light, patch, lights)
+    if frame.body_texture.contrast > 0.0:
+        _texture_rows(canvas, body, shape, patch)
+    paint = canvas.accumulators[Layer.PAINT]
+    for k in range(patch.rows):
+        paint[first + k] += lights[4 * k] + lights[4 * k + 1] + (lights[4 * k + 2] + lights[4 * k + 3])
+
+
+@kernel
+def _texture_rows(canvas: Canvas, body: Record, shape: Quadric, patch: Patch) -> None:
+    """Multiply the lights of each row by the mean of the pattern over a parallelogram between four places."""
+    frame, lights, turns, ups = canvas.frame, canvas.bends.lights, canvas.bends.turns, canvas.bends.ups
+    _find_places(shape, patch, turns, ups)
+    facing, height = math.atan2(-body.dy, -body.dx), body.y + frame.eye_z - shape.over
+    for j in range(0, POINTS * patch.rows, POINTS):
+        across, down = _back(turns[j + 1] - turns[j]), _back(turns[j + 3] - turns[j + 2])
+        s = body.x + body.turn * (facing + turns[j] + 0.5 * across)
+        q = height + 0.5 * (ups[j + 2] + ups[j + 3])
+        one, other = (body.turn * across, ups[j + 1] - ups[j]), (body.turn * down, ups[j + 3] - ups[j + 2])
+        factor = 1.0 + mean_pattern(canvas, frame.body_texture, s, q, Footprint(*one, *other))
+        for k in range(j, j + POINTS):
+            lights[k] *= factor
+
+
+@inlined
+def _back(turn: float) -> float:
+    """A difference of two angles, by the shorter way [rad]."""
+    return turn - 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
+
+
+@kernel
+def _find_places(shape: Quadric, patch: Patch, turns: np.ndarray, ups: np.ndarray) -> None:
+    """Fill where four rays of each row meet the body: left and right, above and below its middle.
+
+    As angles around its axis, from the direction to the eye [rad], and heights [m]. A loop without
+    branches, as `_light_points`.
+    """
+    high = min(patch.top.left, patch.top.right)
+    low = max(patch.bottom.left, patch.bottom.right)
+    for p in range(POINTS * (patch.rows + patch.rows % 2)):
+        row = float(patch.first + (p >> 2))
+        start, end = max(high, row), min(low, row + 1.0)
+        side, middle = float(p & 1), 0.5 * float((p >> 1) & 1)
+        x, y = side * (1.0 - 2.0 * middle) + middle, 0.5 + middle * (2.0 * side - 1.0)
+        u, fall = patch.left + x * patch.wide, (start + y * (end - start) - patch.horizon) * patch.per_row
+        nearest, farthest = _footprint(shape, u)
+        place = _meet(shape, u, fall, nearest, farthest)
+        ahead = -(place.right * shape.right + place.forward * shape.forward)
+        turns[p] = _angle(place.right * shape.forward - place.forward * shape.right, ahead)
+        ups[p] = place.up
+
+
+@inlined
+def _angle(sine: float, cosine: float) -> float:
+    """As `math.atan2`, to 1e-6, without branches."""
+    length = math.sqrt(max(LEAST, sine * sine + cosine * cosine))
+    half = sine / (length + abs(cosine))  # tangent of the half of the angle, and of its quarter
+    x = half / (1.0 + math.sqrt(1.0 + half * half))
+    square = x * x
+    series = 1.0 / 9.0 - square * (1.0 / 11.0 - square * (1.0 / 13.0 - square / 15.0))
+    series = 1.0 - square * (1.0 / 3.0 - square * (0.2 - square * (1.0 / 7.0 - square * series)))
+    angle = 4.0 * x * series
+    return angle if cosine >= 0.0 else math.copysign(math.pi, sine) - angle
+
+
+@kernel
+def _light_points(shape: Quadric, light: Light, patch: Patch, lights: np.ndarray) -> None:
+    """Fill `lights` with the luminance at four points of each row, times their parts of the row.
+
+    At each of two slopes, quarters of what two edges leave of a row. A loop without branches: rays
+    side by side take a vector's time.
+    """
+    top, bottom, horizon, per_row = patch.top, patch.bottom, patch.horizon, patch.per_row
+    fall_top, fall_bottom = top.right - top.left, bottom.right - bottom.left
+    per_top, per_bottom = _inverse(fall_top), _inverse(fall_bottom)
+    high, low = min(top.left, top.right), max(bottom.left, bottom.right)
+    top_falls, top_rises = 1.0 * (fall_top >= MIN_RISE), 1.0 * (fall_top <= -MIN_RISE)
+    bottom_falls, bottom_rises = 1.0 * (fall_bottom >= MIN_RISE), 1.0 * (fall_bottom <= -MIN_RISE)
+    rows = patch.rows + patch.rows % 2  # what does not fill a vector takes as long as many that do
+    for p in range(POINTS * rows):
+        row = float(patch.first + (p >> 2))
+        start, end = max(high, row), min(low, row + 1.0)
+        # From where to where in the strip the edges leave something of the row.
+        below_top = min(1.0, max(0.0, (end - top.left) * per_top))
+        above_bottom = min(1.0, max(0.0, (start - bottom.left) * per_bottom))
+        right = min(1.0 - top_falls * (1.0 - below_top), 1.0 - bottom_rises * (1.0 - above_bottom))
+        left = max(top_rises * below_top, bottom_falls * above_bottom)
+        right = max(left, right)
+        one, other = left + (0.5 - GAUSS) * (right - left), left + (0.5 + GAUSS) * (right - left)
+        upper, upper_other = max(start, top.left + one * fall_top), max(start, top.left + other * fall_top)
+        tall = max(0.0, min(end, bottom.left + one * fall_bottom) - upper)
+        tall_other = max(0.0, min(end, bottom.left + other * fall_bottom) - upper_other)
+        all_tall = max(1e-9, tall + tall_other)
+        share = (_below(row, top, per_top) - _below(row, bottom, per_bottom)) / all_tall
+        if p & 1:
+            one, upper, tall = other, upper_other, tall_other
+        u = patch.left + one * patch.wide
+        fall = (upper + (0.5 + (float(p & 2) - 1.0) * GAUSS) * tall - horizon) * per_row
+        nearest, farthest = _footprint(shape, u)
+        place = _meet(shape, u, fall, nearest, farthest)
+        length = math.sqrt(max(LEAST, shape.size + shape.ratio * (shape.ratio - 1.0) * place.up * place.up))
+        towards = place.right * light.right + place.forward * light.forward
+        towards = (towards + shape.ratio * place.up * light.up) / length
+        lights[p] = 0.5 * tall * share * (light.ambient + light.diffuse * min(1.0, max(0.0, towards)))
+
+
+@inlined
+def _inverse(rise: float) -> float:
+    """1 / rise; of a level edge 0."""
+    return 1.0 / rise if abs(rise) >= MIN_RISE else 0.0
+
+
+@inlined
+def _below(row: float, edge: Ends, per_rise: float) -> float:
+    """As `coverage.share_below`, without branches."""
+    low, spread = min(edge.left, edge.right), abs(edge.right - edge.left)
+    above, below = min(max(row - low, 0.0), spread), min(max(row + 1.0 - low, 0.0), spread)
+    cut = 0.5 * (below - above) * (below + above) * abs(per_rise)
+    return cut + min(1.0, max(0.0, row + 1.0 - low - spread))
