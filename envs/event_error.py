@@ -13,8 +13,10 @@ from envs.kinematics import DIAGONAL, Outcome, Point, clock_us
 from envs.scene import Scene, make_scene
 from envs.sensor import Sensor
 
-# The converged simulation: so many times the renders of the tolerance 0.05, and this anti-aliasing.
-REFERENCE_RENDERS, REFERENCE_SAMPLES = 6, {"raycast": 12, "pyrender": 8}
+# The converged simulation: at least so many times the renders of the tolerance 0.05, and in a control step;
+# outlines may move as far as at this tolerance; and this anti-aliasing.
+REFERENCE_RENDERS, REFERENCE_PARTS, REFERENCE_TOLERANCE = 6, 12, 0.003
+REFERENCE_SAMPLES = {"raycast": 24, "pyrender": 8}
 NO_CULLING_M = 1e6  # farther than any scene reaches
 TIME_SHARE = 0.05  # of a control step: how far apart in time two equal events may be
 MAX_KEPT = 64  # converged flights: several settings are measured against the same
@@ -105,8 +107,10 @@ def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
     asked = dataclasses.replace(config, faults=FaultsConfig(), renderer=renderer)
     camera = dataclasses.replace(config.camera, memory="reference", encoding="linear32")
     usual = dataclasses.replace(asked, camera=camera, fidelity=FidelityConfig())
+    renders_apart_m = plan_renders(usual, scene).max_step_m / REFERENCE_RENDERS
     fidelity = FidelityConfig(
-        max_step_m=plan_renders(usual, scene).max_step_m / REFERENCE_RENDERS,
+        tolerance=REFERENCE_TOLERANCE,
+        max_step_m=min(renders_apart_m, config.speed_mps / config.control_hz / REFERENCE_PARTS),
         samples=REFERENCE_SAMPLES[renderer],
         cull_m=NO_CULLING_M,
     )

@@ -16,24 +16,23 @@ import numba
 from envs.config import EnvConfig
 from envs.events.ramps import can_look
 from envs.raycast import RaycastRenderer
+from envs.raycast.silhouettes import Shifts
 from envs.scene import CONE, ELLIPSOID, Scene
 
 RENDERERS = ("auto", "raycast", "pyrender")
 
 CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the error
 RENDERS_TEXTURED = 1.3  # times those of a plain scene
+LEVEL_PX = 0.3  # at tolerance 0.05: how far a level edge may move between two looks
+UPRIGHT = 2.3  # times as far may an upright one
+BENT = 0.42  # part of it that a bent one may, in a control step of 0.1 m
 SHORT = 2.0  # time constants of a photoreceptor; in shorter control steps it needs no render of its own
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
-# From which tolerance on how many samples do. Straight edges are exact whatever the samples;
-# the light and the arcs of cones and ellipsoids and the patterns of textures converge with them,
-# and patterns on cones and ellipsoids need the most.
-SAMPLES = {
-    "straight": ((0.03, 1), (0.0, 2)),
-    "textured": ((0.15, 2), (0.03, 3), (0.0, 6)),
-    "curved": ((0.15, 2), (0.03, 4), (0.0, 12)),
-    "both": ((0.15, 3), (0.03, 7), (0.0, 12)),
-    "pyrender": ((0.3, 1), (0.15, 2), (0.0, 4)),
-}
+# Samples at tolerance 0.05 in a control step of 0.1 m. Straight edges are exact whatever the samples; the
+# light and the arcs of cones and ellipsoids and the patterns of textures converge with them.
+SAMPLES = {"straight": 0.5, "textured": 1.5, "curved": 1.95, "curved noise": 4.6, "curved pattern": 10.0}
+MAX_SAMPLES = 16
+PYRENDER_SAMPLES = ((0.3, 1), (0.15, 2), (0.0, 4))  # from which tolerance on how many do
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,7 @@ class RenderPlan:
     Attributes:
         renderer: "raycast" or "pyrender".
         samples: Its anti-aliasing.
+        max_shifts_px: How far outlines may move between two looks at their columns.
         max_step_m: Longest way between two renders [m]; infinite: one render a control step.
         by_looks: Whether columns are looked at between the renders too, where something changes
             in them (`envs.sensor.looks`).
@@ -51,6 +51,7 @@ class RenderPlan:
 
     renderer: str
     samples: int
+    max_shifts_px: Shifts
     max_step_m: float
     by_looks: bool
     cull_m: float
@@ -72,7 +73,8 @@ def plan_renders(config: EnvConfig, scene: Scene) -> RenderPlan:
     step_m = asked.max_step_m or _max_step_m(config, scene, by_looks)
     return RenderPlan(
         renderer=renderer,
-        samples=asked.samples or _samples(renderer, scene, asked.tolerance),
+        samples=asked.samples or _samples(config, scene, renderer),
+        max_shifts_px=_max_shifts_px(config, scene),
         max_step_m=step_m if remembers else math.inf,
         by_looks=by_looks,
         cull_m=asked.cull_m or _cull_m(asked.tolerance, scene),
@@ -134,15 +136,32 @@ def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
     and those are the uncertain ones. What is behind a photoreceptor of limited bandwidth changes
     exponentially, so at tolerance 0.05 a step of more than two time constants takes two renders.
     """
-    focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     step_m = config.speed_mps / config.control_hz
     renders = _renders_by_looks(step_m, scene) if by_looks else _renders_alone(step_m, scene)
     if 2.0 * math.pi * config.camera.cutoff_hz / config.control_hz > SHORT:
         renders = max(renders, 2.0)
-    renders *= max(1.0, focal / FOCAL_PIXELS) ** 0.5
-    renders *= max(1.0, config.camera.contrast_threshold / 0.2) ** 0.4
-    renders *= (0.05 / config.fidelity.tolerance) ** (0.65 if config.fidelity.tolerance < 0.05 else 0.5)
-    return step_m / max(1.0, renders)
+    return step_m / max(1.0, renders * _renders_factor(config))
+
+
+def _max_shifts_px(config: EnvConfig, scene: Scene) -> Shifts:
+    """How far outlines may move between two looks at their columns, from a fit of the event error.
+
+    An event may be late by 5 % of a control step, so what bends may move less in a shorter one. The
+    rest as in `_max_step_m`.
+    """
+    share = config.speed_mps / config.control_hz / 0.1
+    shift = LEVEL_PX / _renders_factor(config)
+    if not scene.obstacle_texture.plain:
+        shift /= RENDERS_TEXTURED
+    return Shifts(UPRIGHT * shift, shift, shift * min(1.0, BENT * share**0.65))
+
+
+def _renders_factor(config: EnvConfig) -> float:
+    """Renders of a control step in multiples of those at tolerance 0.05, threshold 0.2 and `FOCAL_PIXELS`."""
+    tolerance, threshold = config.fidelity.tolerance, config.camera.contrast_threshold
+    focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
+    factor = max(1.0, focal / FOCAL_PIXELS) ** 0.5 * max(1.0, threshold / 0.2) ** 0.4
+    return factor * float((0.05 / tolerance) ** (0.8 if tolerance < 0.05 else 0.5))
 
 
 def _renders_alone(step_m: float, scene: Scene) -> float:
@@ -152,12 +171,12 @@ def _renders_alone(step_m: float, scene: Scene) -> float:
 
 def _renders_by_looks(step_m: float, scene: Scene) -> float:
     """The same, beside looks at columns: those follow upright edges, but no level and no bent ones."""
-    share = step_m / 0.1
-    if scene.kinds & {CONE, ELLIPSOID} or (scene.obstacles["z"] > scene.obstacles["rz"] + 1e-9).any():
-        return 3.5 * share**0.5 * (1.0 if _plain(scene) else RENDERS_TEXTURED)
-    if scene.ground_texture.sharp:
-        return 4.7 * share**0.4 * max(1.0, 1.0 / scene.ground_texture.period_m) ** 0.4
-    return 0.95 * share**1.1 if _plain(scene) else max(1.3 * share**0.8, 1.4 * share**0.2)
+    share, ground = step_m / 0.1, scene.ground_texture
+    if ground.sharp:
+        return 4.7 * share**0.4 * max(1.0, 1.0 / ground.period_m) ** 0.4
+    if ground.plain and scene.wall_texture.plain:
+        return 0.75
+    return max(1.3 * share**0.8, 1.4 * share**0.2)
 
 
 def _cull_m(tolerance: float, scene: Scene) -> float:
@@ -171,14 +190,21 @@ def _cull_m(tolerance: float, scene: Scene) -> float:
     return cull_m if cull_m < farthest else math.inf
 
 
-def _samples(renderer: str, scene: Scene, tolerance: float) -> int:
-    """Anti-aliasing whose own error is a small part of the tolerance, see SAMPLES."""
+def _samples(config: EnvConfig, scene: Scene, renderer: str) -> int:
+    """Anti-aliasing whose own error is a small part of the tolerance; shorter steps show smaller errors."""
+    tolerance = config.fidelity.tolerance
+    if renderer == "pyrender":
+        return next(samples for least, samples in PYRENDER_SAMPLES if tolerance >= least)
     kind = "straight" if _plain(scene) else "textured"
     if scene.kinds & {CONE, ELLIPSOID}:
-        kind = "curved" if kind == "straight" else "both"
-    if renderer == "pyrender":
-        kind = "pyrender"
-    return next(samples for least, samples in SAMPLES[kind] if tolerance >= least)
+        kind = "curved"
+        if not scene.obstacle_texture.plain:
+            kind = "curved pattern" if scene.obstacle_texture.sharp else "curved noise"
+    share = config.speed_mps / config.control_hz / 0.1
+    samples = SAMPLES[kind] * (0.05 / tolerance) ** 0.8
+    if kind != "straight":
+        samples *= share**-0.7
+    return min(MAX_SAMPLES, math.ceil(samples))
 
 
 def _plain(scene: Scene) -> bool:

@@ -11,15 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.compiled import inlined, kernel
-from envs.raycast.bodies import see_bodies, silhouette_of
+from envs.raycast.bodies import MIN_DEPTH, see_bodies, silhouette_of
 from envs.raycast.columns import Workspace, aim
 from envs.raycast.records import Record
+from envs.scene import BOX, POLE
 
 BESIDE = 2.0  # columns beside the image in which silhouettes are followed too
 CORRECTIONS = 2  # of the time of a crossing, which linear motion estimates first
-MOVING = 0.15  # columns; a silhouette that moves farther is looked at once more, half-way
+MOVING = 0.08  # columns; a silhouette that moves farther is looked at once more, half-way
 MIN_MOVE = 1e-9  # columns
 LOOKS_PER_COLUMN = 4  # at most, on average over the image; beyond it silhouettes cross unseen
+MAX_STRETCHES = 16  # of one column in a part of a way
 
 
 class Way(NamedTuple):
@@ -43,17 +45,33 @@ class Way(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """A part of a way, from one render to the next.
+    """A part of a way, in which outlines move little.
 
     Attributes:
+        number: Which one it is, from 1 on.
         begin_us, end_us: When it begins and ends [us].
-        before, after: (N, 2), `find_silhouettes` at its begin and at its end.
+        before, after: (N, 4), `find_silhouettes` at its begin and at its end.
     """
 
+    number: int
     begin_us: int
     end_us: int
     before: np.ndarray
     after: np.ndarray
+
+
+class Shifts(NamedTuple):
+    """How far the outline of a body may move between two looks at its columns, by its edges [pixels].
+
+    Attributes:
+        upright: Of a pole, or a box on the ground.
+        level: Of a box above the ground.
+        bent: Of a cone or an ellipsoid.
+    """
+
+    upright: float
+    level: float
+    bent: float
 
 
 class Looks(NamedTuple):
@@ -64,23 +82,21 @@ class Looks(NamedTuple):
         first: First column of each look, int64.
         last: The column after its last one, int64.
         moving: Of each column of the image, whether a silhouette moves fast in it, bool.
+        every: After how many stretches each column of the image is looked at in any case, int64.
     """
 
     t_us: np.ndarray
     first: np.ndarray
     last: np.ndarray
     moving: np.ndarray
+    every: np.ndarray
 
 
 def make_looks(width: int) -> Looks:
     """Room for the looks at images of `width` columns."""
     size = LOOKS_PER_COLUMN * width
-    return Looks(
-        np.empty(size, np.int64),
-        np.empty(size, np.int64),
-        np.empty(size, np.int64),
-        np.empty(width, np.bool_),
-    )
+    times, first, last = np.empty((3, size + width), np.int64)
+    return Looks(times, first, last, np.empty(width, np.bool_), np.empty(width, np.int64))
 
 
 @kernel
@@ -103,37 +119,74 @@ def find_silhouettes(
         width: Columns of the image.
         cull: Bodies farther than this are not seen [m].
         room: A `Workspace`.
-        places: (N, 2) float64, becomes the column of the left and the right silhouette of each
-            body [pixels], nan if it is not in view.
+        places: (N, 4) float64, becomes the column of the left and the right silhouette of each
+            body, and about the rows of its top and its foot [pixels]; nan if it is not in view.
     """
     frame, half = room.frames[0], 0.5 * width
+    high = 2.0 * frame.horizon
     limit = (half + BESIDE) / frame.focal
     places[:] = math.nan
     for k in range(see_bodies(bodies, frame, -limit, limit, cull, room.seen)):
         body = room.seen[k]
         places[body.number, 0] = _near(half + frame.focal * body.low, width)
         places[body.number, 1] = _near(half + frame.focal * body.high, width)
+        per_m = frame.focal / max(MIN_DEPTH, body.forward - body.rx)
+        places[body.number, 2] = _near(frame.horizon + per_m * (frame.eye_z - body.top), high)
+        places[body.number, 3] = _near(frame.horizon + per_m * (frame.eye_z - body.bottom), high)
 
 
 @inlined
-def _near(place: float, width: int) -> float:
+def _near(place: float, width: float) -> float:
     """A place, moved next to the image if it is far outside: beside a body it is infinite."""
     return min(max(place, -BESIDE), width + BESIDE)
 
 
 @kernel
-def fastest(before: np.ndarray, after: np.ndarray) -> float:
-    """How far the silhouette moves that moves most [columns], of bodies seen both times."""
-    farthest = 0.0
-    for i in range(len(before)):
-        for side in range(2):
-            farthest = max(farthest, abs(after[i, side] - before[i, side]))  # nan is not greater
-    return farthest
+def divide_time(
+    bodies: np.ndarray, before: np.ndarray, after: np.ndarray, shifts: Shifts, limit: int, looks: Looks
+) -> int:
+    """Cut a time into stretches, so many that outlines move little in each; say which columns need them all.
+
+    Args:
+        bodies: (N,) BODY.
+        before: (N, 4), `find_silhouettes` at the begin of the time.
+        after: The same at its end.
+        shifts: How far outlines may move in a stretch.
+        limit: How many stretches there may be, if that is less than `MAX_STRETCHES`.
+        looks: Their `every` is filled.
+
+    Returns:
+        The number of stretches, a power of two.
+    """
+    needed, most = looks.every, 1
+    needed[:] = 1
+    for i in range(len(bodies)):
+        moved, stretches = 0.0, 1
+        for edge in range(4):
+            moved = max(moved, abs(after[i, edge] - before[i, edge]))  # nan is not greater
+        shift = _shift_of(bodies[i], shifts)
+        while moved > shift * stretches and 2 * stretches <= min(limit, MAX_STRETCHES):
+            stretches *= 2
+        if stretches > 1:
+            first = max(0, int(min(before[i, 0], after[i, 0])))
+            for column in range(first, min(len(needed), int(max(before[i, 1], after[i, 1])) + 1)):
+                needed[column] = max(needed[column], stretches)
+                most = max(most, stretches)
+    for column in range(len(needed)):
+        looks.every[column] = most // needed[column]
+    return most
+
+
+@inlined
+def _shift_of(body: Record, shifts: Shifts) -> float:
+    if body.kind == POLE or (body.kind == BOX and body.bottom <= MIN_DEPTH):
+        return shifts.upright
+    return shifts.level if body.kind == BOX else shifts.bent
 
 
 @kernel
 def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, looks: Looks) -> int:
-    """The looks that a stretch of a way takes before its end, sorted by time.
+    """The looks that a stretch of a way takes, sorted by time; those at its end by column.
 
     Args:
         bodies: (N,) BODY.
@@ -156,8 +209,22 @@ def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, 
                 continue
             for border in range(max(0, math.ceil(low)), min(width, math.floor(high)) + 1):
                 t_us = _crossing(bodies[i], side, border, width, way, stretch, room)
-                if stretch.begin_us < t_us < stretch.end_us and size < len(looks.t_us):
+                if stretch.begin_us < t_us < stretch.end_us and size < LOOKS_PER_COLUMN * width:
                     size = _add_look(looks, size, t_us, max(0, border - 1), min(width, border + 1))
+    return _look_at_end(stretch, looks, size)
+
+
+@inlined
+def _look_at_end(stretch: Stretch, looks: Looks, size: int) -> int:
+    """Append the looks at the columns that are due at the end of a stretch; the new number."""
+    due, width = False, len(looks.every)
+    for column in range(width):
+        before, due = due, stretch.number % looks.every[column] == 0
+        if due and not before:
+            looks.t_us[size], looks.first[size] = stretch.end_us, column
+            size += 1
+        if due:
+            looks.last[size - 1] = column + 1
     return size
 
 

@@ -1,7 +1,8 @@
 """One control step of a camera that looks at columns when something changes in them.
 
 The whole image is rendered at the end of each part of the way. Before that, a column is looked
-at when the silhouette of a body enters or leaves it, and once half-way where one moves fast. The
+at when the silhouette of a body enters or leaves it, once half-way where one moves fast, and as
+often as outlines in it move far: what is distant moves little and is not looked at again. The
 light of a pixel is linear in time between, so far fewer renders give the same events.
 """
 
@@ -12,7 +13,7 @@ import numba
 import numpy as np
 
 from envs.checks import LIMIT_M, LIMIT_S
-from envs.compiled import kernel
+from envs.compiled import inlined, kernel
 from envs.events.crossings import Room, make_room, named
 from envs.events.emission import EVENT, Span
 from envs.events.lowpass import ColumnFilter
@@ -21,16 +22,17 @@ from envs.raycast.columns import Workspace, make_workspace, paint_columns
 from envs.raycast.records import Noise
 from envs.raycast.silhouettes import (
     Looks,
+    Shifts,
     Stretch,
     aim_along,
-    fastest,
+    divide_time,
     find_looks,
     find_silhouettes,
     make_looks,
 )
 
 BAD_POSE = -2
-FAST = 0.7  # columns from one render to the next; a body that moves more is near, and all its edges move
+ROOM = 8  # images whose pixels can all fire, before only the last one of a part is looked at
 
 
 class Scratch(NamedTuple):
@@ -40,7 +42,7 @@ class Scratch(NamedTuple):
         room: `Workspace` for as many bodies as a scene has, or more.
         image: float32 (H, W), what is painted; in memory column after column.
         pixels: As `crossings.steps` takes its scratch.
-        ramps: For three times as many pixels as the image has.
+        ramps: For `ROOM` times as many pixels as the image has.
         looks: For the looks at it.
         block: For a block of pixels.
     """
@@ -65,6 +67,7 @@ class View(NamedTuple):
         memory: Its memory; the last image is a part of it, behind a filter as it is seen there.
         seen_us: int64 (W,), when each column was looked at last [us].
         bandwidth: Of its photoreceptors.
+        shifts: How far outlines may move between two looks.
         scratch: Room for a step.
     """
 
@@ -76,6 +79,7 @@ class View(NamedTuple):
     memory: tuple
     seen_us: np.ndarray
     bandwidth: ColumnFilter
+    shifts: Shifts
     scratch: Scratch
 
 
@@ -92,7 +96,7 @@ def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
         room=make_workspace(num_bodies, height),
         image=np.zeros((width, height), np.float32).T,
         pixels=(np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)),
-        ramps=make_ramps(3 * size),
+        ramps=make_ramps(ROOM * size),
         looks=make_looks(width),
         block=make_room(),
     )
@@ -105,50 +109,74 @@ def sense_way(view, way, parts):
     Args:
         view: `View`, whose last image becomes that at the end.
         way: `Way`.
-        parts: In how many parts of equal time the way is cut; twice as many where something is near.
+        parts: In how many parts of equal time the way is cut; in more for columns in which something is near.
 
     Returns:
         First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
     """
-    bodies, noise, cull, seen_us = view.bodies, view.noise, view.cull_m, view.seen_us
-    room, image, pixels, ramps, looks, block = view.scratch
+    bodies, cull, scratch = view.bodies, view.cull_m, view.scratch
+    room, image = scratch.room, scratch.image
     model, memory = named(view.model, view.memory)
-    watch = Watch(model, memory, seen_us, pixels, ramps, block, view.bandwidth)
+    watch = Watch(model, memory, view.seen_us, scratch.pixels, scratch.ramps, scratch.block, view.bandwidth)
     frame, width = room.frames[0], image.shape[1]
     room.frames[0] = view.frame[0]
     if not _is_near(way):
         return BAD_POSE, 0, 0, np.empty(0, EVENT)
-    before, after = np.empty((len(bodies), 2)), np.empty((len(bodies), 2))
+    before, after = np.empty((len(bodies), 4)), np.empty((len(bodies), 4))
     aim_along(frame, way, way.start_us + way.moving_us)
     find_silhouettes(bodies, width, cull, room, before)
     aim_along(frame, way, way.start_us)
     find_silhouettes(bodies, width, cull, room, after)
-    parts *= 2 if fastest(before, after) > FAST * parts else 1
-    events, lost, columns, begin_us = np.empty(0, EVENT), 0, 0, way.start_us
-    for part in range(1, parts + 1):
-        end_us = way.start_us + way.moving_us * part // parts
+    limit = way.moving_us // parts  # no stretch is shorter than the clock's microsecond
+    stretches = divide_time(bodies, after, before, _of_part(view.shifts, parts), limit, scratch.looks)
+    events, lost, columns, begun_us, kept = np.empty(0, EVENT), 0, 0, way.start_us, 0
+    end_us = begun_us
+    for number in range(1, parts * stretches + 1):
+        begin_us, end_us = end_us, way.start_us + way.moving_us * number // (parts * stretches)
         before, after = after, before
-        if parts > 1:  # of a way in one part, both ends are known
+        if parts * stretches > 1:  # of a way in one stretch, both ends are known
             aim_along(frame, way, end_us)
             find_silhouettes(bodies, width, cull, room, after)
-        count = find_looks(bodies, way, Stretch(begin_us, end_us, before, after), room, looks)
-        kept = 0
-        for k in range(count + 1):
-            t_us, first, last = end_us, 0, width
-            if k < count:
-                t_us, first, last = looks.t_us[k], looks.first[k], looks.last[k]
-                if kept + 2 * image.size > ramps.pixels.size or _is_seen(seen_us, first, last, t_us):
-                    continue
-            aim_along(frame, way, t_us)
-            paint_columns(bodies, noise, image, first, last, cull, room)
-            bad, kept, more = look_at(image.T, first, last, t_us, watch, kept)
-            if bad >= 0:
-                return bad, 0, 0, np.empty(0, EVENT)
-            lost, columns = lost + more, columns + last - first
-        more_events = events_of_ramps(watch, kept, Span(begin_us, end_us))
-        events = more_events if part == 1 else _joined(events, more_events)
-        begin_us = end_us
+        stretch, ends = Stretch(number, begin_us, end_us, before, after), number % stretches == 0
+        bad, kept, more, looked = _look_along(view, way, stretch, ends, watch, kept)
+        if bad >= 0:
+            return bad, 0, 0, np.empty(0, EVENT)
+        lost, columns = lost + more, columns + looked
+        if ends:
+            more_events = events_of_ramps(watch, kept, Span(begun_us, end_us))
+            events = more_events if number == stretches else _joined(events, more_events)
+            begun_us, kept = end_us, 0
     return -1, lost, columns, events
+
+
+@kernel
+def _look_along(view, way, stretch, ends, watch, kept):
+    """Look at the columns that a stretch of a way asks for; where it `ends` a part of the way, at all.
+
+    Returns:
+        First invalid pixel or -1, ramps in use, events lost, columns looked at.
+    """
+    room, image, looks = view.scratch.room, view.scratch.image, view.scratch.looks
+    lost = columns = 0
+    for k in range(find_looks(view.bodies, way, stretch, room, looks)):
+        t_us, first, last = looks.t_us[k], looks.first[k], looks.last[k]
+        needed = ends and t_us == stretch.end_us
+        full = kept + 2 * image.size > watch.ramps.pixels.size
+        if not needed and (full or _is_seen(view.seen_us, first, last, t_us)):
+            continue
+        aim_along(room.frames[0], way, t_us)
+        paint_columns(view.bodies, view.noise, image, first, last, view.cull_m, room)
+        bad, kept, more = look_at(image.T, first, last, t_us, watch, kept)
+        if bad >= 0:
+            return bad, kept, lost, columns
+        lost, columns = lost + more, columns + last - first
+    return -1, kept, lost, columns
+
+
+@inlined
+def _of_part(shifts, parts):
+    """The `Shifts` of the whole way, of which each of its parts gets its own."""
+    return Shifts(shifts.upright * parts, shifts.level * parts, shifts.bent * parts)
 
 
 @kernel

@@ -14,7 +14,7 @@ from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
 from envs.raycast.noise import NO_NOISE
 from envs.raycast.records import BODY, FRAME
-from envs.raycast.silhouettes import Way
+from envs.raycast.silhouettes import Shifts, Way
 from envs.scene import Scene
 from envs.sensor.looks import BAD_POSE, View, scratch_for, sense_way
 
@@ -125,14 +125,15 @@ class Sensor:
 
     def view(self) -> View:
         """What a compiled step needs of this sensor; without a scene where it does not see by looks."""
-        scene, bandwidth = (np.empty(0, BODY), NO_NOISE, np.zeros(1, FRAME), 0.0), UNLIMITED
+        scene = np.empty(0, BODY), NO_NOISE, np.zeros(1, FRAME), 0.0
+        bandwidth, shifts = UNLIMITED, Shifts(1.0, 1.0, 1.0)
         if self.sees_by_looks:
-            renderer, bandwidth = self._renderer, self._camera.bandwidth
+            renderer, bandwidth, shifts = self._renderer, self._camera.bandwidth, self.plan.max_shifts_px
             scene = renderer.bodies, renderer.noise, renderer.frame, renderer.cull_m
         model, memory, _ = self._camera.state
         camera = self._config.camera
         scratch = scratch_for(camera.width, camera.height, len(scene[0]))
-        return View(*scene, model, memory, self._seen_us, bandwidth, scratch)
+        return View(*scene, model, memory, self._seen_us, bandwidth, shifts, scratch)
 
     def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
         """The events of a step after the faults of this sensor."""

@@ -84,13 +84,13 @@ def test_the_converged_simulation_has_no_error_and_more_renders_never_hurt_much(
     for share in (1, 2, 4, 8):
         asked = FidelityConfig(max_step_m=0.1 / share, samples=8)
         errors.append(measure_event_error(EnvConfig(fidelity=asked), flights=3, steps=8).error)
-    assert (np.diff(errors) < 1e-3).all()  # a few events of thousands come and go once it has converged
-    assert errors[0] > 8 * errors[3]
-    assert errors[3] < 0.03
+    assert (np.diff(errors) < 2e-3).all()  # a few events of thousands come and go once it has converged
+    assert errors[0] > 4 * errors[3]
+    assert errors[3] < 0.003
 
 
 @pytest.mark.parametrize("scene_name", ["poles", "texture_change"])
-def test_the_converged_simulation_renders_six_times_as_often_and_no_setting_spoils_it(scene_name):
+def test_the_converged_simulation_looks_more_often_and_no_setting_spoils_it(scene_name):
     scene = make_scene(scene_name, np.random.default_rng(0))
     usual = plan_renders(EnvConfig(), scene)
     camera = CameraConfig(memory="legacy", encoding="gamma8", contrast_threshold=0.2)
@@ -98,7 +98,8 @@ def test_the_converged_simulation_renders_six_times_as_often_and_no_setting_spoi
     exact = converged(spoilt, scene)
     chosen = plan_renders(exact, scene)
     assert (exact.camera, chosen.renderer) == (with_floor(CameraConfig()), "raycast")
-    assert chosen.max_step_m == pytest.approx(usual.max_step_m / 6)
+    assert chosen.max_step_m <= usual.max_step_m / 6
+    assert all(6.0 * np.array(chosen.max_shifts_px) < usual.max_shifts_px)
     assert chosen.samples > usual.samples
     assert chosen.cull_m > 1e5
 

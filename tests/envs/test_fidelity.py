@@ -60,15 +60,31 @@ def test_a_stricter_tolerance_never_takes_less():
     assert ways == sorted(ways, reverse=True)
     assert samples == sorted(samples)
     assert ways[0] > 2 * ways[-1]
+    shifts = [p.max_shifts_px for p in plans]
+    assert shifts == sorted(shifts, reverse=True)
     assert samples[0] < samples[-1]
 
 
-def test_longer_steps_smaller_pixels_and_textures_take_more_renders():
-    assert renders(EnvConfig(control_hz=45.0)) > renders(EnvConfig(control_hz=200.0)) >= 1
-    sharp = CameraConfig(width=256, height=256)
-    assert renders(EnvConfig(camera=sharp)) > renders(EnvConfig())
+def test_longer_steps_and_textures_take_more_renders():
     textured = make_scene("texture_change", np.random.default_rng(0))
-    assert plan_renders(EnvConfig(), textured).max_step_m < plan_renders(EnvConfig(), SCENE).max_step_m
+    slow, fast = EnvConfig(control_hz=45.0), EnvConfig(control_hz=200.0)
+    assert renders(slow, textured) > renders(fast, textured) > renders(fast)
+    assert renders(slow) == renders(fast) == 1  # of plain scenes only columns in which something moves
+
+
+def test_outlines_may_move_less_where_a_small_error_shows_more():
+    usual = plan_renders(EnvConfig(), SCENE).max_shifts_px
+    assert usual.upright > usual.level > usual.bent > 0.0
+    sharp = EnvConfig(camera=CameraConfig(width=256, height=256))
+    strict, blind = (
+        EnvConfig(fidelity=FidelityConfig(0.01)),
+        EnvConfig(camera=CameraConfig(contrast_threshold=0.5)),
+    )
+    for config in (sharp, strict, blind):
+        assert all(np.array(plan_renders(config, SCENE).max_shifts_px) < usual)
+    shorter = plan_renders(EnvConfig(control_hz=400.0), SCENE).max_shifts_px
+    assert shorter.bent < usual.bent
+    assert shorter[:2] == usual[:2]
 
 
 def test_a_step_of_more_than_two_time_constants_of_a_slow_pixel_takes_two_renders():
