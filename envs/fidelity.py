@@ -30,7 +30,7 @@ SHORT = 2.0  # time constants of a photoreceptor; in shorter control steps it ne
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 # Samples at tolerance 0.05 in a control step of 0.1 m. Straight edges are exact whatever the samples; the
 # light and the arcs of cones and ellipsoids and the patterns of textures converge with them.
-SAMPLES = {"straight": 0.5, "textured": 1.5, "curved": 1.95, "curved noise": 4.6, "curved pattern": 10.0}
+SAMPLES = {"straight": 0.5, "textured": 1.5, "curved": 1.95, "curved noise": 6.5, "curved pattern": 10.0}
 MAX_SAMPLES = 16
 PYRENDER_SAMPLES = ((0.3, 1), (0.15, 2), (0.0, 4))  # from which tolerance on how many do
 
