@@ -18,7 +18,7 @@ from envs.scene import BOX, POLE
 
 BESIDE = 2.0  # columns beside the image in which silhouettes are followed too
 CORRECTIONS = 2  # of the time of a crossing, which linear motion estimates first
-MOVING = 0.06  # columns; a silhouette that moves farther is looked at once more, half-way
+MOVING = 0.2  # columns; a silhouette that moves farther is looked at once more, half-way
 MIN_MOVE = 1e-9  # columns
 LOOKS_PER_COLUMN = 4  # at most, on average over the image; beyond it silhouettes cross unseen
 MAX_STRETCHES = 16  # of one column in a part of a way

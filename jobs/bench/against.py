@@ -1,11 +1,11 @@
 """Speed and event error of a control step, of this checkout against another commit, in one interleaved run.
 
-Run: python -m jobs.bench.against [COMMIT], the one before HEAD unless another is named
+Run: python -m jobs.bench.against [COMMIT [SCENE ...]], the one before HEAD unless another is named
 Expect: a table in about five minutes on one core. Two processes, one of each checkout, take turns
 at the same flights, 32 corridors side by side; a ratio is the median over the rounds of the other's
 time over this one's. The event error is that against the converged simulation of the same checkout,
 at tolerance 0.05. By day and night the pixels have bandwidth and mismatch, but no noise. In the last row
-a shipped policy also encodes the windows and decides.
+a shipped policy also encodes the windows and decides. Rows that the other commit cannot do are left out.
 """
 
 import inspect
@@ -58,7 +58,13 @@ def worker() -> None:
         slow = [float(word) for word in words if word[0].isdigit()]
         folder = words[len(slow) :]
         if line not in known:
-            camera = CameraConfig(cutoff_hz=slow[0], threshold_mismatch=slow[1]) if slow else CameraConfig()
+            camera = CameraConfig()
+            try:
+                if slow:
+                    camera = CameraConfig(cutoff_hz=slow[0], threshold_mismatch=slow[1])
+            except (TypeError, ValueError):  # of a commit that has no such camera
+                print(json.dumps(None), flush=True)
+                continue
             env = CorridorVectorEnv(corridors, EnvConfig(scene=scene, camera=camera, window_capacity=1024))
             env.reset(seed=0)
             policy = load_policy(folder[0]) if folder else None
@@ -93,14 +99,14 @@ class Checkout:
             text=True,
         )
 
-    def fly(self, scene: str) -> tuple[float, float]:
-        """Median seconds of a step, and the event error."""
+    def fly(self, scene: str) -> tuple[float, float] | None:
+        """Median seconds of a step, and the event error; None: this checkout cannot do it."""
         assert self._process.stdin is not None  # noqa: S101  for the type checker
         assert self._process.stdout is not None  # noqa: S101
         self._process.stdin.write(f"{scene}\n")
         self._process.stdin.flush()
-        seconds, error = json.loads(self._process.stdout.readline())
-        return seconds, error
+        found = json.loads(self._process.stdout.readline())
+        return None if found is None else (found[0], found[1])
 
     def end(self) -> None:
         """Stop it."""
@@ -121,14 +127,17 @@ def checked_out(commit: str) -> Iterator[Path]:
             subprocess.run([*git, "remove", "--force", str(place)], check=True)  # noqa: S603
 
 
-def compared(scene: str, here: Checkout, there: Checkout) -> tuple[str, ...]:
-    """A row of the table; the first round, which compiles, does not count."""
-    pairs = [(here.fly(scene), there.fly(scene)) for _ in range(ROUNDS + 1)][1:]
+def compared(scene: str, here: Checkout, there: Checkout) -> list[tuple[str, ...]]:
+    """The row of the table, if both can do it; the first round, which compiles, does not count."""
+    rounds = [(here.fly(scene), there.fly(scene)) for _ in range(ROUNDS + 1)]
+    pairs = [(own, other) for own, other in rounds[1:] if own is not None and other is not None]
+    if not pairs:
+        return []
     ratios = [other[0] / own[0] for own, other in pairs]
     micro = [f"{1e6 * statistics.median(pair[k][0] for pair in pairs):.0f}" for k in range(2)]
     errors = [f"{side[1]:.3f}" for side in pairs[0]]
     spread = f"{min(ratios):.2f} to {max(ratios):.2f}"
-    return NAMES.get(scene, scene), *micro, f"{statistics.median(ratios):.2f}", spread, *errors
+    return [(NAMES.get(scene, scene), *micro, f"{statistics.median(ratios):.2f}", spread, *errors)]
 
 
 def main() -> None:
@@ -136,7 +145,7 @@ def main() -> None:
     commit = sys.argv[1] if len(sys.argv) > 1 else "HEAD^"
     with checked_out(commit) as place:
         here, there = Checkout(ROOT), Checkout(place)
-        rows = [compared(scene, here, there) for scene in (*SCENES, *NAMES)]
+        rows = [row for scene in sys.argv[2:] or (*SCENES, *NAMES) for row in compared(scene, here, there)]
         here.end()
         there.end()
     head = ("scene", "us here", "us there", "there / here", "all rounds", "error here", "error there")
