@@ -21,7 +21,7 @@ from pathlib import Path
 
 from jobs.analysis.tables import show_table
 
-ROUNDS = 15
+ROUNDS, CORRIDORS, STEPS = 15, 32, 12
 SCENES = ("poles", "poles_dense", "shape_change", "gates", "texture_change", "dynamic")
 ROOT = Path(__file__).resolve().parents[2]
 DECIDED = "poles models/pretrained/bytestream-s0"
@@ -32,12 +32,34 @@ NAMES = {  # of rows that are not a scene alone
 }
 
 
+def prepare(scene: str, slow: list[float], folder: list[str]) -> tuple | None:
+    """The corridors, the policy (or None) and the event error of one row; None: this commit cannot do it."""
+    from envs.config import CameraConfig, EnvConfig
+    from envs.corridor import CorridorVectorEnv
+    from envs.event_error import measure_event_error
+    from models.policy import load_policy
+
+    camera = CameraConfig()
+    try:
+        if slow:
+            camera = CameraConfig(cutoff_hz=slow[0], threshold_mismatch=slow[1])
+    except (TypeError, ValueError):  # of a commit that has no such camera
+        return None
+    env = CorridorVectorEnv(CORRIDORS, EnvConfig(scene=scene, camera=camera, window_capacity=1024))
+    env.reset(seed=0)
+    policy = load_policy(folder[0]) if folder else None
+    if policy is not None:
+        policy.reset(CORRIDORS)
+    return env, policy, measure_event_error(EnvConfig(scene=scene, camera=camera)).error
+
+
 def worker() -> None:
     """Answer each line of the input by seconds a step and the event error, as JSON.
 
     A line is the name of a scene, bandwidth [Hz] and mismatch of the pixels, and the folder of a policy
     if one is to decide at each step.
-    It runs by its source alone in another checkout, so that it takes nothing from this file.
+    It runs by its source and that of `prepare` alone in another checkout, so that it takes nothing else
+    from this file.
     """
     import json
     import sys
@@ -46,40 +68,26 @@ def worker() -> None:
     import numpy as np
     import torch
 
-    from envs.config import CameraConfig, EnvConfig
-    from envs.corridor import CorridorVectorEnv
-    from envs.event_error import measure_event_error
-    from models.policy import load_policy
-
     torch.set_num_threads(1)
-    corridors, steps, known = 32, 12, {}
+    known: dict[str, tuple | None] = {}
     for line in sys.stdin:
         scene, *words = line.split()
         slow = [float(word) for word in words if word[0].isdigit()]
-        folder = words[len(slow) :]
         if line not in known:
-            camera = CameraConfig()
-            try:
-                if slow:
-                    camera = CameraConfig(cutoff_hz=slow[0], threshold_mismatch=slow[1])
-            except (TypeError, ValueError):  # of a commit that has no such camera
-                print(json.dumps(None), flush=True)
-                continue
-            env = CorridorVectorEnv(corridors, EnvConfig(scene=scene, camera=camera, window_capacity=1024))
-            env.reset(seed=0)
-            policy = load_policy(folder[0]) if folder else None
-            if policy is not None:
-                policy.reset(corridors)
-            known[line] = env, policy, measure_event_error(EnvConfig(scene=scene, camera=camera)).error
-        env, policy, error = known[line]
+            known[line] = prepare(scene, slow, words[len(slow) :])
+        found = known[line]
+        if found is None:
+            print(json.dumps(None), flush=True)
+            continue
+        env, policy, error = found
         rng, seconds = np.random.default_rng(0), []
-        for _ in range(steps):
-            actions = rng.integers(3, size=corridors)
+        for _ in range(STEPS):
+            actions = rng.integers(3, size=CORRIDORS)
             began = time.perf_counter()
             observations = env.step(actions)[0]
             if policy is not None:
                 policy.logits(observations)
-            seconds.append((time.perf_counter() - began) / corridors)
+            seconds.append((time.perf_counter() - began) / CORRIDORS)
         print(json.dumps([float(np.median(seconds)), error]), flush=True)
 
 
@@ -88,7 +96,8 @@ class Checkout:
 
     def __init__(self, folder: Path) -> None:
         """Start it."""
-        code = f"{inspect.getsource(worker)}\nworker()"
+        numbers = f"CORRIDORS, STEPS = {CORRIDORS}, {STEPS}"
+        code = "\n".join((numbers, inspect.getsource(prepare), inspect.getsource(worker), "worker()"))
         environment = {**os.environ, "PYTHONPATH": str(folder)}
         self._process = subprocess.Popen(  # noqa: S603  own code
             [sys.executable, "-c", code],
