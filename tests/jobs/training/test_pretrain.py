@@ -158,12 +158,12 @@ def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_pat
         config,
         model=dataclasses.replace(config.model, context=64),
         collect=dataclasses.replace(config.collect, num_steps=200, num_validation_steps=100),
-        pretrain=dataclasses.replace(config.pretrain, iterations=40, validate_every=20, beta=weight),
+        pretrain=dataclasses.replace(config.pretrain, iterations=80, validate_every=40, beta=weight),
     )
     folder, listener = open_run(config), Listener()
     file = prepare_encoder(config, folder, listener)
     figures = [figures for step, figures in listener.logged.items() if step > 0]
-    assert sorted(listener.logged) == [0, 20, 40]
+    assert sorted(listener.logged) == [0, 40, 80]
     assert figures[-1]["evae/collapsed"] == dead
     assert load_encoder(file)[1]["figures"]["collapsed"] == dead
     assert capsys.readouterr().out.count("posterior collapse") == dead  # once
