@@ -11,6 +11,7 @@ from envs.scene.collision import first_contact
 
 SPLITS = ("train", "validation", "eval")
 NUM_ACTIONS = 3  # forward, left 45 degrees, right 45 degrees
+MIRRORED_ACTIONS = [0, 2, 1]  # each one's action with left and right exchanged
 DIAGONAL = math.sqrt(0.5)
 GOAL_REWARD, COLLISION_REWARD = 100.0, -100.0
 SEED_STRIDE = 2**32

@@ -50,7 +50,8 @@ class AlgoConfig:
             line costs, of a teacher that knows the geometry.
         shaping: Of the potential -shaping * log(1 + that cost), by which rewards are shaped in training only;
             0: they are not.
-        imitation: Learn from a teacher instead; of the others then only lr, sizes and grad_clip count.
+        imitation: Learn from a teacher instead; of the others then only lr, sizes, grad_clip, mirrored count.
+        mirrored: Learn each step a second time, left and right exchanged (`models.policy.mirror`).
     """
 
     lr: Positive
@@ -70,11 +71,15 @@ class AlgoConfig:
     critic: Literal["observation", "teacher"]
     shaping: NonNegative
     imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)]
+    mirrored: bool
 
     @pydantic.model_validator(mode="after")
     def _minibatch_fits(self) -> "AlgoConfig":
         if self.minibatch_size > self.train_batch_size_per_learner:
             raise ValueError("minibatch_size must not exceed train_batch_size_per_learner")
+        if self.mirrored and self.imitation is None:
+            rule = "must be false without algo.imitation, because PPO learns only from what it did"
+            raise ValueError(f"mirrored {rule}, got true")
         return self
 
 

@@ -276,7 +276,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         observations, infos = self.env.unwrapped.reset(seed=seed)
         first, space = np.ones(self.env.num_envs, bool), self.module.observation_space
         self._stacks = np.zeros((len(first), *space.shape), space.dtype)
-        self._stacks = self.module.remember(self._stacks, observations, first)
+        self._remember(observations, first)
         self._infos, self._over = infos, ~first
         self._episodes = [_begun() for _ in first]
         self._ongoing_episodes_for_metrics = defaultdict(list)
@@ -287,9 +287,13 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         stacks, over = self._stacks, self._over
         actions, outputs = self._decide(stacks)
         observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
-        self._stacks = self.module.remember(stacks, observations, over)
+        self._remember(observations, over)
         self._over = terminated | truncated
         return Step(stacks, actions, outputs, rewards, terminated, truncated, infos, over)
+
+    def _remember(self, observations: Any, first: np.ndarray) -> None:
+        """Add what each environment shows to what the policy keeps; `first` (N,): its episode begins."""
+        self._stacks = self.module.remember(self._stacks, observations, first)
 
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -3,6 +3,8 @@
 The env runners roll out the student, in the first batches mixed with the teacher, and the teacher says
 of each step what each action would have cost: of those, too, to which the student strayed. All steps are
 kept; after each batch the networks learn to act as their labels say. The value network learns nothing.
+
+Mirrored, a step is kept a second time with left and right exchanged, in what was seen as in its labels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,11 +20,14 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
+from envs.kinematics import MIRRORED_ACTIONS
 from jobs.training.ppo_learner import PlainPPOLearner
+from jobs.training.snapshots import Snapshot
 from jobs.training.teacher import TeacherEnvRunner
 
 IMITATION = "imitation"  # of the learner's own settings: those of `ImitationConfig`, and env_steps
 COSTS = "costs"  # of a step: what each action costs more than the cheapest, float32 (actions,)
+MIRRORED = "mirrored"  # of a step: the stack of an episode with left and right exchanged
 AGREEMENT_KEY = (
     "agreement"  # share of the newest steps in which the student's likeliest action is the cheapest
 )
@@ -32,11 +37,33 @@ class TaughtEnvRunner(TeacherEnvRunner):
     """As `PlainEnvRunner`; the teacher labels every step, and acts in some."""
 
     @property
+    def _settings(self) -> dict[str, Any]:
+        own: dict[str, Any] = self.config.learner_config_dict[IMITATION]
+        return own
+
+    @property
     def teacher_share(self) -> float:
         """Of the steps of this round."""
         done = self._callbacks[0].rounds
-        guided = self.config.learner_config_dict[IMITATION]["guided_batches"]
-        return 0.5**done if done < guided else 0.0
+        return 0.5**done if done < self._settings["guided_batches"] else 0.0
+
+    def snapshot(self) -> Snapshot:
+        """As `PlainEnvRunner`'s."""
+        snapshot = super().snapshot()
+        if self._settings.get(MIRRORED) and "stacks" in snapshot.arrays:
+            snapshot.arrays[MIRRORED] = self._mirrored
+        return snapshot
+
+    def _replay(self, snapshot: Snapshot) -> str:
+        if self._settings.get(MIRRORED):
+            self._mirrored = snapshot.arrays[MIRRORED]
+        return super()._replay(snapshot)
+
+    def _remember(self, observations: Any, first: np.ndarray) -> None:
+        super()._remember(observations, first)
+        if self._settings.get(MIRRORED):
+            kept = np.zeros_like(self._stacks) if first.all() else self._mirrored
+            self._mirrored = self.module.remember_mirrored(kept, observations, first)
 
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         actions, outputs = super()._decide(stacks)
@@ -45,7 +72,8 @@ class TaughtEnvRunner(TeacherEnvRunner):
         if self.teacher_share > 0.0:
             by_teacher = torch.rand(len(stacks)).numpy() < self.teacher_share
             actions = np.where(by_teacher, costs.argmin(axis=1), actions)
-        return actions, {**outputs, COSTS: costs}
+        mirrored = {MIRRORED: self._mirrored} if self._settings.get(MIRRORED) else {}
+        return actions, {**outputs, COSTS: costs, **mirrored}
 
 
 class Lessons:
@@ -99,6 +127,7 @@ class ImitationLearner(PlainPPOLearner):
         """As PPO's learner."""
         super().build()
         self._settings: dict[str, Any] = self.config.learner_config_dict[IMITATION]
+        self._mirrored: bool = self._settings.get(MIRRORED, False)
         self._lessons = Lessons(1e6 * self._settings["keep_mb"])
 
     def update(self, *, timesteps: Mapping[str, int] | None = None, **asked: Any) -> Any:
@@ -120,17 +149,17 @@ class ImitationLearner(PlainPPOLearner):
         columns = {
             Columns.OBS: [np.asarray(episode.get_observations())[:-1] for episode in episodes],
             Columns.ACTIONS: [episode.get_actions() for episode in episodes],
-            Columns.ACTION_DIST_INPUTS: [
-                episode.get_extra_model_outputs(Columns.ACTION_DIST_INPUTS) for episode in episodes
-            ],
-            COSTS: [episode.get_extra_model_outputs(COSTS) for episode in episodes],
         }
+        for name in (Columns.ACTION_DIST_INPUTS, COSTS, *([MIRRORED] if self._mirrored else [])):
+            columns[name] = [episode.get_extra_model_outputs(name) for episode in episodes]
         return {name: torch.from_numpy(np.concatenate(parts)) for name, parts in columns.items()}
 
     def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
         """Gradient steps on random rows of all so far; the means of their figures."""
         likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
         self._lessons.add(rows[Columns.OBS].numpy(), costs.numpy())
+        if self._mirrored:
+            self._lessons.add(rows[MIRRORED].numpy(), costs.numpy()[:, MIRRORED_ACTIONS])
         count = self._settings["final_steps" if self._last else "fit_steps"]
         groups = self.get_optimizer(DEFAULT_MODULE_ID).param_groups
         figures = []

@@ -23,7 +23,7 @@ from jobs.config.plugins import plugin_digests
 from jobs.rollout.diagnostics import drift_metrics
 from jobs.run.files import RunError
 from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.imitation import IMITATION, ImitationLearner, TaughtEnvRunner
+from jobs.training.imitation import IMITATION, MIRRORED, ImitationLearner, TaughtEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, SHAPING, VALUE_WARMUP, PlainPPOLearner
 from jobs.training.rounds import MAX_RESTARTS, SAMPLE_TIMEOUT_S
 from jobs.training.teacher import PricedEnvRunner
@@ -225,6 +225,8 @@ def learner_settings(config: Config) -> dict[str, object]:
     settings: dict[str, object] = {REWARD_SCALE: config.algo.reward_scale}
     if config.algo.imitation is not None:
         own = dataclasses.asdict(config.algo.imitation)
+        if config.algo.mirrored:  # only if it is: Tune continues a training only under the keys it began with
+            own[MIRRORED] = True
         return settings | {IMITATION: {**own, "env_steps": config.train.env_steps}}
     if config.algo.shaping:
         settings[SHAPING] = config.algo.shaping

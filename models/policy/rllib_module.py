@@ -24,6 +24,7 @@ from models.encoder.weights import EncoderManifest
 from models.kinds import EvaeSettings, PolicySpec
 from models.policy.features import Windows, feature_of
 from models.policy.memory import remember, windows_us
+from models.policy.mirror import mirror
 from models.policy.networks import PARTS, build_networks, widened
 from models.policy.policy import load_networks
 
@@ -111,11 +112,19 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
             self._table = self._table or tabulate(self.encoder, self.model_config["encoder_file"].settings)
             self.met.append(cut_packed(observations[self.steps % len(observations)]))
             self.steps += 1
+        return self._features(observations)
+
+    def _features(self, observations: Windows) -> np.ndarray:
         return feature_of(self.spec).from_observations(observations, self.spec, self._table)
 
     def remember(self, kept: np.ndarray, observations: Windows, first: np.ndarray) -> np.ndarray:
         """What the networks read, with the features of the newest observations (`models.policy.memory`)."""
         features = self.features(observations)
+        return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
+
+    def remember_mirrored(self, kept: np.ndarray, observations: Windows, first: np.ndarray) -> np.ndarray:
+        """As `remember`, of what would be seen if left and right were exchanged; to be called after it."""
+        features = self._features(mirror(observations, self.spec))
         return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
 
     def set_state(self, state: Any) -> None:

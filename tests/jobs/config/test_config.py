@@ -141,6 +141,7 @@ def test_ppo_is_the_papers():
         "critic": "observation",
         "shaping": 0.0,
         "imitation": None,
+        "mirrored": False,
     }
 
 

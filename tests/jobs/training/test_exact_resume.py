@@ -26,7 +26,10 @@ SMALL = (
     "algo.train_batch_size_per_learner=96",
     "algo.num_epochs=2",
 )
-IMITATION = ("algo=imitation", "model=event_columns", "algo.imitation.fit_steps=5", "algo.minibatch_size=32")
+IMITATION = (
+    *("algo=imitation", "algo.mirrored=true", "model=event_columns"),
+    *("algo.imitation.fit_steps=5", "algo.minibatch_size=32"),
+)
 PRIVILEGED = ("model=event_columns", "algo.critic=teacher", "algo.shaping=10")
 BEGUN = ("model=event_columns", "train.init=X", "train.value_warmup=700")  # eight iterations
 OWN = {

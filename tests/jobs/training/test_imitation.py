@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 import math
 
 import numpy as np
@@ -6,8 +7,10 @@ import pytest
 import torch
 
 from envs.corridor import CorridorEnv
+from envs.kinematics import MIRRORED_ACTIONS
 from envs.scene.planning import cost_to_go
-from jobs.training.imitation import COSTS, ImitationLearner, Lessons, TaughtEnvRunner
+from jobs.config.config import ConfigError
+from jobs.training.imitation import COSTS, MIRRORED, ImitationLearner, Lessons, TaughtEnvRunner
 from jobs.training.ppo import build_ppo, corridor_settings
 from models.kinds import KINDS
 from tests.support.configs import SHORT, make_config
@@ -116,6 +119,85 @@ def test_labels_are_learnt(learner, rolled_out):
         told = learner.update(episodes=copy.deepcopy(episodes), timesteps={SAMPLED: 1}, minibatch_size=64)
         losses.append(float(told["default_policy"]["policy_loss"].peek()))
     assert losses[-1] < 0.8 * losses[0]
+
+
+@pytest.mark.parametrize("name", kinds(TRAINED, quick=("event_columns",)))
+def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(name, tmp_path, monkeypatch):
+    """And nothing else is rolled out than without them; RLlib's own pieces are cut alike."""
+    own = ("model.encoder=finetuned",) if name == "finetuned" else (f"model={name}",)
+    told = {}
+    for mirrored in (False, True):
+        config = make_config(
+            *SHORT, "algo=imitation", "algo.num_env_runners=0", *own, f"algo.mirrored={mirrored}"
+        )
+        encoder = write_encoder(tmp_path, config) if KINDS[config.model.name].encoder else None
+        runner = TaughtEnvRunner(config=build_ppo(config, encoder), worker_index=0)
+        shown = []
+        remember = type(runner)._remember
+
+        def watched(self, observations, first, shown=shown, remember=remember):
+            shown.append((copy.deepcopy(observations), first.copy()))
+            remember(self, observations, first)
+
+        monkeypatch.setattr(runner, "_remember", watched.__get__(runner))
+        torch.manual_seed(1)
+        told[mirrored] = runner.sample(num_timesteps=100)
+        runner.stop()
+    for one, other in zip(*told.values(), strict=True):
+        np.testing.assert_array_equal(one.get_observations(), other.get_observations())
+        np.testing.assert_array_equal(one.get_actions(), other.get_actions())
+        assert MIRRORED not in one.extra_model_outputs
+    kept, met = (
+        np.zeros((len(shown[0][1]), *told[True][0].get_observations().shape[1:])),
+        len(runner.module.met),
+    )
+    kept = kept.astype(told[True][0].get_observations().dtype)
+    expected = []
+    for observations, first in shown:
+        kept = runner.module.remember_mirrored(kept, observations, first)
+        expected.append(kept)
+    assert len(runner.module.met) == met
+    expected = {row.tobytes() for step in expected for row in step}
+    found = np.concatenate([episode.get_extra_model_outputs(MIRRORED) for episode in told[True]])
+    assert {row.tobytes() for row in found} <= expected
+    seen = np.concatenate([episode.get_observations()[:-1] for episode in told[True]])
+    assert not np.array_equal(found, seen)
+
+
+def test_a_mirrored_step_is_learnt_with_the_costs_of_the_mirrored_actions(rolled_out):
+    config = make_config(*WORDS, *SETTINGS, "algo.mirrored=true")
+    runner = TaughtEnvRunner(config=build_ppo(config), worker_index=0)
+    learner = build_ppo(config).build_learner(env=runner.env)
+    episodes = runner.sample(num_timesteps=140)
+    runner.stop()
+    rows = learner._rows(episodes)
+    learner.update(episodes=episodes, timesteps={SAMPLED: 1}, minibatch_size=16)
+    lessons, count = learner._lessons.arrays(), len(rows[COSTS])
+    assert lessons["seen"] == 2 * count
+    np.testing.assert_array_equal(lessons["stacks"][:count], rows["obs"])
+    np.testing.assert_array_equal(lessons["stacks"][count:], rows[MIRRORED])
+    np.testing.assert_array_equal(lessons["costs"][:count, [0, 2, 1]], lessons["costs"][count:])
+
+
+def test_the_teacher_of_the_mirrored_scene_teaches_the_mirrored_actions(config):
+    env = CorridorEnv(corridor_settings(config)["config"])
+    env.reset(seed=3)
+    turned = env.scene.obstacles.copy()
+    turned["x"] *= -1.0
+    mirrored = dataclasses.replace(env.scene, obstacles=turned)
+    plans = [
+        cost_to_go(one, env.config.vehicle_radius_m, env.config.camera_height_m)
+        for one in (env.scene, mirrored)
+    ]
+    rng = np.random.default_rng(0)
+    for x_m, y_m in zip(rng.uniform(-12.0, 12.0, 200), rng.uniform(0.0, 95.0, 200), strict=True):
+        costs, turned_costs = plans[0].of_actions(x_m, y_m), plans[1].of_actions(-x_m, y_m)
+        np.testing.assert_allclose(costs[MIRRORED_ACTIONS], turned_costs, rtol=1e-9)
+
+
+def test_mirrored_steps_ask_for_a_teacher():
+    with pytest.raises(ConfigError, match=r"mirrored.*algo\.imitation"):
+        make_config("algo=ppo", "algo.mirrored=true")
 
 
 def rows_of(first, count):

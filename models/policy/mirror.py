@@ -1,0 +1,55 @@
+"""What a policy would see if left and right were exchanged: a second sample of each step.
+
+The world's sun stands to the right, so a mirrored sample shows it to the left, where it never stands.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from models.kinds import PolicySpec
+
+
+def mirror(observations: Any, spec: PolicySpec) -> Any:
+    """Observations with left and right exchanged.
+
+    Args:
+        observations: B packed windows, of one length or of several, or pictures (B, H, W).
+        spec: The policy, whose kind says which.
+
+    Returns:
+        The same container and types, copies.
+
+    Raises:
+        ValueError: The kind's observation has no mirror image known here.
+    """
+    name = spec.kind.observation
+    if name not in MIRRORS:
+        rule = f"must be one of {', '.join(MIRRORS)} to be mirrored"
+        raise ValueError(f"{spec.model.name}: its observation {rule}, got {name!r}")
+    return MIRRORS[name](observations, spec.width)
+
+
+def _mirror_windows(windows: Any, width: int) -> Any:
+    mirrored = tuple([_mirror_window(window, width) for window in windows])
+    return np.stack(mirrored) if isinstance(windows, np.ndarray) else mirrored
+
+
+def _mirror_window(window: np.ndarray, width: int) -> np.ndarray:
+    """Of rows [t, x, y, p] after a head whose first number counts them."""
+    mirrored = window.copy()
+    events = mirrored[1 : 1 + int(window[0, 0])]
+    events[:, 1] = width - 1 - events[:, 1]
+    return mirrored
+
+
+def _mirror_pictures(pictures: np.ndarray, width: int) -> np.ndarray:
+    return np.ascontiguousarray(pictures[..., ::-1])
+
+
+MIRRORS: dict[str, Callable[[Any, int], Any]] = {
+    "window": _mirror_windows,
+    "event_image": _mirror_pictures,
+    "luminance": _mirror_pictures,
+}
