@@ -35,13 +35,21 @@ class CostToGo:
     prices: np.ndarray
     first_x_m: float
 
-    def of_actions(self, x_m: float, y_m: float) -> np.ndarray:
+    def of_actions(self, x_m: float, y_m: float, sight_m: float = math.inf) -> np.ndarray:
         """What each action costs from anywhere: ahead, left, right; float64 (3,).
 
         A lattice step in the action's direction, and from there the cheapest way, interpolated between
         the four nearest places; outside the lattice, as at its edge.
+
+        Args:
+            x_m: The place, to the right [m].
+            y_m: And ahead [m].
+            sight_m: Ways end so far ahead, whatever stands behind; infinite: at the goal line [m].
         """
-        return _of_actions(self.costs, (x_m - self.first_x_m) / LATTICE_M, y_m / LATTICE_M)
+        column, row, ahead = (x_m - self.first_x_m) / LATTICE_M, y_m / LATTICE_M, sight_m / LATTICE_M
+        if ahead >= len(self.costs):
+            return _of_actions(self.costs, column, row)
+        return _of_actions_in_sight(self.prices, column, row, max(1, round(ahead)))
 
 
 def cost_to_go(scene: Scene, radius_m: float, height_m: float = 2.0, through_x_m: float = 0.0) -> CostToGo:
@@ -126,3 +134,19 @@ def _of_actions(costs: np.ndarray, column: float, row: float) -> np.ndarray:
         far = costs[j + 1, i] + (x - i) * (costs[j + 1, i + 1] - costs[j + 1, i])
         found[action] = near + (y - j) * (far - near) + SIDE_PRICE * abs(side)
     return found
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _of_actions_in_sight(prices: np.ndarray, column: float, row: float, rows_ahead: int) -> np.ndarray:
+    """As `_of_actions`, of ways that end `rows_ahead` rows after the next.
+
+    Only the places that such a way can come to are priced, and as many at each side that what lies beyond
+    cannot be felt.
+    """
+    rows, columns = prices.shape
+    first = min(int(min(max(row + 1.0, 0.0), rows - 1.0)), rows - 2)
+    after_last = min(first + rows_ahead + 1, rows)
+    reach, middle = after_last - first + 3, int(min(max(column, 0.0), columns - 1.0))
+    left, right = max(middle - reach, 0), min(middle + reach, columns)
+    costs = _costs(prices[first:after_last, left:right])
+    return _of_actions(costs, column - left, row - first)

@@ -52,6 +52,8 @@ class AlgoConfig:
             0: they are not.
         imitation: Learn from a teacher instead; of the others then only lr, sizes, grad_clip, mirrored count.
         mirrored: Learn each step a second time, left and right exchanged (`models.policy.mirror`).
+        teacher_sight_m: How far ahead the teacher plans [m], in imitation, critic and shaping alike; None: to
+            the goal line.
     """
 
     lr: Positive
@@ -72,6 +74,7 @@ class AlgoConfig:
     shaping: NonNegative
     imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)]
     mirrored: bool
+    teacher_sight_m: Positive | None
 
     @pydantic.model_validator(mode="after")
     def _minibatch_fits(self) -> "AlgoConfig":
@@ -80,6 +83,10 @@ class AlgoConfig:
         if self.mirrored and self.imitation is None:
             rule = "must be false without algo.imitation, because PPO learns only from what it did"
             raise ValueError(f"mirrored {rule}, got true")
+        taught = self.imitation is not None or self.critic == "teacher" or self.shaping > 0.0
+        if self.teacher_sight_m is not None and not taught:
+            rule = "must be null without a teacher (algo=imitation, algo.critic=teacher, algo.shaping)"
+            raise ValueError(f"teacher_sight_m {rule}, got {self.teacher_sight_m}")
         return self
 
 

@@ -30,7 +30,10 @@ NOT_IN_RUN_NAME = (
 # Settings that older run folders lack, each with the value that does what was done before it existed.
 ADDED_SETTINGS: dict[str, dict[str, object]] = {
     "model": ADDED_MODEL_SETTINGS,
-    "algo": {"imitation": None, "critic": "observation", "shaping": 0.0, "mirrored": False},
+    "algo": {
+        **{"imitation": None, "critic": "observation", "shaping": 0.0},
+        **{"mirrored": False, "teacher_sight_m": None},
+    },
     "env": {"filter_support": 0, "filter_tau_us": 5_000},
     "camera": {name: getattr(CameraConfig, name) for name in LATER_SETTINGS},
     "faults": {"added": {}, "displaced": 0.0, "flipped": 0.0, "leak_jitter": 0.0, "noise_spread": 0.0},

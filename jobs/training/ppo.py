@@ -26,7 +26,7 @@ from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.imitation import IMITATION, MIRRORED, ImitationLearner, TaughtEnvRunner
 from jobs.training.ppo_learner import REWARD_SCALE, SHAPING, VALUE_WARMUP, PlainPPOLearner
 from jobs.training.rounds import MAX_RESTARTS, SAMPLE_TIMEOUT_S
-from jobs.training.teacher import PricedEnvRunner
+from jobs.training.teacher import SIGHT_M, PricedEnvRunner
 from models.encoder.evae import EventVAE
 from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
 from models.kinds import KINDS, PolicySpec
@@ -223,6 +223,8 @@ def _optimiser(ppo: PPOConfig, config: Config) -> PPOConfig:
 def learner_settings(config: Config) -> dict[str, object]:
     """What the learner is told beside RLlib's own settings."""
     settings: dict[str, object] = {REWARD_SCALE: config.algo.reward_scale}
+    if config.algo.teacher_sight_m is not None:
+        settings[SIGHT_M] = config.algo.teacher_sight_m
     if config.algo.imitation is not None:
         own = dataclasses.asdict(config.algo.imitation)
         if config.algo.mirrored:  # only if it is: Tune continues a training only under the keys it began with

@@ -1,5 +1,6 @@
 """Env runners beside which a planner stands that knows the geometry, and says what each place costs."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ from jobs.training.snapshots import Snapshot
 
 # In an info: of the cheapest way (`envs.scene.planning`) to the goal line from where the next action acts.
 COST_TO_GO = "cost_to_go"
+SIGHT_M = (
+    "teacher_sight_m"  # of the learner's own settings: how far the plans look, without it to the goal line
+)
 
 
 class TeacherEnvRunner(PlainEnvRunner):
@@ -31,7 +35,9 @@ class TeacherEnvRunner(PlainEnvRunner):
         if plan is None or scene is not env.scene:
             plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
             self._plans[row] = env.scene, plan
-        return plan.of_actions(*env.place_of_action())
+        sight_m = self.config.learner_config_dict.get(SIGHT_M, math.inf)
+        x_m, y_m = env.place_of_action()
+        return plan.of_actions(x_m, y_m, sight_m)
 
 
 class PricedEnvRunner(TeacherEnvRunner):

@@ -55,7 +55,7 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     """
     variants = config.ablation.variants
     if not variants:
-        raise ConfigError("ablation.variants: must name at least one, got none; +exp=ablation names eleven")
+        raise ConfigError("ablation.variants: must name at least one, got none; +exp=ablation names twelve")
     first = next(iter(variants))
     for name in variants:
         variant_config(config, name, config.ablation.seeds[0])

@@ -3,6 +3,8 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
 
 from envs.config import EnvConfig
 from envs.kinematics import Lane, advance, planned_position
@@ -77,14 +79,27 @@ def test_costs_between_places_are_bilinear_and_outside_those_of_the_edge():
     assert ahead == plan.of_actions(-0.4, 0.3)[0]
 
 
-def flown(scene, seed, random_share, plan=None):
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.integers(2, 12), st.integers(1, 9))
+def test_with_limited_sight_costs_are_those_of_a_world_that_ends_there(seed, rows, columns, ahead):
+    rng = np.random.default_rng(seed)
+    prices = rng.uniform(size=(rows, columns))
+    plan = CostToGo(_costs(prices), prices, -1.0)
+    for x, y in rng.uniform(-3.0, [0.25 * columns + 3.0, 0.25 * rows + 3.0], (8, 2)):
+        next_row = min(int(np.clip(y / LATTICE_M + 1.0, 0, rows - 1)), rows - 2)
+        ends = prices[: next_row + ahead + 1]
+        expected = CostToGo(_costs(ends), ends, -1.0).of_actions(x, y)
+        np.testing.assert_allclose(plan.of_actions(x, y, ahead * LATTICE_M), expected, rtol=1e-12)
+        np.testing.assert_array_equal(plan.of_actions(x, y, 1e9), plan.of_actions(x, y))
+
+
+def flown(scene, seed, random_share, plan=None, sight_m=math.inf):
     """Whether the teacher's cheapest actions lead from a random start to the goal line."""
     plan = plan or cost_to_go(scene, RADIUS_M, HEIGHT_M)
     rng, config = np.random.default_rng(seed), EnvConfig()
     spawn_x, moves = rng.uniform(*scene.spawn_range_m), [0, 0, 0]
     place, lane = (spawn_x, 0.0), Lane(RADIUS_M, 0.5 * scene.width_m, scene.length_m)
     while True:
-        action = rng.integers(3) if rng.random() < random_share else plan.of_actions(*place).argmin()
+        action = rng.integers(3) if rng.random() < random_share else plan.of_actions(*place, sight_m).argmin()
         moves[action] += 1
         planned = planned_position(spawn_x, tuple(moves), (config.speed_mps, config.control_hz))
         told = advance(lane, scene.sections(HEIGHT_M), place, planned)
@@ -99,6 +114,11 @@ def flown(scene, seed, random_share, plan=None):
 )
 def test_the_cheapest_actions_come_through(name, random_share, least):
     assert sum(flown(drawn(name, seed), seed, random_share) for seed in range(40)) >= least
+
+
+@pytest.mark.parametrize("name", ["poles_eval", "poles_dense"])
+def test_the_cheapest_actions_come_through_with_a_sight_of_twenty_metres(name):
+    assert sum(flown(drawn(name, seed), seed, 0.0, sight_m=20.0) for seed in range(40)) >= 39
 
 
 def test_a_mesh_blocks_where_its_surfaces_are(tmp_path):

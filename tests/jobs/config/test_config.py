@@ -142,6 +142,7 @@ def test_ppo_is_the_papers():
         "shaping": 0.0,
         "imitation": None,
         "mirrored": False,
+        "teacher_sight_m": None,
     }
 
 

@@ -195,9 +195,23 @@ def test_the_teacher_of_the_mirrored_scene_teaches_the_mirrored_actions(config):
         np.testing.assert_allclose(costs[MIRRORED_ACTIONS], turned_costs, rtol=1e-9)
 
 
-def test_mirrored_steps_ask_for_a_teacher():
-    with pytest.raises(ConfigError, match=r"mirrored.*algo\.imitation"):
-        make_config("algo=ppo", "algo.mirrored=true")
+@pytest.mark.parametrize("word", ["algo.mirrored=true", "algo.teacher_sight_m=20"])
+def test_without_a_teacher_nothing_can_be_asked_of_it(word):
+    with pytest.raises(ConfigError, match=f"{word[5:10]}.*algo[.=]imitation"):
+        make_config("algo=ppo", word)
+
+
+def test_a_teacher_of_limited_sight_says_what_a_way_so_far_costs():
+    config = make_config(*WORDS, *SETTINGS, "algo.teacher_sight_m=5")
+    runner = TaughtEnvRunner(config=build_ppo(config), worker_index=0)
+    runner.sample(num_timesteps=64)
+    for row, costs in enumerate(runner.costs()):
+        env = runner.env.unwrapped.envs[row]
+        plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
+        expected = plan.of_actions(*env.place_of_action(), 5.0)
+        np.testing.assert_array_equal(costs, expected)
+        assert (expected < plan.of_actions(*env.place_of_action())).all()
+    runner.stop()
 
 
 def rows_of(first, count):
