@@ -92,7 +92,7 @@ def test_with_limited_sight_costs_are_those_of_a_world_that_ends_there(seed, row
         np.testing.assert_array_equal(plan.of_actions(x, y, 1e9), plan.of_actions(x, y))
 
 
-def flown(scene, seed, random_share, plan=None, sight_m=math.inf):
+def flown(scene, seed, random_share, plan=None, sight_m=math.inf, control_hz=200.0):
     """Whether the teacher's cheapest actions lead from a random start to the goal line."""
     plan = plan or cost_to_go(scene, RADIUS_M, HEIGHT_M)
     rng, config = np.random.default_rng(seed), EnvConfig()
@@ -101,7 +101,7 @@ def flown(scene, seed, random_share, plan=None, sight_m=math.inf):
     while True:
         action = rng.integers(3) if rng.random() < random_share else plan.of_actions(*place, sight_m).argmin()
         moves[action] += 1
-        planned = planned_position(spawn_x, tuple(moves), (config.speed_mps, config.control_hz))
+        planned = planned_position(spawn_x, tuple(moves), (config.speed_mps, control_hz))
         told = advance(lane, scene.sections(HEIGHT_M), place, planned)
         if told.success or told.collision:
             return told.success
@@ -116,9 +116,10 @@ def test_the_cheapest_actions_come_through(name, random_share, least):
     assert sum(flown(drawn(name, seed), seed, random_share) for seed in range(40)) >= least
 
 
-@pytest.mark.parametrize("name", ["poles_eval", "poles_dense"])
-def test_the_cheapest_actions_come_through_with_a_sight_of_twenty_metres(name):
-    assert sum(flown(drawn(name, seed), seed, 0.0, sight_m=20.0) for seed in range(40)) >= 39
+@pytest.mark.parametrize("control_hz", [25.0, 200.0])
+def test_five_metres_of_sight_suffice_among_dense_poles(control_hz):
+    flights = [flown(drawn("poles_dense", k), k, 0.0, sight_m=5.0, control_hz=control_hz) for k in range(40)]
+    assert all(flights)
 
 
 def test_a_mesh_blocks_where_its_surfaces_are(tmp_path):
