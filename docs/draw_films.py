@@ -2,15 +2,22 @@
 
 Run from the repository root: python -m docs.draw_films [NAME ...]
 Writes docs/films/NAME.mp4, 720 pixels wide, and docs/images/demo.gif for
-the README. Every film is one corridor, the first (seed 0), whatever happens in it. Expect 3 minutes.
+the README. Every film is one corridor, the first (seed 0), whatever happens in it; those of `FAILURES`
+the first in which the policy fails. Expect 6 minutes.
 """
 
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio_ffmpeg
+import numpy as np
+
+from jobs.bench.throughput import composed
+from jobs.evaluation.demo import find_shown
+from jobs.rollout.episodes import roll_out
 
 DOCS = Path(__file__).resolve().parent
 FILMS = {  # name: the words of the demo
@@ -22,6 +29,12 @@ FILMS = {  # name: the words of the demo
     "dead_pixels": ("faults.sparsity=0.5",),
     "crash": ("demo.policy=bytestream-s1", "env.scene=texture_change", "fidelity.tolerance=0.2"),
 }
+FAILURES = {
+    "fails_dense_25hz": ("env.scene=poles_dense", "env.control_hz=25"),
+    "fails_dense": ("env.scene=poles_dense",),
+    "fails_late": ("env.action_delay_ms=100",),
+}
+AT_ONCE, CORRIDORS = 20, 100  # in which a failure is looked for
 # Of the frames of a demo, 50 a second, keep each fifth and show 10 a second: the same speed.
 SMALL = ("-vf", "select=not(mod(n\\,5)),setpts=N/10/TB,scale=720:-2", "-r", "10", "-crf", "33", "-an")
 MOVING = (
@@ -34,9 +47,11 @@ def main() -> None:
     """Make the films that the command line names, or all."""
     (DOCS / "films").mkdir(exist_ok=True)
     ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-    for name in sys.argv[1:] or FILMS:
+    for name in sys.argv[1:] or (*FILMS, *FAILURES):
         with tempfile.TemporaryDirectory() as place:
-            words = [f"runs_dir={place}", *FILMS[name]]
+            words = [f"runs_dir={place}", *(FILMS | FAILURES)[name]]
+            if name in FAILURES:
+                words.append(f"seed={first_failure(FAILURES[name])}")
             subprocess.run([sys.executable, "-m", "platform.launch", "+exp=demo", *words], check=True)
             (film,) = Path(place).glob("*/demo/*.mp4")
             small = [ffmpeg, "-v", "error", "-y", "-i", str(film)]
@@ -45,6 +60,21 @@ def main() -> None:
                 subprocess.run(
                     [*small, "-vf", MOVING, "-r", "25/3", str(DOCS / "images" / "demo.gif")], check=True
                 )
+
+
+def first_failure(words: Sequence[str]) -> int:
+    """The first held-out corridor in which a demo of these words shows a failure.
+
+    Raises:
+        LookupError: There is none among the first `CORRIDORS`.
+    """
+    _, env, agent = find_shown(composed("+exp=demo", *words))
+    for first in range(0, CORRIDORS, AT_ONCE):
+        episodes = roll_out(agent, env, range(first, first + AT_ONCE), num_envs=AT_ONCE)
+        failed = episodes["seed"][~episodes["success"]]
+        if failed.size:
+            return int(np.min(failed))
+    raise LookupError(f"no failure in the first {CORRIDORS} corridors with {' '.join(words)}")
 
 
 if __name__ == "__main__":

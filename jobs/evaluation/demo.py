@@ -11,16 +11,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from envs.config import EnvConfig
 from jobs.analysis.demo_film import write_film
 from jobs.analysis.tables import events_texts, show_table
 from jobs.config.config import Config
 from jobs.evaluation.evaluate import latent_decoder
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
-from jobs.rollout.policies import find_one_policy, own_sensor_differences, with_own_filter
+from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, own_sensor_differences, with_own_filter
 from jobs.rollout.recorded import RecordedEpisode, record_episode
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console
@@ -33,34 +35,64 @@ HEADINGS = (
 )
 
 
+class Shown(NamedTuple):
+    """Who is shown, and in what.
+
+    Attributes:
+        policy: It.
+        env: The held-out corridors, with the filter that the policy was trained to see through.
+        agent: It acts by its likeliest or its drawn actions, as `evaluate.action` says.
+    """
+
+    policy: EvaluatedPolicy
+    env: EnvConfig
+    agent: PolicyAgent
+
+
+def find_shown(config: Config) -> Shown:
+    """What `config` shows.
+
+    Raises:
+        ConfigError: There is no such policy.
+    """
+    policy = find_one_policy("demo.policy", config.demo.policy, config, locate_run(config))
+    env = with_own_filter(policy, dataclasses.replace(config.env, split="eval"))
+    return Shown(policy, env, PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic"))
+
+
 def run(config: Config) -> np.void:
     """Record one episode of `demo.policy`, print its line and write its film; return the EPISODE ().
 
     Raises:
         ConfigError: If there is no such policy.
     """
-    policy = find_one_policy("demo.policy", config.demo.policy, config, locate_run(config))
+    policy, env, agent = find_shown(config)
     name = f"{policy.group}-s{policy.training}"
-    env = with_own_filter(policy, dataclasses.replace(config.env, split="eval"))
     differ = own_sensor_differences(policy, env)
     if differ:
         said = ", ".join(f"{key}={ours!r} (trained: {theirs!r})" for key, (theirs, ours) in differ.items())
         console.print(f"Another sensor than in training: {said}", markup=False)
-    agent = PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic")
     recorded = record_episode(agent, env, config.seed)
     show_table("One episode in a held-out corridor", HEADINGS, [line(name, recorded)], words=5)
     file = Path(policy.agent) / ENCODER
     decode = latent_decoder(Path(policy.agent)) if file.is_file() else None
     if decode is None and file.is_file():
         console.print("The policy is lean, without a decoder: the film shows its latent as numbers alone.")
+    path = open_run(config).path / "demo" / f"{name}.mp4"
+    console.print(
+        f"Film: {write_film(path, recorded, title_of(name, env, config.seed), decode)}", markup=False
+    )
+    show(path)
+    return recorded.episode
+
+
+def title_of(name: str, env: EnvConfig, seed: int) -> str:
+    """What stands above a film."""
     amounts = dataclasses.asdict(env.faults)
     amounts |= amounts.pop("added")
     faults = [f"{key} {value:g}" for key, value in amounts.items() if value]
-    title = "   ".join([name, f"{env.scene} {config.seed}", *faults])
-    path = open_run(config).path / "demo" / f"{name}.mp4"
-    console.print(f"Film: {write_film(path, recorded, title, decode)}", markup=False)
-    show(path)
-    return recorded.episode
+    late = [f"actions {env.action_delay_ms:g} ms late"] if env.action_delay_ms else []
+    return "   ".join([name, f"{env.scene} {seed}", f"{env.control_hz:g} Hz", *late, *faults])
 
 
 def line(name: str, recorded: RecordedEpisode) -> tuple[str, ...]:
