@@ -28,6 +28,7 @@ from jobs.studies.ablation.page import plot_variants, variant_result
 from jobs.studies.trade.page import draw_settings
 
 DOCS = Path(__file__).resolve().parent
+ABLATIONS = "ablation", "ablation_more"  # each with a recipe of its own
 
 
 def results(data: Path) -> dict[str, Figure]:
@@ -48,15 +49,18 @@ def taught_claims(data: Path) -> dict[str, Figure]:
 
 
 def ablation(data: Path) -> dict[str, Figure]:
-    """That of ablation.md; the first variant is the one that others are compared with."""
+    """Those of ablation.md; in each, the first variant is the one that others are compared with."""
+    return {name: _variants(data / f"{name}_episodes.csv.gz") for name in ABLATIONS}
+
+
+def _variants(episodes: Path) -> Figure:
+    """Success of each variant of one ablation, and what it changes."""
     success: dict[str, dict[str, np.ndarray]] = {}
-    for ((axis, value), name), trainings in read_sweep_episodes(data / "ablation_episodes.csv.gz").items():
+    for ((axis, value), name), trainings in read_sweep_episodes(episodes).items():
         condition = value if axis == NOMINAL else f"{axis}={value}"
         success.setdefault(name, {})[condition] = episode_values(trainings, "success")
     first = next(iter(success.values()))
-    return {
-        "ablation": plot_variants([variant_result(name, own, first, (0.0,)) for name, own in success.items()])
-    }
+    return plot_variants([variant_result(name, own, first, (0.0,)) for name, own in success.items()])
 
 
 def trade(data: Path) -> dict[str, Figure]:
@@ -70,7 +74,7 @@ STUDIES = {
     results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
     dose_response: (f"{DOSES}_episodes.csv.gz", f"{DOSES}_about.json", f"{DOSES}_doses.csv"),
     taught_claims: (f"{TAUGHT}_episodes.csv.gz", f"{TAUGHT}_about.json"),
-    ablation: ("ablation_episodes.csv.gz",),
+    ablation: tuple(f"{name}_episodes.csv.gz" for name in ABLATIONS),
     trade: ("trade_settings.csv",),
 }
 
