@@ -37,9 +37,8 @@ class TaughtEnvRunner(TeacherEnvRunner):
     """As `PlainEnvRunner`; the teacher labels every step, and acts in some."""
 
     @property
-    def _settings(self) -> dict[str, Any]:
-        own: dict[str, Any] = self.config.learner_config_dict[IMITATION]
-        return own
+    def _settings(self) -> Any:
+        return self.config.learner_config_dict[IMITATION]
 
     @property
     def teacher_share(self) -> float:
