@@ -50,7 +50,8 @@ class AlgoConfig:
             line costs, of a teacher that knows the geometry.
         shaping: Of the potential -shaping * log(1 + that cost), by which rewards are shaped in training only;
             0: they are not.
-        imitation: Learn from a teacher instead; of the others then only lr, sizes, grad_clip, mirrored count.
+        imitation: Learn from a teacher instead; of the others then only lr, sizes, grad_clip, mirrored and
+            teacher_sight_m count.
         mirrored: Learn each step a second time, left and right exchanged (`models.policy.mirror`).
         teacher_sight_m: How far ahead the teacher plans [m], in imitation, critic and shaping alike; None: to
             the goal line.

@@ -78,11 +78,10 @@ def run(config: Config) -> np.void:
     decode = latent_decoder(Path(policy.agent)) if file.is_file() else None
     if decode is None and file.is_file():
         console.print("The policy is lean, without a decoder: the film shows its latent as numbers alone.")
-    path = open_run(config).path / "demo" / f"{name}.mp4"
-    console.print(
-        f"Film: {write_film(path, recorded, title_of(name, env, config.seed), decode)}", markup=False
-    )
-    show(path)
+    film = open_run(config).path / "demo" / f"{name}.mp4"
+    write_film(film, recorded, title_of(name, env, config.seed), decode)
+    console.print(f"Film: {film}", markup=False)
+    show(film)
     return recorded.episode
 
 

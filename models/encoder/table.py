@@ -96,14 +96,14 @@ class EncoderTable:
         )
 
     def empty(self) -> np.ndarray:
-        """Context of no event: zeros (D,) of the rows' type.
+        """Context of no event: zeros (D,), int16 for rows of int8, whose sums it holds.
 
         With EventNet's coding (2, D), magnitudes and time bins; int32 for rows of integers.
         """
         dtype = self.features.dtype
         if self.phase is not None:
             return np.zeros((2, self.features.shape[1]), np.int32 if dtype.kind == "i" else dtype)
-        return np.zeros(self.features.shape[1], dtype)
+        return np.zeros(self.features.shape[1], np.int16 if dtype == np.int8 else dtype)
 
     def update(self, context: np.ndarray, events: Any, start_us: int, window_us: int) -> np.ndarray:
         """Context after more events of the same window; `context`, as of `empty`, is left as it was.
@@ -186,9 +186,7 @@ def _rounded(
         scale = 2.0 ** np.ceil(np.log2(highest.max() / INT16_TOP))
         return np.rint(features / scale).astype("i2"), np.rint(embedding / scale).astype("i2"), scale
     scale = highest / INT8_TOP
-    features = np.rint(features / scale)
-    embedding = np.minimum(np.rint(embedding / scale), INT8_TOP - features.max(axis=0))  # sums are int8 too
-    return features.astype("i1"), embedding.astype("i1"), scale
+    return np.rint(features / scale).astype("i1"), np.rint(embedding / scale).astype("i1"), scale
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -22,11 +22,11 @@ def make_evae(variant="bytestream", dtype=torch.float32, **settings):
     return evae.to(dtype).freeze()
 
 
-def make_events(count, seed=0, start_us=0):
+def make_events(count, seed=0, start_us=0, width=16, height=12):
     rng = np.random.default_rng(seed)
     events = np.zeros(count, EVENT)
     events["t"] = start_us + np.sort(rng.integers(1, WINDOW_US + 1, count))
-    events["x"], events["y"] = rng.integers(0, 16, count), rng.integers(0, 12, count)
+    events["x"], events["y"] = rng.integers(0, width, count), rng.integers(0, height, count)
     events["p"] = rng.choice([-1, 1], count)
     return events
 

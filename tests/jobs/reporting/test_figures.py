@@ -7,9 +7,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from docs import from_data
-from docs.from_data import STUDIES, figures, main, pages
+from docs.from_data import ABLATIONS, STUDIES, figures, main, pages
 from envs.config import EnvConfig
 from jobs.analysis.tables import save_plot, write_csv
+from jobs.evaluation.group_stats import episode_values
 from jobs.reporting import dose_response, report
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.dose_response import write_dose_response
@@ -18,7 +19,7 @@ from jobs.reporting.headline import BEGIN, END
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_curves, read_trainings
 from jobs.reporting.report import write_results
 from jobs.reporting.summary_plots import still_going
-from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_sweep, write_data
+from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_sweep, read_sweep_episodes, write_data
 from jobs.rollout.policies import PRETRAINED
 from tests.support.episodes import flights
 from tests.support.sweep_folders import study_places, write_shipped, write_study, write_sweep
@@ -149,3 +150,29 @@ def test_a_group_that_was_not_evaluated_unchanged_is_left_out_of_how_far_episode
     changes = changes_of(about, episodes)
     assert {change.group for change in changes} == {"bytestream", "event_image"}
     assert set(survivals(about, episodes, changes)) == {"event_image"}
+
+
+def cells_of(page):
+    """The cells of each row of a page's tables."""
+    rows = (DOCS / page).read_text().splitlines()
+    return [[cell.strip(" `") for cell in row.strip("|").split("|")] for row in rows if row.startswith("|")]
+
+
+def test_the_table_of_the_policy_that_holds_is_that_of_its_episodes():
+    episodes = read_sweep_episodes(DOCS / "data" / "hold_episodes.csv.gz")
+    expected = [
+        ", ".join(str(round(100 * value)) for value in episode_values(trainings, "success").mean(axis=1))
+        for trainings in episodes.values()
+    ]
+    found = [row[2] for row in cells_of("policies.md") if len(row) == 3 and row[2].count(",") == 4]
+    assert sorted(found) == sorted(expected)
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_the_tables_of_the_ablation_are_those_of_their_episodes(name):
+    success = {}
+    for (_, variant), trainings in read_sweep_episodes(DOCS / "data" / f"{name}_episodes.csv.gz").items():
+        success.setdefault(variant, []).append(episode_values(trainings, "success").mean())
+    expected = [[variant, *(f"{100 * value:.0f}" for value in values)] for variant, values in success.items()]
+    found = [[row[0], *row[2:8]] for row in cells_of("ablation.md")]
+    assert all(row in found for row in expected)

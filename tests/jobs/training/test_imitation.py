@@ -147,11 +147,8 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
         np.testing.assert_array_equal(one.get_observations(), other.get_observations())
         np.testing.assert_array_equal(one.get_actions(), other.get_actions())
         assert MIRRORED not in one.extra_model_outputs
-    kept, met = (
-        np.zeros((len(shown[0][1]), *told[True][0].get_observations().shape[1:])),
-        len(runner.module.met),
-    )
-    kept = kept.astype(told[True][0].get_observations().dtype)
+    seen = np.concatenate([episode.get_observations()[:-1] for episode in told[True]])
+    kept, met = np.zeros((len(shown[0][1]), *seen.shape[1:]), seen.dtype), len(runner.module.met)
     expected = []
     for observations, first in shown:
         kept = runner.module.remember_mirrored(kept, observations, first)
@@ -160,7 +157,6 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
     expected = {row.tobytes() for step in expected for row in step}
     found = np.concatenate([episode.get_extra_model_outputs(MIRRORED) for episode in told[True]])
     assert {row.tobytes() for row in found} <= expected
-    seen = np.concatenate([episode.get_observations()[:-1] for episode in told[True]])
     assert not np.array_equal(found, seen)
 
 

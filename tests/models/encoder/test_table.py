@@ -5,10 +5,9 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, strategies
 
 from models.encoder.event_batch import batch_windows
-from models.encoder.table import PRECISIONS, EncoderTable, _rounded, dense
+from models.encoder.table import PRECISIONS, EncoderTable, dense
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
@@ -83,19 +82,6 @@ def test_a_rounded_table_is_off_by_one_unit_at_the_most_and_smaller(variant, cod
             units, context = units[0], context[0]
         assert (np.abs(units * unit - context) <= 1.001 * unit).all()
         assert 0 < np.abs(rounded.encode(events, 0, WINDOW_US) - mu).max() < 2 * bound
-
-
-@given(strategies.integers(0, 2**32 - 1))
-def test_sums_of_int8_rows_fit_int8_also_where_both_are_rounded_up(seed):
-    rng = np.random.default_rng(seed)
-    highest = rng.choice([0.0, 0.25, 1.0, 3.0, 1e6], (1, 40))
-    features = highest * rng.choice([0.0, 0.5, 1.0], (30, 40))
-    embedding = rng.choice([-1.0, -0.5, 0.5, 1.0], (20, 40))
-    rows, codes, scale = _rounded(features, embedding, "int8", "float32")
-    sums = rows[:, None].astype(int) + codes[None]
-    assert np.abs(sums).max() <= 127
-    off = np.abs(sums * scale - (features[:, None] + embedding)).max(axis=(0, 1))
-    assert (off <= 1.001 * scale).all()
 
 
 def test_large_features_widen_the_unit_of_int16_and_none_overflows():

@@ -2,31 +2,23 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies
 
-from envs.events import EVENT, event_image, pack_window, unpack_window
+from envs.events import event_image, pack_window, unpack_window
 from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec
 from models.policy.features import feature_of
 from models.policy.mirror import mirror
+from tests.support.encoders import WINDOW_US, make_events
 
-WIDTH, HEIGHT, WINDOW_US = 6, 4, 5000
+WIDTH, HEIGHT = 6, 4
 SIZES = (WIDTH, HEIGHT, 3)
 COLUMNS = PolicySpec(DenseModel("event_columns", 3, [8]), *SIZES)
-
-
-def make_events(rng, count):
-    events = np.empty(count, EVENT)
-    events["t"] = np.sort(rng.integers(1, WINDOW_US + 1, count))
-    events["x"], events["y"] = rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count)
-    events["p"] = rng.choice([-1, 1], count)
-    return events
-
 
 batches = strategies.tuples(strategies.integers(0, 2**32 - 1), strategies.lists(strategies.integers(0, 60)))
 
 
 @given(batches, strategies.booleans())
 def test_mirrored_windows_hold_the_events_of_the_mirrored_picture(batch, padded):
-    rng, counts = np.random.default_rng(batch[0]), batch[1]
-    told = [make_events(rng, count) for count in counts]
+    seed, counts = batch
+    told = [make_events(n, seed + k, width=WIDTH, height=HEIGHT) for k, n in enumerate(counts)]
     windows = [pack_window(events, 0, WINDOW_US, 60 if padded else max(1, len(events))) for events in told]
     if padded and windows:
         windows = np.stack(windows)
@@ -47,7 +39,7 @@ def test_mirrored_windows_hold_the_events_of_the_mirrored_picture(batch, padded)
 
 
 def test_the_features_of_a_mirrored_window_are_mirrored():
-    window = pack_window(make_events(np.random.default_rng(0), 40), 0, WINDOW_US, 40)[None]
+    window = pack_window(make_events(40, width=WIDTH, height=HEIGHT), 0, WINDOW_US, 40)[None]
     feature = feature_of(COLUMNS).from_observations
     one, other = (
         feature(shown, COLUMNS, None).reshape(2, WIDTH) for shown in (window, mirror(window, COLUMNS))
