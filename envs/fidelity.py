@@ -16,16 +16,18 @@ import numba
 from envs.config import EnvConfig
 from envs.events.ramps import can_look
 from envs.raycast import RaycastRenderer
-from envs.raycast.silhouettes import Shifts
+from envs.raycast.stretches import Shifts
 from envs.scene import CONE, ELLIPSOID, Scene
 
 RENDERERS = ("auto", "raycast", "pyrender")
 
 CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the error
 RENDERS_TEXTURED = 1.3  # times those of a plain scene
-LEVEL_PX = 0.3  # at tolerance 0.05: how far a level edge may move between two looks
-UPRIGHT = 1.6  # times as far may an upright one
-BENT = 0.42  # part of it that a bent one may, in a control step of 0.1 m
+# How far an edge may move between two looks, at tolerance 0.05 in a control step of 0.1 m [pixels].
+UPRIGHT_PX = 0.48
+LEVEL_PX = 0.25
+BENT_PX = 0.126
+LONGEST_BENT = 2.4  # times that of a bent one, in long control steps
 SHORT = 2.0  # time constants of a photoreceptor; in shorter control steps it needs no render of its own
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 # Samples at tolerance 0.05 in a control step of 0.1 m. Straight edges are exact whatever the samples; the
@@ -137,7 +139,7 @@ def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
     exponentially, so at tolerance 0.05 a step of more than two time constants takes two renders.
     """
     step_m = config.speed_mps / config.control_hz
-    renders = _renders_by_looks(step_m, scene) if by_looks else _renders_alone(step_m, scene)
+    renders = _renders_by_looks(config, scene) if by_looks else _renders_alone(step_m, scene)
     if 2.0 * math.pi * config.camera.cutoff_hz / config.control_hz > SHORT:
         renders = max(renders, 2.0)
     return step_m / max(1.0, renders * _renders_factor(config))
@@ -146,14 +148,16 @@ def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
 def _max_shifts_px(config: EnvConfig, scene: Scene) -> Shifts:
     """How far outlines may move between two looks at their columns, from a fit of the event error.
 
-    An event may be late by 5 % of a control step, so what bends may move less in a shorter one. The
+    An event may be late by 5 % of a control step, so outlines may move less in a shorter one. The
     rest as in `_max_step_m`.
     """
     share = config.speed_mps / config.control_hz / 0.1
-    shift = LEVEL_PX / _renders_factor(config)
-    if not scene.obstacle_texture.plain:
-        shift /= RENDERS_TEXTURED
-    return Shifts(UPRIGHT * shift, shift, shift * min(1.0, BENT * share**0.65))
+    factor = _renders_factor(config) * (1.0 if scene.obstacle_texture.plain else RENDERS_TEXTURED)
+    return Shifts(
+        upright=UPRIGHT_PX / factor * max(1.0, share) ** 0.7,
+        level=LEVEL_PX / factor * max(1.0, share) ** 0.25,
+        bent=BENT_PX / factor * min(LONGEST_BENT, share**0.65),
+    )
 
 
 def _renders_factor(config: EnvConfig) -> float:
@@ -169,14 +173,16 @@ def _renders_alone(step_m: float, scene: Scene) -> float:
     return (3.19 + 1.8 * (step_m / 0.1)) * (1.0 if _plain(scene) else RENDERS_TEXTURED)
 
 
-def _renders_by_looks(step_m: float, scene: Scene) -> float:
-    """The same, beside looks at columns: those follow upright edges, but no level and no bent ones."""
-    share, ground = step_m / 0.1, scene.ground_texture
-    if ground.sharp:
-        return 4.7 * share**0.4 * max(1.0, 1.0 / ground.period_m) ** 0.4
-    if ground.plain and scene.wall_texture.plain:
-        return 0.75
-    return max(1.3 * share**0.8, 1.4 * share**0.2)
+def _renders_by_looks(config: EnvConfig, scene: Scene) -> float:
+    """The same, beside looks at columns: those follow all edges but the ground's, and no noise."""
+    ground, renders = scene.ground_texture, 0.75
+    for texture in (ground, scene.wall_texture):
+        share = (config.speed_mps + math.hypot(*texture.velocity_mps)) / config.control_hz / 0.1
+        if texture.sharp and texture is ground:
+            renders = max(renders, 4.7 * share**0.4 * max(1.0, 1.0 / ground.period_m) ** 0.4)
+        elif not texture.plain:
+            renders = max(renders, 1.3 * share**0.8, 1.4 * share**0.2)
+    return renders
 
 
 def _cull_m(tolerance: float, scene: Scene) -> float:

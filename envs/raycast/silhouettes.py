@@ -11,17 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.compiled import inlined, kernel
-from envs.raycast.bodies import MIN_DEPTH, see_bodies, silhouette_of
+from envs.raycast.bodies import see_bodies, silhouette_of
 from envs.raycast.columns import Workspace, aim
 from envs.raycast.records import Record
-from envs.scene import BOX, POLE
+from envs.scene import BOX
 
 BESIDE = 2.0  # columns beside the image in which silhouettes are followed too
-CORRECTIONS = 2  # of the time of a crossing, which linear motion estimates first
 MOVING = 0.2  # columns; a silhouette that moves farther is looked at once more, half-way
 MIN_MOVE = 1e-9  # columns
 LOOKS_PER_COLUMN = 4  # at most, on average over the image; beyond it silhouettes cross unseen
-MAX_STRETCHES = 16  # of one column in a part of a way
 
 
 class Way(NamedTuple):
@@ -50,28 +48,16 @@ class Stretch(NamedTuple):
     Attributes:
         number: Which one it is, from 1 on.
         begin_us, end_us: When it begins and ends [us].
-        before, after: (N, 4), `find_silhouettes` at its begin and at its end.
+        followed: (K,) int64, the bodies in view, `follow_bodies`.
+        before, after: (K, 2), their silhouettes at its begin and at its end, `find_silhouettes`.
     """
 
     number: int
     begin_us: int
     end_us: int
+    followed: np.ndarray
     before: np.ndarray
     after: np.ndarray
-
-
-class Shifts(NamedTuple):
-    """How far the outline of a body may move between two looks at its columns, by its edges [pixels].
-
-    Attributes:
-        upright: Of a pole, or a box on the ground.
-        level: Of a box above the ground.
-        bent: Of a cone or an ellipsoid.
-    """
-
-    upright: float
-    level: float
-    bent: float
 
 
 class Looks(NamedTuple):
@@ -109,90 +95,76 @@ def aim_along(frame: Record, way: Way, t_us: float) -> None:
 
 
 @kernel
-def find_silhouettes(
-    bodies: np.ndarray, width: int, cull: float, room: Workspace, places: np.ndarray
-) -> None:
-    """Where the silhouettes of the bodies in view stand, seen as `room.frames[0]` says.
+def follow_bodies(
+    bodies: np.ndarray, way: Way, width: int, cull: float, room: Workspace, numbers: np.ndarray
+) -> int:
+    """Find the bodies that are in view where a way begins or where it ends.
 
     Args:
         bodies: (N,) BODY.
+        way: The way; one that a body enters and leaves again within the way is not found.
         width: Columns of the image.
         cull: Bodies farther than this are not seen [m].
-        room: A `Workspace`.
-        places: (N, 4) float64, becomes the column of the left and the right silhouette of each
-            body, and about the rows of its top and its foot [pixels]; nan if it is not in view.
+        room: A `Workspace`; its frame is that of the end of the way then.
+        numbers: (N,) int64, whose first elements become theirs, in ascending order.
+
+    Returns:
+        How many there are.
     """
-    frame, half = room.frames[0], 0.5 * width
-    high = 2.0 * frame.horizon
-    limit = (half + BESIDE) / frame.focal
-    places[:] = math.nan
-    for k in range(see_bodies(bodies, frame, -limit, limit, cull, room.seen)):
-        body = room.seen[k]
-        places[body.number, 0] = _near(half + frame.focal * body.low, width)
-        places[body.number, 1] = _near(half + frame.focal * body.high, width)
-        per_m = frame.focal / max(MIN_DEPTH, body.forward - body.rx)
-        places[body.number, 2] = _near(frame.horizon + per_m * (frame.eye_z - body.top), high)
-        places[body.number, 3] = _near(frame.horizon + per_m * (frame.eye_z - body.bottom), high)
-
-
-@inlined
-def _near(place: float, width: float) -> float:
-    """A place, moved next to the image if it is far outside: beside a body it is infinite."""
-    return min(max(place, -BESIDE), width + BESIDE)
+    frame = room.frames[0]
+    limit = (0.5 * width + BESIDE) / frame.focal
+    numbers[:] = 0
+    for t_us in (way.start_us, way.start_us + way.moving_us):
+        aim_along(frame, way, t_us)
+        for k in range(see_bodies(bodies, frame, -limit, limit, cull, room.seen)):
+            numbers[room.seen[k].number] = 1
+    count = 0
+    for i in range(len(bodies)):
+        if numbers[i]:
+            numbers[count] = i
+            count += 1
+    return count
 
 
 @kernel
-def divide_time(
-    bodies: np.ndarray, before: np.ndarray, after: np.ndarray, shifts: Shifts, limit: int, looks: Looks
-) -> int:
-    """Cut a time into stretches, so many that outlines move little in each; say which columns need them all.
+def find_silhouettes(
+    bodies: np.ndarray, followed: np.ndarray, width: int, room: Workspace, places: np.ndarray
+) -> None:
+    """Where the silhouettes of bodies stand, seen as `room.frames[0]` says.
 
     Args:
         bodies: (N,) BODY.
-        before: (N, 4), `find_silhouettes` at the begin of the time.
-        after: The same at its end.
-        shifts: How far outlines may move in a stretch.
-        limit: How many stretches there may be, if that is less than `MAX_STRETCHES`.
-        looks: Their `every` is filled.
-
-    Returns:
-        The number of stretches, a power of two.
+        followed: (K,) int64, which of them.
+        width: Columns of the image.
+        room: A `Workspace`.
+        places: (K, 2) float64, becomes the column of the left and the right silhouette of each [pixels]; next
+            to the image where it is out of view or infinite, as beside a body.
     """
-    needed, most = looks.every, 1
-    needed[:] = 1
-    for i in range(len(bodies)):
-        moved, stretches = 0.0, 1
-        for edge in range(4):
-            moved = max(moved, abs(after[i, edge] - before[i, edge]))  # nan is not greater
-        shift = _shift_of(bodies[i], shifts)
-        while moved > shift * stretches and 2 * stretches <= min(limit, MAX_STRETCHES):
-            stretches *= 2
-        if stretches > 1:
-            first = max(0, int(min(before[i, 0], after[i, 0])))
-            for column in range(first, min(len(needed), int(max(before[i, 1], after[i, 1])) + 1)):
-                needed[column] = max(needed[column], stretches)
-                most = max(most, stretches)
-    for column in range(len(needed)):
-        looks.every[column] = most // needed[column]
-    return most
+    frame, half = room.frames[0], 0.5 * width
+    for k in range(len(followed)):
+        room.seen[0] = bodies[followed[k]]
+        low, high = silhouette_of(room.seen[0], frame)
+        if low > high:  # behind the eye
+            low = high = -math.inf if room.seen[0].right < 0.0 else math.inf
+        places[k, 0] = near(half + frame.focal * low, width)
+        places[k, 1] = near(half + frame.focal * high, width)
 
 
 @inlined
-def _shift_of(body: Record, shifts: Shifts) -> float:
-    if body.kind == POLE or (body.kind == BOX and body.bottom <= MIN_DEPTH):
-        return shifts.upright
-    return shifts.level if body.kind == BOX else shifts.bent
+def near(place: float, size: float) -> float:
+    """A place, moved next to an image of `size` pixels if it is farther outside."""
+    return min(max(place, -BESIDE), size + BESIDE)
 
 
 @kernel
-def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, looks: Looks) -> int:
+def find_looks(bodies: np.ndarray, focal: float, way: Way, stretch: Stretch, looks: Looks) -> int:
     """The looks that a stretch of a way takes, sorted by time; those at its end by column.
 
     Args:
         bodies: (N,) BODY.
+        focal: Of the camera [pixels].
         way: The whole way.
         stretch: The part of it.
-        room: A `Workspace`; its frame is changed.
         looks: Filled with the looks; those beyond its room are left out.
 
     Returns:
@@ -202,15 +174,16 @@ def find_looks(bodies: np.ndarray, way: Way, stretch: Stretch, room: Workspace, 
     size, half_way_us = 0, (stretch.begin_us + stretch.end_us) // 2
     if half_way_us > stretch.begin_us:
         size = _look_at_moving(stretch, looks, half_way_us)
-    for i in range(len(bodies)):
+    for k in range(len(stretch.followed)):
         for side in range(2):
-            low, high = min(before[i, side], after[i, side]), max(before[i, side], after[i, side])
-            if not (high >= 0.0 and low <= width and high - low > MIN_MOVE):  # also where one is nan
+            low, high = min(before[k, side], after[k, side]), max(before[k, side], after[k, side])
+            if high < 0.0 or low > width or high - low <= MIN_MOVE:
                 continue
             for border in range(max(0, math.ceil(low)), min(width, math.floor(high)) + 1):
-                t_us = _crossing(bodies[i], side, border, width, way, stretch, room)
-                if stretch.begin_us < t_us < stretch.end_us and size < LOOKS_PER_COLUMN * width:
-                    size = _add_look(looks, size, t_us, max(0, border - 1), min(width, border + 1))
+                t_us = _crossing(bodies[stretch.followed[k]], side, (border - 0.5 * width) / focal, way)
+                inside = stretch.begin_us + 0.5 < t_us < stretch.end_us - 0.5
+                if inside and size < LOOKS_PER_COLUMN * width:
+                    size = _add_look(looks, size, round(t_us), max(0, border - 1), min(width, border + 1))
     return _look_at_end(stretch, looks, size)
 
 
@@ -250,21 +223,16 @@ def _look_at_moving(stretch: Stretch, looks: Looks, t_us: int) -> int:
     return size
 
 
-@kernel
-def _crossing(
-    body: Record, side: int, border: int, width: int, way: Way, stretch: Stretch, room: Workspace
-) -> int:
-    """When a silhouette is at a border between columns [us]; its motion is linear at first sight."""
-    frame, start = room.frames[0], stretch.before[body.number, side]
-    room.seen[0] = body
-    per_us = (stretch.after[body.number, side] - start) / (stretch.end_us - stretch.begin_us)
-    t_us = stretch.begin_us + (border - start) / per_us
-    for _ in range(CORRECTIONS):
-        aim_along(frame, way, t_us)
-        low, high = silhouette_of(room.seen[0], frame)
-        beyond = 0.5 * width + frame.focal * (high if side else low) - border
-        t_us = min(max(t_us - beyond / per_us, float(stretch.begin_us)), float(stretch.end_us))
-    return round(t_us)
+@inlined
+def _crossing(body: Record, side: int, u: float, way: Way) -> float:
+    """When the left or the right silhouette of a body is at slope `u` [us]; not finite if it never is.
+
+    There the ray touches the body: its distance from the axis, which is linear in time, is the body's reach.
+    """
+    moved = way.end_x - way.start_x - u * (way.end_y - way.start_y)
+    away = body.x - way.start_x - u * (body.y - way.start_y)
+    reach = body.rx + abs(u) * body.ry if body.kind == BOX else body.rx * math.sqrt(1.0 + u * u)
+    return way.start_us + (away + reach if side else away - reach) / moved * way.moving_us
 
 
 @inlined

@@ -22,14 +22,14 @@ from envs.raycast.columns import Workspace, make_workspace, paint_columns
 from envs.raycast.records import Noise
 from envs.raycast.silhouettes import (
     Looks,
-    Shifts,
     Stretch,
     aim_along,
-    divide_time,
     find_looks,
     find_silhouettes,
+    follow_bodies,
     make_looks,
 )
+from envs.raycast.stretches import Outlines, Shifts, divide_time, find_rows, make_outlines
 
 BAD_POSE = -2
 ROOM = 8  # images whose pixels can all fire, before only the last one of a part is looked at
@@ -44,6 +44,7 @@ class Scratch(NamedTuple):
         pixels: As `crossings.steps` takes its scratch.
         ramps: For `ROOM` times as many pixels as the image has.
         looks: For the looks at it.
+        outlines: For those of the bodies.
         block: For a block of pixels.
     """
 
@@ -52,6 +53,7 @@ class Scratch(NamedTuple):
     pixels: tuple[np.ndarray, np.ndarray]
     ramps: Ramps
     looks: Looks
+    outlines: Outlines
     block: Room
 
 
@@ -98,6 +100,7 @@ def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
         pixels=(np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)),
         ramps=make_ramps(ROOM * size),
         looks=make_looks(width),
+        outlines=make_outlines(num_bodies),
         block=make_room(),
     )
 
@@ -114,30 +117,26 @@ def sense_way(view, way, parts):
     Returns:
         First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
     """
-    bodies, cull, scratch = view.bodies, view.cull_m, view.scratch
-    room, image = scratch.room, scratch.image
+    bodies, scratch, outlines = view.bodies, view.scratch, view.scratch.outlines
     model, memory = named(view.model, view.memory)
     watch = Watch(model, memory, view.seen_us, scratch.pixels, scratch.ramps, scratch.block, view.bandwidth)
-    frame, width = room.frames[0], image.shape[1]
-    room.frames[0] = view.frame[0]
+    scratch.room.frames[0] = view.frame[0]
     if not _is_near(way):
         return BAD_POSE, 0, 0, np.empty(0, EVENT)
-    before, after = np.empty((len(bodies), 4)), np.empty((len(bodies), 4))
-    aim_along(frame, way, way.start_us + way.moving_us)
-    find_silhouettes(bodies, width, cull, room, before)
-    aim_along(frame, way, way.start_us)
-    find_silhouettes(bodies, width, cull, room, after)
-    limit = way.moving_us // parts  # no stretch is shorter than the clock's microsecond
-    stretches = divide_time(bodies, after, before, _of_part(view.shifts, parts), limit, scratch.looks)
+    for column in range(view.seen_us.size):  # nothing was seen while the camera stood still
+        view.seen_us[column] = max(view.seen_us[column], way.start_us)
+    count, stretches = _divide(view, way, parts)
+    before, after, followed = outlines.before[:count], outlines.after[:count], outlines.followed[:count]
     events, lost, columns, begun_us, kept = np.empty(0, EVENT), 0, 0, way.start_us, 0
     end_us = begun_us
     for number in range(1, parts * stretches + 1):
         begin_us, end_us = end_us, way.start_us + way.moving_us * number // (parts * stretches)
-        before, after = after, before
         if parts * stretches > 1:  # of a way in one stretch, both ends are known
-            aim_along(frame, way, end_us)
-            find_silhouettes(bodies, width, cull, room, after)
-        stretch, ends = Stretch(number, begin_us, end_us, before, after), number % stretches == 0
+            before, after = (after, before) if number > 1 else (before, after)
+            aim_along(scratch.room.frames[0], way, end_us)
+            find_silhouettes(bodies, followed, view.seen_us.size, scratch.room, after)
+        stretch = Stretch(number, begin_us, end_us, followed, before, after)
+        ends = number % stretches == 0
         bad, kept, more, looked = _look_along(view, way, stretch, ends, watch, kept)
         if bad >= 0:
             return bad, 0, 0, np.empty(0, EVENT)
@@ -150,6 +149,27 @@ def sense_way(view, way, parts):
 
 
 @kernel
+def _divide(view, way, parts):
+    """Into how many stretches each part of a way is cut.
+
+    Returns:
+        The number of bodies in view, of which the scratch's outlines are those of both ends of the way; and
+        that of stretches.
+    """
+    bodies, room, outlines, width = view.bodies, view.scratch.room, view.scratch.outlines, view.seen_us.size
+    count = follow_bodies(bodies, way, width, view.cull_m, room, outlines.followed[: len(bodies)])
+    followed = outlines.followed[:count]
+    find_silhouettes(bodies, followed, width, room, outlines.after)
+    find_rows(bodies, followed, width, room, outlines.rows_after)
+    aim_along(room.frames[0], way, way.start_us)
+    find_silhouettes(bodies, followed, width, room, outlines.before)
+    find_rows(bodies, followed, width, room, outlines.rows_before)
+    limit = way.moving_us // parts  # no stretch is shorter than the clock's microsecond
+    shifts, frame = _of_part(view.shifts, parts), room.frames[0]
+    return count, divide_time(bodies, count, outlines, way, frame, shifts, limit, view.scratch.looks)
+
+
+@kernel
 def _look_along(view, way, stretch, ends, watch, kept):
     """Look at the columns that a stretch of a way asks for; where it `ends` a part of the way, at all.
 
@@ -158,7 +178,7 @@ def _look_along(view, way, stretch, ends, watch, kept):
     """
     room, image, looks = view.scratch.room, view.scratch.image, view.scratch.looks
     lost = columns = 0
-    for k in range(find_looks(view.bodies, way, stretch, room, looks)):
+    for k in range(find_looks(view.bodies, room.frames[0].focal, way, stretch, looks)):
         t_us, first, last = looks.t_us[k], looks.first[k], looks.last[k]
         needed = ends and t_us == stretch.end_us
         full = kept + 2 * image.size > watch.ramps.pixels.size

@@ -14,7 +14,8 @@ from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
 from envs.raycast.noise import NO_NOISE
 from envs.raycast.records import BODY, FRAME
-from envs.raycast.silhouettes import Shifts, Way
+from envs.raycast.silhouettes import Way
+from envs.raycast.stretches import Shifts
 from envs.scene import Scene
 from envs.sensor.looks import BAD_POSE, View, scratch_for, sense_way
 
@@ -132,7 +133,8 @@ class Sensor:
             scene = renderer.bodies, renderer.noise, renderer.frame, renderer.cull_m
         model, memory, _ = self._camera.state
         camera = self._config.camera
-        scratch = scratch_for(camera.width, camera.height, len(scene[0]))
+        size = (camera.width, camera.height) if self.sees_by_looks else (2, 2)  # 1 would be of another type
+        scratch = scratch_for(*size, len(scene[0]))
         return View(*scene, model, memory, self._seen_us, bandwidth, shifts, scratch)
 
     def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:

@@ -1,13 +1,15 @@
+import itertools
+
 import numpy as np
 import pytest
 
 from envs.config import CameraConfig, EnvConfig, FidelityConfig
 from envs.event_error import event_error
 from envs.events import EventCamera
-from envs.kinematics import Outcome
+from envs.kinematics import Outcome, clock_us
 from envs.raycast import RaycastRenderer
 from envs.raycast.columns import aim, paint_columns
-from envs.scene import make_scene
+from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture, make_scene
 from envs.sensor import Sensor
 
 STEP_M, STEP_US = 0.1, 5000
@@ -66,6 +68,67 @@ def test_few_renders_with_looks_come_as_close_to_the_truth_as_many_without(thres
     assert renders < 2.2
     assert error < 0.06  # of one flight; the mean over flights is what is promised
     assert without > 4 * error
+
+
+SIDEWAYS = (0.5**0.5, 0.5**0.5)
+RINGS = Texture("rings", period_m=1.0, contrast=0.5)
+# What the flights of `envs.event_error`, down the middle of built-in layouts, seldom show.
+SELDOM = {
+    "beside a wall": ((), {}, (12.0, 10.0), SIDEWAYS, 1.0),
+    "a low box": ([(BOX, 0.0, 14.0, 0.75, 2.0, 2.0, 0.75, 0.25)], {}, (0.1, 10.0), (0.0, 1.0), 1.8),
+    "past a wide box": ([(BOX, 3.0, 14.0, 1.25, 2.0, 2.0, 1.25, 0.25)], {}, (0.1, 10.0), (0.0, 1.0), 4.0),
+    "a low pole": ([(POLE, 0.0, 14.0, 0.5, 1.0, 1.0, 0.5, 0.25)], {}, (0.1, 10.0), (0.0, 1.0), 3.0),
+    "a wide cone": ([(CONE, 0.0, 16.0, 1.5, 3.0, 3.0, 1.5, 0.25)], {}, (0.1, 10.0), (0.0, 1.0), 2.0),
+    "an ellipsoid": ([(ELLIPSOID, 0.0, 15.0, 0.8, 3.0, 3.0, 0.8, 0.25)], {}, (0.1, 10.0), (0.0, 1.0), 1.8),
+    "a pole that leaves": ([(POLE, 1.0, 14.3, 4.0, 0.5, 0.5, 4.0, 0.25)], {}, (0.0, 10.0), (0.0, 1.0), 6.0),
+    "rings on a box": (
+        [(BOX, 0.0, 17.0, 4.0, 1.0, 1.0, 4.0, 0.25)],
+        {"obstacle_texture": RINGS},
+        (0.1, 10.0),
+        (0.0, 1.0),
+        4.0,
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "hz"), [("a pole that leaves", 10.0), *itertools.product(SELDOM, (25.0, 45.0, 200.0))]
+)
+def test_the_tolerance_is_kept_where_flights_seldom_lead(name, hz):
+    rows, textures, start, heading, way_m = SELDOM[name]
+    scene = Scene(name, np.array(list(rows), OBSTACLE), **textures)
+    config, step_m = EnvConfig(control_hz=hz), 20.0 / hz
+    steps, renders = max(1, round(way_m / step_m)), 48
+    sensor, seen = Sensor(config), []
+    sensor.reset(scene, start, np.random.default_rng(0))
+    place, poses = np.array(start), []
+    for k in range(steps):
+        end = place + step_m * np.array(heading)
+        begin_us, end_us = clock_us(k, hz), clock_us(k + 1, hz)
+        sensor.step(tuple(place), Outcome(tuple(end), 1.0, 0.0, False, False), end_us)
+        seen.append(sensor.events)
+        for part in np.arange(1, renders + 1) / renders:
+            t_us = begin_us + int(part * (end_us - begin_us))
+            poses.append((*(place + part * (end - place)), 2.0, 0.0, 1e-6 * t_us))
+        place = end
+    renderer, camera = RaycastRenderer(scene, 64, 64, samples=4), EventCamera(config.camera)
+    camera.reset(renderer.render(*start, 2.0), 0)
+    poses = np.array(poses)
+    truth = camera.steps(renderer.render_way(poses), np.rint(1e6 * poses[:, 4]).astype(int).tolist())
+    assert truth.size > 300
+    assert event_error(np.concatenate(seen), truth, 0.05e6 / hz) <= config.fidelity.tolerance
+
+
+def test_a_vehicle_that_stopped_within_a_step_sees_later_events_within_later_steps():
+    scene = make_scene("poles", np.random.default_rng(5))
+    sensor, y = Sensor(EnvConfig()), 10.0
+    sensor.reset(scene, (0.2, y), np.random.default_rng(0))
+    for k, share in enumerate((1.0, 0.3, 1.0, 0.0, 1.0)):
+        end = (0.2, y + share * STEP_M)
+        sensor.step((0.2, y), Outcome(end, share, 0.0, False, False), (k + 1) * STEP_US)
+        y = end[1]
+        assert (sensor.events.size > 0) == (share > 0.0)
+        assert ((sensor.events["t"] > k * STEP_US) & (sensor.events["t"] <= (k + 1) * STEP_US)).all()
 
 
 def test_more_parts_come_closer():
