@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.compiled import inlined, kernel
-from envs.raycast.bodies import see_bodies, silhouette_of
+from envs.raycast.bodies import silhouette_of
 from envs.raycast.columns import Workspace, aim
 from envs.raycast.records import Record
 from envs.scene import BOX
@@ -96,33 +96,33 @@ def aim_along(frame: Record, way: Way, t_us: float) -> None:
 
 @kernel
 def follow_bodies(
-    bodies: np.ndarray, way: Way, width: int, cull: float, room: Workspace, numbers: np.ndarray
+    bodies: np.ndarray, way: Way, focal: float, width: int, cull: float, numbers: np.ndarray
 ) -> int:
-    """Find the bodies that are in view where a way begins or where it ends.
+    """Find the bodies that may be in view where a way begins or where it ends.
 
     Args:
         bodies: (N,) BODY.
-        way: The way; one that a body enters and leaves again within the way is not found.
+        way: The way; what is in view only between its ends is not found.
+        focal: Of the camera [pixels].
         width: Columns of the image.
         cull: Bodies farther than this are not seen [m].
-        room: A `Workspace`; its frame is that of the end of the way then.
         numbers: (N,) int64, whose first elements become theirs, in ascending order.
 
     Returns:
         How many there are.
     """
-    frame = room.frames[0]
-    limit = (0.5 * width + BESIDE) / frame.focal
-    numbers[:] = 0
-    for t_us in (way.start_us, way.start_us + way.moving_us):
-        aim_along(frame, way, t_us)
-        for k in range(see_bodies(bodies, frame, -limit, limit, cull, room.seen)):
-            numbers[room.seen[k].number] = 1
-    count = 0
+    limit, count = (0.5 * width + BESIDE) / focal, 0
+    slack = math.sqrt(1.0 + limit * limit)
     for i in range(len(bodies)):
-        if numbers[i]:
-            numbers[count] = i
-            count += 1
+        body = bodies[i]
+        reach = body.rx if body.kind != BOX else math.hypot(body.rx, body.ry)
+        for x, y in ((way.start_x, way.start_y), (way.end_x, way.end_y)):
+            beside, forward = abs(body.x - x), body.y - y
+            ahead = forward + reach > 0.0 and beside <= limit * forward + slack * reach
+            if ahead and beside * beside + forward * forward <= (cull + reach) ** 2:
+                numbers[count] = i
+                count += 1
+                break
     return count
 
 

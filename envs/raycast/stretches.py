@@ -61,22 +61,38 @@ def make_outlines(num_bodies: int) -> Outlines:
 
 @kernel
 def find_rows(
-    bodies: np.ndarray, followed: np.ndarray, width: int, room: Workspace, rows: np.ndarray
+    bodies: np.ndarray,
+    followed: np.ndarray,
+    width: int,
+    way: Way,
+    shifts: Shifts,
+    room: Workspace,
+    rows: np.ndarray,
 ) -> None:
-    """In which rows bodies show, seen as `room.frames[0]` says, where they are in view.
+    """In which rows bodies show, seen as `room.frames[0]` says, where they are in view and near.
 
     Args:
         bodies: (N,) BODY.
         followed: (K,) int64, which of them.
         width: Columns of the image.
+        way: The way that is cut.
+        shifts: How far outlines may move in a stretch of it.
         room: A `Workspace`.
         rows: (N, 3 * ROWS) float64, becomes the rows of each [pixels] and the logarithms of their depths [m];
-            nan for what is out of view.
+            nan for what is out of view, or so far that no row of it in the image moves by more than that.
     """
     frame = room.frames[0]
     limit = (0.5 * width + BESIDE) / frame.focal
+    moved_m = math.hypot(way.end_x - way.start_x, way.end_y - way.start_y)
+    moved_m += math.hypot(frame.body_texture.speed_s, frame.body_texture.speed_q) * way.moving_us * 1e-6
     for k in range(len(followed)):
         rows[k] = math.nan
+        body = bodies[followed[k]]
+        still_m = (
+            (frame.focal + frame.horizon + BESIDE) * moved_m / min(shifts.level, _shift_of(body, shifts))
+        )
+        if body.y - max(body.rx, body.ry) - frame.eye_y > still_m + moved_m:
+            continue
         room.seen[0] = bodies[followed[k]]
         body = room.seen[0]
         low, high = silhouette_of(body, frame)

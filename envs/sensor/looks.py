@@ -157,15 +157,16 @@ def _divide(view, way, parts):
         that of stretches.
     """
     bodies, room, outlines, width = view.bodies, view.scratch.room, view.scratch.outlines, view.seen_us.size
-    count = follow_bodies(bodies, way, width, view.cull_m, room, outlines.followed[: len(bodies)])
-    followed = outlines.followed[:count]
-    find_silhouettes(bodies, followed, width, room, outlines.after)
-    find_rows(bodies, followed, width, room, outlines.rows_after)
-    aim_along(room.frames[0], way, way.start_us)
-    find_silhouettes(bodies, followed, width, room, outlines.before)
-    find_rows(bodies, followed, width, room, outlines.rows_before)
-    limit = way.moving_us // parts  # no stretch is shorter than the clock's microsecond
     shifts, frame = _of_part(view.shifts, parts), room.frames[0]
+    count = follow_bodies(bodies, way, frame.focal, width, view.cull_m, outlines.followed)
+    followed = outlines.followed[:count]
+    aim_along(frame, way, way.start_us + way.moving_us)
+    find_silhouettes(bodies, followed, width, room, outlines.after)
+    find_rows(bodies, followed, width, way, shifts, room, outlines.rows_after)
+    aim_along(frame, way, way.start_us)
+    find_silhouettes(bodies, followed, width, room, outlines.before)
+    find_rows(bodies, followed, width, way, shifts, room, outlines.rows_before)
+    limit = way.moving_us // parts  # no stretch is shorter than the clock's microsecond
     return count, divide_time(bodies, count, outlines, way, frame, shifts, limit, view.scratch.looks)
 
 

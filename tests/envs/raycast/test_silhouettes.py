@@ -35,7 +35,7 @@ def ends_of(scene, renderer):
     """The bodies in view, and their silhouettes at the begin and at the end of the way, each (K, 2)."""
     renderer.room.frames[0] = renderer.frame[0]
     numbers = np.empty(len(renderer.bodies), np.int64)
-    count = follow_bodies(renderer.bodies, WAY, WIDTH, math.inf, renderer.room, numbers)
+    count = follow_bodies(renderer.bodies, WAY, renderer.frame[0].focal, WIDTH, math.inf, numbers)
     ends = [np.empty((count, 2)) for _ in WHOLE]
     for t_us, found in zip(WHOLE, ends, strict=True):
         aim_along(renderer.room.frames[0], WAY, t_us)
@@ -108,7 +108,7 @@ def test_bodies_in_view_at_one_end_of_a_way_alone_are_followed_to_the_side_that_
         way,
         way._replace(start_x=way.end_x, start_y=way.end_y, end_x=way.start_x, end_y=way.start_y),
     ):
-        count = follow_bodies(renderer.bodies, one, WIDTH, math.inf, renderer.room, numbers)
+        count = follow_bodies(renderer.bodies, one, 32.0, WIDTH, math.inf, numbers)
         assert numbers[:count].tolist() == [0, 1, 2]
     aim_along(renderer.room.frames[0], way, WHOLE[1])
     found = np.empty((4, 2))

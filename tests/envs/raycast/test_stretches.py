@@ -27,14 +27,14 @@ def divided(scene, way, shifts, limit=10**6):
     renderer, looks = RaycastRenderer(scene, WIDTH, HEIGHT), make_looks(WIDTH)
     room, bodies, outlines = renderer.room, renderer.bodies, make_outlines(len(renderer.bodies))
     room.frames[0] = renderer.frame[0]
-    count = follow_bodies(bodies, way, WIDTH, math.inf, room, outlines.followed)
+    count = follow_bodies(bodies, way, FOCAL, WIDTH, math.inf, outlines.followed)
     for t_us, places, rows in (
         (way.start_us, outlines.before, outlines.rows_before),
         (way.start_us + way.moving_us, outlines.after, outlines.rows_after),
     ):
         aim_along(room.frames[0], way, t_us)
         find_silhouettes(bodies, outlines.followed[:count], WIDTH, room, places)
-        find_rows(bodies, outlines.followed[:count], WIDTH, room, rows)
+        find_rows(bodies, outlines.followed[:count], WIDTH, way, shifts, room, rows)
     stretches = divide_time(bodies, count, outlines, way, room.frames[0], shifts, limit, looks)
     assert stretches in (1, 2, 4, 8, 16)
     assert (stretches % looks.every == 0).all()
