@@ -25,7 +25,7 @@ class ImitationConfig:
         guided_batches: In the first batches the teacher acts too: in all steps of the first, then in half as
             many in each; 0: never.
         fit_steps: Gradient steps after each batch, on steps of all batches.
-        final_steps: Gradient steps after the last, with a step size that falls to 0.
+        final_steps: Gradient steps after the last, from the first weights, with a step size that falls to 0.
         keep_mb: Memory for the steps that are kept [MB]; beyond it, a random sample of all.
     """
 

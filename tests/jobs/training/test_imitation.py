@@ -112,6 +112,26 @@ def test_steps_of_all_batches_are_learnt_from_and_none_is_kept_after_the_last(
     assert 0.0 <= float(told["default_policy"]["agreement"].peek()) <= 1.0
 
 
+def test_after_the_last_batch_the_networks_begin_anew(config, rolled_out):
+    """What was learnt from the batches before leaves no trace but their steps."""
+    episodes = [copy.deepcopy(episodes) for _, episodes in rolled_out[1][:2]]
+    weights, rates = [], (1e-3, 1e-5)
+    for rate in rates:
+        learner = build_ppo(config).build_learner(env=rolled_out[0].env)
+        first = copy.deepcopy(learner.module["default_policy"].state_dict())
+        optimiser(learner)["lr"] = rate
+        torch.manual_seed(1)
+        learner.update(episodes=copy.deepcopy(episodes[0]), timesteps={SAMPLED: 1}, minibatch_size=16)
+        before = copy.deepcopy(learner.module["default_policy"].state_dict())
+        assert any(not torch.equal(first[name], value) for name, value in before.items())
+        torch.manual_seed(2)
+        learner.update(episodes=copy.deepcopy(episodes[1]), timesteps={SAMPLED: 1000}, minibatch_size=16)
+        weights.append((before, learner.module["default_policy"].state_dict()))
+    assert any(not torch.equal(weights[0][0][name], weights[1][0][name]) for name in first)
+    for name, value in weights[0][1].items():
+        torch.testing.assert_close(value, weights[1][1][name], rtol=0, atol=0)
+
+
 def test_labels_are_learnt(learner, rolled_out):
     _, episodes = rolled_out[1][0]
     losses = []
