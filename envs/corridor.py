@@ -123,7 +123,7 @@ class CorridorEnv(gymnasium.Env):
             ValueError: An unknown option, or an episode that is no integer >= 0.
         """
         self.begin(seed, options)
-        return self._observation(), self._info()
+        return self._observation(), self.info()
 
     def begin(self, seed: int | None, options: Mapping[str, object] | None) -> None:
         """As `reset`, without a look at what is observed."""
@@ -169,7 +169,7 @@ class CorridorEnv(gymnasium.Env):
             self._vehicles.step(np.full(active.size, action, np.int64), active)
         except StepError as error:
             raise ValueError(f"{self.name_step()}: {error}") from error
-        info, vehicle = self._info(), self._vehicles.rows[row]
+        info, vehicle = self.info(), self._vehicles.rows[row]
         terminated = info["success"] or info["collision"]
         return self._observation(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
 
@@ -237,7 +237,8 @@ class CorridorEnv(gymnasium.Env):
         ends = np.array([0, events.size])
         return pack_windows(events, ends, row["start_us"], row["window_us"], self.config.window_capacity)[0]
 
-    def _info(self) -> Info:
+    def info(self) -> Info:
+        """Where the episode stands, as the last step or reset told."""
         infos = _infos_of([self], self._vehicles.rows[self._row : self._row + 1])
         return cast(Info, {name: values.tolist()[0] for name, values in infos.items()})
 
@@ -309,7 +310,7 @@ class CorridorVectorEnv(VectorEnv):
         for env, own_seed in zip(self.envs, seeds, strict=True):
             env.begin(own_seed, options)
         self._vehicles.forget_events()
-        return self._observations(), self.infos()
+        return self._observations(np.arange(self.num_envs)), self.infos()
 
     def step(
         self, actions: np.ndarray
@@ -322,39 +323,47 @@ class CorridorVectorEnv(VectorEnv):
                 `CorridorEnv.step`.
         """
         over = self._over
-        self._step_active(actions, ~over)
+        self._step_active(np.asarray(actions), ~over)
         for row in np.flatnonzero(over):
             self.envs[row].begin(None, None)
-        results = self._results()
+        results = self._results(np.arange(self.num_envs))
         self._over = results[2] | results[3]
         return results
 
     def step_some(
-        self, actions: np.ndarray, active: np.ndarray
+        self, actions: np.ndarray, some: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Step the active environments and leave the others as they are; as `step`, but nothing is reset.
+        """Step some environments and leave the others as they are; as `step`, but nothing is reset.
 
         Args:
-            actions: Integers (B,), those of the others are ignored.
-            active: bool (B,). What is returned of the others is their last step, without its events.
+            actions: Integers (n,).
+            some: Numbers of the environments, int (n,), ascending. What is returned is theirs alone.
 
         Raises:
-            ResetNeeded: The episode of an active one is over, or has not begun.
+            ResetNeeded: The episode of one of them is over, or has not begun.
             ValueError: As `step`.
         """
-        self._step_active(actions, active)
-        return self._results()
+        active = np.zeros(self.num_envs, bool)
+        active[some] = True
+        own = np.asarray(actions)
+        taken = np.zeros(self.num_envs, own.dtype)
+        taken[some] = own
+        self._step_active(taken, active)
+        return self._results(some)
 
-    def _results(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        rows = self._vehicles.rows
-        terminated, truncated = rows["success"] | rows["collision"], rows["truncated"].copy()
-        return self._observations(), rows["reward"].copy(), terminated, truncated, self.infos()
+    def _results(
+        self, some: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """What `step` returns, of some environments."""
+        rows = self._vehicles.rows[some]
+        terminated, truncated = rows["success"] | rows["collision"], rows["truncated"]
+        return self._observations(some), rows["reward"], terminated, truncated, self._infos(some)
 
-    def _step_active(self, actions: np.ndarray, active: np.ndarray) -> None:
+    def _step_active(self, taken: np.ndarray, active: np.ndarray) -> None:
         """One control step of the active environments."""
-        taken, rows = np.asarray(actions), self._vehicles.rows
+        rows = self._vehicles.rows
         if taken.shape != (self.num_envs,):
-            raise ValueError(f"actions must number {self.num_envs}; got {len(actions)}.")
+            raise ValueError(f"actions must number {self.num_envs}; got {len(taken)}.")
         if (rows["over"] & active).any():
             raise ResetNeeded("An episode is over or has not begun; call reset() before step().")
         wrong = active & ((taken < 0) | (taken >= kinematics.NUM_ACTIONS) | (taken.dtype.kind not in "iu"))
@@ -367,8 +376,11 @@ class CorridorVectorEnv(VectorEnv):
 
     def infos(self) -> dict[str, np.ndarray]:
         """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
-        infos, mask = _infos_of(self.envs, self._vehicles.rows), np.ones(self.num_envs, bool)
-        return infos | {f"_{name}": mask for name in infos}
+        return self._infos(np.arange(self.num_envs))
+
+    def _infos(self, some: np.ndarray) -> dict[str, np.ndarray]:
+        infos = _infos_of([self.envs[row] for row in some], self._vehicles.rows[some])
+        return infos | dict.fromkeys([f"_{name}" for name in infos], np.ones(len(some), bool))
 
     def replay(
         self, episodes: Sequence[tuple[int, int, Sequence[int]]]
@@ -405,13 +417,15 @@ class CorridorVectorEnv(VectorEnv):
         for env in self.envs:
             env.close()
 
-    def _observations(self) -> Any:
-        """What all observe of the last step."""
+    def _observations(self, some: np.ndarray) -> Any:
+        """What some observe of the last step, in which the others had no events."""
         config, vehicles = self.envs[0].config, self._vehicles
         if config.observation != "window":
-            return self._batch([observe(env.config, env.seen_events, env.luminance) for env in self.envs])
-        clocks = vehicles.rows["start_us"], vehicles.rows["window_us"]
-        return pack_windows(vehicles.seen, vehicles.seen_ends, *clocks, config.window_capacity)
+            envs = [self.envs[row] for row in some]
+            return self._batch([observe(env.config, env.seen_events, env.luminance) for env in envs])
+        clocks = vehicles.rows["start_us"][some], vehicles.rows["window_us"][some]
+        ends = np.append(0, vehicles.seen_ends[1:][some])
+        return pack_windows(vehicles.seen, ends, *clocks, config.window_capacity)
 
     def _batch(self, observations: Any) -> Any:
         """Observations as one fresh array; those that differ in length stay a tuple."""

@@ -57,17 +57,17 @@ def measure(changes: dict[str, object]) -> np.ndarray:
     env.reset(seed=0)
     rng, counts = np.random.default_rng(0), np.zeros(3 + 2 * len(SUPPORTS))
     maps = [[quiet_sensor(64, 64) for _ in SUPPORTS] for _ in env.envs]
-    running = np.ones(CORRIDORS, bool)
-    while running.any():
-        _, _, terminated, truncated, _ = env.step_some(rng.integers(3, size=CORRIDORS), running)
-        for row in np.flatnonzero(running):
+    running = np.arange(CORRIDORS)
+    while running.size:
+        _, _, terminated, truncated, _ = env.step_some(rng.integers(3, size=running.size), running)
+        for row in running:
             events, real = env.envs[row].events, set(env.envs[row].true_events.tolist())
             counts[0] += 1
             counts[1:3] += split(events, real)
             for place, support in enumerate(SUPPORTS):
                 kept = filter_neighbours(events, maps[row][place], support, TAU_US)
                 counts[3 + 2 * place : 5 + 2 * place] += split(kept, real)
-        running &= ~(terminated | truncated)
+        running = running[~(terminated | truncated)]
     return counts
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from envs.config import WITHOUT_EVENTS, EnvConfig
-from envs.corridor import CorridorEnv, Info
+from envs.corridor import CorridorEnv
 from jobs.analysis.plots import plot_trajectories
 from jobs.analysis.tables import (
     CAPTION,
@@ -263,7 +263,8 @@ def film_episode(name: str, action: str, env_config: EnvConfig, seed: int, path:
     agent = make_agent(name, action)
     with open_film(path, env_config.control_hz, decode) as film:
 
-        def watch(env: CorridorEnv, seed: int, observation: np.ndarray, info: Info) -> None:
+        def watch(env: CorridorEnv, seed: int, observation: np.ndarray) -> None:
+            info = env.info()
             caption = f"{env_config.scene} {seed}   {info['t_us'] / 1e6:4.2f} s   {info['y_m']:5.1f} m"
             ending = "   goal" if info["success"] else "   collision" if info["collision"] else ""
             events = None if agent.observation in WITHOUT_EVENTS else env.events

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 
 from envs.config import Observation
-from envs.corridor import CorridorEnv, Info
+from envs.corridor import CorridorEnv
 from envs.kinematics import DIAGONAL, NUM_ACTIONS
 from envs.scene import Scene
 from envs.scene.planning import LATTICE_M, SIDE_PRICE, cost_to_go
@@ -37,8 +37,11 @@ class Agent(Protocol):
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Begin one episode per environment, each just reset with its seed."""
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
-        """Actions (B,) for observations (B, ...) and the episodes' infos."""
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (B,) for observations (B, ...)."""
+
+    def keep(self, places: np.ndarray) -> None:
+        """Go on with some episodes of the batch, int (n,), in that order; the others have ended."""
 
 
 def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[str, Any]] = ()) -> Agent:
@@ -72,9 +75,12 @@ class StraightAgent:
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Nothing to remember."""
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Zeros (B,)."""
-        return np.zeros(len(infos), np.int64)
+        return np.zeros(len(observations), np.int64)
+
+    def keep(self, places: np.ndarray) -> None:
+        """Nothing to forget."""
 
 
 class RandomAgent:
@@ -86,9 +92,13 @@ class RandomAgent:
         """Open one stream per episode, so that no episode depends on its neighbours."""
         self._streams = episode_streams(seeds)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Actions (B,)."""
         return np.array([stream.integers(NUM_ACTIONS) for stream in self._streams])
+
+    def keep(self, places: np.ndarray) -> None:
+        """Forget the streams of the others."""
+        self._streams = [self._streams[k] for k in places]
 
 
 class PolicyAgent:
@@ -110,13 +120,18 @@ class PolicyAgent:
         self.policy.reset(len(envs))
         self._streams = episode_streams(seeds)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Actions (B,); draws come from each episode's own stream."""
         self.logits = logits = self.policy.logits(observations).astype(np.float64)
         if not self.stochastic:
             return logits.argmax(axis=1)
         gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])
         return (logits + gumbel).argmax(axis=1)
+
+    def keep(self, places: np.ndarray) -> None:
+        """Forget the other episodes."""
+        self.policy.keep(places)
+        self._streams = [self._streams[k] for k in places]
 
 
 class OracleAgent:
@@ -126,17 +141,20 @@ class OracleAgent:
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Plan one path per episode."""
-        self._envs, self._plans = envs, []
+        self._plans = []
         for env in envs:
             step_m = env.config.speed_mps / env.config.control_hz
             vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
             plan = plan_path(env.scene, env.camera_pose()[0], *vehicle)
-            self._plans.append((plan, MOVES * step_m))
+            self._plans.append((plan, MOVES * step_m, env))
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
         """For each episode the action that ends closest to its plan, where it will be taken."""
-        pairs = zip(self._plans, self._envs, strict=True)
-        return np.array([follow(*plan, *env.place_of_action()) for plan, env in pairs])
+        return np.array([follow(plan, moves_m, *env.place_of_action()) for plan, moves_m, env in self._plans])
+
+    def keep(self, places: np.ndarray) -> None:
+        """Forget the other plans."""
+        self._plans = [self._plans[k] for k in places]
 
 
 def episode_streams(seeds: Sequence[int]) -> list[np.random.Generator]:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.config import EnvConfig
-from envs.corridor import CorridorEnv, Info
+from envs.corridor import CorridorEnv
 from envs.event_error import measure_event_error
 from jobs.run.progress import console
 from models.encoder.evae import EventVAE, event_targets, validate
@@ -67,7 +67,7 @@ class DriftSampler:
         """The sampled windows, packed, in the order in which they were met."""
         return [window for _, window in self._kept]
 
-    def add(self, env: CorridorEnv, seed: int, observation: np.ndarray, info: Info) -> None:
+    def add(self, env: CorridorEnv, seed: int, observation: np.ndarray) -> None:
         """Sample the window of a step, if it is its turn (`jobs.rollout.episodes.Watch`)."""
         if not self._sampling:
             return

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -31,8 +31,8 @@ EPISODE = np.dtype(
         ("dropped", "i8"),
     ]
 )
-# Called after each step with the environment, the seed, the observation and the info.
-Watch = Callable[[CorridorEnv, int, np.ndarray, Info], None]
+# Called after each step with the environment, the seed and the observation.
+Watch = Callable[[CorridorEnv, int, np.ndarray], None]
 
 
 def roll_out(
@@ -73,34 +73,34 @@ def roll_out(
 def _roll_out_batch(
     agent: Agent, env: CorridorVectorEnv, seeds: Sequence[int], watch: Watch | None
 ) -> np.ndarray:
-    """One episode per environment, until the last one ends."""
-    observations, all_infos = env.reset(seed=list(seeds))
-    infos = _by_row(all_infos)
+    """One episode per environment, until the last one ends; nothing is spent on those that have ended."""
+    observations, _ = env.reset(seed=list(seeds))
     agent.reset(env.envs, seeds)
     totals = np.zeros((len(seeds), 4))
     episodes = np.zeros(len(seeds), EPISODE)
     episodes["seed"] = seeds
-    running = np.ones(len(seeds), bool)
-    while running.any():
-        results = env.step_some(agent(observations, infos), running)
-        observations, rewards, terminated, truncated, all_infos = results
-        infos, ones = _by_row(all_infos), np.ones(len(seeds))
-        taken = np.stack((rewards, ones, all_infos["num_events"], all_infos["dropped_events"]), axis=1)
-        totals[running] += taken[running]
-        for row in np.flatnonzero(running).tolist():
-            if watch is not None:
-                watch(env.envs[row], seeds[row], observations[row], infos[row])
-            if terminated[row] or truncated[row]:
-                _record(episodes[row], totals[row], truncated[row], infos[row])
-        running &= ~(terminated | truncated)
+    running = np.arange(len(seeds))
+    while running.size:
+        observations, *results, infos = env.step_some(agent(observations), running)
+        rewards, terminated, truncated = results
+        ones = np.ones(running.size)
+        totals[running] += np.stack((rewards, ones, infos["num_events"], infos["dropped_events"]), axis=1)
+        if watch is not None:
+            for row, observation in zip(running.tolist(), observations, strict=True):
+                watch(env.envs[row], seeds[row], observation)
+        over = terminated | truncated
+        if over.any():
+            for row, late in zip(running[over], truncated[over], strict=True):
+                _record(episodes[row], totals[row], late, env.envs[row].info())
+            going_on = np.flatnonzero(~over)
+            running, observations = running[going_on], _those(observations, going_on)
+            agent.keep(going_on)
     return episodes
 
 
-def _by_row(all_infos: Mapping[str, np.ndarray]) -> list[Info]:
-    """The info of each environment of a vector; names with an underscore are Gymnasium's masks."""
-    names = [name for name in all_infos if not name.startswith("_")]
-    columns = zip(*(all_infos[name].tolist() for name in names), strict=True)
-    return [cast(Info, dict(zip(names, values, strict=True))) for values in columns]
+def _those(observations: Any, places: np.ndarray) -> Any:
+    """Some of a batch of observations, which is an array or a tuple."""
+    return tuple(observations[k] for k in places) if isinstance(observations, tuple) else observations[places]
 
 
 def _record(episode: np.void, totals: np.ndarray, truncated: bool, info: Info) -> None:
@@ -159,10 +159,10 @@ class TrajectoryRecorder:
         self._scenes: dict[int, Scene] = {}
         self._height_m = 0.0
 
-    def add(self, env: CorridorEnv, seed: int, observation: np.ndarray, info: Info) -> None:
+    def add(self, env: CorridorEnv, seed: int, observation: np.ndarray) -> None:
         """Record the position of a step (`Watch`)."""
         if seed in self.seeds:
-            self._points[seed].append((info["x_m"], info["y_m"]))
+            self._points[seed].append(env.camera_pose()[:2])
             self._scenes[seed] = env.scene
             self._height_m = env.config.camera_height_m
 

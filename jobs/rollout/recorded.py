@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.config import WITHOUT_EVENTS, EnvConfig
-from envs.corridor import CorridorEnv, Info
+from envs.corridor import CorridorEnv
 from envs.events import event_image
 from envs.scene import Scene
 from jobs.rollout.agents import PolicyAgent
@@ -78,9 +78,13 @@ class _Recorder:
         (self.env,) = envs
         self.agent.reset(envs, seeds)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
+    def keep(self, places: np.ndarray) -> None:
+        """The one episode has ended."""
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
         """The agent's action (1,)."""
-        actions, (info,), env = self.agent(observations, infos), infos, self.env
+        actions, env = self.agent(observations), self.env
+        info = env.info()
         encoder, (logits,) = self.agent.policy.encoder, self.agent.logits
         weights = np.exp(logits - logits.max())
         height, width = env.luminance.shape

@@ -155,7 +155,7 @@ def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray 
     """
     env = CorridorEnv(config, observation=agent.observation)
     try:
-        observation, info = env.reset(seed=seed)
+        observation, _ = env.reset(seed=seed)
         agent.reset([env], [seed])
         chosen: list[int] = []
         windows, events = [], [np.empty(0, EVENT)]
@@ -163,9 +163,9 @@ def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray 
         while not over:
             windows.append(cut_packed(observation))
             start = time.process_time()
-            chosen.append(int(agent(observation[None], [info])[0]))
+            chosen.append(int(agent(observation[None])[0]))
             action = chosen[-1] if actions is None else int(actions[len(chosen) - 1])
-            observation, _, terminated, truncated, info = env.step(action)
+            observation, _, terminated, truncated, _ = env.step(action)
             seconds += time.process_time() - start
             events.append(env.events)
             over = terminated or truncated

@@ -249,7 +249,10 @@ class HoldingAgent:
         self._hold_steps = max(1.0, MEAN_HOLD_M * config.control_hz / config.speed_mps)
         self._action = self._rng.integers(NUM_ACTIONS)
 
-    def __call__(self, observations: np.ndarray, infos: Sequence[Info]) -> np.ndarray:
+    def keep(self, places: np.ndarray) -> None:
+        """Its one episode has ended."""
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
         """The action, int (1,)."""
         if self._rng.random() < 1.0 / self._hold_steps:
             self._action = self._rng.integers(NUM_ACTIONS)
@@ -284,7 +287,7 @@ def steps_of(
     observation, info = started
     for _ in range(most_steps):
         shown = env.luminance if agent.observation == "luminance" else observation
-        action = int(agent(shown[None], [info])[0])
+        action = int(agent(shown[None])[0])
         observation, _, terminated, truncated, info = env.step(action)
         yield int(info["t_us"])
         if terminated or truncated:

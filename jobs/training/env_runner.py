@@ -27,7 +27,7 @@ from jobs.config.plugins import one_line
 from jobs.run.watchdog import ending_after
 from jobs.training.rllib_internals import ENV_RUNNER, require
 from jobs.training.snapshots import Snapshot, generators, set_generators
-from models.policy.networks import logits_of
+from models.policy.networks import logits_by
 
 MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
 
@@ -257,6 +257,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             raise ValueError("PlainEnvRunner rolls out num_timesteps of drawn actions and nothing else")
         if force_reset or self._needs_initial_reset:
             self._reset_all()
+        self._logits_of = logits_by(self.module.trunk, self.module.pi)
         steps: list[Step] = []
         taken = 0
         while taken < num_timesteps:
@@ -298,7 +299,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Drawn actions (N,), and by name the logits (N, actions) and the actions' log-probabilities."""
-        logits = torch.from_numpy(logits_of(self.module.trunk, self.module.pi, stacks))
+        logits = torch.from_numpy(self._logits_of(stacks))
         chances = torch.softmax(logits, dim=-1)
         actions = torch.multinomial(chances, 1, replacement=True)
         logp = torch.log_softmax(logits, dim=-1).gather(1, actions)

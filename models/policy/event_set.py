@@ -8,7 +8,8 @@ evenly over their order in time; of fewer, the rest of the rows is empty (`event
 
 `EventSet.plain` is this formula, row by row. `EventSet.forward` is the same function with the
 same parameters and gradients, several times faster on a CPU: both factors run once per distinct
-value in the batch, and the products are pooled as they are made. Only the order of sums differs.
+value in the batch, and the products are pooled as they are made. `EventTables` is the function of
+weights that no longer change: both factors are tabulated once. Only the order of sums differs.
 """
 
 import math
@@ -21,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from models.encoder.event_batch import ROW_EMPTY, ROW_OFF, ROW_ON, EventBatch, Grid, batch_rows, distinct
+from models.encoder.table import dense
 
 EVENTS = 256  # of a window that the network sees
 TIMES = 1024  # steps into which a window's time is rounded
@@ -69,16 +71,26 @@ class EventSet(nn.Module):
 
     def _pooled(self, batch: EventBatch) -> tuple[Tensor, Tensor]:
         """Maximum and sum (windows, WIDTH) of the events of each window."""
-        weight, (width, height, _) = self.gate[0].weight, self.grid
         cells, _, cell = distinct(batch.code)
         times, _, time = distinct(batch.bin)
+        return GatedPool.apply(*self.factors(cells, times), Events(cell, time, batch.offsets))
+
+    def factors(self, cells: np.ndarray, times: np.ndarray) -> tuple[Tensor, Tensor]:
+        """What the features of events are the products of.
+
+        Args:
+            cells: int (P,), as `EventBatch.code`.
+            times: int (T,), as `EventBatch.bin`.
+
+        Returns:
+            (P, WIDTH) of the cells, and (T, WIDTH) of the times.
+        """
+        weight, (width, height, _) = self.gate[0].weight, self.grid
         sides = [along(torch.arange(side).to(weight)[:, None], side) for side in (width, height)]
         on = torch.from_numpy(2.0 * (cells >= width * height) - 1.0).to(weight)[:, None]
-        places = self.place(
-            torch.cat(_inputs(sides[0][cells % width], sides[1][cells // width % height], on), dim=-1)
-        )
+        places = _inputs(sides[0][cells % width], sides[1][cells // width % height], on)
         gates = self.gate(torch.from_numpy(times).to(weight)[:, None] / TIMES)
-        return GatedPool.apply(places, gates, Events(cell, time, batch.offsets))
+        return self.place(torch.cat(places, dim=-1)), gates
 
     def _joined(self, pooled: tuple[Tensor, Tensor, Tensor], shape: Sequence[int]) -> Tensor:
         """The trunk's outputs (B, OUTPUTS) of maxima, sums and numbers of all windows."""
@@ -114,6 +126,34 @@ class Factors(NamedTuple):
 
     places: np.ndarray
     gates: np.ndarray
+
+
+class EventTables:
+    """`EventSet` with its weights of now, ten times as fast, by the same bytes in any batch."""
+
+    def __init__(self, net: EventSet) -> None:
+        """Compute the features of every cell and every time."""
+        cells = 2 * net.grid.width * net.grid.height
+        with torch.no_grad():
+            places, gates = net.factors(np.arange(cells), np.arange(TIMES))
+        self._grid, self._factors = net.grid, Factors(places.numpy(), gates.numpy())
+        self._weight, self._bias = (value.detach().numpy().copy() for value in net.join[0].parameters())
+
+    def __call__(self, stacks: np.ndarray) -> np.ndarray:
+        """Features (B, OUTPUTS) of stacks int16 (B, stack, EVENTS, 4).
+
+        Raises:
+            ValueError: A row is no event of the sensor.
+        """
+        batch = batch_rows(stacks.reshape(-1, *stacks.shape[2:]), self._grid)
+        largest, total = (np.zeros((len(batch), WIDTH), self._bias.dtype) for _ in range(2))
+        unused = np.empty((len(batch), WIDTH), np.int32)
+        _pool(self._factors, Events(batch.code, batch.bin, batch.offsets), largest, total, unused)
+        number = np.diff(batch.offsets).astype(self._bias.dtype)[:, None]
+        pooled = np.concatenate([largest, total / np.maximum(number, 1.0), number / EVENTS], axis=1)
+        return np.maximum(
+            dense(pooled.reshape(len(stacks), len(self._weight[0])), self._weight, self._bias), 0.0
+        )
 
 
 class GatedPool(torch.autograd.Function):

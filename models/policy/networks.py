@@ -9,7 +9,7 @@ the stack and the policy, and returns the parts. Weights come from `initialise`,
 import copy
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from models.encoder.finetuned import FinetunedEncoder
 from models.encoder.table import dense
 from models.kinds import PolicySpec, resolve
 from models.policy.dense_update import tanh
-from models.policy.event_set import OUTPUTS, EventSet
+from models.policy.event_set import OUTPUTS, EventSet, EventTables
 from models.policy.features import feature_of
 
 PARTS = ("trunk", "pi", "vf")
@@ -52,21 +52,40 @@ def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
     return networks
 
 
-def logits_of(trunk: nn.Module, pi: nn.Module, stacks: np.ndarray) -> np.ndarray:
-    """Logits float32 (B, actions) of stacks (B, depth, ...); of dense networks the same bytes in any batch.
+def logits_by(trunk: nn.Module, pi: nn.Module) -> Callable[[np.ndarray], np.ndarray]:
+    """What computes the logits float32 (B, actions) of stacks (B, depth, ...), by the weights of now.
 
-    Those run without torch, whose calls take ten times as long as the arithmetic of a few rows.
+    Of all but convolutions and networks of plugins it gives the same bytes in any batch, and runs without
+    torch, whose calls take ten times as long as the arithmetic of a few rows.
     """
-    if not isinstance(trunk, nn.Flatten) or not is_mlp(pi):
+    if isinstance(trunk, nn.Flatten) and is_mlp(pi):
+        return _dense_layers(pi)
+    if isinstance(trunk, EventSet) and isinstance(pi, nn.Linear):
+        features, decide = EventTables(trunk), _dense_layers(nn.Sequential(pi))
+        return lambda stacks: decide(features(stacks))
+
+    def by_torch(stacks: np.ndarray) -> np.ndarray:
         with torch.inference_mode():
             return pi(trunk(torch.from_numpy(stacks))).numpy()
-    values = stacks.reshape(len(stacks), math.prod(stacks.shape[1:]))
-    for layer in pi.children():
-        if isinstance(layer, nn.Linear):
-            values = dense(values, layer.weight.detach().numpy(), layer.bias.detach().numpy())
-        else:
+
+    return by_torch
+
+
+def _dense_layers(network: nn.Sequential) -> Callable[[np.ndarray], np.ndarray]:
+    """What computes the outputs of dense layers with tanh between them, float32 (B, outputs)."""
+    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
+    first, *layers = [
+        [value.detach().numpy().copy() for value in (layer.weight, layer.bias)] for layer in linear
+    ]
+
+    def outputs_of(stacks: np.ndarray) -> np.ndarray:
+        values = dense(stacks.reshape(len(stacks), math.prod(stacks.shape[1:])), *first)
+        for weight, bias in layers:
             tanh(values.reshape(-1))
-    return values
+            values = dense(values, weight, bias)
+        return values
+
+    return outputs_of
 
 
 def two_mlps(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:

@@ -37,7 +37,7 @@ from models.kinds import PolicySpec, needed_plugins, read_spec
 from models.policy.event_filter import filter_of
 from models.policy.features import LATENT, Step, Windows, feature_of
 from models.policy.memory import remember, windows_us
-from models.policy.networks import assemble, logits_of
+from models.policy.networks import assemble, logits_by
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # the shipped policies, a folder each
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
@@ -92,13 +92,14 @@ class Policy:
         rng: np.random.Generator | None = None,
         manifest: PolicyManifest | None = None,
     ) -> None:
-        """Join the networks and the encoder, if any; a stochastic policy needs `rng`."""
+        """Join networks, by their weights of now, and encoder, if any; a stochastic policy needs `rng`."""
         if not deterministic and rng is None:
             raise ValueError("rng must be given for a stochastic policy (deterministic=False), got None")
         self.networks, self.spec, self.encoder = networks, spec, encoder
         self.deterministic, self.rng = deterministic, rng
         self.manifest: PolicyManifest = {} if manifest is None else manifest
         self.feature = feature_of(spec) if encoder is None else LATENT
+        self._logits_of = logits_by(networks["trunk"], networks["pi"])
         self.reset()
 
     @property
@@ -129,6 +130,10 @@ class Policy:
         self._stacks: np.ndarray = np.zeros((num_envs, *self.stack_shape), self.feature.dtype)
         self._first = np.ones(num_envs, bool)
         self._filter = filter_of(self.manifest.get("sensor", {}), self.spec.width, self.spec.height)
+
+    def keep(self, places: np.ndarray) -> None:
+        """Go on with some of the episodes, int (n,): observations are now theirs alone, in that order."""
+        self._stacks, self._first = self._stacks[places], self._first[places]
 
     def __call__(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Choose an action for each episode.
@@ -188,7 +193,7 @@ class Policy:
         first = self._first if restarted is None else self._first | restarted
         self._stacks = remember(self._stacks, features, first, self.spec, window_us)
         self._first = np.zeros(len(features), bool)
-        logits = logits_of(self.networks["trunk"], self.networks["pi"], self._stacks)
+        logits = self._logits_of(self._stacks)
         if not np.isfinite(logits).all():
             raise ValueError("the policy's logits must be finite, got NaN or infinity; train it anew")
         return logits

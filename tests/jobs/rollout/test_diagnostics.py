@@ -55,7 +55,7 @@ def test_the_windows_kept_are_few_and_from_all_over_all_episodes(tmp_path, episo
         for seed in range(episodes):
             observation = np.zeros((3, 4), np.int32)
             observation[0, 2:] = seed, step
-            sampler.add(None, seed, observation, {})
+            sampler.add(None, seed, observation)
             assert len(sampler.windows) <= MAX_WINDOWS
     seeds, steps = np.array([kept[0, 2:] for kept in sampler.windows]).T
     assert len(steps) > MAX_WINDOWS / 2.5

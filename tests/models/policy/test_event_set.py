@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from models.encoder.event_batch import EventBatch, Grid, event_rows, thin
-from models.policy.event_set import EVENTS, TIMES, EventSet
+from models.policy.event_set import EVENTS, TIMES, EventSet, EventTables
 
 
 def addresses(count, seed=0, width=40, height=30):
@@ -61,6 +61,23 @@ def test_the_fused_and_the_plain_form_are_the_formula(dtype, bound):
     for read in (net.forward, net.plain):
         for found, wanted in zip(outcome(net, read, stacks), expected, strict=True):
             assert (found - wanted).abs().max() <= bound * wanted.abs().max().clamp_min(1e-30)
+
+
+def test_tables_give_the_features_of_the_network_and_the_same_bytes_in_any_batch():
+    net = network()
+    windows = [addresses(count, seed) for seed, count in enumerate((500, 0, 256, 1, 30, 0))]
+    stacks = torch.cat([rows_of(*windows[:3]), rows_of(*windows[3:]), rows_of(*windows[1:4])])
+    tables = EventTables(net)
+    with torch.no_grad():
+        expected = net.plain(stacks).numpy()
+        net.join[0].weight.add_(1.0)  # what the network learns later does not reach them
+    found = tables(stacks.numpy())
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    for first, last in ((0, 1), (1, 3), (2, 2)):
+        assert np.array_equal(tables(stacks[first:last].numpy()), found[first:last])
+    stacks[0, 1, 2] = torch.tensor((1, 0, 40, 0))
+    with pytest.raises(ValueError, match="row 258 of events has kind=1"):
+        tables(stacks.numpy())
 
 
 @pytest.mark.parametrize("row", [(1, 0, 40, 0), (1, 0, 0, 30), (2, TIMES, 0, 0), (3, 0, 0, 0), (1, 0, -1, 0)])

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from models.kinds import MIN_IMAGE, EncoderModel, FixedModel, PolicySpec
-from models.policy.networks import PARTS, assemble, build_networks, is_mlp, logits_of, mlp
+from models.policy.networks import PARTS, assemble, build_networks, is_mlp, logits_by, mlp
 
 ENCODER = EncoderModel("bytestream", 64, 8, "batch", "signed", 32, "additive", "frozen", 3, [64, 64])
 MLP = PolicySpec(ENCODER, 64, 64, 3)
@@ -56,15 +56,16 @@ def test_logits_without_torch_are_those_of_the_networks_in_any_batch(hidden):
     networks["pi"][-1].weight.data.mul_(100.0)  # so that logits differ
     trunk, pi = networks["trunk"], networks["pi"]
     stacks = (3.0 * np.random.default_rng(0).normal(size=(9, 3, 8))).astype(np.float32)
-    logits = logits_of(trunk, pi, stacks)
+    read = logits_by(trunk, pi)
+    logits = read(stacks)
     with torch.no_grad():
         expected = pi(trunk(torch.from_numpy(stacks))).numpy()
     np.testing.assert_allclose(logits, expected, rtol=1e-5, atol=1e-5)
     assert (logits.dtype, logits.shape) == (np.float32, (9, 3))
     for first, last in ((0, 1), (2, 5), (8, 9)):
-        assert np.array_equal(logits_of(trunk, pi, stacks[first:last]), logits[first:last])
-    assert logits_of(trunk, pi, stacks[:0]).shape == (0, 3)
-    assert np.isnan(logits_of(trunk, pi, np.full_like(stacks, np.nan))).all()
+        assert np.array_equal(read(stacks[first:last]), logits[first:last])
+    assert read(stacks[:0]).shape == (0, 3)
+    assert np.isnan(read(np.full_like(stacks, np.nan))).all()
 
 
 def test_the_cnn_is_that_of_stable_baselines():
@@ -117,6 +118,6 @@ def test_only_what_mlp_builds_is_computed_as_such(what):
     assert not is_mlp(network)
     with torch.no_grad():
         expected = network(torch.from_numpy(stacks).flatten(1)).numpy()
-    assert np.array_equal(logits_of(nn.Flatten(), network, stacks), expected)
+    assert np.array_equal(logits_by(nn.Flatten(), network)(stacks), expected)
     assert is_mlp(mlp(6, (), 3))
     assert is_mlp(mlp(6, (4, 4), 3))

@@ -116,6 +116,20 @@ def test_a_restarted_flight_forgets_and_its_neighbours_remember(name, folder):
     np.testing.assert_allclose(part[1], alone.logits(steps[3][1:2])[0], rtol=1e-5, atol=1e-5)
 
 
+def test_episodes_that_are_kept_go_on_as_if_the_others_were_there(name, folder):
+    steps = make_observations(name, np.random.default_rng(1), 12)
+    steps = steps.reshape(4, 3, *steps.shape[1:])
+    whole, some = load_policy(folder), load_policy(folder)
+    for policy in (whole, some):
+        policy.reset(3)
+        policy.logits(steps[0])
+        policy.logits(steps[1])
+    some.keep(np.array([0, 2]))
+    for step in steps[2:]:
+        expected = whole.logits(step)[[0, 2]]
+        np.testing.assert_allclose(some.logits(step[[0, 2]]), expected, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_image", "finetuned"])
 def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path, name):
     folder = save(tmp_path, name)
