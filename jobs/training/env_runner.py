@@ -248,7 +248,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
         Returns:
             The episodes that ended, in the order in which they did, then the pieces of those
-            that go on; observations are stacks of features.
+            that go on; observations are stacks of features, `get_infos()` is a dict of arrays (T + 1,).
 
         Raises:
             ValueError: Something else was asked than steps of the policy's drawn actions.
@@ -311,8 +311,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         over = np.stack([step.over for step in steps])
         ended = np.stack([step.terminated | step.truncated for step in steps])
         stacks = np.stack([*(step.stacks for step in steps), self._stacks])
-        infos = [self._infos, *(step.infos for step in steps)]
-        self._infos = infos[-1]
+        infos = _by_name([self._infos, *(step.infos for step in steps)])
+        self._infos = steps[-1].infos
         columns = {name: np.stack([getattr(step, name) for step in steps]) for name in ("actions", "rewards")}
         columns |= {name: np.stack([step.outputs[name] for step in steps]) for name in steps[0].outputs}
         done: list[tuple[int, SingleAgentEpisode]] = []
@@ -330,7 +330,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
                         row,
                         stacks[first : end + 1, row],
                         {name: values[piece, row] for name, values in columns.items()},
-                        [_of_row(info, row) for info in infos[first : end + 1]],
+                        {name: values[first : end + 1, row] for name, values in infos.items()},
                     )
                     if last < len(steps):
                         episode.is_terminated = bool(steps[last].terminated[row])
@@ -342,7 +342,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return [episode for _, episode in sorted(done, key=lambda pair: pair[0])], going_on
 
     def _episode(
-        self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: list[dict[str, object]]
+        self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: dict[str, np.ndarray]
     ) -> SingleAgentEpisode:
         """The next piece of the episode in a row."""
         name, before = self._episodes[row]
@@ -351,7 +351,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             name,
             observations=InfiniteLookbackBuffer(stacks),
             observation_space=self.module.observation_space,
-            infos=infos,
+            infos=InfiniteLookbackBuffer(infos),
             actions=InfiniteLookbackBuffer(columns.pop("actions")),
             action_space=self.module.action_space,
             rewards=InfiniteLookbackBuffer(columns.pop("rewards")),
@@ -366,6 +366,6 @@ def _begun() -> tuple[str, np.ndarray]:
     return uuid.uuid4().hex, np.empty(0, np.uint8)
 
 
-def _of_row(infos: dict[str, np.ndarray], row: int) -> dict[str, object]:
-    """The info of one environment; names with an underscore are Gymnasium's masks."""
-    return {name: values[row] for name, values in infos.items() if not name.startswith("_")}
+def _by_name(infos: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Infos of T steps as arrays (T, N); names with an underscore are Gymnasium's masks."""
+    return {name: np.stack([info[name] for info in infos]) for name in infos[0] if name[0] != "_"}

@@ -65,9 +65,9 @@ class EpisodeMetrics(RLlibCallback):
             for name, value in self._drift(env_runner.module).items():
                 metrics_logger.log_value(name, value, window=1)
         self.rounds += 1
-        infos = [info for chunk in samples for info in chunk.get_infos()[1:]]
         events, dropped = (
-            np.array([info[key] for info in infos]) for key in ("num_events", "dropped_events")
+            np.concatenate([chunk.get_infos()[key][1:] for chunk in samples])
+            for key in ("num_events", "dropped_events")
         )
         metrics_logger.log_value("events_per_step", float(events.mean()), window=1)
         metrics_logger.log_value("dropped_events", float(dropped.sum()), window=1)

@@ -66,4 +66,4 @@ def log_costs(episode: SingleAgentEpisode) -> np.ndarray:
 
     Costs are about 1 where a way is free, and 1000 where none is left; logarithms are 0.7 and 7.
     """
-    return np.log1p(np.array([info[COST_TO_GO] for info in episode.get_infos()]))
+    return np.log1p(episode.get_infos()[COST_TO_GO])

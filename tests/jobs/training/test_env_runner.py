@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
@@ -17,6 +18,7 @@ from models.encoder.weights import load_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
 from tests.support.configs import SHORT, make_config
+from tests.support.episodes import infos_of
 from tests.support.policies import kinds
 from tests.support.runs import write_encoder
 
@@ -54,6 +56,7 @@ def make_runners(name, folder, *overrides):
         env_runner_cls=SingleAgentEnvRunner,
         env_to_module_connector=lambda env, spaces, device: StackFeatures(space),
     )
+    theirs.callbacks(RLlibCallback)  # ours read infos as arrays
     runners = PlainEnvRunner(config=ppo, worker_index=0), SingleAgentEnvRunner(config=theirs, worker_index=0)
     for runner in runners:
         for value in runner.module.pi.parameters():
@@ -78,7 +81,7 @@ def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
             for key in ("action_logp", "action_dist_inputs"):
                 found, expected = (chunk.get_extra_model_outputs(key) for chunk in (one, two))
                 np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-            assert one.get_infos() == two.get_infos()
+            assert infos_of(one) == infos_of(two)
             assert (one.is_terminated, one.is_truncated) == (two.is_terminated, two.is_truncated)
             assert (one.t_started, one.t) == (two.t_started, two.t)
             one.validate()
@@ -105,7 +108,7 @@ def test_one_that_resumes_samples_as_the_one_that_went_on(name, tmp_path):
         for one, two in zip(mine.episodes, other.episodes, strict=True):
             assert one.get_observations().tobytes() == two.get_observations().tobytes()
             assert one.get_actions().tolist() == two.get_actions().tolist()
-            np.testing.assert_equal(one.get_infos(), two.get_infos())
+            np.testing.assert_equal(infos_of(one), infos_of(two))
             assert (one.t_started, one.is_done) == (two.t_started, two.is_done)
         names = {"episode_return", "distance_m", "events_per_step"}
         assert {name: mine.metrics[name].peek() for name in names} == {

@@ -14,6 +14,7 @@ from jobs.training.imitation import COSTS, MIRRORED, ImitationLearner, Lessons, 
 from jobs.training.ppo import build_ppo, corridor_settings
 from models.kinds import KINDS
 from tests.support.configs import SHORT, make_config
+from tests.support.episodes import infos_of
 from tests.support.policies import TRAINED, kinds
 from tests.support.runs import write_encoder
 
@@ -49,7 +50,7 @@ def test_a_step_carries_what_each_action_costs_where_it_began(config, rolled_out
     env = CorridorEnv(corridor_settings(config)["config"])
     for _, episodes in rolled_out[1]:
         for episode in episodes[:6]:
-            infos = episode.get_infos()
+            infos = infos_of(episode)
             env.reset(
                 seed=int(infos[0]["episode_seed"]),
                 options={"episode_number": int(infos[0]["episode_number"])},

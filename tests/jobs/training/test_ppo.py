@@ -17,6 +17,7 @@ from models.kinds import KINDS
 from models.policy import load_policy, save_policy
 from models.policy.features import feature_of
 from tests.support.configs import SHORT, make_config
+from tests.support.episodes import infos_of
 from tests.support.policies import kinds
 
 TRAINED = ("bytestream", "event_columns", "event_set", "event_image", "rgb", "finetuned")
@@ -121,7 +122,7 @@ class Recorder:
 
 def keys(chunk, control_hz=200.0):
     """(seed, episode, step) of a chunk's observations."""
-    infos = chunk.get_infos()
+    infos = infos_of(chunk)
     return [
         (info["episode_seed"], info["episode_number"], round(info["t_us"] * control_hz / 1e6))
         for info in infos

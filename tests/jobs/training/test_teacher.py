@@ -14,6 +14,7 @@ from jobs.training.teacher import COST_TO_GO, PricedEnvRunner
 from models.policy import load_policy, save_policy
 from models.policy.rllib_module import PRIVILEGED
 from tests.support.configs import SHORT, make_config
+from tests.support.episodes import infos_of
 from tests.support.runs import write_networks
 
 SAMPLED = "num_env_steps_sampled_lifetime"
@@ -107,7 +108,7 @@ def test_each_place_of_an_episode_has_its_cost_and_all_else_is_as_without_a_teac
     )
     for episodes in rolled_out[1]:
         for episode, other in zip(episodes, plain.sample(num_timesteps=64), strict=True):
-            infos = episode.get_infos()
+            infos = infos_of(episode)
             series = {"episode_number": int(infos[0]["episode_number"])}
             env.reset(seed=int(infos[0]["episode_seed"]), options=series)
             plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
@@ -126,7 +127,7 @@ def test_with_a_delay_a_cost_is_that_of_the_place_where_the_next_action_is_taken
     runner, env = PricedEnvRunner(config=build_ppo(config), worker_index=0), CorridorEnv()
     compared = 0
     for episode in runner.sample(num_timesteps=64):
-        infos = episode.get_infos()
+        infos = infos_of(episode)
         series = {"episode_number": int(infos[0]["episode_number"])}
         env.reset(seed=int(infos[0]["episode_seed"]), options=series)
         plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
@@ -140,7 +141,7 @@ def test_with_a_delay_a_cost_is_that_of_the_place_where_the_next_action_is_taken
 
 def test_shaping_lowers_what_values_are_taught_by_the_potential_and_leaves_returns(rolled_out, monkeypatch):
     env, (episodes, _) = rolled_out
-    costs = np.concatenate([[info[COST_TO_GO] for info in one.get_infos()] for one in episodes])
+    costs = np.concatenate([[info[COST_TO_GO] for info in infos_of(one)] for one in episodes])
     potentials = -0.5 * WEIGHT * np.log1p(costs).astype("f4")  # rewards are halved (SHORT)
     returns = [episode.get_return() for episode in episodes]
     rows = []
@@ -193,7 +194,7 @@ def test_a_critic_learns_from_what_it_is_told(rolled_out, compiled, monkeypatch)
         monkeypatch.setattr(type(learner), "_dense", False)
     rows = learner._rows(episodes)
     expected = np.concatenate(
-        [np.log1p([info[COST_TO_GO] for info in one.get_infos()[:-1]]) for one in episodes]
+        [np.log1p([info[COST_TO_GO] for info in infos_of(one)[:-1]]) for one in episodes]
     )
     np.testing.assert_array_equal(rows[PRIVILEGED][:, 0], expected.astype("f4"))
     learn(learner, episodes)

@@ -197,7 +197,8 @@ class Chunk:
         return sum(self.rewards)
 
     def get_infos(self, index=None):
-        return self.info if index == -1 else [self.info] * (1 + len(self.rewards))
+        count = 1 + len(self.rewards)
+        return self.info if index == -1 else {name: np.repeat(one, count) for name, one in self.info.items()}
 
 
 class Logger(dict):
