@@ -351,7 +351,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             name,
             observations=InfiniteLookbackBuffer(stacks),
             observation_space=self.module.observation_space,
-            infos=InfiniteLookbackBuffer(infos),
+            infos=InfiniteLookbackBuffer(infos) if infos else None,
             actions=InfiniteLookbackBuffer(columns.pop("actions")),
             action_space=self.module.action_space,
             rewards=InfiniteLookbackBuffer(columns.pop("rewards")),
