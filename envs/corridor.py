@@ -341,13 +341,13 @@ class CorridorVectorEnv(VectorEnv):
 
         Raises:
             ResetNeeded: The episode of one of them is over, or has not begun.
-            ValueError: As `step`.
+            ValueError: The number of actions is not that of these environments; or as `step`.
         """
-        active = np.zeros(self.num_envs, bool)
-        active[some] = True
-        own = np.asarray(actions)
+        own, active = np.asarray(actions), np.zeros(self.num_envs, bool)
+        if own.shape != some.shape:
+            raise ValueError(f"actions must number {len(some)}; got {own.size}.")
         taken = np.zeros(self.num_envs, own.dtype)
-        taken[some] = own
+        active[some], taken[some] = True, own
         self._step_active(taken, active)
         return self._results(some)
 

@@ -129,7 +129,7 @@ class Factors(NamedTuple):
 
 
 class EventTables:
-    """`EventSet` with its weights of now, ten times as fast, by the same bytes in any batch."""
+    """`EventSet` with the weights that it has now: faster, and with the same bytes in any batch."""
 
     def __init__(self, net: EventSet) -> None:
         """Compute the features of every cell and every time."""

@@ -155,6 +155,8 @@ def test_what_is_not_active_stays_where_it_is():
         assert (rewards[0], infos["x_m"][0]) == (reward, info["x_m"])
         assert some.envs[0].info() == before
         assert not some.envs[0].events.size
+    with pytest.raises(ValueError, match="actions must number 2; got 1"):
+        some.step_some(np.array([0]), np.array([0, 1]))
 
 
 def test_what_is_observed_is_what_the_neighbour_filter_leaves():
