@@ -53,10 +53,10 @@ def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
 
 
 def logits_by(trunk: nn.Module, pi: nn.Module) -> Callable[[np.ndarray], np.ndarray]:
-    """What computes the logits float32 (B, actions) of stacks (B, depth, ...), by the weights that they have now.
+    """What computes the logits float32 (B, actions) of stacks (B, depth, ...), by the weights of this moment.
 
-    Dense networks and event sets give the same bytes in any batch, and run without torch, whose calls take ten
-    times as long as the arithmetic of a few rows. All others run by torch.
+    Dense networks and event sets give the same bytes in any batch, and run without torch, whose calls take
+    ten times as long as the arithmetic of a few rows. All others run by torch.
     """
     if isinstance(trunk, nn.Flatten) and is_mlp(pi):
         return _dense_layers(pi)

@@ -92,7 +92,10 @@ class Policy:
         rng: np.random.Generator | None = None,
         manifest: PolicyManifest | None = None,
     ) -> None:
-        """Join the networks, whose weights no longer change, and the encoder, if any; `rng` to draw actions by."""
+        """Join the networks, whose weights no longer change, and the encoder, if any.
+
+        Actions are drawn by `rng`.
+        """
         if not deterministic and rng is None:
             raise ValueError("rng must be given for a stochastic policy (deterministic=False), got None")
         self.networks, self.spec, self.encoder = networks, spec, encoder
