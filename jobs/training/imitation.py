@@ -10,6 +10,7 @@ Mirrored, a step is kept a second time with left and right exchanged, in what wa
 """
 
 import copy
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -146,6 +147,10 @@ class ImitationLearner(PlainPPOLearner):
     def keep(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on with lessons."""
         self._lessons.load(arrays)
+
+    def _threads(self) -> int:
+        """As many as there are env runners, which wait meanwhile; minibatches are large enough to share."""
+        return max(1, min(self.config.num_env_runners, os.cpu_count() or 1))
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
         """The steps of all episodes, one after the other."""
