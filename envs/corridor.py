@@ -239,7 +239,7 @@ class CorridorEnv(gymnasium.Env):
 
     def info(self) -> Info:
         """Where the episode stands, as the last step or reset told."""
-        infos = _infos_of([self], self._vehicles.rows[self._row : self._row + 1])
+        infos = _infos_of([self], self._vehicles, np.array([self._row]))
         return cast(Info, {name: values.tolist()[0] for name, values in infos.items()})
 
 
@@ -379,7 +379,7 @@ class CorridorVectorEnv(VectorEnv):
         return self._infos(np.arange(self.num_envs))
 
     def _infos(self, some: np.ndarray) -> dict[str, np.ndarray]:
-        infos = _infos_of([self.envs[row] for row in some], self._vehicles.rows[some])
+        infos = _infos_of([self.envs[row] for row in some], self._vehicles, some)
         return infos | dict.fromkeys([f"_{name}" for name in infos], np.ones(len(some), bool))
 
     def replay(
@@ -434,11 +434,12 @@ class CorridorVectorEnv(VectorEnv):
         return np.stack(observations)
 
 
-def _infos_of(envs: Sequence[CorridorEnv], rows: np.ndarray) -> dict[str, np.ndarray]:
-    """`Info` of several environments, each value an array; `rows` are their VEHICLE."""
-    config, lost = envs[0].config, rows["dropped"].copy()
+def _infos_of(envs: Sequence[CorridorEnv], vehicles: Vehicles, some: np.ndarray) -> dict[str, np.ndarray]:
+    """`Info` of several environments, each value an array; `some` are the rows of their vehicles."""
+    config, rows = envs[0].config, vehicles.rows[some]
+    lost = rows["dropped"].copy()
     if config.observation == "window" and config.window_capacity is not None:
-        lost += np.maximum(rows["num_events"] - config.window_capacity, 0)
+        lost += np.maximum(vehicles.num_seen[some] - config.window_capacity, 0)
     return {
         "episode_seed": np.array([env.series[0] for env in envs]),
         "episode_number": np.array([env.series[1] for env in envs]),

@@ -12,7 +12,7 @@ The ranges of all settings stand here; configurations, encoder files and policy 
 import dataclasses
 import importlib
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, cast, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, cast
 
 import pydantic
 from pydantic import AfterValidator, Field
@@ -25,7 +25,6 @@ Variant = Literal["bytestream", "bytestream_xy", "event_image_vae"]
 Norm = Literal["batch", "none"]
 Target = Literal["signed", "occupancy", "aged", "counts"]
 Coding = Literal["additive", "eventnet", "none"]
-TARGETS: tuple[str, ...] = get_args(Target)
 
 Side = Annotated[int, Field(ge=1, le=4096)]
 Context = Annotated[int, Field(ge=2, le=8192, multiple_of=2)]

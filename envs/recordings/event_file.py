@@ -317,7 +317,7 @@ def check_order(events: np.ndarray) -> None:
     Raises:
         ValueError: An event is older than the one before it.
     """
-    back = np.diff(events["t"]) < 0
+    back = events["t"][1:] < events["t"][:-1]
     if back.any():
         first = int(np.argmax(back)) + 1
         raise ValueError(f"events must be sorted by t; event {first} is older than the one before it")

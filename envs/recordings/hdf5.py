@@ -6,6 +6,7 @@ events were made. Polarity is 0 or 1 on disk, as in DSEC; files with -1 and 1 ar
 `/CD/events` are rows of x, y, p, t, packed by a filter of its own.
 """
 
+import bisect
 import contextlib
 import dataclasses
 import json
@@ -13,7 +14,6 @@ import mmap
 import re
 import struct
 from collections.abc import Iterator
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +65,9 @@ class Recording:
     index: dict[str, np.ndarray]
     about: dict[str, Any]
 
-    @cached_property
-    def t_us(self) -> np.ndarray:
-        """Times of the events [us], contiguous: searching the strided field copies all of it."""
-        return np.ascontiguousarray(self.events["t"])
+    def count_until(self, t_us: int) -> int:
+        """How many events have t <= t_us [us]; numpy's search would copy the times of all."""
+        return bisect.bisect_right(self.events["t"], t_us)
 
 
 def write_recording(path: Path, recording: Recording) -> None:
@@ -214,7 +213,9 @@ def _columns(request: Request, file: h5py.File) -> np.ndarray:
             raise ValueError("t_offset is no whole number of microseconds")
     if t.dtype.kind not in "iu" or (len(t) and not 0 <= int(t.max()) + abs(offset) < 1 << 62):
         raise ValueError("events/t are no whole microseconds")
-    return assemble(request, t.astype(np.int64) + offset, x, y, p)
+    t = t.astype(np.int64, copy=False)
+    t += offset
+    return assemble(request, t, x, y, p)
 
 
 def _labels(request: Request, file: h5py.File) -> np.ndarray | None:

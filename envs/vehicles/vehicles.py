@@ -31,6 +31,7 @@ class Vehicles:
         ends: int64 (B + 1,), vehicle b has events ends[b] .. ends[b + 1] - 1.
         seen: EVENT of those that the neighbour filter of each vehicle leaves.
         seen_ends: Their ends.
+        num_seen: int64 (B,), how many each vehicle's last step brought.
     """
 
     def __init__(self, count: int) -> None:
@@ -43,12 +44,14 @@ class Vehicles:
         self._decided = np.zeros((count, 0), np.int64)  # actions not yet taken, the delay's steps in turn
         self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
         self._support, self._tau_us = np.zeros((2, count), np.int64)
+        self.num_seen = np.zeros(count, np.int64)
         self.forget_events()
 
     def start(self, row: int, config: EnvConfig, scene: Scene, sensor: Sensor, spawn_x_m: float) -> None:
         """Put a vehicle at the start of a scene that its sensor has been reset to."""
         vehicle = self.rows[row : row + 1]
         vehicle[:] = np.zeros(1, VEHICLE)
+        self.num_seen[row] = 0
         vehicle["spawn_x_m"] = vehicle["x_m"] = spawn_x_m
         vehicle["speed_mps"], vehicle["control_hz"] = config.speed_mps, config.control_hz
         vehicle["radius_m"], vehicle["height_m"] = config.vehicle_radius_m, config.camera_height_m
@@ -97,6 +100,7 @@ class Vehicles:
         if self._support.any():
             filters = self._last_us, self._support, self._tau_us
             self.seen, self.seen_ends = filter_all(self.events, self.ends, *filters)
+        self.num_seen[active] = np.diff(self.seen_ends)[active]
 
     def events_of(self, row: int) -> np.ndarray:
         """EVENT array of a vehicle in the last step of any; empty if it did not take part."""

@@ -113,8 +113,7 @@ def evaluate(
     if config.evaluate.video:
         task, file = tasks[0], folder.evaluation / "episode.mp4"
         seed = seed_to_film(results[label_of(task)].episodes)
-        env_config = dataclasses.replace(config.env, scene=HELD_OUT_SCENE, split="eval")
-        tracker.artifact(film_episode(task.policy.agent, task.action, env_config, seed, file), "eval")
+        tracker.artifact(film_episode(task.policy.agent, task.action, task.env, seed, file), "eval")
     missing = [" ".join(label) for label in map(label_of, tasks) if label not in results]
     commits = sorted({commit for result in results.values() for commit in result.commits})
     finish(

@@ -288,9 +288,7 @@ def write_tables(
     for name, content in (("table.md", text), ("details.md", details_table(groups, reference))):
         write_atomic(place / name, content)
         tracker.text(f"sweep/{name}", content)
-    artifacts = tracker.client.list_artifacts(tracker.run_id, "sweep")
-    if "sweep/results.json" not in {file.path for file in artifacts}:  # MLflow would append to it
-        tracker.table("sweep/results", result_columns(groups))
+    tracker.table("sweep/results", result_columns(groups))
 
 
 def condition_run(found: SweepResults, result: GroupResult) -> ChildRun:

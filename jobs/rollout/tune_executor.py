@@ -34,7 +34,7 @@ MAX_STEP_S, MAX_START_S = 0.1, 900.0
 UNKNOWN_END = "killed, often for lack of memory, or crashed"  # Ray cannot tell which
 # Stored episodes are what a stopped job continues from. Tune's own picture of all trials, written
 # at each result, would cost more than the episodes.
-TUNE_SNAPSHOT_S = "3600"
+SNAPSHOT_S, TUNE_SNAPSHOT_S = "TUNE_GLOBAL_CHECKPOINT_S", "3600"
 
 Files = Mapping[str, Mapping[str, bytes]]  # policy folder -> name -> content
 
@@ -49,12 +49,19 @@ def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterCon
         folder: The folder of a run folder where Tune keeps its state.
     """
     start_ray(cluster, folder.parent)
-    os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = TUNE_SNAPSHOT_S
     trial = tune.with_parameters(run_trial, files=policy_files(parts))
     callback = TrialCallback(recorder)
-    while parts:
-        fit(_tuner(trial, parts, cluster, folder, callback))
-        parts = callback.take_unfinished()
+    before = os.environ.get(SNAPSHOT_S)
+    os.environ[SNAPSHOT_S] = TUNE_SNAPSHOT_S
+    try:
+        while parts:
+            fit(_tuner(trial, parts, cluster, folder, callback))
+            parts = callback.take_unfinished()
+    finally:  # a training of this process has another
+        if before is None:
+            del os.environ[SNAPSHOT_S]
+        else:
+            os.environ[SNAPSHOT_S] = before
 
 
 def _tuner(

@@ -165,8 +165,13 @@ class Tracker:
         self.client.log_text(self.run_id, text, name)
 
     def table(self, name: str, columns: Mapping[str, Sequence[object]]) -> None:
-        """Write a table as `name`.json; the values of its first column must be unique."""
-        self.client.log_table(self.run_id, dict(columns), f"{name}.json")
+        """Write a table as `name`.json, in place of an earlier one; values of its first column are unique."""
+        written = {file.path for file in self.client.list_artifacts(self.run_id, str(Path(name).parent))}
+        if f"{name}.json" not in written:
+            self.client.log_table(self.run_id, dict(columns), f"{name}.json")
+        else:  # to which MLflow would append
+            rows = [list(row) for row in zip(*columns.values(), strict=True)]
+            self.client.log_dict(self.run_id, {"columns": list(columns), "data": rows}, f"{name}.json")
 
     def artifact(self, path: Path, folder: str | None = None) -> None:
         """Write a file, as it is, into a folder of the run's artifacts."""

@@ -30,9 +30,8 @@ from jobs.run.checkpoints import seal
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
-from jobs.training.real_recordings import Recorded, no_episodes, read_recorded, with_recorded
+from jobs.training.real_recordings import GAP_US, Recorded, no_episodes, read_recorded, with_recorded
 
-EPISODE_GAP_US = 1_000_000
 MEAN_HOLD_M = 2.0
 POLICY_EPISODES = 10**6  # number of a policy's first episode: corridors that no random one came to
 
@@ -65,19 +64,19 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
                 (dataclasses.replace(config.env, scene=scene, split=split, observation="events"), share)
                 for scene, share in zip(scenes, shares, strict=False)
             ]
-            recording = true = no_episodes(config.env)
+            denoise = config.pretrain.denoise
+            made = [no_episodes(config.env)] * (1 + denoise)
             if own:
-                recording, true = record(
-                    own, config.seed, advance, policy, config.collect.policy_share, config.collect.conditions
-                )
+                by_policy = policy, config.collect.policy_share
+                made = record(own, config.seed, advance, *by_policy, config.collect.conditions, denoise)
             if recorded:
                 taken = list(zip([part[split] for part in recorded], shares[len(scenes) :], strict=True))
-                recording, true = with_recorded(recording, taken), with_recorded(true, taken)
-            write_recording(data_file(folder, split), recording)
-            if config.pretrain.denoise:
-                write_recording(data_file(folder, f"{split}_true"), true)
-            figures[f"collect/{split}_events"] = len(recording.events)
-            figures[f"collect/{split}_episodes"] = recording.about["flights"]
+                made = [with_recorded(one, taken) for one in made]
+            for name, one in zip((split, f"{split}_true"), made, strict=False):
+                write_recording(data_file(folder, name), one)
+            figures[f"collect/{split}_events"] = len(made[0].events)
+            figures[f"collect/{split}_episodes"] = made[0].about["flights"]
+            del made  # gigabytes, before those of the next split are made
     seal(folder.data)
     if config.collect.scenes:
         figures |= report_event_error(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
@@ -126,7 +125,8 @@ def record(
     policy: Path | None = None,
     policy_share: float = 0.5,
     conditions: Sequence[Mapping[str, Any]] = ({},),
-) -> tuple[Recording, Recording]:
+    keep_true: bool = False,
+) -> list[Recording]:
     """Roll out each environment for a number of control steps; join all episodes on one clock.
 
     Args:
@@ -137,13 +137,14 @@ def record(
             sampling its actions as in training; None: all are random.
         policy_share: That share, 0..1.
         conditions: Of which each episode draws one.
+        keep_true: Whether the events are also kept as they were before the faults of the sensor.
 
     Returns:
-        Events of all episodes, `EPISODE_GAP_US` apart, as they are observed, and as they were before the
-        faults of the sensor. `index` holds `step_t_us`, `step_end_us` and `step_flight` (start and end [us]
+        Events of all episodes, `GAP_US` apart, as they are observed; with `keep_true` those before the faults
+        in a second recording. `index` holds `step_t_us`, `step_end_us` and `step_flight` (start and end [us]
         and episode number of each step).
     """
-    tape = _Tape()
+    tape = _Tape([EventBlock() for _ in range(1 + keep_true)])
     for config, num_steps, by_policy in stints(shares, policy, policy_share):
         actions, draws = (np.random.SeedSequence([seed, len(tape.steps), stream]) for stream in (1, 2))
         agent = make_agent(str(by_policy), "stochastic") if by_policy else HoldingAgent(actions)
@@ -164,23 +165,45 @@ def record(
         "policy_share": 0.0 if policy is None else policy_share,
     }
     index = {"step_t_us": start, "step_end_us": end, "step_flight": number}
-    seen, true = (
-        Recording(np.concatenate([np.empty(0, EVENT), *events]), index, about)
-        for events in (tape.events, tape.true_events)
-    )
-    return seen, true
+    return [Recording(block.events, index, about) for block in tape.blocks]
+
+
+class EventBlock:
+    """Events in one array that grows in place: so large that the system has it back when it is gone.
+
+    Thousands of episodes' arrays would stay with the process as long as anything small lies between them.
+    """
+
+    def __init__(self) -> None:
+        """Begin without events."""
+        self._room, self._size = np.empty(1 << 16, EVENT), 0
+
+    @property
+    def events(self) -> np.ndarray:
+        """All so far; none may be added while this is in use."""
+        return self._room[: self._size]
+
+    def add(self, parts: Sequence[np.ndarray], clock_us: int) -> None:
+        """Append the EVENT arrays of an episode that began at `clock_us`."""
+        size = self._size + sum(map(len, parts))
+        if size > len(self._room):
+            self._room.resize(max(size, 5 * len(self._room) // 4), refcheck=False)
+        if size > self._size:
+            new = self._room[self._size : size]
+            np.concatenate(parts, out=new)
+            new["t"] += clock_us
+        self._size = size
 
 
 @dataclass
 class _Tape:
     """Episodes one after the other on one clock: their events; start, end and episode of each step.
 
-    An episode is joined at once: a hundred thousand small arrays would keep gigabytes from the system even
-    when they are gone.
+    Attributes:
+        blocks: Of the events as observed, and, if there is a second, of those before the faults.
     """
 
-    events: list[np.ndarray] = field(default_factory=list)
-    true_events: list[np.ndarray] = field(default_factory=list)
+    blocks: list[EventBlock]
     steps: list[tuple[int, int, int]] = field(default_factory=list)
     clock_us: int = 0
     episodes: int = 0
@@ -189,14 +212,12 @@ class _Tape:
         self, events: Sequence[np.ndarray], true_events: Sequence[np.ndarray], ends_us: Sequence[int]
     ) -> None:
         """Append an episode: the events of each step, and when it ended [us since the episode's start]."""
-        for parts, kept in ((events, self.events), (true_events, self.true_events)):
-            episode = np.concatenate([np.empty(0, EVENT), *parts])
-            episode["t"] += self.clock_us
-            kept.append(episode)
+        for block, parts in zip(self.blocks, (events, true_events), strict=False):
+            block.add(parts, self.clock_us)
         for start, end in zip([0, *ends_us], ends_us, strict=False):
             self.steps.append((self.clock_us + start, self.clock_us + end, self.episodes))
         self.episodes += 1
-        self.clock_us += ends_us[-1] + EPISODE_GAP_US
+        self.clock_us += ends_us[-1] + GAP_US
 
 
 def _record_stint(

@@ -12,7 +12,6 @@ window never leaves the env runner.
 """
 
 import uuid
-from collections import defaultdict
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -99,7 +98,6 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
     _callbacks: list[Any]
     _needs_initial_reset: bool
-    _ongoing_episodes_for_metrics: dict[str, list[SingleAgentEpisode]]
 
     def __init__(self, **settings: Any) -> None:
         """Build the environments and the policy.
@@ -196,7 +194,6 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self._check_built()
         arrays = snapshot.arrays
         self._callbacks[0].set_state(snapshot.values["metrics"])
-        self._ongoing_episodes_for_metrics = defaultdict(list)
         self._needs_initial_reset = "stacks" not in arrays
         with ending_after(MAX_SAMPLE_S):
             problem = "" if self._needs_initial_reset else self._replay(snapshot)
@@ -264,9 +261,6 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             steps.append(self._step())
             taken += int((~steps[-1].over).sum())
         done, going_on = self._cut(steps)
-        self._done_episodes_for_metrics.extend(done)
-        for piece in going_on:
-            self._ongoing_episodes_for_metrics[piece.id_].append(piece)
         self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=taken)
         self._increase_sampled_metrics(taken, len(done))
         return done + going_on
@@ -280,7 +274,6 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self._remember(observations, first)
         self._infos, self._over = infos, ~first
         self._episodes = [_begun() for _ in first]
-        self._ongoing_episodes_for_metrics = defaultdict(list)
         self._needs_initial_reset = False
 
     def _step(self) -> Step:
@@ -298,13 +291,10 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Drawn actions (N,), and by name the logits (N, actions) and the actions' log-probabilities."""
+        """Drawn actions (N,), and by name the logits (N, actions)."""
         logits = torch.from_numpy(self._logits_of(stacks))
-        chances = torch.softmax(logits, dim=-1)
-        actions = torch.multinomial(chances, 1, replacement=True)
-        logp = torch.log_softmax(logits, dim=-1).gather(1, actions)
-        outputs = {Columns.ACTION_DIST_INPUTS: logits.numpy(), Columns.ACTION_LOGP: logp[:, 0].numpy()}
-        return actions[:, 0].numpy(), outputs
+        actions = torch.multinomial(torch.softmax(logits, dim=-1), 1, replacement=True)
+        return actions[:, 0].numpy(), {Columns.ACTION_DIST_INPUTS: logits.numpy()}
 
     def _cut(self, steps: list[Step]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
         """The episodes that ended in these steps, and the pieces of those that go on."""
@@ -315,6 +305,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self._infos = steps[-1].infos
         columns = {name: np.stack([getattr(step, name) for step in steps]) for name in ("actions", "rewards")}
         columns |= {name: np.stack([step.outputs[name] for step in steps]) for name in steps[0].outputs}
+        columns[Columns.ACTION_LOGP] = _logps(columns[Columns.ACTION_DIST_INPUTS], columns["actions"])
         done: list[tuple[int, SingleAgentEpisode]] = []
         going_on = []
         for row in range(over.shape[1]):
@@ -364,6 +355,12 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 def _begun() -> tuple[str, np.ndarray]:
     """An episode that begins: its name, and the actions so far."""
     return uuid.uuid4().hex, np.empty(0, np.uint8)
+
+
+def _logps(logits: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Log-probabilities float32 (...) of actions (...) by logits (..., actions)."""
+    logps = torch.log_softmax(torch.from_numpy(logits), dim=-1)
+    return logps.gather(-1, torch.from_numpy(actions)[..., None])[..., 0].numpy()
 
 
 def _by_name(infos: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

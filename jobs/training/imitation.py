@@ -10,7 +10,6 @@ Mirrored, a step is kept a second time with left and right exchanged, in what wa
 """
 
 import copy
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -25,7 +24,7 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from envs.kinematics import MIRRORED_ACTIONS
-from jobs.training.ppo_learner import PlainPPOLearner
+from jobs.training.ppo_learner import PlainPPOLearner, shared_threads
 from jobs.training.snapshots import Snapshot
 from jobs.training.teacher import TeacherEnvRunner
 
@@ -92,11 +91,7 @@ class Lessons:
     def add(self, stacks: np.ndarray, costs: np.ndarray) -> None:
         """Keep steps (N, ...) and costs (N, actions); each step seen is as likely kept as any other."""
         if not self.seen:
-            most = max(1, int(self.most_bytes / (stacks[0].nbytes + costs[0].nbytes)))
-            self.stacks = np.empty(
-                (most, *stacks.shape[1:]), stacks.dtype
-            )  # pages that nobody wrote cost nothing
-            self.costs = np.empty((most, *costs.shape[1:]), costs.dtype)
+            self._make_room(stacks, costs)
         numbers = self.seen + np.arange(len(stacks))
         drawn = (torch.rand(len(stacks), dtype=torch.float64).numpy() * (numbers + 1)).astype(np.int64)
         places = np.where(numbers < len(self.stacks), numbers, drawn)
@@ -117,10 +112,16 @@ class Lessons:
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on from `arrays`."""
-        self.seen = 0
-        if len(arrays["stacks"]):
-            self.add(arrays["stacks"], arrays["costs"])
-        self.seen = int(arrays["seen"])
+        self.seen, size = int(arrays["seen"]), len(arrays["stacks"])
+        if size:
+            self._make_room(arrays["stacks"], arrays["costs"])
+            self.stacks[:size], self.costs[:size] = arrays["stacks"], arrays["costs"]
+
+    def _make_room(self, stacks: np.ndarray, costs: np.ndarray) -> None:
+        """As many rows like these as the bound allows; pages that nobody wrote cost nothing."""
+        most = max(1, int(self.most_bytes / (stacks[0].nbytes + costs[0].nbytes)))
+        self.stacks = np.empty((most, *stacks.shape[1:]), stacks.dtype)
+        self.costs = np.empty((most, *costs.shape[1:]), costs.dtype)
 
 
 class ImitationLearner(PlainPPOLearner):
@@ -150,7 +151,7 @@ class ImitationLearner(PlainPPOLearner):
 
     def _threads(self) -> int:
         """As many as there are env runners, which wait meanwhile; minibatches are large enough to share."""
-        return max(1, min(self.config.num_env_runners, os.cpu_count() or 1))
+        return shared_threads(self.config)
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
         """The steps of all episodes, one after the other."""

@@ -10,7 +10,6 @@ deviation of the advantages. Here it is in neither.
 """
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -46,6 +45,7 @@ READ = (
 GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
 # Of a minibatch, in the order in which `update_dense` returns them.
 FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
+MOST_THREADS = 8  # of a learner
 MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
 # Of the learner's own settings: it multiplies rewards; episodes keep the true ones.
 REWARD_SCALE = "reward_scale"
@@ -82,6 +82,14 @@ def shaping(potentials: np.ndarray, terminated: bool, gamma: float) -> np.ndarra
     after = potentials[1:].copy()
     after[-1] *= not terminated
     return gamma * after - potentials[:-1]
+
+
+def shared_threads(config: Any) -> int:
+    """Threads of a learner's matrix products while the env runners wait: as many, whatever the machine.
+
+    The order of sums follows the number, so that a training resumed elsewhere must have the same.
+    """
+    return max(1, min(config.num_env_runners, MOST_THREADS))
 
 
 class PlainPPOLearner(PPOTorchLearner):
@@ -165,7 +173,7 @@ class PlainPPOLearner(PPOTorchLearner):
 
     def _threads(self) -> int:
         """As many as there are env runners, which wait meanwhile; one for networks too small to share."""
-        return 1 if self._dense else max(1, min(self.config.num_env_runners, os.cpu_count() or 1))
+        return 1 if self._dense else shared_threads(self.config)
 
     @property
     def _dense(self) -> bool:

@@ -53,6 +53,8 @@ MIN_STEPS, MAX_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
 PICTURE_WINDOWS = 8
 MANY = 10**9  # events
+SPLITS = ("train", "validation")
+NEVER_US = 1 << 62  # when the episode after the last one begins
 COLLAPSED = (
     "the latent says nothing of its window (posterior collapse), a policy would see nothing; "
     "if more iterations do not help, take a smaller pretrain.beta or pretrain.beta_schedule=constant"
@@ -129,19 +131,13 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
         return done
     settings = config.pretrain
     check_data(folder)
-    train = read_recording(data_file(folder, "train"))
-    validation = read_recording(data_file(folder, "validation"))
-    true, validation_true = None, None
-    if settings.denoise:
-        true, validation_true = (
-            read_recording(data_file(folder, f"{split}_true")) for split in ("train", "validation")
-        )
+    (train, true), (validation, validation_true) = (read_split(folder, split) for split in SPLITS)
     training = EvaeTraining.begin(evae_settings(config), train, settings, (config.seed, 2), true)
-    evae, begin = training.evae, initial_state(folder)
+    evae, first = training.evae, restore(folder.encoder, training)
+    begin = initial_state(folder)  # none where a checkpoint was restored; a damaged one is gone by now
     if begin is not None:
         evae.load_state_dict(begin)
     held_out = held_out_windows(validation, settings, evae.grid, validation_true)
-    first = restore(folder.encoder, training)
     latest: dict[str, float] = {}
     title = "Pretrain the event VAE"
     with threads(), progress(title, settings.iterations, "iterations", done=first) as advance:
@@ -171,6 +167,19 @@ def threads() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def read_split(folder: Run, split: str) -> tuple[Recording, Recording | None]:
+    """What was recorded of a split, and what is to be decoded from it; None: the same.
+
+    Raises:
+        ConfigError: Windows are to be cut by the number of events, and there is none.
+    """
+    settings, seen = folder.config.pretrain, read_recording(data_file(folder, split))
+    if settings.windows == "count" and not len(seen.events):
+        rule = "count needs events, and none were recorded; lower camera.contrast_threshold, or take mixed"
+        raise ConfigError(f"pretrain.windows: {rule}")
+    return seen, read_recording(data_file(folder, f"{split}_true")) if settings.denoise else None
 
 
 def check_data(folder: Run) -> None:
@@ -270,22 +279,21 @@ def _window_by_time(recording: Recording, most_events: int, rng: np.random.Gener
     start, end, episode = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
     step = int(rng.integers(len(start)))
     period_us = int(end[step] - start[step])
+    first, last = (int(np.searchsorted(episode, episode[step], side)) for side in ("left", "right"))
+    begin_us, end_us = int(start[first]), int(end[last - 1])
     ratio = np.exp(rng.uniform(np.log(MIN_STEPS), np.log(MAX_STEPS)))
-    window_us = max(1, round(period_us * ratio))
-    last = int(np.searchsorted(episode, episode[step], side="right")) - 1
+    window_us = min(max(1, round(period_us * ratio)), end_us - begin_us)
     start_us = int(start[step]) + int(rng.integers(period_us))
-    start_us = min(start_us, int(end[last]) - window_us)
-    first = int(np.searchsorted(episode, episode[step]))
-    start_us = max(start_us, int(start[first]))
+    start_us = max(min(start_us, end_us - window_us), begin_us)
     return cut_window(recording, start_us, window_us, most_events)
 
 
 def _window_by_count(recording: Recording, num_events: int, rng: np.random.Generator) -> Window:
-    t_us, start, episode = recording.t_us, recording.index["step_t_us"], recording.index["step_flight"]
+    t_us, start, episode = recording.events["t"], recording.index["step_t_us"], recording.index["step_flight"]
     first = int(rng.integers(len(t_us)))
     step = int(np.searchsorted(start, t_us[first], side="left")) - 1
     last_step = int(np.searchsorted(episode, episode[step], side="right")) - 1
-    episode_end = int(np.searchsorted(t_us, recording.index["step_end_us"][last_step], side="right"))
+    episode_end = recording.count_until(int(recording.index["step_end_us"][last_step]))
     stop = min(first + num_events, episode_end)
     start_us = int(t_us[first]) - 1
     return recording.events[first:stop], start_us, int(t_us[stop - 1]) - start_us
@@ -293,7 +301,7 @@ def _window_by_count(recording: Recording, num_events: int, rng: np.random.Gener
 
 def cut_window(recording: Recording, start_us: int, window_us: int, most_events: int) -> Window:
     """The newest `most_events` of the events with start_us < t <= start_us + window_us."""
-    first, stop = np.searchsorted(recording.t_us, [start_us, start_us + window_us], side="right")
+    first, stop = (recording.count_until(t_us) for t_us in (start_us, start_us + window_us))
     return recording.events[max(first, stop - most_events) : stop], start_us, window_us
 
 
@@ -312,11 +320,14 @@ def held_out_windows(
 ) -> HeldOut:
     """Fixed windows of unseen episodes, one and four control steps long, and what each is to decode to."""
     rng = np.random.default_rng(0)
-    start, end = recording.index["step_t_us"], recording.index["step_end_us"]
+    start, end, episode = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    following = np.searchsorted(episode, episode, side="right")  # the first step of the next episode
+    room = np.append(start, NEVER_US)[following] - start
     windows: HeldOut = {}
     for name, steps in (("step", 1), ("four_steps", 4)):
         chosen = rng.choice(len(start), VALIDATION_WINDOWS)
-        spans = [(int(start[step]), steps * int(end[step] - start[step])) for step in chosen]
+        lengths = np.minimum(steps * (end - start), room)
+        spans = [(int(start[step]), int(lengths[step])) for step in chosen]
         cut = [cut_window(recording, begin, span, settings.window_events) for begin, span in spans]
         decoded = cut if true is None else true_windows(true, cut, settings.window_events)
         windows[name] = batch_windows(cut, grid), batch_windows(decoded, grid)

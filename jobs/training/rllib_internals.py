@@ -13,12 +13,10 @@ TESTED_RAY = "2.60.0"
 # Of a SingleAgentEnvRunner.
 ENV_RUNNER = (
     "_callbacks",
-    "_done_episodes_for_metrics",
     "_increase_sampled_metrics",
     "_log_env_steps",
     "_metrics_num_env_steps_sampled",
     "_needs_initial_reset",
-    "_ongoing_episodes_for_metrics",
     "_sample",
     "_seed",
     "_weights_seq_no",

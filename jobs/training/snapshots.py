@@ -56,7 +56,8 @@ def write_snapshots(checkpoint: Path, snapshots: dict[str, Snapshot]) -> None:
     for name, snapshot in snapshots.items():
         # NaN is no JSON, but Python reads and writes it.
         (folder / f"{name}.json").write_text(json.dumps(snapshot.values))
-        np.savez_compressed(folder / f"{name}.npz", **snapshot.arrays)  # type: ignore[arg-type]
+        # Not compressed: that takes a second for 20 MB, of gigabytes that hardly shrink, while all wait.
+        np.savez(folder / f"{name}.npz", **snapshot.arrays)  # type: ignore[arg-type]
     write_json(folder / ABOUT, {"layout": LAYOUT, "processes": list(snapshots)})
 
 

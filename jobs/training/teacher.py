@@ -27,17 +27,16 @@ class TeacherEnvRunner(PlainEnvRunner):
 
     def costs(self) -> np.ndarray:
         """What each action costs where it is taken, float64 (N, actions): now, but for a delay of actions."""
-        return np.stack([self._costs(row) for row in range(self.env.num_envs)])
+        sight_m = self.config.learner_config_dict.get(SIGHT_M, math.inf)
+        return np.stack([self._costs(row, sight_m) for row in range(self.env.num_envs)])
 
-    def _costs(self, row: int) -> np.ndarray:
+    def _costs(self, row: int, sight_m: float) -> np.ndarray:
         env = self.env.unwrapped.envs[row]
         scene, plan = self._plans.get(row, (None, None))
         if plan is None or scene is not env.scene:
             plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
             self._plans[row] = env.scene, plan
-        sight_m = self.config.learner_config_dict.get(SIGHT_M, math.inf)
-        x_m, y_m = env.place_of_action()
-        return plan.of_actions(x_m, y_m, sight_m)
+        return plan.of_actions(*env.place_of_action(), sight_m)
 
 
 class PricedEnvRunner(TeacherEnvRunner):

@@ -225,7 +225,7 @@ def thin(batch: EventBatch, most: int) -> EventBatch:
     window = np.repeat(np.arange(len(batch)), kept)
     place = np.arange(offsets[-1]) - offsets[window]
     chosen = batch.offsets[window] + (2 * place + 1) * counts[window] // (2 * kept[window])
-    return EventBatch(batch.grid, batch.code[chosen], batch.bin[chosen], offsets)
+    return EventBatch.known(batch.grid, np.stack([batch.code[chosen], batch.bin[chosen]]), offsets)
 
 
 def event_rows(batch: EventBatch, size: int) -> np.ndarray:
@@ -263,8 +263,7 @@ def batch_rows(rows: np.ndarray, grid: Grid) -> EventBatch:
         kind, time, x, y = rows.reshape(-1, 4)[bad].tolist()
         rule = f"need kind 0, 1 or 2, time < {grid.time_bins}, x < {grid.width}, y < {grid.height}"
         raise ValueError(f"row {bad} of events has kind={kind}, time={time}, x={x}, y={y}: {rule}")
-    code, time_bins = address[:, : offsets[-1]]
-    return EventBatch(grid, code, time_bins, offsets)
+    return EventBatch.known(grid, address[:, : offsets[-1]], offsets)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -196,6 +196,22 @@ def test_events_that_a_window_cannot_hold_are_counted():
     assert np.array_equal(window[1:, 1], env.events["x"][-5:])
 
 
+def test_what_the_neighbour_filter_removes_is_not_counted_as_lost():
+    faults = FaultsConfig(background_activity=0.5)
+    env = CorridorEnv(faults=faults, filter_support=1, window_capacity=60)
+    many = CorridorVectorEnv(2, faults=faults, filter_support=1, window_capacity=60)
+    env.reset(seed=1)
+    many.reset(seed=[1, 2])
+    lost = 0
+    for _ in range(20):
+        window, *_, info = env.step(0)
+        _, *_, infos = many.step(np.array([0, 0]))
+        assert info["dropped_events"] == window[0, 1] == infos["dropped_events"][0]
+        assert info["num_events"] > len(env.seen_events)
+        lost += info["dropped_events"]
+    assert lost > 0
+
+
 @pytest.mark.parametrize("faults", [FaultsConfig(), FAULTY])
 def test_the_same_seed_gives_the_same_bytes(faults):
     actions = np.random.default_rng(0).integers(0, 3, 60)

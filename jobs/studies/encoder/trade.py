@@ -154,7 +154,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
     with progress("Record other scenes", steps * len(OTHER_SCENES), "steps") as advance:
         for scene in OTHER_SCENES:
             world = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
-            recording, _ = record([(world, steps)], config.seed, advance)
+            (recording,) = record([(world, steps)], config.seed, advance)
             scenes[scene] = held_out_windows(recording, config.pretrain, evae.grid)["four_steps"][0]
     shares = {scene: explained(evae, batch) for scene, batch in scenes.items()}
     rows = {

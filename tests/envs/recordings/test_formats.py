@@ -37,7 +37,7 @@ def test_a_recording_without_events_is_read_too(tmp_path):
 
 
 def test_milliseconds_point_at_the_first_event_not_before_them(recording):
-    t_us = recording.t_us - recording.t_us[0]
+    t_us = recording.events["t"] - recording.events["t"][0]
     index = milliseconds_to_index(t_us)
     for ms, first in enumerate(index):
         assert t_us[first] >= 1000 * ms

@@ -3,6 +3,7 @@ import math
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from mlflow.exceptions import MlflowException
@@ -48,6 +49,15 @@ def test_what_is_logged_can_be_read_back(folder, tmp_path):
     assert {file.path for file in tracker.client.list_artifacts(tracker.run_id, "eval")} == {
         "eval/table.md", "eval/results.json", "eval/note.txt"
     }  # fmt: skip
+
+
+def test_a_table_takes_the_place_of_an_earlier_one(folder, tmp_path):
+    with open_tracker(folder.config, folder, key="tables") as tracker:
+        for rates in ([0.2, 1.0], [0.5, 0.9, 0.1]):
+            names = ["policy", "oracle", "straight"][: len(rates)]
+            tracker.table("eval/results", {"agent": names, "success_rate": rates})
+    file = tracker.client.download_artifacts(tracker.run_id, "eval/results.json", str(tmp_path))
+    assert pd.read_json(file, orient="split").to_dict("list") == {"agent": names, "success_rate": rates}
 
 
 def test_reopening_continues_the_same_run(folder):

@@ -5,12 +5,14 @@ import pytest
 
 from envs.config import EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
+from envs.events import EVENT
 from envs.recordings import read_recording
 from jobs.config.config import ConfigError
 from jobs.rollout.agents import PolicyAgent
 from jobs.run.folder import finish, locate_run, open_run
 from jobs.training import collect
-from jobs.training.collect import EPISODE_GAP_US, check_policy, record
+from jobs.training.collect import EventBlock, check_policy, record
+from jobs.training.real_recordings import GAP_US
 from tests.support.configs import small_config
 from tests.support.policies import kinds, save_untrained
 
@@ -29,9 +31,24 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(recording):
     assert record(flights(), 1, lambda count: None)[0].events.tobytes() != recording.events.tobytes()
 
 
+def test_a_block_of_events_grows_to_all_that_was_added():
+    rng, block, expected, clock_us = np.random.default_rng(0), EventBlock(), [np.empty(0, EVENT)], 0
+    for size in (0, 3, 70_000, 1, 40_000, 90_000):
+        parts = [np.zeros(size, EVENT), np.zeros(0, EVENT), np.zeros(2, EVENT)]
+        for part in parts:
+            part["t"], part["x"] = np.arange(len(part)), rng.integers(64, size=len(part))
+        block.add(parts, clock_us)
+        expected.append(np.concatenate(parts))
+        expected[-1]["t"] += clock_us
+        clock_us += 100_000
+    assert block.events.tobytes() == np.concatenate(expected).tobytes()
+    block.add([], 0)
+    assert len(block.events) == sum(map(len, expected))
+
+
 def test_what_is_recorded_before_the_faults_is_what_a_sensor_without_any_sees(recording):
     faults = FaultsConfig(sparsity=0.4, background_activity=0.2, hot_pixel_share=0.01, hot_pixel_hz=200.0)
-    seen, true = record(flights(faults=faults, filter_support=1), 0, lambda count: None)
+    seen, true = record(flights(faults=faults, filter_support=1), 0, lambda count: None, keep_true=True)
     assert true.events.tobytes() == recording.events.tobytes()
     assert seen.events.tobytes() != true.events.tobytes()
     for name, places in recording.index.items():
@@ -40,7 +57,7 @@ def test_what_is_recorded_before_the_faults_is_what_a_sensor_without_any_sees(re
 
 def test_each_episode_draws_its_condition():
     conditions = [{"env.control_hz": 100.0}, {"env.control_hz": 400.0}]
-    made, _ = record(flights(), 0, lambda count: None, conditions=conditions)
+    (made,) = record(flights(), 0, lambda count: None, conditions=conditions)
     lasting = made.index["step_end_us"] - made.index["step_t_us"]
     assert set(lasting) == {10_000, 2_500}
     episode = made.index["step_flight"]
@@ -66,19 +83,19 @@ def test_every_event_lies_in_a_step_and_no_step_spans_two_flights(recording):
     assert np.all(end > start)
     same = flight[1:] == flight[:-1]
     assert np.all(start[1:][same] == end[:-1][same])
-    assert np.all(start[1:][~same] == end[:-1][~same] + EPISODE_GAP_US)
-    step = np.searchsorted(start, recording.t_us, side="left") - 1
-    assert np.all(recording.t_us <= end[step])
+    assert np.all(start[1:][~same] == end[:-1][~same] + GAP_US)
+    step = np.searchsorted(start, recording.events["t"], side="left") - 1
+    assert np.all(recording.events["t"] <= end[step])
 
 
 def test_events_are_in_time_order_and_on_the_sensor(recording):
-    assert np.all(np.diff(recording.t_us) >= 0)
+    assert np.all(np.diff(recording.events["t"]) >= 0)
     assert recording.events["x"].max() < 64
     assert len(recording.events) > 900 * 50
 
 
 def test_splits_share_no_flight(recording):
-    other, _ = record(flights(split="validation"), 0, lambda count: None)
+    (other,) = record(flights(split="validation"), 0, lambda count: None)
     assert other.events.tobytes() != recording.events.tobytes()
 
 
@@ -124,7 +141,7 @@ def test_a_policy_flies_its_share_of_the_steps_in_corridors_of_its_own(policy, m
     assert mixed.about["policy"] == str(policy)
     assert mixed.about["policy_share"] == 1 / 3
     assert len(mixed.index["step_t_us"]) == 900
-    assert np.all(np.diff(mixed.t_us) >= 0)
+    assert np.all(np.diff(mixed.events["t"]) >= 0)
 
 
 def test_the_random_flights_are_those_of_a_recording_without_a_policy(recording, policy):
@@ -142,7 +159,7 @@ def test_a_policy_draws_its_actions_and_the_same_seed_gives_the_same_bytes(polic
 def test_flights_of_a_policy_that_sees_pictures_are_recorded_with_their_events(tmp_path):
     rgb = save_untrained(tmp_path, name="rgb")
     flown = record([(EnvConfig(), 40)], 0, lambda count: None, rgb, 1.0)[0]
-    steps = np.unique(np.searchsorted(flown.index["step_t_us"], flown.t_us))
+    steps = np.unique(np.searchsorted(flown.index["step_t_us"], flown.events["t"]))
     assert len(steps) > 30, "there are events in nearly every step"
 
 

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from envs.config import EnvConfig, FaultsConfig
+from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from jobs.config.config import ConfigError
 from jobs.config.schema import PretrainConfig
 from jobs.run.folder import open_run
 from jobs.training.collect import record
 from jobs.training.pretrain import (
     THREADS,
+    VALIDATION_WINDOWS,
     EvaeTraining,
     beta,
     check_sources,
@@ -62,6 +63,19 @@ def test_windows_hold_what_they_say_and_stay_in_one_flight(recording, settings):
         first = int(np.searchsorted(start, start_us, side="right")) - 1
         last = int(np.searchsorted(end, start_us + window_us, side="left"))
         assert flight[max(first, 0)] == flight[last]
+
+
+def test_windows_at_slow_control_end_before_the_next_flight_begins():
+    slow = EnvConfig(observation="events", control_hz=2.0, speed_mps=8.0)
+    flown = record([(slow, 30)], 0, lambda count: None)[0]
+    start, end, flight = (flown.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
+    assert flight[-1] > 0
+    for _, start_us, window_us in sample_windows(flown, SETTINGS, 500, np.random.default_rng(1)):
+        step = int(np.searchsorted(start, start_us, side="right")) - 1
+        last = int(np.searchsorted(flight, flight[step], side="right")) - 1
+        assert 0 < window_us <= end[last] - start_us
+    held_out = held_out_windows(flown, SETTINGS, EventVAE(context=64).grid)
+    assert all(len(seen) == VALIDATION_WINDOWS for seen, _ in held_out.values())
 
 
 def test_mixed_windows_last_from_half_a_step_to_eight_steps(recording):
@@ -192,6 +206,32 @@ def test_a_refresh_begins_with_the_weights_of_the_encoder_that_is_named(tmp_path
     check_sources(config)  # pretrained already: the encoder is no longer needed
 
 
+def test_a_refresh_whose_checkpoints_are_all_damaged_begins_with_the_named_encoder_again(tmp_path):
+    torch.manual_seed(7)
+    evae, run_folder = EventVAE(context=64, latent=32, target="occupancy"), tmp_path / "before"
+    save_encoder(run_folder / "encoder" / "encoder.safetensors", evae, {})
+    config = refreshing(tmp_path, str(run_folder))
+    folder = open_run(config)
+    prepare_encoder(config, folder, Listener())
+    (folder.path / "stages" / "pretrain.json").unlink()
+    for checkpoint in checkpoints(folder.encoder):
+        checkpoint.write_bytes(b"damaged")
+    file = prepare_encoder(config, folder, Listener())
+    for name, value in load_encoder(file)[0].named_parameters():
+        torch.testing.assert_close(value, evae.state_dict()[name], atol=1e-6, rtol=0)
+
+
+def test_windows_of_so_many_events_need_a_recording_with_some(tmp_path):
+    config = refreshing(tmp_path, None)
+    config = dataclasses.replace(
+        config,
+        env=dataclasses.replace(config.env, camera=CameraConfig(contrast_threshold=10.0)),
+        pretrain=dataclasses.replace(config.pretrain, windows="count"),
+    )
+    with pytest.raises(ConfigError, match=r"pretrain\.windows: count needs events, and none were recorded"):
+        prepare_encoder(config, open_run(config), Listener())
+
+
 def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anything_is_made(tmp_path):
     save_encoder(tmp_path / "encoder.safetensors", EventVAE(context=64, latent=32, target="signed"), {})
     rules = {
@@ -221,13 +261,13 @@ def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
 
 def test_an_encoder_that_denoises_decodes_the_events_before_the_faults():
     noisy = EnvConfig(observation="events", faults=FaultsConfig(sparsity=0.5, background_activity=1.0))
-    seen, true = record([(noisy, 300)], 0, lambda count: None)
+    seen, true = record([(noisy, 300)], 0, lambda count: None, keep_true=True)
     rng = np.random.default_rng(0)
     windows = sample_windows(seen, SETTINGS, 200, rng)
     found = true_windows(true, windows, SETTINGS.window_events)
     for (events, start_us, window_us), (clean, begin_us, length_us) in zip(windows, found, strict=True):
         assert (start_us, window_us) == (begin_us, length_us)
-        times = true.t_us[(true.t_us > start_us) & (true.t_us <= start_us + window_us)]
+        times = true.events["t"][(true.events["t"] > start_us) & (true.events["t"] <= start_us + window_us)]
         if len(events) == SETTINGS.window_events:  # the window begins with its oldest event
             times = times[times >= events["t"][0]]
         assert np.array_equal(clean["t"], times)

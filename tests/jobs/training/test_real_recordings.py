@@ -74,11 +74,11 @@ def test_parts_follow_a_recording_as_flights_of_its_own(tmp_path):
     assert joined.about["recordings"] == ["bar.npz", "bar.npz"]
     assert joined.about["sensor"] == flown.about["sensor"]
     np.testing.assert_array_equal(joined.events[: len(flown.events)], flown.events)
-    assert (np.diff(joined.t_us) >= 0).all()
+    assert (np.diff(joined.events["t"]) >= 0).all()
     changes = np.flatnonzero(np.diff(flight))
     np.testing.assert_array_equal(start[changes + 1] - end[changes], GAP_US)
-    step = np.searchsorted(start, joined.t_us, side="left") - 1
-    assert (joined.t_us <= end[step]).all()
+    step = np.searchsorted(start, joined.events["t"], side="left") - 1
+    assert (joined.events["t"] <= end[step]).all()
 
 
 def test_windows_are_drawn_from_recordings_alone(tmp_path):

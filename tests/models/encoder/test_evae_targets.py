@@ -1,10 +1,12 @@
+from typing import get_args
+
 import numpy as np
 import pytest
 import torch
 
 from models.encoder.evae import event_targets, pictures, reconstruct, target_shape
 from models.encoder.event_batch import EventBatch, batch_windows
-from models.kinds import TARGETS
+from models.kinds import Target
 from tests.support.encoders import bars, events, small
 
 
@@ -47,7 +49,7 @@ def test_the_counts_target_counts_every_event_of_a_cell_once():
     assert torch.allclose(picture, expected)
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("target", get_args(Target))
 def test_every_target_has_its_shape_its_decoder_and_a_picture_of_the_sensors_size(target):
     evae = small(target=target)
     batch = bars(evae, 3, np.random.default_rng(0))
