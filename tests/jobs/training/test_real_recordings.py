@@ -66,7 +66,7 @@ def test_no_time_is_lost_and_none_is_in_both_parts(tmp_path, control_hz):
 def test_parts_follow_a_recording_as_flights_of_its_own(tmp_path):
     write_events(tmp_path / "bar.npz", bright_bar(), 128, 100)
     part = read_recorded(tmp_path / "bar.npz", ENV, 0.5)["train"]
-    flown, _ = collect.record([(ENV, 60)], 0, lambda count: None)
+    (flown,) = collect.record([(ENV, 60)], 0, lambda count: None)
     joined = with_recorded(flown, [(part, 20), (part, 10**6)])
     start, end, flight = (joined.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
     assert len(start) == 60 + 20 + len(part.ends_us)
