@@ -36,7 +36,8 @@ class TeacherEnvRunner(PlainEnvRunner):
         if plan is None or scene is not env.scene:
             plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
             self._plans[row] = env.scene, plan
-        return plan.of_actions(*env.place_of_action(), sight_m)
+        x_m, y_m = env.place_of_action()
+        return plan.of_actions(x_m, y_m, sight_m)
 
 
 class PricedEnvRunner(TeacherEnvRunner):
