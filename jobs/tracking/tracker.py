@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+import pandas as pd
+
 from envs.checks import replaced
 from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
@@ -170,8 +172,8 @@ class Tracker:
         if f"{name}.json" not in written:
             self.client.log_table(self.run_id, dict(columns), f"{name}.json")
         else:  # to which MLflow would append
-            rows = [list(row) for row in zip(*columns.values(), strict=True)]
-            self.client.log_dict(self.run_id, {"columns": list(columns), "data": rows}, f"{name}.json")
+            text = pd.DataFrame(dict(columns)).to_json(orient="split", index=False)
+            self.client.log_text(self.run_id, text, f"{name}.json")
 
     def artifact(self, path: Path, folder: str | None = None) -> None:
         """Write a file, as it is, into a folder of the run's artifacts."""

@@ -150,7 +150,7 @@ class ImitationLearner(PlainPPOLearner):
         self._lessons.load(arrays)
 
     def _threads(self) -> int:
-        """As many as there are env runners, which wait meanwhile; minibatches are large enough to share."""
+        """Those of `shared_threads` for dense networks too: minibatches of 512 rows are worth it."""
         return shared_threads(self.config)
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:

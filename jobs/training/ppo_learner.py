@@ -45,7 +45,7 @@ READ = (
 GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
 # Of a minibatch, in the order in which `update_dense` returns them.
 FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
-MOST_THREADS = 8  # of a learner
+MOST_THREADS = 8
 MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
 # Of the learner's own settings: it multiplies rewards; episodes keep the true ones.
 REWARD_SCALE = "reward_scale"
@@ -85,9 +85,10 @@ def shaping(potentials: np.ndarray, terminated: bool, gamma: float) -> np.ndarra
 
 
 def shared_threads(config: Any) -> int:
-    """Threads of a learner's matrix products while the env runners wait: as many, whatever the machine.
+    """Threads of a learner while the env runners wait: one for each of them, at most `MOST_THREADS`.
 
-    The order of sums follows the number, so that a training resumed elsewhere must have the same.
+    The number of cores does not count: sums are added in another order by other threads, and a training
+    that is resumed on another machine must give the same weights.
     """
     return max(1, min(config.num_env_runners, MOST_THREADS))
 

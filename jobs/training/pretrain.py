@@ -131,7 +131,9 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
         return done
     settings = config.pretrain
     check_data(folder)
-    (train, true), (validation, validation_true) = (read_split(folder, split) for split in SPLITS)
+    (train, true), (validation, validation_true) = (
+        read_split(folder, split, settings.denoise) for split in SPLITS
+    )
     training = EvaeTraining.begin(evae_settings(config), train, settings, (config.seed, 2), true)
     evae, first = training.evae, restore(folder.encoder, training)
     begin = initial_state(folder)  # none where a checkpoint was restored; a damaged one is gone by now
@@ -169,17 +171,10 @@ def threads() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def read_split(folder: Run, split: str) -> tuple[Recording, Recording | None]:
-    """What was recorded of a split, and what is to be decoded from it; None: the same.
-
-    Raises:
-        ConfigError: Windows are to be cut by the number of events, and there is none.
-    """
-    settings, seen = folder.config.pretrain, read_recording(data_file(folder, split))
-    if settings.windows == "count" and not len(seen.events):
-        rule = "count needs events, and none were recorded; lower camera.contrast_threshold, or take mixed"
-        raise ConfigError(f"pretrain.windows: {rule}")
-    return seen, read_recording(data_file(folder, f"{split}_true")) if settings.denoise else None
+def read_split(folder: Run, split: str, denoise: bool) -> tuple[Recording, Recording | None]:
+    """What was recorded of a split, and, to `denoise`, what is to be decoded from it."""
+    seen = read_recording(data_file(folder, split))
+    return seen, read_recording(data_file(folder, f"{split}_true")) if denoise else None
 
 
 def check_data(folder: Run) -> None:
@@ -225,7 +220,16 @@ class EvaeTraining:
         seed: tuple[int, int],
         true: Recording | None = None,
     ) -> "EvaeTraining":
-        """A training from random weights; `seed` is that of the experiment and the number of its stream."""
+        """A training from random weights; `seed` is that of the experiment and the number of its stream.
+
+        Raises:
+            ConfigError: Windows are to hold a number of events, and the recording has none.
+        """
+        if settings.windows == "count" and not len(recording.events):
+            rule = (
+                "count needs events, and none were recorded; lower camera.contrast_threshold, or take mixed"
+            )
+            raise ConfigError(f"pretrain.windows: {rule}")
         torch.manual_seed(seed[0])
         evae = EventVAE.of(model)
         optimizer = torch.optim.Adam(

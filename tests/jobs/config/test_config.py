@@ -146,10 +146,10 @@ def test_ppo_is_the_papers():
     }
 
 
-STUDIES = "_ablation", "_claims"  # lengths of studies, which name an algorithm no more
+OF_EXPERIMENTS = "_ablation", "_claims", "_hold"  # lengths that name an experiment instead of an algorithm
 
 
-@pytest.mark.parametrize("length", [name for name in options("length") if not name.endswith(STUDIES)])
+@pytest.mark.parametrize("length", [name for name in options("length") if not name.endswith(OF_EXPERIMENTS)])
 def test_an_algorithm_trains_as_long_as_it_needs_in_each_budget(length):
     budget, _, algo = length.partition("_")
     told = compose("+exp=bytestream", f"budget={budget}", f"algo={algo}")
@@ -162,6 +162,16 @@ def test_an_algorithm_trains_as_long_as_it_needs_in_each_budget(length):
         ]
         == 7
     )
+
+
+def test_an_experiment_with_a_length_of_its_own_is_as_short_as_others_in_a_smoke_test():
+    own, usual = (
+        compose(f"+exp={name}", "budget=smoke") for name in ("bytestream_hold", "bytestream_imitation")
+    )
+    assert own["train"]["env_steps"] == usual["train"]["env_steps"]
+    assert own["algo"]["imitation"]["final_steps"] == usual["algo"]["imitation"]["final_steps"]
+    short = compose("+exp=bytestream_hold")
+    assert short["train"]["env_steps"] > compose("+exp=bytestream_imitation")["train"]["env_steps"]
 
 
 def test_wrong_settings_of_imitation_are_refused_by_name():
