@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from envs.event_error import measure_event_error
 from jobs.config.plugins import one_line
@@ -17,6 +16,7 @@ from jobs.rollout.store import EpisodeStore, PartResult, SimulationAccuracy
 from jobs.rollout.tasks import EvaluationTask
 from jobs.run.progress import console
 from jobs.run.provenance import git_commit
+from jobs.run.torch_threads import torch_threads
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,9 @@ Executor = Callable[[Sequence[Part], Recorder], None]
 
 def run_serially(parts: Sequence[Part], recorder: Recorder) -> None:
     """Evaluate one part after the other in this process, with one thread as a worker has."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with torch_threads(1):
         for part in parts:
             recorder.finish(part, attempt(functools.partial(evaluate_part, part)))
-    finally:
-        torch.set_num_threads(threads)
 
 
 def attempt(evaluation: Callable[[], PartResult]) -> PartResult | str:

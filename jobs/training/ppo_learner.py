@@ -28,6 +28,7 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
+from jobs.run.torch_threads import torch_threads
 from jobs.training.rllib_internals import LEARNER, require
 from jobs.training.teacher import log_costs
 from models.policy.dense_update import Rows, Settings, update_dense
@@ -138,7 +139,6 @@ class PlainPPOLearner(PPOTorchLearner):
         Raises:
             RuntimeError: A gradient is not finite; the weights are those before it.
         """
-        torch.set_num_threads(self._threads())
         counters = dict(timesteps or {})
         self.before_gradient_based_update(timesteps=counters)
         training_data = training_data or TrainingData(episodes=episodes)
@@ -147,9 +147,10 @@ class PlainPPOLearner(PPOTorchLearner):
         self._weights_seq_no += 1
         before = counters.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0) - sum(map(len, training_data.episodes))
         self._warming_up = before < self.config.learner_config_dict.get(VALUE_WARMUP, -math.inf)
-        rows = self._rows(training_data.episodes)
-        count = len(rows[Columns.ACTIONS])
-        figures = self._improve(rows, num_epochs, minibatch_size or count)
+        with torch_threads(self._threads()):
+            rows = self._rows(training_data.episodes)
+            count = len(rows[Columns.ACTIONS])
+            figures = self._improve(rows, num_epochs, minibatch_size or count)
         self.metrics.log_dict(figures, key=DEFAULT_MODULE_ID, window=1)
         steps = SampleBatch({Columns.ACTIONS: rows[Columns.ACTIONS]})
         self._log_steps_trained_metrics(MultiAgentBatch({DEFAULT_MODULE_ID: steps}, env_steps=count))

@@ -6,11 +6,10 @@ with its manifest, and `encoder/reconstructions.png`, in the run folder. A kille
 continues from its last checkpoint.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from jobs.run.checkpoints import UNSEALED, damage
 from jobs.run.files import RunError, write_atomic
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console, progress
+from jobs.run.torch_threads import torch_threads
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.collect import check_collect, collect, data_file
 from models.encoder.evae import (
@@ -142,7 +142,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     held_out = held_out_windows(validation, settings, evae.grid, validation_true)
     latest: dict[str, float] = {}
     title = "Pretrain the event VAE"
-    with threads(), progress(title, settings.iterations, "iterations", done=first) as advance:
+    with torch_threads(THREADS), progress(title, settings.iterations, "iterations", done=first) as advance:
         for iteration in range(first, settings.iterations):
             losses = training.step(iteration)
             last = iteration + 1 == settings.iterations
@@ -158,17 +158,6 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
             measured = f", held out {latest['explained_loss_step']:.0%} explained" if latest else ""
             advance(1, note=f"loss {losses['loss']:.4f}{measured}")
     return freeze(config, folder, tracker, evae, train.about, held_out)
-
-
-@contextlib.contextmanager
-def threads() -> Iterator[None]:
-    """Let torch take `THREADS` threads: nothing else of a job runs meanwhile."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(THREADS)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def read_split(folder: Run, split: str, denoise: bool) -> tuple[Recording, Recording | None]:

@@ -9,8 +9,15 @@ import pytest
 from tests.support.clusters import TOKEN, cluster  # noqa: F401  a fixture
 from tests.support.faults import DEADLINE_S, TABLE
 
-# Ray reads them once in a process, whichever of its tests comes first; jobs make their own.
-os.environ.update(TOKEN)
+
+@pytest.fixture(scope="session", autouse=True)
+def token():
+    """Ray reads it once in a process, whichever of its tests comes first; jobs make their own.
+
+    Not when this file is imported: it is when any test is collected, and a local Ray of another test,
+    already imported without a token, could not be reached with it.
+    """
+    os.environ.update(TOKEN)
 
 
 def pytest_collection_modifyitems(items):

@@ -9,6 +9,7 @@ from safetensors.numpy import load_file
 
 from jobs.run.files import RunError, read_json, write_json
 from jobs.run.ray_cluster import start_ray
+from jobs.run.torch_threads import torch_threads
 from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.ppo import build_ppo
 from jobs.training.snapshots import FOLDER, generators, set_generators
@@ -121,14 +122,16 @@ def test_a_training_goes_on_from_its_checkpoint_with_the_same_bytes(name, runner
 
 def test_a_training_that_is_never_saved_has_the_same_bytes(tmp_path):
     _, _, make = built(tmp_path, "event_columns")
-    one, other = make(), None
-    told = rows(one, 3)
-    one.stop()
-    other = make()
-    pieces = []
-    for k in range(3):
-        pieces += json.loads(rows(other, 1))
-        saved(other, tmp_path / str(k))
+    with torch_threads(3):  # the learner takes one, whatever the process has, and gives them back
+        one, other = make(), None
+        told = rows(one, 3)
+        one.stop()
+        assert torch.get_num_threads() == 3
+        other = make()
+        pieces = []
+        for k in range(3):
+            pieces += json.loads(rows(other, 1))
+            saved(other, tmp_path / str(k))
     assert json.dumps(pieces) == told
     assert_same(one, other)
     other.stop()

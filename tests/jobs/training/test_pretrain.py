@@ -10,7 +10,6 @@ from jobs.config.schema import PretrainConfig
 from jobs.run.folder import open_run
 from jobs.training.collect import record
 from jobs.training.pretrain import (
-    THREADS,
     VALIDATION_WINDOWS,
     EvaeTraining,
     beta,
@@ -24,7 +23,6 @@ from jobs.training.pretrain import (
     run,
     sample_windows,
     save_checkpoint,
-    threads,
     true_windows,
 )
 from models.encoder.evae import EventVAE
@@ -273,10 +271,3 @@ def test_an_encoder_that_denoises_decodes_the_events_before_the_faults():
         assert np.array_equal(clean["t"], times)
     plain, denoising = (trained(seen, 1, true=whole) for whole in (None, true))
     assert not torch.equal(plain.evae.decoder[0].weight, denoising.evae.decoder[0].weight)
-
-
-def test_pretraining_gives_its_threads_back():
-    before = torch.get_num_threads()
-    with threads():
-        assert torch.get_num_threads() == THREADS
-    assert torch.get_num_threads() == before
