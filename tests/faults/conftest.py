@@ -10,14 +10,14 @@ from tests.support.clusters import TOKEN, cluster  # noqa: F401  a fixture
 from tests.support.faults import DEADLINE_S, TABLE
 
 
-@pytest.fixture(scope="session", autouse=True)
-def token():
-    """Ray reads it once in a process, whichever of its tests comes first; jobs make their own.
+def pytest_configure(config):
+    """Ray reads the token once in a process, when it is imported; jobs make their own.
 
-    Not when this file is imported: it is when any test is collected, and a local Ray of another test,
-    already imported without a token, could not be reached with it.
+    Only for the fault tests: this file is loaded when any test of the tree is collected, and a local Ray of
+    another test could not be reached with it.
     """
-    os.environ.update(TOKEN)
+    if config.option.markexpr == "faults":
+        os.environ.update(TOKEN)
 
 
 def pytest_collection_modifyitems(items):
