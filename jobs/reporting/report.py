@@ -34,7 +34,7 @@ from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
 from jobs.reporting.paper_claims import GAIN, UNITS, Claim, Finding
 from jobs.reporting.replay_page import PAGE
-from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, write_data
+from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, replaced_text, write_data
 from jobs.reporting.taught_claims import TAUGHT, write_taught_claims
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.checkpoints import sha256
@@ -105,7 +105,11 @@ def write_trade(trade: Path, docs: Path) -> Path:
     if (trade / "settings.csv").is_file():  # trades of earlier versions have none
         (docs / "data").mkdir(exist_ok=True)
         write_atomic(docs / "data" / "trade_settings.csv", (trade / "settings.csv").read_text())
-    write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
+    text = (trade / "trade.md").read_text()
+    if replaced := replaced_text(read_json(trade / "about.json").get("commit", "")):
+        title, made, rest = text.split("\n\n", 2)
+        text = "\n\n".join((title, f"{made} {replaced}", rest))
+    write_atomic(docs / "trade.md", text)
     return docs / "trade.md"
 
 
@@ -201,6 +205,7 @@ def page_values(
         "about": about,
         "commits": ", ".join(commit[:7] for commit in about["evaluated_at"]),
         "groups": ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
+        "replaced": replaced_text(about["commit"]),
         "short": in_short(about, episodes, changes, findings),
         "breaks": breaks_table(about, changes),
         "tests": len(replicated(changes)),

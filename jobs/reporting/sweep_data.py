@@ -20,6 +20,13 @@ from jobs.run.files import RunError, read_json, write_atomic, write_json
 
 SWEEP = "robustness"  # name of the published data of the sweep that docs/results.md is about
 TRAININGS = "trainings.csv"  # of every published training, how it learnt
+# Commit of a published study -> groups whose trainings in models/pretrained have been replaced since, and the
+# commit that shipped those which were evaluated.
+REPLACED = {
+    "24277db": {"bytestream_hold": "2991870"},  # docs/results.md
+    "81ef066": {"bytestream_hold": "2991870"},  # docs/dose_response.md
+    "28420bd": {"bytestream_hold": "2991870"},  # docs/trade.md
+}
 
 
 def read_sweep(sweep: Path) -> tuple[SweepFacts, SweptEpisodes]:
@@ -82,6 +89,20 @@ def read_data(folder: Path, name: str) -> tuple[SweepFacts, SweptEpisodes]:
     """What `write_data` has written: what made a sweep, and its episodes."""
     about: SweepFacts = read_json(folder / f"{name}_about.json")
     return about, read_sweep_episodes(folder / f"{name}_episodes.csv.gz")
+
+
+def replaced_text(commit: str) -> str:
+    """What a page says of groups whose trainings are not those of models/pretrained; "" if all are.
+
+    Args:
+        commit: Of the study that the page is about.
+    """
+    sentences = [
+        f"`{group}` stands for trainings shipped at commit {shipped}, of an earlier recipe than those in "
+        "`models/pretrained` today."
+        for group, shipped in REPLACED.get(commit[:7], {}).items()
+    ]
+    return " ".join(sentences)
 
 
 def copy_plot(picture: Path, target: Path) -> None:

@@ -7,11 +7,12 @@ from jobs.evaluation.group_stats import episode_values
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.dose_response import DOSES
 from jobs.reporting.headline import BEGIN, COLUMNS, END, headline_table, with_headline
-from jobs.reporting.sweep_data import read_data
-from jobs.run.files import RunError
+from jobs.reporting.sweep_data import read_data, replaced_text
+from jobs.run.files import RunError, read_json
 from jobs.run.provenance import REPOSITORY
 from tests.support.episodes import flights
 
+DATA = {"results": "robustness", "dose_response": DOSES}  # pages and the names of their data
 TRAININGS = REPOSITORY / "docs" / "data" / "robustness_trainings.csv"
 
 
@@ -158,3 +159,30 @@ def test_the_losses_that_the_page_calls_certain_are_those_of_the_data(sweep):
     }
     ends = [[round(100 * part.mean()) for part in (one.before, one.success)] for one in found.values()]
     assert sorted(ends) == [[90, 10], [93, 52]]
+
+
+def test_what_the_readme_says_of_the_papers_claims_is_what_the_results_say():
+    counted = re.search(
+        r"Of the paper's (\d+) claims: (\d+) undecided, (\d+) does not hold, (\d+) equivalent\.",
+        (REPOSITORY / "docs" / "results.md").read_text(),
+    )
+    readme = " ".join((REPOSITORY / "README.md").read_text().split())
+    said = re.search(
+        r"Of the paper's (\d+) claims \[none is confirmed\]\S+ (\d+) are undecided by three "
+        r"trainings a kind, (\d+) do not hold, in (\d+) both kinds do equally well\.",
+        readme,
+    )
+    assert said.groups() == counted.groups()
+    assert sum(map(int, said.groups()[1:])) == int(said[1])
+
+
+@pytest.mark.parametrize(
+    ("page", "commit"),
+    [("results", "24277db"), ("dose_response", "81ef066"), ("trade", "28420bd")],
+)
+def test_a_page_about_trainings_that_have_been_replaced_says_so(page, commit):
+    text = (REPOSITORY / "docs" / f"{page}.md").read_text()
+    assert commit in text or commit in str(read_json(TRAININGS.parent / f"{DATA[page]}_about.json")["commit"])
+    assert replaced_text(commit)
+    assert replaced_text(commit) in text
+    assert replaced_text("0000000") == ""
