@@ -35,7 +35,7 @@ Size = Annotated[int, Field(ge=1, le=65536)]
 TimesMs = Annotated[list[Annotated[float, Field(gt=0, le=1e6)]], Field(max_length=16)]
 
 MAX_ROW_TIME_BINS = 1 << 15  # of an encoder that PPO trains on: events are kept as rows of int16
-MIN_IMAGE = 36  # pixels, of the picture that leaves the third convolution of `nature_cnn` one pixel
+MIN_IMAGE = 36  # pixels, of the picture that leaves the third convolution of `nature_layers` one pixel
 
 
 def _of_a_kind(name: str) -> str:

@@ -110,10 +110,7 @@ def filter_frames(
         for i in range(size):
             rate[i] = black + white * 0.5 * (np.float64(pixels.light[i]) + frames[k, i])
             decay[i] = -min(rate[i] * seconds, MOST_PERIODS)
-        if white > 0.0:
-            exponential(decay, exponents)
-        else:
-            decay[:] = math.exp(decay[0])
+        exponential(decay, exponents)
         for i in range(size):
             slope = pixels.response[i], after[i], rate[i] * seconds
             pixels.filtered[i] = _followed(pixels.filtered[i], slope, decay[i])

@@ -131,9 +131,13 @@ def light_of(curve, levels, exponents):
         for i in range(levels.size):
             levels[i] -= curve.shift
         return
+    first = 0  # of a run above the knee: the exponential is fast over many
     for i in range(levels.size):
-        linear = min(levels[i] - curve.lowest, 0.0) * curve.knee
-        levels[i] = np.exp(max(levels[i], curve.lowest)) + linear
+        if levels[i] < curve.lowest:
+            exponential(levels[first:i], exponents[first:i])
+            levels[i] = curve.knee + (levels[i] - curve.lowest) * curve.knee
+            first = i + 1
+    exponential(levels[first:], exponents[first:])
 
 
 def encoding_tables(encoding: str) -> tuple[np.ndarray, np.ndarray]:

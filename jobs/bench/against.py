@@ -6,6 +6,7 @@ at the same flights, 32 corridors side by side; a ratio is the median over the r
 time over this one's. The event error is that against the converged simulation of the same checkout,
 at tolerance 0.05. By day and night the pixels have bandwidth and mismatch, but no noise. In the last row
 a shipped policy also encodes the windows and decides. Rows that the other commit cannot do are left out.
+Below it stands the memory of a process that does what the last row does, without the converged simulation.
 """
 
 import inspect
@@ -91,6 +92,42 @@ def worker() -> None:
         print(json.dumps([float(np.median(seconds)), error]), flush=True)
 
 
+def fly_alone() -> None:
+    """Fly, encode and decide 200 steps, and print the most memory that this process ever held [MB].
+
+    It runs by its source alone in another checkout, as `worker` does.
+    """
+    import resource
+
+    import numpy as np
+    import torch
+
+    from envs.config import EnvConfig
+    from envs.corridor import CorridorVectorEnv
+    from models.policy import load_policy
+
+    torch.set_num_threads(1)
+    env = CorridorVectorEnv(CORRIDORS, EnvConfig(scene="poles", window_capacity=1024))
+    observations = env.reset(seed=0)[0]
+    policy = load_policy("models/pretrained/bytestream-s0")
+    policy.reset(CORRIDORS)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        policy.logits(observations)
+        observations = env.step(rng.integers(3, size=CORRIDORS))[0]
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
+def memory(folder: Path) -> float:
+    """MB of a process that flies by a checkout, once its kernels are compiled."""
+    code = "\n".join((f"CORRIDORS = {CORRIDORS}", inspect.getsource(fly_alone), "fly_alone()"))
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    command = [sys.executable, "-c", code]
+    for _ in range(2):  # the first compiles, which takes memory
+        said = subprocess.check_output(command, cwd=folder, env=environment, text=True)  # noqa: S603  own code
+    return float(said)
+
+
 class Checkout:
     """A process that flies with the code of one checkout."""
 
@@ -157,8 +194,10 @@ def main() -> None:
         rows = [row for scene in sys.argv[2:] or (*SCENES, *NAMES) for row in compared(scene, here, there)]
         here.end()
         there.end()
+        megabytes = [memory(folder) for folder in (ROOT, place)]
     head = ("scene", "us here", "us there", "there / here", "all rounds", "error here", "error there")
     show_table(f"A control step, against {commit}", head, rows)
+    print(f"Memory of a process: {megabytes[0]:.0f} MB here, {megabytes[1]:.0f} there")
 
 
 if __name__ == "__main__":

@@ -4,14 +4,40 @@ A power failure, a full disk or an interrupted copy leaves files that look right
 differs from what was written is replaced by the newest one that does not.
 """
 
+import contextlib
 import hashlib
 import shutil
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from jobs.run.files import RunError, read_json, write_json
 
 SEAL = "sha256.json"
 UNSEALED = "not sealed"
+UNFINISHED = ".checkpoint-"  # begins the names of folders that checkpoints are made in; `mend` sees none
+
+
+@contextlib.contextmanager
+def unfinished(place: Path | None) -> Iterator[str]:
+    """A folder to make a checkpoint in, beside the finished ones; it goes, whatever ends the block.
+
+    Not in the system's temporary folder, which may be memory, or have less room.
+
+    Args:
+        place: The folder of the finished ones, made if it is missing; None: there is none on this machine,
+            and the system's temporary folder has to do.
+    """
+    if place is not None:
+        place.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=place, ignore_cleanup_errors=True) as folder:
+        yield folder
+
+
+def drop_unfinished(place: Path | None) -> None:
+    """Remove what a process that was killed has left of checkpoints that it was making in a folder."""
+    for left in place.glob(f"{UNFINISHED}*") if place is not None else ():
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def seal(checkpoint: Path) -> None:

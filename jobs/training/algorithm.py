@@ -1,9 +1,10 @@
 """RLlib's PPO, made to end with the same bytes whatever interrupts it."""
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
+import pyarrow.fs
+from ray import tune
 from ray.rllib.algorithms.ppo import PPO as RLlibPPO
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import (
@@ -16,6 +17,7 @@ from ray.rllib.utils.metrics import (
     TIMERS,
 )
 
+from jobs.run.checkpoints import drop_unfinished, unfinished
 from jobs.run.files import RunError
 from jobs.training.env_runner import Part
 from jobs.training.rounds import Rounds
@@ -26,7 +28,25 @@ NOTICE = "notice"  # of a result: what the user has to know, one line
 NEW_EPISODES = "Goes on with new episodes, so that its end will differ from that of an undisturbed training"
 
 
-class PPO(RLlibPPO):
+class Trainable(tune.Trainable):
+    """Tune's, but it makes its checkpoints beside the finished ones, and a save that fails leaves nothing."""
+
+    _storage: Any = None  # Tune's; without Tune there is none
+
+    def checkpoints(self) -> Path | None:
+        """The folder of the finished ones; None without Tune, or where an object store keeps them."""
+        kept = self._storage and isinstance(self._storage.storage_filesystem, pyarrow.fs.LocalFileSystem)
+        return Path(self._storage.trial_fs_path) if kept else None
+
+    def save(self, checkpoint_dir: str | None = None) -> Any:
+        """As Tune's, which copies what it finds in the folder to where it stays."""
+        if checkpoint_dir or not self._storage:
+            return super().save(checkpoint_dir)
+        with unfinished(self.checkpoints()) as folder:
+            return super().save(folder)
+
+
+class PPO(Trainable, RLlibPPO):
     """RLlib's PPO; an error of its construction is raised by the first iteration instead.
 
     Ray ends an actor whose construction failed once everything it owns is released, and env runners
@@ -40,17 +60,11 @@ class PPO(RLlibPPO):
     def setup(self, config: Any) -> None:
         """Build it."""
         try:
+            drop_unfinished(self.checkpoints())
             super().setup(config)
             self._rounds = Rounds(self.env_runner_group)
         except Exception as error:
             self._refused = error
-
-    def save(self, checkpoint_dir: str | None = None) -> Any:
-        """As RLlib's, but its temporary folder goes also where a full disk ends the save."""
-        if checkpoint_dir or not self._storage:
-            return super().save(checkpoint_dir)
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            return super().save(folder)
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Write what the future of the training depends on."""

@@ -22,7 +22,7 @@ OFF_SHARE = 125.0 / 255.0  # of the picture value of ON (appendix D.1.2)
 
 
 class PictureContextNetwork(nn.Module):
-    """Event image to context: three convolutions and a dense layer (Mnih et al., Nature 2015).
+    """Event image to context: the convolutions of `nature_layers`.
 
     Args:
         grid: Sensor size; time is not seen.
@@ -39,14 +39,7 @@ class PictureContextNetwork(nn.Module):
                 f"event images need {MIN_IMAGE} pixels each way, got {grid.width} x {grid.height}"
             )
         self.grid = grid
-        height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in (grid.height, grid.width))
-        self.layers = nn.Sequential(
-            *(nn.Conv2d(1, 32, 8, 4), nn.ReLU()),
-            *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),
-            *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),
-            nn.Flatten(),
-            *(nn.Linear(64 * height * width, context), nn.ReLU()),
-        )
+        self.layers = nn.Sequential(*nature_layers((1, grid.height, grid.width), context))
         for layer in self.layers:
             if isinstance(layer, nn.Conv2d | nn.Linear):  # torch's own weights let sparse pictures fade
                 nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
@@ -55,6 +48,24 @@ class PictureContextNetwork(nn.Module):
     def forward(self, batch: EventBatch) -> Tensor:
         """Context (B, D) of a batch of windows."""
         return self.layers(event_pictures(batch).to(self.layers[0].weight))
+
+
+def nature_layers(shape: Sequence[int], outputs: int) -> list[nn.Module]:
+    """Three convolutions and a dense layer with the sizes of Mnih et al. (Nature 2015).
+
+    Args:
+        shape: Channels, height and width of a picture, `models.kinds.MIN_IMAGE` pixels each way.
+        outputs: Features of the last layer.
+    """
+    channels, *sides = shape
+    height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in sides)
+    return [
+        *(nn.Conv2d(channels, 32, 8, 4), nn.ReLU()),
+        *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),
+        *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),
+        nn.Flatten(),
+        *(nn.Linear(64 * height * width, outputs), nn.ReLU()),
+    ]
 
 
 def last_polarity(batch: EventBatch) -> np.ndarray:

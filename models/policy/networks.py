@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from models.encoder.event_images import nature_layers
 from models.encoder.finetuned import FinetunedEncoder
 from models.encoder.table import dense
 from models.kinds import PolicySpec, resolve
@@ -122,19 +123,10 @@ def widened(network: nn.Module, inputs: int) -> nn.Module:
 def nature_cnn(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
     """Convolutions that policy and value share, over the stacked pictures as channels.
 
-    The sizes are those of Mnih et al. (Nature 2015), as in stable-baselines' CnnPolicy, which
+    They are those of `models.encoder.event_images.nature_layers`, as in stable-baselines' CnnPolicy, which
     appendix D.1.2 names. Pictures need `models.kinds.MIN_IMAGE` pixels each way.
     """
-    stack, *sides = shape
-    height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in sides)
-    trunk = nn.Sequential(
-        Bytes(),
-        *(nn.Conv2d(stack, 32, 8, 4), nn.ReLU()),
-        *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),
-        *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),
-        nn.Flatten(),
-        *(nn.Linear(64 * height * width, CNN_OUTPUTS), nn.ReLU()),
-    )
+    trunk = nn.Sequential(Bytes(), *nature_layers(shape, CNN_OUTPUTS))
     return trunk, nn.Linear(CNN_OUTPUTS, spec.num_actions), nn.Linear(CNN_OUTPUTS, 1)
 
 

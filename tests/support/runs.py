@@ -3,6 +3,7 @@
 import dataclasses
 
 import torch
+from ray.train._internal.storage import StorageContext
 
 from envs.config import sensor_settings, settings_hash
 from jobs.evaluation.sweep_plan import plan_sweep
@@ -39,6 +40,11 @@ def tracked_sweeps(config, kind="condition", parent="sweep"):
         for run in parents
     }
     return client, {parent: {run.info.run_name: run for run in runs} for parent, runs in children.items()}
+
+
+def trial_storage(folder, filesystem=None):
+    """Where Tune keeps a trial: folder / "train" / "trial", of the local file system or another."""
+    return StorageContext(str(folder), "train", storage_filesystem=filesystem, trial_dir_name="trial")
 
 
 def write_networks(folder, config):

@@ -2,23 +2,21 @@
 
 import dataclasses
 import math
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import torch
-from ray import tune
-
 from jobs.config.config import Config
 from jobs.rollout.agents import make_agent
 from jobs.rollout.episodes import roll_out
+from jobs.run.checkpoints import drop_unfinished, unfinished
 from jobs.run.files import read_json, write_atomic, write_json
 from jobs.run.folder import Run
+from jobs.run.torch_threads import torch_threads
 from jobs.studies.search.space import encoder_facts, read_settings, with_settings
 from jobs.tracking.tracker import Tracker
-from jobs.training.algorithm import PPO
+from jobs.training.algorithm import PPO, Trainable
 from jobs.training.ppo import build_ppo
 from jobs.training.pretrain import prepare_encoder
 from jobs.training.train import ENV_STEPS, TrainingError, export_policy, read_metrics
@@ -39,9 +37,10 @@ class Unrecorded:
         return lambda *args, **kwargs: None
 
 
-class SearchTrial(tune.Trainable):
+class SearchTrial(Trainable):
     """Trains with some settings; each step of it ends with a measurement."""
 
+    @torch_threads(1)
     def setup(self, config: dict[str, Any], base: Config, files: Files) -> None:
         """Build the training.
 
@@ -50,7 +49,7 @@ class SearchTrial(tune.Trainable):
             base: The experiment that they change.
             files: An encoder to share or a policy to begin from, by name; empty: there is none.
         """
-        torch.set_num_threads(1)
+        drop_unfinished(self.checkpoints())
         self._steps, self._experiment = 0, with_settings(base, read_settings(config))
         place = Path(self.logdir)
         for name, content in files.items():
@@ -64,6 +63,7 @@ class SearchTrial(tune.Trainable):
         ppo = build_ppo(self._experiment, self._encoder, init)
         self._training = PPO(config=ppo)
 
+    @torch_threads(1)
     def step(self) -> dict[str, Any]:
         """Train up to the next measurement, and measure; a training that has diverged ends at 0 m."""
         asked = self._experiment
@@ -89,7 +89,7 @@ class SearchTrial(tune.Trainable):
         """How the policy does in validation corridors: those of training and evaluation are others."""
         asked = self._experiment
         env = dataclasses.replace(asked.env, split="validation")
-        with tempfile.TemporaryDirectory() as folder:
+        with unfinished(self.checkpoints()) as folder:
             checkpoint, policy = Path(folder, "checkpoint"), Path(folder, "policy")
             self.save_checkpoint(str(checkpoint))
             export_policy(asked, checkpoint, self._encoder, policy, {})

@@ -16,7 +16,6 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import pydantic
-import torch
 
 from envs.config import EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
@@ -34,6 +33,7 @@ from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import console, progress
 from jobs.run.provenance import command, provenance, today
+from jobs.run.torch_threads import torch_threads
 from jobs.studies.encoder.costs import CAPS, TIME_BINS
 from jobs.studies.encoder.trade import EVENT_ENCODERS
 from jobs.studies.replays import Measured, measure_settings
@@ -222,10 +222,10 @@ def measure_plans(
     config: Config, plans: Sequence[Plan], results: Mapping[str, TaskResult]
 ) -> list[list[TradedSetting]]:
     """The rows of each scene: what was evaluated, and cost and errors on recorded episodes."""
-    torch.set_num_threads(1)
     able = [own._replace(tasks=[task for task in own.tasks if task.key in results]) for own in plans]
     seeds = range(config.trade.replays)
-    with progress("Replay", len(seeds) * sum(len(own.tasks) for own in able), "episodes") as advance:
+    total = len(seeds) * sum(len(own.tasks) for own in able)
+    with torch_threads(1), progress("Replay", total, "episodes") as advance:
         measured = [_measured(own, seeds, advance) for own in able]
     found = []
     for scene in dict.fromkeys(config.trade.scenes):

@@ -10,6 +10,8 @@ from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from envs.corridor import CorridorEnv
 from envs.event_error import event_error
 from envs.events import EventCamera
+from envs.events.lowpass import filter_frames, low_pass, start_filter
+from envs.events.photoreceptor import response_curve
 from envs.events.ramps import can_look, look_at
 from tests.support.looks import HEIGHT, WIDTH, Looker
 
@@ -87,6 +89,17 @@ def test_frames_on_a_line_between_two_others_change_nothing(grows):
         camera, _ = shown(values, times, cutoff_hz=30.0, cutoff_grows_with_light=grows, luminance_floor=1e-9)
         results.append(filtered(camera))
     assert np.ptp(results) < (2e-5 if grows else 2e-7)  # the light of an interval is its mean
+
+
+def test_a_bandwidth_that_grows_by_nothing_is_one_that_does_not_grow_to_the_last_bit():
+    frames = np.random.default_rng(0).uniform(0.0, 1.0, (20, 64)).astype(np.float32)
+    times_us, curve, told = 1000 * np.arange(20), response_curve("log", 1e-3), []
+    for growth in (0.0, 1e-300):
+        pixels = low_pass(64)
+        start_filter(frames[0], curve, pixels)
+        seen = filter_frames(frames[1:], times_us, curve, (2 * math.pi * 30.0, growth), pixels)
+        told.append((seen.tobytes(), pixels.filtered.tobytes()))
+    assert told[0] == told[1]
 
 
 def test_in_the_dark_a_photoreceptor_is_slower_as_v2e_has_it():

@@ -49,6 +49,17 @@ def test_a_response_and_its_light_undo_each_other(response):
     assert (np.abs(levels - light) <= 1e-11 * (light + 1e-3)).all()
 
 
+@pytest.mark.parametrize("response", ["log", "lin_log"])
+def test_light_is_by_our_own_exponential_and_the_same_on_every_machine(response):
+    curve = response_curve(response, 1e-3)
+    levels = np.random.default_rng(0).permutation(np.linspace(-9.0, 88.0, 1000))  # the knee is at -6.9
+    expected, dark = levels.copy(), levels < curve.lowest
+    exponential(expected, room(expected))
+    expected[dark] = curve.knee + (levels[dark] - curve.lowest) * curve.knee
+    light_of(curve, levels, room(levels))
+    assert levels.tobytes() == (expected - curve.shift).tobytes()
+
+
 @pytest.mark.parametrize(("encoding", "gamma"), [("linear8", 1.0), ("gamma8", 2.2)])
 def test_eight_bits_round_light_as_the_formula_has_it(encoding, gamma):
     rng = np.random.default_rng(0)

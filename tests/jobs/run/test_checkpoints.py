@@ -1,9 +1,12 @@
+import contextlib
 import json
 import shutil
+import tempfile
+from pathlib import Path
 
 import pytest
 
-from jobs.run.checkpoints import SEAL, UNSEALED, damage, mend, seal
+from jobs.run.checkpoints import SEAL, UNSEALED, damage, drop_unfinished, mend, seal, unfinished
 from jobs.run.files import RunError
 
 
@@ -95,3 +98,33 @@ def test_without_a_whole_checkpoint_the_remedy_is_said(tmp_path):
         RunError, match=rf"no other is whole; delete {tmp_path}, and the same command trains anew"
     ):
         mend(paths[1])
+
+
+def test_an_unfinished_checkpoint_lies_beside_the_finished_ones_and_goes_by_error_too(tmp_path):
+    place = tmp_path / "trial"
+    for error in (None, OSError):
+        with contextlib.suppress(OSError), unfinished(place) as folder:
+            assert Path(folder).parent == place
+            (Path(folder) / "weights").write_bytes(b"half")
+            if error:
+                raise error
+        assert not list(place.iterdir())
+    with unfinished(None) as folder:
+        assert Path(folder).parent == Path(tempfile.gettempdir())
+    drop_unfinished(None)
+    drop_unfinished(tmp_path / "nowhere")
+
+
+def test_what_a_killed_process_was_making_is_never_taken_for_a_checkpoint_and_goes(tmp_path):
+    first, last = (checkpoint(tmp_path, number) for number in (1, 2))
+    with unfinished(first.parent) as folder:
+        left = Path(folder).with_name(f"{Path(folder).name}-killed")
+    shutil.copytree(first, left)  # whole, and newer than the first
+    flip(last)
+    assert f"{first.name} takes its place" in mend(last)
+    flip(last)
+    flip(first)
+    with pytest.raises(RunError, match="no other is whole"):
+        mend(last)
+    drop_unfinished(first.parent)
+    assert sorted(first.parent.iterdir()) == [first, last]

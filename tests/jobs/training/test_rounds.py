@@ -7,7 +7,7 @@ import pytest
 import torch
 from ray.exceptions import ActorDiedError, ActorUnavailableError
 
-from jobs.training import algorithm, rounds
+from jobs.training import rounds
 from jobs.training.env_runner import PlainEnvRunner, RolloutError
 from jobs.training.ppo import build_ppo
 from jobs.training.rounds import Rounds
@@ -220,19 +220,3 @@ def test_what_an_env_runner_raises_is_not_tried_again(make):
     with pytest.raises(RolloutError, match="step 7, seed 0: the reward must be finite; got nan"):
         taking.take()
     assert manager.restarts == 0
-
-
-def test_a_save_that_fails_leaves_no_temporary_folder(monkeypatch):
-    folders = []
-
-    def fail(self, checkpoint_dir):
-        folders.append(Path(checkpoint_dir))
-        assert folders[0].is_dir()
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(algorithm.RLlibPPO, "save", fail)
-    ppo = object.__new__(algorithm.PPO)
-    ppo._storage = object()
-    with pytest.raises(OSError, match="No space left"):
-        ppo.save()
-    assert not folders[0].exists()

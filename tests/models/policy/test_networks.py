@@ -7,6 +7,8 @@ import pytest
 import torch
 from torch import nn
 
+from models.encoder.event_batch import Grid
+from models.encoder.event_images import PictureContextNetwork, nature_layers
 from models.kinds import MIN_IMAGE, EncoderModel, FixedModel, PolicySpec
 from models.policy.networks import PARTS, assemble, build_networks, is_mlp, logits_by, mlp
 
@@ -66,6 +68,19 @@ def test_logits_without_torch_are_those_of_the_networks_in_any_batch(hidden):
         assert np.array_equal(read(stacks[first:last]), logits[first:last])
     assert read(stacks[:0]).shape == (0, 3)
     assert np.isnan(read(np.full_like(stacks, np.nan))).all()
+
+
+def test_the_encoder_of_pictures_has_the_convolutions_of_the_policy():
+    spec = dataclasses.replace(CNN, model=FixedModel("event_image", 1))
+    torch.manual_seed(0)
+    trunk = assemble(spec)["trunk"]
+    torch.manual_seed(0)
+    encoder = nn.Sequential(nn.Identity(), *nature_layers((1, 64, 64), 512))
+    ours, theirs = trunk.state_dict(), encoder.state_dict()
+    assert [*ours] == [*theirs] == [f"{n}.{part}" for n in (1, 3, 5, 8) for part in ("weight", "bias")]
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    network = PictureContextNetwork(Grid(64, 64, 1024), 512)
+    assert repr(network.layers) == repr(nn.Sequential(*encoder[1:])) == repr(nn.Sequential(*trunk[1:]))
 
 
 def test_the_cnn_is_that_of_stable_baselines():

@@ -1,16 +1,20 @@
 import dataclasses
 import json
+from pathlib import Path
 
+import numpy as np
 import pytest
 import ray
+import torch
 
 from jobs.rollout.episodes import roll_out
 from jobs.run.ray_cluster import start_ray
+from jobs.run.torch_threads import torch_threads
 from jobs.studies.search import search, trial
 from jobs.studies.search.trial import SearchTrial
 from jobs.tracking.tracker import open_store
 from tests.support.configs import tune_config
-from tests.support.runs import write_encoder
+from tests.support.runs import trial_storage, write_encoder
 
 SMALL = (
     *("budget=smoke", "env.time_limit_s=0.1", "algo.num_envs_per_env_runner=2"),
@@ -48,6 +52,59 @@ def test_the_words_of_settings_can_be_given_to_the_launcher():
         search.words({"algo.lr": 0.000312345, "model.hidden": [64, 64]})
         == "algo.lr=0.0003123 'model.hidden=[64,64]'"
     )
+
+
+class Diverging:
+    """A training that notes how many threads it has."""
+
+    def __init__(self, config):
+        self.threads = [torch.get_num_threads()]
+
+    def train(self):
+        self.threads.append(torch.get_num_threads())
+        raise ValueError("losses must be finite")
+
+    def save_checkpoint(self, checkpoint_dir):
+        Path(checkpoint_dir, "weights").write_bytes(b"w")
+
+
+@pytest.fixture
+def a_trial(tmp_path, monkeypatch):
+    """One of such a training, which Tune keeps."""
+    monkeypatch.setattr(trial, "build_ppo", lambda *asked: None)
+    monkeypatch.setattr(trial, "PPO", Diverging)
+    one = SearchTrial.__new__(SearchTrial)
+    one.__dict__.update(_logdir=str(tmp_path / "log"), _storage=trial_storage(tmp_path))
+    return one
+
+
+def test_a_trial_takes_one_thread_and_gives_the_others_back(a_trial):
+    with torch_threads(3):
+        a_trial.setup({}, base=tune_config(*SMALL, "model=event_columns"), files={})
+        assert torch.get_num_threads() == 3
+        assert a_trial.step()["diverged"] == 1.0
+        assert (a_trial._training.threads, torch.get_num_threads()) == ([1, 1], 3)
+
+
+def test_a_measurement_leaves_nothing_beside_the_checkpoints_even_if_it_was_killed(
+    a_trial, tmp_path, monkeypatch
+):
+    place, made_in = tmp_path / "train" / "trial", []
+    (place / ".checkpoint-killed" / "checkpoint").mkdir(parents=True)
+    a_trial.setup({}, base=tune_config(*SMALL, "model=event_columns"), files={})
+    assert not list(place.iterdir())
+
+    def exported(asked, checkpoint, encoder, target, figures):
+        assert (checkpoint / "weights").read_bytes() == b"w"
+        made_in.append(checkpoint.parents[1])
+
+    monkeypatch.setattr(trial, "export_policy", exported)
+    monkeypatch.setattr(trial, "make_agent", lambda *asked: None)
+    told = np.array([(1.0, True)], [("distance_m", float), ("success", bool)])
+    monkeypatch.setattr(trial, "roll_out", lambda *asked: told)
+    assert a_trial.measured() == {"distance_m": 1.0, "success_rate": 1.0}
+    assert made_in == [place]
+    assert not list(place.iterdir())
 
 
 @pytest.fixture

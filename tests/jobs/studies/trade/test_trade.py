@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from envs.event_error import NO_CULLING_M
 from jobs.config.config import ConfigError
@@ -10,6 +11,7 @@ from jobs.rollout.executors import evaluate_part
 from jobs.rollout.policies import read_policy
 from jobs.rollout.store import TaskResult
 from jobs.run.folder import locate_run
+from jobs.run.torch_threads import torch_threads
 from jobs.studies.replays import Measured
 from jobs.studies.trade import trade
 from jobs.tracking.store import check_metrics
@@ -120,6 +122,14 @@ def test_without_the_default_there_is_nothing_to_compare(tmp_path, policy, execu
     executor.broken = {"default": "RuntimeError: no OpenGL"}
     with pytest.raises(RuntimeError, match=r"^default of a s0 in poles_eval: .*RuntimeError: no OpenGL"):
         trade.run(trade_config(tmp_path, policy), executor)
+
+
+def test_costs_are_measured_with_one_thread_which_is_given_back(tmp_path, policy, monkeypatch):
+    config, threads = trade_config(tmp_path), []
+    monkeypatch.setattr(trade, "_measured", lambda *asked: threads.append(torch.get_num_threads()) or {})
+    with torch_threads(3):
+        trade.measure_plans(config, [trade.plan(config, read_policy(policy), "poles_eval")], {})
+        assert (threads, torch.get_num_threads()) == ([1], 3)
 
 
 def measured(*steps_us):
