@@ -340,6 +340,7 @@ class AblationConfig:
         seeds: Of the trainings of each variant.
         variants: Name -> what it changes, key -> value, with the place in a list as a number. Each is
             compared with the first. `train.init` names the first: its policy of the same seed is trained on.
+            `seeds` gives a variant fewer trainings: some of `seeds` above.
     """
 
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]

@@ -13,6 +13,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.evaluation.group_stats import LABELS, episode_values
 from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep
@@ -40,6 +42,7 @@ ENCODER_FILES = (
 # Settings by which a variant needs no encoder of its own, but sees by that of the first variant.
 SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden")
 INIT = "train.init"
+SEEDS = "seeds"  # of a variant that has fewer trainings than the first; not a setting of its experiment
 Variant = Mapping[str, Any]  # key -> value
 
 
@@ -58,12 +61,12 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
         raise ConfigError("ablation.variants: must name at least one, got none; +exp=ablation names twelve")
     first = next(iter(variants))
     for name in variants:
-        variant_config(config, name, config.ablation.seeds[0])
+        variant_config(config, name, seeds_of(config, name)[0])
     folder = open_run(config)
     config = folder.config
     trained: dict[tuple[str, int], Run] = {}
     for seed in config.ablation.seeds:
-        for name in variants:
+        for name in [name for name in variants if seed in seeds_of(config, name)]:
             trained[name, seed] = train_variant(config, name, seed, trained.get((first, seed)))
     policies = [
         dataclasses.replace(read_policy(str(run.policy)), group=name, training=seed)
@@ -72,13 +75,32 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     return compare(config, folder, trained, policies, executor)
 
 
+def seeds_of(config: Config, name: str) -> list[int]:
+    """Of the trainings of a variant, in the order of `ablation.seeds`: all of these unless it names fewer.
+
+    Raises:
+        ConfigError: They are fewer than two, or others, or it is the first variant, which has all.
+    """
+    every, named = config.ablation.seeds, config.ablation.variants[name].get(SEEDS)
+    if named is None:
+        return every
+    first = next(iter(config.ablation.variants))
+    several = isinstance(named, list) and len(named) > 1
+    if name == first or not several or any(one not in every or named.count(one) > 1 for one in named):
+        raise ConfigError(
+            f"ablation.variants.{name}.{SEEDS}: must be two or more of ablation.seeds, {every}, and not of "
+            f"{first}, with which the others are compared; got {named!r}"
+        )
+    return [seed for seed in every if seed in named]
+
+
 def variant_config(config: Config, name: str, seed: int) -> Config:
     """The experiment of one training.
 
     Raises:
         ConfigError: It has a wrong key or value.
     """
-    changes, first = config.ablation.variants[name], next(iter(config.ablation.variants))
+    changes, first = changes_of(config, name), next(iter(config.ablation.variants))
     values = as_dict(config) | {"job": "train", "exp": f"{config.exp}_{name}", "seed": seed}
     try:
         for key, value in changes.items():
@@ -91,6 +113,11 @@ def variant_config(config: Config, name: str, seed: int) -> Config:
     except ConfigError as error:
         raise ConfigError(f"ablation.variants.{name}: {error}") from None
     return dataclasses.replace(parsed, tracking=config.tracking)  # with its password
+
+
+def changes_of(config: Config, name: str) -> Variant:
+    """The settings that a variant changes."""
+    return {key: value for key, value in config.ablation.variants[name].items() if key != SEEDS}
 
 
 def _set(values: Any, key: str, value: Any) -> None:
@@ -107,7 +134,7 @@ def _set(values: Any, key: str, value: Any) -> None:
 def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Run:
     """Train a variant unless that is done, on the encoder of the first one where it may; return its run."""
     own = open_run(variant_config(config, name, seed))
-    changes = config.ablation.variants[name]
+    changes = changes_of(config, name)
     if finished(own, "train") is None:
         console.print(f"Train {name}, seed {seed}", markup=False)
         shares = changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
@@ -138,9 +165,11 @@ def compare(
                 f"not evaluated: {next(iter(found.failed.values()))}; the same command tries again"
             )
         success = {name: by_condition(found, name) for name in config.ablation.variants}
-        times = {name: [minutes(trained[name, seed]) for seed in config.ablation.seeds] for name in success}
-        first = next(iter(success))
-        results = [variant_result(name, success[name], success[first], times[name]) for name in success]
+        times = {name: [minutes(trained[name, seed]) for seed in seeds_of(config, name)] for name in success}
+        results = [
+            variant_result(name, success[name], paired(config, success, name), times[name])
+            for name in success
+        ]
         write_all_episodes(place, found)
         write_page(folder, tracker, results, facts_of(config, folder, found))
         metrics = {f"eval/{result.name}_success": result.mean.value for result in results}
@@ -157,6 +186,17 @@ def by_condition(found: SweepResults, name: str) -> dict[str, Any]:
         )
         for axis, value in found.sweep.conditions
     }
+
+
+def paired(
+    config: Config, success: Mapping[str, Mapping[str, np.ndarray]], name: str
+) -> Mapping[str, np.ndarray]:
+    """Success of the first variant, (trainings, corridors) by condition, of those seeds that another has."""
+    first, own = next(iter(success)), seeds_of(config, name)
+    if name == first:
+        return success[first]
+    rows = [config.ablation.seeds.index(seed) for seed in own]
+    return {condition: values[rows] for condition, values in success[first].items()}
 
 
 def minutes(training: Run) -> float:

@@ -81,11 +81,13 @@ def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], 
     head = ("Variant", *results[0].success, "Mean", "Change [points]", "Minutes")
     rows = [table_row(result) for result in results]
     show_table(TITLE, head, rows, 1, None)
+    fewer = [f"`{name}` {len(one['seeds'])}" for name, one in facts["variants"].items() if "seeds" in one]
+    but = f" ({', '.join(fewer)})" if fewer else ""
     said = (
-        f"{len(facts['seeds'])} trainings each, {facts['env_steps']:,} environment steps, {facts['trials']} "
-        "corridors for each training and condition. Mean: over the conditions, 95 % interval by trainings "
-        "(Student). Change: to the first variant, by pairs of trainings with the same seed. Minutes: of the "
-        "policy's training, without the encoder's."
+        f"{len(facts['seeds'])} trainings each{but}, {facts['env_steps']:,} environment steps, "
+        f"{facts['trials']} corridors for each training and condition. Mean: over the conditions, 95 % "
+        "interval by trainings (Student). Change: to the first variant, by pairs of trainings with the same "
+        "seed. Minutes: of the policy's training, without the encoder's."
     )
     table = markdown_table(head, rows, 1)
     text = f"`{facts['command']}`, {facts['date']}, commit {facts['commit']}.\n\n{table}\n{said}\n"

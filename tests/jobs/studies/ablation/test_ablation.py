@@ -10,7 +10,7 @@ from jobs.config.config import ConfigError, parse
 from jobs.run.files import read_json
 from jobs.run.folder import locate_run
 from jobs.studies.ablation import ablation
-from jobs.studies.ablation.ablation import variant_config
+from jobs.studies.ablation.ablation import paired, seeds_of, variant_config
 from jobs.studies.ablation.page import plot_variants, table_row, variant_result
 from tests.support.configs import SHORT, compose
 
@@ -83,6 +83,10 @@ def test_the_experiment_names_variants_that_can_be_trained():
         ("{recipe: {}, other: {algo.lr.what: 1}}", "algo.lr.what"),
         ("{recipe: {}, other: {train.init: another}}", "train.init"),
         ("{recipe: {train.init: recipe}}", "train.init"),
+        ("{recipe: {}, other: {seeds: [0, 2]}}", "seeds"),
+        ("{recipe: {}, other: {seeds: [1]}}", "seeds"),
+        ("{recipe: {}, other: {seeds: 2}}", "seeds"),
+        ("{recipe: {seeds: [0, 1]}, other: {}}", "seeds"),
     ],
 )
 def test_a_wrong_variant_is_refused_before_anything_is_trained(tmp_path, change, message):
@@ -92,6 +96,22 @@ def test_a_wrong_variant_is_refused_before_anything_is_trained(tmp_path, change,
     with pytest.raises(ConfigError, match=rf"ablation\.variants.*{re.escape(message)}"):
         ablation.run(config)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_variant_with_fewer_trainings_is_compared_with_those_of_the_same_seeds():
+    variants = {"recipe": {}, "other": {"seeds": [7, 3], "algo.lr": 1e-4}}
+    config = ablation_config(ablation={"seeds": [3, 5, 7], "variants": variants})
+    assert seeds_of(config, "recipe") == [3, 5, 7]
+    assert seeds_of(config, "other") == [3, 7]
+    assert variant_config(config, "other", 7).algo.lr == 1e-4
+    success = {
+        "recipe": {"nominal": np.array([[0.5, 0.5], [0.0, 0.0], [1.0, 1.0]])},
+        "other": {"nominal": np.array([[0.0, 0.5], [1.0, 0.5]])},
+    }
+    result = variant_result("other", success["other"], paired(config, success, "other"), [1.0, 1.0])
+    assert result.differences.tolist() == [-0.25, -0.25]
+    itself = variant_result("recipe", success["recipe"], paired(config, success, "recipe"), [1.0] * 3)
+    assert itself.difference is None
 
 
 @pytest.mark.slow
