@@ -180,7 +180,7 @@ class ImitationLearner(PlainPPOLearner):
                 optimizer.param_groups[0]["lr"] = self.config.lr * (1.0 - step / count)
             for name, figure in self._step(self._lessons.draw(minibatch_size)).items():
                 # Into one array: a tensor kept for each step lies between the minibatches in memory, and the
-                # allocator then does not use their places again (5 GB in 20,000 steps).
+                # allocator then does not use their places again (gigabytes in 20,000 steps).
                 if not step:
                     figures[name] = torch.empty(count)
                 figures[name][step] = figure

@@ -171,7 +171,7 @@ def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
     """The model in float64 without its decoder, with another resolution of time unless that is None."""
     settings = evae.settings
     exact = EventVAE.of(settings if time_bins is None else replace(settings, time_bins=time_bins))
-    del exact.decoder  # two thirds of the memory that loading a policy takes for a moment
+    del exact.decoder  # which nothing reads here, and which is large in float64
     exact = exact.double()
     exact.load_state_dict({k: v for k, v in evae.state_dict().items() if not k.startswith("decoder.")})
     return exact
