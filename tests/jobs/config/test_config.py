@@ -19,6 +19,7 @@ JOBS = {
     "dose_response": "sweep",
     "calibrated_camera": "ablation",
     "taught_claims": "ablation",
+    "taught": "ablation",
 }
 POLICIES = {
     "bytestream": "bytestream",

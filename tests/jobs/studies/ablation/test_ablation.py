@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 import yaml
 
-from jobs.config.config import ConfigError, parse
+from jobs.config.config import ConfigError, as_dict, parse
 from jobs.run.files import read_json
 from jobs.run.folder import locate_run
 from jobs.studies.ablation import ablation
 from jobs.studies.ablation.ablation import paired, seeds_of, variant_config
 from jobs.studies.ablation.page import plot_variants, table_row, variant_result
+from models.kinds import KINDS
 from tests.support.configs import SHORT, compose
+
+# As docs/policies.md says, rounded up.
+STEP_BYTES = {"event_columns": 1_600, "event_set": 6_500, "event_image": 12_400, "rgb": 12_400}
 
 
 def of(first, *changes):
@@ -72,6 +76,22 @@ def test_the_experiment_names_variants_that_can_be_trained():
     assert configs["ppo"].algo.imitation is None
     assert configs["no_textures"].train.conditions[3]["weight"] < 1e-6
     assert configs["no_textures"].train.conditions[2]["weight"] == config.train.conditions[2]["weight"]
+
+
+def test_every_kind_of_policy_is_taught_alike():
+    """By the step size of its PPO; with means over time where it can have them; all of its steps are kept."""
+    config = parse(compose("+exp=taught"))
+    trained = {name: variant_config(config, name, 1) for name in config.ablation.variants}
+    assert {one.model.name for one in trained.values()} == set(trained) == set(KINDS)
+    alike = []
+    for name, one in trained.items():
+        values = as_dict(one)
+        algo = values.pop("algo")
+        assert algo.pop("lr") == parse(compose(f"+exp={name}")).algo.lr
+        assert algo["imitation"].pop("keep_mb") * 1e6 > config.train.env_steps * STEP_BYTES.get(name, 700)
+        assert values.pop("model").get("memory_ms", [10, 30, 100, 300]) == [10, 30, 100, 300]
+        alike.append((algo, {key: value for key, value in values.items() if key != "exp"}))
+    assert all(one == alike[0] for one in alike)
 
 
 @pytest.mark.parametrize(
