@@ -2,7 +2,7 @@
 
 Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=ship
 Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each
-experiment, length and seed in `runs_dir` with the configured budget, a few hundred kilobytes each
+experiment, length and seed in `runs_dir` with the configured budget, 0.1 to 2 megabytes each
 (weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`; what was published
 before stays. A group is an experiment; trainings of another length than the one that all are
 compared at have its thousands of steps behind their name: bytestream_1500k. Each becomes a
