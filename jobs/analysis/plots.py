@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
@@ -52,10 +52,15 @@ BASELINE_STYLES = {
     "random": ("#c4c9d1", "."),
 }
 OTHER_STYLES = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
+TAUGHT = "taught_"  # before the name of a kind: the group of +exp=taught
 
 
 def style_of(group: str) -> tuple[str, str]:
-    """Colour and marker of a group, the same in every plot."""
+    """Colour and marker of a group, the same in every plot; a taught kind looks as its kind, but paler."""
+    kind = group.removeprefix(TAUGHT)
+    if kind != group and kind in GROUP_STYLES:
+        colour, marker = GROUP_STYLES[kind]
+        return to_hex(0.55 * np.array(to_rgb(colour)) + 0.45), marker
     return (GROUP_STYLES | BASELINE_STYLES).get(group) or OTHER_STYLES[
         sum(group.encode()) % len(OTHER_STYLES)
     ]

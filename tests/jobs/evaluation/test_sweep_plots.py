@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import yaml
 
-from jobs.analysis.plots import BASELINE_STYLES, GROUP_STYLES, style_of
+from jobs.analysis.plots import BASELINE_STYLES, GROUP_STYLES, TAUGHT, style_of
 from jobs.config.conditions import axis_points
 from jobs.evaluation.group_stats import summarise_group
 from jobs.evaluation.sweep_plan import value_text
@@ -89,7 +89,9 @@ def test_a_condition_that_was_not_evaluated_leaves_a_gap():
 
 def test_every_experiment_has_a_colour_and_marker_of_its_own():
     looks = [style_of(group) for group in (*GROUP_STYLES, *BASELINE_STYLES)]
-    assert len({colour for colour, _ in looks}) == len(looks)
+    taught = {group: style_of(f"{TAUGHT}{group}") for group in GROUP_STYLES}
+    assert len({colour for colour, _ in (*looks, *taught.values())}) == len(looks) + len(taught)
+    assert all(marker == GROUP_STYLES[group][1] for group, (_, marker) in taught.items())
     assert len({marker for _, marker in looks[: len(GROUP_STYLES)]}) == len(GROUP_STYLES)
     assert style_of("mine") == style_of("mine")
 
@@ -107,4 +109,4 @@ def test_the_map_shows_contacts_alone():
 
 def test_every_policy_that_is_shipped_has_a_look_of_its_own():
     shipped = {path.parent.name.rpartition("-s")[0] for path in PRETRAINED.glob(f"*/{MANIFEST}")}
-    assert shipped <= GROUP_STYLES.keys()
+    assert {group.removeprefix(TAUGHT) for group in shipped} <= GROUP_STYLES.keys()
