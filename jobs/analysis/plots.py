@@ -60,7 +60,8 @@ def style_of(group: str) -> tuple[str, str]:
     kind = group.removeprefix(TAUGHT)
     if kind != group and kind in GROUP_STYLES:
         colour, marker = GROUP_STYLES[kind]
-        return to_hex(0.55 * np.array(to_rgb(colour)) + 0.45), marker
+        red, green, blue = (0.55 * part + 0.45 for part in to_rgb(colour))
+        return to_hex((red, green, blue)), marker
     return (GROUP_STYLES | BASELINE_STYLES).get(group) or OTHER_STYLES[
         sum(group.encode()) % len(OTHER_STYLES)
     ]

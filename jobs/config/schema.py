@@ -341,10 +341,13 @@ class AblationConfig:
         variants: Name -> what it changes, key -> value, with the place in a list as a number. Each is
             compared with the first. `train.init` names the first: its policy of the same seed is trained on.
             `seeds` gives a variant fewer trainings: some of `seeds` above.
+        trained: A folder of their policies, each named as in models/pretrained, which are then only
+            evaluated; None: they are trained.
     """
 
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]
     variants: dict[AxisName, dict[str, Any]]
+    trained: str | None = None
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -3,7 +3,8 @@
 Run: python -m platform.launch +exp=ablation
 Expect: by estimate six hours on two idle cores. Each training has a run folder of its own, and is read from
 it once it is finished; in this run's folder under `ablation/`, and in MLflow, every episode, a table and
-a plot. A stopped job continues when the same command is given again.
+a plot. A stopped job continues when the same command is given again. With `ablation.trained=FOLDER` nothing
+is trained: the policies of that folder are evaluated.
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jobs.config.config import Config, ConfigError, as_dict, parse
+from jobs.config.errors import differences
 from jobs.evaluation.group_stats import LABELS, episode_values
 from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep
 from jobs.evaluation.sweep_report import SweepResults, about, training_text
@@ -26,12 +28,14 @@ from jobs.rollout.scheduler import default_executor, evaluate_tasks
 from jobs.rollout.store import EpisodeStore
 from jobs.run.checkpoints import sha256
 from jobs.run.files import read_json_lines
-from jobs.run.folder import Run, finish, finished, locate_run, open_run
+from jobs.run.folder import Run, finish, finished, group_name, locate_run, open_run
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
 from jobs.studies.ablation.page import AblationFacts, variant_result, write_page
 from jobs.tracking.tracker import open_tracker
 from jobs.training import train
+from models.kinds import model_keys
+from models.policy.policy import MANIFEST, read_policy_manifest
 
 ENCODER_FILES = (
     "encoder/encoder.safetensors",
@@ -42,6 +46,7 @@ ENCODER_FILES = (
 # Settings by which a variant needs no encoder of its own, but sees by that of the first variant.
 SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden")
 INIT = "train.init"
+TOLD = ("algo", "train", "collect", "pretrain")  # settings that a manifest tells, beside the model's
 SEEDS = "seeds"  # of a variant that has fewer trainings than the first; not a setting of its experiment
 Variant = Mapping[str, Any]  # key -> value
 
@@ -54,25 +59,70 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
         executor: Computes the missing episodes; None: on all cores.
 
     Raises:
-        ConfigError: There is no variant, or one has a wrong key or value.
+        ConfigError: There is no variant, or one has a wrong key or value; or as `trained_policies`.
     """
     variants = config.ablation.variants
     if not variants:
         raise ConfigError("ablation.variants: must name at least one, got none; +exp=ablation names twelve")
-    first = next(iter(variants))
     for name in variants:
         variant_config(config, name, seeds_of(config, name)[0])
+    places = None if config.ablation.trained is None else trained_policies(config)
     folder = open_run(config)
     config = folder.config
-    trained: dict[tuple[str, int], Run] = {}
+    times: dict[str, list[float]] = {name: [] for name in variants}
+    if places is None:
+        runs = train_variants(config)
+        places = {training: run.policy for training, run in runs.items()}
+        times = {name: [minutes(runs[name, seed]) for seed in seeds_of(config, name)] for name in variants}
+    policies = [
+        dataclasses.replace(read_policy(str(place)), group=name, training=seed)
+        for (name, seed), place in sorted(places.items(), key=lambda item: list(variants).index(item[0][0]))
+    ]
+    return compare(config, folder, times, policies, executor)
+
+
+def trained_policies(config: Config) -> dict[tuple[str, int], Path]:
+    """The policy folders of all trainings in `ablation.trained`, by variant and seed, named as by +exp=ship.
+
+    Raises:
+        ConfigError: A training is missing, or its manifest says that it was trained otherwise.
+    """
+    named = str(config.ablation.trained)
+    found, wrong = {}, []
+    for name in config.ablation.variants:
+        for seed in seeds_of(config, name):
+            expected = as_dict(variant_config(config, name, seed))
+            place = Path(named) / f"{group_name(expected)}-s{seed}"
+            found[name, seed] = place
+            if not (place / MANIFEST).is_file():
+                wrong.append(f"{place.name} is not there")
+                continue
+            there, here = told(read_policy_manifest(place / MANIFEST)), told(expected)
+            both = there.keys() & here.keys()  # older policies lack what was added since
+            differ = differences({key: there[key] for key in both}, {key: here[key] for key in both})
+            wrong += [f"{place.name} has {differ}"] if differ else []
+    if wrong:
+        rule = f"must hold every training, as +exp={config.exp} makes and +exp=ship names them"
+        raise ConfigError(f"ablation.trained: {rule}, got {named!r}: {'; '.join(wrong)}")
+    return found
+
+
+def told(settings: Mapping[str, Any]) -> dict[str, object]:
+    """What a manifest says of how its policy was trained, or the same of a configuration."""
+    parts = {f"{part}.{key}": value for part in TOLD for key, value in settings.get(part, {}).items()}
+    parts.pop("algo.num_env_runners", None)  # as many as there were cores
+    model = settings.get("model", {name: settings[name] for name in model_keys() if name in settings})
+    return {**model, **parts}
+
+
+def train_variants(config: Config) -> dict[tuple[str, int], Run]:
+    """Train every variant with every seed unless that is done; return the runs."""
+    variants, trained = config.ablation.variants, dict[tuple[str, int], Run]()
+    first = next(iter(variants))
     for seed in config.ablation.seeds:
         for name in [name for name in variants if seed in seeds_of(config, name)]:
             trained[name, seed] = train_variant(config, name, seed, trained.get((first, seed)))
-    policies = [
-        dataclasses.replace(read_policy(str(run.policy)), group=name, training=seed)
-        for (name, seed), run in sorted(trained.items(), key=lambda item: list(variants).index(item[0][0]))
-    ]
-    return compare(config, folder, trained, policies, executor)
+    return trained
 
 
 def seeds_of(config: Config, name: str) -> list[int]:
@@ -149,11 +199,11 @@ def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Ru
 def compare(
     config: Config,
     folder: Run,
-    trained: Mapping[tuple[str, int], Run],
+    times: Mapping[str, Sequence[float]],
     policies: Sequence[EvaluatedPolicy],
     executor: Executor | None,
 ) -> dict[str, float]:
-    """Evaluate all trainings in the same corridors, and write table and plot."""
+    """Evaluate all trainings in the same corridors, and write table and plot; `times` [min] may be empty."""
     sweep = plan_sweep(config, policies)
     place = folder.path / "ablation"
     store, executor = EpisodeStore(place), executor or default_executor(config.cluster, place)
@@ -165,7 +215,6 @@ def compare(
                 f"not evaluated: {next(iter(found.failed.values()))}; the same command tries again"
             )
         success = {name: by_condition(found, name) for name in config.ablation.variants}
-        times = {name: [minutes(trained[name, seed]) for seed in seeds_of(config, name)] for name in success}
         results = [
             variant_result(name, success[name], paired(config, success, name), times[name])
             for name in success

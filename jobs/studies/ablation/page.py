@@ -35,7 +35,7 @@ class VariantResult(NamedTuple):
         mean: Over conditions and trainings, interval by trainings (Student).
         difference: Of that to the first variant, by pairs of trainings of a seed; None: it is the first.
         differences: The difference of each pair (n,).
-        minutes: Of the policy's training, the mean [min].
+        minutes: Of the policy's training, the mean [min]; None: not known.
     """
 
     name: str
@@ -43,7 +43,7 @@ class VariantResult(NamedTuple):
     mean: Estimate
     difference: Estimate | None
     differences: np.ndarray
-    minutes: float
+    minutes: float | None
 
 
 def variant_result(
@@ -55,7 +55,7 @@ def variant_result(
         name: Of the variant.
         success: Condition -> success (trainings, corridors).
         first: The same of the first variant, trained with the same seeds.
-        minutes: Of each training [min].
+        minutes: Of each training [min]; empty: not known.
 
     Raises:
         ValueError: There is only one training.
@@ -65,9 +65,8 @@ def variant_result(
     )
     difference = None if success is first else _estimate(own - theirs)
     per_training = {condition: values.mean(axis=1) for condition, values in success.items()}
-    return VariantResult(
-        name, per_training, _estimate(own), difference, own - theirs, float(np.mean(minutes))
-    )
+    mean_minutes = float(np.mean(minutes)) if minutes else None
+    return VariantResult(name, per_training, _estimate(own), difference, own - theirs, mean_minutes)
 
 
 def _estimate(values: np.ndarray) -> Estimate:
@@ -104,7 +103,7 @@ def table_row(result: VariantResult) -> tuple[str, ...]:
         *(f"{100 * values.mean():.0f}" for values in result.success.values()),
         estimate_text(result.mean, 100, ".0f"),
         estimate_text(result.difference, 100, "+.0f"),
-        f"{result.minutes:.1f}",
+        "-" if result.minutes is None else f"{result.minutes:.1f}",
     )
 
 

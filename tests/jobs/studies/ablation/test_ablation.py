@@ -1,5 +1,6 @@
 import csv
 import dataclasses
+import json
 import re
 
 import numpy as np
@@ -7,13 +8,17 @@ import pytest
 import yaml
 
 from jobs.config.config import ConfigError, as_dict, parse
+from jobs.reporting.publish import newest_trainings, publish
 from jobs.run.files import read_json
 from jobs.run.folder import locate_run
 from jobs.studies.ablation import ablation
-from jobs.studies.ablation.ablation import paired, seeds_of, variant_config
+from jobs.studies.ablation.ablation import paired, seeds_of, trained_policies, variant_config
 from jobs.studies.ablation.page import plot_variants, table_row, variant_result
+from models.encoder.weights import with_checksum
 from models.kinds import KINDS
-from tests.support.configs import SHORT, compose
+from models.policy.policy import MANIFEST, read_policy_manifest
+from tests.support.configs import SHORT, compose, make_config
+from tests.support.policies import save_training
 
 # As docs/policies.md says, rounded up.
 STEP_BYTES = {"event_columns": 1_600, "event_set": 6_500, "event_image": 12_400, "rgb": 12_400}
@@ -134,13 +139,42 @@ def test_a_variant_with_fewer_trainings_is_compared_with_those_of_the_same_seeds
     assert itself.difference is None
 
 
+def save_trained(folder, name, seed, settings, **changes):
+    """An untrained policy whose manifest says that it was trained so, but for `changes` of its algorithm."""
+    path = folder / f"ablation_{name}-s{seed}"
+    save_training(path, f"ablation_{name}", seed, make_config().env)
+    said = {**settings["model"], **{part: settings[part] for part in ("train", "collect", "pretrain")}}
+    manifest = read_policy_manifest(path / MANIFEST) | {**said, "algo": {**settings["algo"], **changes}}
+    (path / MANIFEST).write_text(json.dumps(with_checksum(manifest)))
+
+
+def test_policies_that_were_trained_before_are_taken_by_name_if_they_were_trained_so(tmp_path):
+    variants = {"recipe": {}, "other": {"algo.lr": 1e-4}}
+    config = ablation_config(ablation={"seeds": [0, 1], "trained": str(tmp_path), "variants": variants})
+    config = dataclasses.replace(config, model=make_config("model=event_columns").model)
+    settings = as_dict(config)
+    for name, seed, lr in (("recipe", 0, 1e-3), ("recipe", 1, 1e-3), ("other", 1, 1e-3)):
+        save_trained(tmp_path, name, seed, settings, lr=lr)
+    with pytest.raises(ConfigError) as refused:
+        trained_policies(config)
+    assert str(refused.value).startswith("ablation.trained: must hold every training")
+    assert str(refused.value).endswith(
+        "ablation_other-s0 is not there; ablation_other-s1 has algo.lr: 0.001 there, 0.0001 here"
+    )
+    for seed in (0, 1):
+        save_trained(tmp_path, "other", seed, settings, lr=1e-4, num_env_runners=7)
+    assert {key: place.name for key, place in trained_policies(config).items()} == {
+        (name, seed): f"ablation_{name}-s{seed}" for name in variants for seed in (0, 1)
+    }
+
+
 @pytest.mark.slow
 @pytest.mark.system
 def test_every_variant_is_trained_and_evaluated_once(tmp_path):
     words = "budget=smoke", "sweep.trials=1", *SHORT
     variants = {
         "recipe": {},
-        "ppo": {"algo.imitation": None, "train.init": "recipe"},
+        "ppo": {"algo.imitation": None, "algo.mirrored": False, "train.init": "recipe"},
         "bare": {"env.filter_support": 0},
     }
     config = ablation_config(*words, runs_dir=str(tmp_path), ablation={"seeds": [0, 1], "variants": variants})
@@ -168,6 +202,13 @@ def test_every_variant_is_trained_and_evaluated_once(tmp_path):
     ablation.run(config)
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/policy/*")}
     assert len(before) > 6
+    for training in newest_trainings(tmp_path, "smoke"):
+        publish(training, tmp_path / "published")
+    again = dataclasses.replace(config.ablation, trained=str(tmp_path / "published"))
+    config = dataclasses.replace(config, ablation=again, name="again")
+    assert ablation.run(config) == metrics
+    lines = (locate_run(config).path / "ablation" / "ablation.md").read_text().splitlines()
+    assert next(line for line in lines if line.startswith("| bare ")).endswith("| - |")
 
 
 def runs_of(config, name):
