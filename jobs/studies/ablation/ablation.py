@@ -12,7 +12,7 @@ import itertools
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -107,11 +107,12 @@ def trained_policies(config: Config) -> dict[tuple[str, int], Path]:
     return found
 
 
-def told(settings: Mapping[str, Any]) -> dict[str, object]:
+def told(settings: Mapping[str, object]) -> dict[str, object]:
     """What a manifest says of how its policy was trained, or the same of a configuration."""
-    parts = {f"{part}.{key}": value for part in TOLD for key, value in settings.get(part, {}).items()}
+    sections = {name: cast(dict[str, object], settings.get(name, {})) for name in (*TOLD, "model")}
+    model = sections.pop("model") or {name: settings[name] for name in model_keys() if name in settings}
+    parts = {f"{name}.{key}": value for name, own in sections.items() for key, value in own.items()}
     parts.pop("algo.num_env_runners", None)  # as many as there were cores
-    model = settings.get("model", {name: settings[name] for name in model_keys() if name in settings})
     return {**model, **parts}
 
 

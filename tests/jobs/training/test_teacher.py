@@ -167,7 +167,8 @@ def test_what_is_privileged_changes_values_alone(rolled_out, tmp_path):
     plain, told = make_learner(env), make_learner(env, "algo.critic=teacher")
     rows = told._rows(episodes)
     one, other = module_of(plain), module_of(told)
-    assert torch.equal(one.compute_values(rows), other.compute_values(rows))  # nothing is learnt of it yet
+    # Nothing is learnt of it yet; one input more may add the others in another order.
+    torch.testing.assert_close(one.compute_values(rows), other.compute_values(rows), rtol=1e-4, atol=1e-5)
     with torch.no_grad():
         other.vf[0].weight[:, -1] = 1.0
     assert not torch.isclose(one.compute_values(rows), other.compute_values(rows)).any()
