@@ -205,7 +205,7 @@ def test_every_variant_is_trained_and_evaluated_once(tmp_path):
     for training in newest_trainings(tmp_path, "smoke"):
         publish(training, tmp_path / "published")
     again = dataclasses.replace(config.ablation, trained=str(tmp_path / "published"))
-    config = dataclasses.replace(config, ablation=again, name="again")
+    config = dataclasses.replace(config, ablation=again)
     assert ablation.run(config) == metrics
     lines = (locate_run(config).path / "ablation" / "ablation.md").read_text().splitlines()
     assert next(line for line in lines if line.startswith("| bare ")).endswith("| - |")
