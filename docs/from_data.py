@@ -24,11 +24,11 @@ from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_ep
 from jobs.reporting.taught_claims import TAUGHT, draw_taught
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_atomic
-from jobs.studies.ablation.page import plot_variants, variant_result
+from jobs.studies.ablation.page import VariantResult, plot_variants, variant_result
 from jobs.studies.trade.page import draw_settings
 
 DOCS = Path(__file__).resolve().parent
-ABLATIONS = "ablation", "ablation_more"  # each with a recipe of its own
+ABLATIONS = "ablation", "ablation_more", "taught"  # each with a recipe of its own
 
 
 def results(data: Path) -> dict[str, Figure]:
@@ -49,18 +49,18 @@ def taught_claims(data: Path) -> dict[str, Figure]:
 
 
 def ablation(data: Path) -> dict[str, Figure]:
-    """Those of ablation.md; in each, the first variant is the one that others are compared with."""
-    return {name: _variants(data / f"{name}_episodes.csv.gz") for name in ABLATIONS}
+    """Those of ablation.md and policies.md; others are compared with the first variant of each."""
+    return {name: plot_variants(variant_results(data / f"{name}_episodes.csv.gz")) for name in ABLATIONS}
 
 
-def _variants(episodes: Path) -> Figure:
-    """Success of each variant of one ablation, and what it changes."""
+def variant_results(episodes: Path) -> list[VariantResult]:
+    """Success of each variant of one ablation, and what it changes; the minutes are not known."""
     success: dict[str, dict[str, np.ndarray]] = {}
     for ((axis, value), name), trainings in read_sweep_episodes(episodes).items():
         condition = value if axis == NOMINAL else f"{axis}={value}"
         success.setdefault(name, {})[condition] = episode_values(trainings, "success")
     first = next(iter(success.values()))
-    return plot_variants([variant_result(name, own, first, (0.0,)) for name, own in success.items()])
+    return [variant_result(name, own, first, ()) for name, own in success.items()]
 
 
 def trade(data: Path) -> dict[str, Figure]:

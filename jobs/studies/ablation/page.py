@@ -32,8 +32,9 @@ class VariantResult(NamedTuple):
     Attributes:
         name: Of the variant.
         success: Condition -> mean success of each training (n,).
-        mean: Over conditions and trainings, interval by trainings (Student).
-        difference: Of that to the first variant, by pairs of trainings of a seed; None: it is the first.
+        mean: Over conditions and trainings, interval by trainings (Student), within 0 and 1.
+        difference: Of that to the first variant, by pairs of trainings of a seed, within -1 and 1; None: it
+            is the first.
         differences: The difference of each pair (n,).
         minutes: Of the policy's training, the mean [min]; None: not known.
     """
@@ -63,16 +64,16 @@ def variant_result(
     own, theirs = (
         np.mean([values.mean(axis=1) for values in every.values()], axis=0) for every in (success, first)
     )
-    difference = None if success is first else _estimate(own - theirs)
+    difference = None if success is first else _estimate(own - theirs, -1.0)
     per_training = {condition: values.mean(axis=1) for condition, values in success.items()}
     mean_minutes = float(np.mean(minutes)) if minutes else None
-    return VariantResult(name, per_training, _estimate(own), difference, own - theirs, mean_minutes)
+    return VariantResult(name, per_training, _estimate(own, 0.0), difference, own - theirs, mean_minutes)
 
 
-def _estimate(values: np.ndarray) -> Estimate:
-    """The mean over trainings (n,) with its 95 % interval."""
+def _estimate(values: np.ndarray, least: float) -> Estimate:
+    """The mean over trainings (n,) with its 95 % interval, of what lies between `least` and 1."""
     value, half = float(values.mean()), float(half_width(values[:, None])[0])
-    return Estimate(value, (value - half, value + half))
+    return Estimate(value, (max(value - half, least), min(value + half, 1.0)))
 
 
 def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], facts: AblationFacts) -> None:

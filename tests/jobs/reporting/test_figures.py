@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from docs import from_data
-from docs.from_data import ABLATIONS, STUDIES, figures, main, pages
+from docs.from_data import ABLATIONS, STUDIES, figures, main, pages, variant_results
 from envs.config import EnvConfig
-from jobs.analysis.tables import save_plot, write_csv
+from jobs.analysis.tables import estimate_text, save_plot, write_csv
 from jobs.evaluation.group_stats import episode_values
 from jobs.reporting import dose_response, report
 from jobs.reporting.breaks import changes_of
@@ -170,9 +170,10 @@ def test_the_table_of_the_policy_that_holds_is_that_of_its_episodes():
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_the_tables_of_the_ablation_are_those_of_their_episodes(name):
-    success = {}
-    for (_, variant), trainings in read_sweep_episodes(DOCS / "data" / f"{name}_episodes.csv.gz").items():
-        success.setdefault(variant, []).append(episode_values(trainings, "success").mean())
-    expected = [[variant, *(f"{100 * value:.0f}" for value in values)] for variant, values in success.items()]
-    found = [[row[0], *row[2:8]] for row in cells_of("ablation.md")]
+    expected = []
+    for one in variant_results(DOCS / "data" / f"{name}_episodes.csv.gz"):
+        success = (f"{100 * values.mean():.0f}" for values in one.success.values())
+        expected.append([one.name, *success, estimate_text(one.mean, 100, ".0f")])
+    page = "policies.md" if name == "taught" else "ablation.md"
+    found = [[row[0], *row[2:9]] for row in cells_of(page)]
     assert all(row in found for row in expected)
