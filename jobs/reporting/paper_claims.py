@@ -150,22 +150,30 @@ def verdict_of(overall: Difference | None, adjusted_p: float | None, gain: float
 
 def compare(claim: Claim, find: Find, baselines: Mapping[Condition, Condition]) -> Finding:
     """The differences of a claim, on those of its conditions under which both groups were evaluated."""
+    ours, theirs = compared(claim, find, baselines)
+    if not ours:
+        return Finding("not tested", None, {})
+    bounds = None if claim.measure == "distance_m" else CHANGE if claim.change else RATE
+    single = {at: crossed_difference(ours[at], theirs[at], bounds) for at in ours}
+    first, second = (over_conditions(side) for side in (ours, theirs))
+    overall = crossed_difference(first, second, bounds)
+    if min(len(first), len(second)) == 1:  # of one training nothing follows for others
+        overall = Difference(overall.value, None, None)
+    needed = trainings_needed(first.mean(axis=1), second.mean(axis=1), GAIN[claim.measure])
+    return Finding("undecided", overall, single, needed=needed)
+
+
+def compared(
+    claim: Claim, find: Find, baselines: Mapping[Condition, Condition]
+) -> tuple[dict[Condition, np.ndarray], dict[Condition, np.ndarray]]:
+    """What is compared of both groups, (trainings, corridors), under each condition that both have."""
     ours: dict[Condition, np.ndarray] = {}
     theirs: dict[Condition, np.ndarray] = {}
     for at in claim.conditions:
         here, there = (_values(claim, find, at, group, baselines) for group in (claim.ours, claim.theirs))
         if here is not None and there is not None:
             ours[at], theirs[at] = here, there
-    if not ours:
-        return Finding("not tested", None, {})
-    bounds = None if claim.measure == "distance_m" else CHANGE if claim.change else RATE
-    single = {at: crossed_difference(ours[at], theirs[at], bounds) for at in ours}
-    first, second = (_over_conditions(list(side.values())) for side in (ours, theirs))
-    overall = crossed_difference(first, second, bounds)
-    if min(len(first), len(second)) == 1:  # of one training nothing follows for others
-        overall = Difference(overall.value, None, None)
-    needed = trainings_needed(first.mean(axis=1), second.mean(axis=1), GAIN[claim.measure])
-    return Finding("undecided", overall, single, needed=needed)
+    return ours, theirs
 
 
 def _values(
@@ -190,8 +198,9 @@ def compare_learning(claim: Claim, trainings: Mapping[str, Sequence[float]]) -> 
     return Finding("undecided", overall, {}, needed=trainings_needed(ours, theirs, GAIN[claim.measure]))
 
 
-def _over_conditions(tables: list[np.ndarray]) -> np.ndarray:
+def over_conditions(values: Mapping[Condition, np.ndarray]) -> np.ndarray:
     """Mean over conditions; where a training lacks one, over trainings first."""
+    tables = list(values.values())
     if len({table.shape for table in tables}) > 1:
         tables = [table.mean(axis=0, keepdims=True) for table in tables]
     means: np.ndarray = np.mean(tables, axis=0)
