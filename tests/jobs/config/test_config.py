@@ -18,6 +18,7 @@ JOBS = {
     "robustness": "sweep",
     "dose_response": "sweep",
     "calibrated_camera": "ablation",
+    "memory_seconds": "ablation",
     "taught_claims": "ablation",
     "taught": "ablation",
 }

@@ -10,7 +10,7 @@ import yaml
 from jobs.config.config import ConfigError, as_dict, parse
 from jobs.reporting.publish import newest_trainings, publish
 from jobs.run.files import read_json
-from jobs.run.folder import locate_run
+from jobs.run.folder import COMPARED_STEPS, locate_run
 from jobs.studies.ablation import ablation
 from jobs.studies.ablation.ablation import paired, seeds_of, trained_policies, variant_config
 from jobs.studies.ablation.page import plot_variants, table_row, variant_result
@@ -96,6 +96,26 @@ def test_every_kind_of_policy_is_taught_alike():
         assert values.pop("model").get("memory_ms", [10, 30, 100, 300]) == [10, 30, 100, 300]
         alike.append((algo, {key: value for key, value in values.items() if key != "exp"}))
     assert all(one == alike[0] for one in alike)
+
+
+@pytest.mark.parametrize("way", ["taught", "ppo"])
+def test_memory_in_seconds_is_compared_with_a_stack_of_the_same_training(way):
+    config = parse(compose("+exp=memory_seconds"))
+    stack, seconds = (
+        as_dict(variant_config(config, f"{way}_{memory}", 1)) for memory in ("stack", "seconds")
+    )
+    assert stack["model"].pop("memory_ms") == []
+    assert len(seconds["model"].pop("memory_ms")) == 4
+    assert stack | {"exp": ""} == seconds | {"exp": ""}
+    if way == "ppo":
+        usual = as_dict(parse(compose("+exp=bytestream")))
+        usual["train"] |= {
+            "env_steps": COMPARED_STEPS,
+            "checkpoint_every": stack["train"]["checkpoint_every"],
+        }
+        assert [stack[name] for name in ("algo", "train", "env")] == [
+            usual[name] for name in ("algo", "train", "env")
+        ]
 
 
 @pytest.mark.parametrize(
