@@ -23,7 +23,6 @@ TRAININGS = "trainings.csv"  # of every published training, how it learnt
 # Commit of a published study -> groups whose trainings in models/pretrained have been replaced since, and the
 # commit that shipped those which were evaluated.
 REPLACED = {
-    "24277db": {"bytestream_hold": "2991870"},  # docs/results.md
     "81ef066": {"bytestream_hold": "2991870"},  # docs/dose_response.md
     "28420bd": {"bytestream_hold": "2991870"},  # docs/trade.md
 }

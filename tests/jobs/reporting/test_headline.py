@@ -178,7 +178,7 @@ def test_what_the_readme_says_of_the_papers_claims_is_what_the_results_say():
 
 @pytest.mark.parametrize(
     ("page", "commit"),
-    [("results", "24277db"), ("dose_response", "81ef066"), ("trade", "28420bd")],
+    [("dose_response", "81ef066"), ("trade", "28420bd")],
 )
 def test_a_page_about_trainings_that_have_been_replaced_says_so(page, commit):
     text = (REPOSITORY / "docs" / f"{page}.md").read_text()
