@@ -90,7 +90,7 @@ def trained(about):
 
 
 def test_what_the_readme_says_below_its_table_is_what_the_data_say(sweep):
-    """Noise costs the five groups that never met it; ten of eleven fail on textures; one holds."""
+    """Noise costs the five groups that never met it; nine of eleven fail on textures; one holds."""
     about, _ = sweep
     groups = trained(about)
     faults = {"sparsity", "background_activity", "sensor_noise"}
@@ -101,9 +101,9 @@ def test_what_the_readme_says_below_its_table_is_what_the_data_say(sweep):
         noisy = [success(sweep, COLUMNS[name], group) for name in ("10 % false events", "noise by night")]
         assert min(noisy) < success(sweep, COLUMNS["nothing changed"], group) / 2, group
     below = [success(sweep, COLUMNS["other textures"], group) < 0.5 for group in groups]
-    assert (sum(below), len(below)) == (10, 11)
+    assert (sum(below), len(below)) == (9, 11)
     held = {name: success(sweep, at, "bytestream_hold") for name, at in COLUMNS.items()}
-    assert round(100 * held.pop("actions 100 ms late")) == 77
+    assert round(100 * held.pop("actions 100 ms late")) == 66
     assert min(held.values()) > 0.94
 
 
@@ -126,16 +126,15 @@ def test_what_is_left_to_the_policy_that_holds_is_what_the_data_say(sweep):
         for axis, points in about["axes"].items()
         for value in points
     }
-    dense = {("control_hz_dense", rate) for rate in ("25", "45", "100", "400", "800")}
-    assert {at for at, rate in rates.items() if round(100 * rate) < 94} == {
+    dense = {("control_hz_dense", rate) for rate in ("25", "45", "800")}
+    assert {at for at, rate in rates.items() if round(100 * rate) < 96} == {
         *dense,
-        ("memory_400hz", "legacy"),
+        ("action_delay", "50"),
         ("action_delay", "100"),
     }
     shown = {rate: round(100 * rates["control_hz_dense", rate]) for rate in ("25", "45", "200", "800")}
-    assert shown == {"25": 60, "45": 73, "200": 94, "800": 80}
-    assert round(100 * rates["memory_400hz", "legacy"]) == 77
-    assert [round(100 * rates["action_delay", late]) for late in ("50", "100")] == [94, 77]
+    assert shown == {"25": 90, "45": 87, "200": 97, "800": 94}
+    assert [round(100 * rates["action_delay", late]) for late in ("50", "100")] == [94, 66]
 
 
 def test_late_actions_change_what_the_page_says(sweep):
@@ -148,28 +147,25 @@ def test_late_actions_change_what_the_page_says(sweep):
             success(sweep, ("action_delay", d), group) - usual[group] for d in delays for group in groups
         ]
         ends.append((round(100 * min(found)), round(100 * max(found))))
-    assert ends == [(-7, 19), (-24, -5)]
+    assert ends == [(-7, 17), (-34, -5)]
 
 
 def test_the_losses_that_the_page_calls_certain_are_those_of_the_data(sweep):
     found = {(one.group, one.condition): one for one in changes_of(*sweep) if one.certain}
-    assert set(found) == {
-        ("bytestream", ("world", "poles_dense")),
-        ("event_set", ("world", "texture_change")),
-    }
+    assert set(found) == {("event_set", ("world", "poles_dense"))}
     ends = [[round(100 * part.mean()) for part in (one.before, one.success)] for one in found.values()]
-    assert sorted(ends) == [[90, 10], [93, 52]]
+    assert ends == [[98, 43]]
 
 
 def test_what_the_readme_says_of_the_papers_claims_is_what_the_results_say():
     counted = re.search(
-        r"Of the paper's (\d+) claims: (\d+) undecided, (\d+) does not hold, (\d+) equivalent\.",
+        r"Of the paper's (\d+) claims: (\d+) undecided, (\d+) does not hold, (\d+) equivalent, (\d+) reversed\.",
         (REPOSITORY / "docs" / "results.md").read_text(),
     )
     readme = " ".join((REPOSITORY / "README.md").read_text().split())
     said = re.search(
         r"Of the paper's (\d+) claims \[none is confirmed\]\S+ (\d+) are undecided by three "
-        r"trainings a kind, (\d+) do not hold, in (\d+) both kinds do equally well\.",
+        r"trainings a kind, (\d+) do not hold, in (\d+) both kinds do equally well, (\d+) is reversed\.",
         readme,
     )
     assert said.groups() == counted.groups()
