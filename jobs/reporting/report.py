@@ -241,7 +241,8 @@ def in_short(
     certain = sum(change.certain and _loses(change) for change in changes)
     sentences.append(
         f"Losses that are certain for further trainings too: {certain} of {len(replicated(changes))} changes "
-        "of groups with several trainings; with three trainings a group only losses on which all agree can be."
+        "of groups with several trainings; with three trainings a group only losses on which all agree can "
+        "be."
     )
     verdicts = Counter(one.verdict for one in findings.values())
     counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())

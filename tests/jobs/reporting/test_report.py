@@ -233,7 +233,8 @@ def test_a_group_of_one_training_is_in_no_test_of_groups(sweep):
     only = changes_of({**ABOUT, "groups": {"event_image": [0]}}, swept)
     assert [one.certain for one in only] == [False, False]
     assert (
-        "Of 2 changes of groups with several trainings 1 are losses" in in_short(ABOUT, swept, changes, {})[2]
+        "Losses that are certain for further trainings too: 1 of 2 changes"
+        in in_short(ABOUT, swept, changes, {})[2]
     )
 
 
