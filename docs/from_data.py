@@ -28,7 +28,7 @@ from jobs.studies.ablation.page import VariantResult, plot_variants, variant_res
 from jobs.studies.trade.page import draw_settings
 
 DOCS = Path(__file__).resolve().parent
-ABLATIONS = "ablation", "ablation_more", "taught"  # each with a recipe of its own
+ABLATIONS = "ablation", "ablation_more", "taught", "memory_seconds"  # each with a recipe of its own
 
 
 def results(data: Path) -> dict[str, Figure]:
