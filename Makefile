@@ -90,10 +90,10 @@ test: setup ## the quick tests (4 minutes on two cores)
 	$(PYTEST) --dist worksteal $(ARGS)
 
 test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the site, the notebooks (8 minutes)
-	$(PYTEST) -m "system and not slow" --dist loadgroup $(ARGS)
+	$(PYTEST) -m "system and not slow" --dist loadfile $(ARGS)
 
 test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
-	$(PYTEST) -m slow --dist loadgroup $(ARGS)
+	$(PYTEST) -m slow --dist loadfile $(ARGS)
 
 test-faults: setup ## inject faults into running jobs and print what was lost (19 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 3 --dist worksteal $(ARGS)

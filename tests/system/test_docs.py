@@ -189,7 +189,6 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.system
-@pytest.mark.xdist_group("pages")
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if BLOCKS.search(page.read_text())], ids=lambda page: page.name
 )

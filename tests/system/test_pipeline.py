@@ -16,8 +16,8 @@ from models.policy import load_policy
 from tests.support.faults import launch as start_job
 from tests.support.sockets import check_ray, listening
 
-# One run serves most tests of this file, so one worker takes them all.
-pytestmark = [pytest.mark.system, pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(900)]
+# One run serves most tests of this file; make gives each worker whole files.
+pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 ROOT = Path(__file__).resolve().parents[2]
 SECTIONS = ("evae/", "train/", "eval/", "sim/", "perf/")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = [pytest.mark.system, pytest.mark.xdist_group("wheel")]
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "install.md").read_text(), re.DOTALL)[1]
 # Raised before a meta path finder is asked, as if the package were not installed.
