@@ -231,6 +231,46 @@ def trainings_needed(ours: np.ndarray, theirs: np.ndarray, gain: float) -> int |
     return max(2, int(np.ceil(variance * (quantiles / gain) ** 2)))
 
 
+class Spread(NamedTuple):
+    """Standard deviations in a group: between its trainings, and of an episode of a training."""
+
+    trainings: float
+    episodes: float
+
+
+def spread_of(values: np.ndarray) -> Spread:
+    """Both standard deviations, by analysis of variance of two crossed factors (method of moments).
+
+    What all trainings share in a corridor is no part of them. Where trainings differ less than single
+    episodes would make them differ, the first is 0.
+
+    Args:
+        values: Shape (trainings, corridors), two of each at least.
+    """
+    variance = _residual(values) * values.size
+    between = _by_trainings(values) * len(values) - variance / values.shape[1]
+    return Spread(float(np.sqrt(max(between, 0.0))), float(np.sqrt(variance)))
+
+
+def expected_half_width(ours: Spread, theirs: Spread, trainings: int, corridors: int) -> float:
+    """Half of Welch's 95 % interval of the difference of two groups, in the unit of their spreads.
+
+    Args:
+        ours: Of one group.
+        theirs: Of the other.
+        trainings: Of each, two at least.
+        corridors: In which all are evaluated.
+
+    Raises:
+        ValueError: There is only one training.
+    """
+    parts = [(one.trainings**2 + one.episodes**2 / corridors) / trainings for one in (ours, theirs)]
+    interval = _tested(0.0, [(part, trainings - 1) for part in parts], 0.0).interval
+    if interval is None:
+        raise ValueError(f"an interval over trainings needs two of them, got {trainings}")
+    return interval[1]
+
+
 def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
     """Success rate of ours minus that of theirs on the same corridors, with its 95 % interval.
 

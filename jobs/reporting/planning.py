@@ -1,20 +1,16 @@
 """What a study of other numbers of trainings and corridors would tell of the paper's claims.
 
 Run: python -m jobs.reporting.planning taught_claims 10 28
-Prints, for each claim of a study whose episodes are in docs/data: how much trainings differ, how much single
-episodes do beside that, and half of the 95 % interval of the difference with as many trainings of each
-group and as many corridors as asked, if they differ as those of the study.
+Prints, for each claim of a study whose episodes are in docs/data: the standard deviation between trainings
+of a group, that of single episodes of a training, and half of the 95 % interval of the difference, with as
+many trainings of each group and as many corridors as asked, if they differ as those of the study.
 """
 
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple
 
-import numpy as np
-from scipy.stats import t
-
-from jobs.analysis.statistics import CONFIDENCE
+from jobs.analysis.statistics import expected_half_width, spread_of
 from jobs.analysis.tables import show_table
 from jobs.reporting.breaks import place
 from jobs.reporting.paper_claims import CLAIMS, UNITS, compared, over_conditions
@@ -22,42 +18,7 @@ from jobs.reporting.sweep_data import read_data
 from jobs.run.provenance import REPOSITORY
 
 DATA, ABOUT = REPOSITORY / "docs" / "data", "_about.json"
-HEAD = ("Claim", "Against", "Of trainings", "Of episodes", "Interval")
-
-
-class Spread(NamedTuple):
-    """Standard deviations of a group: of what trainings are on average, and of an episode beside that."""
-
-    trainings: float
-    episodes: float
-
-
-def spread_of(values: np.ndarray) -> Spread:
-    """Of values (trainings, corridors), two of each at least, by analysis of variance of two crossed factors.
-
-    What corridors share is no part of it; where trainings differ less than their episodes alone would make
-    them differ, theirs is 0.
-    """
-    trainings, corridors = values.shape
-    rest = values - values.mean(axis=0) - values.mean(axis=1, keepdims=True) + values.mean()
-    chance = (rest**2).sum() / ((trainings - 1) * (corridors - 1))
-    between = values.mean(axis=1).var(ddof=1) - chance / corridors
-    return Spread(float(np.sqrt(max(between, 0.0))), float(np.sqrt(chance)))
-
-
-def expected_half_width(ours: Spread, theirs: Spread, trainings: int, corridors: int) -> float:
-    """Half of Welch's 95 % interval of the difference of two groups, in the unit of their spreads.
-
-    Args:
-        ours: Of one group.
-        theirs: Of the other.
-        trainings: Of each, two at least.
-        corridors: In which all are evaluated.
-    """
-    parts = [(one.trainings**2 + one.episodes**2 / corridors) / trainings for one in (ours, theirs)]
-    squares = sum(part**2 for part in parts)
-    freedom = sum(parts) ** 2 / squares * (trainings - 1) if squares > 0 else 2.0 * (trainings - 1)
-    return float(t.ppf((1 + CONFIDENCE) / 2, freedom) * np.sqrt(sum(parts)))
+HEAD = ("Claim", "Against", "SD between trainings", "SD of an episode", "95 % interval")
 
 
 def plan_rows(study: str, trainings: int, corridors: int) -> list[tuple[str, ...]]:

@@ -17,10 +17,12 @@ from jobs.reporting.dose_response import write_dose_response
 from jobs.reporting.figures import condition_text, contacts, survivals
 from jobs.reporting.headline import BEGIN, END
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_curves, read_trainings
+from jobs.reporting.paper_claims import CLAIMS, compare
 from jobs.reporting.report import write_results
 from jobs.reporting.summary_plots import still_going
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_sweep, read_sweep_episodes, write_data
 from jobs.rollout.policies import PRETRAINED
+from jobs.studies.ablation.page import variant_result
 from tests.support.episodes import flights
 from tests.support.sweep_folders import study_places, write_shipped, write_study, write_sweep
 
@@ -176,3 +178,31 @@ def test_the_tables_of_the_ablation_are_those_of_their_episodes(name):
         success = (f"{100 * values.mean():.0f}" for values in one.success.values())
         expected = [one.name, *success, estimate_text(one.mean, 100, ".0f")]
         assert expected in [[row[0], *row[2 : 1 + len(expected)]] for row in rows]
+
+
+def test_what_memory_in_seconds_is_worth_is_that_of_its_episodes():
+    success = {
+        one.name: {at: values[:, None] for at, values in one.success.items()}
+        for one in variant_results(DOCS / "data" / "memory_seconds_episodes.csv.gz")
+    }
+    shown = {row[0]: row[-1] for row in cells_of("policies.md")}
+    for way in ("taught", "ppo"):
+        own = variant_result("seconds", success[f"{way}_seconds"], success[f"{way}_stack"], ())
+        assert shown[f"{way}_seconds"] == estimate_text(own.difference, 100, "+.0f")
+
+
+def test_what_taught_policies_say_of_cameras_and_autoencoders_is_that_of_their_episodes():
+    episodes = read_sweep_episodes(DOCS / "data" / "taught_episodes.csv.gz")
+    nominal, text = ("nominal", "poles_eval"), " ".join((DOCS / "policies.md").read_text().split())
+
+    def find(at, group):
+        return episodes[nominal if at == ("world", "poles_eval") else at, group]
+
+    for claim in (one for one in CLAIMS if one.source == "D.1.2"):
+        found = compare(claim, find, {("world", "texture_change"): nominal}).overall
+        ends = [round(100 * end) for end in found.interval]
+        cost = [round(-100 * found.value), -ends[1], -ends[0]]
+        said = f"{cost[0]} points [{cost[1]}, {cost[2]}]" if claim.ours == "bytestream" else None
+        if claim.ours == "bytestream_xy":
+            said = f"{cost[0]} [{cost[1]}, {cost[2]}]"
+        assert (said or f"{round(100 * found.value)} points [{ends[0]}, +{ends[1]}]") in text
