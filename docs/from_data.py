@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 from jobs.evaluation.group_stats import episode_values
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.reporting.breaks import changes_of
+from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
 from jobs.reporting.dose_response import DOSES, draw, read_doses
 from jobs.reporting.figures import results_figures
 from jobs.reporting.learning_curves import read_trainings
 from jobs.reporting.report import results_pages, write_figures
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_episodes
-from jobs.reporting.taught_claims import TAUGHT, draw_taught
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_atomic
 from jobs.studies.ablation.page import VariantResult, plot_variants, variant_result
@@ -45,7 +45,12 @@ def dose_response(data: Path) -> dict[str, Figure]:
 
 def taught_claims(data: Path) -> dict[str, Figure]:
     """That of taught_claims.md."""
-    return {TAUGHT: draw_taught(*read_data(data, TAUGHT))}
+    return {TAUGHT: draw_study(data, TAUGHT)}
+
+
+def ppo_claims(data: Path) -> dict[str, Figure]:
+    """That of ppo_claims.md."""
+    return {BY_PPO: draw_study(data, BY_PPO)}
 
 
 def ablation(data: Path) -> dict[str, Figure]:
@@ -74,6 +79,7 @@ STUDIES = {
     results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
     dose_response: (f"{DOSES}_episodes.csv.gz", f"{DOSES}_about.json", f"{DOSES}_doses.csv"),
     taught_claims: (f"{TAUGHT}_episodes.csv.gz", f"{TAUGHT}_about.json"),
+    ppo_claims: (f"{BY_PPO}_episodes.csv.gz", f"{BY_PPO}_about.json"),
     ablation: tuple(f"{name}_episodes.csv.gz" for name in ABLATIONS),
     trade: ("trade_settings.csv",),
 }

@@ -277,6 +277,7 @@ class SweepConfig:
         axes: Name -> setting -> values. The first setting names the points of the axis; others
             have as many values, or one that stays.
         reference: The group that paired differences are taken against.
+        split: Whose corridors: "eval", by which results are told, or "validation", by which settings are chosen.
     """
 
     scene: Name
@@ -284,6 +285,7 @@ class SweepConfig:
     axes: dict[AxisName, Axis]
     trials: Count
     reference: Name
+    split: Literal["eval", "validation"] = "eval"
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -340,7 +342,8 @@ class AblationConfig:
         seeds: Of the trainings of each variant.
         variants: Name -> what it changes, key -> value, with the place in a list as a number. Each is
             compared with the first. `train.init` names the first: its policy of the same seed is trained on.
-            `seeds` gives a variant fewer trainings: some of `seeds` above.
+            `seeds` gives a variant fewer trainings: some of `seeds` above. `encoder_seed` names one of them:
+            all trainings of the variant see by the first variant's encoder of that seed.
         trained: A folder of their policies, each named as in models/pretrained, which are then only
             evaluated; None: they are trained.
     """

@@ -68,7 +68,7 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
     Raises:
         ConfigError: If a policy's own sensor and a changed setting exclude each other.
     """
-    configured = dataclasses.replace(config.env, scene=config.sweep.scene, split="eval")
+    configured = dataclasses.replace(config.env, scene=config.sweep.scene, split=config.sweep.split)
     axes = axes_of(config.sweep)
     tasks = [
         make_task(

@@ -81,6 +81,7 @@ class SweepFacts(TypedDict):
     date: str
     budget: str
     scene: str
+    split: NotRequired[str]  # older sweeps are all "eval"
     trials: int
     reference: str
     action: str
@@ -234,6 +235,7 @@ def about(config: Config, folder: Run, found: SweepResults) -> SweepFacts:
         "date": today(),
         "budget": config.budget,
         "scene": config.sweep.scene,
+        "split": config.sweep.split,
         "trials": config.sweep.trials,
         "reference": config.sweep.reference,
         "action": config.evaluate.action,

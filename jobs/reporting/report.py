@@ -3,8 +3,8 @@
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
 docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page, the results in
-docs/dose_response.md and docs/taught_claims.md of the newest studies of these names; with `resume` of what
-that run folder holds.
+docs/dose_response.md, docs/taught_claims.md and docs/ppo_claims.md of the newest studies of these names; with
+`resume` of what that run folder holds.
 """
 
 from collections import Counter
@@ -28,6 +28,7 @@ from jobs.evaluation.group_stats import (
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, replicated
+from jobs.reporting.claims_study import BY_PPO, TAUGHT, write_claims_study
 from jobs.reporting.dose_response import DOSES, write_dose_response
 from jobs.reporting.figures import TITLES, condition_text, group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
@@ -35,7 +36,6 @@ from jobs.reporting.learning_curves import PublishedTraining, published_training
 from jobs.reporting.paper_claims import GAIN, UNITS, Claim, Finding
 from jobs.reporting.replay_page import PAGE
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, replaced_text, write_data
-from jobs.reporting.taught_claims import TAUGHT, write_taught_claims
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.checkpoints import sha256
 from jobs.run.files import read_json, write_atomic
@@ -58,7 +58,8 @@ def run(config: Config) -> dict[str, Any]:
         "sweep": write_results,
         "replay": write_replay,
         DOSES: partial(write_dose_response, env=config.env),
-        TAUGHT: write_taught_claims,
+        BY_PPO: partial(write_claims_study, name=BY_PPO),
+        TAUGHT: partial(write_claims_study, name=TAUGHT),
     }
     found = {name: find_study(config, name) for name in writers}
     if not any(found.values()):
@@ -77,13 +78,16 @@ def find_study(config: Config, name: str) -> Path | None:
     Args:
         config: The experiment.
         name: "sweep", "trade" or "replay", as its folder is called; `DOSES` is the sweep of that experiment,
-            "sweep" that of any other, `TAUGHT` the ablation of that experiment.
+            "sweep" that of any other in the corridors of evaluation, `TAUGHT` and `BY_PPO` the ablations of
+            these experiments.
     """
     where = Path(config.runs_dir).glob("*") if config.resume is None else [Path(config.resume)]
-    folder = {DOSES: "sweep", TAUGHT: "ablation"}.get(name, name)
+    folder = {DOSES: "sweep", TAUGHT: "ablation", BY_PPO: "ablation"}.get(name, name)
     found = [path for path in (run / folder / "about.json" for run in where) if path.is_file()]
     if folder == "sweep":
-        found = [path for path in found if (read_json(path).get("exp") == DOSES) == (name == DOSES)]
+        facts = {path: read_json(path) for path in found}
+        found = [path for path, one in facts.items() if (one.get("exp") == DOSES) == (name == DOSES)]
+        found = [path for path in found if facts[path].get("split", "eval") == "eval"]
     if folder == "ablation":
         found = [path for path in found if read_json(path).get("exp") == name]
     newest = max(found, key=lambda path: path.stat().st_mtime_ns, default=None)

@@ -114,19 +114,20 @@ def write_study(folder):
     return folder
 
 
-def write_taught(folder, lost=()):
-    """Leave a study of taught policies in `folder`, whose trainings lose none or one of 14; returns it.
+def write_claims(folder, lost=(), exp="taught_claims"):
+    """Leave a study of the paper's claims in `folder`, whose trainings lose none or one of 14; returns it.
 
     Args:
         folder: Where.
         lost: Group, axis, value and how many episodes more each training loses there.
+        exp: Its experiment.
     """
-    config = parse(compose("+exp=taught_claims"))
+    config = parse(compose(f"+exp={exp}"))
     axes, env = axes_of(config.sweep), dataclasses.replace(config.env, scene="poles_eval", split="eval")
     groups = dict.fromkeys(config.ablation.variants, config.ablation.seeds[:3])
     baselines, same = baselines_of(env, axes), same_simulations(env, axes)
     about = {
-        **ABOUT, "run": "taught_claims-short-s0-1", "exp": "taught_claims", "axes": axes, "groups": groups,
+        **ABOUT, "run": f"{exp}-short-s0-1", "exp": exp, "axes": axes, "groups": groups,
         "trials": 14, "met": [], "exactness": [],
         "compared": [{"condition": at, "baseline": baselines[at], "same_as": same[at]} for at in baselines],
     }  # fmt: skip

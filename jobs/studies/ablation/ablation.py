@@ -47,7 +47,9 @@ ENCODER_FILES = (
 SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden")
 INIT = "train.init"
 TOLD = ("algo", "train", "collect", "pretrain")  # settings that a manifest tells, beside the model's
-SEEDS = "seeds"  # of a variant that has fewer trainings than the first; not a setting of its experiment
+# Of a variant, and not settings of its experiment: the trainings that it has, if fewer than the first, and the seed of
+# the encoder of the first by which all of them see.
+SEEDS, ENCODER_SEED = "seeds", "encoder_seed"
 Variant = Mapping[str, Any]  # key -> value
 
 
@@ -65,7 +67,9 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     if not variants:
         raise ConfigError("ablation.variants: must name at least one, got none; +exp=ablation names twelve")
     for name in variants:
-        variant_config(config, name, seeds_of(config, name)[0])
+        seeds = seeds_of(config, name)
+        variant_config(config, name, seeds[0])
+        encoder_seed_of(config, name, seeds[0])
     places = None if config.ablation.trained is None else trained_policies(config)
     folder = open_run(config)
     config = folder.config
@@ -120,9 +124,10 @@ def train_variants(config: Config) -> dict[tuple[str, int], Run]:
     """Train every variant with every seed unless that is done; return the runs."""
     variants, trained = config.ablation.variants, dict[tuple[str, int], Run]()
     first = next(iter(variants))
-    for seed in config.ablation.seeds:
-        for name in [name for name in variants if seed in seeds_of(config, name)]:
-            trained[name, seed] = train_variant(config, name, seed, trained.get((first, seed)))
+    for name in variants:
+        for seed in seeds_of(config, name):
+            sees_by = trained.get((first, encoder_seed_of(config, name, seed)))
+            trained[name, seed] = train_variant(config, name, seed, sees_by)
     return trained
 
 
@@ -143,6 +148,30 @@ def seeds_of(config: Config, name: str) -> list[int]:
             f"{first}, with which the others are compared; got {named!r}"
         )
     return [seed for seed in every if seed in named]
+
+
+def encoder_seed_of(config: Config, name: str, seed: int) -> int:
+    """The seed of the training of the first variant whose encoder a training sees by, if it has none of its own.
+
+    Raises:
+        ConfigError: The variant names a seed that the first has not, needs an encoder of its own, or is the first.
+    """
+    named = config.ablation.variants[name].get(ENCODER_SEED)
+    if named is None:
+        return seed
+    first = next(iter(config.ablation.variants))
+    if name == first or named not in config.ablation.seeds or not shares_encoder(config, name):
+        raise ConfigError(
+            f"ablation.variants.{name}.{ENCODER_SEED}: must be one of ablation.seeds, {config.ablation.seeds}, of a "
+            f"variant after the first, {first}, that changes nothing its encoder learns from; got {named!r}"
+        )
+    return int(named)
+
+
+def shares_encoder(config: Config, name: str) -> bool:
+    """Whether a variant sees by an encoder of the first: it changes nothing that the encoder learns from."""
+    changes = changes_of(config, name)
+    return changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
 
 
 def variant_config(config: Config, name: str, seed: int) -> Config:
@@ -168,7 +197,8 @@ def variant_config(config: Config, name: str, seed: int) -> Config:
 
 def changes_of(config: Config, name: str) -> Variant:
     """The settings that a variant changes."""
-    return {key: value for key, value in config.ablation.variants[name].items() if key != SEEDS}
+    apart = (SEEDS, ENCODER_SEED)
+    return {key: value for key, value in config.ablation.variants[name].items() if key not in apart}
 
 
 def _set(values: Any, key: str, value: Any) -> None:
@@ -183,13 +213,11 @@ def _set(values: Any, key: str, value: Any) -> None:
 
 
 def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Run:
-    """Train a variant unless that is done, on the encoder of the first one where it may; return its run."""
+    """Train a variant unless that is done, on the encoder of a run of the first where it may; return its run."""
     own = open_run(variant_config(config, name, seed))
-    changes = changes_of(config, name)
     if finished(own, "train") is None:
         console.print(f"Train {name}, seed {seed}", markup=False)
-        shares = changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
-        if first is not None and shares and finished(own, "pretrain") is None:
+        if first is not None and shares_encoder(config, name) and finished(own, "pretrain") is None:
             for file in ENCODER_FILES:  # the marks of the finished stages last
                 (own.path / file).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(first.path / file, own.path / file)

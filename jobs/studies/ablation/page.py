@@ -83,9 +83,10 @@ def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], 
     show_table(TITLE, head, rows, 1, None)
     fewer = [f"`{name}` {len(one['seeds'])}" for name, one in facts["variants"].items() if "seeds" in one]
     but = f" ({', '.join(fewer)})" if fewer else ""
+    apart = "validation " if facts["split"] == "validation" else ""
     said = (
         f"{len(facts['seeds'])} trainings each{but}, {facts['env_steps']:,} environment steps, "
-        f"{facts['trials']} corridors for each training and condition. Mean: over the conditions, 95 % "
+        f"{facts['trials']} {apart}corridors for each training and condition. Mean: over the conditions, 95 % "
         "interval by trainings (Student). Change: to the first variant, by pairs of trainings with the same "
         "seed. Minutes: of the policy's training, without the encoder's."
     )

@@ -18,7 +18,11 @@ JOBS = {
     "robustness": "sweep",
     "dose_response": "sweep",
     "calibrated_camera": "ablation",
+    "camera_rates": "ablation",
+    "encoder_seeds": "ablation",
+    "learning_rates": "ablation",
     "memory_seconds": "ablation",
+    "ppo_claims": "ablation",
     "taught_claims": "ablation",
     "taught": "ablation",
 }
@@ -148,7 +152,7 @@ def test_ppo_is_the_papers():
     }
 
 
-OF_EXPERIMENTS = "_ablation", "_claims", "_hold"  # lengths that name an experiment instead of an algorithm
+OF_EXPERIMENTS = "_ablation", "_claims", "_compared", "_hold"  # lengths that name an experiment instead of an algorithm
 
 
 @pytest.mark.parametrize("length", [name for name in options("length") if not name.endswith(OF_EXPERIMENTS)])

@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 from jobs.config.config import ConfigError, as_dict, parse
+from jobs.evaluation.sweep_plan import plan_sweep
 from jobs.reporting.publish import newest_trainings, publish
+from jobs.rollout.policies import read_policy
 from jobs.run.files import read_json
 from jobs.run.folder import COMPARED_STEPS, locate_run
 from jobs.studies.ablation import ablation
@@ -17,7 +19,7 @@ from jobs.studies.ablation.page import plot_variants, table_row, variant_result
 from models.encoder.weights import with_checksum
 from models.kinds import KINDS
 from models.policy.policy import MANIFEST, read_policy_manifest
-from tests.support.configs import SHORT, compose, make_config
+from tests.support.configs import CONF, SHORT, compose, make_config
 from tests.support.policies import save_training
 
 # As docs/policies.md says, rounded up.
@@ -98,6 +100,45 @@ def test_every_kind_of_policy_is_taught_alike():
     assert all(one == alike[0] for one in alike)
 
 
+def test_learning_rates_differ_in_nothing_else_and_are_judged_apart_from_every_study():
+    config = parse(compose("+exp=learning_rates", "model=event_image"))
+    trained = [as_dict(variant_config(config, name, 10)) for name in config.ablation.variants]
+    rates = sorted(one["algo"].pop("lr") for one in trained)
+    assert rates == [3e-4, 1e-3, 3e-3]
+    assert [{**one, "exp": ""} for one in trained[1:]] == [{**trained[0], "exp": ""}] * 2
+    assert config.train.env_steps == COMPARED_STEPS
+    tasks = plan_sweep(config, [read_policy("oracle")]).tasks
+    assert {task.env.split for task in tasks} == {"validation"}
+    files = {path.stem: yaml.safe_load(path.read_text()) for path in (CONF / "exp").glob("*.yaml")}
+    seeds = {name: set((file.get("ablation") or {}).get("seeds", {0, 1, 2})) for name, file in files.items()}
+    assert [name for name, one in seeds.items() if one & set(config.ablation.seeds)] == ["learning_rates"]
+
+
+def test_every_encoder_is_met_by_every_seed_of_ppo_once(monkeypatch):
+    """Encoder and seed crossed, the trainings of `own` on the diagonal."""
+    config = parse(compose("+exp=encoder_seeds"))
+    trained = []
+    monkeypatch.setattr(ablation, "train_variant", lambda config, name, seed, first: (name, seed, first))
+    for (_, seed), (_, _, first) in ablation.train_variants(config).items():
+        encoder = seed if first is None else first[1]
+        assert first is None or first[0] == "own"
+        trained.append((encoder, seed))
+    assert sorted(trained) == [(encoder, seed) for encoder in range(5) for seed in range(5)]
+
+
+def test_cameras_are_compared_at_each_rate_with_nothing_else_changed():
+    config = parse(compose("+exp=camera_rates"))
+    seen = {}
+    for name in config.ablation.variants:
+        one = as_dict(variant_config(config, name, 1))
+        seen[name] = one["env"].pop("control_hz"), one["camera"].pop("memory")
+        first = as_dict(variant_config(config, "pixels_200hz", 1))
+        del first["env"]["control_hz"], first["camera"]["memory"]
+        assert {**one, "exp": ""} == {**first, "exp": ""}
+    assert set(seen.values()) == {(hz, kind) for hz in (45.0, 200.0, 400.0) for kind in ("reference", "frame")}
+    assert len(seen) == 6
+
+
 @pytest.mark.parametrize("way", ["taught", "ppo"])
 def test_memory_in_seconds_is_compared_with_a_stack_of_the_same_training(way):
     config = parse(compose("+exp=memory_seconds"))
@@ -131,6 +172,9 @@ def test_memory_in_seconds_is_compared_with_a_stack_of_the_same_training(way):
         ("{recipe: {}, other: {seeds: [1]}}", "seeds"),
         ("{recipe: {}, other: {seeds: 2}}", "seeds"),
         ("{recipe: {seeds: [0, 1]}, other: {}}", "seeds"),
+        ("{recipe: {}, other: {encoder_seed: 2}}", "encoder_seed"),
+        ("{recipe: {encoder_seed: 1}, other: {}}", "encoder_seed"),
+        ("{recipe: {}, other: {encoder_seed: 1, env.filter_support: 0}}", "encoder_seed"),
     ],
 )
 def test_a_wrong_variant_is_refused_before_anything_is_trained(tmp_path, change, message):

@@ -5,18 +5,27 @@ import numpy as np
 import pytest
 
 from docs.from_data import figures
-from jobs.config.config import parse
+from jobs.config.config import as_dict, parse
 from jobs.evaluation.sweep_plan import axes_of
-from jobs.reporting.paper_claims import CLAIMS
+from jobs.reporting.claims_study import (
+    BY_PPO,
+    TAUGHT,
+    other_findings,
+    read_findings,
+    study_findings,
+    write_claims_study,
+)
+from jobs.reporting.paper_claims import CLAIMS, LEARNT
 from jobs.reporting.planned_page import RESULTS
 from jobs.reporting.report import find_study
 from jobs.reporting.sweep_data import read_sweep
-from jobs.reporting.taught_claims import TAUGHT, taught_findings, write_taught_claims
+from jobs.run.folder import COMPARED_STEPS
 from jobs.studies.ablation.ablation import variant_config
 from tests.support.configs import compose, small_config
-from tests.support.sweep_folders import write_taught
+from tests.support.sweep_folders import write_claims, write_shipped
 
 TEXTURES = "generalises to other textures"
+TEXTS = {TAUGHT: "gains much over event images with moving textures", BY_PPO: "generalises to other shapes"}
 PLAN = "# A plan\n\n- **Rule.** As it was.\n"
 
 
@@ -41,12 +50,34 @@ def test_the_study_trains_the_groups_of_the_claims_alike_and_evaluates_their_con
     assert len(algos) == len({str(dataclasses.asdict(one.train)) for one in trained.values()}) == 1
 
 
+def test_the_study_by_ppo_is_that_of_taught_policies_but_for_how_they_learn():
+    taught, ppo = (parse(compose(f"+exp={name}")) for name in (TAUGHT, BY_PPO))
+    assert (taught.sweep, taught.ablation.seeds) == (ppo.sweep, ppo.ablation.seeds)
+    groups = {one for claim in (*CLAIMS, *LEARNT) for one in (claim.ours, claim.theirs)}
+    assert set(taught.ablation.variants) < set(ppo.ablation.variants) == groups
+    for name in taught.ablation.variants:
+        one, other, usual = (
+            as_dict(config)
+            for config in (
+                variant_config(ppo, name, 1),
+                variant_config(taught, name, 1),
+                parse(compose(f"+exp={name}")),
+            )
+        )
+        for part in ("env", "model", "collect", "pretrain"):
+            assert one[part] == other[part]
+        assert one["model"] == usual["model"]
+        assert one["algo"] == usual["algo"]
+        assert one["train"]["env_steps"] == COMPARED_STEPS
+        assert one["train"]["conditions"] == other["train"]["conditions"] == usual["train"]["conditions"]
+
+
 def test_a_loss_of_the_rival_alone_shows_in_the_claims_about_it_and_in_no_other(tmp_path):
-    even = taught_findings(*read_sweep(write_taught(tmp_path / "even")))
+    even = study_findings(*read_sweep(write_claims(tmp_path / "even")), ())
     assert len(even) == 15
     assert {one.overall.value for one in even.values()} == {0.0}
     lost = [("event_image", "world", "texture_change", 9)]
-    findings = taught_findings(*read_sweep(write_taught(tmp_path / "lost", lost)))
+    findings = study_findings(*read_sweep(write_claims(tmp_path / "lost", lost)), ())
     changed = {claim.ours: one for claim, one in findings.items() if claim.text == TEXTURES}
     assert set(changed) == {"bytestream", "bytestream_xy"}
     for one in changed.values():
@@ -60,18 +91,48 @@ def test_the_page_keeps_its_plan_and_is_written_again_the_same(tmp_path):
     docs = tmp_path / "docs"
     docs.mkdir()
     (docs / f"{TAUGHT}.md").write_text(PLAN)
-    study = write_taught(tmp_path / "run" / "ablation", [("event_image", "world", "dynamic", 9)])
-    page = write_taught_claims(study, docs)
+    study = write_claims(tmp_path / "run" / "ablation", [("event_image", "world", "dynamic", 9)])
+    page = write_claims_study(study, docs, TAUGHT)
     first = page.read_text()
     assert first.startswith(PLAN)
     assert first.count(RESULTS) == 1
     assert first.count("| `bytestream") >= 15
-    assert write_taught_claims(study, docs).read_text() == first
+    assert write_claims_study(study, docs, TAUGHT).read_text() == first
     assert set(figures(docs / "data")) == {TAUGHT}
 
 
+def test_each_study_is_shown_beside_the_other_way_to_learn(tmp_path):
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    study = {
+        name: write_claims(tmp_path / name / "ablation", [("event_image", "world", value, 9)], name)
+        for name, value in ((TAUGHT, "dynamic"), (BY_PPO, "shape_change"))
+    }
+    assert other_findings(docs / "data", TAUGHT) == (BY_PPO, {})
+    pages = {name: write_claims_study(study[name], docs, name) for name in (TAUGHT, BY_PPO, TAUGHT)}
+    assert set(figures(docs / "data")) == {TAUGHT, BY_PPO}
+    for name, other in ((TAUGHT, BY_PPO), (BY_PPO, TAUGHT)):
+        beside, findings = other_findings(docs / "data", name)
+        assert (beside, findings) == (other, read_findings(docs / "data", other))
+        text = pages[name].read_text()
+        assert f"({other}.md#results)" in text
+        assert f"images/{name}.png" in text
+        row = next(line for line in text.splitlines() if line.startswith(f"| `bytestream`: {TEXTS[other]}"))
+        assert [cell.strip() for cell in row.split("|")][3:8:4] == ["equivalent", "holds"]
+
+
+def test_how_fast_groups_learn_is_tested_where_a_study_has_learning_curves(tmp_path):
+    data = tmp_path / "data"
+    write_claims_study(write_claims(tmp_path / "run" / "ablation", (), BY_PPO), tmp_path, BY_PPO)
+    assert len(read_findings(data, BY_PPO)) == 15
+    write_shipped(data / f"{BY_PPO}_policies")
+    found = read_findings(data, BY_PPO)
+    assert len(found) == 16
+    assert found[LEARNT[0]].overall.value == pytest.approx((0.805 - 0.405) / 2)
+
+
 def test_only_a_study_of_this_name_is_reported(tmp_path):
-    study = write_taught(tmp_path / "a" / "ablation")
+    study = write_claims(tmp_path / "a" / "ablation")
     config = dataclasses.replace(small_config(tmp_path), runs_dir=str(tmp_path))
     assert find_study(config, TAUGHT) == study
     about = json.loads((study / "about.json").read_text())
@@ -80,7 +141,7 @@ def test_only_a_study_of_this_name_is_reported(tmp_path):
 
 
 def test_the_constructed_study_loses_what_it_is_told_to(tmp_path):
-    _, episodes = read_sweep(write_taught(tmp_path, [("bytestream", "sparsity", "0.5", 4)]))
+    _, episodes = read_sweep(write_claims(tmp_path, [("bytestream", "sparsity", "0.5", 4)]))
     rates = {place: np.mean([own["success"].sum() for own in of.values()]) for place, of in episodes.items()}
     usual = rates[("sparsity", "0.2"), "bytestream"]
     assert rates[("sparsity", "0.5"), "event_image"] == usual > 13
