@@ -24,6 +24,7 @@ from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep, w
 from jobs.run.templates import render
 
 TAUGHT, BY_PPO = "taught_claims", "ppo_claims"  # names of the experiments, and of what is published of them
+SHORT = {TAUGHT: "Taught", BY_PPO: "By PPO"}  # as heads of columns
 TEMPLATE = Path(__file__).parent / "templates" / "claims_study.md.j2"
 HEAD = ("The paper says of", "Against", "Finding", "Difference", "p (Holm)", "Trainings needed")
 
@@ -128,7 +129,7 @@ def results_text(
         verdicts=counted(findings.values()),
         verdicts_other=counted(beside[claim] for claim in beside if claim in findings),
         claims=markdown_table(
-            (*HEAD, "By PPO" if name == TAUGHT else "Taught"),
+            (*HEAD, SHORT[BY_PPO if name == TAUGHT else TAUGHT]),
             [claim_line(at, one, beside.get(at)) for at, one in findings.items()],
             3,
         ),
@@ -136,6 +137,12 @@ def results_text(
         each={group: ", ".join(f"{100 * rate:.0f}" for rate in rates) for group, rates in each.items()},
         success=markdown_table(head, lines, 2),
     )
+
+
+def published_studies(data: Path) -> dict[str, dict[Claim, Finding]]:
+    """Name of each study of the claims that is published in a folder -> what it says of them."""
+    found = {name: read_findings(data, name) for name in (BY_PPO, TAUGHT)}
+    return {name: findings for name, findings in found.items() if findings}
 
 
 def counted(findings: Iterable[Finding]) -> str:

@@ -28,7 +28,7 @@ from jobs.evaluation.group_stats import (
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, replicated
-from jobs.reporting.claims_study import BY_PPO, TAUGHT, write_claims_study
+from jobs.reporting.claims_study import BY_PPO, SHORT, TAUGHT, counted, published_studies, write_claims_study
 from jobs.reporting.dose_response import DOSES, write_dose_response
 from jobs.reporting.figures import TITLES, condition_text, group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
@@ -43,6 +43,11 @@ from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
 from jobs.run.templates import render
 
+# How the results page calls the studies of the claims that are published beside it.
+OF_STUDIES = {
+    BY_PPO: f"[by PPO, with more trainings and corridors]({BY_PPO}.md#results)",
+    TAUGHT: f"[on taught policies]({TAUGHT}.md#results)",
+}
 TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -203,6 +208,7 @@ def page_values(
 ) -> dict[str, object]:
     """What the templates name."""
     changes, findings = changes_of(about, episodes), judge_claims(about, episodes, trainings)
+    studies = published_studies(docs / "data")
     success, every = estimate_tables(about, episodes)
     most = max(map(len, about["groups"].values()))
     return {
@@ -210,10 +216,11 @@ def page_values(
         "commits": ", ".join(commit[:7] for commit in about["evaluated_at"]),
         "groups": ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
         "replaced": replaced_text(about["commit"]),
-        "short": in_short(about, episodes, changes, findings),
+        "short": in_short(about, episodes, changes, findings, studies),
         "breaks": breaks_table(about, changes),
         "tests": len(replicated(changes)),
-        "claims": claims_table(findings),
+        "claims": claims_table(findings, studies),
+        "studies": [(name, SHORT[name]) for name in studies],
         "family": sum(one.adjusted_p is not None for one in findings.values()),
         "gain": GAIN,
         "compared_steps": COMPARED_STEPS,
@@ -232,6 +239,7 @@ def in_short(
     episodes: SweptEpisodes,
     changes: Sequence[Change],
     findings: Mapping[Claim, Finding],
+    studies: Mapping[str, Mapping[Claim, Finding]],
 ) -> list[str]:
     """What a reader wants to know first: which policy to take, what breaks most, what the paper had right."""
     trained = [group for group in about["groups"] if any(change.group == group for change in changes)]
@@ -248,9 +256,11 @@ def in_short(
         "of groups with several trainings; with three trainings a group only losses on which all agree can "
         "be."
     )
-    verdicts = Counter(one.verdict for one in findings.values())
-    counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
-    return [*sentences, f"Of the paper's {len(findings)} claims: {counted}."]
+    sentences.append(f"Of the paper's {len(findings)} claims: {counted(findings.values())}.")
+    sentences += [
+        f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}." for name, own in studies.items()
+    ]
+    return sentences
 
 
 def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[Change]) -> list[str]:
@@ -315,11 +325,18 @@ def _loss_text(change: Change) -> str:
     return f"**{text}**" if change.certain else text
 
 
-def claims_table(findings: Mapping[Claim, Finding]) -> str:
-    """The paper's claims with our findings."""
-    lines = [_claim_line(claim, one) for claim, one in findings.items()]
+def claims_table(findings: Mapping[Claim, Finding], studies: Mapping[str, Mapping[Claim, Finding]]) -> str:
+    """The paper's claims with our findings, and the verdicts of the studies that are published beside."""
+    lines = [
+        (*_claim_line(claim, one), *(_verdict(own.get(claim)) for own in studies.values()))
+        for claim, one in findings.items()
+    ]
     head = ("The paper says of", "Source", "Against", "Finding", "Difference", "p (Holm)", "Trainings needed")
-    return markdown_table(head, lines, 4)
+    return markdown_table((*head, *(SHORT[name] for name in studies)), lines, 4)
+
+
+def _verdict(finding: Finding | None) -> str:
+    return "-" if finding is None else finding.verdict
 
 
 def _claim_line(claim: Claim, finding: Finding) -> tuple[str, ...]:

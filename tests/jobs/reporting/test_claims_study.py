@@ -11,13 +11,14 @@ from jobs.reporting.claims_study import (
     BY_PPO,
     TAUGHT,
     other_findings,
+    published_studies,
     read_findings,
     study_findings,
     write_claims_study,
 )
 from jobs.reporting.paper_claims import CLAIMS, LEARNT
 from jobs.reporting.planned_page import RESULTS
-from jobs.reporting.report import find_study
+from jobs.reporting.report import claims_table, find_study
 from jobs.reporting.sweep_data import read_sweep
 from jobs.run.folder import COMPARED_STEPS
 from jobs.studies.ablation.ablation import variant_config
@@ -119,15 +120,20 @@ def test_each_study_is_shown_beside_the_other_way_to_learn(tmp_path):
         assert f"images/{name}.png" in text
         row = next(line for line in text.splitlines() if line.startswith(f"| `bytestream`: {TEXTS[other]}"))
         assert [cell.strip() for cell in row.split("|")][3:8:4] == ["equivalent", "holds"]
+    studies = published_studies(docs / "data")
+    head, _, *lines = claims_table(studies[TAUGHT], studies).splitlines()
+    assert head.endswith("| By PPO | Taught |")
+    row = next(line for line in lines if line.startswith(f"| `bytestream`: {TEXTS[TAUGHT]}"))
+    assert row.endswith("| equivalent | holds |")
 
 
 def test_how_fast_groups_learn_is_tested_where_a_study_has_learning_curves(tmp_path):
     data = tmp_path / "data"
     write_claims_study(write_claims(tmp_path / "run" / "ablation", (), BY_PPO), tmp_path, BY_PPO)
-    assert len(read_findings(data, BY_PPO)) == 15
+    assert len(read_findings(data, BY_PPO)) == 18
     write_shipped(data / f"{BY_PPO}_policies")
     found = read_findings(data, BY_PPO)
-    assert len(found) == 16
+    assert len(found) == 19
     assert found[LEARNT[0]].overall.value == pytest.approx((0.805 - 0.405) / 2)
 
 

@@ -234,7 +234,7 @@ def test_a_group_of_one_training_is_in_no_test_of_groups(sweep):
     assert [one.certain for one in only] == [False, False]
     assert (
         "Losses that are certain for further trainings too: 1 of 2 changes"
-        in in_short(ABOUT, swept, changes, {})[2]
+        in in_short(ABOUT, swept, changes, {}, {})[2]
     )
 
 
@@ -242,13 +242,13 @@ def test_a_policy_that_was_not_evaluated_unchanged_is_not_recommended(sweep):
     swept = read_sweep_episodes(sweep / "episodes.csv")
     about = {**ABOUT, "compared": [*ABOUT["compared"][:2],
                                    {**ABOUT["compared"][2], "baseline": ["sparsity", "0.2"]}]}  # fmt: skip
-    assert in_short(about, swept, changes_of(about, swept), {})[0].startswith("Take `bytestream`: 80 %")
+    assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("Take `bytestream`: 80 %")
     del swept[("nominal", "poles_eval"), "bytestream"]
     changes = changes_of(about, swept)
-    assert in_short(about, swept, changes, {})[0].startswith("Take `event_image`: 20 %")
+    assert in_short(about, swept, changes, {}, {})[0].startswith("Take `event_image`: 20 %")
     assert "| `bytestream` | - |" in breaks_table(about, changes)
     del swept[("nominal", "poles_eval"), "event_image"]
-    assert in_short(about, swept, changes_of(about, swept), {})[0].startswith("What breaks most")
+    assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("What breaks most")
 
 
 @pytest.mark.parametrize("part", ["results_figures", "page_values", "with_headline"])
