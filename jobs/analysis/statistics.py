@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, norm, sem, t
+from scipy.stats import binomtest, bootstrap, f, norm, sem, t
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -269,6 +269,51 @@ def expected_half_width(ours: Spread, theirs: Spread, trainings: int, corridors:
     if interval is None:
         raise ValueError(f"an interval over trainings needs two of them, got {trainings}")
     return interval[1]
+
+
+class CrossedSpread(NamedTuple):
+    """Standard deviations of the rows and the columns of a table, and the p of the tests that they are 0.
+
+    Attributes:
+        rows, columns: Of what a row or a column has in common; 0 where the rest alone would make them differ
+            as much.
+        rest: Of what neither explains.
+        rows_p, columns_p: None: nothing differs at all.
+    """
+
+    rows: float
+    columns: float
+    rest: float
+    rows_p: float | None
+    columns_p: float | None
+
+
+def crossed_spread(values: np.ndarray) -> CrossedSpread:
+    """From which of two crossed factors values differ (analysis of variance without replication, F tests).
+
+    Args:
+        values: Shape (rows, columns), two of each at least.
+
+    Raises:
+        ValueError: There are fewer, or a value is NaN or infinite.
+    """
+    values = _checked(values, "values")
+    if min(values.shape) < 2:
+        raise ValueError(f"values must have two rows and two columns, got shape {values.shape}")
+    rest = _residual(values) * values.size
+    rows, rows_p = _factor(values, rest)
+    columns, columns_p = _factor(values.T, rest)
+    return CrossedSpread(rows, columns, float(np.sqrt(rest)), rows_p, columns_p)
+
+
+def _factor(values: np.ndarray, rest: float) -> tuple[float, float | None]:
+    """Standard deviation of the rows, and the p of its test, by the variance of the rest."""
+    rows, columns = values.shape
+    between = columns * float(values.mean(axis=1).var(ddof=1))
+    spread = float(np.sqrt(max(between - rest, 0.0) / columns))
+    if rest > 0:
+        return spread, float(f.sf(between / rest, rows - 1, (rows - 1) * (columns - 1)))
+    return spread, 0.0 if between > 0 else None
 
 
 def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:

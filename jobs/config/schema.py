@@ -277,7 +277,7 @@ class SweepConfig:
         axes: Name -> setting -> values. The first setting names the points of the axis; others
             have as many values, or one that stays.
         reference: The group that paired differences are taken against.
-        split: Whose corridors: "eval", by which results are told, or "validation", by which settings are chosen.
+        split: Whose corridors: "eval", by which results are told, or "validation", for choosing settings.
     """
 
     scene: Name

@@ -1,4 +1,4 @@
-"""The pages of the two studies of the paper's claims, of policies that a planner teaches and of policies by PPO.
+"""The pages of the two studies of the paper's claims: on policies that a planner teaches, and by PPO.
 
 The plan stands on the page and is left as it is; what is below it is written from the study's episodes alone.
 """

@@ -47,8 +47,8 @@ ENCODER_FILES = (
 SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden")
 INIT = "train.init"
 TOLD = ("algo", "train", "collect", "pretrain")  # settings that a manifest tells, beside the model's
-# Of a variant, and not settings of its experiment: the trainings that it has, if fewer than the first, and the seed of
-# the encoder of the first by which all of them see.
+# Of a variant, and not settings of its experiment: the trainings that it has, if fewer than the first, and
+# the seed of the encoder of the first by which all of them see.
 SEEDS, ENCODER_SEED = "seeds", "encoder_seed"
 Variant = Mapping[str, Any]  # key -> value
 
@@ -151,10 +151,10 @@ def seeds_of(config: Config, name: str) -> list[int]:
 
 
 def encoder_seed_of(config: Config, name: str, seed: int) -> int:
-    """The seed of the training of the first variant whose encoder a training sees by, if it has none of its own.
+    """The seed of the training of the first variant whose encoder a training sees by, if not by its own.
 
     Raises:
-        ConfigError: The variant names a seed that the first has not, needs an encoder of its own, or is the first.
+        ConfigError: The variant names another seed than those, needs an encoder of its own, or is the first.
     """
     named = config.ablation.variants[name].get(ENCODER_SEED)
     if named is None:
@@ -162,8 +162,9 @@ def encoder_seed_of(config: Config, name: str, seed: int) -> int:
     first = next(iter(config.ablation.variants))
     if name == first or named not in config.ablation.seeds or not shares_encoder(config, name):
         raise ConfigError(
-            f"ablation.variants.{name}.{ENCODER_SEED}: must be one of ablation.seeds, {config.ablation.seeds}, of a "
-            f"variant after the first, {first}, that changes nothing its encoder learns from; got {named!r}"
+            f"ablation.variants.{name}.{ENCODER_SEED}: must be one of ablation.seeds, "
+            f"{config.ablation.seeds}, of a variant after the first, {first}, that changes nothing its "
+            f"encoder learns from; got {named!r}"
         )
     return int(named)
 
@@ -213,7 +214,7 @@ def _set(values: Any, key: str, value: Any) -> None:
 
 
 def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Run:
-    """Train a variant unless that is done, on the encoder of a run of the first where it may; return its run."""
+    """Train a variant unless that is done, on the encoder of a run of the first where it may."""
     own = open_run(variant_config(config, name, seed))
     if finished(own, "train") is None:
         console.print(f"Train {name}, seed {seed}", markup=False)

@@ -86,9 +86,9 @@ def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], 
     apart = "validation " if facts["split"] == "validation" else ""
     said = (
         f"{len(facts['seeds'])} trainings each{but}, {facts['env_steps']:,} environment steps, "
-        f"{facts['trials']} {apart}corridors for each training and condition. Mean: over the conditions, 95 % "
-        "interval by trainings (Student). Change: to the first variant, by pairs of trainings with the same "
-        "seed. Minutes: of the policy's training, without the encoder's."
+        f"{facts['trials']} {apart}corridors for each training and condition. Mean: over the conditions, "
+        "95 % interval by trainings (Student). Change: to the first variant, by pairs of trainings with the "
+        "same seed. Minutes: of the policy's training, without the encoder's."
     )
     table = markdown_table(head, rows, 1)
     text = f"`{facts['command']}`, {facts['date']}, commit {facts['commit']}.\n\n{table}\n{said}\n"

@@ -152,7 +152,12 @@ def test_ppo_is_the_papers():
     }
 
 
-OF_EXPERIMENTS = "_ablation", "_claims", "_compared", "_hold"  # lengths that name an experiment instead of an algorithm
+OF_EXPERIMENTS = (
+    "_ablation",
+    "_claims",
+    "_compared",
+    "_hold",
+)  # lengths that name an experiment instead of an algorithm
 
 
 @pytest.mark.parametrize("length", [name for name in options("length") if not name.endswith(OF_EXPERIMENTS)])

@@ -135,7 +135,9 @@ def test_cameras_are_compared_at_each_rate_with_nothing_else_changed():
         first = as_dict(variant_config(config, "pixels_200hz", 1))
         del first["env"]["control_hz"], first["camera"]["memory"]
         assert {**one, "exp": ""} == {**first, "exp": ""}
-    assert set(seen.values()) == {(hz, kind) for hz in (45.0, 200.0, 400.0) for kind in ("reference", "frame")}
+    assert set(seen.values()) == {
+        (hz, kind) for hz in (45.0, 200.0, 400.0) for kind in ("reference", "frame")
+    }
     assert len(seen) == 6
 
 
