@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.stats import kstest
+from scipy.stats import f, kstest
 
 from jobs.analysis.statistics import crossed_spread
 
@@ -39,7 +39,9 @@ def test_the_test_is_that_of_two_nested_linear_models():
         rests.append(((values.ravel() - design @ solution) ** 2).sum())
     found = crossed_spread(values)
     assert found.rest == pytest.approx(np.sqrt(rests[0] / 12))
-    assert found.rows**2 * 4 + found.rest**2 == pytest.approx((rests[1] - rests[0]) / 4)
+    explained = (rests[1] - rests[0]) / 4
+    assert found.rows**2 * 4 + found.rest**2 == pytest.approx(explained)
+    assert found.rows_p == pytest.approx(f.sf(explained / (rests[0] / 12), 4, 12))
 
 
 def test_exchanging_rows_and_columns_exchanges_what_is_said_of_them():

@@ -99,6 +99,16 @@ def test_the_newest_study_is_found_unless_one_is_named(sweep, tmp_path):
     assert find_study(config, "trade") is None
 
 
+def test_a_sweep_in_validation_corridors_is_no_result(sweep, tmp_path):
+    later = tmp_path / "runs" / "later" / "sweep"
+    later.mkdir(parents=True)
+    config = small_config(tmp_path, job="report")
+    for split, found in (("eval", later), ("validation", sweep)):
+        write_json(later / "about.json", ABOUT | {"split": split})
+        os.utime(later / "about.json", (2**32, 2**32))
+        assert find_study(config, "sweep") == found
+
+
 @pytest.fixture
 def trade(tmp_path):
     """The folder that a trade leaves."""
