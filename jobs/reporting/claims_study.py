@@ -151,16 +151,17 @@ def counted(findings: Iterable[Finding]) -> str:
     return ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
 
 
-def claim_line(claim: Claim, finding: Finding, other: Finding | None) -> tuple[str, ...]:
-    """One claim as a row under `HEAD` and the verdict of another study."""
+def claim_line(claim: Claim, finding: Finding, *others: Finding | None) -> tuple[str, ...]:
+    """One claim as a row under `HEAD` and the verdicts of other studies."""
     scale, form, unit = UNITS[claim.measure]
+    difference = f"{estimate_text(finding.overall, scale, form)}{unit}"
     needed = finding.needed if finding.verdict == "undecided" else None
     return (
         f"`{claim.ours}`: {claim.text}",
         f"`{claim.theirs}`",
         finding.verdict,
-        f"{estimate_text(finding.overall, scale, form)}{unit}",
+        difference if finding.overall else "one of them is missing",
         "-" if finding.adjusted_p is None else f"{finding.adjusted_p:.2g}",
         "-" if needed is None else str(needed),
-        "-" if other is None else other.verdict,
+        *("-" if other is None else other.verdict for other in others),
     )

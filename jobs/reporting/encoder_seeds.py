@@ -64,7 +64,9 @@ def _row(name: str, table: np.ndarray) -> tuple[str, ...]:
 
 
 def main(episodes: Path = EPISODES) -> None:
-    """Print the table."""
+    """Print the table; without the study's episodes the program ends with the rule."""
+    if not episodes.is_file():
+        raise SystemExit(f"{episodes}: must hold the episodes of +exp=encoder_seeds, packed; it is not there")
     rows = spread_rows(by_encoder(read_sweep_episodes(episodes)))
     show_table("From what trainings by PPO differ", HEAD, rows, 1, None)
 

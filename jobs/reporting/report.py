@@ -28,12 +28,21 @@ from jobs.evaluation.group_stats import (
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, replicated
-from jobs.reporting.claims_study import BY_PPO, SHORT, TAUGHT, counted, published_studies, write_claims_study
+from jobs.reporting.claims_study import (
+    BY_PPO,
+    HEAD,
+    SHORT,
+    TAUGHT,
+    claim_line,
+    counted,
+    published_studies,
+    write_claims_study,
+)
 from jobs.reporting.dose_response import DOSES, write_dose_response
 from jobs.reporting.figures import TITLES, condition_text, group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
-from jobs.reporting.paper_claims import GAIN, UNITS, Claim, Finding
+from jobs.reporting.paper_claims import GAIN, Claim, Finding
 from jobs.reporting.replay_page import PAGE
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, replaced_text, write_data
 from jobs.rollout.policies import PRETRAINED
@@ -327,31 +336,12 @@ def _loss_text(change: Change) -> str:
 
 def claims_table(findings: Mapping[Claim, Finding], studies: Mapping[str, Mapping[Claim, Finding]]) -> str:
     """The paper's claims with our findings, and the verdicts of the studies that are published beside."""
-    lines = [
-        (*_claim_line(claim, one), *(_verdict(own.get(claim)) for own in studies.values()))
-        for claim, one in findings.items()
-    ]
-    head = ("The paper says of", "Source", "Against", "Finding", "Difference", "p (Holm)", "Trainings needed")
-    return markdown_table((*head, *(SHORT[name] for name in studies)), lines, 4)
-
-
-def _verdict(finding: Finding | None) -> str:
-    return "-" if finding is None else finding.verdict
-
-
-def _claim_line(claim: Claim, finding: Finding) -> tuple[str, ...]:
-    scale, form, unit = UNITS[claim.measure]
-    overall = f"{estimate_text(finding.overall, scale, form)}{unit}"
-    undecided = finding.verdict == "undecided" and finding.needed is not None
-    return (
-        f"`{claim.ours}`: {claim.text}",
-        claim.source,
-        f"`{claim.theirs}`",
-        finding.verdict,
-        overall if finding.overall else "one of them is missing",
-        "-" if finding.adjusted_p is None else f"{finding.adjusted_p:.2g}",
-        str(finding.needed) if undecided else "-",
-    )
+    lines = []
+    for claim, one in findings.items():
+        text, *rest = claim_line(claim, one, *(own.get(claim) for own in studies.values()))
+        lines.append((text, claim.source, *rest))
+    first, *head = HEAD
+    return markdown_table((first, "Source", *head, *(SHORT[name] for name in studies)), lines, 4)
 
 
 def estimate_tables(about: SweepFacts, episodes: SweptEpisodes) -> tuple[str, str]:

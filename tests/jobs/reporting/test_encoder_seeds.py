@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from jobs.evaluation.sweep_plan import NOMINAL
-from jobs.reporting.encoder_seeds import by_encoder, spread_rows
+from jobs.reporting.encoder_seeds import by_encoder, main, spread_rows
 from tests.support.episodes import flights
 
 AT = (NOMINAL, "poles_eval")
@@ -32,3 +32,8 @@ def test_a_study_that_lacks_a_training_is_refused():
     del episodes[AT, "encoder_1"][2]
     with pytest.raises(ValueError, match=r"missing: \[\(1, 2\)\]"):
         by_encoder(episodes)
+
+
+def test_without_its_episodes_the_program_ends_with_the_rule(tmp_path):
+    with pytest.raises(SystemExit, match="must hold the episodes of"):
+        main(tmp_path / "none.csv.gz")
