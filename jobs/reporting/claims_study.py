@@ -148,7 +148,10 @@ def published_studies(data: Path) -> dict[str, dict[Claim, Finding]]:
 def counted(findings: Iterable[Finding]) -> str:
     """How many findings have each verdict, the most frequent first."""
     verdicts = Counter(one.verdict for one in findings)
-    return ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+    return ", ".join(
+        f"{count} {'do not hold' if verdict == 'does not hold' and count > 1 else verdict}"
+        for verdict, count in verdicts.most_common()
+    )
 
 
 def claim_line(claim: Claim, finding: Finding, *others: Finding | None) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from jobs.reporting.breaks import CHANGE
 
 GAIN = {"success": 0.1, "distance_m": 10.0}  # the smallest difference that matters
 # Factor, format and unit in which a measure is shown.
-UNITS = {"success": (100, "+.0f", " %"), "distance_m": (1, "+.1f", " m")}
+UNITS = {"success": (100, "+.0f", " points"), "distance_m": (1, "+.1f", " m")}
 Verdict = Literal["holds", "reversed", "equivalent", "does not hold", "undecided", "not tested"]
 Measure = Literal["success", "distance_m"]
 Find = Callable[[Condition, str], TrainingEpisodes]  # of a group under a condition; empty if there are none

@@ -27,7 +27,7 @@ from jobs.evaluation.group_stats import (
 )
 from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
-from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, replicated
+from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, compared_pairs, replicated
 from jobs.reporting.claims_study import (
     BY_PPO,
     HEAD,
@@ -39,10 +39,10 @@ from jobs.reporting.claims_study import (
     write_claims_study,
 )
 from jobs.reporting.dose_response import DOSES, write_dose_response
-from jobs.reporting.figures import TITLES, condition_text, group_results, judge_claims, results_figures
+from jobs.reporting.figures import TITLES, WORDS, condition_text, group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
-from jobs.reporting.paper_claims import GAIN, Claim, Finding
+from jobs.reporting.paper_claims import CLAIMS, GAIN, Claim, Finding
 from jobs.reporting.replay_page import PAGE
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, replaced_text, write_data
 from jobs.rollout.policies import PRETRAINED
@@ -219,7 +219,7 @@ def page_values(
     changes, findings = changes_of(about, episodes), judge_claims(about, episodes, trainings)
     studies = published_studies(docs / "data")
     success, every = estimate_tables(about, episodes)
-    most = max(map(len, about["groups"].values()))
+    sizes = sorted({len(seeds) for seeds in about["groups"].values()} - {1})
     return {
         "about": about,
         "commits": ", ".join(commit[:7] for commit in about["evaluated_at"]),
@@ -233,9 +233,11 @@ def page_values(
         "family": sum(one.adjusted_p is not None for one in findings.values()),
         "gain": GAIN,
         "compared_steps": COMPARED_STEPS,
-        "most": most,
-        "coverage": coverage_text(most, about["trials"]),
+        "coverage": {size: coverage_text(size, about["trials"]) for size in sizes},
+        "several": several_at_once(about),
+        "values": paper_values(),
         "shared": shared_encoders(about, pretrained),
+        "doses": (docs / "dose_response.md").is_file(),
         "trade": (docs / "trade.md").is_file(),
         "success": success,
         "details": every,
@@ -251,25 +253,56 @@ def in_short(
     studies: Mapping[str, Mapping[Claim, Finding]],
 ) -> list[str]:
     """What a reader wants to know first: which policy to take, what breaks most, what the paper had right."""
-    trained = [group for group in about["groups"] if any(change.group == group for change in changes)]
-    sentences = _best_policy(about, episodes, changes)
-    broken: Counter[Condition] = Counter()
-    for change in changes:
-        broken[change.condition] += int(change.broken.sum())
-    every = sum(len(about["groups"][group]) for group in trained)
-    worst = [f'"{condition_text(*at)}" ({count} of {every})' for at, count in broken.most_common(3) if count]
-    sentences.append(f"What breaks most of the published trainings: {', '.join(worst) or 'nothing'}.")
-    certain = sum(change.certain and _loses(change) for change in changes)
-    sentences.append(
-        f"Losses that are certain for further trainings too: {certain} of {len(replicated(changes))} changes "
-        "of groups with several trainings; with three trainings a group only losses on which all agree can "
-        "be."
-    )
-    sentences.append(f"Of the paper's {len(findings)} claims: {counted(findings.values())}.")
-    sentences += [
-        f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}." for name, own in studies.items()
+    certain = [change for change in changes if change.certain and _loses(change)]
+    named = [
+        f'`{one.group}` in "{condition_text(*one.condition)}" '
+        f"({100 * one.before.mean():.0f} to {100 * one.success.mean():.0f} %)"
+        for one in certain
     ]
-    return sentences
+    return [
+        *_best_policy(about, episodes, changes),
+        _worst_conditions(about, changes),
+        f"Losses certain for further trainings too: {len(certain)} of {len(replicated(changes))} changes of "
+        f"groups with several trainings{': ' if named else ''}{', '.join(named)}.",
+        f"Of the paper's {len(findings)} claims: {counted(findings.values())}{_decided(findings)}.",
+        *(
+            f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}{_decided(own)}."
+            for name, own in studies.items()
+        ),
+    ]
+
+
+def _worst_conditions(about: SweepFacts, changes: Sequence[Change]) -> str:
+    """The sentence on the three conditions in which most of the published trainings lose half or more."""
+    trained = {change.group for change in changes}
+    every = sum(len(about["groups"][group]) for group in trained)
+    halved, broken = Counter[Condition](), Counter[Condition]()
+    for change in changes:
+        halved[change.condition] += int((change.success <= change.before / 2)[change.before > 0].sum())
+        broken[change.condition] += int(change.broken.sum())
+    worst = [
+        f'"{condition_text(*at)}" ({count}; {broken[at]} lose for certain)'
+        for at, count in halved.most_common(3)
+        if count
+    ]
+    return (
+        f"Conditions that take half or more of their success from the most of {every} published trainings: "
+        f"{', '.join(worst) or 'none'}."
+    )
+
+
+def _decided(findings: Mapping[Claim, Finding]) -> str:
+    """The claims that hold or are reversed, to be said behind how many there are."""
+    named = {
+        verdict: [
+            f"`{claim.ours}` {claim.text} (against `{claim.theirs}`)"
+            for claim, one in findings.items()
+            if one.verdict == verdict
+        ]
+        for verdict in ("holds", "reversed")
+    }
+    holds, other = ("; ".join(claims) for claims in named.values())
+    return (f". It holds: {holds}" if holds else ". None holds") + (f". Reversed: {other}" if other else "")
 
 
 def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[Change]) -> list[str]:
@@ -287,9 +320,30 @@ def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[C
     least = min(own[best], key=lambda one: one.success.mean())
     unchanged = 100 * episode_values(episodes[(NOMINAL, value), best], "success").mean()
     return [
-        f"Take `{best}`: {unchanged:.0f} % with nothing changed, {100 * mean[best]:.0f} % as the mean of all "
+        f"Take [`{best}`](policies.md): {unchanged:.0f} % with nothing changed, {100 * mean[best]:.0f} % as the mean of all "
         f'conditions, least in "{condition_text(*least.condition)}" with {100 * least.success.mean():.0f} %.'
     ]
+
+
+def several_at_once(about: SweepFacts) -> dict[str, str]:
+    """Condition in words -> its settings, of those that change several and have no words of their own."""
+    found = {}
+    for at, baseline in compared_pairs(about):
+        settings, usual = (about["axes"][axis][value] for axis, value in (at, baseline))
+        changed = [f"`{key}={value}`" for key, value in settings.items() if usual.get(key) != value]
+        if len(settings) > 2 and at not in WORDS:
+            found[condition_text(*at)] = ", ".join(changed)
+    return found
+
+
+def paper_values() -> str:
+    """The values of each axis by which the paper's claims are tested."""
+    values: dict[str, list[str]] = {}
+    for claim in CLAIMS:
+        for axis, value in claim.conditions:
+            if axis != NOMINAL and value not in values.setdefault(axis, []):
+                values[axis].append(value)
+    return "; ".join(f"`{axis}` {', '.join(own)}" for axis, own in values.items())
 
 
 def shared_encoders(about: SweepFacts, pretrained: Path) -> str:
@@ -328,7 +382,7 @@ def _loses(change: Change) -> bool:
 def _loss_text(change: Change) -> str:
     """A loss with its interval, and how many trainings break; bold where it is certain for others too."""
     text = (
-        f"{' '.join(change.condition)}: {estimate_text(change.difference, 100, '+.0f')}, "
+        f"{condition_text(*change.condition)}: {estimate_text(change.difference, 100, '+.0f')}, "
         f"{change.broken.sum()} of {len(change.broken)}"
     )
     return f"**{text}**" if change.certain else text

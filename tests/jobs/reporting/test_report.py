@@ -13,7 +13,14 @@ from jobs.evaluation.group_stats import LABELS
 from jobs.reporting import report as results
 from jobs.reporting.breaks import changes_of, compared_pairs, replicated
 from jobs.reporting.headline import BEGIN, END
-from jobs.reporting.report import breaks_table, find_study, in_short, write_results, write_trade
+from jobs.reporting.report import (
+    breaks_table,
+    find_study,
+    in_short,
+    several_at_once,
+    write_results,
+    write_trade,
+)
 from jobs.reporting.sweep_data import read_data, read_sweep_episodes
 from jobs.run.files import write_json
 from jobs.run.provenance import REPOSITORY
@@ -155,9 +162,21 @@ def test_a_condition_breaks_a_policy_where_its_own_loss_is_certain(sweep, tmp_pa
         ("0.2", "event_image", False), ("0.5", "event_image", False),
     }  # fmt: skip
     text = breaks_table(ABOUT, changes)
-    assert re.search(r"\| `bytestream` \| 80 \| \*\*sparsity 0.5: -50 \[-\d+, -\d+\], 3 of 3\*\* \|", text)
+    assert re.search(r"\| `bytestream` \| 80 \| \*\*Dead pixels: 0.5: -50 \[-\d+, -\d+\], 3 of 3\*\* \|", text)
     assert "| `event_image` (1 training) | 20 | none is certain |" in text
     assert "oracle" not in text
+
+
+def test_trainings_that_lose_half_are_counted_beside_those_that_lose_for_certain(sweep):
+    swept = read_sweep_episodes(sweep / "episodes.csv")
+    for seed, kept in ((0, 8), (1, 7), (2, 12)):
+        own = swept[("sparsity", "0.5"), "bytestream"][seed]
+        own["success"] = np.arange(own.size) < kept  # of 16 to 20 before
+    sentence = in_short(ABOUT, swept, changes_of(ABOUT, swept), {}, {})[1]
+    before = [swept[("nominal", "poles_eval"), "bytestream"][seed]["success"].sum() for seed in (0, 1, 2)]
+    halved = sum(kept <= all_of / 2 for kept, all_of in zip((8, 7, 12), before, strict=True))
+    assert 0 < halved < 3
+    assert f'"Dead pixels: 0.5" ({halved}; ' in sentence
 
 
 def test_one_training_that_breaks_is_told_and_says_nothing_of_others(sweep):
@@ -202,6 +221,14 @@ def test_a_scene_that_is_the_baseline_of_an_axis_is_itself_compared_once():
     ]
 
 
+def test_conditions_that_change_several_settings_are_told_with_them():
+    about, _ = read_data(REPOSITORY / "docs" / "data", "robustness")
+    (name, settings) = next(iter(several_at_once(about).items()))
+    assert name == "Several at once: 45"
+    changed = about["axes"]["worst"]["45"]
+    assert settings == ", ".join(f"`{key}={value}`" for key, value in changed.items())
+
+
 def test_the_published_sweep_tells_what_the_dense_scene_changes():
     about, swept = read_data(REPOSITORY / "docs" / "data", "robustness")
     pairs = compared_pairs(about)
@@ -243,7 +270,7 @@ def test_a_group_of_one_training_is_in_no_test_of_groups(sweep):
     only = changes_of({**ABOUT, "groups": {"event_image": [0]}}, swept)
     assert [one.certain for one in only] == [False, False]
     assert (
-        "Losses that are certain for further trainings too: 1 of 2 changes"
+        "Losses certain for further trainings too: 1 of 2 changes"
         in in_short(ABOUT, swept, changes, {}, {})[2]
     )
 
@@ -252,13 +279,14 @@ def test_a_policy_that_was_not_evaluated_unchanged_is_not_recommended(sweep):
     swept = read_sweep_episodes(sweep / "episodes.csv")
     about = {**ABOUT, "compared": [*ABOUT["compared"][:2],
                                    {**ABOUT["compared"][2], "baseline": ["sparsity", "0.2"]}]}  # fmt: skip
-    assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("Take `bytestream`: 80 %")
+    first = in_short(about, swept, changes_of(about, swept), {}, {})[0]
+    assert first.startswith("Take [`bytestream`](policies.md): 80 %")
     del swept[("nominal", "poles_eval"), "bytestream"]
     changes = changes_of(about, swept)
-    assert in_short(about, swept, changes, {}, {})[0].startswith("Take `event_image`: 20 %")
+    assert in_short(about, swept, changes, {}, {})[0].startswith("Take [`event_image`](policies.md): 20 %")
     assert "| `bytestream` | - |" in breaks_table(about, changes)
     del swept[("nominal", "poles_eval"), "event_image"]
-    assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("What breaks most")
+    assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("Conditions that take half")
 
 
 @pytest.mark.parametrize("part", ["results_figures", "page_values", "with_headline"])
