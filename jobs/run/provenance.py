@@ -51,7 +51,9 @@ def _git(*arguments: str) -> str | None:
 def command() -> str:
     """The command that is running, without the words that say where it runs and writes; no local paths."""
     words = [
-        re.sub(r"/[^\s,\]]*/", "", word) for word in sys.argv[1:] if not word.lstrip("+").startswith(PLACES)
+        re.sub(r"(?<![\w/.-])(?:\.\.)?/[^\s,\]]*/", "", word)  # what stands within the repository stays
+        for word in sys.argv[1:]
+        if not word.lstrip("+").startswith(PLACES)
     ]
     return f"python -m platform.launch {shlex.join(words)}"
 
