@@ -10,16 +10,18 @@ import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from jobs.evaluation.group_stats import episode_values
-from jobs.evaluation.sweep_plan import NOMINAL
+from jobs.config.conditions import NOMINAL
+from jobs.evaluation.group_stats import TrainingEpisodes, episode_values
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
+from jobs.reporting.claims_study import published_text as claims_text
 from jobs.reporting.dose_response import DOSES, draw, read_doses
+from jobs.reporting.dose_response import published_text as dose_response_text
 from jobs.reporting.figures import results_figures
 from jobs.reporting.learning_curves import read_trainings
+from jobs.reporting.planned_page import below_plan
 from jobs.reporting.report import results_pages, write_figures
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_episodes
 from jobs.rollout.policies import PRETRAINED
@@ -58,14 +60,24 @@ def ablation(data: Path) -> dict[str, Figure]:
     return {name: plot_variants(variant_results(data / f"{name}_episodes.csv.gz")) for name in ABLATIONS}
 
 
-def variant_results(episodes: Path) -> list[VariantResult]:
-    """Success of each variant of one ablation, and what it changes; the minutes are not known."""
-    success: dict[str, dict[str, np.ndarray]] = {}
+def variant_results(episodes: Path, first: str | None = None) -> list[VariantResult]:
+    """Success of each variant of one ablation, and what it changes; the minutes are not known.
+
+    Args:
+        episodes: Of the ablation.
+        first: The variant that the others are compared with, by pairs of seeds; None: the first.
+    """
+    found: dict[str, dict[str, TrainingEpisodes]] = {}
     for ((axis, value), name), trainings in read_sweep_episodes(episodes).items():
-        condition = value if axis == NOMINAL else f"{axis}={value}"
-        success.setdefault(name, {})[condition] = episode_values(trainings, "success")
-    first = next(iter(success.values()))
-    return [variant_result(name, own, first, ()) for name, own in success.items()]
+        found.setdefault(name, {})[value if axis == NOMINAL else f"{axis}={value}"] = trainings
+    compared = found[first or next(iter(found))]
+    results = []
+    for name, conditions in found.items():
+        own = {at: episode_values(trainings, "success") for at, trainings in conditions.items()}
+        same = {at: {seed: compared[at][seed] for seed in trainings} for at, trainings in conditions.items()}
+        theirs = {at: episode_values(trainings, "success") for at, trainings in same.items()}
+        results.append(variant_result(name, own, None if conditions is compared else theirs, ()))
+    return results
 
 
 def trade(data: Path) -> dict[str, Figure]:
@@ -101,11 +113,18 @@ def pages(docs: Path, drawn: Collection[str]) -> dict[str, str]:
         docs: Where the data and the pages are.
         drawn: Names of the figures that there are.
     """
-    data = docs / "data"
-    if not all((data / name).is_file() for name in STUDIES[results]):
-        return {}
+    data, found = docs / "data", dict[str, str]()
     names = [name for name in drawn if name.startswith("results_")]
-    return results_pages(*read_data(data, SWEEP), read_trainings(data / TRAININGS), names, docs, PRETRAINED)
+    if names:
+        found = results_pages(
+            *read_data(data, SWEEP), read_trainings(data / TRAININGS), names, docs, PRETRAINED
+        )
+    if DOSES in drawn:
+        found[f"{DOSES}.md"] = below_plan(docs / f"{DOSES}.md", dose_response_text(data))
+    for name in (TAUGHT, BY_PPO):
+        if name in drawn:
+            found[f"{name}.md"] = below_plan(docs / f"{name}.md", claims_text(data, name))
+    return found
 
 
 def main(docs: Path, target: Path) -> None:

@@ -1,9 +1,10 @@
 """How often 95 % intervals over trainings and corridors hold the truth: python -m jobs.analysis.coverage.
 
 Studies are simulated: the logit of success is a mean, plus a normal effect of each training and of each
-corridor, and episodes are drawn from it. Printed are the share of intervals that hold the true rate (of
-`rate_estimate`) or the true difference, which is 0 (of `crossed_difference`, two groups; of
-`crossed_mean`, the same trainings once more), and the mean width.
+corridor, and episodes are drawn from it; those that fail end anywhere before the goal line. Printed are the
+share of intervals that hold the true rate (of `rate_estimate`) or the true difference, which is 0 (of
+`crossed_difference`, two groups, in success and in distance; of `crossed_mean`, the same trainings once
+more), and the mean width.
 """
 
 from collections.abc import Iterator
@@ -15,11 +16,11 @@ from jobs.analysis.statistics import crossed_difference, crossed_mean, rate_esti
 from jobs.analysis.tables import show_table
 
 STUDIES = 300
-TRAININGS = ((3, 14), (4, 25), (8, 10), (10, 14))
+TRAININGS = ((3, 14), (4, 25), (8, 10), (10, 14), (10, 28))
 SPREADS = (0.0, 1.0, 2.0, 3.0)  # of the trainings' logits; the shipped policies under noise: about 2
 MEANS = (0.0, 1.5, 3.0)  # logits: a rate of 50, 80 and 94 % if trainings agree
 CORRIDORS = 0.7  # spread of the corridors' logits
-RATE = (0.0, 1.0)
+RATE, GOAL_M = (0.0, 1.0), 100.0
 
 
 def studies(
@@ -52,6 +53,16 @@ def coverage(trainings: int, corridors: int, mean: float, spread: float) -> tupl
     return *held.mean(axis=0), *widths.mean(axis=0)
 
 
+def distance_coverage(trainings: int, corridors: int, mean: float, spread: float) -> float:
+    """Share of intervals of a difference in distance that hold the true one, 0, of two groups."""
+    rng, ends, held = np.random.default_rng(0), np.random.default_rng(2), 0
+    for both in studies(rng, trainings, corridors, mean, spread):
+        ours, theirs = (np.where(won > 0, GOAL_M, ends.uniform(0.0, GOAL_M, won.shape)) for won in both)
+        low, high = crossed_difference(ours, theirs, (0.0, GOAL_M)).interval or (0.0, 0.0)
+        held += low <= 0.0 <= high
+    return held / STUDIES
+
+
 def change_coverage(trainings: int, corridors: int, mean: float, spread: float) -> float:
     """Share of intervals that hold 0, of what changes where nothing does: trainings are evaluated twice."""
     rng, held = np.random.default_rng(1), 0
@@ -77,12 +88,15 @@ def main() -> None:
     for trainings, corridors in TRAININGS:
         for mean in MEANS:
             for spread in SPREADS:
-                found = coverage(trainings, corridors, mean, spread)
-                change = change_coverage(trainings, corridors, mean, spread)
-                shares = [f"{100 * share:.0f}" for share in (true_rate(mean, spread), *found, change)]
+                asked = trainings, corridors, mean, spread
+                others = change_coverage(*asked), distance_coverage(*asked)
+                shares = [
+                    f"{100 * share:.0f}" for share in (true_rate(mean, spread), *coverage(*asked), *others)
+                ]
                 rows.append((f"{trainings} x {corridors}", f"{spread:g}", *shares))
-    held = "Rate held [%]", "Difference held [%]", "Rate's width", "Difference's", "Change held [%]"
-    head = ("Trainings x corridors", "Spread", "True rate [%]", *held)
+    held = "Rate held [%]", "Difference held [%]", "Rate's width", "Difference's"
+    more = "Change held [%]", "Difference in distance held [%]"
+    head = ("Trainings x corridors", "Spread", "True rate [%]", *held, *more)
     show_table("Coverage of 95 % intervals", head, rows, 1, None)
 
 

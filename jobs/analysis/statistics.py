@@ -9,11 +9,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, f, norm, sem, t
+from scipy.stats import binomtest, bootstrap, f, nct, sem, t
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
 POWER = 0.8
+MOST_TRAININGS = 10_000  # beyond which no study is planned
+CERTAIN = (
+    30.0  # standard errors beyond which the noncentral t has no digits, and power is 1 wherever it matters
+)
 
 Interval = tuple[float, float]
 
@@ -100,20 +104,21 @@ def crossed_mean(values: np.ndarray, bounds: Interval | None = None) -> Differen
     """Mean over trainings and corridors, and the test that it is 0; both are drawn at random, and crossed.
 
     Student's interval of the training means, widened by what the corridors add to their scatter (the analysis
-    of variance of a crossed design; degrees of freedom as Satterthwaite 1946). A single training says nothing
-    of others: the interval is then over corridors.
+    of variance of a crossed design; degrees of freedom as Satterthwaite 1946, those of the trainings at
+    most). A single training says nothing of others: the interval is then over corridors.
 
     Args:
         values: Shape (trainings, corridors).
-        bounds: The least and the greatest value that there can be; where all values agree, one of each is
-            added to find how sure that is. None: there are none.
+        bounds: The least and the greatest value that there can be. Where values agree by chance, one of each
+            is added to find how sure that is. None: there are none, and values that agree leave no doubt.
 
     Raises:
         ValueError: If there is no value, or one is NaN or infinite.
     """
     values = _checked(values, "values")
-    parts = [(_by_trainings(values), len(values) - 1), (_by_corridors([values]), values.shape[1] - 1)]
-    return _within(_tested(values.mean(), parts, _least(values, bounds)), bounds)
+    trainings, corridors = (size - 1 for size in values.shape)
+    parts = [(_by_trainings(values), trainings), (_by_corridors([values]), corridors)]
+    return _within(_tested(values.mean(), parts, _least(values, bounds), trainings or corridors), bounds)
 
 
 def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | None = None) -> Difference:
@@ -134,11 +139,13 @@ def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | 
     if ours.shape[1] != theirs.shape[1]:
         raise ValueError(f"both must be of the same corridors, got {ours.shape[1]} and {theirs.shape[1]}")
     parts = [(_by_corridors([ours, -theirs]), ours.shape[1] - 1)]
+    most = ours.shape[1] - 1
     if min(len(ours), len(theirs)) > 1:
         parts += [(_by_trainings(side), len(side) - 1) for side in (ours, theirs)]
+        most = len(ours) + len(theirs) - 2
     least = _least(ours, bounds) + _least(theirs, bounds)
     span = None if bounds is None else (bounds[0] - bounds[1], bounds[1] - bounds[0])
-    return _within(_tested(ours.mean() - theirs.mean(), parts, least), span)
+    return _within(_tested(ours.mean() - theirs.mean(), parts, least, most), span)
 
 
 def _within(found: Difference, bounds: Interval | None) -> Difference:
@@ -171,31 +178,60 @@ def _residual(values: np.ndarray) -> float:
     return float((rest**2).sum() / ((trainings - 1) * (corridors - 1)) / values.size)
 
 
-def _least(values: np.ndarray, bounds: Interval | None) -> float:
-    """Variance of the mean with one value more at each bound (Agresti and Coull 1998); 0 without bounds."""
-    return 0.0 if bounds is None else float(np.append(values, bounds).var() / (values.size + 2))
+def _least(values: np.ndarray, bounds: Interval | None, size: int | None = None) -> float:
+    """Variance of the mean by chance alone, with one value more at each bound; 0 without bounds.
+
+    As Agresti and Coull (1998) add a success and a failure to a rate; what trainings and corridors explain is
+    no chance, so that pairs of episodes in a corridor stay pairs.
+
+    Args:
+        values: Of one group, (trainings, corridors).
+        bounds: As in `crossed_mean`.
+        size: Of so many values that scatter as these do; None: of these.
+    """
+    if bounds is None:
+        return 0.0
+    count, mean = values.size if size is None else size, float(values.mean())
+    chance = _residual(values) * values.size if min(values.shape) > 1 else 0.0
+    return (count * chance + sum((end - mean) ** 2 for end in bounds)) / (count + 2) ** 2
 
 
-def _tested(value: float, parts: Sequence[tuple[float, int]], least: float) -> Difference:
-    """Student's interval and two-sided test of a value; None where no part has degrees of freedom.
+def _tested(value: float, parts: Sequence[tuple[float, int]], least: float, most: int) -> Difference:
+    """Student's interval and two-sided test of a value; None where there are no degrees of freedom.
 
     Args:
         value: What is tested.
-        parts: Parts of its variance with their degrees of freedom, joined as Welch and Satterthwaite do.
-        least: Variance that it has at least.
+        parts: As for `_error`, as `least` and `most`.
+        least: As there.
+        most: As there.
     """
-    value, known = float(value), [(part, freedom) for part, freedom in parts if freedom > 0]
-    if not known:
+    value = float(value)
+    if most < 1:
         return Difference(value, None, None)
-    variance = sum(part for part, _ in known)
-    freedom = float(sum(count for _, count in known))
-    if variance > 0:
-        freedom = variance**2 / sum(part**2 / count for part, count in known)
-    error = float(np.sqrt(max(variance, least)))
-    half = float(t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+    error, freedom = _error(parts, least, most)
     if error == 0.0:
         return Difference(value, (value, value), float(value == 0.0))
+    half = float(t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
     return Difference(value, (value - half, value + half), float(2 * t.sf(abs(value) / error, freedom)))
+
+
+def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple[float, float]:
+    """Standard error and its degrees of freedom, joined as Welch and Satterthwaite do.
+
+    Args:
+        parts: Parts of the variance with their degrees of freedom; what has none is left out.
+        least: Variance that there is at least.
+        most: Degrees of freedom that there are at most, and of what `least` adds: those of the trainings.
+            Without this limit small p values come two or three times too often with three trainings, whose
+            scatter looks small by chance beside that of corridors.
+    """
+    known = [(part, freedom) for part, freedom in parts if freedom > 0]
+    known.append((max(least - sum(part for part, _ in known), 0.0), most))
+    variance = sum(part for part, _ in known)
+    if variance == 0.0:
+        return 0.0, float(most)
+    freedom = variance**2 / sum(part**2 / freedom for part, freedom in known)
+    return float(np.sqrt(variance)), min(freedom, float(most))
 
 
 def exact_pair_p(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -213,22 +249,48 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in adjusted]
 
 
-def trainings_needed(ours: np.ndarray, theirs: np.ndarray, gain: float) -> int | None:
+def trainings_needed(
+    ours: np.ndarray, theirs: np.ndarray, gain: float, family: int = 1, bounds: Interval | None = None
+) -> int | None:
     """How many trainings of each side would show a difference of `gain` in four of five studies.
 
+    The power of the test of `crossed_difference` (noncentral t), in as many corridors as these; it must also
+    pass the first step of Holm's adjustment, so that the number suffices whatever the other tests say.
+
     Args:
-        ours: Training means (n,).
-        theirs: Those of the other side.
+        ours: Shape (trainings, corridors).
+        theirs: Shape (other trainings, the same corridors).
         gain: Difference of the means.
+        family: Tests that are adjusted together.
+        bounds: As in `crossed_difference`.
 
     Returns:
-        None where a side has one training, of which no spread is known.
+        None where a side has one training, of which no spread is known, or no number of trainings is enough,
+        since what corridors add remains.
     """
     if min(len(ours), len(theirs)) < 2:
         return None
-    variance = np.var(ours, ddof=1) + np.var(theirs, ddof=1)
-    quantiles = norm.ppf((1 + CONFIDENCE) / 2) + norm.ppf(POWER)
-    return max(2, int(np.ceil(variance * (quantiles / gain) ** 2)))
+    corridors, added = ours.shape[1], _by_corridors([ours, -theirs])
+
+    def power(count: int) -> float:
+        parts = [(added, corridors - 1)]
+        parts += [(_by_trainings(side) * len(side) / count, count - 1) for side in (ours, theirs)]
+        least = sum(_least(side, bounds, count * corridors) for side in (ours, theirs))
+        error, freedom = _error(parts, least, 2 * (count - 1))
+        if error == 0.0:
+            return 1.0
+        limit = t.isf((1 - CONFIDENCE) / family / 2, freedom)
+        return float(nct.sf(limit, freedom, min(gain / error, CERTAIN)))
+
+    low, high = 1, 2
+    while power(high) < POWER:
+        low, high = high, 2 * high
+        if high > MOST_TRAININGS:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if power(middle) < POWER else (low, middle)
+    return high
 
 
 class Spread(NamedTuple):
@@ -252,23 +314,39 @@ def spread_of(values: np.ndarray) -> Spread:
     return Spread(float(np.sqrt(max(between, 0.0))), float(np.sqrt(variance)))
 
 
-def expected_half_width(ours: Spread, theirs: Spread, trainings: int, corridors: int) -> float:
-    """Half of Welch's 95 % interval of the difference of two groups, in the unit of their spreads.
+def corridor_spread(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Standard deviation between corridors of the difference of two groups, beyond what chance makes.
+
+    What a corridor does to both alike is no part of it.
+
+    Args:
+        ours: Shape (trainings, corridors).
+        theirs: Shape (other trainings, the same corridors), two trainings of each at least.
+    """
+    return float(np.sqrt(_by_corridors([ours, -theirs]) * ours.shape[1]))
+
+
+def expected_half_width(ours: Spread, theirs: Spread, apart: float, trainings: int, corridors: int) -> float:
+    """Half of the 95 % interval of the difference of two groups, in the unit of their spreads.
 
     Args:
         ours: Of one group.
         theirs: Of the other.
+        apart: `corridor_spread` of both.
         trainings: Of each, two at least.
         corridors: In which all are evaluated.
 
     Raises:
         ValueError: There is only one training.
     """
-    parts = [(one.trainings**2 + one.episodes**2 / corridors) / trainings for one in (ours, theirs)]
-    interval = _tested(0.0, [(part, trainings - 1) for part in parts], 0.0).interval
-    if interval is None:
+    if trainings < 2:
         raise ValueError(f"an interval over trainings needs two of them, got {trainings}")
-    return interval[1]
+    parts = [
+        ((one.trainings**2 + one.episodes**2 / corridors) / trainings, trainings - 1)
+        for one in (ours, theirs)
+    ]
+    error, freedom = _error([*parts, (apart**2 / corridors, corridors - 1)], 0.0, 2 * (trainings - 1))
+    return float(t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
 
 
 class CrossedSpread(NamedTuple):
@@ -314,40 +392,6 @@ def _factor(values: np.ndarray, rest: float) -> tuple[float, float | None]:
     if rest > 0:
         return spread, float(f.sf(between / rest, rows - 1, (rows - 1) * (columns - 1)))
     return spread, 0.0 if between > 0 else None
-
-
-def paired_rate_difference(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
-    """Success rate of ours minus that of theirs on the same corridors, with its 95 % interval.
-
-    The interval is Newcombe's for pairs (1998, method 10), made of both Wilson intervals and the
-    correlation of the outcomes. Unlike a bootstrap's it has a width where all pairs agree, too.
-
-    Args:
-        ours: Successes bool (n,).
-        theirs: Successes bool (n,), corridor by corridor.
-
-    Raises:
-        ValueError: If there are no episodes, or not as many of both.
-    """
-    ours, theirs = np.asarray(ours, bool), np.asarray(theirs, bool)
-    if ours.shape != theirs.shape or ours.ndim != 1 or ours.size == 0:
-        rule = "both must be episodes of the same corridors, at least one"
-        raise ValueError(f"{rule}, got shapes {ours.shape} and {theirs.shape}")
-    count = ours.size
-    both, neither = int((ours & theirs).sum()), int((~ours & ~theirs).sum())
-    first, second = int(ours.sum()), int(theirs.sum())
-    agreement = float(both * neither) - (first - both) * (second - both)
-    if agreement > 0:
-        agreement = max(agreement - count / 2, 0.0)
-    spread = np.sqrt(float(first * (count - first)) * float(second * (count - second)))
-    phi = agreement / spread if spread else 0.0
-    ends = []
-    for place in (0, 1):  # the lower end of ours meets the upper one of theirs
-        own = first / count - wilson_interval(first, count)[place]
-        other = wilson_interval(second, count)[1 - place] - second / count
-        ends.append(float(np.sqrt(max(own * own - 2 * phi * own * other + other * other, 0.0))))
-    difference = (first - second) / count
-    return Estimate(difference, (difference - ends[0], difference + ends[1]))
 
 
 def half_width(values: np.ndarray) -> np.ndarray:

@@ -70,6 +70,7 @@ def estimate_text(estimate: Estimate | Difference | None, scale: float = 1, form
     """Format a value with its interval, such as "84 [76, 90]"; "-" for None."""
     if estimate is None:
         return "-"
+    form = form.replace("+", "+z") if form.startswith("+") else f"z{form}"  # what rounds to 0 has no minus
     ends = ", ".join(format(scale * end, form) for end in estimate.interval or ())
     return f"{scale * estimate.value:{form}}" + (f" [{ends}]" if ends else "")
 

@@ -67,6 +67,7 @@ def _searched(value: object) -> Any:
 
 
 Setting = Annotated[float | str | None, PlainValidator(_number_or_word)]
+NOMINAL = "nominal"  # the axis of the one condition that changes nothing
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Values = Annotated[list[Setting], Field(min_length=1)]
 Axis = Annotated[dict[str, Values], Field(min_length=1)]
@@ -108,7 +109,9 @@ def axis_numbers(points: Mapping[str, Mapping[str, object]]) -> dict[str, float]
 
 def axis_errors(axes: Mapping[str, Mapping[str, Sequence[Setting]]], env: EnvConfig) -> list[str]:
     """One line for each setting of a sweep that the simulation would otherwise reject hours later."""
-    return [
+    rule = "must have another name, this one is of the condition that changes nothing; rename the axis"
+    taken = [f"sweep.axes.{NOMINAL}: {rule}, got {dict(axes[NOMINAL])!r}"] if NOMINAL in axes else []
+    return taken + [
         f"sweep.axes.{name}: {reason}" for name, axis in axes.items() for reason in _axis_errors(axis, env)
     ]
 

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envs.scene import Scene
 from jobs.analysis.statistics import (
     Difference,
     Estimate,
+    Interval,
     crossed_difference,
     crossed_mean,
     rate_estimate,
@@ -25,6 +27,7 @@ Condition = tuple[str, str]  # axis and value
 LABELS = ("Axis", "Value", "Group", "Training")
 TrainingEpisodes = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the same corridors
 RATE = (0.0, 1.0)  # bounds of a rate
+CHANGE = (-1.0, 1.0)  # of what changes a rate
 MET = "°"  # behind a result whose condition lies within what the group was trained on
 
 
@@ -79,9 +82,10 @@ def summarise_group(
     success, distance = episode_values(trainings, "success"), episode_values(trainings, "distance_m")
     differences: list[Difference | None] = [None, None]
     if reference:
+        theirs = episode_values(reference, "distance_m")
         differences = [
             crossed_difference(success, episode_values(reference, "success"), RATE),
-            crossed_difference(distance, episode_values(reference, "distance_m")),
+            crossed_difference(distance, theirs, reach(distance, theirs)),
         ]
     return GroupResult(
         condition=condition,
@@ -89,12 +93,17 @@ def summarise_group(
         trainings=tuple(trainings),
         episodes=success.size,
         success=rate_estimate(success),
-        distance_m=crossed_mean(distance),
+        distance_m=crossed_mean(distance, reach(distance)),
         success_difference=differences[0],
         distance_difference_m=differences[1],
         events_per_step=float(episode_values(trainings, "events_per_step").mean()),
         dropped=int(episode_values(trainings, "dropped").sum()),
     )
+
+
+def reach(*distances_m: np.ndarray) -> Interval:
+    """The least and the greatest distance that an episode can have [m]; the goal line is at the latter."""
+    return 0.0, max(Scene.length_m, *(float(own.max()) for own in distances_m))
 
 
 def episode_values(trainings: TrainingEpisodes, name: str) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import pydantic
 
 from envs.config import EnvConfig, settings_hash
-from jobs.config.conditions import Condition, Setting, axis_points, moving_settings
+from jobs.config.conditions import NOMINAL, Condition, Setting, axis_points, moving_settings
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import env_with
 from jobs.config.schema import SweepConfig
@@ -15,7 +15,6 @@ from jobs.evaluation.met import met
 from jobs.rollout.policies import Differences, EvaluatedPolicy, own_sensor_differences, with_sensor
 from jobs.rollout.tasks import EvaluationTask, make_task
 
-NOMINAL = "nominal"  # the axis of the one condition that changes nothing
 Place = tuple[str, str]  # axis and value of a condition
 Axes = dict[str, dict[str, Condition]]  # axis -> value as text -> settings that it changes
 

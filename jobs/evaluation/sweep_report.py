@@ -11,7 +11,7 @@ import numpy as np
 from envs.scene import make_scene
 from jobs.analysis.plots import style_of
 from jobs.analysis.tables import markdown_table, save_plot, show_table
-from jobs.config.conditions import axis_numbers
+from jobs.config.conditions import NOMINAL, axis_numbers
 from jobs.config.config import Config
 from jobs.evaluation.evaluate import VIEW_COLUMNS, film_episode
 from jobs.evaluation.group_stats import (
@@ -27,7 +27,7 @@ from jobs.evaluation.group_stats import (
     success_text,
     summarise_group,
 )
-from jobs.evaluation.sweep_plan import NOMINAL, Axes, Sweep
+from jobs.evaluation.sweep_plan import Axes, Sweep
 from jobs.evaluation.sweep_plots import axis_figure, collision_figure
 from jobs.rollout.diagnostics import mean_drift
 from jobs.rollout.episodes import EPISODE, write_episodes

@@ -11,10 +11,9 @@ import numpy as np
 from scipy.stats import false_discovery_control
 
 from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_mean, exact_pair_p
-from jobs.evaluation.group_stats import Condition, TrainingEpisodes, episode_values
+from jobs.evaluation.group_stats import CHANGE, Condition, TrainingEpisodes, episode_values
 from jobs.evaluation.sweep_report import SweepFacts
 
-CHANGE = (-1.0, 1.0)  # bounds of a change of success
 SweptEpisodes = dict[tuple[Condition, str], dict[int | None, np.ndarray]]  # by condition and group
 
 
@@ -128,7 +127,8 @@ def _change(
     at: Condition, baseline: Condition, group: str, here: TrainingEpisodes, there: TrainingEpisodes
 ) -> tuple[Change, np.ndarray]:
     """A change of which it is not yet known what is certain, and the p value of each training alone."""
-    success, before = episode_values(here, "success"), episode_values(there, "success")
+    success = episode_values(here, "success")
+    before = episode_values({seed: there[seed] for seed in here}, "success")
     alone = np.array(
         [exact_pair_p(ours > 0, theirs > 0) for ours, theirs in zip(success, before, strict=True)]
     )

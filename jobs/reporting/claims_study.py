@@ -10,9 +10,9 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot
+from jobs.config.conditions import NOMINAL
 from jobs.config.errors import ConfigError
 from jobs.evaluation.group_stats import episode_values, success_table
-from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import SweptEpisodes
 from jobs.reporting.figures import group_results, judge_claims
@@ -88,6 +88,12 @@ def write_claims_study(study: Path, docs: Path, name: str) -> Path:
     return write_below_plan(docs / f"{name}.md", text)
 
 
+def published_text(data: Path, name: str) -> str:
+    """What stands below the plan of a published study."""
+    about, episodes = read_data(data, name)
+    return results_text(name, about, episodes, read_findings(data, name), *other_findings(data, name))
+
+
 def other_findings(data: Path, name: str) -> tuple[str, dict[Claim, Finding]]:
     """The name of the study that another is shown beside, and what it says; empty if none is published.
 
@@ -158,13 +164,14 @@ def claim_line(claim: Claim, finding: Finding, *others: Finding | None) -> tuple
     """One claim as a row under `HEAD` and the verdicts of other studies."""
     scale, form, unit = UNITS[claim.measure]
     difference = f"{estimate_text(finding.overall, scale, form)}{unit}"
-    needed = finding.needed if finding.verdict == "undecided" else None
+    asked = finding.verdict == "undecided" and finding.adjusted_p is not None
+    needed = "-" if not asked else "corridors" if finding.needed is None else str(finding.needed)
     return (
         f"`{claim.ours}`: {claim.text}",
         f"`{claim.theirs}`",
         finding.verdict,
         difference if finding.overall else "one of them is missing",
         "-" if finding.adjusted_p is None else f"{finding.adjusted_p:.2g}",
-        "-" if needed is None else str(needed),
+        needed,
         *("-" if other is None else other.verdict for other in others),
     )

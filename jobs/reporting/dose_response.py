@@ -16,15 +16,16 @@ from envs.config import EnvConfig
 from envs.event_error import error_between
 from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_mean, holm
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot, write_csv
+from jobs.config.conditions import NOMINAL
 from jobs.config.env_keys import env_with
 from jobs.evaluation.group_stats import MET, Condition, TrainingEpisodes, episode_values
-from jobs.evaluation.sweep_plan import NOMINAL, Axes
+from jobs.evaluation.sweep_plan import Axes
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of, replicated
 from jobs.reporting.dose_plan import PLAN, check_planned, read_plan
 from jobs.reporting.dose_plot import dose_plot
 from jobs.reporting.planned_page import write_below_plan
-from jobs.reporting.sweep_data import read_sweep, replaced_text, write_data
+from jobs.reporting.sweep_data import read_data, read_sweep, replaced_text, write_data
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json
 from jobs.run.templates import render
@@ -250,6 +251,13 @@ def write_dose_response(
     doses, changes = read_doses(table), changes_of(about, swept, every=True)  # the plan names all of them
     save_plot(docs / "images" / f"{DOSES}.png", draw(doses, changes))
     return write_below_plan(docs / f"{DOSES}.md", results_text(about, swept, doses, changes))
+
+
+def published_text(data: Path) -> str:
+    """What stands below the plan of the published study."""
+    about, swept = read_data(data, DOSES)
+    doses = read_doses(data / f"{DOSES}_doses.csv")
+    return results_text(about, swept, doses, changes_of(about, swept, every=True))
 
 
 def read_doses(file: Path) -> list[Dose]:

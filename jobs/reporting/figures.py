@@ -6,9 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.scene import make_scene
-from jobs.config.conditions import axis_numbers
+from jobs.config.conditions import NOMINAL, axis_numbers
 from jobs.evaluation.group_stats import Condition, GroupResult, summarise_group
-from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_plots import axis_figure, collision_figure
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, content, place

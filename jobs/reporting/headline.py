@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from jobs.analysis.tables import markdown_table
+from jobs.config.conditions import NOMINAL
 from jobs.evaluation.group_stats import MET, Condition, episode_values
-from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.reporting.breaks import SweptEpisodes
 from jobs.run.files import RunError
 

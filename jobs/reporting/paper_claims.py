@@ -5,10 +5,16 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_difference, holm, trainings_needed
-from jobs.evaluation.group_stats import RATE, Condition, TrainingEpisodes, episode_values
-from jobs.evaluation.sweep_plan import NOMINAL
-from jobs.reporting.breaks import CHANGE
+from jobs.analysis.statistics import (
+    CONFIDENCE,
+    Difference,
+    Interval,
+    crossed_difference,
+    holm,
+    trainings_needed,
+)
+from jobs.config.conditions import NOMINAL
+from jobs.evaluation.group_stats import RATE, Condition, TrainingEpisodes, episode_values, reach
 
 GAIN = {"success": 0.1, "distance_m": 10.0}  # the smallest difference that matters
 # Factor, format and unit in which a measure is shown.
@@ -48,7 +54,8 @@ class Finding(NamedTuple):
         overall: Difference of the means over all conditions; None: one of the groups is missing.
         conditions: The difference under each.
         adjusted_p: Of `overall`, for the family of all claims; None: there is no test.
-        needed: Trainings of each group that would show a difference that matters; None: not known.
+        needed: Trainings of each group that would show a difference that matters, if it is undecided; None:
+            no number would in these corridors, or there is no test.
     """
 
     verdict: Verdict
@@ -122,13 +129,15 @@ def judge_all(
     found |= {claim: compare_learning(claim, trainings) for claim in LEARNT}
     tested = [claim for claim, one in found.items() if one.overall and one.overall.p is not None]
     adjusted = dict(zip(tested, holm([found[claim].overall.p for claim in tested]), strict=True))  # type: ignore[union-attr, misc]
-    return {
-        claim: one._replace(
-            adjusted_p=adjusted.get(claim),
-            verdict=verdict_of(one.overall, adjusted.get(claim), GAIN[claim.measure]),
-        )
-        for claim, one in found.items()
-    }
+    judged = {}
+    for claim, one in found.items():
+        p, gain = adjusted.get(claim), GAIN[claim.measure]
+        verdict, needed = verdict_of(one.overall, p, gain), None
+        if verdict == "undecided" and p is not None:
+            sides = compared_sides(claim, find, baselines, trainings)
+            needed = trainings_needed(*sides, gain, len(tested), bounds_of(claim, *sides))
+        judged[claim] = one._replace(adjusted_p=p, verdict=verdict, needed=needed)
+    return judged
 
 
 def verdict_of(overall: Difference | None, adjusted_p: float | None, gain: float) -> Verdict:
@@ -154,55 +163,86 @@ def compare(claim: Claim, find: Find, baselines: Mapping[Condition, Condition]) 
     ours, theirs = compared(claim, find, baselines)
     if not ours:
         return Finding("not tested", None, {})
-    bounds = None if claim.measure == "distance_m" else CHANGE if claim.change else RATE
-    single = {at: crossed_difference(ours[at], theirs[at], bounds) for at in ours}
-    first, second = (over_conditions(side) for side in (ours, theirs))
-    overall = crossed_difference(first, second, bounds)
-    if min(len(first), len(second)) == 1:  # of one training nothing follows for others
-        overall = Difference(overall.value, None, None)
-    needed = trainings_needed(first.mean(axis=1), second.mean(axis=1), GAIN[claim.measure])
-    return Finding("undecided", overall, single, needed=needed)
+    single = {
+        at: crossed_difference(ours[at], theirs[at], bounds_of(claim, ours[at], theirs[at])) for at in ours
+    }
+    return Finding("undecided", _difference(claim, over_conditions(ours), over_conditions(theirs)), single)
+
+
+def compare_learning(claim: Claim, trainings: Mapping[str, Sequence[float]]) -> Finding:
+    """The difference of a claim of `LEARNT`; arguments as in `judge_all`."""
+    ours, theirs = _learnt(claim, trainings)
+    if not len(ours) or not len(theirs):
+        return Finding("not tested", None, {})
+    return Finding("undecided", _difference(claim, ours, theirs), {})
+
+
+def compared_sides(
+    claim: Claim,
+    find: Find,
+    baselines: Mapping[Condition, Condition],
+    trainings: Mapping[str, Sequence[float]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a tested claim compares of both groups, (trainings, corridors); arguments as in `judge_all`."""
+    if claim in LEARNT:
+        return _learnt(claim, trainings)
+    ours, theirs = compared(claim, find, baselines)
+    return over_conditions(ours), over_conditions(theirs)
+
+
+def _learnt(claim: Claim, trainings: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Success of the trainings of both groups while they learnt, (trainings, 1)."""
+    ours, theirs = (np.array(trainings.get(group, ())) for group in (claim.ours, claim.theirs))
+    return ours[:, None], theirs[:, None]
+
+
+def _difference(claim: Claim, ours: np.ndarray, theirs: np.ndarray) -> Difference:
+    """Of two groups (trainings, corridors); of one training nothing follows for others."""
+    found = crossed_difference(ours, theirs, bounds_of(claim, ours, theirs))
+    return found if min(len(ours), len(theirs)) > 1 else Difference(found.value, None, None)
+
+
+def bounds_of(claim: Claim, *values: np.ndarray) -> Interval | None:
+    """The least and the greatest value of what a claim compares that there can be; None: no corridors."""
+    if claim in LEARNT:
+        return None
+    low, high = RATE if claim.measure == "success" else reach(*values)
+    return (-high, high) if claim.change else (low, high)
 
 
 def compared(
     claim: Claim, find: Find, baselines: Mapping[Condition, Condition]
 ) -> tuple[dict[Condition, np.ndarray], dict[Condition, np.ndarray]]:
-    """What is compared of both groups, (trainings, corridors), under each condition that both have."""
-    ours: dict[Condition, np.ndarray] = {}
-    theirs: dict[Condition, np.ndarray] = {}
-    for at in claim.conditions:
-        here, there = (_values(claim, find, at, group, baselines) for group in (claim.ours, claim.theirs))
-        if here is not None and there is not None:
-            ours[at], theirs[at] = here, there
-    return ours, theirs
+    """What is compared of both groups, (trainings, corridors), under each condition that both have.
+
+    Of each group the trainings that were evaluated under all of these conditions, and at their baselines
+    where it is about a change: the same rows everywhere.
+    """
+    groups = claim.ours, claim.theirs
+
+    def needed(at: Condition) -> tuple[Condition, ...]:
+        return (at, baselines.get(at, at)) if claim.change else (at,)
+
+    swept = [at for at in claim.conditions if all(find(one, group) for one in needed(at) for group in groups)]
+    sides: list[dict[Condition, np.ndarray]] = []
+    for group in groups:
+        every = [set(find(one, group)) for at in swept for one in needed(at)]
+        seeds = sorted(set.intersection(*every) if every else (), key=str)
+        sides.append({at: _values(claim, find, needed(at), group, seeds) for at in swept if seeds})
+    return (sides[0], sides[1]) if all(sides) else ({}, {})
 
 
 def _values(
-    claim: Claim, find: Find, at: Condition, group: str, baselines: Mapping[Condition, Condition]
-) -> np.ndarray | None:
-    """What is compared of a group under a condition, (trainings, corridors); None: not evaluated."""
-    here, before = find(at, group), find(baselines.get(at, at), group)
-    if not here or (claim.change and here.keys() != before.keys()):
-        return None
-    values = episode_values(here, claim.measure)
-    return values - episode_values(before, claim.measure) if claim.change else values
-
-
-def compare_learning(claim: Claim, trainings: Mapping[str, Sequence[float]]) -> Finding:
-    """The difference of a claim of `LEARNT`; arguments as in `judge_all`."""
-    ours, theirs = (np.array(trainings.get(group, ())) for group in (claim.ours, claim.theirs))
-    if not len(ours) or not len(theirs):
-        return Finding("not tested", None, {})
-    if min(len(ours), len(theirs)) == 1:
-        return Finding("undecided", Difference(float(ours.mean() - theirs.mean()), None, None), {})
-    overall = crossed_difference(ours[:, None], theirs[:, None])
-    return Finding("undecided", overall, {}, needed=trainings_needed(ours, theirs, GAIN[claim.measure]))
+    claim: Claim, find: Find, places: Sequence[Condition], group: str, seeds: Sequence[int | None]
+) -> np.ndarray:
+    """What is compared of these trainings of a group under a condition, less its baseline if there is one."""
+    here, *before = (
+        episode_values({seed: find(at, group)[seed] for seed in seeds}, claim.measure) for at in places
+    )
+    return here - before[0] if before else here
 
 
 def over_conditions(values: Mapping[Condition, np.ndarray]) -> np.ndarray:
-    """Mean over conditions; where a training lacks one, over trainings first."""
-    tables = list(values.values())
-    if len({table.shape for table in tables}) > 1:
-        tables = [table.mean(axis=0, keepdims=True) for table in tables]
-    means: np.ndarray = np.mean(tables, axis=0)
+    """Mean over conditions (trainings, corridors)."""
+    means: np.ndarray = np.mean(list(values.values()), axis=0)
     return means

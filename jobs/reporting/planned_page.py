@@ -7,8 +7,13 @@ from jobs.run.files import write_atomic
 RESULTS = "## Results\n"  # what stands above it is the plan
 
 
+def below_plan(page: Path, text: str) -> str:
+    """The text of a page with results below its plan, in place of earlier ones."""
+    above = page.read_text().split(RESULTS)[0] if page.is_file() else ""
+    return above.rstrip("\n") + f"\n\n{RESULTS}" + text
+
+
 def write_below_plan(page: Path, text: str) -> Path:
     """Write results below the plan of a page, in place of earlier ones; return the page."""
-    above = page.read_text().split(RESULTS)[0] if page.is_file() else ""
-    write_atomic(page, above.rstrip("\n") + f"\n\n{RESULTS}" + text)
+    write_atomic(page, below_plan(page, text))
     return page

@@ -2,15 +2,16 @@
 
 Run: python -m jobs.reporting.planning taught_claims 10 28
 Prints, for each claim of a study whose episodes are in docs/data: the standard deviation between trainings
-of a group, that of single episodes of a training, and half of the 95 % interval of the difference, with as
-many trainings of each group and as many corridors as asked, if they differ as those of the study.
+of a group, that of single episodes of a training, that of the groups' difference between corridors, and
+half of the 95 % interval of the difference, with as many trainings of each group and as many corridors as
+asked, if they differ as those of the study.
 """
 
 import argparse
 import sys
 from collections.abc import Sequence
 
-from jobs.analysis.statistics import expected_half_width, spread_of
+from jobs.analysis.statistics import corridor_spread, expected_half_width, spread_of
 from jobs.analysis.tables import show_table
 from jobs.reporting.breaks import place
 from jobs.reporting.paper_claims import CLAIMS, UNITS, compared, over_conditions
@@ -18,7 +19,14 @@ from jobs.reporting.sweep_data import read_data
 from jobs.run.provenance import REPOSITORY
 
 DATA, ABOUT = REPOSITORY / "docs" / "data", "_about.json"
-HEAD = ("Claim", "Against", "SD between trainings", "SD of an episode", "95 % interval")
+HEAD = (
+    "Claim",
+    "Against",
+    "SD between trainings",
+    "SD of an episode",
+    "SD between corridors",
+    "95 % interval",
+)
 
 
 def plan_rows(study: str, trainings: int, corridors: int) -> list[tuple[str, ...]]:
@@ -38,12 +46,14 @@ def plan_rows(study: str, trainings: int, corridors: int) -> list[tuple[str, ...
         if len(means) < len(sides) or min(map(len, means)) < 2:  # of one training no spread is known
             continue
         ours, theirs = (spread_of(side) for side in means)
+        apart = corridor_spread(*means)
         scale, _, unit = UNITS[claim.measure]
         spreads = [
             f"{scale * one:.0f}, {scale * other:.0f}{unit}" for one, other in zip(ours, theirs, strict=True)
         ]
-        half = scale * expected_half_width(ours, theirs, trainings, corridors)
-        rows.append((f"{claim.ours}: {claim.text}", claim.theirs, *spreads, f"±{half:.1f}{unit}"))
+        half = scale * expected_half_width(ours, theirs, apart, trainings, corridors)
+        texts = (*spreads, f"{scale * apart:.0f}{unit}", f"±{half:.1f}{unit}")
+        rows.append((f"{claim.ours}: {claim.text}", claim.theirs, *texts))
     return rows
 
 

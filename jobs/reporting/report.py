@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from jobs.analysis.coverage import coverage_text
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot, write_csv
+from jobs.config.conditions import NOMINAL
 from jobs.config.config import Config, ConfigError
 from jobs.evaluation.group_stats import (
     Condition,
@@ -25,7 +26,6 @@ from jobs.evaluation.group_stats import (
     episode_values,
     success_table,
 )
-from jobs.evaluation.sweep_plan import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, compared_pairs, replicated
 from jobs.reporting.claims_study import (
@@ -101,9 +101,10 @@ def find_study(config: Config, name: str) -> Path | None:
     if folder == "sweep":
         facts = {path: read_json(path) for path in found}
         found = [path for path, one in facts.items() if (one.get("exp") == DOSES) == (name == DOSES)]
-        found = [path for path in found if facts[path].get("split", "eval") == "eval"]
     if folder == "ablation":
         found = [path for path in found if read_json(path).get("exp") == name]
+    if folder in ("sweep", "ablation"):
+        found = [path for path in found if read_json(path).get("split", "eval") == "eval"]
     newest = max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
     return newest and newest.parent
 
@@ -306,22 +307,27 @@ def _decided(findings: Mapping[Claim, Finding]) -> str:
 
 
 def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[Change]) -> list[str]:
-    """The sentence on the group that succeeds most; none if nothing was evaluated unchanged of any."""
-    (value,) = about["axes"][NOMINAL]
-    own = {
-        group: [change for change in changes if change.group == group]
-        for group in about["groups"]
+    """The sentence on the group that succeeds most over the same conditions; none if none was evaluated."""
+    ((value, _),) = about["axes"][NOMINAL].items()
+    groups = [
+        group
+        for group in dict.fromkeys(change.group for change in changes)
         if ((NOMINAL, value), group) in episodes
-    }
-    mean = {group: np.mean([one.success.mean() for one in of]) for group, of in own.items() if of}
-    if not mean:
+    ]
+    every = [at for at, _ in compared_pairs(about) if all((at, group) in episodes for group in groups)]
+    if not groups or not every:
         return []
-    best = max(mean, key=lambda group: mean[group])
-    least = min(own[best], key=lambda one: one.success.mean())
+    rates = {
+        group: {at: float(episode_values(episodes[at, group], "success").mean()) for at in every}
+        for group in groups
+    }
+    best = max(rates, key=lambda group: sum(rates[group].values()))
+    least = min(every, key=lambda at: rates[best][at])
     unchanged = 100 * episode_values(episodes[(NOMINAL, value), best], "success").mean()
     return [
-        f"Take [`{best}`](policies.md): {unchanged:.0f} % with nothing changed, {100 * mean[best]:.0f} % as the mean of all "
-        f'conditions, least in "{condition_text(*least.condition)}" with {100 * least.success.mean():.0f} %.'
+        f"Take [`{best}`](policies.md): {unchanged:.0f} % with nothing changed, "
+        f"{100 * np.mean(list(rates[best].values())):.0f} % as the mean of all conditions, least in "
+        f'"{condition_text(*least)}" with {100 * rates[best][least]:.0f} %.'
     ]
 
 

@@ -96,7 +96,7 @@ def write_study(folder):
         "run": "dose_response-short-s0-1", "exp": "dose_response", "identity": "abc", "command": "command",
         "commit": "c0ffee", "evaluated_at": ["c0ffee"], "date": "2026-01-02", "scene": "poles_eval",
         "trials": 14, "reference": "steady", "action": "stochastic", "axes": axes,
-        "groups": {"weak": [0, 1, 2], "steady": [0, 1, 2]},
+        "groups": {"weak": list(range(6)), "steady": list(range(6))},
         "compared": [{"condition": at, "baseline": nominal, "same_as": at} for at in places],
         "met": [],
     }  # fmt: skip
@@ -114,17 +114,18 @@ def write_study(folder):
     return folder
 
 
-def write_claims(folder, lost=(), exp="taught_claims"):
+def write_claims(folder, lost=(), exp="taught_claims", trainings=3):
     """Leave a study of the paper's claims in `folder`, whose trainings lose none or one of 14; returns it.
 
     Args:
         folder: Where.
         lost: Group, axis, value and how many episodes more each training loses there.
         exp: Its experiment.
+        trainings: Of each group.
     """
     config = parse(compose(f"+exp={exp}"))
     axes, env = axes_of(config.sweep), dataclasses.replace(config.env, scene="poles_eval", split="eval")
-    groups = dict.fromkeys(config.ablation.variants, config.ablation.seeds[:3])
+    groups = dict.fromkeys(config.ablation.variants, config.ablation.seeds[:trainings])
     baselines, same = baselines_of(env, axes), same_simulations(env, axes)
     about = {
         **ABOUT, "run": f"{exp}-short-s0-1", "exp": exp, "axes": axes, "groups": groups,

@@ -16,10 +16,11 @@ from typing import Any, cast
 
 import numpy as np
 
+from jobs.config.conditions import NOMINAL
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.errors import differences
 from jobs.evaluation.group_stats import LABELS, episode_values
-from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep
+from jobs.evaluation.sweep_plan import plan_sweep
 from jobs.evaluation.sweep_report import SweepResults, about, training_text
 from jobs.rollout.episodes import write_episodes
 from jobs.rollout.executors import Executor
@@ -269,11 +270,11 @@ def by_condition(found: SweepResults, name: str) -> dict[str, Any]:
 
 def paired(
     config: Config, success: Mapping[str, Mapping[str, np.ndarray]], name: str
-) -> Mapping[str, np.ndarray]:
-    """Success of the first variant, (trainings, corridors) by condition, of those seeds that another has."""
+) -> Mapping[str, np.ndarray] | None:
+    """Success of the first variant, (trainings, corridors) by condition, of the seeds that another has."""
     first, own = next(iter(success)), seeds_of(config, name)
     if name == first:
-        return success[first]
+        return None
     rows = [config.ablation.seeds.index(seed) for seed in own]
     return {condition: values[rows] for condition, values in success[first].items()}
 

@@ -7,8 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jobs.analysis.plots import BLUE, INK, MUTED, tidy
-from jobs.analysis.statistics import Estimate, half_width
+from jobs.analysis.statistics import Difference, Estimate, crossed_mean
 from jobs.analysis.tables import estimate_text, markdown_table, publish_plot, show_table
+from jobs.evaluation.group_stats import CHANGE, RATE
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run
@@ -32,7 +33,7 @@ class VariantResult(NamedTuple):
     Attributes:
         name: Of the variant.
         success: Condition -> mean success of each training (n,).
-        mean: Over conditions and trainings, interval by trainings (Student), within 0 and 1.
+        mean: Over conditions, trainings and corridors, within 0 and 1.
         difference: Of that to the first variant, by pairs of trainings of a seed, within -1 and 1; None: it
             is the first.
         differences: The difference of each pair (n,).
@@ -42,38 +43,32 @@ class VariantResult(NamedTuple):
     name: str
     success: dict[str, np.ndarray]
     mean: Estimate
-    difference: Estimate | None
+    difference: Difference | None
     differences: np.ndarray
     minutes: float | None
 
 
 def variant_result(
-    name: str, success: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray], minutes: Sequence[float]
+    name: str,
+    success: Mapping[str, np.ndarray],
+    first: Mapping[str, np.ndarray] | None,
+    minutes: Sequence[float],
 ) -> VariantResult:
-    """Compare a variant with the first one; trainings are the unit, each the mean of all conditions.
+    """Compare a variant with the first one; trainings are the unit, in the same corridors (`crossed_mean`).
 
     Args:
         name: Of the variant.
-        success: Condition -> success (trainings, corridors).
-        first: The same of the first variant, trained with the same seeds.
+        success: Condition -> success (trainings, corridors), of the same corridors each.
+        first: The same of the first variant, trained with the same seeds; None: it is the first.
         minutes: Of each training [min]; empty: not known.
-
-    Raises:
-        ValueError: There is only one training.
     """
-    own, theirs = (
-        np.mean([values.mean(axis=1) for values in every.values()], axis=0) for every in (success, first)
-    )
-    difference = None if success is first else _estimate(own - theirs, -1.0)
+    own = np.mean(list(success.values()), axis=0)
+    mean = Estimate(*crossed_mean(own, RATE)[:2])
+    differences = own - (own if first is None else np.mean(list(first.values()), axis=0))
+    difference = None if first is None else crossed_mean(differences, CHANGE)
     per_training = {condition: values.mean(axis=1) for condition, values in success.items()}
     mean_minutes = float(np.mean(minutes)) if minutes else None
-    return VariantResult(name, per_training, _estimate(own, 0.0), difference, own - theirs, mean_minutes)
-
-
-def _estimate(values: np.ndarray, least: float) -> Estimate:
-    """The mean over trainings (n,) with its 95 % interval, of what lies between `least` and 1."""
-    value, half = float(values.mean()), float(half_width(values[:, None])[0])
-    return Estimate(value, (max(value - half, least), min(value + half, 1.0)))
+    return VariantResult(name, per_training, mean, difference, differences.mean(axis=1), mean_minutes)
 
 
 def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], facts: AblationFacts) -> None:
@@ -87,8 +82,8 @@ def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], 
     said = (
         f"{len(facts['seeds'])} trainings each{but}, {facts['env_steps']:,} environment steps, "
         f"{facts['trials']} {apart}corridors for each training and condition. Mean: over the conditions, "
-        "95 % interval by trainings (Student). Change: to the first variant, by pairs of trainings with the "
-        "same seed. Minutes: of the policy's training, without the encoder's."
+        "95 % interval by trainings and corridors. Change: to the first variant, by pairs of trainings with "
+        "the same seed. Minutes: of the policy's training, without the encoder's."
     )
     table = markdown_table(head, rows, 1)
     text = f"`{facts['command']}`, {facts['date']}, commit {facts['commit']}.\n\n{table}\n{said}\n"

@@ -378,7 +378,7 @@ EXTREMES = (
     ),
     Extreme(
         "simulator",
-        "45 to 800 Hz, tolerances of 0.5 to 20 %, five worlds",
+        "seven settings of world, rate (45 to 800 Hz) and tolerance (0.5 to 20 %)",
         "an event error within the tolerance",
         "of the tolerance",
         1.0,
@@ -414,7 +414,7 @@ EXTREMES = (
     ),
     Extreme(
         "clock",
-        "up to 10^9 steps at 0.1 Hz to 1 MHz, 71 years",
+        "up to 10^9 steps at 0.1 Hz to 1 MHz, at most 71 years",
         "the exact time, rounded",
         "us",
         0.5,

@@ -10,7 +10,6 @@ from jobs.analysis.statistics import (
     exact_pair_p,
     half_width,
     holm,
-    paired_rate_difference,
     rate_estimate,
     trainings_needed,
     wilson_interval,
@@ -196,8 +195,59 @@ def test_an_interval_ends_at_what_is_possible():
     assert crossed_difference(ones, lost + 1.0, (0.0, 1.0)).interval[1] == 1.0
 
 
+def test_distances_that_agree_at_the_goal_line_leave_a_doubt_that_shrinks_with_the_episodes():
+    widths = []
+    for trainings, corridors in ((3, 14), (10, 28), (40, 100)):
+        goal = np.full((trainings, corridors), 100.0)
+        found = crossed_difference(goal, goal, (0.0, 100.0))
+        assert (found.value, found.p) == (0.0, 1.0)
+        widths.append(np.ptp(found.interval))
+    assert widths[0] > 10.0 > widths[1] > widths[2] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("trainings", "corridors", "share"), [(3, 14, 0.03), (10, 28, 0.003), (10, 28, 0.01)]
+)
+def test_intervals_of_distances_hold_the_truth_also_where_few_episodes_fail(trainings, corridors, share):
+    rng, held = np.random.default_rng(11), 0
+    for _ in range(300):
+        failed = rng.random((trainings, corridors)) < share
+        ours = np.where(failed, rng.uniform(0.0, 100.0, failed.shape), 100.0)
+        low, high = crossed_difference(ours, np.full(ours.shape, 100.0), (0.0, 100.0)).interval
+        held += low <= -50.0 * share <= high
+    assert held / 300 >= 0.95
+
+
+def test_small_p_values_come_no_more_often_than_they_say_with_three_trainings_that_react_differently():
+    """Two conditions that change each training at random, averaged over four levels: nothing in the mean."""
+    rng, small = np.random.default_rng(5), 0
+    for _ in range(3000):
+        changed = rng.normal(0.0, 2.0, (2, 3, 1)) + rng.normal(0.0, 0.7, (1, 1, 14)) + rng.normal(size=(3, 1))
+        won = rng.random((4, 2, 3, 14)) < 1 / (1 + np.exp(-changed))
+        p = crossed_mean((won[:, 0].astype(float) - won[:, 1]).mean(axis=0), (-1.0, 1.0)).p
+        small += p < 0.002
+    assert small / 3000 < 0.003  # 0.006 where degrees of freedom have no limit
+
+
+def test_one_loss_more_never_makes_a_verdict_jump():
+    """Trainings that tie exactly are known no better than those that nearly do."""
+    corridors = 14
+
+    def p_of(losses):
+        lost = np.zeros((len(losses), corridors))
+        for row, count in enumerate(losses):
+            lost[row, :count] = -1.0
+        return crossed_mean(lost, (-1.0, 1.0)).p
+
+    ties = [((4, 4, 4), (4, 4, 5)), ((6, 6, 6), (6, 6, 7)), ((5, 5, 5), (4, 5, 5)), ((8, 8, 8), (7, 8, 8))]
+    for tie, near in ties:
+        assert 0.3 < p_of(tie) / p_of(near) < 3.0, (tie, near)
+    each = [p_of((count,) * 3) for count in range(3, 12)]
+    assert each == sorted(each, reverse=True)
+
+
 def test_pairs_are_tested_exactly():
-    ours, theirs = paired_flights(5, 4, 0, 5)
+    ours, theirs = (np.array([True] * 5 + [own] * 4 + [False] * 5) for own in (True, False))
     assert exact_pair_p(ours, theirs) == pytest.approx(2 * 0.5**4)
     assert exact_pair_p(theirs, ours) == pytest.approx(2 * 0.5**4)
     assert exact_pair_p(ours, ours) == 1.0
@@ -213,65 +263,34 @@ def test_holms_adjustment_has_its_known_values_and_keeps_the_order():
     assert 0.03 <= wrong / 2000 <= 0.065
 
 
-def test_as_many_trainings_as_are_needed_show_the_difference_in_four_of_five_studies():
-    rng = np.random.default_rng(10)
-    ours, theirs = np.array([0.0, 2.0, 4.0]), np.array([1.0, 2.0, 3.0])  # variances 4 and 1
-    count = trainings_needed(ours, theirs, 2.0)
-    shown = [
-        ttest_ind(rng.normal(2.0, 2.0, count), rng.normal(0.0, 1.0, count), equal_var=False).pvalue < 0.05
-        for _ in range(2000)
-    ]
-    assert 0.72 <= np.mean(shown) <= 0.88
+@pytest.mark.parametrize(
+    ("gain", "family", "apart"), [(4.0, 1, 0.0), (2.0, 1, 0.0), (2.0, 20, 0.0), (2.0, 1, 2.0)]
+)
+def test_as_many_trainings_as_are_needed_show_the_difference_in_four_of_five_studies(gain, family, apart):
+    """Standard deviations of 2 and 1 between trainings, and of the difference of both between corridors."""
+    rng, known, corridors = np.random.default_rng(10), np.array([[-1.0], [1.0]]) / 2**0.5, np.arange(14.0)
+    hard = apart * (corridors - corridors.mean()) / corridors.std(ddof=1)  # exactly as it is said to be
+    count = trainings_needed(2.0 * known + hard, known + 0.0 * hard, gain, family)
+
+    def shown(trainings):
+        found = []
+        for _ in range(1000):
+            ours, theirs = (spread * rng.normal(size=(trainings, 1)) for spread in (2.0, 1.0))
+            added = rng.normal(0.0, apart, (1, 14))
+            p = crossed_difference(ours + gain + added, theirs + 0.0 * added).p
+            found.append(p < 0.05 / family)
+        return np.mean(found)
+
+    assert 0.76 <= shown(count) <= 0.9
+    assert count < 4 or shown(count // 2) < 0.7
+
+
+def test_no_number_of_trainings_is_named_where_none_is_enough():
+    ours, theirs = np.array([[0.0], [2.0]]), np.array([[1.0], [3.0]])
     assert trainings_needed(ours[:1], theirs, 2.0) is None
-
-
-def paired_flights(both, ours, theirs, neither):
-    """Successes of two sides by how often both, one of them, or none came through."""
-    first = [True] * (both + ours) + [False] * (theirs + neither)
-    second = [True] * both + [False] * ours + [True] * theirs + [False] * neither
-    return np.array(first), np.array(second)
-
-
-def test_a_paired_rate_difference_turns_round_with_its_sides():
-    ours, theirs = paired_flights(60, 14, 5, 21)
-    there, back = paired_rate_difference(ours, theirs), paired_rate_difference(theirs, ours)
-    assert there.value == pytest.approx(0.09) == -back.value
-    assert there.interval == pytest.approx((-back.interval[1], -back.interval[0]))
-
-
-def test_without_correlation_a_paired_rate_difference_is_newcombes_of_two_samples():
-    ours, theirs = paired_flights(25, 25, 25, 25)
-    low, high = wilson_interval(50, 100)
-    half = np.hypot(0.5 - low, high - 0.5)
-    assert paired_rate_difference(ours, theirs).interval == pytest.approx((-half, half))
-
-
-def test_flights_that_all_agree_leave_a_doubt_that_shrinks_with_their_number():
-    widths = []
-    for count in (4, 20, 100):
-        same = np.arange(count) % 10 > 0
-        found = paired_rate_difference(same, same)
-        assert found.value == 0.0
-        assert found.interval[0] < 0.0 < found.interval[1]
-        widths.append(np.ptp(found.interval))
-    assert widths[0] > 2 * widths[1] > 4 * widths[2]
-
-
-def test_paired_rate_differences_hold_the_true_one_about_as_often_as_they_say():
-    rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(400):
-        hard = rng.random(60)
-        ours, theirs = (rng.random(60) < 0.95 - loss - 0.3 * hard for loss in (0.0, 0.1))
-        low, high = paired_rate_difference(ours, theirs).interval
-        hits += low <= 0.1 <= high
-    assert 0.92 <= hits / 400 <= 0.985
-
-
-@pytest.mark.parametrize(("ours", "theirs"), [([], []), ([True], [True, False]), ([[True]], [[True]])])
-def test_pairs_that_are_none_are_refused(ours, theirs):
-    with pytest.raises(ValueError, match="same corridors"):
-        paired_rate_difference(np.array(ours, bool), np.array(theirs, bool))
+    apart = 10.0 * np.linspace(-1.0, 1.0, 14)[None]  # corridors leave an error of 1.7
+    assert trainings_needed(ours + apart, theirs + 0.0 * apart, 2.0) is None
+    assert trainings_needed(ours + apart, theirs + 0.0 * apart, 20.0) is not None
 
 
 def test_the_interval_over_trainings_holds_the_true_mean_as_often_as_it_says_and_needs_two():

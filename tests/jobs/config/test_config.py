@@ -292,6 +292,11 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("sweep.axes", {"a/b": {"env.control_hz": [1]}}, "String should match pattern"),
         (
             "sweep.axes",
+            {"nominal": {"faults.sparsity": [0.5]}},
+            "sweep.axes.nominal: must have another name, this one is of the condition that changes nothing",
+        ),
+        (
+            "sweep.axes",
             {"where": {"env.scene": ["moon"]}},
             "sweep.axes: must be one of cones, dynamic, gates",
         ),

@@ -4,8 +4,9 @@ import json
 import pytest
 
 from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
+from jobs.config.conditions import NOMINAL
 from jobs.config.config import ConfigError
-from jobs.evaluation.sweep_plan import NOMINAL, plan_sweep, value_text
+from jobs.evaluation.sweep_plan import plan_sweep, value_text
 from jobs.rollout.policies import find_sweep_policies, read_policy, with_sensor
 from jobs.run.folder import open_run
 from models.policy.policy import MANIFEST, read_policy_manifest

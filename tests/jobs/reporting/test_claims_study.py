@@ -74,11 +74,11 @@ def test_the_study_by_ppo_is_that_of_taught_policies_but_for_how_they_learn():
 
 
 def test_a_loss_of_the_rival_alone_shows_in_the_claims_about_it_and_in_no_other(tmp_path):
-    even = study_findings(*read_sweep(write_claims(tmp_path / "even")), ())
+    even = study_findings(*read_sweep(write_claims(tmp_path / "even", trainings=6)), ())
     assert len(even) == 15
     assert {one.overall.value for one in even.values()} == {0.0}
     lost = [("event_image", "world", "texture_change", 9)]
-    findings = study_findings(*read_sweep(write_claims(tmp_path / "lost", lost)), ())
+    findings = study_findings(*read_sweep(write_claims(tmp_path / "lost", lost, trainings=6)), ())
     changed = {claim.ours: one for claim, one in findings.items() if claim.text == TEXTURES}
     assert set(changed) == {"bytestream", "bytestream_xy"}
     for one in changed.values():
@@ -106,7 +106,7 @@ def test_each_study_is_shown_beside_the_other_way_to_learn(tmp_path):
     docs = tmp_path / "docs"
     docs.mkdir()
     study = {
-        name: write_claims(tmp_path / name / "ablation", [("event_image", "world", value, 9)], name)
+        name: write_claims(tmp_path / name / "ablation", [("event_image", "world", value, 9)], name, 6)
         for name, value in ((TAUGHT, "dynamic"), (BY_PPO, "shape_change"))
     }
     assert other_findings(docs / "data", TAUGHT) == (BY_PPO, {})

@@ -119,7 +119,7 @@ def test_invented_events_are_worse_where_they_are_and_nowhere_else(study):
 
 
 def test_only_a_difference_that_is_certain_in_its_family_and_by_its_interval_is_a_verdict():
-    values = np.full((3, 14), -0.5) + np.array([[-0.03], [0.0], [0.03]])
+    values = np.full((3, 14), -0.5) + np.array([[-0.06], [0.0], [0.06]])
     few = compare_kinds({("a", "invented"): values, ("a", "lost"): 0 * values})
     many = compare_kinds({("a", "invented"): values, **{("a", str(k)): 0 * values for k in range(40)}})
     assert [one.verdict for one in few] == ["worse"]
@@ -170,8 +170,8 @@ OTHERS = {
     "trials must be 14, got 2": lambda about: about.update(trials=2),
     "scene must be 'poles_eval', got 'poles'": lambda about: about.update(scene="poles"),
     "action must be 'stochastic', got 'deterministic'": lambda about: about.update(action="deterministic"),
-    r"groups.steady must be \[0, 1, 2\], got nothing": lambda about: about["groups"].pop("steady"),
-    r"groups.weak must be \[0, 1, 2\], got \[0\]": lambda about: about["groups"].update(weak=[0]),
+    r"groups.steady must be \[0, 1, 2, 3, 4, 5\], got nothing": lambda about: about["groups"].pop("steady"),
+    r"groups.weak must be \[0, 1, 2, 3, 4, 5\], got \[0\]": lambda about: about["groups"].update(weak=[0]),
     "groups.rgb must be nothing, got": lambda about: about["groups"].update(rgb=[0]),
     "axes.flipped.0.2 must be {.*}, got nothing": lambda about: about["axes"]["flipped"].pop("0.2"),
     "axes.lost.0.3 must be nothing, got": lambda about: about["axes"]["lost"].update({"0.3": {"a.b": 0.3}}),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from jobs.evaluation.sweep_plan import NOMINAL
+from jobs.config.conditions import NOMINAL
 from jobs.reporting.encoder_seeds import by_encoder, main, spread_rows
 from tests.support.episodes import flights
 

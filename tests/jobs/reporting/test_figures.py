@@ -10,9 +10,10 @@ from docs import from_data
 from docs.from_data import ABLATIONS, STUDIES, figures, main, pages, variant_results
 from envs.config import EnvConfig
 from jobs.analysis.tables import estimate_text, save_plot, write_csv
-from jobs.evaluation.group_stats import episode_values
+from jobs.evaluation.group_stats import LABELS, episode_values
 from jobs.reporting import dose_response, report
 from jobs.reporting.breaks import changes_of
+from jobs.reporting.claims_study import TAUGHT
 from jobs.reporting.dose_response import write_dose_response
 from jobs.reporting.figures import condition_text, contacts, survivals
 from jobs.reporting.headline import BEGIN, END
@@ -21,8 +22,8 @@ from jobs.reporting.paper_claims import CLAIMS, compare
 from jobs.reporting.report import write_results
 from jobs.reporting.summary_plots import still_going
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_sweep, read_sweep_episodes, write_data
+from jobs.rollout.episodes import write_episodes
 from jobs.rollout.policies import PRETRAINED
-from jobs.studies.ablation.page import variant_result
 from tests.support.episodes import flights
 from tests.support.sweep_folders import study_places, write_shipped, write_study, write_sweep
 
@@ -52,13 +53,14 @@ def test_the_figures_of_a_report_are_drawn_again_from_its_data_alone(tmp_path, m
 def test_the_published_pages_are_those_of_the_published_data(monkeypatch):
     """`python -m docs.from_data` changes nothing; coverage is simulated elsewhere."""
     was = (DOCS / "results.md").read_text()
-    (coverage,) = re.findall(r"between trainings, (.*) do\.", was)
-    monkeypatch.setattr(report, "coverage_text", lambda trainings, corridors: coverage)
+    shares = dict(re.findall(r"(\d+) trainings do in ([^;.]*)", was))
+    monkeypatch.setattr(report, "coverage_text", lambda trainings, corridors: shares[str(trainings)])
     drawn = sorted((DOCS / "images").glob("results_*.png"))
     shown = re.findall(r"images/(results_\w+)\.png", was + (DOCS / "results_tables.md").read_text())
     assert sorted(shown) == [path.stem for path in drawn]
-    found = pages(DOCS, shown)
-    assert list(found) == ["results.md", "results_tables.md", "robustness.md"]
+    found = pages(DOCS, [*shown, dose_response.DOSES, TAUGHT])
+    studies = [f"{name}.md" for name in (dose_response.DOSES, TAUGHT)]
+    assert list(found) == ["results.md", "results_tables.md", "robustness.md", *studies]
     for name, text in found.items():
         assert text == (DOCS / name).read_text(), f"{name}: renew it by python -m docs.from_data"
 
@@ -177,17 +179,27 @@ def test_the_tables_of_the_ablation_are_those_of_their_episodes(name):
     for one in variant_results(DOCS / "data" / f"{name}_episodes.csv.gz"):
         success = (f"{100 * values.mean():.0f}" for values in one.success.values())
         expected = [one.name, *success, estimate_text(one.mean, 100, ".0f")]
+        if name != "memory_seconds":  # whose column compares two others
+            expected.append(estimate_text(one.difference, 100, "+.0f") if one.difference else "")
         assert expected in [[row[0], *row[2 : 1 + len(expected)]] for row in rows]
 
 
+def test_variants_are_paired_with_the_first_by_seed_whatever_their_order_and_number(tmp_path):
+    won = {"first": {0: 20, 1: 4, 2: 12}, "fewer": {2: 12, 1: 4}}
+    rows = {("nominal", "poles_eval", group, str(seed)): flights(count)
+            for group, own in won.items() for seed, count in own.items()}  # fmt: skip
+    write_episodes(tmp_path / "episodes.csv", LABELS, rows)
+    first, fewer = variant_results(tmp_path / "episodes.csv")
+    assert first.difference is None
+    assert fewer.differences.tolist() == [0.0, 0.0]
+    assert fewer.difference.value == 0.0
+
+
 def test_what_memory_in_seconds_is_worth_is_that_of_its_episodes():
-    success = {
-        one.name: {at: values[:, None] for at, values in one.success.items()}
-        for one in variant_results(DOCS / "data" / "memory_seconds_episodes.csv.gz")
-    }
     shown = {row[0]: row[-1] for row in cells_of("policies.md")}
     for way in ("taught", "ppo"):
-        own = variant_result("seconds", success[f"{way}_seconds"], success[f"{way}_stack"], ())
+        found = variant_results(DOCS / "data" / "memory_seconds_episodes.csv.gz", f"{way}_stack")
+        own = next(one for one in found if one.name == f"{way}_seconds")
         assert shown[f"{way}_seconds"] == estimate_text(own.difference, 100, "+.0f")
 
 
