@@ -12,9 +12,9 @@ from jobs.run.provenance import command
             "ablation.trained=docs/data/taught_claims_policies",
             "ablation.trained=docs/data/taught_claims_policies",
         ),
-        ("ablation.trained=/home/someone/work/policies", "ablation.trained=policies"),
+        ("ablation.trained=/elsewhere/work/policies", "ablation.trained=policies"),
         ("ablation.trained=../someone/work/policies", "ablation.trained=policies"),
-        ("sweep.policies=[/home/someone/a,models/b/c]", "'sweep.policies=[a,models/b/c]'"),
+        ("sweep.policies=[/elsewhere/a,models/b/c]", "'sweep.policies=[a,models/b/c]'"),
     ],
 )
 def test_the_command_keeps_paths_of_the_repository_and_tells_no_local_ones(word, shown, monkeypatch):
