@@ -5,6 +5,7 @@ import pytest
 
 from jobs.evaluation.group_stats import episode_values
 from jobs.reporting.breaks import changes_of
+from jobs.reporting.claims_study import TAUGHT, read_findings
 from jobs.reporting.dose_response import DOSES
 from jobs.reporting.headline import BEGIN, COLUMNS, END, headline_table, with_headline
 from jobs.reporting.sweep_data import read_data, replaced_text
@@ -105,6 +106,20 @@ def test_what_the_readme_says_below_its_table_is_what_the_data_say(sweep):
     held = {name: success(sweep, at, "bytestream_hold") for name, at in COLUMNS.items()}
     assert round(100 * held.pop("actions 100 ms late")) == 66
     assert min(held.values()) > 0.94
+
+
+def test_what_the_front_page_says_of_taught_policies_is_what_the_data_say():
+    findings = read_findings(TRAININGS.parent, TAUGHT)
+    verdicts = [one.verdict for one in findings.values()]
+    reversed_m = [-one.overall.value for one in findings.values() if one.verdict == "reversed"]
+    text = " ".join((REPOSITORY / "docs" / "index.md").read_text().split())
+    assert (
+        f"{verdicts.count('equivalent')} of {len(findings)} of the paper's claims make no difference" in text
+    )
+    assert "none holds, and 2 are reversed" in text
+    assert "holds" not in verdicts
+    assert f"lose {min(reversed_m):.0f} and {max(reversed_m):.0f} m more" in text
+    assert len(reversed_m) == 2
 
 
 def test_what_readme_and_front_page_say_of_kinds_of_wrong_events_is_what_the_data_say():
