@@ -17,11 +17,12 @@ from jobs.reporting.report import (
     breaks_table,
     find_study,
     in_short,
+    results_pages,
     several_at_once,
     write_results,
     write_trade,
 )
-from jobs.reporting.sweep_data import read_data, read_sweep_episodes
+from jobs.reporting.sweep_data import read_data, read_sweep, read_sweep_episodes
 from jobs.run.files import write_json
 from jobs.run.provenance import REPOSITORY
 from tests.support.configs import small_config
@@ -327,6 +328,7 @@ def test_what_cannot_be_drawn_or_written_replaces_nothing(sweep, tmp_path, monke
 
 
 def test_the_page_of_a_trade_is_linked_where_there_is_one(sweep, trade, tmp_path):
-    assert "(trade.md)" not in write_results(sweep, tmp_path / "docs").read_text()
-    write_trade(trade, tmp_path / "docs")
-    assert "(trade.md)" in write_results(sweep, tmp_path / "docs").read_text()
+    docs, (about, episodes) = tmp_path / "docs", read_sweep(sweep)
+    assert "(trade.md)" not in results_pages(about, episodes, (), (), docs, tmp_path)["results.md"]
+    write_trade(trade, docs)
+    assert "(trade.md)" in results_pages(about, episodes, (), (), docs, tmp_path)["results.md"]
