@@ -22,7 +22,7 @@ from jobs.reporting.report import (
     write_results,
     write_trade,
 )
-from jobs.reporting.sweep_data import read_data, read_sweep, read_sweep_episodes
+from jobs.reporting.sweep_data import read_data, read_sweep, read_sweep_episodes, write_data
 from jobs.run.files import write_json
 from jobs.run.provenance import REPOSITORY
 from tests.support.configs import small_config
@@ -80,7 +80,7 @@ def test_every_episode_and_training_is_there_to_be_analysed_again(sweep, tmp_pat
         assert int(one["episodes"]) == len(own) == 20
     assert len(trainings) == 3 * 5
     before = (data / "robustness_episodes.csv.gz").read_bytes()
-    write_results(sweep, tmp_path / "docs", shipped(tmp_path))
+    write_data(data, "robustness", sweep, read_sweep(sweep)[1])
     assert before == (data / "robustness_episodes.csv.gz").read_bytes()
 
 
