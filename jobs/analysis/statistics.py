@@ -15,9 +15,7 @@ CONFIDENCE = 0.95
 RESAMPLES = 10_000
 POWER = 0.8
 MOST_TRAININGS = 10_000  # beyond which no study is planned
-CERTAIN = (
-    30.0  # standard errors beyond which the noncentral t has no digits, and power is 1 wherever it matters
-)
+CERTAIN = 30.0  # standard errors beyond which power is 1, and scipy's noncentral t has no digits
 
 Interval = tuple[float, float]
 

@@ -282,13 +282,11 @@ def _worst_conditions(about: SweepFacts, changes: Sequence[Change]) -> str:
         halved[change.condition] += int((change.success <= change.before / 2)[change.before > 0].sum())
         broken[change.condition] += int(change.broken.sum())
     worst = [
-        f'"{condition_text(*at)}" ({count}; {broken[at]} lose for certain)'
-        for at, count in halved.most_common(3)
-        if count
+        f'"{condition_text(*at)}" {count} ({broken[at]})' for at, count in halved.most_common(3) if count
     ]
     return (
-        f"Conditions that take half or more of their success from the most of {every} published trainings: "
-        f"{', '.join(worst) or 'none'}."
+        f"Worst conditions, by how many of the {every} published trainings lose half of their success or "
+        f"more (how many lose for certain): {', '.join(worst) or 'none'}."
     )
 
 
