@@ -7,7 +7,8 @@ Writes results.md, results_tables.md, the table of robustness.md, and each figur
 
 import csv
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -24,6 +25,9 @@ from jobs.reporting.learning_curves import read_trainings
 from jobs.reporting.planned_page import below_plan
 from jobs.reporting.report import results_pages, write_figures
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_episodes
+from jobs.reporting.training_studies import STUDIES as TRAINING_STUDIES
+from jobs.reporting.training_studies import draw_study as draw_training_study
+from jobs.reporting.training_studies import published_text as study_text
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_atomic
 from jobs.studies.ablation.page import VariantResult, plot_variants, variant_result
@@ -53,6 +57,11 @@ def taught_claims(data: Path) -> dict[str, Figure]:
 def ppo_claims(data: Path) -> dict[str, Figure]:
     """That of ppo_claims.md."""
     return {BY_PPO: draw_study(data, BY_PPO)}
+
+
+def training_studies(data: Path, name: str) -> dict[str, Figure]:
+    """That of a study of what trainings depend on."""
+    return {name: draw_training_study(data, name)}
 
 
 def ablation(data: Path) -> dict[str, Figure]:
@@ -87,11 +96,15 @@ def trade(data: Path) -> dict[str, Figure]:
 
 
 # What draws the figures of a study -> the files that it needs.
-STUDIES = {
+STUDIES: dict[Callable[[Path], Mapping[str, Figure]], tuple[str, ...]] = {
     results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
     dose_response: (f"{DOSES}_episodes.csv.gz", f"{DOSES}_about.json", f"{DOSES}_doses.csv"),
     taught_claims: (f"{TAUGHT}_episodes.csv.gz", f"{TAUGHT}_about.json"),
     ppo_claims: (f"{BY_PPO}_episodes.csv.gz", f"{BY_PPO}_about.json"),
+    **{
+        partial(training_studies, name=name): (f"{name}_episodes.csv.gz", f"{name}_about.json")
+        for name in TRAINING_STUDIES
+    },
     ablation: tuple(f"{name}_episodes.csv.gz" for name in ABLATIONS),
     trade: ("trade_settings.csv",),
 }
@@ -124,6 +137,9 @@ def pages(docs: Path, drawn: Collection[str]) -> dict[str, str]:
     for name in (TAUGHT, BY_PPO):
         if name in drawn:
             found[f"{name}.md"] = below_plan(docs / f"{name}.md", claims_text(data, name))
+    for name in TRAINING_STUDIES:
+        if name in drawn:
+            found[f"{name}.md"] = below_plan(docs / f"{name}.md", study_text(data, name))
     return found
 
 

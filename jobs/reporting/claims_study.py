@@ -18,7 +18,7 @@ from jobs.reporting.breaks import SweptEpisodes
 from jobs.reporting.figures import group_results, judge_claims
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_trainings
 from jobs.reporting.paper_claims import GAIN, UNITS, Claim, Finding
-from jobs.reporting.planned_page import write_below_plan
+from jobs.reporting.planned_page import made_text, write_below_plan
 from jobs.reporting.summary_plots import claims_plot
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep, write_data
 from jobs.run.templates import render
@@ -127,10 +127,7 @@ def results_text(
         name=name,
         taught=name == TAUGHT,
         other="results.md#the-papers-claims" if other == SWEEP else f"{other}.md#results",
-        about=about,
-        commits=", ".join(commit[:7] for commit in about["evaluated_at"]),
-        groups=", ".join(f"`{group}` ({len(seeds)})" for group, seeds in about["groups"].items()),
-        count=sum(len(own) for trainings in episodes.values() for own in trainings.values()),
+        made=made_text(about, episodes),
         tests=len(findings),
         verdicts=counted(findings.values()),
         verdicts_other=counted(beside[claim] for claim in beside if claim in findings),

@@ -24,7 +24,7 @@ from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import CHANGE, Change, SweptEpisodes, changes_of, replicated
 from jobs.reporting.dose_plan import PLAN, check_planned, read_plan
 from jobs.reporting.dose_plot import dose_plot
-from jobs.reporting.planned_page import write_below_plan
+from jobs.reporting.planned_page import made_text, write_below_plan
 from jobs.reporting.sweep_data import read_data, read_sweep, replaced_text, write_data
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json
@@ -292,11 +292,8 @@ def results_text(
     same = [kind for kind in kinds if kind not in (*apart, WORST)]
     return render(
         TEMPLATE,
-        about=about,
-        commits=", ".join(commit[:7] for commit in about["evaluated_at"]),
-        groups=", ".join(f"`{group}` ({len(seeds)})" for group, seeds in about["groups"].items()),
+        made=made_text(about, swept),
         replaced=replaced_text(about["commit"]),
-        episodes=sum(len(own) for trainings in swept.values() for own in trainings.values()),
         means=means_table(means, groups, kinds),
         verdicts=verdict_table(compared, groups, kinds),
         worst=WORST,

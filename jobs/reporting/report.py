@@ -3,8 +3,8 @@
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
 docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page, the results in
-docs/dose_response.md, docs/taught_claims.md and docs/ppo_claims.md of the newest studies of these names; with
-`resume` of what that run folder holds.
+docs/dose_response.md, docs/taught_claims.md, docs/ppo_claims.md, docs/encoder_seeds.md and
+docs/camera_rates.md of the newest studies of these names; with `resume` of what that run folder holds.
 """
 
 from collections import Counter
@@ -45,6 +45,7 @@ from jobs.reporting.learning_curves import PublishedTraining, published_training
 from jobs.reporting.paper_claims import CLAIMS, GAIN, Claim, Finding
 from jobs.reporting.replay_page import PAGE
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, replaced_text, write_data
+from jobs.reporting.training_studies import STUDIES, write_training_study
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.checkpoints import sha256
 from jobs.run.files import read_json, write_atomic
@@ -74,6 +75,7 @@ def run(config: Config) -> dict[str, Any]:
         DOSES: partial(write_dose_response, env=config.env),
         BY_PPO: partial(write_claims_study, name=BY_PPO),
         TAUGHT: partial(write_claims_study, name=TAUGHT),
+        **{name: partial(write_training_study, name=name) for name in STUDIES},
     }
     found = {name: find_study(config, name) for name in writers}
     if not any(found.values()):
@@ -92,11 +94,12 @@ def find_study(config: Config, name: str) -> Path | None:
     Args:
         config: The experiment.
         name: "sweep", "trade" or "replay", as its folder is called; `DOSES` is the sweep of that experiment,
-            "sweep" that of any other in the corridors of evaluation, `TAUGHT` and `BY_PPO` the ablations of
-            these experiments.
+            "sweep" that of any other in the corridors of evaluation, `TAUGHT`, `BY_PPO` and `STUDIES` the
+            ablations of these experiments.
     """
     where = Path(config.runs_dir).glob("*") if config.resume is None else [Path(config.resume)]
-    folder = {DOSES: "sweep", TAUGHT: "ablation", BY_PPO: "ablation"}.get(name, name)
+    ablations = dict.fromkeys((TAUGHT, BY_PPO, *STUDIES), "ablation")
+    folder = {DOSES: "sweep", **ablations}.get(name, name)
     found = [path for path in (run / folder / "about.json" for run in where) if path.is_file()]
     if folder == "sweep":
         facts = {path: read_json(path) for path in found}

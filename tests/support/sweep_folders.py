@@ -15,6 +15,7 @@ from jobs.evaluation.sweep_plan import axes_of, baselines_of, same_simulations
 from jobs.reporting.learning_curves import as_csv
 from jobs.rollout.episodes import EPISODE, write_episodes
 from jobs.run.files import write_json
+from jobs.studies.ablation.ablation import seeds_of
 from models.policy.policy import MANIFEST
 from tests.support.configs import compose
 from tests.support.episodes import flights
@@ -123,22 +124,38 @@ def write_claims(folder, lost=(), exp="taught_claims", trainings=3):
         exp: Its experiment.
         trainings: Of each group.
     """
+    more = {tuple(place): count for *place, count in lost}
+
+    def failed(group, axis, value, seed):
+        return seed % 2 + more.get((group, axis, value), 0)
+
+    return write_ablation(folder, exp, failed, trainings)
+
+
+def write_ablation(folder, exp, failed, trainings=None):
+    """Leave the study of an experiment in `folder`, 14 episodes of each training and condition; returns it.
+
+    Args:
+        folder: Where.
+        exp: The experiment.
+        failed: How many episodes fail, by group, axis, value and seed.
+        trainings: Of each group; None: all.
+    """
     config = parse(compose(f"+exp={exp}"))
     axes, env = axes_of(config.sweep), dataclasses.replace(config.env, scene="poles_eval", split="eval")
-    groups = dict.fromkeys(config.ablation.variants, config.ablation.seeds[:trainings])
+    groups = {name: seeds_of(config, name)[:trainings] for name in config.ablation.variants}
     baselines, same = baselines_of(env, axes), same_simulations(env, axes)
     about = {
         **ABOUT, "run": f"{exp}-short-s0-1", "exp": exp, "axes": axes, "groups": groups,
         "trials": 14, "met": [], "exactness": [],
         "compared": [{"condition": at, "baseline": baselines[at], "same_as": same[at]} for at in baselines],
     }  # fmt: skip
-    rows, more = {}, {tuple(place): count for *place, count in lost}
+    rows = {}
     for (axis, value), (group, seeds) in itertools.product(baselines, groups.items()):
         for seed in seeds:
             episodes = np.zeros(14, EPISODE)
             episodes["seed"] = np.arange(14)
-            failed = seed % 2 + more.get((group, axis, value), 0)
-            episodes["success"] = (np.arange(14) + 3 * seed) % 14 >= failed
+            episodes["success"] = (np.arange(14) + 3 * seed) % 14 >= failed(group, axis, value, seed)
             episodes["distance_m"] = np.where(episodes["success"], 100.0, 40.0)
             rows[axis, value, group, str(seed)] = episodes
     folder.mkdir(parents=True, exist_ok=True)

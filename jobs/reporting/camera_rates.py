@@ -1,0 +1,155 @@
+"""How much of what policies lose at other control rates is the paper's two-frame camera.
+
+The study `+exp=camera_rates` trains by both cameras at three rates; docs/camera_rates.md has its plan.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from jobs.analysis.plots import BLUE, GREEN, MUTED, RED, tidy
+from jobs.analysis.statistics import Difference, crossed_difference, crossed_mean, holm
+from jobs.analysis.tables import estimate_text, markdown_table
+from jobs.config.conditions import NOMINAL
+from jobs.evaluation.group_stats import CHANGE, RATE, Condition, episode_values
+from jobs.evaluation.sweep_report import SweepFacts
+from jobs.reporting.breaks import SweptEpisodes
+
+CAMERAS = "camera_rates"  # name of the experiment, and of what is published of it
+PIXELS, FRAMES = "pixels", "frames"  # cameras; a group is one of them and the rate of training
+NOMINAL_HZ = 200
+OWN, REPLACED = "control_hz", "pixels"  # axes: rates by the own camera, and by `PIXELS`
+HEAD = (
+    "Trained by",
+    "at [Hz]",
+    "At its rate [%]",
+    "At all rates [%]",
+    "Loss by rates [points]",
+    "`pixels` in place of its camera [%]",
+)
+TESTS = ("Trained at [Hz]", "Measure", "`frames` minus `pixels` [points]", "p (Holm)")
+
+
+class Group(NamedTuple):
+    """Success of the trainings by one camera at one rate, bool (trainings, corridors) each.
+
+    Attributes:
+        own: Control rate [Hz] -> by its own camera.
+        replaced: The same by `PIXELS` in its place.
+    """
+
+    own: Mapping[int, np.ndarray]
+    replaced: Mapping[int, np.ndarray]
+
+
+def groups_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[tuple[str, int], Group]:
+    """Camera and rate of training [Hz] -> what its trainings do.
+
+    Args:
+        about: What made the study.
+        episodes: Of the study.
+
+    Raises:
+        ValueError: A rate at which a group was trained was not evaluated.
+    """
+    found = {}
+    for name in about["groups"]:
+        camera, hz = name.removesuffix("hz").split("_")
+        swept = {at: episode_values(own, "success") for (at, group), own in episodes.items() if group == name}
+        own = {_rate(at): values for at, values in swept.items() if at[0] in (NOMINAL, OWN)}
+        replaced = {_rate(at): values for at, values in swept.items() if at[0] == REPLACED}
+        if int(hz) not in own:
+            raise ValueError(f"{name} must be evaluated at {hz} Hz, got {sorted(own)}; evaluate it there")
+        found[camera, int(hz)] = Group(dict(sorted(own.items())), dict(sorted(replaced.items())))
+    return dict(sorted(found.items(), key=lambda item: (item[0][1], item[0][0])))
+
+
+def _rate(condition: Condition) -> int:
+    axis, value = condition
+    return NOMINAL_HZ if axis == NOMINAL else int(float(value))
+
+
+def measures(group: Group, hz: int) -> dict[str, np.ndarray]:
+    """What is tested of a group trained at a rate, by name (trainings, corridors)."""
+    at_own = group.own[hz].astype(float)
+    return {
+        "success at its rate": at_own,
+        "loss by rates": at_own - np.mean(list(group.own.values()), axis=0),
+    }
+
+
+def compared(groups: Mapping[tuple[str, int], Group]) -> list[tuple[int, str, Difference, float]]:
+    """Rate of training, measure, `FRAMES` minus `PIXELS`, and its p; all are one family after Holm."""
+    found = []
+    for hz in sorted({hz for _, hz in groups}):
+        frames, pixels = (measures(groups[camera, hz], hz) for camera in (FRAMES, PIXELS))
+        for name, bounds in zip(frames, (RATE, CHANGE), strict=True):
+            found.append((hz, name, crossed_difference(frames[name], pixels[name], bounds)))
+    adjusted = holm([1.0 if one.p is None else one.p for *_, one in found])
+    return [(*one, p) for one, p in zip(found, adjusted, strict=True)]
+
+
+def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
+    """What the results say, as Markdown: the tests, and the measures of each group."""
+    groups = groups_of(about, episodes)
+    tests = compared(groups)
+    certain = sum(p < 0.05 for *_, p in tests)
+    lines = [(f"{hz}", name, estimate_text(one, 100, "+.0f"), f"{p:.2g}") for hz, name, one, p in tests]
+    return "\n\n".join(
+        [
+            f"Of {len(tests)} comparisons of the cameras {certain or 'none'} "
+            f"{'are' if certain > 1 else 'is'} certain after Holm.",
+            markdown_table(TESTS, lines, 2).rstrip("\n"),
+            markdown_table(HEAD, [_row(*name, one) for name, one in groups.items()], 1).rstrip("\n"),
+            "Means with 95 % intervals by trainings and corridors, each alone.",
+        ]
+    )
+
+
+def _row(camera: str, hz: int, group: Group) -> tuple[str, ...]:
+    """The measures of a group as a row under `HEAD`."""
+    at_own, loss = measures(group, hz).values()
+    everywhere = np.mean(list(group.own.values()), axis=0)
+    means = [estimate_text(crossed_mean(values, RATE), 100, ".0f") for values in (at_own, everywhere)]
+    replaced = group.replaced.get(hz)
+    return (
+        f"`{camera}`",
+        f"{hz}",
+        *means,
+        estimate_text(crossed_mean(loss, CHANGE), 100, "+.0f"),
+        "-"
+        if replaced is None or camera == PIXELS
+        else estimate_text(crossed_mean(replaced, RATE), 100, ".0f"),
+    )
+
+
+def draw(about: SweepFacts, episodes: SweptEpisodes) -> Figure:
+    """Draw success against control rate, a panel for each rate of training, a dot for each training."""
+    groups = groups_of(about, episodes)
+    trained = sorted({hz for _, hz in groups})
+    figure = Figure(figsize=(3.4 * len(trained), 3.4), layout="constrained")
+    panels = figure.subplots(1, len(trained), sharey=True, squeeze=False)[0]
+    for panel, hz in zip(panels, trained, strict=True):
+        pixels, frames = groups[PIXELS, hz], groups[FRAMES, hz]
+        for label, colour, marker, aside, curve in (
+            ("pixels", BLUE, "o", 0.96, pixels.own),
+            ("frames", RED, "s", 1.0, frames.own),
+            ("frames, then seen by pixels", GREEN, "^", 1.04, frames.replaced),
+        ):
+            rates = np.array(list(curve)) * aside
+            success = 100 * np.array([values.mean(axis=1) for values in curve.values()])
+            panel.plot(rates, success.mean(axis=1), color=colour, lw=1.4, label=label)
+            panel.plot(rates, success, marker, color=colour, ms=3.5, alpha=0.7)
+        panel.axvline(hz, color=MUTED, lw=0.8, ls=":")
+        panel.set_xscale("log")
+        panel.set_xticks(list(pixels.own), [f"{rate}" for rate in pixels.own])
+        panel.xaxis.set_minor_locator(NullLocator())
+        panel.set_xlabel("Control rate [Hz]")
+        panel.set_title(f"Trained at {hz} Hz", loc="left", fontsize=10)
+        tidy(panel)
+    panels[0].set(ylabel="Success [%]", ylim=(-3, 103))
+    panels[-1].legend(frameon=False, fontsize=8)
+    return figure

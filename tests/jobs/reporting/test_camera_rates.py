@@ -1,0 +1,54 @@
+import pytest
+
+from jobs.reporting.camera_rates import compared, groups_of, measures, results_text
+from jobs.reporting.sweep_data import read_sweep
+from tests.support.sweep_folders import write_ablation
+
+
+def study(folder, failed):
+    return read_sweep(write_ablation(folder, "camera_rates", failed))
+
+
+def frames_lose_elsewhere(group, axis, value, seed):
+    """Those trained by frames lose 6 of 14 at every rate but 200 Hz by their own camera."""
+    return seed % 2 + 6 * (group.startswith("frames") and axis == "control_hz")
+
+
+def test_each_group_has_five_rates_by_its_own_camera_and_three_by_the_other(tmp_path):
+    groups = groups_of(*study(tmp_path, lambda group, axis, value, seed: seed))
+    assert set(groups) == {(camera, hz) for camera in ("pixels", "frames") for hz in (45, 200, 400)}
+    assert all(list(one.own) == [45, 100, 200, 400, 800] for one in groups.values())
+    assert all(list(one.replaced) == [45, 200, 400] for one in groups.values())
+    assert {values.shape for one in groups.values() for values in one.own.values()} == {(3, 14)}
+
+
+def test_a_loss_at_other_rates_is_that_of_the_rate_of_training(tmp_path):
+    groups = groups_of(*study(tmp_path, frames_lose_elsewhere))
+    lost = {hz: measures(groups["frames", hz], hz)["loss by rates"].mean() for hz in (45, 200, 400)}
+    assert lost[200] == pytest.approx(4 / 5 * 6 / 14)
+    assert lost[45] == lost[400] == pytest.approx(-1 / 5 * 6 / 14)  # it does worse at its rate than at 200 Hz
+    assert not any(measures(groups["pixels", hz], hz)["loss by rates"].any() for hz in (45, 200, 400))
+
+
+def test_cameras_are_compared_at_the_same_rate_of_training(tmp_path):
+    tests = {
+        (hz, name): one for hz, name, one, _ in compared(groups_of(*study(tmp_path, frames_lose_elsewhere)))
+    }
+    assert len(tests) == 6
+    assert tests[200, "success at its rate"].value == 0.0
+    assert tests[200, "loss by rates"].value == pytest.approx(4 / 5 * 6 / 14)
+    assert tests[45, "success at its rate"].value == pytest.approx(-6 / 14)
+
+
+def test_equal_cameras_give_no_certain_difference_and_unequal_ones_do(tmp_path):
+    even = results_text(*study(tmp_path / "even", lambda group, axis, value, seed: seed % 2))
+    assert "Of 6 comparisons of the cameras none is certain" in even
+    far = results_text(*study(tmp_path / "far", lambda group, *_: 12 * group.startswith("frames")))
+    assert "Of 6 comparisons of the cameras 3 are certain" in far
+
+
+def test_a_group_that_was_not_evaluated_at_its_rate_is_refused(tmp_path):
+    about, episodes = study(tmp_path, lambda *_: 0)
+    kept = {(at, group): one for (at, group), one in episodes.items() if at != ("control_hz", "400")}
+    with pytest.raises(ValueError, match="pixels_400hz must be evaluated at 400 Hz"):
+        groups_of(about, kept)
