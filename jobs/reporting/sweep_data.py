@@ -26,6 +26,9 @@ REPLACED = {
     "81ef066": {"bytestream_hold": "2991870"},  # docs/dose_response.md
     "28420bd": {"bytestream_hold": "2991870"},  # docs/trade.md
 }
+EARLIER = (
+    "[Results](results.md) were evaluated at a later commit, so that success with nothing changed is not the same."
+)
 
 
 def read_sweep(sweep: Path) -> tuple[SweepFacts, SweptEpisodes]:
@@ -91,7 +94,7 @@ def read_data(folder: Path, name: str) -> tuple[SweepFacts, SweptEpisodes]:
 
 
 def replaced_text(commit: str) -> str:
-    """What a page says of groups whose trainings are not those of models/pretrained; "" if all are.
+    """What a page says of an earlier study: which groups it had of other trainings; "" if it is not earlier.
 
     Args:
         commit: Of the study that the page is about.
@@ -101,7 +104,7 @@ def replaced_text(commit: str) -> str:
         "`models/pretrained` today."
         for group, shipped in REPLACED.get(commit[:7], {}).items()
     ]
-    return " ".join(sentences)
+    return " ".join((*sentences, EARLIER)) if sentences else ""
 
 
 def copy_plot(picture: Path, target: Path) -> None:
