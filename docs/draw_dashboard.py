@@ -2,7 +2,7 @@
 
 Run from the repository root: python -m docs.draw_dashboard [mlflow.db]
 Needs Chromium and a store with a sweep, an evaluated training and a registered `bytestream`. Writes
-docs/images/dashboard_*.png with the newest of each, in `COLOURS` colours.
+docs/images/dashboard_*.png with the newest of each.
 """
 
 import io
@@ -18,7 +18,6 @@ from jobs.tracking.pages import run_address, view_address
 from jobs.tracking.tracker import open_store
 
 IMAGES = Path(__file__).resolve().parent / "images"
-COLOURS = 160
 SETTLE_S = 6.0
 DRAWN = "document.querySelectorAll('.js-plotly-plot .scatterlayer .trace').length > 3"
 # Texts of MLflow's buttons that unfold a part of a page.
@@ -42,8 +41,7 @@ def main() -> None:
                 browser.wait(DRAWN, "the charts")
             time.sleep(SETTLE_S)
             picture = Image.open(io.BytesIO(browser.picture())).convert("RGB")
-            small = picture.quantize(COLOURS, dither=Image.Dither.NONE)
-            small.save(IMAGES / f"dashboard_{name}.png", optimize=True)
+            picture.save(IMAGES / f"dashboard_{name}.png", optimize=True)
         browser.close()
 
 

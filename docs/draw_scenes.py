@@ -2,7 +2,7 @@
 
 Run from the repository root: python docs/draw_scenes.py [NAME ...]
 Writes docs/images/scene_NAME.png, three panels each: the corridor from above the start, what
-the camera sees, and the events of one control step (0.1 m at 200 Hz), ON red and OFF blue.
+the camera sees, and the events of one control step (0.1 m at 200 Hz), ON blue and OFF orange.
 """
 
 import statistics

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from jobs.config.conditions import NOMINAL
 from jobs.evaluation.group_stats import TrainingEpisodes, episode_values
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
@@ -28,6 +27,7 @@ from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_ep
 from jobs.reporting.training_studies import STUDIES as TRAINING_STUDIES
 from jobs.reporting.training_studies import draw_study as draw_training_study
 from jobs.reporting.training_studies import published_text as study_text
+from jobs.reporting.words import condition_text
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_atomic
 from jobs.studies.ablation.page import VariantResult, plot_variants, variant_result
@@ -35,6 +35,8 @@ from jobs.studies.trade.page import draw_settings
 
 DOCS = Path(__file__).resolve().parent
 ABLATIONS = "ablation", "ablation_more", "taught", "memory_seconds"  # each with a recipe of its own
+# Of an ablation whose variants are not all compared with the first: variant -> the one it is compared with.
+PAIRS = {"memory_seconds": {"taught_seconds": "taught_stack", "ppo_seconds": "ppo_stack"}}
 
 
 def results(data: Path) -> dict[str, Figure]:
@@ -66,26 +68,30 @@ def training_studies(data: Path, name: str) -> dict[str, Figure]:
 
 def ablation(data: Path) -> dict[str, Figure]:
     """Those of ablation.md and policies.md; others are compared with the first variant of each."""
-    return {name: plot_variants(variant_results(data / f"{name}_episodes.csv.gz")) for name in ABLATIONS}
+    every = {name: data / f"{name}_episodes.csv.gz" for name in ABLATIONS}
+    return {name: plot_variants(variant_results(own, PAIRS.get(name))) for name, own in every.items()}
 
 
-def variant_results(episodes: Path, first: str | None = None) -> list[VariantResult]:
+def variant_results(episodes: Path, pairs: Mapping[str, str] | None = None) -> list[VariantResult]:
     """Success of each variant of one ablation, and what it changes; the minutes are not known.
 
     Args:
         episodes: Of the ablation.
-        first: The variant that the others are compared with, by pairs of seeds; None: the first.
+        pairs: Variant -> the one that it is compared with, by pairs of seeds; None: all with the first.
     """
     found: dict[str, dict[str, TrainingEpisodes]] = {}
     for ((axis, value), name), trainings in read_sweep_episodes(episodes).items():
-        found.setdefault(name, {})[value if axis == NOMINAL else f"{axis}={value}"] = trainings
-    compared = found[first or next(iter(found))]
+        found.setdefault(name, {})[condition_text(axis, value)] = trainings
+    first, *others = found
+    rivals = dict.fromkeys(others, first) if pairs is None else pairs
     results = []
     for name, conditions in found.items():
         own = {at: episode_values(trainings, "success") for at, trainings in conditions.items()}
-        same = {at: {seed: compared[at][seed] for seed in trainings} for at, trainings in conditions.items()}
-        theirs = {at: episode_values(trainings, "success") for at, trainings in same.items()}
-        results.append(variant_result(name, own, None if conditions is compared else theirs, ()))
+        theirs = None
+        if rival := found.get(rivals.get(name, "")):
+            same = {at: {seed: rival[at][seed] for seed in one} for at, one in conditions.items()}
+            theirs = {at: episode_values(trainings, "success") for at, trainings in same.items()}
+        results.append(variant_result(name, own, theirs, ()))
     return results
 
 

@@ -9,6 +9,7 @@ from envs.events.photoreceptor import GAMMA
 from envs.events.windows import GREY_OFF, GREY_ON
 
 ZOOM = 4
+ON_RGB, OFF_RGB = (96, 165, 250), (249, 115, 22)  # events in every picture for people
 
 
 def observation_space(config: EnvConfig) -> spaces.Space:
@@ -53,7 +54,7 @@ def observe(config: EnvConfig, events: np.ndarray, luminance: np.ndarray) -> np.
 
 
 def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
-    """Luminance (gamma 2.2) beside the events, ON red and OFF blue, four times enlarged.
+    """Luminance (gamma 2.2) beside the events, ON blue and OFF orange, four times enlarged.
 
     Args:
         events: EVENT in time order.
@@ -66,6 +67,6 @@ def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
     grey = np.rint(255.0 * np.clip(luminance, 0.0, 1.0) ** (1.0 / GAMMA)).astype(np.uint8)
     polarity = event_image(events, width, height)
     image = np.repeat(np.concatenate((grey, np.zeros_like(polarity)), axis=1)[:, :, None], 3, axis=2)
-    image[:, width:][polarity == GREY_ON] = (255, 80, 40)
-    image[:, width:][polarity == GREY_OFF] = (40, 120, 255)
+    image[:, width:][polarity == GREY_ON] = ON_RGB
+    image[:, width:][polarity == GREY_OFF] = OFF_RGB
     return image.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)

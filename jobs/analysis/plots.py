@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
+from envs.observations import OFF_RGB, ON_RGB
 from envs.scene import Scene
 from jobs.analysis.ground_plan import ground_plan
 from jobs.analysis.statistics import half_width
@@ -22,7 +23,8 @@ BLACK, SLATE = "#111827", "#64748b"
 BLUE, CYAN, GREEN, LIME = "#2563eb", "#0891b2", "#059669", "#65a30d"
 AMBER, BROWN, RED, PINK, PURPLE, VIOLET = "#d97706", "#b45309", "#dc2626", "#db2777", "#7c3aed", "#9333ea"
 GREYS = ("#9ca3af", "#6b7280", "#374151", "#111827")  # of what is shown for comparison, from light to dark
-EVENT_COLOURS = LinearSegmentedColormap.from_list("events", ["#f97316", "#15181f", "#60a5fa"])  # OFF, no, ON
+OFF_ON = [np.array(colour) / 255.0 for colour in (OFF_RGB, (21, 24, 31), ON_RGB)]
+EVENT_COLOURS = LinearSegmentedColormap.from_list("events", OFF_ON)  # OFF, no event, ON
 # Colours by what is drawn.
 COLOURS = {
     # outcomes of episodes

@@ -11,11 +11,10 @@ from matplotlib.figure import Figure
 from jobs.analysis.plots import BLUE, MUTED, RED, tidy
 from jobs.analysis.statistics import crossed_spread, holm
 from jobs.analysis.tables import markdown_table
-from jobs.config.conditions import NOMINAL
 from jobs.evaluation.group_stats import Condition, episode_values
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import SweptEpisodes
-from jobs.reporting.figures import condition_text
+from jobs.reporting.words import condition_text
 
 ENCODERS = "encoder_seeds"  # name of the experiment, and of what is published of it
 OWN, OTHER = "own", "encoder_"  # groups: encoder and PPO of one seed; by the encoder of the seed in the name
@@ -29,13 +28,6 @@ HEAD = (
     "SD of the rest",
 )
 MEAN = "mean of these"
-WORDS = {
-    (NOMINAL, "poles_eval"): "nothing changed",
-    ("control_hz", "45"): "45 Hz",
-    ("background_activity", "0.1"): "10 % false events",
-    ("scene", "texture_change"): "other textures",
-    ("scene", "poles_dense"): "more poles",
-}
 
 
 def by_encoder(episodes: SweptEpisodes) -> dict[Condition, np.ndarray]:
@@ -69,12 +61,8 @@ def spread_rows(tables: Mapping[Condition, np.ndarray]) -> list[tuple[str, ...]]
     mean = np.mean(list(tables.values()), axis=0)
     return [
         *_rows({MEAN: mean}),
-        *_rows({_words(condition): table for condition, table in tables.items()}),
+        *_rows({condition_text(*condition): table for condition, table in tables.items()}),
     ]
-
-
-def _words(condition: Condition) -> str:
-    return WORDS.get(condition) or condition_text(*condition)
 
 
 def _rows(tables: Mapping[str, np.ndarray]) -> list[tuple[str, ...]]:
@@ -134,7 +122,7 @@ def draw(about: SweepFacts, episodes: SweptEpisodes) -> Figure:
     left.set(xlabel="Seed of PPO", ylabel="Seed of the encoder")
     left.set_title("Success [%], mean of the conditions", loc="left", fontsize=10)
     spreads = {MEAN: crossed_spread(mean)}
-    spreads |= {_words(at): crossed_spread(100 * table) for at, table in tables.items()}
+    spreads |= {condition_text(*at): crossed_spread(100 * table) for at, table in tables.items()}
     shown = {"encoder": (BLUE, "o"), "seed of PPO": (RED, "s"), "neither": (MUTED, "D")}
     for place, (label, (colour, marker)) in enumerate(shown.items()):
         values = [(one.rows, one.columns, one.rest)[place] for one in spreads.values()]

@@ -8,42 +8,14 @@ from matplotlib.figure import Figure
 from envs.scene import make_scene
 from jobs.config.conditions import NOMINAL, axis_numbers
 from jobs.evaluation.group_stats import Condition, GroupResult, summarise_group
-from jobs.evaluation.sweep_plots import axis_figure, collision_figure
+from jobs.evaluation.sweep_plots import collision_figure
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, content, place
 from jobs.reporting.learning_curves import PublishedTraining
 from jobs.reporting.paper_claims import Claim, Finding, judge_all
 from jobs.reporting.summary_plots import Survival, axes_map, change_map, claims_plot, survival_plot
+from jobs.reporting.words import TITLES, condition_text
 from jobs.rollout.episodes import EPISODE
-
-TITLES = {
-    "control_hz": "Control rate",
-    "control_hz_dense": "Control rate among more poles",
-    "contrast_threshold": "Contrast threshold",
-    "sparsity": "Dead pixels",
-    "background_activity": "Background activity",
-    "sensor_noise": "Noise of a real sensor: none, by day, by night",
-    "world": "Other worlds",
-    "memory": "Memory of the pixels",
-    "memory_400hz": "Memory of the pixels at 400 Hz",
-    "action_delay": "Delay of actions [ms]",
-    "worst": "Several at once",
-    "axes": "Success along every axis of numbers, one policy a row",
-    "contacts": "Where episodes end in contact",
-}
-
-
-# Conditions whose values say little, in words.
-WORDS = {
-    ("sensor_noise", "0"): "No noise of a real sensor",
-    ("sensor_noise", "0.1"): "Noise of a real sensor by day",
-    ("sensor_noise", "5"): "Noise of a real sensor by night",
-}
-
-
-def condition_text(axis: str, value: str) -> str:
-    """A condition in words."""
-    return WORDS.get((axis, value)) or f"{TITLES.get(axis, axis)}: {value}"
 
 
 def results_figures(
@@ -65,11 +37,6 @@ def results_figures(
         "map": change_map(changes, list(about["groups"]), labels),
         "claims": claims_plot(findings),
         "survival": survival_plot(survivals(about, episodes, changes), scene.length_m),
-        **{
-            axis: axis_figure(axis, points, own)
-            for axis, points in about["axes"].items()
-            if axis != NOMINAL and (own := [one for one in results if one.condition[0] == axis])
-        },
         **({"axes": axes_map(numbers, list(about["groups"]))} if numbers else {}),
         "contacts": collision_figure(contacts(about, episodes), scene.length_m, scene.width_m / 2),
     }

@@ -1,5 +1,6 @@
 """Pictures of a whole sweep: its map, the paper's claims, every axis, and how far episodes get."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, cast
 
@@ -53,9 +54,12 @@ def change_map(changes: Sequence[Change], groups: Sequence[str], labels: Mapping
     panel.tick_params(length=0)
     bar = figure.colorbar(picture, ax=panel, shrink=0.5, pad=0.01)
     bar.set_label("Change against the baseline [points]", fontsize=8)
+    bold = (
+        "bold where the change is certain" if any(one.certain for one in changes) else "no change is certain"
+    )
     note = (
-        "Numbers: success [%], bold where the change is certain. Dots: each training, from 0 (left) to 100 %."
-        " Empty: for this policy the same simulation as another row or the baseline."
+        f"Numbers: success [%]; {bold} for further trainings. Dots: each training, from 0 (left) to 100 %."
+        " Empty: this change cannot affect that policy, or is another row."
     )
     figure.supxlabel(note, fontsize=8, color=MUTED)
     return figure
@@ -66,7 +70,7 @@ def claims_plot(findings: Mapping[Claim, Finding]) -> Figure:
     tested = {claim: one for claim, one in findings.items() if one.overall and one.overall.interval}
     measures = [name for name in UNITS if any(claim.measure == name for claim in tested)]
     sizes = [sum(claim.measure == name for claim in tested) for name in measures]
-    figure = Figure(figsize=(9.6, 1.2 + 0.34 * sum(sizes)), layout="constrained")
+    figure = Figure(figsize=(9.6, 1.2 + 0.42 * sum(sizes)), layout="constrained")
     panels = figure.subplots(len(measures), 1, squeeze=False, height_ratios=sizes)[:, 0]
     for panel, name in zip(panels, measures, strict=True):
         scale, unit = UNITS[name]
@@ -77,14 +81,19 @@ def claims_plot(findings: Mapping[Claim, Finding]) -> Figure:
             colour, overall = VERDICT_COLOURS.get(one.verdict, MUTED), cast(Difference, one.overall)
             panel.plot([scale * end for end in overall.interval or ()], [row, row], color=colour, lw=1.6)
             panel.plot(scale * overall.value, row, "o", color=colour, ms=5)
-            panel.text(1.01, row, one.verdict, transform=panel.get_yaxis_transform(), va="center", fontsize=8)
-        names = [f"{claim.ours}: {claim.text}" for claim, _ in own]
-        panel.set_yticks(range(len(own)), [text if len(text) < 70 else f"{text[:67]}..." for text in names])
-        panel.tick_params(axis="y", labelsize=8)
+            beside = {"transform": panel.get_yaxis_transform(), "va": "center", "fontsize": 8}
+            panel.text(1.01, row, one.verdict, color=colour, **beside)
+        panel.set_yticks(range(len(own)), [_claim_label(claim) for claim, _ in own])
+        panel.tick_params(axis="y", labelsize=7.5)
         panel.set_ylim(len(own) - 0.5, -0.5)
         panel.set_xlabel(f"Difference [{unit}]; grey: too small to matter", fontsize=8)
         tidy(panel, "x")
     return figure
+
+
+def _claim_label(claim: Claim) -> str:
+    """Two groups, and below them what the paper says of the first."""
+    return "\n".join((f"{claim.ours} against {claim.theirs}:", *textwrap.wrap(claim.text, 52)))
 
 
 class Survival(NamedTuple):

@@ -27,7 +27,8 @@ REPLACED = {
     "28420bd": {"bytestream_hold": "2991870"},  # docs/trade.md
 }
 EARLIER = (
-    "[Results](results.md) were evaluated at a later commit, so that success with nothing changed is not the same."
+    "[Results](results.md) were evaluated at a later commit, so that success with nothing changed is not the "
+    "same."
 )
 
 

@@ -1,6 +1,6 @@
 """Trained policies in MLflow's model registry: one name for each experiment, one version for each training.
 
-A version is sufficient alone: the policy folder (safetensors and JSON), the script `tracking.served_policy`
+A version is complete in itself: the policy folder (safetensors and JSON), the script `tracking.served_policy`
 and the package `models`. Nothing is pickled, and nothing is installed to find out what it needs.
 """
 

@@ -138,7 +138,7 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
             process; a metric that was not measured is NaN.
 
     Returns:
-        The policy folder, sufficient alone.
+        The policy folder, complete in itself.
 
     Raises:
         TrainingError: If training failed or a loss is not finite.

@@ -219,7 +219,7 @@ def save_policy(
     encoder_metrics: Mapping[str, float] | None = None,
     lean: bool = False,
 ) -> Path:
-    """Write a policy folder that is sufficient alone; its manifest comes last, and seals it.
+    """Write a policy folder that is complete in itself; its manifest comes last, and seals it.
 
     Args:
         path: Folder, made if missing.

@@ -59,7 +59,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     """Frozen encoder, where the policy has one, and the networks.
 
     The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
-    checkpoint is sufficient alone. A fine-tuned encoder is the networks' trunk instead.
+    checkpoint is complete in itself. A fine-tuned encoder is the networks' trunk instead.
     `model_config` holds what `module_spec` puts there. What is `PRIVILEGED` only widens the first layer of
     the value network, and a policy that is exported is without it.
 

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from docs import from_data
-from docs.from_data import ABLATIONS, STUDIES, figures, main, pages, variant_results
+from docs.from_data import ABLATIONS, PAIRS, STUDIES, figures, main, pages, variant_results
 from envs.config import EnvConfig
 from jobs.analysis.tables import estimate_text, save_plot, write_csv
 from jobs.evaluation.group_stats import LABELS, episode_values
@@ -15,7 +15,7 @@ from jobs.reporting import dose_response, report
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import TAUGHT
 from jobs.reporting.dose_response import write_dose_response
-from jobs.reporting.figures import condition_text, contacts, survivals
+from jobs.reporting.figures import contacts, survivals
 from jobs.reporting.headline import BEGIN, END
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_curves, read_trainings
 from jobs.reporting.paper_claims import CLAIMS, compare
@@ -126,7 +126,7 @@ def test_the_worst_condition_of_a_group_is_the_one_it_succeeds_least_in(tmp_path
     for one in episodes[("sparsity", "0.2"), "bytestream"].values():
         one["success"][:] = False
     found = survivals(about, episodes, changes_of(about, episodes))
-    assert found["bytestream"].worst == "Dead pixels: 0.2"
+    assert found["bytestream"].worst == "20 % dead pixels"
     assert len(found["bytestream"].there) == 3
     assert not np.concatenate(found["bytestream"].there)["success"].any()
 
@@ -140,11 +140,6 @@ def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(tmp_pat
     episodes[("sparsity", "0.2"), "bytestream"] = episodes[("nominal", "poles_eval"), "bytestream"]
     about["compared"].reverse()  # nothing changed stays nothing changed wherever it stands
     assert [len(part) for part in contacts(about, episodes)["bytestream"]] == [3 * 20, 0]
-
-
-def test_a_condition_is_told_in_words():
-    assert condition_text("sensor_noise", "5") == "Noise of a real sensor by night"
-    assert condition_text("action_delay", "50") == "Delay of actions [ms]: 50"
 
 
 def test_a_group_that_was_not_evaluated_unchanged_is_left_out_of_how_far_episodes_get(tmp_path):
@@ -197,10 +192,10 @@ def test_variants_are_paired_with_the_first_by_seed_whatever_their_order_and_num
 
 def test_what_memory_in_seconds_is_worth_is_that_of_its_episodes():
     shown = {row[0]: row[-1] for row in cells_of("policies.md")}
-    for way in ("taught", "ppo"):
-        found = variant_results(DOCS / "data" / "memory_seconds_episodes.csv.gz", f"{way}_stack")
-        own = next(one for one in found if one.name == f"{way}_seconds")
-        assert shown[f"{way}_seconds"] == estimate_text(own.difference, 100, "+.0f")
+    found = variant_results(DOCS / "data" / "memory_seconds_episodes.csv.gz", PAIRS["memory_seconds"])
+    for own in found:
+        paired = own.name.endswith("_seconds")
+        assert shown[own.name] == (estimate_text(own.difference, 100, "+.0f") if paired else "")
 
 
 def test_what_taught_policies_say_of_cameras_and_autoencoders_is_that_of_their_episodes():

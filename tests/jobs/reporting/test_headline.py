@@ -1,9 +1,12 @@
 import csv
+import dataclasses
 import re
 
 import pytest
 
+from jobs.config.config import parse
 from jobs.evaluation.group_stats import episode_values
+from jobs.evaluation.sweep_plan import axes_of, same_simulations
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import TAUGHT, read_findings
 from jobs.reporting.dose_response import DOSES
@@ -11,6 +14,7 @@ from jobs.reporting.headline import BEGIN, COLUMNS, END, headline_table, with_he
 from jobs.reporting.sweep_data import read_data, replaced_text
 from jobs.run.files import RunError, read_json
 from jobs.run.provenance import REPOSITORY
+from tests.support.configs import compose
 from tests.support.episodes import flights
 
 DATA = {"results": "robustness", "dose_response": DOSES}  # pages and the names of their data
@@ -32,7 +36,7 @@ def cells_of(text):
 
 
 def test_a_cell_is_the_mean_of_the_trainings_and_marked_where_training_met_the_condition():
-    at, dead = COLUMNS["nothing changed"], COLUMNS["half of the pixels dead"]
+    at, dead = COLUMNS["nothing changed"], COLUMNS["50 % dead pixels"]
     episodes = {
         (at, "bytestream"): {0: flights(20), 1: flights(10)},
         (dead, "bytestream"): {0: flights(5), 1: flights(0)},
@@ -41,7 +45,7 @@ def test_a_cell_is_the_mean_of_the_trainings_and_marked_where_training_met_the_c
     table = headline_table({"bytestream": [0, 1], "oracle": [None]}, episodes, {(*dead, "bytestream")})
     cells, total = cells_of(table), len(flights(0))
     assert cells["bytestream"]["nothing changed"] == f"{100 * 15 / total:.0f}"
-    assert cells["bytestream"]["half of the pixels dead"] == f"{100 * 2.5 / total:.0f}°"
+    assert cells["bytestream"]["50 % dead pixels"] == f"{100 * 2.5 / total:.0f}°"
     assert cells["oracle"]["45 Hz"] == "-"
     assert list(cells) == ["oracle", "bytestream"]  # the best mean first
 
@@ -72,8 +76,23 @@ def test_published_rows_are_those_of_the_published_data(page):
     assert len(published) >= 4
     for group, cells in published.items():
         for heading, cell in cells.items():
-            values = rates[(*COLUMNS[heading], group)]
-            assert abs(float(cell.strip("*°")) - 100 * sum(values) / len(values)) <= 0.51, (group, heading)
+            values = [100 * rate for rate in rates[(*COLUMNS[heading], group)]]
+            mean, *span = map(float, re.findall(r"\d+", cell))
+            assert abs(mean - sum(values) / len(values)) <= 0.51, (group, heading)
+            ends = [min(values), max(values)] if span else []
+            assert span == pytest.approx(ends, abs=0.51), (group, heading)
+
+
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/index.md", "docs/start.md", "docs/robustness.md", "docs/commands.md"]
+)
+def test_pages_say_how_many_conditions_of_the_sweep_differ(page):
+    config = parse(compose("+exp=robustness"))
+    env = dataclasses.replace(config.env, scene=config.sweep.scene)
+    differ = set(same_simulations(env, axes_of(config.sweep)).values())
+    assert f"under {len(differ)} conditions" in (REPOSITORY / page).read_text().replace(
+        "policies under", "under"
+    )
 
 
 @pytest.fixture(scope="module")
