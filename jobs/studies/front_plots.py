@@ -20,24 +20,34 @@ class CostedSetting(NamedTuple):
     error: float
 
 
-def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Places of the points that no other beats in cost and error both, by rising cost."""
-    order = sorted(range(len(points)), key=lambda place: points[place])
-    front: list[int] = []
-    for place in order:
-        if not front or points[place][1] < points[front[-1]][1]:
-            front.append(place)
-    return front
+def pareto(points: Sequence[tuple[float, float]], noise: float = 0.0) -> list[int]:
+    """Places of the points that no other beats in cost and error, by rising cost.
+
+    Args:
+        points: Cost and error of each.
+        noise: Share of a cost by which it differs when it is measured again: a point is beaten by one that is
+            as exact and cheaper by more than that, and by one that is more exact and no dearer beyond that.
+    """
+
+    def beats(ours: tuple[float, float], theirs: tuple[float, float]) -> bool:
+        cheaper = ours[0] < (1.0 - noise) * theirs[0]
+        return (ours[1] <= theirs[1] and cheaper) or (
+            ours[1] < theirs[1] and ours[0] <= (1.0 + noise) * theirs[0]
+        )
+
+    front = [place for place, one in enumerate(points) if not any(beats(other, one) for other in points)]
+    return sorted(front, key=lambda place: points[place])
 
 
 def plot_costs(
     scene: str, settings: Sequence[CostedSetting], front: Sequence[int], tolerance: float
 ) -> Figure:
-    """Draw the cost of settings against their event error, with the Pareto front as a line."""
+    """Draw the cost of settings against their event error; those of the front are ringed."""
     figure = Figure(figsize=(9.6, 5.6), layout="constrained")
     panel = figure.subplots()
     places = np.array([(setting.cost_us, max(setting.error, MIN_ERROR)) for setting in settings])
-    panel.plot(*places[list(front)].T, color=MUTED, lw=1.2, ls="--", zorder=1, label="Pareto front")
+    ring = {"s": 130, "facecolors": "none", "edgecolors": INK, "linewidths": 1.0}
+    panel.scatter(*places[list(front)].T, **ring, zorder=5, label="no other is better")
     for knob in dict.fromkeys(setting.knob for setting in settings):
         own = [place for place, setting in enumerate(settings) if setting.knob == knob]
         marker, size, order = ("*", 260, 4) if knob == "default" else ("o", 34, 3)

@@ -28,6 +28,17 @@ def test_the_front_is_what_nothing_beats_in_both(points):
     assert [points[place] for place in front] == sorted(points[place] for place in front)
 
 
+@given(POINTS)
+def test_what_is_beaten_within_the_noise_is_beaten_by_what_is_more_exact_alone(points):
+    twice = [*points, *((1.04 * cost, error) for cost, error in points)]
+    front = [twice[place] for place in pareto(twice, 0.05)]
+    assert front
+    for cost, error in front:
+        assert not any(other < error and price <= 1.05 * cost for price, other in twice)
+    both = {(cost, error) for cost, error in points if (1.04 * cost, error) in front}
+    assert both <= set(front)  # what differs by noise alone is not told apart
+
+
 def test_more_renders_cost_more():
     once, often = (
         dataclasses.replace(
