@@ -1,8 +1,9 @@
 """Make the result pages and their figures again from docs/data alone: no run folder and no store is needed.
 
 Run from the repository root: python -m docs.from_data [FOLDER]
-Writes results.md, results_tables.md, the table of robustness.md, and each figure whose data are there, as
-`+exp=report` does, into FOLDER and FOLDER/images; by default docs. docs/data.md explains the data.
+Writes results.md, results_tables.md, the table of robustness.md, what stands below the plan of each planned
+study, and each figure whose data are there, as `+exp=report` does, into FOLDER and FOLDER/images; by default
+docs. docs/data.md explains the data.
 """
 
 import csv

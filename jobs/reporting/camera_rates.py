@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from jobs.analysis.plots import BLUE, GREEN, MUTED, RED, tidy
-from jobs.analysis.statistics import Difference, crossed_difference, crossed_mean, holm
+from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_difference, crossed_mean, holm
 from jobs.analysis.tables import estimate_text, markdown_table
 from jobs.config.conditions import NOMINAL
 from jobs.evaluation.group_stats import CHANGE, RATE, Condition, episode_values
@@ -45,15 +45,15 @@ class Group(NamedTuple):
     replaced: Mapping[int, np.ndarray]
 
 
-def groups_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[tuple[str, int], Group]:
-    """Camera and rate of training [Hz] -> what its trainings do.
+def groups_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[tuple[int, str], Group]:
+    """Rate of training [Hz] and camera -> what its trainings do.
 
     Args:
         about: What made the study.
         episodes: Of the study.
 
     Raises:
-        ValueError: A rate at which a group was trained was not evaluated.
+        ValueError: A camera was not trained, or not evaluated, at a rate at which another was trained.
     """
     found = {}
     for name in about["groups"]:
@@ -61,10 +61,13 @@ def groups_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[tuple[str, int
         swept = {at: episode_values(own, "success") for (at, group), own in episodes.items() if group == name}
         own = {_rate(at): values for at, values in swept.items() if at[0] in (NOMINAL, OWN)}
         replaced = {_rate(at): values for at, values in swept.items() if at[0] == REPLACED}
-        if int(hz) not in own:
-            raise ValueError(f"{name} must be evaluated at {hz} Hz, got {sorted(own)}; evaluate it there")
-        found[camera, int(hz)] = Group(dict(sorted(own.items())), dict(sorted(replaced.items())))
-    return dict(sorted(found.items(), key=lambda item: (item[0][1], item[0][0])))
+        found[int(hz), camera] = Group(dict(sorted(own.items())), dict(sorted(replaced.items())))
+    trained = sorted({hz for hz, _ in found})
+    every = {(hz, camera): set(trained) for hz in trained for camera in (FRAMES, PIXELS)}
+    lacking = [key for key, rates in every.items() if key not in found or not rates <= set(found[key].own)]
+    if lacking:
+        raise ValueError(f"each camera must be trained and evaluated at {trained} Hz; lacking: {lacking}")
+    return dict(sorted(found.items()))
 
 
 def _rate(condition: Condition) -> int:
@@ -81,11 +84,11 @@ def measures(group: Group, hz: int) -> dict[str, np.ndarray]:
     }
 
 
-def compared(groups: Mapping[tuple[str, int], Group]) -> list[tuple[int, str, Difference, float]]:
+def compared(groups: Mapping[tuple[int, str], Group]) -> list[tuple[int, str, Difference, float]]:
     """Rate of training, measure, `FRAMES` minus `PIXELS`, and its p; all are one family after Holm."""
     found = []
-    for hz in sorted({hz for _, hz in groups}):
-        frames, pixels = (measures(groups[camera, hz], hz) for camera in (FRAMES, PIXELS))
+    for hz in sorted({hz for hz, _ in groups}):
+        frames, pixels = (measures(groups[hz, camera], hz) for camera in (FRAMES, PIXELS))
         for name, bounds in zip(frames, (RATE, CHANGE), strict=True):
             found.append((hz, name, crossed_difference(frames[name], pixels[name], bounds)))
     adjusted = holm([1.0 if one.p is None else one.p for *_, one in found])
@@ -96,7 +99,7 @@ def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
     """What the results say, as Markdown: the tests, and the measures of each group."""
     groups = groups_of(about, episodes)
     tests = compared(groups)
-    certain = sum(p < 0.05 for *_, p in tests)
+    certain = sum(p < 1.0 - CONFIDENCE for *_, p in tests)
     lines = [(f"{hz}", name, estimate_text(one, 100, "+.0f"), f"{p:.2g}") for hz, name, one, p in tests]
     return "\n\n".join(
         [
@@ -109,7 +112,7 @@ def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
     )
 
 
-def _row(camera: str, hz: int, group: Group) -> tuple[str, ...]:
+def _row(hz: int, camera: str, group: Group) -> tuple[str, ...]:
     """The measures of a group as a row under `HEAD`."""
     at_own, loss = measures(group, hz).values()
     everywhere = np.mean(list(group.own.values()), axis=0)
@@ -129,11 +132,11 @@ def _row(camera: str, hz: int, group: Group) -> tuple[str, ...]:
 def draw(about: SweepFacts, episodes: SweptEpisodes) -> Figure:
     """Draw success against control rate, a panel for each rate of training, a dot for each training."""
     groups = groups_of(about, episodes)
-    trained = sorted({hz for _, hz in groups})
+    trained = sorted({hz for hz, _ in groups})
     figure = Figure(figsize=(3.4 * len(trained), 3.4), layout="constrained")
     panels = figure.subplots(1, len(trained), sharey=True, squeeze=False)[0]
     for panel, hz in zip(panels, trained, strict=True):
-        pixels, frames = groups[PIXELS, hz], groups[FRAMES, hz]
+        pixels, frames = groups[hz, PIXELS], groups[hz, FRAMES]
         for label, colour, marker, aside, curve in (
             ("pixels", BLUE, "o", 0.96, pixels.own),
             ("frames", RED, "s", 1.0, frames.own),

@@ -3,13 +3,14 @@
 The study `+exp=encoder_seeds` crosses both; docs/encoder_seeds.md has its plan.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jobs.analysis.plots import BLUE, MUTED, RED, tidy
-from jobs.analysis.statistics import crossed_spread, holm
+from jobs.analysis.statistics import CONFIDENCE, CrossedSpread, crossed_spread, holm
 from jobs.analysis.tables import markdown_table
 from jobs.evaluation.group_stats import Condition, episode_values
 from jobs.evaluation.sweep_report import SweepFacts
@@ -56,51 +57,71 @@ def _table(cells: Mapping[tuple[int, int], float]) -> np.ndarray:
     return np.array([[cells[encoder, seed] for seed in seeds] for encoder in seeds])
 
 
-def spread_rows(tables: Mapping[Condition, np.ndarray]) -> list[tuple[str, ...]]:
-    """A row under `HEAD` for the mean of all conditions, a family of tests, and one for each, another."""
+class Factors(NamedTuple):
+    """What the trainings of a table differ by.
+
+    Attributes:
+        mean: Success of all [%].
+        spread: Standard deviations [points].
+        encoder_p, seed_p: Of the tests that these are 0, after Holm; None: not tested.
+    """
+
+    mean: float
+    spread: CrossedSpread
+    encoder_p: float | None
+    seed_p: float | None
+
+
+def factors(tables: Mapping[Condition, np.ndarray]) -> dict[str, Factors]:
+    """Those of the mean of all conditions, whose tests are a family, and of each, whose tests are another."""
     mean = np.mean(list(tables.values()), axis=0)
-    return [
-        *_rows({MEAN: mean}),
-        *_rows({condition_text(*condition): table for condition, table in tables.items()}),
-    ]
+    return _family({MEAN: mean}) | _family({condition_text(*at): table for at, table in tables.items()})
 
 
-def _rows(tables: Mapping[str, np.ndarray]) -> list[tuple[str, ...]]:
-    """Rows of tables whose tests are one family."""
-    spreads = [crossed_spread(100 * table) for table in tables.values()]
-    tested = [p for one in spreads for p in (one.rows_p, one.columns_p) if p is not None]
+def _family(tables: Mapping[str, np.ndarray]) -> dict[str, Factors]:
+    """Of tables whose tests are one family."""
+    spreads = {name: crossed_spread(100 * table) for name, table in tables.items()}
+    tested = [p for one in spreads.values() for p in (one.rows_p, one.columns_p) if p is not None]
     adjusted = iter(holm(tested))
-    rows = list[tuple[str, ...]]()
-    for (name, table), one in zip(tables.items(), spreads, strict=True):
-        ps = ["-" if p is None else f"{next(adjusted):.2g}" for p in (one.rows_p, one.columns_p)]
-        mean = f"{100 * table.mean():.0f}"
-        rows.append((name, mean, f"{one.rows:.0f}", ps[0], f"{one.columns:.0f}", ps[1], f"{one.rest:.0f}"))
-    return rows
+    found = {}
+    for name, one in spreads.items():
+        ps = [None if p is None else next(adjusted) for p in (one.rows_p, one.columns_p)]
+        found[name] = Factors(100 * float(tables[name].mean()), one, *ps)
+    return found
+
+
+def _row(name: str, one: Factors) -> tuple[str, ...]:
+    """A row under `HEAD`."""
+    encoder_p, seed_p = ("-" if p is None else f"{p:.2g}" for p in (one.encoder_p, one.seed_p))
+    spread = one.spread
+    return (
+        name, f"{one.mean:.0f}", f"{spread.rows:.0f}", encoder_p, f"{spread.columns:.0f}", seed_p,
+        f"{spread.rest:.0f}",
+    )  # fmt: skip
+
+
+def certain_factors(one: Factors) -> list[str]:
+    """Which of the two factors make trainings differ for certain."""
+    tested = {"encoder": one.encoder_p, "seed of PPO": one.seed_p}
+    return [name for name, p in tested.items() if p is not None and p < 1.0 - CONFIDENCE]
 
 
 def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
     """What the results say, as Markdown: what is found in the mean, and a table."""
     tables = by_encoder(episodes)
-    mean, rows = np.mean(list(tables.values()), axis=0), spread_rows(tables)
+    mean, found = np.mean(list(tables.values()), axis=0), factors(tables)
+    certain = " and by their ".join(certain_factors(found[MEAN]))
+    verdict = f"differ by their {certain}, for certain" if certain else "differ for certain by neither"
     parts = (
-        f"{_found(rows[0])} Under all {len(tables)} conditions together the {mean.size} trainings succeed in "
+        f"Trainings {verdict}. Under all {len(tables)} conditions together the {mean.size} succeed in "
         f"{_span(mean)} % of their flights; the means by encoder are {_span(mean.mean(axis=1))} %, those by "
         f"seed of PPO {_span(mean.mean(axis=0))} %.",
-        markdown_table(HEAD, rows, 1).rstrip("\n"),
+        markdown_table(HEAD, [_row(*item) for item in found.items()], 1).rstrip("\n"),
         "Standard deviations [points] of what the trainings by one encoder have in common, of what those of "
         "one seed of PPO have in common, and of what neither explains. The tests of the mean are one family, "
         "those of the single conditions another.",
     )
     return "\n\n".join(parts)
-
-
-def _found(row: Sequence[str]) -> str:
-    """Which of the two factors are certain, by a row under `HEAD`."""
-    tested = (("encoder", row[3]), ("seed of PPO", row[5]))
-    certain = [name for name, p in tested if p != "-" and float(p) < 0.05]
-    if certain:
-        return f"Trainings differ by their {' and their '.join(certain)}, for certain."
-    return "Trainings differ for certain neither by their encoder nor by their seed of PPO."
 
 
 def _span(values: np.ndarray) -> str:
@@ -121,8 +142,7 @@ def draw(about: SweepFacts, episodes: SweptEpisodes) -> Figure:
     left.set_yticks(range(len(mean)))
     left.set(xlabel="Seed of PPO", ylabel="Seed of the encoder")
     left.set_title("Success [%], mean of the conditions", loc="left", fontsize=10)
-    spreads = {MEAN: crossed_spread(mean)}
-    spreads |= {condition_text(*at): crossed_spread(100 * table) for at, table in tables.items()}
+    spreads = {name: one.spread for name, one in factors(tables).items()}
     shown = {"encoder": (BLUE, "o"), "seed of PPO": (RED, "s"), "neither": (MUTED, "D")}
     for place, (label, (colour, marker)) in enumerate(shown.items()):
         values = [(one.rows, one.columns, one.rest)[place] for one in spreads.values()]

@@ -66,6 +66,7 @@ NOTES = {
         "been evaluated in these corridors, too)"
     )
 }
+WEAK = 0.6  # success with nothing changed below which a group is said to have little to lose
 TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -138,7 +139,8 @@ def write_trade(trade: Path, docs: Path) -> Path:
     text = (trade / "trade.md").read_text()
     if replaced := replaced_text(read_json(trade / "about.json").get("commit", "")):
         title, made, rest = text.split("\n\n", 2)
-        text = "\n\n".join((title, f"{made} {replaced}", rest))
+        rule = "Intervals are by the [rule of that commit](statistics.md#what-an-interval-says)."
+        text = "\n\n".join((title, f"{made} {replaced} {rule}", rest))
     write_atomic(docs / "trade.md", text)
     return docs / "trade.md"
 
@@ -247,6 +249,7 @@ def page_values(
         "several": several_at_once(about),
         "values": paper_values(),
         "weak": weak_groups(about, episodes),
+        "weakest": round(100 * WEAK),
         "shared": shared_encoders(about, pretrained),
         "doses": (docs / "dose_response.md").is_file(),
         "trade": (docs / "trade.md").is_file(),
@@ -337,14 +340,15 @@ def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[C
 
 
 def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> str:
-    """Groups with several trainings that succeed in less than 60 % with nothing changed, and how often."""
+    """Groups of claims that succeed in less than `WEAK` with nothing changed, and how often."""
     (value,) = about["axes"][NOMINAL]
+    compared = {group for claim in CLAIMS for group in (claim.ours, claim.theirs)}
     unchanged = {
         group: float(episode_values(episodes[(NOMINAL, value), group], "success").mean())
-        for group, seeds in about["groups"].items()
-        if len(seeds) > 1 and ((NOMINAL, value), group) in episodes
+        for group in about["groups"]
+        if group in compared and ((NOMINAL, value), group) in episodes
     }
-    return ", ".join(f"`{group}` {100 * rate:.0f} %" for group, rate in unchanged.items() if rate < 0.6)
+    return ", ".join(f"`{group}` {100 * rate:.0f} %" for group, rate in unchanged.items() if rate < WEAK)
 
 
 def several_at_once(about: SweepFacts) -> dict[str, str]:

@@ -57,7 +57,7 @@ def write_training_study(study: Path, docs: Path, name: str) -> Path:
     Raises:
         ConfigError: If an earlier version wrote the study.
         RunError: If a file of the study is damaged.
-        ValueError: If the study lacks a training or a condition.
+        ValueError: If the study lacks a training or a rate that is compared.
     """
     about, episodes = read_sweep(study)
     text, figure = _text(name, about, episodes), STUDIES[name].draw(about, episodes)

@@ -5,13 +5,18 @@ from collections.abc import Callable
 from jobs.config.conditions import NOMINAL
 
 WORLDS = {
+    "poles_eval": "nothing changed",
     "poles": "poles as in training",
     "poles_dense": "more poles",
     "texture_change": "other textures",
     "shape_change": "other shapes",
-    "dynamic": "textures that move",
+    "dynamic": "moving textures",
 }
-MEMORIES = {"frame": "two-frame camera", "legacy": "camera of the published code"}
+MEMORIES = {
+    "reference": "memory in each pixel",
+    "frame": "two-frame camera",
+    "legacy": "camera of the published code",
+}
 NOISE = {"0": "no sensor noise", "0.1": "noise by day", "5": "noise by night"}
 
 
@@ -33,13 +38,15 @@ WORDS: dict[str, Callable[[str], str]] = {
     "memory": lambda value: MEMORIES.get(value, f"memory {value}"),
     "memory_400hz": lambda value: f"{MEMORIES.get(value, f'memory {value}')}, 400 Hz",
     "action_delay": lambda value: f"actions {value} ms late",
-    "worst": lambda value: f"several at once, {value} Hz",
+    "worst": lambda value: "nothing changed" if value == "200" else f"several at once, {value} Hz",
+    "pixels": lambda value: f"memory in each pixel, {value} Hz",
+    "speed": lambda value: f"{value} m/s",
 }
 # Axis of numbers -> what is varied, with its unit.
 TITLES = {
     "control_hz": "Control rate [Hz]",
-    "control_hz_dense": "The same, more poles",
-    "contrast_threshold": "Threshold",
+    "control_hz_dense": "Among more poles [Hz]",
+    "contrast_threshold": "Threshold [log intensity]",
     "sparsity": "Share of dead pixels",
     "background_activity": "False events per true one",
     "action_delay": "Delay of actions [ms]",

@@ -1,4 +1,4 @@
-"""Plots of what accuracy costs: cost against error with its Pareto front, events against control rate."""
+"""Plots of what accuracy costs: cost against error, events against control rate."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -46,8 +46,8 @@ def plot_costs(
     figure = Figure(figsize=(9.6, 5.6), layout="constrained")
     panel = figure.subplots()
     places = np.array([(setting.cost_us, max(setting.error, MIN_ERROR)) for setting in settings])
-    ring = {"s": 130, "facecolors": "none", "edgecolors": INK, "linewidths": 1.0}
-    panel.scatter(*places[list(front)].T, **ring, zorder=5, label="no other is better")
+    x, y = places[list(front)].T
+    panel.scatter(x, y, s=130, facecolors="none", edgecolors=INK, zorder=5, label="no other is better")
     for knob in dict.fromkeys(setting.knob for setting in settings):
         own = [place for place, setting in enumerate(settings) if setting.knob == knob]
         marker, size, order = ("*", 260, 4) if knob == "default" else ("o", 34, 3)

@@ -34,8 +34,8 @@ class VariantResult(NamedTuple):
         name: Of the variant.
         success: Condition -> mean success of each training (n,).
         mean: Over conditions, trainings and corridors, within 0 and 1.
-        difference: Of that to the first variant, by pairs of trainings of a seed, within -1 and 1; None: it
-            is the first.
+        difference: Of that to the variant it is compared with, by pairs of trainings of a seed, within -1 and
+            1; None: it is compared with none.
         differences: The difference of each pair (n,).
         minutes: Of the policy's training, the mean [min]; None: not known.
     """
@@ -54,12 +54,12 @@ def variant_result(
     first: Mapping[str, np.ndarray] | None,
     minutes: Sequence[float],
 ) -> VariantResult:
-    """Compare a variant with the first one; trainings are the unit, in the same corridors (`crossed_mean`).
+    """Compare a variant with another; trainings are the unit, in the same corridors (`crossed_mean`).
 
     Args:
         name: Of the variant.
         success: Condition -> success (trainings, corridors), of the same corridors each.
-        first: The same of the first variant, trained with the same seeds; None: it is the first.
+        first: The same of the other, trained with the same seeds; None: it is compared with none.
         minutes: Of each training [min]; empty: not known.
     """
     own = np.mean(list(success.values()), axis=0)

@@ -16,7 +16,7 @@ def frames_lose_elsewhere(group, axis, value, seed):
 
 def test_each_group_has_five_rates_by_its_own_camera_and_three_by_the_other(tmp_path):
     groups = groups_of(*study(tmp_path, lambda group, axis, value, seed: seed))
-    assert set(groups) == {(camera, hz) for camera in ("pixels", "frames") for hz in (45, 200, 400)}
+    assert set(groups) == {(hz, camera) for hz in (45, 200, 400) for camera in ("pixels", "frames")}
     assert all(list(one.own) == [45, 100, 200, 400, 800] for one in groups.values())
     assert all(list(one.replaced) == [45, 200, 400] for one in groups.values())
     assert {values.shape for one in groups.values() for values in one.own.values()} == {(3, 14)}
@@ -24,10 +24,10 @@ def test_each_group_has_five_rates_by_its_own_camera_and_three_by_the_other(tmp_
 
 def test_a_loss_at_other_rates_is_that_of_the_rate_of_training(tmp_path):
     groups = groups_of(*study(tmp_path, frames_lose_elsewhere))
-    lost = {hz: measures(groups["frames", hz], hz)["loss by rates"].mean() for hz in (45, 200, 400)}
+    lost = {hz: measures(groups[hz, "frames"], hz)["loss by rates"].mean() for hz in (45, 200, 400)}
     assert lost[200] == pytest.approx(4 / 5 * 6 / 14)
     assert lost[45] == lost[400] == pytest.approx(-1 / 5 * 6 / 14)  # it does worse at its rate than at 200 Hz
-    assert not any(measures(groups["pixels", hz], hz)["loss by rates"].any() for hz in (45, 200, 400))
+    assert not any(measures(groups[hz, "pixels"], hz)["loss by rates"].any() for hz in (45, 200, 400))
 
 
 def test_cameras_are_compared_at_the_same_rate_of_training(tmp_path):
@@ -41,14 +41,20 @@ def test_cameras_are_compared_at_the_same_rate_of_training(tmp_path):
 
 
 def test_equal_cameras_give_no_certain_difference_and_unequal_ones_do(tmp_path):
-    even = results_text(*study(tmp_path / "even", lambda group, axis, value, seed: seed % 2))
-    assert "Of 6 comparisons of the cameras none is certain" in even
-    far = results_text(*study(tmp_path / "far", lambda group, *_: 12 * group.startswith("frames")))
-    assert "Of 6 comparisons of the cameras 3 are certain" in far
+    even = compared(groups_of(*study(tmp_path / "even", lambda group, axis, value, seed: seed % 2)))
+    assert {p for *_, p in even} == {1.0}
+    far = compared(groups_of(*study(tmp_path / "far", lambda group, *_: 12 * group.startswith("frames"))))
+    certain = {name: one.value < 0 for _, name, one, p in far if p < 0.05}
+    assert certain == {"success at its rate": True}
+    assert "Of 6 comparisons of the cameras 3 are certain" in results_text(
+        *study(tmp_path / "far", lambda group, *_: 12 * group.startswith("frames"))
+    )
 
 
-def test_a_group_that_was_not_evaluated_at_its_rate_is_refused(tmp_path):
+@pytest.mark.parametrize("lost", ["frames_45hz", ("control_hz", "400")])
+def test_a_camera_that_lacks_a_rate_is_refused(tmp_path, lost):
     about, episodes = study(tmp_path, lambda *_: 0)
-    kept = {(at, group): one for (at, group), one in episodes.items() if at != ("control_hz", "400")}
-    with pytest.raises(ValueError, match="pixels_400hz must be evaluated at 400 Hz"):
+    about["groups"] = {name: seeds for name, seeds in about["groups"].items() if name != lost}
+    kept = {(at, group): one for (at, group), one in episodes.items() if at != lost}
+    with pytest.raises(ValueError, match="each camera must be trained and evaluated at"):
         groups_of(about, kept)

@@ -1,18 +1,32 @@
+import dataclasses
+
 import pytest
 
 from jobs.config.config import parse
-from jobs.evaluation.sweep_plan import axes_of
+from jobs.evaluation.sweep_plan import axes_of, same_simulations
 from jobs.reporting.words import TITLES, WORDS, condition_text
 from tests.support.configs import compose
 
+SWEEPS = (
+    "robustness",
+    "taught_claims",
+    "encoder_seeds",
+    "camera_rates",
+    "ablation",
+    "memory_seconds",
+    "hold",
+)
 
-@pytest.mark.parametrize("sweep", ["robustness", "taught_claims", "encoder_seeds"])
+
+@pytest.mark.parametrize("sweep", SWEEPS)
 def test_every_condition_has_words_of_its_own_that_name_no_key(sweep):
-    axes = axes_of(parse(compose("+exp=robustness", f"sweep={sweep}")).sweep)
+    config = parse(compose("+exp=robustness", f"sweep={sweep}"))
+    axes = axes_of(config.sweep)
     assert set(axes) <= set(WORDS)
-    every = [condition_text(axis, value) for axis, points in axes.items() for value in points]
-    assert len(set(every)) > len(axes)
-    assert not any("_" in text for text in every if "poles_eval" not in text)
+    differ = set(same_simulations(dataclasses.replace(config.env, scene=config.sweep.scene), axes).values())
+    texts = [condition_text(*at) for at in differ]
+    assert len(set(texts)) == len(texts)
+    assert not any("_" in text for text in texts)
 
 
 def test_an_axis_without_words_is_named():
