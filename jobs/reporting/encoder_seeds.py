@@ -3,6 +3,7 @@
 The study `+exp=encoder_seeds` crosses both; docs/encoder_seeds.md has its plan.
 """
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -111,11 +112,18 @@ def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
     tables = by_encoder(episodes)
     mean, found = np.mean(list(tables.values()), axis=0), factors(tables)
     certain = " and by their ".join(certain_factors(found[MEAN]))
-    verdict = f"differ by their {certain}, for certain" if certain else "differ for certain by neither"
+    flights = about["trials"] * len(tables)
+    verdict = (
+        f"differ by their {certain}, for certain"
+        if certain
+        else "differ for certain neither by their encoder nor by their seed of PPO"
+    )
     parts = (
         f"Trainings {verdict}. Under all {len(tables)} conditions together the {mean.size} succeed in "
         f"{_span(mean)} % of their flights; the means by encoder are {_span(mean.mean(axis=1))} %, those by "
-        f"seed of PPO {_span(mean.mean(axis=0))} %.",
+        f"seed of PPO {_span(mean.mean(axis=0))} %. What neither explains is {found[MEAN].spread.rest:.0f} "
+        f"points of standard deviation, of which chance over {flights} flights makes at most "
+        f"{50 / math.sqrt(flights):.0f}.",
         markdown_table(HEAD, [_row(*item) for item in found.items()], 1).rstrip("\n"),
         "Standard deviations [points] of what the trainings by one encoder have in common, of what those of "
         "one seed of PPO have in common, and of what neither explains. The tests of the mean are one family, "

@@ -3,7 +3,8 @@ import pytest
 
 from jobs.config.conditions import NOMINAL
 from jobs.reporting.encoder_seeds import MEAN, by_encoder, certain_factors, factors, results_text
-from jobs.reporting.sweep_data import read_sweep
+from jobs.reporting.sweep_data import read_data, read_sweep
+from jobs.run.provenance import REPOSITORY
 from tests.support.episodes import flights
 from tests.support.sweep_folders import write_ablation
 
@@ -60,6 +61,7 @@ def test_what_decides_is_told(failed, certain, tmp_path):
     text = results_text(about, episodes)
     assert all(name in text for name in certain)
     assert "the 25 succeed in" in text
+    assert "chance over 70 flights makes at most 6." in text
 
 
 def test_a_study_that_lacks_a_training_is_refused():
@@ -67,3 +69,15 @@ def test_a_study_that_lacks_a_training_is_refused():
     del episodes[AT, "encoder_1"][2]
     with pytest.raises(ValueError, match=r"missing: \[\(1, 2\)\]"):
         by_encoder(episodes)
+
+
+def test_what_other_pages_say_of_the_published_study_is_what_its_data_say():
+    about, episodes = read_data(REPOSITORY / "docs" / "data", "encoder_seeds")
+    tables = by_encoder(episodes)
+    found, mean = factors(tables)[MEAN], 100 * np.mean(list(tables.values()), axis=0)
+    assert mean.size == 25
+    assert certain_factors(found) == []
+    assert found.spread.rest > max(found.spread.rows, found.spread.columns)
+    for page in ("index.md", "statistics.md"):
+        text = " ".join((REPOSITORY / "docs" / page).read_text().split())
+        assert f"keep {mean.min():.0f} to {mean.max():.0f} % over five conditions" in text
