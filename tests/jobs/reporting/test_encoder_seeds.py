@@ -72,7 +72,7 @@ def test_a_study_that_lacks_a_training_is_refused():
 
 
 def test_what_other_pages_say_of_the_published_study_is_what_its_data_say():
-    about, episodes = read_data(REPOSITORY / "docs" / "data", "encoder_seeds")
+    _, episodes = read_data(REPOSITORY / "docs" / "data", "encoder_seeds")
     tables = by_encoder(episodes)
     found, mean = factors(tables)[MEAN], 100 * np.mean(list(tables.values()), axis=0)
     assert mean.size == 25
