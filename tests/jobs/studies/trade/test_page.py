@@ -110,7 +110,7 @@ def test_advice_is_the_fastest_that_is_as_good_in_each_scene_and_what_to_avoid()
     assert [one.name for one in found.worse] == ["memory legacy", "renders 1"]
     assert [one.name for one in found.undecided] == ["pyrender samples 1"]
     text = trade_page(ABOUT, ROWS)
-    assert "choose tolerance 0.5" in text
+    assert "choose the setting *tolerance 0.5*" in text
     assert "renders 1 (-30 [-35, -25] points in" in text
 
 
