@@ -6,6 +6,7 @@ import pytest
 
 from docs.from_data import figures
 from jobs.config.config import as_dict, parse
+from jobs.evaluation.group_stats import episode_values
 from jobs.evaluation.sweep_plan import axes_of
 from jobs.reporting.claims_study import (
     BY_PPO,
@@ -19,8 +20,9 @@ from jobs.reporting.claims_study import (
 from jobs.reporting.paper_claims import CLAIMS, LEARNT
 from jobs.reporting.planned_page import RESULTS
 from jobs.reporting.report import claims_table, find_study
-from jobs.reporting.sweep_data import read_sweep
+from jobs.reporting.sweep_data import read_sweep, read_sweep_episodes
 from jobs.run.folder import COMPARED_STEPS
+from jobs.run.provenance import REPOSITORY
 from jobs.studies.ablation.ablation import variant_config
 from tests.support.configs import compose, small_config
 from tests.support.sweep_folders import write_claims, write_shipped
@@ -68,9 +70,34 @@ def test_the_study_by_ppo_is_that_of_taught_policies_but_for_how_they_learn():
         for part in ("env", "model", "collect", "pretrain"):
             assert one[part] == other[part]
         assert one["model"] == usual["model"]
-        assert one["algo"] == usual["algo"]
+        searched = searched_rates(name)
+        best = max(searched, key=lambda lr: (searched[lr].mean(), -lr)) if searched else usual["algo"]["lr"]
+        assert one["algo"] == usual["algo"] | {"lr": best}
         assert one["train"]["env_steps"] == COMPARED_STEPS
         assert one["train"]["conditions"] == other["train"]["conditions"] == usual["train"]["conditions"]
+
+
+def searched_rates(name):
+    """Learning rate -> success of its trainings in validation corridors; empty: none was searched."""
+    file = REPOSITORY / "docs" / "data" / f"learning_rates_{name}_episodes.csv.gz"
+    if not file.is_file():
+        return {}
+    variants = parse(compose("+exp=learning_rates")).ablation.variants
+    return {
+        variants[group]["algo.lr"]: episode_values(trainings, "success").mean(axis=1)
+        for (_, group), trainings in read_sweep_episodes(file).items()
+    }
+
+
+def test_the_page_shows_the_learning_rates_that_were_searched():
+    text = (REPOSITORY / "docs" / "ppo_claims.md").read_text()
+    searched = searched_rates("bytestream")
+    best = max(searched, key=lambda lr: searched[lr].mean())
+    cells = []
+    for lr in sorted(searched):
+        mean, each = f"{100 * searched[lr].mean():.0f}", (f"{100 * one:.0f}" for one in searched[lr])
+        cells.append(f"{f'**{mean}**' if lr == best else mean} ({', '.join(each)})")
+    assert f"| `bytestream` | {' | '.join(cells)} |" in text
 
 
 def test_a_loss_of_the_rival_alone_shows_in_the_claims_about_it_and_in_no_other(tmp_path):
