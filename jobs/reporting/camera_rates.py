@@ -20,7 +20,7 @@ from jobs.reporting.breaks import SweptEpisodes
 
 CAMERAS = "camera_rates"  # name of the experiment, and of what is published of it
 PIXELS, FRAMES = "pixels", "frames"  # cameras; a group is one of them and the rate of training
-NOMINAL_HZ = 200
+NOMINAL_HZ = 200  # control rate of what nothing changes
 OWN, REPLACED = "control_hz", "pixels"  # axes: rates by the own camera, and by `PIXELS`
 HEAD = (
     "Trained by",

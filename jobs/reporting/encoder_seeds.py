@@ -1,4 +1,4 @@
-"""From what trainings by PPO differ: from their encoder, or from the seed of PPO.
+"""Why trainings by PPO differ: by their encoder, or by their seed of PPO.
 
 The study `+exp=encoder_seeds` crosses both; docs/encoder_seeds.md has its plan.
 """
