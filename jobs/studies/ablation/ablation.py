@@ -171,9 +171,10 @@ def encoder_seed_of(config: Config, name: str, seed: int) -> int:
 
 
 def shares_encoder(config: Config, name: str) -> bool:
-    """Whether a variant sees by an encoder of the first: it changes nothing that the encoder learns from."""
+    """Whether a variant sees by an encoder of the first: there is one, and it learns from nothing changed."""
     changes = changes_of(config, name)
-    return changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
+    same = changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
+    return config.model.has_encoder and same
 
 
 def variant_config(config: Config, name: str, seed: int) -> Config:

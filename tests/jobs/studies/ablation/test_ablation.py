@@ -116,6 +116,15 @@ def test_learning_rates_differ_in_nothing_else_and_are_judged_apart_from_every_s
     assert [name for name, one in seeds.items() if one & set(config.ablation.seeds)] == ["learning_rates"]
 
 
+def test_a_variant_of_a_kind_without_an_encoder_looks_for_none(tmp_path, monkeypatch):
+    trained = []
+    monkeypatch.setattr(ablation.train, "run", trained.append)
+    config = parse(compose("+exp=learning_rates", "model=event_image", f"runs_dir={tmp_path}"))
+    runs = ablation.train_variants(config)
+    assert [one.seed for one in trained] == 3 * config.ablation.seeds
+    assert len({run.path for run in runs.values()}) == 9
+
+
 def test_every_encoder_is_met_by_every_seed_of_ppo_once(monkeypatch):
     """Encoder and seed crossed, the trainings of `own` on the diagonal."""
     config = parse(compose("+exp=encoder_seeds"))
