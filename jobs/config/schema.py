@@ -392,12 +392,23 @@ class ClusterConfig:
         num_cpus: How many cores jobs may use; None for all.
         storage: A folder that every node sees (NFS), or an address such as s3://bucket/evade;
             None for the run folder, where there is only one machine.
+        device: Where PPO computes the gradients of networks with convolutions; cuda: on this machine's GPU.
+            Digits differ between the two by rounding.
     """
 
     name: Literal["local", "ray"]
     address: str | None
     num_cpus: Count | None
     storage: str | None
+    device: Literal["cpu", "cuda"] = "cpu"
+
+    @pydantic.model_validator(mode="after")
+    def _has_a_gpu_here(self) -> "ClusterConfig":
+        if self.device == "cuda" and self.name != "local":
+            raise ValueError(
+                "device must be cpu on a cluster, of which no machine is asked for a GPU; got 'cuda'"
+            )
+        return self
 
     @pydantic.field_validator("storage")
     @classmethod

@@ -14,6 +14,7 @@ from jobs.config.config import ConfigError
 from jobs.config.plugins import with_plugins
 from jobs.config.schema import ClusterConfig
 from jobs.run.compile import compile_kernels
+from jobs.run.device import device_variables
 from jobs.run.head_watch import watching_head
 from jobs.run.locks import locked, private_folder
 from jobs.run.ray_sessions import forget_sessions
@@ -80,7 +81,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     # It logs the traceback of a trial's error, which it also writes beside the trial and jobs report.
     logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
-        "runtime_env": with_plugins({"env_vars": ONE_THREAD}),
+        "runtime_env": with_plugins({"env_vars": ONE_THREAD | device_variables(cluster.device)}),
         "log_to_driver": False,
         "logging_level": logging.ERROR,
         "configure_logging": True,

@@ -189,9 +189,11 @@ class ImitationLearner(PlainPPOLearner):
         means = {name: values.mean() for name, values in figures.items()}
         return means | {AGREEMENT_KEY: (costs.gather(1, likeliest) == 0.0).float().mean()}
 
-    def _loss(self, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    def _on_gpu(self) -> None:
+        """Nothing: lessons are gigabytes, and stay with the processor."""
+
+    def _loss(self, module: Any, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Cross-entropy of the labels, softmax(-cost / temperature); and the policy's entropy."""
-        module = self.module[DEFAULT_MODULE_ID].unwrapped()
         logits = module._forward_train(rows)[Columns.ACTION_DIST_INPUTS]
         labels = torch.softmax(-rows[COSTS] / self._settings["temperature"], dim=-1)
         loss = cross_entropy(logits, labels)

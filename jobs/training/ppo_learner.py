@@ -11,6 +11,7 @@ deviation of the advantages. Here it is in neither.
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,9 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
+from jobs.run.device import learner_device
 from jobs.run.torch_threads import torch_threads
+from jobs.training.gpu_steps import NORM, TOTAL, GpuSteps
 from jobs.training.rllib_internals import LEARNER, require
 from jobs.training.teacher import log_costs
 from models.policy.dense_update import Rows, Settings, update_dense
@@ -102,6 +105,7 @@ class PlainPPOLearner(PPOTorchLearner):
         super().build()
         require(self, LEARNER)
         self._warming_up = False
+        self._gpu = self._on_gpu()
 
     def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
         """Adam with all its steps in one call."""
@@ -161,6 +165,8 @@ class PlainPPOLearner(PPOTorchLearner):
         """All epochs over the rows; the figures of the last."""
         orders = torch.stack([torch.randperm(len(rows[Columns.ACTIONS])) for _ in range(num_epochs)])
         learn = self._epochs_of_dense if self._dense and not self._warming_up else self._epochs
+        if self._gpu is not None:
+            learn = partial(self._epochs_on_gpu, self._gpu)
         figures = learn(rows, orders, minibatch_size)
         if self._warming_up:
             self.get_optimizer(DEFAULT_MODULE_ID).state.clear()  # Adam counts the steps of all weights alike
@@ -192,7 +198,7 @@ class PlainPPOLearner(PPOTorchLearner):
         if module.privileged:
             privileged[:, 0] = np.concatenate([log_costs(episode) for episode in episodes])
         told = {Columns.OBS: torch.from_numpy(stacks), PRIVILEGED: torch.from_numpy(privileged)}
-        values = module.compute_values(told).numpy()
+        values = self._values(told).numpy()
         estimates = [
             advantages(
                 of_episode, self._rewards(episode), episode.is_terminated, config.gamma, config.lambda_
@@ -248,6 +254,35 @@ class PlainPPOLearner(PPOTorchLearner):
         means = update_dense((module.pi, module.vf), optimizer, read, orders.numpy(), settings)
         return dict(zip(FIGURES, means.tolist(), strict=True))
 
+    def _on_gpu(self) -> GpuSteps | None:
+        """What takes the steps of a network with convolutions on a GPU; None: the processor takes them."""
+        module, device = self.module[DEFAULT_MODULE_ID].unwrapped(), learner_device()
+        if device == "cpu" or not any(isinstance(layer, nn.Conv2d) for layer in module.trunk.modules()):
+            return None
+        adam = self.get_optimizer(DEFAULT_MODULE_ID).param_groups[0]
+        return GpuSteps(module, adam, self._loss, device)
+
+    def _epochs_on_gpu(
+        self, gpu: GpuSteps, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
+    ) -> dict[str, Any]:
+        """As `_epochs`, on the GPU."""
+        told = gpu.take(
+            self.module[DEFAULT_MODULE_ID].unwrapped(),
+            self.get_optimizer(DEFAULT_MODULE_ID),
+            {name: rows[name] for name in READ},
+            orders,
+            minibatch_size,
+            self._grad_clip,
+            variant=(self._warming_up, self._entropy_coeff),
+        )
+        total, norm = told.pop(TOTAL), told.pop(NORM)
+        return {**told, PPOTorchLearner.TOTAL_LOSS_KEY: total, GRADIENT_NORM_KEY: norm}
+
+    def _values(self, told: dict[str, Tensor]) -> Tensor:
+        """Of what the value network is told, float32 (B,), where the gradients are computed."""
+        module = self.module[DEFAULT_MODULE_ID].unwrapped()
+        return module.compute_values(told) if self._gpu is None else self._gpu.values(module, told)
+
     def _epochs(self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int) -> dict[str, Any]:
         """Passes over the rows, in the order of each; means over the minibatches of the last."""
         for order in orders:
@@ -259,7 +294,7 @@ class PlainPPOLearner(PPOTorchLearner):
         """One gradient step; its losses, entropy and the gradient's norm before the clip."""
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
         parameters = optimizer.param_groups[0]["params"]
-        total, figures = self._loss(rows)
+        total, figures = self._loss(self.module[DEFAULT_MODULE_ID].unwrapped(), rows)
         optimizer.zero_grad(set_to_none=True)
         total.backward()
         norm = nn.utils.clip_grad_norm_(parameters, self._grad_clip, error_if_nonfinite=True)
@@ -276,9 +311,9 @@ class PlainPPOLearner(PPOTorchLearner):
         """The weight of the entropy now."""
         return float(self.entropy_coeff_schedulers_per_module[DEFAULT_MODULE_ID].get_current_value())
 
-    def _loss(self, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    def _loss(self, module: Any, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """The clipped surrogate, the value's squared error and the entropy, joined as RLlib joins them."""
-        config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
+        config = self.config
         out = module._forward_train(rows)
         logps = torch.log_softmax(out[Columns.ACTION_DIST_INPUTS], dim=-1)
         logp = logps.gather(1, rows[Columns.ACTIONS].long()[:, None]).squeeze(1)
@@ -298,7 +333,7 @@ class PlainPPOLearner(PPOTorchLearner):
     @torch.no_grad()
     def _explained_variance(self, rows: dict[str, Tensor]) -> Tensor:
         """Share of the targets' variance that the values explain after the update; at least -1, as RLlib."""
-        module, targets = self.module[DEFAULT_MODULE_ID].unwrapped(), rows[Postprocessing.VALUE_TARGETS]
-        values = module.compute_values(rows)
+        targets = rows[Postprocessing.VALUE_TARGETS]
+        values = self._values({name: rows[name] for name in (Columns.OBS, PRIVILEGED)})
         unexplained = (targets - values).var() / targets.var().clamp_min(1e-12)
         return (1.0 - unexplained).clamp_min(-1.0)
