@@ -79,10 +79,11 @@ def test_steps_on_a_device_are_those_of_the_processor(ppo, flights, monkeypatch,
         again.set_state(other.get_state())
         again._gpu = on_the_way(again, device)
         other = again
-    moved = max(float((weights(plain)[name] - first[name]).abs().max()) for name in first)
-    apart = max(float((value - weights(plain)[name]).abs().max()) for name, value in weights(other).items())
-    assert moved > 1e-4
-    assert apart < 0.02 * moved
+    found, expected = weights(other), weights(plain)
+    for name, value in expected.items():
+        moved, apart = (float((value - one[name]).norm()) for one in (first, found))
+        assert moved > 1e-4, name
+        assert apart < 0.02 * moved, name
     steps = [
         {float(state["step"]) for state in learner.get_optimizer(MODULE).state_dict()["state"].values()}
         for learner in (plain, other)
