@@ -9,6 +9,7 @@ sample, as many threads of the learner, and minibatches of 256. Wall time, media
 import os
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -50,7 +51,8 @@ def trainings(folder: Path) -> dict[tuple[str, str], Callable[[], object]]:
     for algorithm in ALGORITHMS:
         for device in DEVICES:
             config = composed(f"algo={algorithm}", "model=event_image", "algo.lr_schedule=constant")
-            start_ray(config.cluster, folder)
+            # All four are there at once: on a machine of two cores Ray would let one wait forever.
+            start_ray(replace(config.cluster, num_cpus=4), folder)
             os.environ.update(device_variables(device))  # read when the learner is built, in this process
             work[algorithm, device] = build_ppo(config).build_algo().train
     return work

@@ -20,8 +20,8 @@ from jobs.run.progress import console
 from jobs.run.provenance import provenance
 from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
 
-# Sections that do not change what is trained: where a run is computed and recorded, and what is
-# done with its policy afterwards.
+# Sections that do not change what is trained, but by rounding: where a run is computed and recorded, and what
+# is done with its policy afterwards.
 NOT_IN_RUN_NAME = (
     "job", "resume", "runs_dir", "plugins", "cluster", "tracking",
     "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "tune", "ablation",

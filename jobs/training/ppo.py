@@ -288,7 +288,6 @@ def policy_about(config: Config) -> dict[str, object]:
         "algo": dataclasses.asdict(config.algo),
         **({} if config.train.init is None else {"init": config.train.init}),
         **({"plugins": plugin_digests()} if config.plugins else {}),
-        **({} if config.cluster.device == "cpu" else {"learner_device": config.cluster.device}),
     }
 
 

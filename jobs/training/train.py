@@ -147,7 +147,6 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
         return folder.policy
     start_ray(config.cluster, folder.path)
     check_cpus(config)
-    check_device(config)
     init = folder.init / NETWORKS if config.train.init else None
     algorithm = build_ppo(config, encoder_path, init)
     with _listening(config, folder, on_result) as last:
@@ -183,13 +182,6 @@ def check_cpus(config: Config) -> None:
     if config.cluster.name == "local" and needed > cpus:
         rule = f"needs as many CPUs, and Ray has {cpus} (algo=ppo needs one)"
         raise ConfigError(f"algo.num_env_runners: {rule}, got {config.algo.num_env_runners}")
-
-
-def check_device(config: Config) -> None:
-    """Refuse a GPU that torch does not see."""
-    if config.cluster.device == "cuda" and not torch.cuda.is_available():
-        rule = "cuda needs a GPU, and a build of torch with CUDA, which sees none here; take cpu"
-        raise ConfigError(f"cluster.device: {rule}, got 'cuda'")
 
 
 def export_policy(

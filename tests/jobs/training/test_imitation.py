@@ -75,8 +75,9 @@ def test_the_teacher_acts_in_half_as_many_steps_of_each_batch_and_then_in_none(r
 
 def test_the_loss_is_the_cross_entropy_of_the_labels(learner, rolled_out):
     rows = learner._rows(rolled_out[1][2][1])
-    loss, figures = learner._loss(rows)
-    logits = learner.module["default_policy"].unwrapped()._forward(rows)["action_dist_inputs"].double()
+    module = learner.module["default_policy"].unwrapped()
+    loss, figures = learner._loss(module, rows)
+    logits = module._forward(rows)["action_dist_inputs"].double()
     weights = torch.exp(-rows[COSTS].double() / 0.003)
     labels = weights / weights.sum(1, keepdim=True)
     expected = -(labels * (logits - logits.exp().sum(1, keepdim=True).log())).sum(1).mean()
