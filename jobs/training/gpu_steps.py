@@ -1,11 +1,11 @@
 """A learner's gradient steps on a GPU, each a replay of one recorded step.
 
-A step on 256 pictures takes 1.4 ms of an H200, and 70 ms of a core (docs/performance.md). It consists of many
-small kernels, which take longer to start one after the other than to run. So a step is recorded once as a CUDA
-graph, and all of an update are replays of it: weights, Adam's moments and the rows of an iteration travel to
-the GPU once an update, and what was learnt travels back. Arithmetic is float32 (the variable
-TORCH_ALLOW_TF32_CUBLAS_OVERRIDE would make products of matrices TF32), by algorithms that give the same digits
-each time on the same GPU.
+A step on 256 pictures takes 1.4 ms of an H200, and 70 ms of a core (docs/performance.md). It consists of
+many small kernels, which take longer to start one after the other than to run. So a step is recorded once as
+a CUDA graph, and all of an update are replays of it: weights, Adam's moments and the rows of an iteration
+travel to the GPU once an update, and what was learnt travels back. Arithmetic is float32 (the variable
+TORCH_ALLOW_TF32_CUBLAS_OVERRIDE would make products of matrices TF32), by algorithms that give the same
+digits each time on the same GPU.
 """
 
 import contextlib
