@@ -43,12 +43,12 @@ class GpuSteps:
     Without a GPU (`device="cpu"`) no step is recorded, each is computed: for tests.
     """
 
-    def __init__(self, module: nn.Module, adam: Mapping[str, Any], loss: Loss, device: str) -> None:
+    def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer, loss: Loss, device: str) -> None:
         """Make the copies.
 
         Args:
             module: An RLlib module with `compute_values`; its parameters are those that the optimiser has.
-            adam: Settings of the optimiser, as `torch.optim.Adam` names them in `param_groups`.
+            optimizer: Adam of its parameters.
             loss: The loss of a minibatch and its named parts, computed by the module that it is given.
             device: As torch names it.
         """
@@ -56,12 +56,13 @@ class GpuSteps:
         self._recording = self._device.type == "cuda"
         self._module = copy.deepcopy(module).to(self._device)
         self._parameters = [value for value in self._module.parameters() if value.requires_grad]
+        (group,) = optimizer.param_groups
         self._lr = torch.zeros((), device=self._device)
         self._adam = torch.optim.Adam(
             self._parameters,
             lr=self._lr,
-            betas=adam["betas"],
-            eps=adam["eps"],
+            betas=group["betas"],
+            eps=group["eps"],
             fused=True,
             capturable=self._recording,
         )

@@ -259,12 +259,11 @@ class PlainPPOLearner(PPOTorchLearner):
         module, device = self.module[DEFAULT_MODULE_ID].unwrapped(), learner_device()
         if device == "cpu" or not any(isinstance(layer, nn.Conv2d) for layer in module.trunk.modules()):
             return None
-        adam = self.get_optimizer(DEFAULT_MODULE_ID).param_groups[0]
-        return GpuSteps(module, adam, self._loss, device)
+        return GpuSteps(module, self.get_optimizer(DEFAULT_MODULE_ID), self._loss, device)
 
     def _epochs_on_gpu(
         self, gpu: GpuSteps, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
-    ) -> dict[str, Any]:
+    ) -> dict[str, Tensor]:
         """As `_epochs`, on the GPU."""
         told = gpu.take(
             self.module[DEFAULT_MODULE_ID].unwrapped(),

@@ -45,8 +45,8 @@ def make_learner(ppo, env, monkeypatch, device, **training):
 
 def on_the_way(learner, device):
     """What takes its steps on a device, also on the processor, which a learner does without."""
-    optimizer = learner.get_optimizer(MODULE)
-    return GpuSteps(learner.module[MODULE].unwrapped(), optimizer.param_groups[0], learner._loss, device)
+    module = learner.module[MODULE].unwrapped()
+    return GpuSteps(module, learner.get_optimizer(MODULE), learner._loss, device)
 
 
 def weights(learner):
