@@ -43,8 +43,8 @@ def make_learner(ppo, env, monkeypatch, device, **training):
     return made.build_learner(env=env)
 
 
-def on_the_way(learner, device):
-    """What takes its steps on a device, also on the processor, which a learner does without."""
+def steps_on(learner, device):
+    """What takes the steps of a learner on a device; on the processor, too, where a learner has none."""
     module = learner.module[MODULE].unwrapped()
     return GpuSteps(module, learner.get_optimizer(MODULE), learner._loss, device)
 
@@ -68,7 +68,7 @@ def test_steps_on_a_device_are_those_of_the_processor(ppo, flights, monkeypatch,
     monkeypatch.setattr(gpu_steps, "ROOM", 8)
     plain, other = (make_learner(ppo, env, monkeypatch, "cpu") for _ in range(2))
     other.set_state(plain.get_state())
-    other._gpu = on_the_way(other, device)
+    other._gpu = steps_on(other, device)
     assert plain._gpu is None
     first = weights(plain)
     taken = samples[0], samples[1] + samples[2], samples[2][:1], samples[1]
@@ -110,7 +110,7 @@ def test_a_value_network_that_learns_alone_at_first_is_followed_by_the_policy(
         make_learner(ppo, env, monkeypatch, "cpu", learner_config_dict=settings) for _ in range(2)
     )
     other.set_state(plain.get_state())
-    other._gpu = on_the_way(other, device)
+    other._gpu = steps_on(other, device)
     for sampled in (64, 200):
         first = weights(plain)
         for learner in (plain, other):
@@ -128,7 +128,7 @@ def test_a_value_network_that_learns_alone_at_first_is_followed_by_the_policy(
 def test_another_step_size_and_another_entropy_are_taken_from_then_on(ppo, flights, monkeypatch, device):
     env, (episodes, *_) = flights
     learner = make_learner(ppo, env, monkeypatch, "cpu", lr=0.0)
-    learner._gpu = on_the_way(learner, device)
+    learner._gpu = steps_on(learner, device)
     first = weights(learner)
     asked = {"num_epochs": 1, "minibatch_size": 16}
     learner.update(episodes=copy.deepcopy(episodes), **asked)
@@ -147,7 +147,7 @@ def test_another_step_size_and_another_entropy_are_taken_from_then_on(ppo, fligh
 def test_a_gradient_that_is_not_finite_leaves_everything_as_it_was(ppo, flights, monkeypatch, device):
     env, (episodes, *_) = flights
     learner = make_learner(ppo, env, monkeypatch, "cpu")
-    learner._gpu = on_the_way(learner, device)
+    learner._gpu = steps_on(learner, device)
     learner.update(episodes=copy.deepcopy(episodes), num_epochs=1, minibatch_size=16)
     first, state = weights(learner), copy.deepcopy(learner.get_optimizer(MODULE).state_dict())
     broken = copy.deepcopy(episodes)
