@@ -32,10 +32,13 @@ from jobs.reporting.words import condition_text
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_atomic
 from jobs.studies.ablation.page import VariantResult, plot_variants, variant_result
+from jobs.studies.encoder.costs import read_costs
+from jobs.studies.encoder.plots import plot_encoding_costs
 from jobs.studies.trade.page import draw_settings
 
 DOCS = Path(__file__).resolve().parent
 ABLATIONS = "ablation", "ablation_more", "taught", "memory_seconds"  # each with a recipe of its own
+ENCODER_COSTS = "encoder_costs.csv"  # as `+exp=trade_encoder` writes trade/inference.csv
 # Of an ablation whose variants are not all compared with the first: variant -> the one it is compared with.
 PAIRS = {"memory_seconds": {"taught_seconds": "taught_stack", "ppo_seconds": "ppo_stack"}}
 
@@ -102,6 +105,11 @@ def trade(data: Path) -> dict[str, Figure]:
         return {"trade": draw_settings(list(csv.DictReader(file)))}
 
 
+def encoder_costs(data: Path) -> dict[str, Figure]:
+    """The first of encoder_accuracy.md; the data are the numbers of its table."""
+    return {"encoder_inference": plot_encoding_costs(read_costs(data / ENCODER_COSTS))}
+
+
 # What draws the figures of a study -> the files that it needs.
 STUDIES: dict[Callable[[Path], Mapping[str, Figure]], tuple[str, ...]] = {
     results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
@@ -114,6 +122,7 @@ STUDIES: dict[Callable[[Path], Mapping[str, Figure]], tuple[str, ...]] = {
     },
     ablation: tuple(f"{name}_episodes.csv.gz" for name in ABLATIONS),
     trade: ("trade_settings.csv",),
+    encoder_costs: (ENCODER_COSTS,),
 }
 
 

@@ -1,8 +1,10 @@
 """Cost of several ways to encode events, and the latent's error of each against float64 with exact time."""
 
 import copy
+import csv
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,8 @@ TIME_BINS = (16, 64, 256, 1024, 4096, 65536)
 CAPS = (250, 500, 1000, 2000, 4096)
 CHUNKS = (1, 2, 5, 20)
 TIMED_WINDOWS = 8
+# Settings that leave the default as it is, for a model of 1,024 time bins and windows of up to 4,096 events.
+UNCHANGED = (("default", ""), ("time bins", "1024"), ("newest events", "4096"), ("chunks", "1"))
 Encode = Callable[[Window], np.ndarray]
 
 
@@ -191,3 +195,22 @@ def costs_us(encodings: Sequence[Encoding], timed: tuple[list[Window], ...], rou
                     encoding.encode(window)
                 seconds[turn, place, kind] = (time.process_time() - start) / len(windows[:TIMED_WINDOWS])
     return 1e6 * np.median(seconds[1:], axis=0)
+
+
+def repeats(rows: Sequence[EncodingCost]) -> list[EncodingCost]:
+    """The default, and the rows that compute the same: their costs differ by the noise of timing alone."""
+    (default,) = (row for row in rows if row.knob == "default")
+    return [
+        row for row in rows if (row.knob, row.setting) in UNCHANGED and row.error_mean == default.error_mean
+    ]
+
+
+def read_costs(file: Path) -> list[EncodingCost]:
+    """The rows of a CSV file with the fields of `EncodingCost`."""
+    with file.open(encoding="utf-8") as lines:
+        return [
+            EncodingCost(
+                one["knob"], one["setting"], *(float(one[name]) for name in EncodingCost._fields[2:])
+            )
+            for one in csv.DictReader(lines)
+        ]

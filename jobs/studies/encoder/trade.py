@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from envs.recordings import read_recording
-from jobs.analysis.tables import publish_plot, publish_table, short
+from jobs.analysis.tables import publish_plot, publish_table, short, write_csv
 from jobs.config.config import Config, ConfigError
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
@@ -35,7 +35,6 @@ from jobs.studies.encoder.trials import (
     spread,
     trained,
 )
-from jobs.studies.front_plots import pareto
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.collect import data_file, record
 from jobs.training.pretrain import check_sources, encoder_file, held_out_windows, prepare_encoder
@@ -54,7 +53,7 @@ STEPS_BETWEEN = 7
 SHOWN = ("sparse", "age over 0.9", "dense")
 HEADINGS = (
     "Knob", "Setting", "Control step [us]", "2,000 events [us]", "Times faster",
-    "Error, mean [% of sd]", "Error, largest [% of sd]", "Explained [%]", "Front",
+    "Error, mean [% of sd]", "Error, largest [% of sd]", "Explained [%]",
 )  # fmt: skip
 
 
@@ -95,12 +94,12 @@ def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVA
     with progress("Measure encodings", len(encodings), "encodings") as advance:
         timed = control_steps(validation, trade.windows), dense
         rows = measure_encodings(encodings, usual, timed, trade.rounds, advance)
-    front = fronts(rows)
-    lines = [cost_cells(row, rows[1].dense_us, place in front) for place, row in enumerate(rows)]
+    lines = [cost_cells(row, rows[1].dense_us) for row in rows]
     title = "Encoding a window, one setting changed at a time"
     publish_table(folder, tracker, "trade/inference", title, HEADINGS, lines)
     tracker.table("trade/inference", cost_columns(rows))
-    publish_plot(folder, tracker, "trade/inference", plot_encoding_costs(rows, front))
+    publish_plot(folder, tracker, "trade/inference", plot_encoding_costs(rows))
+    write_csv(folder.path / "trade" / "inference.csv", EncodingCost._fields, rows)
     first, network = rows[:2]
     return {
         "perf/encode_step_us": first.step_us,
@@ -195,21 +194,11 @@ def between(evae: EventVAE, batch: EventBatch) -> dict[str, list[np.ndarray]]:
     return rows
 
 
-def fronts(rows: Sequence[EncodingCost]) -> set[int]:
-    """Places of the rows that no other beats: one model by its error, context sizes by what they explain."""
-    sizes = [place for place, row in enumerate(rows) if row.knob == "context"]
-    same = [place for place, row in enumerate(rows) if row.knob != "context"]
-    by_error = pareto([(rows[place].dense_us, rows[place].error_mean) for place in same])
-    by_share = pareto([(rows[place].dense_us, -rows[place].explained) for place in sizes])
-    return {same[place] for place in by_error} | {sizes[place] for place in by_share}
-
-
-def cost_cells(row: EncodingCost, network_us: float, on_front: bool) -> tuple[str, ...]:
+def cost_cells(row: EncodingCost, network_us: float) -> tuple[str, ...]:
     """A text for each of `HEADINGS`; "times faster" refers to the network's cost of 2,000 events."""
     costs = f"{row.step_us:,.0f}", f"{row.dense_us:,.0f}", f"{network_us / row.dense_us:,.0f}"
     errors = short(100 * row.error_mean), short(100 * row.error_max)
-    mark = ("*" if on_front else "") + (" default" if row.knob == "default" else "")
-    return (row.knob, row.setting, *costs, *errors, f"{100 * row.explained:.1f}", mark.strip())
+    return (row.knob, row.setting, *costs, *errors, f"{100 * row.explained:.1f}")
 
 
 def cost_columns(rows: Sequence[EncodingCost]) -> dict[str, list[str | float]]:

@@ -7,7 +7,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from docs import from_data
-from docs.from_data import ABLATIONS, PAIRS, STUDIES, figures, main, pages, variant_results
+from docs.from_data import (
+    ABLATIONS,
+    PAIRS,
+    STUDIES,
+    ablation,
+    figures,
+    main,
+    pages,
+    trade,
+    variant_results,
+)
 from envs.config import EnvConfig
 from jobs.analysis.tables import estimate_text, save_plot, write_csv
 from jobs.evaluation.group_stats import LABELS, episode_values
@@ -88,10 +98,13 @@ def test_every_published_study_with_data_is_drawn_again(tmp_path):
     data = DOCS / "data"
     there = [study for study, files in STUDIES.items() if all((data / name).is_file() for name in files)]
     drawn = figures(data)
-    assert set(drawn) >= {study.__name__ for study in there if study.__name__ in ("ablation", "trade")}
+    assert set(drawn) >= {study.__name__ for study in (ablation, trade) if study in there}
     assert len(there) >= 2
-    save_plot(tmp_path / "ablation.png", drawn["ablation"])
-    np.testing.assert_array_equal(pixels(tmp_path / "ablation.png"), pixels(DOCS / "images" / "ablation.png"))
+    for name in ("ablation", "encoder_inference"):
+        save_plot(tmp_path / f"{name}.png", drawn[name])
+        np.testing.assert_array_equal(
+            pixels(tmp_path / f"{name}.png"), pixels(DOCS / "images" / f"{name}.png")
+        )
     for name, figure in drawn.items():
         save_plot(tmp_path / f"{name}.png", figure)
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000

@@ -1,15 +1,18 @@
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from jobs.analysis.tables import write_csv
 from jobs.bench.encoder import compare
 from jobs.config.config import ConfigError
 from jobs.run.folder import locate_run
 from jobs.studies.encoder import costs as encoder_costs
 from jobs.studies.encoder import trade as trade_encoder
 from jobs.studies.encoder.costs import (
+    UNCHANGED,
     Encoding,
     EncodingCost,
     costs_us,
@@ -19,9 +22,12 @@ from jobs.studies.encoder.costs import (
     encode_whole,
     exact_latents,
     explained,
+    read_costs,
+    repeats,
 )
-from jobs.studies.encoder.trade import cost_cells, cost_columns, fronts, percent
-from jobs.studies.encoder.trials import spread, squeezed
+from jobs.studies.encoder.plots import plot_encoding_costs
+from jobs.studies.encoder.trade import cost_cells, cost_columns, percent
+from jobs.studies.encoder.trials import MAX_EVENTS, spread, squeezed
 from models.encoder.evae import EventVAE, event_targets, reconstruct
 from models.encoder.event_batch import EventBatch, batch_windows
 from models.encoder.table import EncoderTable
@@ -29,11 +35,12 @@ from models.kinds import DenseModel
 from tests.support.configs import small_config
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
+ROOT = Path(__file__).resolve().parents[4]
 WINDOWS = [(make_events(count, seed=count), 0, WINDOW_US) for count in (0, 1, 40, 300)]
 
 
-def make_row(knob="default", cost=10.0, error=0.01, share=0.2):
-    return EncodingCost(knob, "", cost / 2, cost, 2 * error, error, share)
+def make_row(knob="default", cost=10.0, error=0.01, share=0.2, setting=""):
+    return EncodingCost(knob, setting, cost / 2, cost, 2 * error, error, share)
 
 
 @pytest.mark.parametrize("coding", ["additive", "none"])
@@ -122,24 +129,56 @@ def test_a_spread_is_students_interval_of_the_mean():
     assert (percent((0.123, 0.04)), percent(spread([0.1]))) == ("12 ± 4", "10")
 
 
-def test_fronts_compare_one_model_by_its_error_and_context_sizes_by_what_they_explain():
+def test_only_what_computes_the_same_as_the_default_repeats_its_timing():
     rows = [
-        make_row(cost=10.0, error=0.1),
-        make_row("torch", cost=1000.0, error=0.1),
-        make_row("time bins", cost=5.0, error=0.5),
-        make_row("context", cost=4.0, error=0.9, share=0.1),
-        make_row("context", cost=8.0, error=0.01, share=0.05),
-        make_row("context", cost=9.0, error=0.9, share=0.3),
+        make_row(),
+        make_row("chunks", setting="1"),
+        make_row("chunks", setting="2"),
+        make_row("newest events", setting=str(MAX_EVENTS)),
+        make_row("time bins", setting="1024", error=0.02),  # of a model of other bins
+        make_row("context", setting="1024"),
     ]
-    assert fronts(rows) == {0, 2, 3, 5}
+    assert repeats(rows) == [rows[0], rows[1], rows[3]]
+
+
+def test_rows_that_compute_the_same_give_the_same_latents():
+    evae = make_evae(time_bins=1024)
+    forms = [form for form in default_encodings(evae) if (form.knob, form.setting) in UNCHANGED]
+    assert len(forms) == len(UNCHANGED)
+    latents = [np.stack([form.encode(window) for window in WINDOWS]) for form in forms]
+    assert all(np.array_equal(latents[0], other) for other in latents)
+
+
+def test_costs_are_read_as_they_were_written(tmp_path):
+    rows = [make_row(), make_row("torch", cost=1234.5), make_row("time bins", setting="16", error=1 / 3)]
+    write_csv(tmp_path / "costs.csv", EncodingCost._fields, rows)
+    assert read_costs(tmp_path / "costs.csv") == rows
+
+
+def test_the_figure_of_costs_has_no_line_and_its_axis_of_shares_begins_at_zero():
+    rows = [make_row(), make_row("time bins", setting="16", cost=8.0, error=0.5)]
+    rows += [make_row("context", cost=cost, share=share) for cost, share in ((4.0, 0.19), (9.0, 0.2))]
+    left, right = plot_encoding_costs(rows).axes
+    joined = [line for panel in (left, right) for line in panel.get_lines() if line.get_linestyle() != "None"]
+    assert [list(line.get_ydata()) for line in joined] == [[0, 0]]  # of the axis
+    assert right.get_ylim()[0] <= 0
+
+
+def test_the_published_costs_are_those_of_the_page():
+    page = (ROOT / "docs" / "encoder_accuracy.md").read_text().split("## ")[0]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
+    published = read_costs(ROOT / "docs" / "data" / "encoder_costs.csv")
+    cells = [list(cost_cells(row, published[1].dense_us)) for row in published]
+    for row in (*lines, *cells):
+        del row[4]  # a quotient, which whole microseconds do not give to the digit
+    assert lines[2:] == cells
 
 
 def test_a_row_becomes_text_and_columns():
     row = EncodingCost("precision", "int16", 60.4, 250.0, 0.0123, 0.001, 0.234)
-    expected = ("precision", "int16", "60", "250", "100", "0.1", "1.2", "23.4", "*")
-    assert cost_cells(row, 25_000.0, True) == expected
-    assert cost_cells(make_row(), 10.0, True)[-1] == "* default"
-    assert cost_cells(make_row(error=12.5), 10.0, False)[5:7] == ("1,250", "2,500")
+    expected = ("precision", "int16", "60", "250", "100", "0.1", "1.2", "23.4")
+    assert cost_cells(row, 25_000.0) == expected
+    assert cost_cells(make_row(error=12.5), 10.0)[5:7] == ("1,250", "2,500")
     assert cost_columns([row]) == {
         "form": ["precision int16"],
         "step_us": [60.4],
@@ -170,7 +209,8 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
     assert len(list((folder / "encoders").glob("*.safetensors"))) == 2 + 2 * 3 - 1
     lines = [line.split("|") for line in (folder / "inference.md").read_text().splitlines()[2:]]
     assert [line[1].strip() for line in lines].count("newest events") == 5
-    assert "default" in lines[0][-2]
+    assert lines[0][1].strip() == "default"
+    assert len(read_costs(folder / "inference.csv")) == len(lines)
     assert (folder / "coding.md").read_text().count("±") == 3 * 7
     assert metrics["perf/encode_step_us"] > 0
     assert {
