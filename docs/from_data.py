@@ -14,6 +14,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from jobs.bench.scaling_model import from_plain, plot_scaling
 from jobs.evaluation.group_stats import TrainingEpisodes, episode_values
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
@@ -30,7 +31,7 @@ from jobs.reporting.training_studies import draw_study as draw_training_study
 from jobs.reporting.training_studies import published_text as study_text
 from jobs.reporting.words import condition_text
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.files import write_atomic
+from jobs.run.files import read_json, write_atomic
 from jobs.studies.ablation.page import VariantResult, plot_variants, variant_result
 from jobs.studies.encoder.costs import read_costs
 from jobs.studies.encoder.plots import plot_encoding_costs
@@ -110,6 +111,11 @@ def encoder_costs(data: Path) -> dict[str, Figure]:
     return {"encoder_inference": plot_encoding_costs(read_costs(data / ENCODER_COSTS))}
 
 
+def scaling(data: Path) -> dict[str, Figure]:
+    """That of cluster.md."""
+    return {"scaling": plot_scaling(from_plain(read_json(data / "scaling.json")))}
+
+
 # What draws the figures of a study -> the files that it needs.
 STUDIES: dict[Callable[[Path], Mapping[str, Figure]], tuple[str, ...]] = {
     results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
@@ -123,6 +129,7 @@ STUDIES: dict[Callable[[Path], Mapping[str, Figure]], tuple[str, ...]] = {
     ablation: tuple(f"{name}_episodes.csv.gz" for name in ABLATIONS),
     trade: ("trade_settings.csv",),
     encoder_costs: (ENCODER_COSTS,),
+    scaling: ("scaling.json",),
 }
 
 

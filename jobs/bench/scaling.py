@@ -1,11 +1,11 @@
 """How training and sweeps grow with cores: measured on simulated nodes of this machine, then a model.
 
-Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.scaling [docs/images/scaling.png]
-Expect: five tables in about five minutes, and their plot if a file is named; the machine should be
-quiet. Nodes beyond this machine's cores share them, so that measured rates stop growing there; the
-model predicts them for nodes of their own. Its inputs are measured: seconds of a core for a step
-simulated, seconds of the learner and bytes through the object store for a step learnt, seconds of a
-core for a condition, seconds of the driver for a trial.
+Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m jobs.bench.scaling [docs/data/scaling.json]
+Expect: five tables in about five minutes, and their numbers in a file if one is named, from which
+`python -m docs.from_data` draws the plot; the machine should be quiet. Nodes beyond this machine's cores
+share them, so that measured rates stop growing there; the model predicts them for nodes of their own. Its
+inputs are measured: seconds of a core for a step simulated, seconds of the learner and bytes through the
+object store for a step learnt, seconds of a core for a condition, seconds of the driver for a trial.
 """
 
 import contextlib
@@ -18,54 +18,33 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import ray
-from matplotlib.figure import Figure
 from ray import tune
 from ray._private.authentication.authentication_token_setup import enable_token_auth_by_default
 from ray.cluster_utils import Cluster
 
 from envs.config import EnvConfig
 from jobs.analysis.tables import show_table
+from jobs.bench.scaling_model import CORES, STEPS, Costs, Measured, as_plain, conditions_per_s, iteration_s
 from jobs.bench.throughput import composed
 from jobs.config.config import HELD_OUT_SCENE
 from jobs.rollout.episodes import roll_out
 from jobs.rollout.executors import cached_agent
 from jobs.rollout.policies import PRETRAINED
+from jobs.run.files import write_json
+from jobs.run.provenance import git_commit, today
 from jobs.run.ray_cluster import QUIET, on_loopback, ray_folder, use_token
 from jobs.run.threads import ONE_THREAD
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
 
-STEPS = 2048  # of an iteration (appendix D.1.2)
 ROUNDS = 3
 TRIALS = 1000
 CONDITIONS, EPISODES = 12, 7  # evaluated to measure their rate; of one condition in the default sweep
 POLICY = "event_columns-s0"
-BANDWIDTH = 1e9  # of the network between nodes [bytes/s]: 10 Gbit/s
-CORES = (1, 2, 10, 100, 1000)
 OBJECT_STORE = 150 * 2**20
-
-
-class Costs(NamedTuple):
-    """What the model is made from.
-
-    Attributes:
-        step_s: Of a core, for a simulated step [s].
-        learn_s: Of the learner, for a step learnt; all runners wait [s].
-        step_bytes: Through the object store, for a step.
-        weight_bytes: To each runner, for an iteration.
-        cell_s: Of a core, for a condition of a sweep [s].
-        trial_s: Of the driver, for a trial of a sweep [s].
-    """
-
-    step_s: float
-    learn_s: float
-    step_bytes: float
-    weight_bytes: float
-    cell_s: float
-    trial_s: float
 
 
 def main() -> None:
@@ -94,7 +73,9 @@ def main() -> None:
     show_measured(rates, sweeps)
     show_model(costs)
     if sys.argv[1:]:
-        plot_scaling(costs, rates, sweeps).savefig(sys.argv[1], dpi=120)
+        measured = Measured(os.cpu_count() or 1, costs, rates, sweeps)
+        source = f"measured on {today()} at commit {git_commit()}"
+        write_json(Path(sys.argv[1]), as_plain(measured, source))
 
 
 def show_measured(rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]) -> None:
@@ -120,43 +101,6 @@ def show_model(costs: Costs) -> None:
         [(cores, f"{3600 * conditions_per_s(costs, cores):,.0f}",
           "cores" if cores / costs.cell_s < 1 / costs.trial_s else "the driver") for cores in CORES],
     )  # fmt: skip
-
-
-def conditions_per_s(costs: Costs, cores: int) -> float:
-    """Conditions of a sweep per second: cores share nothing, until the driver is busy all the time."""
-    return min(cores / costs.cell_s, 1 / costs.trial_s)
-
-
-def plot_scaling(costs: Costs, rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]) -> Figure:
-    """Draw rates over cores: the model as a line, what was measured on this machine as points."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    cores = range(1, max(CORES) + 1)
-    left.plot(cores, [STEPS / sum(iteration_s(costs, count)) for count in cores], label="model")
-    left.axhline(1 / costs.learn_s, color="0.5", linestyle="--", label="the learner alone")
-    for nodes in sorted({nodes for nodes, _ in rates}):
-        own = {runners: rate for (n, runners), rate in rates.items() if n == nodes and runners}
-        name = f"measured, {nodes} simulated node{'s' * (nodes > 1)}"
-        left.plot(list(own), list(own.values()), "os"[nodes - 1], label=name)
-    left.set(xlabel="Cores that sample", ylabel="Environment steps per second", title="Training")
-    right.plot(cores, [3600 * conditions_per_s(costs, count) for count in cores], label="model")
-    right.axhline(3600 / costs.trial_s, color="0.5", linestyle="--", label="the driver alone")
-    right.plot(list(sweeps), [3600 * rate for rate in sweeps.values()], "o", label="measured on two cores")
-    right.set(xlabel="Cores", ylabel="Conditions per hour", title="A sweep")
-    for axes in (left, right):
-        axes.set(xscale="log", yscale="log")
-        axes.grid(alpha=0.3)
-        axes.legend(frameon=False, fontsize=8)
-    return figure
-
-
-def iteration_s(costs: Costs, cores: int) -> tuple[float, float, float]:
-    """Seconds of one PPO iteration that are spent sampling, learning, and sending samples and weights.
-
-    Each runner samples on a core; one process learns while they wait, and receives all samples.
-    """
-    sent = STEPS * costs.step_bytes + cores * costs.weight_bytes
-    return STEPS * costs.step_s / cores, STEPS * costs.learn_s, sent / BANDWIDTH
 
 
 def bytes_sent(*words: str) -> tuple[float, float]:
