@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from envs.config import Split
-from jobs.analysis.plots import COLOURS, GREYS, INK, MUTED, tidy
+from jobs.analysis.plots import BROWN, COLOURS, CYAN, GREYS, INK, MUTED, VIOLET, tidy
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.config import Config, ConfigError
 from jobs.run.folder import Run, finish, locate_run, open_run
@@ -42,6 +42,14 @@ from models.encoder.weights import load_encoder
 from models.kinds import KINDS
 
 OWN = "run's encoder"
+# Colour and dashes [points] of each representation without a latent size; the targets have other colours.
+LEVEL_LOOKS = (
+    (GREYS[0], (0, (6, 3))),  # nothing
+    (BROWN, (0, (2, 2))),  # image columns
+    (CYAN, (0, (6, 2, 1, 2))),  # few cells
+    (VIOLET, (0, (10, 2))),  # many cells
+    (INK, (0, (1, 2))),  # the run's encoder
+)
 
 
 class Representation(NamedTuple):
@@ -225,10 +233,10 @@ def _draw(panel: Axes, rows: Sequence[ProbeResult], values: Sequence[Interval]) 
     """Draw a line per target over the latent sizes, and a level per representation without training."""
     pairs = list(zip(rows, values, strict=True))
     levels = [(row.representation.name, value) for row, value in pairs if row.representation.place is None]
-    for (name, value), colour in zip(levels[:-1], GREYS, strict=True):
-        panel.axhspan(*value[1:], color=colour, alpha=0.08, lw=0)
-        panel.axhline(value[0], color=colour, lw=1.2, ls="--", label=name)
-    panel.axhline(levels[-1][1][0], color=INK, lw=1.6, ls=":", label=levels[-1][0])
+    for (name, value), (colour, dashes) in zip(levels, LEVEL_LOOKS, strict=True):
+        if name != OWN:
+            panel.axhspan(*value[1:], color=colour, alpha=0.08, lw=0)
+        panel.axhline(value[0], color=colour, lw=1.6, ls=dashes, label=name)
     placed = [
         (*row.representation.place, value) for row, value in pairs if row.representation.place is not None
     ]

@@ -1,13 +1,16 @@
 import dataclasses
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from jobs.analysis.plots import COLOURS
 from jobs.config.config import ConfigError
 from jobs.run.folder import locate_run
 from jobs.studies.probe import probe
 from jobs.studies.probe.probe import (
+    LEVEL_LOOKS,
     ProbeResult,
     Representation,
     headings,
@@ -17,7 +20,7 @@ from jobs.studies.probe.probe import (
     result_columns,
 )
 from jobs.studies.probe.readout import Scores
-from models.kinds import DenseModel
+from models.kinds import DenseModel, Target
 from tests.support.configs import small_config
 
 
@@ -108,5 +111,10 @@ def test_the_figure_has_a_line_for_each_target_and_a_level_for_the_rest():
     assert len(figure.axes) == 4
     _, labels = figure.axes[0].get_legend_handles_labels()
     assert sorted(labels) == sorted((*names, "aged", "counts"))
-    (level,) = (line for line in figure.axes[0].lines if line.get_label() == "16 x 16 cells")
-    assert np.allclose(level.get_ydata(), 30)
+    levels = {line.get_label(): line for line in figure.axes[0].lines if line.get_label() in names}
+    assert np.allclose(levels["16 x 16 cells"].get_ydata(), 30)
+    assert list(levels) == list(names)
+    assert (
+        len({line.get_color() for line in levels.values()} - {COLOURS[one] for one in get_args(Target)}) == 5
+    )
+    assert len({dashes for _, dashes in LEVEL_LOOKS}) == 5  # told apart without colours too
