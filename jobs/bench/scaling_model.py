@@ -1,7 +1,7 @@
 """How training and sweeps grow with cores: a model from what `jobs.bench.scaling` measures, and its plot."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -50,7 +50,32 @@ class Measured(NamedTuple):
     sweeps: Mapping[int, float]
 
 
-def as_plain(measured: Measured, source: str) -> dict[str, Any]:
+class TrainingRate(TypedDict):
+    """Environment steps per second of a training."""
+
+    nodes: int
+    env_runners: int
+    steps_per_s: float
+
+
+class SweepRate(TypedDict):
+    """Conditions per hour of a sweep."""
+
+    cores: int
+    conditions_per_h: float
+
+
+class PlainMeasured(TypedDict):
+    """`Measured` in plain containers, and where it is from."""
+
+    source: str
+    cores: int
+    costs: dict[str, float]
+    training: list[TrainingRate]
+    sweep: list[SweepRate]
+
+
+def as_plain(measured: Measured, source: str) -> PlainMeasured:
     """Plain containers for a JSON file; `source` says where the numbers are from."""
     return {
         "source": source,
@@ -66,7 +91,7 @@ def as_plain(measured: Measured, source: str) -> dict[str, Any]:
     }
 
 
-def from_plain(values: Mapping[str, Any]) -> Measured:
+def from_plain(values: PlainMeasured) -> Measured:
     """What `as_plain` was given."""
     return Measured(
         values["cores"],
