@@ -1,8 +1,9 @@
-"""The numbers of the README that other tests do not know are those of the data and of the configuration."""
+"""Numbers of the README and of pages that other tests do not know are those of data and configuration."""
 
 import re
 import shlex
 
+import numpy as np
 import pytest
 
 from jobs.analysis.statistics import wilson_interval
@@ -10,10 +11,11 @@ from jobs.config.conditions import NOMINAL
 from jobs.config.config import parse
 from jobs.evaluation.sweep_plan import axes_of, plan_sweep
 from jobs.reporting.sweep_data import SWEEP, read_sweep_episodes
-from jobs.rollout.policies import BASELINES, find_sweep_policies
+from jobs.rollout.policies import BASELINES, PRETRAINED, find_sweep_policies
 from jobs.run.files import read_json
 from jobs.run.folder import locate_run
 from jobs.run.provenance import REPOSITORY
+from models.policy.policy import MANIFEST
 from tests.support.configs import compose
 
 DATA = REPOSITORY / "docs" / "data"
@@ -106,3 +108,44 @@ def test_pages_say_the_minutes_that_the_readme_measured():
     quick, slow = (round(int(minutes) + int(seconds) / 60) for minutes, seconds in measured)
     for page in ("README.md", "docs/index.md", "docs/start.md", "docs/commands.md", "docs/faq.md"):
         assert f"{quick} to {slow} minutes" in page_text(page), page
+
+
+def test_pages_give_the_numbers_of_both_hosts_on_the_readme():
+    readme = page_text("README.md")
+    told = re.search(r"sampled action \| `poles_eval` \| \*\*(\d+)\*\* (\[\d+, \d+\])", readme)
+    other = re.search(r"that host gave (\d+ \[\d+, \d+\])", readme)
+    text = page_text("docs/representations.md")
+    assert f"succeeded in {told[1]} {told[2]} of 100 held-out corridors" in text
+    assert f"rounds differently, in {other[1]}" in text
+
+
+def test_the_front_page_counts_the_shipped_policies():
+    shipped = [path.parent.name for path in PRETRAINED.glob(f"*/{MANIFEST}")]
+    groups = read_json(DATA / f"{SWEEP}_about.json")["groups"]
+    evaluated = [f"{group}-s{seed}" for group, seeds in groups.items() for seed in seeds if seed is not None]
+    taught = [name for name in shipped if name.startswith("taught_")]
+    assert sorted(shipped) == sorted([*evaluated, *taught])
+    said = said_numbers(
+        r"Any of (\d+) shipped policies .* the (\d+) of the eleven groups .*?, and (\d+) by which",
+        page_text("docs/index.md"),
+    )
+    assert said == [len(shipped), len(evaluated), len(taught)]
+
+
+def test_what_the_gallery_says_of_other_textures_is_what_the_data_say():
+    episodes = read_sweep_episodes(DATA / f"{SWEEP}_episodes.csv.gz")
+    textured = [
+        own
+        for (at, group), trainings in episodes.items()
+        if at == ("world", "texture_change") and group not in BASELINES
+        for own in trainings.values()
+    ]
+    first = np.concatenate([own[own["seed"] == 0] for own in textured])
+    said = said_numbers(
+        r"(\d+) of the (\d+) trainings .* end within 20 m, and (\d+) do not reach the goal; "
+        r"in all of its (\d+) corridors together half of the episodes end within (\d+) m",
+        page_text("docs/gallery.md"),
+    )
+    early, failed = (first["distance_m"] < 20).sum(), (~first["success"]).sum()
+    half = np.median(np.concatenate([own["distance_m"] for own in textured]))
+    assert said == [early, len(first), failed, len(textured[0]), round(half)]
