@@ -128,7 +128,7 @@ def baselines_of(configured: EnvConfig, axes: Axes) -> dict[Place, Place]:
 
 
 def was_met(policy: EvaluatedPolicy, nominal: EnvConfig, cell: EnvConfig) -> bool:
-    """Whether a cell lies within what a policy's training drew; not known of policies of older versions."""
+    """Whether a cell lies within what a policy's training drew; of baselines none does."""
     if not policy.conditions:
         return False
     trained = with_sensor(EnvConfig(**policy.world), policy.sensor)

@@ -1,9 +1,12 @@
 """Pages of planned studies: the plan stands above and is left as it is, what is below it is written anew."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from jobs.evaluation.sweep_report import SweepFacts
-from jobs.reporting.breaks import SweptEpisodes
+from jobs.config.conditions import NOMINAL
+from jobs.evaluation.sweep_report import Exactness, SweepFacts
+from jobs.reporting.breaks import SweptEpisodes, place
+from jobs.reporting.words import condition_text
 from jobs.run.files import write_atomic
 
 RESULTS = "## Results\n"  # what stands above it is the plan
@@ -29,5 +32,26 @@ def made_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
         f"Made on {about['date']} by `{about['command']}`, then `python -m platform.launch +exp=report`; run "
         f"`{about['run']}`, evaluated at commit {', '.join(commit[:7] for commit in about['evaluated_at'])}. "
         f"Groups, with their number of trainings: {groups}; {about['trials']} corridors, {count:,} episodes, "
-        f"actions {about['action']}."
+        f"actions {about['action']}. {coarse_text(about.get('exactness', []))}".rstrip()
+    )
+
+
+def coarse_text(found: Sequence[Exactness]) -> str:
+    """The conditions that were simulated more coarsely than the rest, and how exactly; "" if none was.
+
+    Args:
+        found: How exact the events of each condition were.
+    """
+    finest = min((one["asked"] for one in found), default=0.0)
+    coarse = [one for one in found if one["asked"] > finest]
+    if not coarse:
+        return ""
+    errors = [
+        f"{condition_text(*place(one['condition']))} {100 * one['event_error']:.1f} %" for one in coarse
+    ]
+    usual = [one["event_error"] for one in found if place(one["condition"])[0] == NOMINAL]
+    beside = f"; with nothing changed {100 * usual[0]:.1f} %" if usual else ""
+    return (
+        "Simulated more coarsely than the rest, by the share of events that differ from the converged "
+        f"simulation: {', '.join(errors)}{beside}."
     )

@@ -22,12 +22,11 @@ from jobs.config.conditions import NOMINAL
 from jobs.config.config import Config, ConfigError
 from jobs.evaluation.group_stats import (
     Condition,
-    details_table,
     episode_values,
     success_table,
 )
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
-from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, compared_pairs, replicated
+from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, compared_pairs, place, replicated
 from jobs.reporting.claims_study import (
     BY_PPO,
     HEAD,
@@ -43,8 +42,18 @@ from jobs.reporting.figures import group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
 from jobs.reporting.paper_claims import CLAIMS, GAIN, Claim, Finding
+from jobs.reporting.planned_page import coarse_text
 from jobs.reporting.replay_page import PAGE
-from jobs.reporting.sweep_data import SWEEP, TRAININGS, copy_plot, read_sweep, replaced_text, write_data
+from jobs.reporting.sweep_data import (
+    SWEEP,
+    TRAININGS,
+    copy_plot,
+    read_sweep,
+    replaced_text,
+    write_changes,
+    write_data,
+    write_estimates,
+)
 from jobs.reporting.training_studies import STUDIES, write_training_study
 from jobs.reporting.words import condition_text
 from jobs.rollout.policies import PRETRAINED
@@ -172,6 +181,8 @@ def write_results(sweep: Path, docs: Path, pretrained: Path = PRETRAINED) -> Pat
     figures = results_figures(about, episodes, trainings)
     pages = results_pages(about, episodes, trainings, list(figures), docs, pretrained)
     write_data(docs / "data", SWEEP, sweep, episodes)
+    write_estimates(docs / "data", SWEEP, group_results(about, episodes))
+    write_changes(docs / "data", SWEEP, changes_of(about, episodes))
     write_csv(docs / "data" / TRAININGS, PublishedTraining._fields, trainings)
     write_figures(docs / "images", figures)
     for name, text in pages.items():
@@ -230,7 +241,6 @@ def page_values(
     """What the templates name."""
     changes, findings = changes_of(about, episodes), judge_claims(about, episodes, trainings)
     studies = published_studies(docs / "data")
-    success, every = estimate_tables(about, episodes)
     sizes = sorted({len(seeds) for seeds in about["groups"].values()} - {1})
     return {
         "about": about,
@@ -238,6 +248,7 @@ def page_values(
         "groups": ", ".join(f"{group} ({len(seeds)})" for group, seeds in about["groups"].items()),
         "replaced": replaced_text(about["commit"]),
         "short": in_short(about, episodes, changes, findings, studies),
+        "coarse": coarse_text(about.get("exactness", [])),
         "breaks": breaks_table(about, changes),
         "tests": len(replicated(changes)),
         "claims": claims_table(findings, studies),
@@ -248,13 +259,14 @@ def page_values(
         "coverage": {size: coverage_text(size, about["trials"]) for size in sizes},
         "several": several_at_once(about),
         "values": paper_values(),
-        "weak": weak_groups(about, episodes),
+        "weak": ", ".join(
+            f"`{group}` {100 * rate:.0f} %" for group, rate in weak_groups(about, episodes).items()
+        ),
         "weakest": round(100 * WEAK),
         "shared": shared_encoders(about, pretrained),
         "doses": (docs / "dose_response.md").is_file(),
         "trade": (docs / "trade.md").is_file(),
-        "success": success,
-        "details": every,
+        "success": estimates_table(about, episodes),
         "exactness": exactness_table(about.get("exactness", [])),
     }
 
@@ -267,17 +279,14 @@ def in_short(
     studies: Mapping[str, Mapping[Claim, Finding]],
 ) -> list[str]:
     """What a reader wants to know first: which policy to take, what breaks most, what the paper had right."""
-    certain = [change for change in changes if change.certain and _loses(change)]
-    named = [f"`{one.group}` with {_drop_text(one)}" for one in certain]
     return [
         *_best_policy(about, episodes, changes),
         _worst_conditions(about, changes),
-        f"What a further training would lose: {len(certain) or 'none'} of {len(replicated(changes))} changes "
-        f"of groups with several trainings {'are' if len(certain) > 1 else 'is'} certain to come back"
-        f"{': ' if named else ''}{', '.join(named)}.",
-        f"Of the paper's {len(findings)} claims: {counted(findings.values())}{_decided(findings)}.",
+        _foretold(changes),
+        f"Of the paper's {len(findings)} claims: {counted(findings.values())}"
+        f"{_decided(findings, weak_groups(about, episodes))}.",
         *(
-            f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}{_decided(own)}."
+            f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}{_decided(own, {})}."
             for name, own in studies.items()
         ),
     ]
@@ -300,11 +309,37 @@ def _worst_conditions(about: SweepFacts, changes: Sequence[Change]) -> str:
     )
 
 
-def _decided(findings: Mapping[Claim, Finding]) -> str:
-    """The claims that hold or are reversed, to be said behind how many there are."""
+def _foretold(changes: Sequence[Change]) -> str:
+    """The sentence on what a further training of these groups would lose for certain."""
+    several = replicated(changes)
+    certain = [change for change in several if change.certain and _loses(change)]
+    sizes = sorted({len(change.success) for change in several})
+    if not certain:
+        count = " to ".join(str(size) for size in sizes[:1] + sizes[1:][-1:])
+        few = f": {count} trainings of a group are too few for that" if sizes else ""
+        return f"Of what a further training would lose nothing is certain (of {len(several)} changes){few}."
+    named = ", ".join(f"`{one.group}` with {_drop_text(one)}" for one in certain)
+    return (
+        f"What a further training would lose for certain, {len(certain)} of {len(several)} changes of groups "
+        f"with several trainings: {named}."
+    )
+
+
+def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> str:
+    """The claims that hold or are reversed, to be said behind how many there are.
+
+    Args:
+        findings: Of the claims.
+        weak: Groups that have little to lose, and their success with nothing changed, 0..1.
+    """
+    beside = {
+        group: f", which succeeds in {100 * rate:.0f} % with nothing changed and has little to lose"
+        for group, rate in weak.items()
+    }
     named = {
         verdict: [
-            f"`{claim.ours}` {claim.text} (against `{claim.theirs}`)"
+            f"`{claim.ours}` {claim.text} (against `{claim.theirs}`"
+            f"{beside.get(claim.theirs, '') if claim.change else ''})"
             for claim, one in findings.items()
             if one.verdict == verdict
         ]
@@ -339,8 +374,8 @@ def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[C
     ]
 
 
-def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> str:
-    """Groups of claims that succeed in less than `WEAK` with nothing changed, and how often."""
+def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> dict[str, float]:
+    """Groups of claims that succeed in less than `WEAK` with nothing changed, and how often, 0..1."""
     (value,) = about["axes"][NOMINAL]
     compared = {group for claim in CLAIMS for group in (claim.ours, claim.theirs)}
     unchanged = {
@@ -348,7 +383,7 @@ def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> str:
         for group in about["groups"]
         if group in compared and ((NOMINAL, value), group) in episodes
     }
-    return ", ".join(f"`{group}` {100 * rate:.0f} %" for group, rate in unchanged.items() if rate < WEAK)
+    return {group: rate for group, rate in unchanged.items() if rate < WEAK}
 
 
 def several_at_once(about: SweepFacts) -> dict[str, str]:
@@ -432,13 +467,12 @@ def claims_table(findings: Mapping[Claim, Finding], studies: Mapping[str, Mappin
     return markdown_table((first, "Source", *head, *(SHORT[name] for name in studies)), lines, 4)
 
 
-def estimate_tables(about: SweepFacts, episodes: SweptEpisodes) -> tuple[str, str]:
-    """Success of all groups under all conditions, and every estimate."""
-    conditions = [(axis, value) for axis, points in about["axes"].items() for value in points]
-    groups, reference = list(about["groups"]), about["reference"]
-    rows = group_results(about, episodes)
-    head, lines = success_table(rows, conditions, groups, {}, met_places(about))
-    return markdown_table(head, lines, 2), details_table(rows, reference)
+def estimates_table(about: SweepFacts, episodes: SweptEpisodes) -> str:
+    """Success of all groups under all conditions, no simulation twice."""
+    conditions = [place(one["condition"]) for one in about["compared"] if one["same_as"] == one["condition"]]
+    results = group_results(about, episodes)
+    head, lines = success_table(results, conditions, list(about["groups"]), {}, met_places(about))
+    return markdown_table(head, lines, 2)
 
 
 def met_places(about: SweepFacts) -> set[tuple[str, str, str]]:

@@ -2,7 +2,7 @@
 
 import csv
 import gzip
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +11,25 @@ from PIL import Image
 from envs.checks import replaced
 from jobs.analysis.tables import write_csv
 from jobs.config.errors import ConfigError
-from jobs.evaluation.group_stats import LABELS, Condition
+from jobs.evaluation.group_stats import LABELS, Condition, GroupResult
 from jobs.evaluation.sweep_report import SweepFacts
-from jobs.reporting.breaks import SweptEpisodes
+from jobs.reporting.breaks import Change, SweptEpisodes
 from jobs.rollout.episodes import EPISODE
 from jobs.run.checkpoints import sha256
 from jobs.run.files import RunError, read_json, write_atomic, write_json
 
 SWEEP = "robustness"  # name of the published data of the sweep that docs/results.md is about
+ESTIMATES = (
+    *("axis", "value", "group", "trainings", "episodes"),
+    *("success_rate", "success_rate_low", "success_rate_high"),
+    *("distance_m", "distance_m_low", "distance_m_high"),
+    *("events_per_step", "dropped"),
+)
+CHANGES = (
+    *("axis", "value", "baseline_axis", "baseline_value", "group", "trainings"),
+    *("success_rate", "baseline_success_rate", "change", "change_low", "change_high"),
+    *("p", "certain", "broken"),
+)
 TRAININGS = "trainings.csv"  # of every published training, how it learnt
 # Commit of a published study -> groups whose trainings in models/pretrained have been replaced since, and the
 # commit that shipped those which were evaluated.
@@ -30,6 +41,8 @@ EARLIER = (
     "[Results](results.md) were evaluated at a later commit, so that success with nothing changed is not the "
     "same."
 )
+# Commit of a published study -> what has changed since of what it measured.
+SINCE = {"28420bd": "The simulator was rewritten since: speeds and event errors are of the one before."}
 
 
 def read_sweep(sweep: Path) -> tuple[SweepFacts, SweptEpisodes]:
@@ -88,6 +101,44 @@ def write_data(folder: Path, name: str, sweep: Path, episodes: SweptEpisodes) ->
     write_csv(folder / f"{name}_trainings.csv", (*LABELS, "episodes", "success_rate", "distance_m"), rows)
 
 
+def write_estimates(folder: Path, name: str, results: Sequence[GroupResult]) -> None:
+    """Write what was estimated of each group under each condition into `<name>_estimates.csv`."""
+    rows = [
+        (
+            *(*one.condition, one.group, len(one.trainings), one.episodes),
+            *_numbers(one.success.value, one.success.interval, ".4f"),
+            *_numbers(one.distance_m.value, one.distance_m.interval, ".2f"),
+            *(f"{one.events_per_step:.1f}", one.dropped),
+        )
+        for one in results
+    ]
+    write_csv(folder / f"{name}_estimates.csv", ESTIMATES, rows)
+
+
+def write_changes(folder: Path, name: str, changes: Sequence[Change]) -> None:
+    """Write each change against its baseline into `<name>_changes.csv`: those that the tests are about."""
+    rows = [
+        (
+            *(*one.condition, *one.baseline, one.group, len(one.success)),
+            *(f"{one.success.mean():.4f}", f"{one.before.mean():.4f}"),
+            *_numbers(one.difference.value, one.difference.interval, ".4f"),
+            *(_text(one.difference.p, ".3g"), int(one.certain), int(one.broken.sum())),
+        )
+        for one in changes
+    ]
+    write_csv(folder / f"{name}_changes.csv", CHANGES, rows)
+
+
+def _numbers(value: float, interval: tuple[float, float] | None, form: str) -> tuple[str, str, str]:
+    """A value and the ends of its interval as text."""
+    low, high = interval or (None, None)
+    return _text(value, form), _text(low, form), _text(high, form)
+
+
+def _text(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
 def read_data(folder: Path, name: str) -> tuple[SweepFacts, SweptEpisodes]:
     """What `write_data` has written: what made a sweep, and its episodes."""
     about: SweepFacts = read_json(folder / f"{name}_about.json")
@@ -105,7 +156,8 @@ def replaced_text(commit: str) -> str:
         "`models/pretrained` today."
         for group, shipped in REPLACED.get(commit[:7], {}).items()
     ]
-    return " ".join((*sentences, EARLIER)) if sentences else ""
+    since = [SINCE[commit[:7]]] if commit[:7] in SINCE else []
+    return " ".join((*sentences, EARLIER, *since)) if sentences else ""
 
 
 def copy_plot(picture: Path, target: Path) -> None:

@@ -20,12 +20,14 @@ class TrainingStudy(NamedTuple):
     Attributes:
         text: What its results say, as Markdown.
         draw: Its figure.
-        shows: What is seen in the figure.
+        shows: What the figure is of.
+        caption: What is seen in it.
     """
 
     text: Callable[[SweepFacts, SweptEpisodes], str]
     draw: Callable[[SweepFacts, SweptEpisodes], Figure]
     shows: str
+    caption: str
 
 
 # Name of the experiment, of its page, and of its data.
@@ -34,11 +36,15 @@ STUDIES = {
         encoder_seeds.results_text,
         encoder_seeds.draw,
         "Mean success of every training by encoder and seed of PPO, and what success differs by",
+        "Left: a cell is one training, its mean success under all conditions. Right: the standard deviations "
+        "of the table below.",
     ),
     camera_rates.CAMERAS: TrainingStudy(
         camera_rates.results_text,
         camera_rates.draw,
         "Success against control rate for trainings by either camera at three rates",
+        "A dot is one training, a line the mean of the three; the dotted line is the rate at which they were "
+        "trained. Green: trained by `frames`, evaluated by `pixels`.",
     ),
 }
 
@@ -83,6 +89,7 @@ def _text(name: str, about: SweepFacts, episodes: SweptEpisodes) -> str:
     parts = (
         made_text(about, episodes),
         f"![{study.shows}](images/{name}.png)",
+        study.caption,
         study.text(about, episodes),
         f"Data: {files}.",
     )

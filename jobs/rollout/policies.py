@@ -76,9 +76,10 @@ def read_policy(agent: str) -> EvaluatedPolicy:
         identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
     except ValueError as error:
         raise ConfigError(f"policy: {agent!r}: {error}{needed_plugins(manifest)}") from None
-    # Policies of earlier versions name their conditions among the settings of their training.
-    conditions = manifest.get("conditions") or manifest.get("train", {}).get("conditions", ())
-    seed, met = int(manifest["seed"]), (manifest.get("world", {}), conditions)
+    # Policies of earlier versions name their conditions among the settings of their training, or have none:
+    # what they met is then their simulation as it is.
+    named = manifest.get("conditions") or manifest.get("train", {}).get("conditions")
+    seed, met = int(manifest["seed"]), (manifest.get("world", {}), named or ({},))
     return EvaluatedPolicy(agent, group, seed, identity, manifest["sensor"], observation, *met)
 
 

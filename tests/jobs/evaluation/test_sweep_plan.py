@@ -6,8 +6,8 @@ import pytest
 from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from jobs.config.conditions import NOMINAL
 from jobs.config.config import ConfigError
-from jobs.evaluation.sweep_plan import plan_sweep, value_text
-from jobs.rollout.policies import find_sweep_policies, read_policy, with_sensor
+from jobs.evaluation.sweep_plan import plan_sweep, value_text, was_met
+from jobs.rollout.policies import PRETRAINED, find_sweep_policies, read_policy, with_sensor
 from jobs.run.folder import open_run
 from models.policy.policy import MANIFEST, read_policy_manifest
 from tests.support.configs import AXES, sweep_config
@@ -201,3 +201,12 @@ def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
 )
 def test_a_value_is_told_from_every_other_by_its_label(value, label):
     assert value_text(value) == label
+
+
+def test_a_policy_whose_manifest_names_no_conditions_met_the_scene_of_training_and_a_baseline_none():
+    old, baseline = read_policy(str(PRETRAINED / "bytestream-s0")), read_policy("straight")
+    assert "conditions" not in read_policy_manifest(PRETRAINED / "bytestream-s0" / MANIFEST)
+    nominal, trained_in = EnvConfig(scene="poles_eval"), EnvConfig(scene="poles")
+    assert was_met(old, nominal, trained_in)
+    assert not was_met(old, nominal, EnvConfig(scene="poles_dense"))
+    assert not was_met(baseline, nominal, trained_in)

@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import gzip
+import json
 import os
 import re
 
@@ -12,17 +13,27 @@ from jobs.config.config import ConfigError
 from jobs.evaluation.group_stats import LABELS
 from jobs.reporting import report as results
 from jobs.reporting.breaks import changes_of, compared_pairs, replicated
+from jobs.reporting.figures import group_results, judge_claims
 from jobs.reporting.headline import BEGIN, END
 from jobs.reporting.report import (
     breaks_table,
+    estimates_table,
     find_study,
     in_short,
     results_pages,
     several_at_once,
+    weak_groups,
     write_results,
     write_trade,
 )
-from jobs.reporting.sweep_data import read_data, read_sweep, read_sweep_episodes, write_data
+from jobs.reporting.sweep_data import (
+    read_data,
+    read_sweep,
+    read_sweep_episodes,
+    write_changes,
+    write_data,
+    write_estimates,
+)
 from jobs.run.files import write_json
 from jobs.run.provenance import REPOSITORY
 from tests.support.configs import small_config
@@ -290,7 +301,8 @@ def test_a_group_of_one_training_is_in_no_test_of_groups(sweep):
     assert [one.group for one in replicated(changes)] == ["bytestream", "bytestream"]
     only = changes_of({**ABOUT, "groups": {"event_image": [0]}}, swept)
     assert [one.certain for one in only] == [False, False]
-    assert "1 of 2 changes of groups with several" in in_short(ABOUT, swept, changes, {}, {})[2]
+    sentence = in_short(ABOUT, swept, changes, {}, {})[2]
+    assert "for certain, 1 of 2 changes of groups with several" in sentence
 
 
 def test_policies_are_recommended_by_the_same_conditions_whatever_changes_them(sweep):
@@ -342,3 +354,29 @@ def test_the_page_of_a_trade_is_linked_where_there_is_one(sweep, trade, tmp_path
     assert "(trade.md)" not in results_pages(about, episodes, (), (), docs, tmp_path)["results.md"]
     write_trade(trade, docs)
     assert "(trade.md)" in results_pages(about, episodes, (), (), docs, tmp_path)["results.md"]
+
+
+def test_published_estimates_and_changes_are_those_of_the_published_episodes(tmp_path):
+    data = REPOSITORY / "docs" / "data"
+    about, swept = read_data(data, "robustness")
+    write_estimates(tmp_path, "robustness", group_results(about, swept))
+    write_changes(tmp_path, "robustness", changes_of(about, swept))
+    for name in ("robustness_estimates.csv", "robustness_changes.csv"):
+        assert (tmp_path / name).read_text() == (data / name).read_text()
+
+
+def test_a_group_that_has_little_to_lose_is_named_beside_a_claim_about_losses():
+    about, swept = read_data(REPOSITORY / "docs" / "data", "robustness")
+    findings = judge_claims(about, swept, [])
+    (reversed_,) = [claim for claim, one in findings.items() if one.verdict == "reversed"]
+    assert (reversed_.theirs, reversed_.change) == ("rgb", True)
+    assert set(weak_groups(about, swept)) == {"rgb"}
+    sentence = in_short(about, swept, changes_of(about, swept), findings, {})[3]
+    assert "`rgb`, which succeeds in 40 % with nothing changed and has little to lose" in sentence
+
+
+def test_no_simulation_stands_twice_in_the_table_of_success():
+    about, swept = read_data(REPOSITORY / "docs" / "data", "robustness")
+    lines = estimates_table(about, swept).splitlines()[2:]
+    assert len(lines) == len({json.dumps(one["same_as"]) for one in about["compared"]})
+    assert len({line.split("|", 3)[3] for line in lines}) == len(lines)

@@ -2,7 +2,7 @@ import pytest
 
 from docs.from_data import figures, pages
 from jobs.config.config import parse
-from jobs.reporting.planned_page import RESULTS
+from jobs.reporting.planned_page import RESULTS, coarse_text
 from jobs.reporting.report import find_study
 from jobs.reporting.training_studies import STUDIES, write_training_study
 from tests.support.configs import compose
@@ -33,3 +33,20 @@ def test_the_report_finds_each_study_by_its_experiment(name, tmp_path):
         write_ablation(tmp_path / exp / "ablation", exp, lambda *_: 1)
     config = parse(compose("+exp=report", f"runs_dir={tmp_path}"))
     assert find_study(config, name) == tmp_path / name / "ablation"
+
+
+def test_what_was_simulated_more_coarsely_is_named_with_its_error_and_nothing_else():
+    def one(axis, value, asked, error):
+        return {
+            "condition": [axis, value],
+            "asked": asked,
+            "event_error": error,
+            "renders_per_step": 1.0,
+        }
+
+    usual, rate = one("nominal", "poles_eval", 0.05, 0.019), one("control_hz", "45", 0.05, 0.022)
+    assert coarse_text([]) == coarse_text([usual, rate]) == ""
+    text = coarse_text([usual, rate, one("world", "dynamic", 0.5, 0.182)])
+    assert "moving textures 18.2 %" in text
+    assert "with nothing changed 1.9 %" in text
+    assert "45 Hz" not in text
