@@ -79,8 +79,9 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     # Policies of earlier versions name their conditions among the settings of their training, or have none:
     # what they met is then their simulation as it is.
     named = manifest.get("conditions") or manifest.get("train", {}).get("conditions")
-    seed, met = int(manifest["seed"]), (manifest.get("world", {}), named or ({},))
-    return EvaluatedPolicy(agent, group, seed, identity, manifest["sensor"], observation, *met)
+    met: list[dict[str, Any]] = named or [{}]
+    about = identity, manifest["sensor"], observation, manifest.get("world", {}), met
+    return EvaluatedPolicy(agent, group, int(manifest["seed"]), *about)
 
 
 def find_policy(config: Config, run: Run) -> EvaluatedPolicy:
