@@ -22,14 +22,7 @@ CAMERAS = "camera_rates"  # name of the experiment, and of what is published of 
 PIXELS, FRAMES = "pixels", "frames"  # cameras; a group is one of them and the rate of training
 NOMINAL_HZ = 200  # control rate of what nothing changes
 OWN, REPLACED = "control_hz", "pixels"  # axes: rates by the own camera, and by `PIXELS`
-HEAD = (
-    "Trained by",
-    "at [Hz]",
-    "At its rate [%]",
-    "At all rates [%]",
-    "Loss by rates [points]",
-    "`pixels` in place of its camera [%]",
-)
+HEAD = ("Trained by", "at [Hz]", "At its rate [%]", "At all rates [%]", "Loss by rates [points]")
 TESTS = ("Trained at [Hz]", "Measure", "`frames` minus `pixels` [points]", "p (Holm)")
 
 
@@ -108,6 +101,8 @@ def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
             markdown_table(TESTS, lines, 2).rstrip("\n"),
             markdown_table(HEAD, [_row(*name, one) for name, one in groups.items()], 1).rstrip("\n"),
             "Means with 95 % intervals by trainings and corridors, each alone.",
+            "Success [%] at each rate: the mean, in brackets each training.",
+            _by_rates(groups),
         ]
     )
 
@@ -117,16 +112,26 @@ def _row(hz: int, camera: str, group: Group) -> tuple[str, ...]:
     at_own, loss = measures(group, hz).values()
     everywhere = np.mean(list(group.own.values()), axis=0)
     means = [estimate_text(crossed_mean(values, RATE), 100, ".0f") for values in (at_own, everywhere)]
-    replaced = group.replaced.get(hz)
-    return (
-        f"`{camera}`",
-        f"{hz}",
-        *means,
-        estimate_text(crossed_mean(loss, CHANGE), 100, "+.0f"),
-        "-"
-        if replaced is None or camera == PIXELS
-        else estimate_text(crossed_mean(replaced, RATE), 100, ".0f"),
-    )
+    return (f"`{camera}`", f"{hz}", *means, estimate_text(crossed_mean(loss, CHANGE), 100, "+.0f"))
+
+
+def _by_rates(groups: Mapping[tuple[int, str], Group]) -> str:
+    """Success at every rate, also by `PIXELS` in place of `FRAMES`, as a table."""
+    rates = sorted({rate for group in groups.values() for rate in group.own})
+    lines = []
+    for (hz, camera), group in groups.items():
+        seen = {camera: group.own} if camera == PIXELS else {camera: group.own, PIXELS: group.replaced}
+        for by, swept in seen.items():
+            cells = [_each_text(swept[rate]) if rate in swept else "-" for rate in rates]
+            lines.append((f"`{camera}`", f"{hz}", f"`{by}`", *cells))
+    head = ("Trained by", "at [Hz]", "Evaluated by", *(f"{rate} Hz" for rate in rates))
+    return markdown_table(head, lines, 3).rstrip("\n")
+
+
+def _each_text(values: np.ndarray) -> str:
+    """Success of trainings (trainings, corridors): mean and each [%]."""
+    each = ", ".join(f"{100 * rate:.0f}" for rate in values.mean(axis=1))
+    return f"{100 * values.mean():.0f} ({each})"
 
 
 def draw(about: SweepFacts, episodes: SweptEpisodes) -> Figure:

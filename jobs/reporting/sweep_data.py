@@ -20,14 +20,14 @@ from jobs.run.files import RunError, read_json, write_atomic, write_json
 
 SWEEP = "robustness"  # name of the published data of the sweep that docs/results.md is about
 ESTIMATES = (
-    *("axis", "value", "group", "trainings", "episodes"),
-    *("success_rate", "success_rate_low", "success_rate_high"),
-    *("distance_m", "distance_m_low", "distance_m_high"),
+    *(*LABELS[:3], "trainings", "episodes"),
+    *("success_rate", "success_low", "success_high"),
+    *("distance_m", "distance_low_m", "distance_high_m"),
     *("events_per_step", "dropped"),
 )
 CHANGES = (
-    *("axis", "value", "baseline_axis", "baseline_value", "group", "trainings"),
-    *("success_rate", "baseline_success_rate", "change", "change_low", "change_high"),
+    *(*LABELS[:3], "baseline_axis", "baseline_value", "trainings"),
+    *("success_rate", "baseline_success_rate", "difference", "difference_low", "difference_high"),
     *("p", "certain", "broken"),
 )
 TRAININGS = "trainings.csv"  # of every published training, how it learnt
@@ -119,7 +119,7 @@ def write_changes(folder: Path, name: str, changes: Sequence[Change]) -> None:
     """Write each change against its baseline into `<name>_changes.csv`: those that the tests are about."""
     rows = [
         (
-            *(*one.condition, *one.baseline, one.group, len(one.success)),
+            *(*one.condition, one.group, *one.baseline, len(one.success)),
             *(f"{one.success.mean():.4f}", f"{one.before.mean():.4f}"),
             *_numbers(one.difference.value, one.difference.interval, ".4f"),
             *(_text(one.difference.p, ".3g"), int(one.certain), int(one.broken.sum())),

@@ -1,7 +1,8 @@
 import pytest
 
 from jobs.reporting.camera_rates import compared, groups_of, measures, results_text
-from jobs.reporting.sweep_data import read_sweep
+from jobs.reporting.sweep_data import read_data, read_sweep
+from jobs.run.provenance import REPOSITORY
 from tests.support.sweep_folders import write_ablation
 
 
@@ -58,3 +59,25 @@ def test_a_camera_that_lacks_a_rate_is_refused(tmp_path, lost):
     kept = {(at, group): one for (at, group), one in episodes.items() if at != lost}
     with pytest.raises(ValueError, match="each camera must be trained and evaluated at"):
         groups_of(about, kept)
+
+
+def test_what_the_page_says_above_its_plan_is_what_the_published_data_say():
+    text = (REPOSITORY / "docs" / "camera_rates.md").read_text().split("## Plan")[0].replace("\n", " ")
+    about, episodes = read_data(REPOSITORY / "docs" / "data", "camera_rates")
+    groups, tests = groups_of(about, episodes), compared(groups_of(about, episodes))
+    frames, pixels = (groups[45, camera] for camera in ("frames", "pixels"))
+
+    def percent(values):
+        return f"{100 * values.mean():.0f}"
+
+    own = frames.own
+    assert (
+        f"from {percent(own[45])} % to {percent(own[400])} and {percent(own[800])} % at 400 and 800" in text
+    )
+    assert f"stays at {percent(pixels.own[400])} and {percent(pixels.own[800])} %" in text
+    assert f"succeed in {percent(frames.replaced[400])} % at 400 Hz" in text
+    assert all(sorted(own[hz].mean(axis=1))[1] <= 0.4 for hz in (400, 800))
+    (loss,) = [one for hz, name, one, _ in tests if hz == 200 and name == "loss by rates"]
+    low, high = (100 * end for end in loss.interval)
+    assert f"differs by {100 * loss.value:.0f} points [{low:+.0f}, {high:+.0f}]" in text
+    assert ("of six tests none is certain" in text) == (len(tests) == 6 and min(p for *_, p in tests) > 0.05)
