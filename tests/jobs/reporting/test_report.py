@@ -34,7 +34,7 @@ from jobs.reporting.sweep_data import (
     write_data,
     write_estimates,
 )
-from jobs.run.files import write_json
+from jobs.run.files import read_json, write_json
 from jobs.run.provenance import REPOSITORY
 from tests.support.configs import small_config
 from tests.support.episodes import flights
@@ -356,13 +356,15 @@ def test_the_page_of_a_trade_is_linked_where_there_is_one(sweep, trade, tmp_path
     assert "(trade.md)" in results_pages(about, episodes, (), (), docs, tmp_path)["results.md"]
 
 
-def test_published_estimates_and_changes_are_those_of_the_published_episodes(tmp_path):
+@pytest.mark.parametrize("name", ["robustness_estimates.csv", "robustness_changes.csv"])
+def test_published_estimates_and_changes_are_those_of_the_published_episodes(name, tmp_path):
     data = REPOSITORY / "docs" / "data"
     about, swept = read_data(data, "robustness")
-    write_estimates(tmp_path, "robustness", group_results(about, swept))
-    write_changes(tmp_path, "robustness", changes_of(about, swept))
-    for name in ("robustness_estimates.csv", "robustness_changes.csv"):
-        assert (tmp_path / name).read_text() == (data / name).read_text()
+    if name == "robustness_changes.csv":
+        write_changes(tmp_path, "robustness", changes_of(about, swept))
+    else:
+        write_estimates(tmp_path, "robustness", group_results(about, swept))
+    assert (tmp_path / name).read_text() == (data / name).read_text()
 
 
 def test_a_group_that_has_little_to_lose_is_named_beside_a_claim_about_losses():
@@ -376,7 +378,15 @@ def test_a_group_that_has_little_to_lose_is_named_beside_a_claim_about_losses():
 
 
 def test_no_simulation_stands_twice_in_the_table_of_success():
-    about, swept = read_data(REPOSITORY / "docs" / "data", "robustness")
-    lines = estimates_table(about, swept).splitlines()[2:]
-    assert len(lines) == len({json.dumps(one["same_as"]) for one in about["compared"]})
+    about = read_json(REPOSITORY / "docs" / "data" / "robustness_about.json")
+    page = (REPOSITORY / "docs" / "results_tables.md").read_text()
+    lines = page.split("## Success [%]")[1].split("| ---", 1)[1].split("\n\n")[0].splitlines()[1:]
+    assert len(lines) == len({json.dumps(one["same_as"]) for one in about["compared"]}) == 36
     assert len({line.split("|", 3)[3] for line in lines}) == len(lines)
+
+
+def test_the_table_of_success_leaves_out_what_is_the_same_simulation_as_another(sweep):
+    swept = read_sweep_episodes(sweep / "episodes.csv")
+    assert len(estimates_table(ABOUT, swept).splitlines()) == 2 + 3
+    same = [*ABOUT["compared"][:2], {**ABOUT["compared"][2], "same_as": ["sparsity", "0.2"]}]
+    assert len(estimates_table({**ABOUT, "compared": same}, swept).splitlines()) == 2 + 2
