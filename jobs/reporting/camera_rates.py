@@ -13,15 +13,14 @@ from matplotlib.ticker import NullLocator
 from jobs.analysis.plots import BLUE, GREEN, MUTED, RED, tidy
 from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_difference, crossed_mean, holm
 from jobs.analysis.tables import estimate_text, markdown_table
-from jobs.config.conditions import NOMINAL
-from jobs.evaluation.group_stats import CHANGE, RATE, Condition, episode_values
+from jobs.evaluation.group_stats import CHANGE, RATE, episode_values
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import SweptEpisodes
 
 CAMERAS = "camera_rates"  # name of the experiment, and of what is published of it
 PIXELS, FRAMES = "pixels", "frames"  # cameras; a group is one of them and the rate of training
-NOMINAL_HZ = 200  # control rate of what nothing changes
-OWN, REPLACED = "control_hz", "pixels"  # axes: rates by the own camera, and by `PIXELS`
+# Axes: rates by the own camera, and by `PIXELS`. With nothing changed each training has the rate of its own.
+OWN, REPLACED = "control_hz", "pixels"
 HEAD = ("Trained by", "at [Hz]", "At its rate [%]", "At all rates [%]", "Loss by rates [points]")
 TESTS = ("Trained at [Hz]", "Measure", "`frames` minus `pixels` [points]", "p (Holm)")
 
@@ -52,8 +51,8 @@ def groups_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[tuple[int, str
     for name in about["groups"]:
         camera, hz = name.removesuffix("hz").split("_")
         swept = {at: episode_values(own, "success") for (at, group), own in episodes.items() if group == name}
-        own = {_rate(at): values for at, values in swept.items() if at[0] in (NOMINAL, OWN)}
-        replaced = {_rate(at): values for at, values in swept.items() if at[0] == REPLACED}
+        own = {int(float(rate)): values for (axis, rate), values in swept.items() if axis == OWN}
+        replaced = {int(float(rate)): values for (axis, rate), values in swept.items() if axis == REPLACED}
         found[int(hz), camera] = Group(dict(sorted(own.items())), dict(sorted(replaced.items())))
     trained = sorted({hz for hz, _ in found})
     every = {(hz, camera): set(trained) for hz in trained for camera in (FRAMES, PIXELS)}
@@ -61,11 +60,6 @@ def groups_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[tuple[int, str
     if lacking:
         raise ValueError(f"each camera must be trained and evaluated at {trained} Hz; lacking: {lacking}")
     return dict(sorted(found.items()))
-
-
-def _rate(condition: Condition) -> int:
-    axis, value = condition
-    return NOMINAL_HZ if axis == NOMINAL else int(float(value))
 
 
 def measures(group: Group, hz: int) -> dict[str, np.ndarray]:
