@@ -2,8 +2,8 @@
 
 Run from the repository root: python -m docs.from_data [FOLDER]
 Writes results.md, results_tables.md, the table of robustness.md, what stands below the plan of each planned
-study, and each figure whose data are there, as `+exp=report` does, into FOLDER and FOLDER/images; by default
-docs. docs/data.md explains the data.
+study, and each figure whose data are there, as `+exp=report` and the studies' commands do, into FOLDER and
+FOLDER/images; by default docs. docs/data.md explains the data.
 """
 
 import csv

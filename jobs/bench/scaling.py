@@ -48,7 +48,7 @@ OBJECT_STORE = 150 * 2**20
 
 
 def main() -> None:
-    """Measure, and print the tables."""
+    """Measure, print the tables, and write what was measured into the file that is named, if one is."""
     settings = ["model=event_columns", "algo=ppo_fast", "algo.lr_schedule=constant"]
     step_bytes, weight_bytes = bytes_sent(*settings)
     rates: dict[tuple[int, int], float] = {}

@@ -95,7 +95,7 @@ def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
             markdown_table(TESTS, lines, 2).rstrip("\n"),
             markdown_table(HEAD, [_row(*name, one) for name, one in groups.items()], 1).rstrip("\n"),
             "Means with 95 % intervals by trainings and corridors, each alone.",
-            "Success [%] at each rate: the mean, in brackets each training.",
+            "Success [%] at each rate: the mean, in brackets each training; -: not evaluated.",
             _by_rates(groups),
         ]
     )

@@ -1,11 +1,14 @@
-"""Pages of planned studies: the plan stands above and is left as it is, what is below it is written anew."""
+"""Pages of planned studies, and what pages of results say of how they were made.
+
+The plan of a study stands above and is left as it is, what is below it is written anew.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from jobs.config.conditions import NOMINAL
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
-from jobs.reporting.breaks import SweptEpisodes, place
+from jobs.reporting.breaks import SweptEpisodes, content, place
 from jobs.reporting.words import condition_text
 from jobs.run.files import write_atomic
 
@@ -25,9 +28,10 @@ def write_below_plan(page: Path, text: str) -> Path:
 
 
 def made_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
-    """The sentences on what made the results of a study."""
+    """The sentences on what made the results of a study; what several conditions share is counted once."""
     groups = ", ".join(f"`{group}` ({len(seeds)})" for group, seeds in about["groups"].items())
-    count = sum(len(own) for trainings in episodes.values() for own in trainings.values())
+    different = {(group, content(trainings)): trainings for (_, group), trainings in episodes.items()}
+    count = sum(len(own) for trainings in different.values() for own in trainings.values())
     return (
         f"Made on {about['date']} by `{about['command']}`, then `python -m platform.launch +exp=report`; run "
         f"`{about['run']}`, evaluated at commit {', '.join(commit[:7] for commit in about['evaluated_at'])}. "

@@ -315,9 +315,9 @@ def _foretold(changes: Sequence[Change]) -> str:
     certain = [change for change in several if change.certain and _loses(change)]
     sizes = sorted({len(change.success) for change in several})
     if not certain:
-        count = " to ".join(str(size) for size in sizes[:1] + sizes[1:][-1:])
-        few = f": {count} trainings of a group are too few for that" if sizes else ""
-        return f"Of what a further training would lose nothing is certain (of {len(several)} changes){few}."
+        count = " or ".join(str(size) for size in sizes)
+        of = f" of groups of {count} trainings" if sizes else ""
+        return f"What a further training would lose: none of {len(several)} changes{of} is certain among all."
     named = ", ".join(f"`{one.group}` with {_drop_text(one)}" for one in certain)
     return (
         f"What a further training would lose for certain, {len(certain)} of {len(several)} changes of groups "
@@ -339,7 +339,7 @@ def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> st
     named = {
         verdict: [
             f"`{claim.ours}` {claim.text} (against `{claim.theirs}`"
-            f"{beside.get(claim.theirs, '') if claim.change else ''})"
+            f"{beside.get(claim.theirs, '') if claim.change and verdict == 'reversed' else ''})"
             for claim, one in findings.items()
             if one.verdict == verdict
         ]

@@ -42,7 +42,10 @@ EARLIER = (
     "same."
 )
 # Commit of a published study -> what has changed since of what it measured.
-SINCE = {"28420bd": "The simulator was rewritten since: speeds and event errors are of the one before."}
+SINCE = {
+    "81ef066": "The simulator was rewritten since: event errors are of the one before.",
+    "28420bd": "The simulator was rewritten since: speeds and event errors are of the one before.",
+}
 
 
 def read_sweep(sweep: Path) -> tuple[SweepFacts, SweptEpisodes]:
@@ -146,7 +149,7 @@ def read_data(folder: Path, name: str) -> tuple[SweepFacts, SweptEpisodes]:
 
 
 def replaced_text(commit: str) -> str:
-    """What a page says of an earlier study: which groups it had of other trainings; "" if it is not earlier.
+    """What a page says of an earlier study: groups of other trainings, another simulator; "" of a later one.
 
     Args:
         commit: Of the study that the page is about.
@@ -156,8 +159,8 @@ def replaced_text(commit: str) -> str:
         "`models/pretrained` today."
         for group, shipped in REPLACED.get(commit[:7], {}).items()
     ]
-    since = [SINCE[commit[:7]]] if commit[:7] in SINCE else []
-    return " ".join((*sentences, EARLIER, *since)) if sentences else ""
+    since = SINCE.get(commit[:7], "")
+    return " ".join(filter(None, (*sentences, EARLIER if sentences else "", since)))
 
 
 def copy_plot(picture: Path, target: Path) -> None:

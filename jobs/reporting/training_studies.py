@@ -43,8 +43,9 @@ STUDIES = {
         camera_rates.results_text,
         camera_rates.draw,
         "Success against control rate for trainings by either camera at three rates",
-        "A dot is one training, a line the mean of the three; the dotted line is the rate at which they were "
-        "trained. Green: trained by `frames`, evaluated by `pixels`.",
+        "A marker is one training, set a little aside of its rate, a line the mean of the three; dotted: the "
+        "rate at which they were trained. Blue: `pixels`, red: `frames`, green: trained by `frames`, "
+        "evaluated by `pixels`.",
     ),
 }
 

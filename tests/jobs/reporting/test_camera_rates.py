@@ -1,5 +1,6 @@
 import pytest
 
+from jobs.reporting.breaks import content
 from jobs.reporting.camera_rates import compared, groups_of, measures, results_text
 from jobs.reporting.sweep_data import read_data, read_sweep
 from jobs.run.provenance import REPOSITORY
@@ -21,6 +22,19 @@ def test_each_group_has_five_rates_by_its_own_camera_and_three_by_the_other(tmp_
     assert all(list(one.own) == [45, 100, 200, 400, 800] for one in groups.values())
     assert all(list(one.replaced) == [45, 200, 400] for one in groups.values())
     assert {values.shape for one in groups.values() for values in one.own.values()} == {(3, 14)}
+
+
+def test_what_was_flown_with_nothing_changed_stands_for_no_rate(tmp_path):
+    """A training at 45 Hz flies at 45 Hz with nothing changed, one at 400 Hz at 400 Hz."""
+    groups = groups_of(*study(tmp_path, lambda group, axis, value, seed: 14 * (axis == "nominal")))
+    assert all(values.all() for one in groups.values() for values in one.own.values())
+
+
+def test_no_two_rates_of_the_published_trainings_are_the_same_flights():
+    _, episodes = read_data(REPOSITORY / "docs" / "data", "camera_rates")
+    for axis in ("control_hz", "pixels"):
+        swept = [(group, content(own)) for (at, group), own in episodes.items() if at[0] == axis]
+        assert len(set(swept)) == len(swept)
 
 
 def test_a_loss_at_other_rates_is_that_of_the_rate_of_training(tmp_path):

@@ -1,5 +1,4 @@
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ from jobs.analysis.tables import write_csv
 from jobs.bench.encoder import compare
 from jobs.config.config import ConfigError
 from jobs.run.folder import locate_run
+from jobs.run.provenance import REPOSITORY
 from jobs.studies.encoder import costs as encoder_costs
 from jobs.studies.encoder import trade as trade_encoder
 from jobs.studies.encoder.costs import (
@@ -35,7 +35,6 @@ from models.kinds import DenseModel
 from tests.support.configs import small_config
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
-ROOT = Path(__file__).resolve().parents[4]
 WINDOWS = [(make_events(count, seed=count), 0, WINDOW_US) for count in (0, 1, 40, 300)]
 
 
@@ -165,9 +164,9 @@ def test_the_figure_of_costs_has_no_line_and_its_axis_of_shares_begins_at_zero()
 
 
 def test_the_published_costs_are_those_of_the_page():
-    page = (ROOT / "docs" / "encoder_accuracy.md").read_text().split("## ")[0]
+    page = (REPOSITORY / "docs" / "encoder_accuracy.md").read_text().split("## ")[0]
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
-    published = read_costs(ROOT / "docs" / "data" / "encoder_costs.csv")
+    published = read_costs(REPOSITORY / "docs" / "data" / "encoder_costs.csv")
     cells = [list(cost_cells(row, published[1].dense_us)) for row in published]
     for row in (*lines, *cells):
         del row[4]  # a quotient, which whole microseconds do not give to the digit
