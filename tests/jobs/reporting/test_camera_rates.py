@@ -13,7 +13,7 @@ def study(folder, failed):
 
 def frames_lose_elsewhere(group, axis, value, seed):
     """Those trained by frames lose 6 of 14 at every rate but 200 Hz by their own camera."""
-    return seed % 2 + 6 * (group.startswith("frames") and axis == "control_hz")
+    return seed % 2 + 6 * (group.startswith("frames") and axis == "control_hz" and value != "200")
 
 
 def test_each_group_has_five_rates_by_its_own_camera_and_three_by_the_other(tmp_path):
@@ -84,14 +84,21 @@ def test_what_the_page_says_above_its_plan_is_what_the_published_data_say():
     def percent(values):
         return f"{100 * values.mean():.0f}"
 
+    def listed(by_rate, *rates):
+        *most, last = (percent(by_rate[hz]) for hz in rates)
+        return f"{', '.join(most)} and {last} %"
+
     own = frames.own
+    fallen = listed(own, 200, 400, 800)
+    assert f"falls from {percent(own[45])} % to {fallen} at 200, 400 and 800 Hz" in text
+    assert all(sorted(own[hz].mean(axis=1))[1] <= 0.4 for hz in (200, 400, 800))
+    assert f"By `pixels` trainings keep {listed(pixels.own, 200, 400, 800)}" in text
+    assert f"succeed in {listed(frames.replaced, 200, 400)} at 200 and 400 Hz" in text
+    loss = {hz: (one, p) for hz, name, one, p in tests if name == "loss by rates"}
+    usual, slow = ([100 * end for end in loss[hz][0].interval] for hz in (200, 45))
+    assert f"lose {100 * loss[200][0].value:.0f} points [{usual[0]:+.0f}, {usual[1]:+.0f}] more" in text
     assert (
-        f"from {percent(own[45])} % to {percent(own[400])} and {percent(own[800])} % at 400 and 800" in text
+        f"({100 * loss[45][0].value:+.0f} points [{slow[0]:+.0f}, {slow[1]:+.0f}], p = {loss[45][1]:.2g}"
+        in text
     )
-    assert f"stays at {percent(pixels.own[400])} and {percent(pixels.own[800])} %" in text
-    assert f"succeed in {percent(frames.replaced[400])} % at 400 Hz" in text
-    assert all(sorted(own[hz].mean(axis=1))[1] <= 0.4 for hz in (400, 800))
-    (loss,) = [one for hz, name, one, _ in tests if hz == 200 and name == "loss by rates"]
-    low, high = (100 * end for end in loss.interval)
-    assert f"differs by {100 * loss.value:.0f} points [{low:+.0f}, {high:+.0f}]" in text
     assert ("of six tests none is certain" in text) == (len(tests) == 6 and min(p for *_, p in tests) > 0.05)
