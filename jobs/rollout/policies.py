@@ -79,9 +79,8 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     # Policies of earlier versions name their conditions among the settings of their training, or have none:
     # what they met is then their simulation as it is.
     named = manifest.get("conditions") or manifest.get("train", {}).get("conditions")
-    met: list[dict[str, Any]] = named or [{}]
-    about = identity, manifest["sensor"], observation, manifest.get("world", {}), met
-    return EvaluatedPolicy(agent, group, int(manifest["seed"]), *about)
+    seed, sensor, world = int(manifest["seed"]), manifest["sensor"], manifest.get("world", {})
+    return EvaluatedPolicy(agent, group, seed, identity, sensor, observation, world, named or [{}])
 
 
 def find_policy(config: Config, run: Run) -> EvaluatedPolicy:
