@@ -21,11 +21,18 @@ from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
 from jobs.reporting.claims_study import published_text as claims_text
 from jobs.reporting.dose_response import DOSES, draw, read_doses
 from jobs.reporting.dose_response import published_text as dose_response_text
-from jobs.reporting.figures import results_figures
+from jobs.reporting.figures import group_results, results_figures
 from jobs.reporting.learning_curves import read_trainings
 from jobs.reporting.planned_page import below_plan
 from jobs.reporting.report import results_pages, write_figures
-from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep_episodes
+from jobs.reporting.sweep_data import (
+    SWEEP,
+    TRAININGS,
+    read_data,
+    read_sweep_episodes,
+    write_changes,
+    write_estimates,
+)
 from jobs.reporting.training_studies import STUDIES as TRAINING_STUDIES
 from jobs.reporting.training_studies import draw_study as draw_training_study
 from jobs.reporting.training_studies import published_text as study_text
@@ -167,11 +174,11 @@ def pages(docs: Path, drawn: Collection[str]) -> dict[str, str]:
 
 
 def main(docs: Path, target: Path) -> None:
-    """Write pages and figures.
+    """Write pages, figures, and what is estimated from the sweep's episodes.
 
     Args:
         docs: Where the data and the pages are.
-        target: Where pages go, figures into `images`.
+        target: Where pages go, figures into `images`, estimates into `data`.
     """
     drawn = figures(docs / "data")
     texts = pages(docs, drawn)
@@ -179,6 +186,11 @@ def main(docs: Path, target: Path) -> None:
     write_figures(target / "images", drawn)
     for name, text in texts.items():
         write_atomic(target / name, text)
+    if "results.md" in texts:
+        (target / "data").mkdir(exist_ok=True)
+        about, episodes = read_data(docs / "data", SWEEP)
+        write_estimates(target / "data", SWEEP, group_results(about, episodes))
+        write_changes(target / "data", SWEEP, changes_of(about, episodes))
     for name in (*texts, *(f"images/{name}.png" for name in drawn)):
         sys.stdout.write(f"{target / name}\n")
 

@@ -86,7 +86,9 @@ def test_pages_and_figures_are_written_from_the_data_alone(tmp_path, monkeypatch
     monkeypatch.setattr(from_data, "results_figures", lambda *data: {"results_map": Figure()})
     main(docs, again)
     written = {str(path.relative_to(again)) for path in again.rglob("*") if path.is_file()}
-    assert written == {"results.md", "results_tables.md", "robustness.md", "images/results_map.png"}
+    estimated = {"data/robustness_estimates.csv", "data/robustness_changes.csv"}
+    pages = {"results.md", "results_tables.md", "robustness.md"}
+    assert written == pages | estimated | {"images/results_map.png"}
     assert "| `bytestream` (3) | 80 |" in (again / "robustness.md").read_text()
     assert (docs / "robustness.md").read_text() == f"before\n{BEGIN}{END}"
     main(docs, docs)
