@@ -89,6 +89,9 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
 def trained_policies(config: Config) -> dict[tuple[str, int], Path]:
     """The policy folders of all trainings in `ablation.trained`, by variant and seed, named as by +exp=ship.
 
+    Those of another experiment are taken, too, where it names its variants alike and only one such training
+    is there: a study may evaluate what another has trained.
+
     Raises:
         ConfigError: A training is missing, or its manifest says that it was trained otherwise.
     """
@@ -98,6 +101,8 @@ def trained_policies(config: Config) -> dict[tuple[str, int], Path]:
         for seed in seeds_of(config, name):
             expected = as_dict(variant_config(config, name, seed))
             place = Path(named) / f"{group_name(expected)}-s{seed}"
+            others = [path.parent for path in Path(named).glob(f"*_{name}-s{seed}/{MANIFEST}")]
+            place = others[0] if not place.is_dir() and len(others) == 1 else place
             found[name, seed] = place
             if not (place / MANIFEST).is_file():
                 wrong.append(f"{place.name} is not there")

@@ -17,6 +17,7 @@ from tests.support.configs import CONF, compose
 JOBS = {
     "robustness": "sweep",
     "dose_response": "sweep",
+    "dose_response_taught": "ablation",
     "calibrated_camera": "ablation",
     "camera_rates": "ablation",
     "encoder_seeds": "ablation",

@@ -242,6 +242,16 @@ def test_policies_that_were_trained_before_are_taken_by_name_if_they_were_traine
     assert {key: place.name for key, place in trained_policies(config).items()} == {
         (name, seed): f"ablation_{name}-s{seed}" for name in variants for seed in (0, 1)
     }
+    elsewhere = dataclasses.replace(config, exp="another")
+    assert trained_policies(elsewhere) == trained_policies(config)
+    (tmp_path / "ablation_other-s1").rename(tmp_path / "third_other-s1")
+    assert trained_policies(elsewhere)["other", 1].name == "third_other-s1"
+    (tmp_path / "ablation_recipe-s0").rename(tmp_path / "another_recipe-s0")
+    save_trained(tmp_path, "recipe", 0, settings, lr=1e-2)  # of its own experiment it has one
+    assert trained_policies(elsewhere)["recipe", 0].name == "another_recipe-s0"
+    save_trained(tmp_path, "other", 1, settings, lr=1e-4)
+    with pytest.raises(ConfigError, match="another_other-s1 is not there"):  # of two others none is meant
+        trained_policies(elsewhere)
 
 
 @pytest.mark.slow
