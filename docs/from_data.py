@@ -21,6 +21,8 @@ from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
 from jobs.reporting.claims_study import published_text as claims_text
 from jobs.reporting.dose_response import DOSES, draw, read_doses
 from jobs.reporting.dose_response import published_text as dose_response_text
+from jobs.reporting.dose_taught import DOSES_TAUGHT, draw_published
+from jobs.reporting.dose_taught import published_text as dose_taught_text
 from jobs.reporting.figures import group_results, results_figures
 from jobs.reporting.learning_curves import read_trainings
 from jobs.reporting.planned_page import below_plan
@@ -61,6 +63,11 @@ def dose_response(data: Path) -> dict[str, Figure]:
     return {
         DOSES: draw(read_doses(data / f"{DOSES}_doses.csv"), changes_of(*read_data(data, DOSES), every=True))
     }
+
+
+def dose_taught(data: Path) -> dict[str, Figure]:
+    """That of dose_response_taught.md."""
+    return {DOSES_TAUGHT: draw_published(data)}
 
 
 def taught_claims(data: Path) -> dict[str, Figure]:
@@ -127,6 +134,7 @@ def scaling(data: Path) -> dict[str, Figure]:
 STUDIES: dict[Callable[[Path], Mapping[str, Figure]], tuple[str, ...]] = {
     results: (f"{SWEEP}_episodes.csv.gz", f"{SWEEP}_about.json", TRAININGS),
     dose_response: (f"{DOSES}_episodes.csv.gz", f"{DOSES}_about.json", f"{DOSES}_doses.csv"),
+    dose_taught: tuple(f"{DOSES_TAUGHT}_{part}" for part in ("episodes.csv.gz", "about.json", "doses.csv")),
     taught_claims: (f"{TAUGHT}_episodes.csv.gz", f"{TAUGHT}_about.json"),
     ppo_claims: (f"{BY_PPO}_episodes.csv.gz", f"{BY_PPO}_about.json"),
     **{
@@ -164,6 +172,8 @@ def pages(docs: Path, drawn: Collection[str]) -> dict[str, str]:
         )
     if DOSES in drawn:
         found[f"{DOSES}.md"] = below_plan(docs / f"{DOSES}.md", dose_response_text(data))
+    if DOSES_TAUGHT in drawn:
+        found[f"{DOSES_TAUGHT}.md"] = below_plan(docs / f"{DOSES_TAUGHT}.md", dose_taught_text(data))
     for name in (TAUGHT, BY_PPO):
         if name in drawn:
             found[f"{name}.md"] = below_plan(docs / f"{name}.md", claims_text(data, name))

@@ -25,6 +25,7 @@ def dose_plot(
     changes: Sequence[Change],
     errors: Mapping[Condition, float],
     met: Collection[tuple[str, str, str]] = (),
+    dashed: Sequence[Change] = (),
 ) -> Figure:
     """Draw a panel for each group: change of success [points] with its interval, a line for each kind.
 
@@ -32,14 +33,16 @@ def dose_plot(
         changes: What is drawn.
         errors: Condition -> event error that was measured.
         met: Axis, value and group of what trainings met; their markers are hollow.
+        dashed: Changes under the same conditions behind a filter, drawn as dashed lines.
     """
     groups = list(dict.fromkeys(change.group for change in changes))
     kinds = list(dict.fromkeys(kind for kind, _ in errors))
     figure, panels = panel_grid(len(groups), 4, (3.1, 2.7), (0.4, 0.9), sharex=True, sharey=True)
     for panel, group in zip(panels, groups, strict=True):
         for place, kind in enumerate(kinds):
-            own = [one for one in changes if (one.group, one.condition[0]) == (group, kind)]
-            _draw_kind(panel, own, errors, met, DODGE * (place - (len(kinds) - 1) / 2))
+            aside = DODGE * (place - (len(kinds) - 1) / 2)
+            _draw_kind(panel, _own(changes, group, kind), errors, met, aside)
+            _draw_kind(panel, _own(dashed, group, kind), errors, met, aside, "--")
         panel.axhline(0, color=MUTED, lw=0.8, zorder=1)
         count = max(len(one.success) for one in changes if one.group == group)
         plural = "s" if count > 1 else ""
@@ -51,6 +54,8 @@ def dose_plot(
     keys = [Line2D([], [], color=_look(kind)[0], marker=_look(kind)[1], label=kind) for kind in kinds]
     if met:
         keys.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="met in training"))
+    if dashed:
+        keys.append(Line2D([], [], color=MUTED, ls="--", label="behind the filter"))
     figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), frameon=False, fontsize=9)
     figure.supxlabel("Measured event error [%], square-root scale", fontsize=9)
     figure.supylabel("Change of success [points]", fontsize=9)
@@ -61,12 +66,17 @@ def _look(kind: str) -> tuple[str, str]:
     return KINDS.get(kind, OTHER)
 
 
+def _own(changes: Sequence[Change], group: str, kind: str) -> list[Change]:
+    return [one for one in changes if (one.group, one.condition[0]) == (group, kind)]
+
+
 def _draw_kind(
     panel: Axes,
     changes: Sequence[Change],
     errors: Mapping[Condition, float],
     met: Collection[tuple[str, str, str]],
     aside: float,
+    line: str = "-",
 ) -> None:
     """Draw the line of one kind through no error and no change, its intervals, and a marker for each dose."""
     if not changes:
@@ -75,7 +85,7 @@ def _draw_kind(
     colour, marker = _look(ordered[0].condition[0])
     x = np.sqrt([100 * errors[one.condition] for one in ordered]) + aside
     y = [100 * one.difference.value for one in ordered]
-    panel.plot([0.0, *x], [0.0, *y], color=colour, lw=1.6, zorder=3)
+    panel.plot([0.0, *x], [0.0, *y], color=colour, lw=1.6, ls=line, zorder=3)
     for place, value, one in zip(x, y, ordered, strict=True):
         ends = [100 * end for end in one.difference.interval or ()]
         panel.plot([place] * len(ends), ends, color=colour, lw=1.0, alpha=0.55, zorder=2)

@@ -241,13 +241,8 @@ def write_dose_response(
     env = dataclasses.replace(env, scene=about["scene"], split="eval")
     doses = doses_of(about["axes"], env, drawn_conditions(about["groups"], pretrained))
     write_data(docs / "data", DOSES, sweep, swept)
-    rows = [
-        (*one.condition, "" if one.asked is None else f"{one.asked:.4f}", f"{one.measured:.4f}",
-         " ".join(one.met_by))
-        for one in doses
-    ]  # fmt: skip
     table = docs / "data" / f"{DOSES}_doses.csv"
-    write_csv(table, DATA, rows)
+    write_doses(table, doses)
     doses, changes = read_doses(table), changes_of(about, swept, every=True)  # the plan names all of them
     save_plot(docs / "images" / f"{DOSES}.png", draw(doses, changes))
     return write_below_plan(docs / f"{DOSES}.md", results_text(about, swept, doses, changes))
@@ -258,6 +253,16 @@ def published_text(data: Path) -> str:
     about, swept = read_data(data, DOSES)
     doses = read_doses(data / f"{DOSES}_doses.csv")
     return results_text(about, swept, doses, changes_of(about, swept, every=True))
+
+
+def write_doses(file: Path, doses: Sequence[Dose]) -> None:
+    """Write the table of the doses, which `read_doses` reads."""
+    rows = [
+        (*one.condition, "" if one.asked is None else f"{one.asked:.4f}", f"{one.measured:.4f}",
+         " ".join(one.met_by))
+        for one in doses
+    ]  # fmt: skip
+    write_csv(file, DATA, rows)
 
 
 def read_doses(file: Path) -> list[Dose]:
@@ -372,7 +377,7 @@ def change_table(changes: Sequence[Change], doses: Sequence[Dose], groups: Seque
     found = {(one.condition, one.group): one for one in changes}
     lines = [
         (
-            dose.kind,
+            dose.kind.replace("_", ", "),
             f"{100 * dose.measured:.1f}",
             *(_change_text(found.get((dose.condition, group)), group in dose.met_by) for group in groups),
         )

@@ -3,8 +3,9 @@
 Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
 docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page, the results in
-docs/dose_response.md, docs/taught_claims.md, docs/ppo_claims.md, docs/encoder_seeds.md and
-docs/camera_rates.md of the newest studies of these names; with `resume` of what that run folder holds.
+docs/dose_response.md, docs/dose_response_taught.md, docs/taught_claims.md, docs/ppo_claims.md,
+docs/encoder_seeds.md and docs/camera_rates.md of the newest studies of these names; with `resume` of what
+that run folder holds.
 """
 
 from collections import Counter
@@ -38,6 +39,7 @@ from jobs.reporting.claims_study import (
     write_claims_study,
 )
 from jobs.reporting.dose_response import DOSES, write_dose_response
+from jobs.reporting.dose_taught import DOSES_TAUGHT, write_dose_taught
 from jobs.reporting.figures import group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
@@ -91,6 +93,7 @@ def run(config: Config) -> dict[str, Any]:
         "sweep": write_results,
         "replay": write_replay,
         DOSES: partial(write_dose_response, env=config.env),
+        DOSES_TAUGHT: partial(write_dose_taught, env=config.env),
         BY_PPO: partial(write_claims_study, name=BY_PPO),
         TAUGHT: partial(write_claims_study, name=TAUGHT),
         **{name: partial(write_training_study, name=name) for name in STUDIES},
@@ -112,11 +115,11 @@ def find_study(config: Config, name: str) -> Path | None:
     Args:
         config: The experiment.
         name: "sweep", "trade" or "replay", as its folder is called; `DOSES` is the sweep of that experiment,
-            "sweep" that of any other in the corridors of evaluation, `TAUGHT`, `BY_PPO` and `STUDIES` the
-            ablations of these experiments.
+            "sweep" that of any other in the corridors of evaluation, `DOSES_TAUGHT`, `TAUGHT`, `BY_PPO` and
+            `STUDIES` the ablations of these experiments.
     """
     where = Path(config.runs_dir).glob("*") if config.resume is None else [Path(config.resume)]
-    ablations = dict.fromkeys((TAUGHT, BY_PPO, *STUDIES), "ablation")
+    ablations = dict.fromkeys((DOSES_TAUGHT, TAUGHT, BY_PPO, *STUDIES), "ablation")
     folder = {DOSES: "sweep", **ablations}.get(name, name)
     found = [path for path in (run / folder / "about.json" for run in where) if path.is_file()]
     if folder == "sweep":
