@@ -57,7 +57,7 @@ def test_the_study_by_ppo_is_that_of_taught_policies_but_for_how_they_learn():
     taught, ppo = (parse(compose(f"+exp={name}")) for name in (TAUGHT, BY_PPO))
     assert (taught.sweep, taught.ablation.seeds) == (ppo.sweep, ppo.ablation.seeds)
     groups = {one for claim in (*CLAIMS, *LEARNT) for one in (claim.ours, claim.theirs)}
-    assert set(taught.ablation.variants) < set(ppo.ablation.variants) == groups
+    assert set(taught.ablation.variants) < set(ppo.ablation.variants) == groups - {"rgb"}  # left out by its plan
     for name in taught.ablation.variants:
         one, other, usual = (
             as_dict(config)
@@ -162,10 +162,10 @@ def test_each_study_is_shown_beside_the_other_way_to_learn(tmp_path):
 def test_how_fast_groups_learn_is_tested_where_a_study_has_learning_curves(tmp_path):
     data = tmp_path / "data"
     write_claims_study(write_claims(tmp_path / "run" / "ablation", (), BY_PPO), tmp_path, BY_PPO)
-    assert len(read_findings(data, BY_PPO)) == 18
+    assert len(read_findings(data, BY_PPO)) == 16
     write_shipped(data / f"{BY_PPO}_policies")
     found = read_findings(data, BY_PPO)
-    assert len(found) == 19
+    assert len(found) == 17
     assert found[LEARNT[0]].overall.value == pytest.approx((0.805 - 0.405) / 2)
 
 
