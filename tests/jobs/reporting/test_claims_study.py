@@ -57,7 +57,7 @@ def test_the_study_by_ppo_is_that_of_taught_policies_but_for_how_they_learn():
     taught, ppo = (parse(compose(f"+exp={name}")) for name in (TAUGHT, BY_PPO))
     assert (taught.sweep, taught.ablation.seeds) == (ppo.sweep, ppo.ablation.seeds)
     groups = {one for claim in (*CLAIMS, *LEARNT) for one in (claim.ours, claim.theirs)}
-    assert set(taught.ablation.variants) < set(ppo.ablation.variants) == groups - {"rgb"}  # left out by its plan
+    assert set(taught.ablation.variants) < set(ppo.ablation.variants) == groups - {"rgb"}
     for name in taught.ablation.variants:
         one, other, usual = (
             as_dict(config)
