@@ -344,8 +344,8 @@ class AblationConfig:
             compared with the first. `train.init` names the first: its policy of the same seed is trained on.
             `seeds` gives a variant fewer trainings: some of `seeds` above. `encoder_seed` names one of them:
             all trainings of the variant see by the first variant's encoder of that seed.
-        trained: A folder of their policies, each named as in models/pretrained, which are then only
-            evaluated; None: they are trained.
+        trained: A folder of their policies, each named as in models/pretrained, of this experiment or of
+            another that trains the same, which are then only evaluated; None: they are trained.
     """
 
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]

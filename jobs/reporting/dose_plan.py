@@ -57,6 +57,21 @@ def check_planned(
     other = _difference("", planned, {name: about.get(name) for name in planned})
     if other:
         raise ConfigError(f"resume: {sweep} is not the planned study: its {other}; {REMEDY}")
+    check_whole(sweep, env, about, swept)
+
+
+def check_whole(sweep: Path, env: EnvConfig, about: SweepFacts, swept: SweptEpisodes) -> None:
+    """Check that a sweep has all of its episodes, and the simulation of this command.
+
+    Args:
+        sweep: The folder that the sweep has left in its run folder.
+        env: The simulation of this command, in which event errors are measured.
+        about: What made the sweep.
+        swept: Its episodes.
+
+    Raises:
+        ConfigError: It has not; the message names the first difference.
+    """
     changed = _difference("", json.loads(json.dumps(flat_env(env))), _stored_env(sweep.parent))
     if changed:
         rule = f"{sweep} must have the simulation of this command: its {changed}"

@@ -42,7 +42,7 @@ def dose_plot(
         for place, kind in enumerate(kinds):
             aside = DODGE * (place - (len(kinds) - 1) / 2)
             _draw_kind(panel, _own(changes, group, kind), errors, met, aside)
-            _draw_kind(panel, _own(dashed, group, kind), errors, met, aside, "--")
+            _draw_dashed(panel, _own(dashed, group, kind), errors, aside)
         panel.axhline(0, color=MUTED, lw=0.8, zorder=1)
         count = max(len(one.success) for one in changes if one.group == group)
         plural = "s" if count > 1 else ""
@@ -55,7 +55,9 @@ def dose_plot(
     if met:
         keys.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="met in training"))
     if dashed:
-        keys.append(Line2D([], [], color=MUTED, ls="--", label="behind the filter"))
+        keys.append(
+            Line2D([], [], color=MUTED, ls="--", marker="o", ms=3.5, mfc="white", label="behind the filter")
+        )
     figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), frameon=False, fontsize=9)
     figure.supxlabel("Measured event error [%], square-root scale", fontsize=9)
     figure.supylabel("Change of success [points]", fontsize=9)
@@ -76,7 +78,6 @@ def _draw_kind(
     errors: Mapping[Condition, float],
     met: Collection[tuple[str, str, str]],
     aside: float,
-    line: str = "-",
 ) -> None:
     """Draw the line of one kind through no error and no change, its intervals, and a marker for each dose."""
     if not changes:
@@ -85,9 +86,21 @@ def _draw_kind(
     colour, marker = _look(ordered[0].condition[0])
     x = np.sqrt([100 * errors[one.condition] for one in ordered]) + aside
     y = [100 * one.difference.value for one in ordered]
-    panel.plot([0.0, *x], [0.0, *y], color=colour, lw=1.6, ls=line, zorder=3)
+    panel.plot([0.0, *x], [0.0, *y], color=colour, lw=1.6, zorder=3)
     for place, value, one in zip(x, y, ordered, strict=True):
         ends = [100 * end for end in one.difference.interval or ()]
         panel.plot([place] * len(ends), ends, color=colour, lw=1.0, alpha=0.55, zorder=2)
         hollow = (*one.condition, one.group) in met
         panel.plot(place, value, marker, color=colour, ms=5, mfc="white" if hollow else colour, zorder=4)
+
+
+def _draw_dashed(
+    panel: Axes, changes: Sequence[Change], errors: Mapping[Condition, float], aside: float
+) -> None:
+    """Draw the dashed line of one kind, without intervals."""
+    ordered = sorted(changes, key=lambda one: errors[one.condition])
+    for colour, marker in (_look(kind) for kind in dict.fromkeys(one.condition[0] for one in ordered)):
+        x = np.sqrt([100 * errors[one.condition] for one in ordered]) + aside
+        y = [100 * one.difference.value for one in ordered]
+        panel.plot([0.0, *x], [0.0, *y], "--", color=colour, lw=1.1, zorder=3)
+        panel.plot(x, y, marker, color=colour, ms=3.5, mfc="white", zorder=5)

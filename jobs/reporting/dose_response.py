@@ -6,7 +6,7 @@ The plan stands on the page and is left as it is; what is below it is written fr
 import csv
 import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -372,12 +372,24 @@ def _verdict_text(one: Compared | None) -> str:
     return f"{verdict}: {estimate_text(one.difference, 100, '+.0f')}, p = {one.adjusted_p:.2g}{alone}"
 
 
-def change_table(changes: Sequence[Change], doses: Sequence[Dose], groups: Sequence[str]) -> str:
-    """Every change of success [points], by condition and group; certain ones in bold."""
+def change_table(
+    changes: Sequence[Change],
+    doses: Sequence[Dose],
+    groups: Sequence[str],
+    text: Callable[[str], str] = str,
+) -> str:
+    """Every change of success [points], by condition and group; certain ones in bold.
+
+    Args:
+        changes: Of the study.
+        doses: Its conditions.
+        groups: What was trained.
+        text: How a kind is called.
+    """
     found = {(one.condition, one.group): one for one in changes}
     lines = [
         (
-            dose.kind.replace("_", ", "),
+            text(dose.kind),
             f"{100 * dose.measured:.1f}",
             *(_change_text(found.get((dose.condition, group)), group in dose.met_by) for group in groups),
         )
@@ -409,7 +421,7 @@ def pair_table(changes: Sequence[Change], pairs: Sequence[tuple[Dose, Dose]], gr
 
 
 def dose_table(doses: Sequence[Dose]) -> str:
-    """What each dose is: its setting, the event error asked and measured, and who met as much."""
+    """What each dose is: its setting, the event error asked and measured, and who met as much, if anyone."""
     lines = [
         (
             dose.kind,
@@ -420,4 +432,6 @@ def dose_table(doses: Sequence[Dose]) -> str:
         )
         for dose in doses
     ]
-    return markdown_table(("Kind", "Setting", "asked [%]", "measured [%]", "met by"), lines)
+    head = ("Kind", "Setting", "asked [%]", "measured [%]", "met by")
+    shown = len(head) if any(dose.met_by for dose in doses) else len(head) - 1
+    return markdown_table(head[:shown], [line[:shown] for line in lines])

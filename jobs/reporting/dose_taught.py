@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import yaml
 from matplotlib.figure import Figure
 
 from envs.config import EnvConfig
-from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_mean, holm
-from jobs.analysis.tables import estimate_text, markdown_table, save_plot
+from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_mean, holm, rate_estimate
+from jobs.analysis.tables import estimate_text, markdown_table, percent_text, save_plot
 from jobs.config.conditions import NOMINAL
+from jobs.config.errors import ConfigError
 from jobs.evaluation.group_stats import CHANGE, episode_values
-from jobs.evaluation.sweep_plan import Axes
+from jobs.evaluation.sweep_plan import Axes, axes_of
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, replicated
+from jobs.reporting.dose_plan import ACTION, check_whole, read_plan
 from jobs.reporting.dose_plot import dose_plot
 from jobs.reporting.dose_response import (
     DRAWN,
@@ -34,14 +37,16 @@ from jobs.reporting.dose_response import (
 )
 from jobs.reporting.planned_page import made_text, write_below_plan
 from jobs.reporting.sweep_data import read_data, read_sweep, write_data
+from jobs.run.provenance import REPOSITORY
 from jobs.run.templates import render
 
 DOSES_TAUGHT = "dose_response_taught"  # name of the experiment, and of what is published of it
+TRAINED = REPOSITORY / "conf" / "exp" / "taught_claims.yaml"  # the experiment whose policies are evaluated
 TEMPLATE = Path(__file__).parent / "templates" / f"{DOSES_TAUGHT}.md.j2"
 FILTER, FILTERED = "filtered", "_filtered"  # the axis of the filter alone, and how the others behind it end
 NO_ERROR = "no error"
 MARGIN = 0.1  # of success: smaller changes do not matter
-Means = Mapping[tuple[str, str], np.ndarray]  # group and kind -> change of success (trainings, corridors)
+ByKind = Mapping[tuple[str, str], np.ndarray]  # group and kind, or axis -> values (trainings, corridors)
 
 
 class Words(NamedTuple):
@@ -53,6 +58,7 @@ class Words(NamedTuple):
 
 
 ERRORS, FILTERS = Words("costs", "gains", "free"), Words("harms", "helps", "equal")
+BEYOND = ("worse", "better")  # invented events, than another kind
 UNDECIDED = "undecided"
 
 
@@ -81,7 +87,7 @@ def mean_success(about: SweepFacts, swept: SweptEpisodes) -> dict[tuple[str, str
     }
 
 
-def error_changes(success: Means) -> dict[tuple[str, str], np.ndarray]:
+def error_changes(success: ByKind) -> dict[tuple[str, str], np.ndarray]:
     """Group and kind of error -> what it changes without a filter, of `mean_success`."""
     return {
         (group, axis): values - success[group, NOMINAL]
@@ -90,7 +96,7 @@ def error_changes(success: Means) -> dict[tuple[str, str], np.ndarray]:
     }
 
 
-def filter_changes(success: Means) -> dict[tuple[str, str], np.ndarray]:
+def filter_changes(success: ByKind) -> dict[tuple[str, str], np.ndarray]:
     """Group and kind of error, or `NO_ERROR` -> what the filter changes under it, of `mean_success`."""
     found = {}
     for (group, axis), values in success.items():
@@ -102,7 +108,7 @@ def filter_changes(success: Means) -> dict[tuple[str, str], np.ndarray]:
     return found
 
 
-def judge(changes: Means, words: Words) -> dict[tuple[str, str], Judged]:
+def judge(changes: ByKind, words: Words) -> dict[tuple[str, str], Judged]:
     """Test each change against 0; all are one family (Holm)."""
     differences = {at: crossed_mean(values, CHANGE) for at, values in changes.items()}
     adjusted = holm([1.0 if one.p is None else one.p for one in differences.values()])
@@ -119,9 +125,8 @@ def _verdict(difference: Difference, adjusted_p: float, words: Words) -> str:
     return words.within if low > -MARGIN and high < MARGIN else UNDECIDED
 
 
-def count_words(judged: Mapping[tuple[str, str], Judged], words: Words) -> dict[str, int]:
-    """Verdict -> how many tests of a family have it; none is left out."""
-    verdicts = [one.verdict for one in judged.values()]
+def count_words(verdicts: Sequence[str], words: Sequence[str]) -> dict[str, int]:
+    """Verdict -> how many tests have it; none is left out."""
     return {word: verdicts.count(word) for word in (*words, UNDECIDED)}
 
 
@@ -138,12 +143,20 @@ def _judged_text(one: Judged) -> str:
 
 
 def behind_filter(doses: Sequence[Dose], axes: Axes) -> list[Dose]:
-    """The doses that were flown behind the filter, too: the sensor's errors are the same."""
-    return [
+    """The filter alone, and the doses that were flown behind it, too: the sensor's errors are the same."""
+    alone = [Dose(FILTER, value, 0.0, 0.0, ()) for value in axes[FILTER]]
+    return alone + [
         dose._replace(kind=dose.kind + FILTERED)
         for dose in doses
         if dose.value in axes.get(dose.kind + FILTERED, {})
     ]
+
+
+def kind_text(kind: str) -> str:
+    """How the page calls a kind of error, or the same behind the filter."""
+    if kind == FILTER:
+        return "the filter alone"
+    return f"{kind.removesuffix(FILTERED)}, filtered" if kind.endswith(FILTERED) else kind
 
 
 def draw(about: SweepFacts, swept: SweptEpisodes, doses: Sequence[Dose]) -> Figure:
@@ -171,24 +184,35 @@ def results_text(about: SweepFacts, swept: SweptEpisodes, doses: Sequence[Dose])
     errors, filters = judge(means, ERRORS), judge(filter_changes(success), FILTERS)
     compared, groups = compare_kinds(means), list(about["groups"])
     kinds = list(dict.fromkeys(kind for _, kind in means))
-    verdicts = [one.verdict for one in compared]
-    nominal = {group: estimate_text(crossed_mean(success[group, NOMINAL], (0.0, 1.0)), 100, ".0f")
-               for group in groups}  # fmt: skip
+    apart = [dose.kind for dose in doses if dose.asked is None][:1]
+    every = [*doses, *behind_filter(doses, about["axes"])]
     return render(
         TEMPLATE,
         made=made_text(about, swept),
         name=DOSES_TAUGHT,
         worst=WORST,
-        nominal=nominal,
+        nominal={group: percent_text(rate_estimate(success[group, NOMINAL])) for group in groups},
+        apart=apart,
         margin=f"{100 * MARGIN:.0f}",
         costs=judged_table(errors),
-        cost_counts=count_words(errors, ERRORS),
+        cost_counts=[
+            (
+                kind,
+                count_words(
+                    [one.verdict for (_, own), one in errors.items() if (own in apart) == kind], ERRORS
+                ),
+            )
+            for kind in (False, True)
+        ],
         compared=verdict_table(compared, groups, kinds),
-        compared_counts={word: verdicts.count(word) for word in ("worse", "better", UNDECIDED)},  # type: ignore[arg-type]
+        compared_counts=[
+            (kind, count_words([one.verdict for one in compared if (one.kind in apart) == kind], BEYOND))
+            for kind in (False, True)
+        ],
         filters=judged_table(filters),
-        filter_counts=count_words(filters, FILTERS),
+        filter_counts=count_words([one.verdict for one in filters.values()], FILTERS),
         tests=len(replicated(changes)),
-        changes=change_table(changes, [*doses, *behind_filter(doses, about["axes"])], groups),
+        changes=change_table(changes, every, groups, kind_text),
         doses=dose_table(doses),
     )
 
@@ -215,15 +239,38 @@ def write_dose_taught(study: Path, docs: Path, env: EnvConfig) -> Path:
         The page.
 
     Raises:
-        ConfigError: If an earlier version wrote the study.
+        ConfigError: If an earlier version wrote the study, or it is not the planned one, complete.
         RunError: If a file of the study is damaged.
     """
     about, swept = read_sweep(study)
+    check_study(study, env, about, swept)
     env = dataclasses.replace(env, scene=about["scene"], split="eval")
     plain = {axis: points for axis, points in about["axes"].items() if axis == NOMINAL or axis in DRAWN}
     file = docs / "data" / f"{DOSES_TAUGHT}_doses.csv"
-    write_data(docs / "data", DOSES_TAUGHT, study, swept)
     write_doses(file, doses_of(plain, env, {}))
     doses = read_doses(file)
-    save_plot(docs / "images" / f"{DOSES_TAUGHT}.png", draw(about, swept, doses))
-    return write_below_plan(docs / f"{DOSES_TAUGHT}.md", results_text(about, swept, doses))
+    text, figure = results_text(about, swept, doses), draw(about, swept, doses)
+    write_data(docs / "data", DOSES_TAUGHT, study, swept)
+    save_plot(docs / "images" / f"{DOSES_TAUGHT}.png", figure)
+    return write_below_plan(docs / f"{DOSES_TAUGHT}.md", text)
+
+
+def check_study(study: Path, env: EnvConfig, about: SweepFacts, swept: SweptEpisodes) -> None:
+    """Check that a study has the trainings, corridors and doses of its plan, and all of its episodes.
+
+    Raises:
+        ConfigError: It has not; the message names what it has instead.
+    """
+    plan = read_plan()
+    trained = yaml.safe_load(TRAINED.read_text())["ablation"]
+    groups = dict.fromkeys(trained["variants"], trained["seeds"])
+    planned = {"groups": groups, "trials": plan.trials, "action": ACTION, "axes": axes_of(plan)}
+    found = {name: about.get(name) for name in planned}
+    found["axes"] = {name: about["axes"].get(name) for name in planned["axes"]}
+    for name, asked in planned.items():
+        if found[name] != asked:
+            rule = f"{study} is not the planned study: its {name} must be {asked!r}, got {found[name]!r}"
+            raise ConfigError(
+                f"resume: {rule}; give `python -m platform.launch +exp={DOSES_TAUGHT}` as it stands"
+            )
+    check_whole(study, env, about, swept)

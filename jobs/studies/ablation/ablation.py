@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from envs.config import sensor_settings
 from jobs.config.conditions import NOMINAL
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.errors import differences
@@ -89,8 +90,8 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
 def trained_policies(config: Config) -> dict[tuple[str, int], Path]:
     """The policy folders of all trainings in `ablation.trained`, by variant and seed, named as by +exp=ship.
 
-    Those of another experiment are taken, too, where it names its variants alike and only one such training
-    is there: a study may evaluate what another has trained.
+    Those of another experiment are taken, too, where only one folder's name ends as that of the training
+    does: a study may evaluate what another has trained.
 
     Raises:
         ConfigError: A training is missing, or its manifest says that it was trained otherwise.
@@ -99,17 +100,23 @@ def trained_policies(config: Config) -> dict[tuple[str, int], Path]:
     found, wrong = {}, []
     for name in config.ablation.variants:
         for seed in seeds_of(config, name):
-            expected = as_dict(variant_config(config, name, seed))
+            training = variant_config(config, name, seed)
+            expected = as_dict(training)
             place = Path(named) / f"{group_name(expected)}-s{seed}"
-            others = [path.parent for path in Path(named).glob(f"*_{name}-s{seed}/{MANIFEST}")]
+            ending = place.name.removeprefix(config.exp)
+            others = [path.parent for path in Path(named).glob(f"*{ending}/{MANIFEST}")]
             place = others[0] if not place.is_dir() and len(others) == 1 else place
             found[name, seed] = place
             if not (place / MANIFEST).is_file():
                 wrong.append(f"{place.name} is not there")
                 continue
-            there, here = told(read_policy_manifest(place / MANIFEST)), told(expected)
+            manifest = read_policy_manifest(place / MANIFEST)
+            there, here = told(manifest), told(expected)
             both = there.keys() & here.keys()  # older policies lack what was added since
             differ = differences({key: there[key] for key in both}, {key: here[key] for key in both})
+            sensor = sensor_settings(training.env)
+            seen = {key: value for key, value in manifest["sensor"].items() if key in sensor}
+            differ = differ or differences(seen, {key: sensor[key] for key in seen})
             wrong += [f"{place.name} has {differ}"] if differ else []
     if wrong:
         rule = f"must hold every training, as +exp={config.exp} makes and +exp=ship names them"

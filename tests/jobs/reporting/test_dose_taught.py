@@ -1,14 +1,19 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from docs.from_data import figures, pages
-from jobs.config.config import parse
+from jobs.config.config import ConfigError, parse
+from jobs.config.env_keys import flat_env
 from jobs.reporting import dose_response
+from jobs.reporting.dose_plot import KINDS as LOOKS
 from jobs.reporting.dose_response import asked_error
 from jobs.reporting.dose_taught import (
     ERRORS,
     FILTERS,
     count_words,
+    draw,
     error_changes,
     filter_changes,
     judge,
@@ -18,6 +23,8 @@ from jobs.reporting.dose_taught import (
 from jobs.reporting.planned_page import RESULTS
 from jobs.reporting.report import find_study
 from jobs.reporting.sweep_data import read_sweep
+from jobs.run.files import read_json, write_json
+from jobs.studies.ablation.ablation import trained_policies
 from tests.support.configs import compose
 from tests.support.sweep_folders import KINDS, write_ablation
 
@@ -27,16 +34,21 @@ FILTERED = ("lost", "displaced", "invented")
 
 
 def failed(group, axis, value, seed):
-    """Invented events cost one group most of its flights without a filter, and some behind it."""
-    lost = {"invented": 11, "invented_filtered": 4}.get(axis, 0) if group == "bytestream" else 0
-    return seed % 2 + lost
+    """Invented events cost one group flights, the largest dose most; the filter costs two and saves more."""
+    lost = 2 if axis in ("filtered", "lost_filtered", "displaced_filtered") else 0
+    if axis.startswith("invented"):
+        most = float(value) > 1
+        lost = (3 if most else 2) if axis.endswith("filtered") else (12 if most else 8)
+    return seed % 2 + (lost if group == "bytestream" else 0)
 
 
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     """The folder that the study of constructed episodes leaves."""
     monkeypatch.setattr(dose_response, "error_between", lambda one, other: 0.125)
-    return write_ablation(tmp_path / "runs" / "one" / "ablation", NAME, failed)
+    folder = write_ablation(tmp_path / "runs" / "one" / "ablation", NAME, failed)
+    write_json(folder.parent / "config.json", flat_env(parse(compose(f"+exp={NAME}")).env))
+    return folder
 
 
 def test_doses_behind_the_filter_are_those_of_the_first_study():
@@ -55,15 +67,51 @@ def test_errors_are_compared_with_none_and_the_filter_with_none_at_the_same_dose
     groups = ("bytestream", "bytestream_xy", "event_image")
     assert set(errors) == {(group, kind) for group in groups for kind in KINDS}
     assert set(filters) == {(group, kind) for group in groups for kind in ("no error", *FILTERED)}
-    assert errors["bytestream", "invented"].mean() == pytest.approx(-11 / 14)
-    assert filters["bytestream", "invented"].mean() == pytest.approx(7 / 14)
-    others = [at for at in (*errors, *filters) if at != ("bytestream", "invented")]
-    assert {values.mean() for values in (*errors.values(), *filters.values())} == {-11 / 14, 7 / 14, 0.0}
-    assert all(not (errors | filters)[at].any() for at in others)
+    own = {at: values.mean() for at, values in errors.items() if at[0] == "bytestream"}
+    assert own.pop(("bytestream", "invented")) == pytest.approx(-(3 * 8 + 12) / 4 / 14)
+    assert set(own.values()) == {0.0}
+    own = {kind: values.mean() for (group, kind), values in filters.items() if group == "bytestream"}
+    assert own.pop("invented") == pytest.approx((3 * 6 + 9) / 4 / 14)
+    assert list(own.values()) == pytest.approx([-2 / 14] * 3)
+    others = [values for found in (errors, filters) for at, values in found.items() if at[0] != "bytestream"]
+    assert not np.any(others)
     judged = judge(errors, ERRORS), judge(filters, FILTERS)
     assert [own["bytestream", "invented"].verdict for own in judged] == ["costs", "helps"]
-    assert count_words(judged[0], ERRORS) == {"costs": 1, "gains": 0, "free": 14, "undecided": 0}
-    assert count_words(judged[1], FILTERS) == {"harms": 0, "helps": 1, "equal": 11, "undecided": 0}
+    verdicts = [[one.verdict for one in own.values()] for own in judged]
+    assert count_words(verdicts[0], ERRORS) == {"costs": 1, "gains": 0, "free": 14, "undecided": 0}
+    assert count_words(verdicts[1], FILTERS) == {"harms": 3, "helps": 1, "equal": 8, "undecided": 0}
+
+
+def test_dashed_lines_are_against_the_filter_alone_and_the_others_against_no_error(study):
+    about, swept = read_sweep(study)
+    env = parse(compose(f"+exp={NAME}")).env
+    doses = dose_response.doses_of({kind: about["axes"][kind] for kind in KINDS}, env, {})
+    panel = draw(about, swept, doses).axes[0]
+    lines = {line.get_linestyle(): line.get_ydata() for line in panel.lines
+             if line.get_color() == LOOKS["invented"][0] and len(line.get_ydata()) == 5}  # fmt: skip
+    assert lines["-"] == pytest.approx(np.array([0, -8, -8, -8, -12]) / 14 * 100)
+    assert lines["--"] == pytest.approx(np.array([0, 0, 0, 0, -1]) / 14 * 100)
+
+
+@pytest.mark.parametrize(("name", "value"), [("trials", 7), ("groups", {"bytestream": [0]})])
+def test_another_study_is_refused_before_anything_is_written(study, tmp_path, name, value):
+    about = read_json(study / "about.json")
+    write_json(study / "about.json", about | {name: value})
+    env = parse(compose("+exp=report")).env
+    with pytest.raises(ConfigError, match=f"its {name} must be"):
+        write_dose_taught(study, tmp_path / "docs", env)
+    write_json(study / "about.json", about)
+    with pytest.raises(ConfigError, match="simulation of this command"):
+        write_dose_taught(study, tmp_path / "docs", dataclasses.replace(env, control_hz=100.0))
+    assert not (tmp_path / "docs").exists()
+
+
+@pytest.mark.parametrize("name", [NAME, "taught_claims"])
+def test_the_thirty_policies_are_there_and_trained_so(name):
+    config = parse(compose(f"+exp={name}", "ablation.trained=docs/data/taught_claims_policies"))
+    found = trained_policies(config)
+    assert len({path.name for path in found.values()}) == 30
+    assert all(path.name.endswith(f"_{variant}-s{seed}") for (variant, seed), path in found.items())
 
 
 def test_what_is_certain_alone_need_not_be_so_in_a_family_and_wide_intervals_are_not_free():
@@ -85,9 +133,15 @@ def test_the_page_keeps_its_plan_and_is_made_again_from_what_it_publishes(study,
     page = write_dose_taught(study, docs, config.env)
     text = page.read_text()
     assert text.startswith(f"{PLAN}\n{RESULTS}")
-    assert "1 costs, 0 gains, 14 free, 0 undecided" in text
-    assert "0 harms, 1 helps, 11 equal, 0 undecided" in text
-    assert text.count("\n| invented | 12.5 |") == text.count("\n| invented, filtered | 12.5 |") == 4
+    assert "1 costs, 0 gains, 11 free, 0 undecided" in text
+    assert "0 costs, 0 gains, 3 free, 0 undecided" in text
+    assert "3 harms, 1 helps, 8 equal, 0 undecided" in text
+    rows = [
+        line for line in text.splitlines() if line.startswith(("| invented | 12.5", "| invented, filtered |"))
+    ]
+    assert len(rows) == 8
+    assert text.count("\n| the filter alone | 0.0 | **-14 [") == 1
+    assert "met by" not in text
     assert write_dose_taught(study, docs, config.env).read_text() == text
     assert set(figures(docs / "data")) == {NAME}
     assert pages(docs, [NAME]) == {f"{NAME}.md": text}
