@@ -36,6 +36,13 @@ def test_every_column_of_every_table_has_its_row_and_every_row_its_column():
     assert sorted(known) == sorted({name for file in files for name in columns(file)})
 
 
+def test_every_file_is_told_of():
+    table = PAGE.split("| file | a row is |")[1].split("\n\n")[0]
+    names = {f"{path.name}/" if path.is_dir() else path.name for path in (DOCS / "data").iterdir()}
+    told = set(re.findall(r"`(?:models/pretrained/)?([\w.]+/?)`", table))
+    assert names - told == set()
+
+
 @pytest.mark.slow
 def test_a_figure_is_drawn_from_the_data_or_named_as_one_that_cannot_be():
     linked = {
