@@ -30,7 +30,8 @@ class Sweep:
         tasks: One for each policy and condition; two may share a key.
         met: Axis, value and group of those that lie within what a training of the group drew.
         baselines: Condition -> what it is compared with, see `baselines_of`.
-        same_as: Condition -> the first one that is the same simulation.
+        own_baselines: Group -> the same for its own sensor and control rate, where they differ.
+        same_as: Condition -> the first one that is the same simulation for every policy.
     """
 
     policies: tuple[EvaluatedPolicy, ...]
@@ -39,6 +40,7 @@ class Sweep:
     tasks: tuple[EvaluationTask, ...]
     met: frozenset[tuple[str, str, str]] = frozenset()
     baselines: Mapping[Place, Place] = field(default_factory=dict)
+    own_baselines: Mapping[str, Mapping[Place, Place]] = field(default_factory=dict)
     same_as: Mapping[Place, Place] = field(default_factory=dict)
 
     @property
@@ -89,8 +91,19 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
         if was_met(task.policy, nominal[task.policy.name], task.env)
     )
     own = {agent: found for agent, found in differences.items() if found}
-    same = same_simulations(configured, axes)
-    return Sweep(tuple(policies), own, axes, tuple(tasks), within, baselines_of(configured, axes), same)
+    usual = baselines_of(configured, axes)
+    envs = {policy.group: with_sensor(configured, policy.sensor) for policy in reversed(policies)}
+    baselines = {group: baselines_of(env, axes) for group, env in envs.items()}
+    return Sweep(
+        tuple(policies),
+        own,
+        axes,
+        tuple(tasks),
+        within,
+        baselines=usual,
+        own_baselines={group: found for group, found in baselines.items() if found != usual},
+        same_as=same_for_all([same_simulations(env, axes) for env in (configured, *envs.values())]),
+    )
 
 
 def axes_of(settings: SweepConfig) -> Axes:
@@ -106,6 +119,12 @@ def same_simulations(configured: EnvConfig, axes: Axes) -> dict[Place, Place]:
     every = {(axis, value): changes for axis, points in axes.items() for value, changes in points.items()}
     envs = {at: env_with(configured, changes) for at, changes in every.items()}
     return {at: next(first for first, other in envs.items() if other == env) for at, env in envs.items()}
+
+
+def same_for_all(found: Sequence[Mapping[Place, Place]]) -> dict[Place, Place]:
+    """Condition -> the first one that is the same simulation in each of several `same_simulations`."""
+    first: dict[tuple[Place, ...], Place] = {}
+    return {at: first.setdefault(tuple(same[at] for same in found), at) for at in found[0]}
 
 
 def baselines_of(configured: EnvConfig, axes: Axes) -> dict[Place, Place]:

@@ -1,7 +1,7 @@
 """The report of a sweep: plots, tables, every episode, MLflow runs, and videos of typical crashes."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NotRequired, TypedDict
@@ -62,11 +62,15 @@ class Exactness(TypedDict):
 
 
 class Compared(TypedDict):
-    """What a condition is compared with, and the first condition that is the same simulation."""
+    """What a condition is compared with, and the first condition that is the same simulation for all.
+
+    Groups that were trained at another rate may be compared with another one.
+    """
 
     condition: tuple[str, str]
     baseline: tuple[str, str]
     same_as: tuple[str, str]
+    own_baseline: NotRequired[Mapping[str, tuple[str, str]]]  # group -> in place of `baseline`
 
 
 class SweepFacts(TypedDict):
@@ -242,12 +246,17 @@ def about(config: Config, folder: Run, found: SweepResults) -> SweepFacts:
         "groups": sweep.groups,
         "axes": sweep.axes,
         "exactness": exactness(found),
-        "compared": [
-            Compared(condition=at, baseline=sweep.baselines[at], same_as=sweep.same_as[at])
-            for at in sweep.conditions
-        ],
+        "compared": [compared(sweep, at) for at in sweep.conditions],
         "met": sorted(sweep.met),
     }
+
+
+def compared(sweep: Sweep, at: Condition) -> Compared:
+    """What a condition of a sweep is compared with."""
+    usual = sweep.baselines[at]
+    one = Compared(condition=at, baseline=usual, same_as=sweep.same_as[at])
+    own = {group: found[at] for group, found in sweep.own_baselines.items() if found[at] != usual}
+    return {**one, "own_baseline": own} if own else one
 
 
 def exactness(found: SweepResults) -> list[Exactness]:

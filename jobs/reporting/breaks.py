@@ -83,12 +83,18 @@ def content(trainings: TrainingEpisodes) -> bytes:
     return b"".join(own.tobytes() for own in trainings.values())
 
 
-def compared_pairs(about: SweepFacts) -> list[tuple[Condition, Condition]]:
-    """Condition and baseline of each change; of those that are the same at both ends the first."""
+def compared_pairs(about: SweepFacts, group: str | None = None) -> list[tuple[Condition, Condition]]:
+    """Condition and baseline of each change; of those that are the same at both ends the first.
+
+    Args:
+        about: What made the sweep.
+        group: Whose: one that was trained at another rate may have other baselines. None: those of most.
+    """
     same = {place(one["condition"]): place(one["same_as"]) for one in about["compared"]}
     found: dict[tuple[Condition, Condition], tuple[Condition, Condition]] = {}
     for one in about["compared"]:
-        at, baseline = place(one["condition"]), place(one["baseline"])
+        own = one.get("own_baseline", {}) if group else {}
+        at, baseline = place(one["condition"]), place(own.get(group or "", one["baseline"]))
         ends = same[at], same.get(baseline, baseline)
         if ends[0] != ends[1]:
             found.setdefault(ends, (at, baseline))
@@ -99,16 +105,17 @@ def _told_apart(
     about: SweepFacts, episodes: SweptEpisodes, every: bool
 ) -> Iterator[tuple[Condition, Condition, str]]:
     """Condition, baseline and group of each change whose both ends were evaluated, see `changes_of`."""
+    order = {place(one["condition"]): rank for rank, one in enumerate(about["compared"])}
+    pairs = [(*pair, group) for group in about["groups"] for pair in compared_pairs(about, group)]
     seen = set()
-    for at, baseline in compared_pairs(about):
-        for group in about["groups"]:
-            here, there = episodes.get((at, group), {}), episodes.get((baseline, group), {})
-            if not here or here.keys() != there.keys() or None in here:
-                continue
-            ends = group, content(here), content(there)
-            if every or (ends[1] != ends[2] and ends not in seen):
-                seen.add(ends)
-                yield at, baseline, group
+    for at, baseline, group in sorted(pairs, key=lambda pair: order[pair[0]]):
+        here, there = episodes.get((at, group), {}), episodes.get((baseline, group), {})
+        if not here or here.keys() != there.keys() or None in here:
+            continue
+        ends = group, content(here), content(there)
+        if every or (ends[1] != ends[2] and ends not in seen):
+            seen.add(ends)
+            yield at, baseline, group
 
 
 def _p(change: Change) -> float:

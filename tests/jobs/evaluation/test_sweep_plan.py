@@ -7,6 +7,7 @@ from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from jobs.config.conditions import NOMINAL
 from jobs.config.config import ConfigError
 from jobs.evaluation.sweep_plan import plan_sweep, value_text, was_met
+from jobs.evaluation.sweep_report import compared
 from jobs.rollout.policies import PRETRAINED, find_sweep_policies, read_policy, with_sensor
 from jobs.run.folder import open_run
 from models.policy.policy import MANIFEST, read_policy_manifest
@@ -82,6 +83,30 @@ def test_what_an_agent_does_not_see_makes_no_task_of_its_own(tmp_path):
     assert keys["rgb"]["exactness", "8"] != keys["rgb"][NOMINAL, "poles_eval"]
     errors = {task.simulation for task in sweep.tasks if task.condition == ("threshold", "0.4")}
     assert len(errors) == 1, "the condition is the same for all"
+
+
+def test_a_policy_of_another_rate_is_compared_at_its_own_and_shares_only_what_is_the_same_for_all(tmp_path):
+    dense = {"env.control_hz": [100, 200], "env.scene": ["poles_dense"]}
+    config = sweep_config(tmp_path, axes={**AXES, "rate_dense": dense})
+    usual, slow = (
+        save_training(tmp_path / f"{hz}", f"at_{hz}", 0, dataclasses.replace(config.env, control_hz=hz))
+        for hz in (200.0, 100.0)
+    )
+    alone, both = planned(config, usual, "straight"), planned(config, usual, "straight", slow)
+    nominal = (NOMINAL, "poles_eval")
+    assert alone.own_baselines == {}
+    assert (
+        alone.baselines["rate_dense", "100"] == both.baselines["rate_dense", "100"] == ("rate_dense", "200")
+    )
+    assert both.own_baselines.keys() == {"at_100.0"}
+    own = both.own_baselines["at_100.0"]
+    assert own["rate_dense", "100"] == own["rate_dense", "200"] == ("rate_dense", "100")
+    assert {own[axis, value] for axis, value in both.conditions if axis != "rate_dense"} == {nominal}
+    assert (alone.same_as["rate", "200"], both.same_as["rate", "200"]) == (nominal, ("rate", "200"))
+    assert alone.same_as["sparsity", "0"] == both.same_as["sparsity", "0"] == nominal
+    told = {at: compared(both, at) for at in both.conditions}
+    assert told["rate_dense", "200"]["own_baseline"] == {"at_100.0": ("rate_dense", "100")}
+    assert "own_baseline" not in told["sparsity", "0.5"]
 
 
 def test_a_policy_keeps_its_own_sensor_with_an_axis_changed_on_it(tmp_path):

@@ -235,6 +235,23 @@ def test_a_simulation_that_two_axes_have_is_tested_once_and_a_baseline_never(swe
     }
 
 
+def test_a_group_of_another_rate_is_compared_with_its_own_baseline_and_the_others_with_theirs(sweep):
+    swept = read_sweep_episodes(sweep / "episodes.csv")
+    nominal, sparse, dead = (one["condition"] for one in ABOUT["compared"])
+    own = {"own_baseline": {"bytestream": dead}}
+    told = [
+        {"condition": nominal, "baseline": nominal, "same_as": nominal},
+        {"condition": sparse, "baseline": nominal, "same_as": sparse, **own},
+        {"condition": dead, "baseline": nominal, "same_as": dead, **own},
+    ]
+    found = changes_of({**ABOUT, "compared": told}, swept, every=True)
+    pairs = {(one.group, one.condition, one.baseline) for one in found}
+    assert {pair[1:] for pair in pairs if pair[0] == "bytestream"} == {(tuple(sparse), tuple(dead))}
+    others = {(tuple(at), tuple(nominal)) for at in (sparse, dead)}
+    assert {pair[1:] for pair in pairs if pair[0] == "event_image"} == others
+    assert compared_pairs({**ABOUT, "compared": told}) == sorted(others)
+
+
 def test_a_scene_that_is_the_baseline_of_an_axis_is_itself_compared_once():
     """`world/dense` is the simulation of `rate_dense/200`, which is its own baseline."""
     usual, dense = ["nominal", "poles_eval"], ["rate_dense", "200"]
