@@ -264,12 +264,12 @@ def check_study(study: Path, env: EnvConfig, about: SweepFacts, swept: SweptEpis
     plan = read_plan()
     trained = yaml.safe_load(TRAINED.read_text())["ablation"]
     groups = dict.fromkeys(trained["variants"], trained["seeds"])
-    planned = {"groups": groups, "trials": plan.trials, "action": ACTION, "axes": axes_of(plan)}
-    found = {name: about.get(name) for name in planned}
-    found["axes"] = {name: about["axes"].get(name) for name in planned["axes"]}
+    axes = axes_of(plan)
+    planned = {"groups": groups, "trials": plan.trials, "action": ACTION, "axes": axes}
+    found = {**about, "axes": {name: about["axes"].get(name) for name in axes}}
     for name, asked in planned.items():
-        if found[name] != asked:
-            rule = f"{study} is not the planned study: its {name} must be {asked!r}, got {found[name]!r}"
+        if found.get(name) != asked:
+            rule = f"{study} is not the planned study: its {name} must be {asked!r}, got {found.get(name)!r}"
             raise ConfigError(
                 f"resume: {rule}; give `python -m platform.launch +exp={DOSES_TAUGHT}` as it stands"
             )
