@@ -25,6 +25,7 @@ from jobs.reporting import dose_response, report
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import TAUGHT
 from jobs.reporting.dose_response import write_dose_response
+from jobs.reporting.dose_taught import DOSES_TAUGHT
 from jobs.reporting.figures import contacts, survivals
 from jobs.reporting.headline import BEGIN, END
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_curves, read_trainings
@@ -68,8 +69,8 @@ def test_the_published_pages_are_those_of_the_published_data(monkeypatch):
     drawn = sorted((DOCS / "images").glob("results_*.png"))
     shown = re.findall(r"images/(results_\w+)\.png", was + (DOCS / "results_tables.md").read_text())
     assert sorted(shown) == [path.stem for path in drawn]
-    found = pages(DOCS, [*shown, dose_response.DOSES, TAUGHT])
-    studies = [f"{name}.md" for name in (dose_response.DOSES, TAUGHT)]
+    found = pages(DOCS, [*shown, dose_response.DOSES, DOSES_TAUGHT, TAUGHT])
+    studies = [f"{name}.md" for name in (dose_response.DOSES, DOSES_TAUGHT, TAUGHT)]
     assert list(found) == ["results.md", "results_tables.md", "robustness.md", *studies]
     for name, text in found.items():
         assert text == (DOCS / name).read_text(), f"{name}: renew it by python -m docs.from_data"
