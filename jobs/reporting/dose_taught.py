@@ -143,7 +143,7 @@ def _judged_text(one: Judged) -> str:
 
 
 def behind_filter(doses: Sequence[Dose], axes: Axes) -> list[Dose]:
-    """The filter alone, and the doses that were flown behind it, too: the sensor's errors are the same."""
+    """The filter alone, and the doses that stand behind it, too: the sensor's errors are the same."""
     alone = [Dose(FILTER, value, 0.0, 0.0, ()) for value in axes[FILTER]]
     return alone + [
         dose._replace(kind=dose.kind + FILTERED)
