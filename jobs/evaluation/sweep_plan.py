@@ -92,6 +92,7 @@ def plan_sweep(config: Config, policies: Sequence[EvaluatedPolicy]) -> Sweep:
     )
     own = {agent: found for agent, found in differences.items() if found}
     usual = baselines_of(configured, axes)
+    # Of each group that of its first training.
     envs = {policy.group: with_sensor(configured, policy.sensor) for policy in reversed(policies)}
     baselines = {group: baselines_of(env, axes) for group, env in envs.items()}
     return Sweep(

@@ -130,6 +130,25 @@ def count_words(verdicts: Sequence[str], words: Sequence[str]) -> dict[str, int]
     return {word: verdicts.count(word) for word in (*words, UNDECIDED)}
 
 
+def counts(
+    verdicts: Mapping[tuple[str, str], str], words: Sequence[str], apart: Sequence[str]
+) -> list[tuple[bool, dict[str, int]]]:
+    """Whether kinds stand apart, because their doses are others -> `count_words` of these.
+
+    Args:
+        verdicts: Of each group and kind.
+        words: Of the family.
+        apart: The kinds that do.
+    """
+    return [
+        (
+            is_apart,
+            count_words([one for (_, kind), one in verdicts.items() if (kind in apart) == is_apart], words),
+        )
+        for is_apart in (False, True)
+    ]
+
+
 def judged_table(judged: Mapping[tuple[str, str], Judged]) -> str:
     """Verdict, change [points] and p of each test: a row for each group, a column for each kind."""
     groups, kinds = (list(dict.fromkeys(at[place] for at in judged)) for place in (0, 1))
@@ -195,20 +214,9 @@ def results_text(about: SweepFacts, swept: SweptEpisodes, doses: Sequence[Dose])
         apart=apart,
         margin=f"{100 * MARGIN:.0f}",
         costs=judged_table(errors),
-        cost_counts=[
-            (
-                kind,
-                count_words(
-                    [one.verdict for (_, own), one in errors.items() if (own in apart) == kind], ERRORS
-                ),
-            )
-            for kind in (False, True)
-        ],
+        cost_counts=counts({at: one.verdict for at, one in errors.items()}, ERRORS, apart),
         compared=verdict_table(compared, groups, kinds),
-        compared_counts=[
-            (kind, count_words([one.verdict for one in compared if (one.kind in apart) == kind], BEYOND))
-            for kind in (False, True)
-        ],
+        compared_counts=counts({(one.group, one.kind): one.verdict for one in compared}, BEYOND, apart),
         filters=judged_table(filters),
         filter_counts=count_words([one.verdict for one in filters.values()], FILTERS),
         tests=len(replicated(changes)),
