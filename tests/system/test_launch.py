@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 from jobs.config.config import Config
+from tests.support.configs import compose
 
 ROOT = Path(__file__).resolve().parents[2]
 EVADE = Path(sys.executable).parent / "evade"
@@ -246,8 +246,8 @@ def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):
 def test_every_job_has_a_module_and_an_experiment_that_runs_it(launcher):
     missing = [job.module for job in launcher.JOBS.values() if importlib.util.find_spec(job.module) is None]
     assert missing == []
-    experiments = [yaml.safe_load(file.read_text()) for file in (ROOT / "conf" / "exp").glob("*.yaml")]
-    assert {experiment["job"] for experiment in experiments} == set(launcher.JOBS)
+    experiments = [file.stem for file in (ROOT / "conf" / "exp").glob("*.yaml")]
+    assert {compose(f"+exp={exp}")["job"] for exp in experiments} == set(launcher.JOBS)
 
 
 def test_the_launcher_says_so_when_conf_is_not_there(launch, launcher, monkeypatch, tmp_path):
