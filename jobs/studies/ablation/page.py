@@ -73,8 +73,7 @@ def variant_result(
 
 def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], facts: AblationFacts) -> None:
     """Print the table; write table, plot and facts into the run folder and the tracker."""
-    head = ("Variant", *results[0].success, "Mean", "Change [points]", "Minutes")
-    rows = [table_row(result) for result in results]
+    head, *rows = table_lines(results)
     show_table(TITLE, head, rows, 1, None)
     fewer = [f"`{name}` {len(one['seeds'])}" for name, one in facts["variants"].items() if "seeds" in one]
     but = f" ({', '.join(fewer)})" if fewer else ""
@@ -91,6 +90,13 @@ def write_page(folder: Run, tracker: Tracker, results: Sequence[VariantResult], 
     tracker.text("ablation/ablation.md", text)
     publish_plot(folder, tracker, "ablation/ablation", plot_variants(results))
     write_json(folder.path / "ablation" / "about.json", facts)  # the last: it says that the rest is there
+
+
+def table_lines(results: Sequence[VariantResult]) -> list[tuple[str, ...]]:
+    """Heading and lines of the table: a variant in each line, or in each column if conditions are more."""
+    head = ("Variant", *results[0].success, "Mean", "Change [points]", "Minutes")
+    lines = [head, *(table_row(result) for result in results)]
+    return list(zip(*lines, strict=True)) if len(results[0].success) > len(results) else lines
 
 
 def table_row(result: VariantResult) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from jobs.run.files import read_json
 from jobs.run.folder import COMPARED_STEPS, locate_run
 from jobs.studies.ablation import ablation
 from jobs.studies.ablation.ablation import paired, seeds_of, trained_policies, variant_config
-from jobs.studies.ablation.page import plot_variants, table_row, variant_result
+from jobs.studies.ablation.page import plot_variants, table_lines, table_row, variant_result
 from models.encoder.weights import with_checksum
 from models.kinds import KINDS
 from models.policy.policy import MANIFEST, read_policy_manifest
@@ -55,6 +55,18 @@ def test_a_variant_is_compared_by_pairs_of_trainings_of_one_seed():
     assert np.ptp(result.difference.interval) < 0.8 * np.ptp(others.interval)
     assert table_row(result)[1:3] == ("50", "50")
     assert table_row(result)[4].startswith("-25 [-")
+
+
+@pytest.mark.parametrize("variants", [1, 2, 3])
+def test_the_table_is_never_wider_than_long(variants):
+    success = of((1.0, 0.75, 0.5), 0, 0, 0)
+    results = [variant_result(f"variant {place}", success, None, (1,)) for place in range(variants)]
+    lines = table_lines(results)
+    across, down = set(lines[0]), {line[0] for line in lines}
+    names, conditions = {one.name for one in results}, set(success)
+    assert (names <= down and conditions <= across) == (variants >= len(conditions))
+    assert (names <= across and conditions <= down) == (variants < len(conditions))
+    assert {len(line) for line in lines} == {len(lines[0])}
 
 
 def test_the_plot_has_a_dot_for_each_training_and_a_number_for_each_cell():
