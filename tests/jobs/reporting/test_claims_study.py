@@ -89,6 +89,13 @@ def searched_rates(name):
     }
 
 
+def test_the_page_says_how_many_of_the_trainings_are_made():
+    docs = REPOSITORY / "docs"
+    made = len(list((docs / "data" / f"{BY_PPO}_policies").glob("*/policy.json")))
+    text = " ".join((docs / f"{BY_PPO}.md").read_text().split())
+    assert f"Of the forty trainings {made} are made" in text
+
+
 def test_the_page_shows_the_learning_rates_that_were_searched():
     text = (REPOSITORY / "docs" / "ppo_claims.md").read_text()
     files = (REPOSITORY / "docs" / "data").glob("learning_rates_*_episodes.csv.gz")

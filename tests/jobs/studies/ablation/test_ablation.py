@@ -58,7 +58,7 @@ def test_a_variant_is_compared_by_pairs_of_trainings_of_one_seed():
 
 
 @pytest.mark.parametrize("variants", [1, 2, 3])
-def test_the_table_is_never_wider_than_long(variants):
+def test_variants_and_conditions_are_lines_of_the_table_whichever_are_more(variants):
     success = of((1.0, 0.75, 0.5), 0, 0, 0)
     results = [variant_result(f"variant {place}", success, None, (1,)) for place in range(variants)]
     lines = table_lines(results)
