@@ -40,7 +40,7 @@ class Scratch(NamedTuple):
 
     Attributes:
         room: `Workspace` for as many bodies as a scene has, or more.
-        image: float32 (H, W), what is painted; in memory column after column.
+        columns: float32 (W, H), what is painted, column after column.
         pixels: As `crossings.steps` takes its scratch.
         ramps: For `ROOM` times as many pixels as the image has.
         looks: For the looks at it.
@@ -49,7 +49,7 @@ class Scratch(NamedTuple):
     """
 
     room: Workspace
-    image: np.ndarray
+    columns: np.ndarray
     pixels: tuple[np.ndarray, np.ndarray]
     ramps: Ramps
     looks: Looks
@@ -96,7 +96,7 @@ def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
     size, words = width * height, (width * height + 7) // 8
     return Scratch(
         room=make_workspace(num_bodies, height),
-        image=np.zeros((width, height), np.float32).T,
+        columns=np.zeros((width, height), np.float32),
         pixels=(np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)),
         ramps=make_ramps(ROOM * size),
         looks=make_looks(width),
@@ -127,7 +127,8 @@ def sense_way(view, way, parts):
         view.seen_us[column] = max(view.seen_us[column], way.start_us)
     count, stretches = _divide(view, way, parts)
     before, after, followed = outlines.before[:count], outlines.after[:count], outlines.followed[:count]
-    events, lost, columns, begun_us, kept = np.empty(0, EVENT), 0, 0, way.start_us, 0
+    events, lost, columns, begun_us = np.empty(0, EVENT), 0, 0, way.start_us
+    kept = np.int64(0)  # not 0, for which numba would compile everything below a second time
     end_us = begun_us
     for number in range(1, parts * stretches + 1):
         begin_us, end_us = end_us, way.start_us + way.moving_us * number // (parts * stretches)
@@ -144,7 +145,7 @@ def sense_way(view, way, parts):
         if ends:
             more_events = events_of_ramps(watch, kept, Span(begun_us, end_us))
             events = more_events if number == stretches else _joined(events, more_events)
-            begun_us, kept = end_us, 0
+            begun_us, kept = end_us, np.int64(0)
     return -1, lost, columns, events
 
 
@@ -177,17 +178,17 @@ def _look_along(view, way, stretch, ends, watch, kept):
     Returns:
         First invalid pixel or -1, ramps in use, events lost, columns looked at.
     """
-    room, image, looks = view.scratch.room, view.scratch.image, view.scratch.looks
+    room, painted, looks = view.scratch.room, view.scratch.columns, view.scratch.looks
     lost = columns = 0
     for k in range(find_looks(view.bodies, room.frames[0].focal, way, stretch, looks)):
         t_us, first, last = looks.t_us[k], looks.first[k], looks.last[k]
         needed = ends and t_us == stretch.end_us
-        full = kept + 2 * image.size > watch.ramps.pixels.size
+        full = kept + 2 * painted.size > watch.ramps.pixels.size
         if not needed and (full or _is_seen(view.seen_us, first, last, t_us)):
             continue
         aim_along(room.frames[0], way, t_us)
-        paint_columns(view.bodies, view.noise, image, first, last, view.cull_m, room)
-        bad, kept, more = look_at(image.T, first, last, t_us, watch, kept)
+        paint_columns(view.bodies, view.noise, painted.T, first, last, view.cull_m, room)
+        bad, kept, more = look_at(painted, first, last, t_us, watch, kept)
         if bad >= 0:
             return bad, kept, lost, columns
         lost, columns = lost + more, columns + last - first

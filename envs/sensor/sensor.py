@@ -151,7 +151,7 @@ class Sensor:
             return np.empty(0, EVENT)
         way, view = Way(*start, *end, self._config.camera_height_m, self.t_us, moving_us), self.view()
         bad, self.dropped, columns, events = sense_way(view, way, self.renders)
-        check_sensed(bad, way, view.scratch.image)
+        check_sensed(bad, way, view.scratch.columns)
         self.renders = columns / self._config.camera.width
         return events
 
@@ -210,10 +210,10 @@ class Sensor:
             self._renderer.expect_height(self._config.camera_height_m)
 
 
-def check_sensed(bad: int, way: Way, image: np.ndarray) -> None:
-    """Raise ValueError for what `sense_way` found to be wrong, if anything; `image` is what it painted."""
+def check_sensed(bad: int, way: Way, columns: np.ndarray) -> None:
+    """Raise ValueError for what `sense_way` found to be wrong, if anything; `columns` is what it painted."""
     if bad == BAD_POSE:
         check_pose((way.end_x, way.end_y, way.height, 0.0), (way.start_us + way.moving_us) * 1e-6)
     if bad >= 0:
-        x, y = divmod(bad, image.shape[0])
-        raise ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {image[y, x]!s}.")
+        x, y = divmod(bad, columns.shape[1])
+        raise ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {columns[x, y]!s}.")

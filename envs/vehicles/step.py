@@ -115,7 +115,7 @@ def way_of(vehicle):
     return Way(place[0], place[1], place[2], place[3], vehicle.height_m, vehicle.start_us, moving_us)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", inline="always")
 def _look(vehicle, view):
     """Events of the last step of a vehicle; it stands still, and sees nothing, once it has stopped."""
     way = way_of(vehicle)

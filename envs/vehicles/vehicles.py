@@ -189,6 +189,6 @@ class Vehicles:
             way = f"from {vehicle['start_x_m']}, {vehicle['start_y_m']} to {vehicle['x_m']}, {vehicle['y_m']}"
             raise StepError(row, f"the reward must be finite; got {vehicle['reward']} on the way {way}.")
         try:
-            check_sensed(int(vehicle["problem"]), way_of(vehicle), sensor.view().scratch.image)
+            check_sensed(int(vehicle["problem"]), way_of(vehicle), sensor.view().scratch.columns)
         except ValueError as error:
             raise StepError(row, str(error)) from error

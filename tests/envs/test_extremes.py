@@ -11,6 +11,7 @@ from envs.events.windows import MAX_WINDOW_US
 from envs.kinematics import Outcome, clock_us
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene
 from envs.sensor import Sensor
+from envs.vehicles.step import step_all
 
 TINY = CameraConfig(width=8, height=8)
 FREE = {"num_obstacles": 0}
@@ -72,6 +73,17 @@ def test_any_size_of_sensor(width, height):
     *_, info = check_step(env)
     assert env.luminance.shape == (height, width)
     assert (info["num_events"] > 1000) == (width == 1280)
+
+
+def test_sensors_of_every_size_share_one_compiled_step():
+    """An image of one row or column has another layout to numba, which would compile for a minute."""
+    compiled = []
+    for width, height in ((8, 8), (1, 1), (1, 8), (8, 1)):
+        env = CorridorEnv(camera=CameraConfig(width, height))
+        env.reset(seed=0)
+        env.step(0)
+        compiled.append(set(step_all.signatures))
+    assert compiled[1:] == compiled[:-1]
 
 
 @pytest.mark.parametrize(("count", "width_m"), [(0, 30.0), (10_000, 2000.0)])
