@@ -13,6 +13,7 @@ from scipy.stats import false_discovery_control
 from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_mean, exact_pair_p
 from jobs.evaluation.group_stats import CHANGE, Condition, TrainingEpisodes, episode_values
 from jobs.evaluation.sweep_report import SweepFacts
+from jobs.reporting.words import condition_text
 
 SweptEpisodes = dict[tuple[Condition, str], dict[int | None, np.ndarray]]  # by condition and group
 
@@ -76,6 +77,17 @@ def changes_of(about: SweepFacts, episodes: SweptEpisodes, every: bool = False) 
 def replicated(changes: Sequence[Change]) -> list[Change]:
     """The changes of groups with several trainings, which can say something of others."""
     return [change for change in changes if len(change.success) > 1]
+
+
+def loses(change: Change) -> bool:
+    """Whether the mean of the trainings falls."""
+    return change.difference.value < 0
+
+
+def drop_text(change: Change) -> str:
+    """From which success to which a change takes the mean of the trainings."""
+    before, success = 100 * change.before.mean(), 100 * change.success.mean()
+    return f"{condition_text(*change.condition)}: {before:.0f} to {success:.0f} %"
 
 
 def content(trainings: TrainingEpisodes) -> bytes:

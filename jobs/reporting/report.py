@@ -8,33 +8,35 @@ docs/encoder_seeds.md and docs/camera_rates.md of the newest studies of these na
 that run folder holds.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from jobs.analysis.coverage import coverage_text
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot, write_csv
 from jobs.config.conditions import NOMINAL
 from jobs.config.config import Config, ConfigError
-from jobs.evaluation.group_stats import (
-    Condition,
-    episode_values,
-    success_table,
-)
+from jobs.evaluation.group_stats import success_table
 from jobs.evaluation.sweep_report import Exactness, SweepFacts
-from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, compared_pairs, place, replicated
+from jobs.reporting.breaks import (
+    Change,
+    SweptEpisodes,
+    changes_of,
+    compared_pairs,
+    drop_text,
+    loses,
+    place,
+    replicated,
+)
 from jobs.reporting.claims_study import (
     BY_PPO,
     HEAD,
     SHORT,
     TAUGHT,
     claim_line,
-    counted,
     published_studies,
     write_claims_study,
 )
@@ -42,6 +44,7 @@ from jobs.reporting.dose_response import DOSES, write_dose_response
 from jobs.reporting.dose_taught import DOSES_TAUGHT, write_dose_taught
 from jobs.reporting.figures import group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
+from jobs.reporting.in_short import WEAK, in_short, weak_groups
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings
 from jobs.reporting.paper_claims import CLAIMS, GAIN, Claim, Finding
 from jobs.reporting.planned_page import coarse_text
@@ -65,19 +68,6 @@ from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
 from jobs.run.templates import render
 
-# How the results page calls the studies of the claims that are published beside it.
-OF_STUDIES = {
-    BY_PPO: f"[by PPO, with more trainings and corridors]({BY_PPO}.md#results)",
-    TAUGHT: f"[on taught policies]({TAUGHT}.md#results)",
-}
-# What a reader must know of a group before taking it.
-NOTES = {
-    "bytestream_hold": (
-        ", which a planner that sees everything has taught under drawn conditions (earlier recipes of it had "
-        "been evaluated in these corridors, too)"
-    )
-}
-WEAK = 0.6  # success with nothing changed below which a group is said to have little to lose
 TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -274,121 +264,6 @@ def page_values(
     }
 
 
-def in_short(
-    about: SweepFacts,
-    episodes: SweptEpisodes,
-    changes: Sequence[Change],
-    findings: Mapping[Claim, Finding],
-    studies: Mapping[str, Mapping[Claim, Finding]],
-) -> list[str]:
-    """What a reader wants to know first: which policy to take, what breaks most, what the paper had right."""
-    return [
-        *_best_policy(about, episodes, changes),
-        _worst_conditions(about, changes),
-        _foretold(changes),
-        f"Of the paper's {len(findings)} claims: {counted(findings.values())}"
-        f"{_decided(findings, weak_groups(about, episodes))}.",
-        *(
-            f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}{_decided(own, {})}."
-            for name, own in studies.items()
-        ),
-    ]
-
-
-def _worst_conditions(about: SweepFacts, changes: Sequence[Change]) -> str:
-    """The sentence on the three conditions in which most of the published trainings lose half or more."""
-    trained = {change.group for change in changes}
-    every = sum(len(about["groups"][group]) for group in trained)
-    halved, broken = Counter[Condition](), Counter[Condition]()
-    for change in changes:
-        halved[change.condition] += int((change.success <= change.before / 2)[change.before > 0].sum())
-        broken[change.condition] += int(change.broken.sum())
-    worst = [
-        f"{count} with {condition_text(*at)} ({broken[at]})" for at, count in halved.most_common(3) if count
-    ]
-    return (
-        f"What breaks most, by how many of the {every} published trainings lose half of their success or "
-        f"more (how many lose for certain): {'; '.join(worst) or 'nothing'}."
-    )
-
-
-def _foretold(changes: Sequence[Change]) -> str:
-    """The sentence on what a further training of these groups would lose for certain."""
-    several = replicated(changes)
-    certain = [change for change in several if change.certain and _loses(change)]
-    sizes = sorted({len(change.success) for change in several})
-    if not certain:
-        count = " or ".join(str(size) for size in sizes)
-        of = f" of groups of {count} trainings" if sizes else ""
-        return f"What a further training would lose: none of {len(several)} changes{of} is certain among all."
-    named = ", ".join(f"`{one.group}` with {_drop_text(one)}" for one in certain)
-    return (
-        f"What a further training would lose for certain, {len(certain)} of {len(several)} changes of groups "
-        f"with several trainings: {named}."
-    )
-
-
-def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> str:
-    """The claims that hold or are reversed, to be said behind how many there are.
-
-    Args:
-        findings: Of the claims.
-        weak: Groups that have little to lose, and their success with nothing changed, 0..1.
-    """
-    beside = {
-        group: f", which succeeds in {100 * rate:.0f} % with nothing changed and has little to lose"
-        for group, rate in weak.items()
-    }
-    named = {
-        verdict: [
-            f"`{claim.ours}` {claim.text} (against `{claim.theirs}`"
-            f"{beside.get(claim.theirs, '') if claim.change and verdict == 'reversed' else ''})"
-            for claim, one in findings.items()
-            if one.verdict == verdict
-        ]
-        for verdict in ("holds", "reversed")
-    }
-    holds, other = ("; ".join(claims) for claims in named.values())
-    return (f". It holds: {holds}" if holds else ". None holds") + (f". Reversed: {other}" if other else "")
-
-
-def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[Change]) -> list[str]:
-    """The sentence on the group that succeeds most over the same conditions; none if none was evaluated."""
-    ((value, _),) = about["axes"][NOMINAL].items()
-    groups = [
-        group
-        for group in dict.fromkeys(change.group for change in changes)
-        if ((NOMINAL, value), group) in episodes
-    ]
-    every = [at for at, _ in compared_pairs(about) if all((at, group) in episodes for group in groups)]
-    if not groups or not every:
-        return []
-    rates = {
-        group: {at: float(episode_values(episodes[at, group], "success").mean()) for at in every}
-        for group in groups
-    }
-    best = max(rates, key=lambda group: sum(rates[group].values()))
-    least = min(every, key=lambda at: rates[best][at])
-    unchanged = 100 * episode_values(episodes[(NOMINAL, value), best], "success").mean()
-    return [
-        f"Take [`{best}`](policies.md){NOTES.get(best, '')}: {unchanged:.0f} % with nothing changed, "
-        f"{100 * np.mean(list(rates[best].values())):.0f} % as the mean of all conditions; its worst is "
-        f"{condition_text(*least)}, {100 * rates[best][least]:.0f} %."
-    ]
-
-
-def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> dict[str, float]:
-    """Groups of claims that succeed in less than `WEAK` with nothing changed, and how often, 0..1."""
-    (value,) = about["axes"][NOMINAL]
-    compared = {group for claim in CLAIMS for group in (claim.ours, claim.theirs)}
-    unchanged = {
-        group: float(episode_values(episodes[(NOMINAL, value), group], "success").mean())
-        for group in about["groups"]
-        if group in compared and ((NOMINAL, value), group) in episodes
-    }
-    return {group: rate for group, rate in unchanged.items() if rate < WEAK}
-
-
 def several_at_once(about: SweepFacts) -> dict[str, str]:
     """Condition in words -> its settings, of those that change several and have no words of their own."""
     found = {}
@@ -427,7 +302,7 @@ def breaks_table(about: SweepFacts, changes: Sequence[Change]) -> str:
     lines = []
     for group, seeds in about["groups"].items():
         own = [change for change in changes if change.group == group]
-        lost = [change for change in own if change.broken.any() or (change.certain and _loses(change))]
+        lost = [change for change in own if change.broken.any() or (change.certain and loses(change))]
         lost.sort(key=lambda change: (-change.broken.mean(), change.difference.value))
         if own:
             before = next((one.before for one in own if one.baseline == (NOMINAL, nominal)), None)
@@ -435,20 +310,10 @@ def breaks_table(about: SweepFacts, changes: Sequence[Change]) -> str:
             texts = [_loss_text(change) for change in lost]
             unchanged = "-" if before is None else f"{100 * before.mean():.0f}"
             worst = min(own, key=lambda change: change.difference.value)
-            largest = _drop_text(worst) if _loses(worst) else "-"
+            largest = drop_text(worst) if loses(worst) else "-"
             lines.append((name, unchanged, largest, "; ".join(texts) or "none is certain"))
     head = ("Group", "Nothing changed [%]", "Loses most with", "Certain for some of its trainings")
     return markdown_table(head, lines, len(head))
-
-
-def _loses(change: Change) -> bool:
-    return change.difference.value < 0
-
-
-def _drop_text(change: Change) -> str:
-    """From which success to which a change takes the mean of the trainings."""
-    before, success = 100 * change.before.mean(), 100 * change.success.mean()
-    return f"{condition_text(*change.condition)}: {before:.0f} to {success:.0f} %"
 
 
 def _loss_text(change: Change) -> str:

@@ -13,16 +13,15 @@ from jobs.config.config import ConfigError
 from jobs.evaluation.group_stats import LABELS
 from jobs.reporting import report as results
 from jobs.reporting.breaks import changes_of, compared_pairs, replicated
-from jobs.reporting.figures import group_results, judge_claims
+from jobs.reporting.figures import group_results
 from jobs.reporting.headline import BEGIN, END
+from jobs.reporting.in_short import in_short
 from jobs.reporting.report import (
     breaks_table,
     estimates_table,
     find_study,
-    in_short,
     results_pages,
     several_at_once,
-    weak_groups,
     write_results,
     write_trade,
 )
@@ -188,18 +187,6 @@ def test_a_condition_breaks_a_policy_where_its_own_loss_is_certain(sweep, tmp_pa
     assert "oracle" not in text
 
 
-def test_trainings_that_lose_half_are_counted_beside_those_that_lose_for_certain(sweep):
-    swept = read_sweep_episodes(sweep / "episodes.csv")
-    for seed, kept in ((0, 8), (1, 7), (2, 12)):
-        own = swept[("sparsity", "0.5"), "bytestream"][seed]
-        own["success"] = np.arange(own.size) < kept  # of 16 to 20 before
-    sentence = in_short(ABOUT, swept, changes_of(ABOUT, swept), {}, {})[1]
-    before = [swept[("nominal", "poles_eval"), "bytestream"][seed]["success"].sum() for seed in (0, 1, 2)]
-    halved = sum(kept <= all_of / 2 for kept, all_of in zip((8, 7, 12), before, strict=True))
-    assert 0 < halved < 3
-    assert f"{halved} with 50 % dead pixels (" in sentence
-
-
 def test_one_training_that_breaks_is_told_and_says_nothing_of_others(sweep):
     swept = read_sweep_episodes(sweep / "episodes.csv")
     swept[("sparsity", "0.5"), "bytestream"][1]["success"] = False
@@ -322,32 +309,6 @@ def test_a_group_of_one_training_is_in_no_test_of_groups(sweep):
     assert "for certain, 1 of 2 changes of groups with several" in sentence
 
 
-def test_policies_are_recommended_by_the_same_conditions_whatever_changes_them(sweep):
-    """What is the same simulation as the baseline for one group counts for it nonetheless."""
-    swept = read_sweep_episodes(sweep / "episodes.csv")
-    nominal, few, many = ("nominal", "poles_eval"), ("sparsity", "0.2"), ("sparsity", "0.5")
-    for at in (nominal, few, many):
-        swept[at, "bytestream"] = {seed: flights(14) for seed in (0, 1, 2)}
-        swept[at, "event_image"] = {0: flights(10 if at == many else 20)}
-    swept[few, "bytestream"][0]["steps"][0] += 1
-    first = in_short(ABOUT, swept, changes_of(ABOUT, swept), {}, {})[0]
-    assert first.startswith("Take [`event_image`](policies.md): 100 % with nothing changed, 75 % as the mean")
-
-
-def test_a_policy_that_was_not_evaluated_unchanged_is_not_recommended(sweep):
-    swept = read_sweep_episodes(sweep / "episodes.csv")
-    about = {**ABOUT, "compared": [*ABOUT["compared"][:2],
-                                   {**ABOUT["compared"][2], "baseline": ["sparsity", "0.2"]}]}  # fmt: skip
-    first = in_short(about, swept, changes_of(about, swept), {}, {})[0]
-    assert first.startswith("Take [`bytestream`](policies.md): 80 %")
-    del swept[("nominal", "poles_eval"), "bytestream"]
-    changes = changes_of(about, swept)
-    assert in_short(about, swept, changes, {}, {})[0].startswith("Take [`event_image`](policies.md): 20 %")
-    assert "| `bytestream` | - |" in breaks_table(about, changes)
-    del swept[("nominal", "poles_eval"), "event_image"]
-    assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("What breaks most")
-
-
 @pytest.mark.parametrize("part", ["results_figures", "page_values", "with_headline"])
 def test_what_cannot_be_drawn_or_written_replaces_nothing(sweep, tmp_path, monkeypatch, part):
     docs = tmp_path / "docs"
@@ -382,16 +343,6 @@ def test_published_estimates_and_changes_are_those_of_the_published_episodes(nam
     else:
         write_estimates(tmp_path, "robustness", group_results(about, swept))
     assert (tmp_path / name).read_text() == (data / name).read_text()
-
-
-def test_a_group_that_has_little_to_lose_is_named_beside_a_claim_about_losses():
-    about, swept = read_data(REPOSITORY / "docs" / "data", "robustness")
-    findings = judge_claims(about, swept, [])
-    (reversed_,) = [claim for claim, one in findings.items() if one.verdict == "reversed"]
-    assert (reversed_.theirs, reversed_.change) == ("rgb", True)
-    assert set(weak_groups(about, swept)) == {"rgb"}
-    sentence = in_short(about, swept, changes_of(about, swept), findings, {})[3]
-    assert "`rgb`, which succeeds in 40 % with nothing changed and has little to lose" in sentence
 
 
 def test_no_simulation_stands_twice_in_the_table_of_success():

@@ -1,0 +1,172 @@
+"""What stands first on the results page: which policy to take, what breaks most, what the paper had right."""
+
+import itertools
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from jobs.analysis.statistics import CONFIDENCE, crossed_difference, holm
+from jobs.analysis.tables import estimate_text
+from jobs.config.conditions import NOMINAL
+from jobs.evaluation.group_stats import RATE, Condition, episode_values
+from jobs.evaluation.sweep_report import SweepFacts
+from jobs.reporting.breaks import Change, SweptEpisodes, compared_pairs, drop_text, loses, replicated
+from jobs.reporting.claims_study import BY_PPO, TAUGHT, counted
+from jobs.reporting.paper_claims import CLAIMS, Claim, Finding
+from jobs.reporting.words import condition_text
+
+# How the results page calls the studies of the claims that are published beside it.
+OF_STUDIES = {
+    BY_PPO: f"[by PPO, with more trainings and corridors]({BY_PPO}.md#results)",
+    TAUGHT: f"[on taught policies]({TAUGHT}.md#results)",
+}
+# What a reader must know of a group before taking it.
+NOTES = {
+    "bytestream_hold": (
+        ", which a planner that sees everything has taught under drawn conditions (earlier recipes of it had "
+        "been evaluated in these corridors, too)"
+    )
+}
+WEAK = 0.6  # success with nothing changed below which a group is said to have little to lose
+
+
+def in_short(
+    about: SweepFacts,
+    episodes: SweptEpisodes,
+    changes: Sequence[Change],
+    findings: Mapping[Claim, Finding],
+    studies: Mapping[str, Mapping[Claim, Finding]],
+) -> list[str]:
+    """What a reader wants to know first: which policy to take, what breaks most, what the paper had right."""
+    return [
+        *_best_policy(about, episodes, changes),
+        _worst_conditions(about, changes),
+        _foretold(changes),
+        f"Of the paper's {len(findings)} claims: {counted(findings.values())}"
+        f"{_decided(findings, weak_groups(about, episodes))}.",
+        *(
+            f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}{_decided(own, {})}."
+            for name, own in studies.items()
+        ),
+    ]
+
+
+def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[Change]) -> list[str]:
+    """The sentences on the group that succeeds most over the same conditions; none if none was evaluated."""
+    ((value, _),) = about["axes"][NOMINAL].items()
+    nominal = NOMINAL, value
+    trained = dict.fromkeys(change.group for change in changes)
+    groups = [group for group in trained if (nominal, group) in episodes]
+    every = [at for at, _ in compared_pairs(about) if all((at, group) in episodes for group in groups)]
+    if not groups or not every:
+        return []
+    rates = {
+        group: np.stack([episode_values(episodes[at, group], "success") for at in every]) for group in groups
+    }
+    best = max(rates, key=lambda group: float(rates[group].mean()))
+    by_condition = 100 * rates[best].mean(axis=(1, 2))
+    least = int(by_condition.argmin())
+    unchanged = 100 * episode_values(episodes[nominal, best], "success").mean()
+    return [
+        f"Take [`{best}`](policies.md){NOTES.get(best, '')}: {unchanged:.0f} % with nothing changed, "
+        f"{by_condition.mean():.0f} % as the mean of all conditions; its worst is "
+        f"{condition_text(*every[least])}, {by_condition[least]:.0f} %. "
+        f"{_lead({group: own.mean(axis=0) for group, own in rates.items()}, best)}"
+    ]
+
+
+def _lead(success: Mapping[str, np.ndarray], best: str) -> str:
+    """The sentence on how sure it is that the best group leads, so that nobody takes a lucky training.
+
+    The best is found by the same episodes, so that all pairs are the family, not its own pairs alone.
+
+    Args:
+        success: Group -> mean over conditions, (trainings, corridors), of the same corridors.
+        best: The group with the largest mean.
+    """
+    several = {group: values for group, values in success.items() if len(values) > 1}
+    if best not in several:
+        return "It is a single training, which says nothing of another of its kind."
+    others = sorted(several.keys() - {best}, key=lambda group: -float(several[group].mean()))
+    if not others:
+        return "No other group has several trainings to compare it with."
+    pairs = list(itertools.combinations(several, 2))
+    found = {pair: crossed_difference(*(several[group] for group in pair), RATE) for pair in pairs}
+    adjusted = holm([1.0 if one.p is None else one.p for one in found.values()])
+    ahead = sum(p < 1 - CONFIDENCE for pair, p in zip(pairs, adjusted, strict=True) if best in pair)
+    lead = crossed_difference(several[best], several[others[0]], RATE)
+    return (
+        f"That mean is for certain above those of {ahead} of the {len(others)} other groups with several "
+        f"trainings (Holm over all {len(pairs)} pairs of groups); above the next, `{others[0]}`, by "
+        f"{estimate_text(lead, 100, '.0f')} points."
+    )
+
+
+def _worst_conditions(about: SweepFacts, changes: Sequence[Change]) -> str:
+    """The sentence on the three conditions in which most of the published trainings lose half or more."""
+    trained = {change.group for change in changes}
+    every = sum(len(about["groups"][group]) for group in trained)
+    halved, broken = Counter[Condition](), Counter[Condition]()
+    for change in changes:
+        halved[change.condition] += int((change.success <= change.before / 2)[change.before > 0].sum())
+        broken[change.condition] += int(change.broken.sum())
+    worst = [
+        f"{count} with {condition_text(*at)} ({broken[at]})" for at, count in halved.most_common(3) if count
+    ]
+    return (
+        f"What breaks most, by how many of the {every} published trainings lose half of their success or "
+        f"more (how many lose for certain): {'; '.join(worst) or 'nothing'}."
+    )
+
+
+def _foretold(changes: Sequence[Change]) -> str:
+    """The sentence on what a further training of these groups would lose for certain."""
+    several = replicated(changes)
+    certain = [change for change in several if change.certain and loses(change)]
+    sizes = sorted({len(change.success) for change in several})
+    if not certain:
+        count = " or ".join(str(size) for size in sizes)
+        of = f" of groups of {count} trainings" if sizes else ""
+        return f"What a further training would lose: none of {len(several)} changes{of} is certain among all."
+    named = ", ".join(f"`{one.group}` with {drop_text(one)}" for one in certain)
+    return (
+        f"What a further training would lose for certain, {len(certain)} of {len(several)} changes of groups "
+        f"with several trainings: {named}."
+    )
+
+
+def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> str:
+    """The claims that hold or are reversed, to be said behind how many there are.
+
+    Args:
+        findings: Of the claims.
+        weak: Groups that have little to lose, and their success with nothing changed, 0..1.
+    """
+    beside = {
+        group: f", which succeeds in {100 * rate:.0f} % with nothing changed and has little to lose"
+        for group, rate in weak.items()
+    }
+    named = {
+        verdict: [
+            f"`{claim.ours}` {claim.text} (against `{claim.theirs}`"
+            f"{beside.get(claim.theirs, '') if claim.change and verdict == 'reversed' else ''})"
+            for claim, one in findings.items()
+            if one.verdict == verdict
+        ]
+        for verdict in ("holds", "reversed")
+    }
+    holds, other = ("; ".join(claims) for claims in named.values())
+    return (f". It holds: {holds}" if holds else ". None holds") + (f". Reversed: {other}" if other else "")
+
+
+def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> dict[str, float]:
+    """Groups of claims that succeed in less than `WEAK` with nothing changed, and how often, 0..1."""
+    (value,) = about["axes"][NOMINAL]
+    compared = {group for claim in CLAIMS for group in (claim.ours, claim.theirs)}
+    unchanged = {
+        group: float(episode_values(episodes[(NOMINAL, value), group], "success").mean())
+        for group in about["groups"]
+        if group in compared and ((NOMINAL, value), group) in episodes
+    }
+    return {group: rate for group, rate in unchanged.items() if rate < WEAK}
