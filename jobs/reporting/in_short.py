@@ -92,8 +92,8 @@ def _lead(success: Mapping[str, np.ndarray], best: str) -> str:
     if not others:
         return "No other group has several trainings to compare it with."
     pairs = list(itertools.combinations(several, 2))
-    found = {pair: crossed_difference(*(several[group] for group in pair), RATE) for pair in pairs}
-    adjusted = holm([1.0 if one.p is None else one.p for one in found.values()])
+    found = [crossed_difference(several[one], several[other], RATE) for one, other in pairs]
+    adjusted = holm([1.0 if one.p is None else one.p for one in found])
     ahead = sum(p < 1 - CONFIDENCE for pair, p in zip(pairs, adjusted, strict=True) if best in pair)
     lead = crossed_difference(several[best], several[others[0]], RATE)
     return (
