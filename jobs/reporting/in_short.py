@@ -88,7 +88,8 @@ def _lead(success: Mapping[str, np.ndarray], best: str) -> str:
     several = {group: values for group, values in success.items() if len(values) > 1}
     if best not in several:
         return "It is a single training, which says nothing of another of its kind."
-    others = sorted(several.keys() - {best}, key=lambda group: -float(several[group].mean()))
+    others = [group for group in several if group != best]
+    others.sort(key=lambda group: -float(several[group].mean()))
     if not others:
         return "No other group has several trainings to compare it with."
     pairs = list(itertools.combinations(several, 2))
