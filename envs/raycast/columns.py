@@ -114,7 +114,8 @@ def render_way(
         if not (near and abs(yaw) < np.inf and abs(time) <= LIMIT_S):
             return k
         aim(room.frames[0], x, y, z, yaw, time)
-        paint_columns(bodies, noise, columns[k].T, 0, columns.shape[1], cull, room)
+        first = np.int64(0)  # not 0, for which numba would compile all of it a second time
+        paint_columns(bodies, noise, columns[k].T, first, columns.shape[1], cull, room)
     return -1
 
 

@@ -48,7 +48,8 @@ def test_a_column_painted_alone_is_that_of_the_whole_image(name, samples):
     renderer = RaycastRenderer(make_scene(name, rng), 40, 30, samples=samples)
     for _ in range(20):
         pose = *rng.uniform((-3.0, 0.0, 0.5), (3.0, 80.0, 6.0)), rng.uniform(-0.3, 0.3), rng.uniform(0, 2)
-        whole, part = renderer.render(*pose), np.full((30, 40), -1.0, np.float32)
+        whole = renderer.render(*pose)
+        part = np.full((40, 30), -1.0, np.float32).T  # column after column, as the camera keeps it
         first, last = np.sort(rng.choice(41, 2, replace=False))
         renderer.room.frames[0] = renderer.frame[0]
         aim(renderer.room.frames[0], *pose)
