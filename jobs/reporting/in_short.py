@@ -98,9 +98,9 @@ def _lead(success: Mapping[str, np.ndarray], best: str) -> str:
     ahead = sum(p < 1 - CONFIDENCE for pair, p in zip(pairs, adjusted, strict=True) if best in pair)
     lead = crossed_difference(several[best], several[others[0]], RATE)
     return (
-        f"That mean is for certain above those of {ahead} of the {len(others)} other groups with several "
-        f"trainings (Holm over all {len(pairs)} pairs of groups); above the next, `{others[0]}`, by "
-        f"{estimate_text(lead, 100, '.0f')} points."
+        f"Its lead is certain over {ahead} of the {len(others)} other groups with several trainings (Holm "
+        f"over all {len(pairs)} pairs of groups); over the next, `{others[0]}`, it is "
+        f"{estimate_text(lead, 100, '.0f')} points, with the interval of this pair alone."
     )
 
 

@@ -76,14 +76,12 @@ def test_any_size_of_sensor(width, height):
 
 
 def test_sensors_of_every_size_share_one_compiled_step():
-    """An image of one row or column has another layout to numba, which would compile for a minute."""
-    compiled = []
+    """To numba an image of one row or column has a layout of its own, for which it would compile a minute."""
     for width, height in ((8, 8), (1, 1), (1, 8), (8, 1)):
         env = CorridorEnv(camera=CameraConfig(width, height))
         env.reset(seed=0)
         env.step(0)
-        compiled.append(set(step_all.signatures))
-    assert compiled[1:] == compiled[:-1]
+    assert len(step_all.signatures) == 1
 
 
 @pytest.mark.parametrize(("count", "width_m"), [(0, 30.0), (10_000, 2000.0)])

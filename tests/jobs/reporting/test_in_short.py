@@ -21,10 +21,10 @@ def swept(tmp_path):
 
 def test_trainings_that_lose_half_are_counted_beside_those_that_lose_for_certain(swept):
     for seed, kept in ((0, 8), (1, 7), (2, 12)):
-        own = swept[("sparsity", "0.5"), "bytestream"][seed]
+        own = swept[MANY, "bytestream"][seed]
         own["success"] = np.arange(own.size) < kept  # of 16 to 20 before
     sentence = in_short(ABOUT, swept, changes_of(ABOUT, swept), {}, {})[1]
-    before = [swept[("nominal", "poles_eval"), "bytestream"][seed]["success"].sum() for seed in (0, 1, 2)]
+    before = [swept[NOMINAL, "bytestream"][seed]["success"].sum() for seed in (0, 1, 2)]
     halved = sum(kept <= all_of / 2 for kept, all_of in zip((8, 7, 12), before, strict=True))
     assert 0 < halved < 3
     assert f"{halved} with 50 % dead pixels (" in sentence
@@ -32,11 +32,10 @@ def test_trainings_that_lose_half_are_counted_beside_those_that_lose_for_certain
 
 def test_policies_are_recommended_by_the_same_conditions_whatever_changes_them(swept):
     """What is the same simulation as the baseline for one group counts for it nonetheless."""
-    nominal, few, many = ("nominal", "poles_eval"), ("sparsity", "0.2"), ("sparsity", "0.5")
-    for at in (nominal, few, many):
+    for at in (NOMINAL, FEW, MANY):
         swept[at, "bytestream"] = {seed: flights(14) for seed in (0, 1, 2)}
-        swept[at, "event_image"] = {0: flights(10 if at == many else 20)}
-    swept[few, "bytestream"][0]["steps"][0] += 1
+        swept[at, "event_image"] = {0: flights(10 if at == MANY else 20)}
+    swept[FEW, "bytestream"][0]["steps"][0] += 1
     first = in_short(ABOUT, swept, changes_of(ABOUT, swept), {}, {})[0]
     assert first.startswith("Take [`event_image`](policies.md): 100 % with nothing changed, 75 % as the mean")
 
@@ -46,11 +45,11 @@ def test_a_policy_that_was_not_evaluated_unchanged_is_not_recommended(swept):
                                    {**ABOUT["compared"][2], "baseline": ["sparsity", "0.2"]}]}  # fmt: skip
     first = in_short(about, swept, changes_of(about, swept), {}, {})[0]
     assert first.startswith("Take [`bytestream`](policies.md): 80 %")
-    del swept[("nominal", "poles_eval"), "bytestream"]
+    del swept[NOMINAL, "bytestream"]
     changes = changes_of(about, swept)
     assert in_short(about, swept, changes, {}, {})[0].startswith("Take [`event_image`](policies.md): 20 %")
     assert "| `bytestream` | - |" in breaks_table(about, changes)
-    del swept[("nominal", "poles_eval"), "event_image"]
+    del swept[NOMINAL, "event_image"]
     assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("What breaks most")
 
 
@@ -78,24 +77,24 @@ def recommended(won):
 def test_a_lead_that_other_trainings_would_keep_is_told_apart_from_a_lucky_one():
     sure = recommended({"ours": (19, 18, 19), "near": (17, 18, 19), "far": (4, 3, 4)})
     assert sure.startswith("Take [`ours`]")
-    assert "for certain above those of 1 of the 2 other groups" in sure
+    assert "certain over 1 of the 2 other groups" in sure
     assert "all 3 pairs" in sure
-    assert "next, `near`, by 3 [" in sure
+    assert "next, `near`, it is 3 [" in sure
     lucky = recommended({"ours": (20, 12, 4), "near": (17, 11, 6)})
-    assert "for certain above those of 0 of the 1 other groups" in lucky
+    assert "certain over 0 of the 1 other groups" in lucky
 
 
 def test_pairs_without_the_best_group_count_in_the_family():
     """Which group is best is found by the same episodes: who looks at more groups wants larger leads."""
     two = {"ours": (16, 17, 18), "near": (6, 8, 11)}
-    assert "above those of 1 of the 1 other" in recommended(two)
-    assert "above those of 0 of the 2 other" in recommended({**two, "beside": (6, 8, 11)})
+    assert "over 1 of the 1 other" in recommended(two)
+    assert "over 0 of the 2 other" in recommended({**two, "beside": (6, 8, 11)})
 
 
 def test_of_a_single_training_nothing_is_said_of_others():
     alone = recommended({"ours": (19,), "near": (17, 18, 19), "far": (4, 3, 4)})
     assert alone.startswith("Take [`ours`]")
     assert "single training" in alone
-    assert "for certain" not in alone
+    assert "lead" not in alone
     beside = recommended({"ours": (19, 18), "near": (17,)})
     assert "No other group has several trainings" in beside
