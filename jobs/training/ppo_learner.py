@@ -35,6 +35,7 @@ from jobs.training.gpu_steps import NORM, TOTAL, GpuSteps
 from jobs.training.rllib_internals import LEARNER, require
 from jobs.training.teacher import log_costs
 from models.policy.dense_update import Rows, Settings, update_dense
+from models.policy.event_set import EventSet
 from models.policy.networks import is_mlp
 from models.policy.rllib_module import PRIVILEGED
 
@@ -50,6 +51,7 @@ GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
 # Of a minibatch, in the order in which `update_dense` returns them.
 FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
 MOST_THREADS = 8
+LARGE = nn.Conv2d, EventSet  # layers whose gradients are worth a GPU
 MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
 # Of the learner's own settings: it multiplies rewards; episodes keep the true ones.
 REWARD_SCALE = "reward_scale"
@@ -255,9 +257,9 @@ class PlainPPOLearner(PPOTorchLearner):
         return dict(zip(FIGURES, means.tolist(), strict=True))
 
     def _on_gpu(self) -> GpuSteps | None:
-        """What takes the steps of a network with convolutions on a GPU; None: the processor takes them."""
+        """What takes the steps of a network over pictures or sets on a GPU; None: the processor does."""
         module, device = self.module[DEFAULT_MODULE_ID].unwrapped(), learner_device()
-        if device == "cpu" or not any(isinstance(layer, nn.Conv2d) for layer in module.trunk.modules()):
+        if device == "cpu" or not any(isinstance(layer, LARGE) for layer in module.trunk.modules()):
             return None
         return GpuSteps(module, self.get_optimizer(DEFAULT_MODULE_ID), self._loss, device)
 

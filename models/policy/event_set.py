@@ -102,8 +102,9 @@ class EventSet(nn.Module):
 def along(place: Tensor, side: int) -> Tensor:
     """Fourier features (..., 1 + 2 OCTAVES) of places (..., 1) along a side of so many pixels."""
     scaled = place * (2.0 / max(side - 1, 1)) - 1.0
-    waves = place.new_tensor([math.pi * 2.0 ** (octave - 1) for octave in range(OCTAVES)])
-    return torch.cat([scaled, (scaled * waves).sin(), (scaled * waves).cos()], dim=-1)
+    # Numbers and no tensor of them: that would travel to a GPU, which a recorded step must not wait for.
+    turns = torch.cat([scaled * (math.pi * 2.0 ** (octave - 1)) for octave in range(OCTAVES)], dim=-1)
+    return torch.cat([scaled, turns.sin(), turns.cos()], dim=-1)
 
 
 def _inputs(x: Tensor, y: Tensor, on: Tensor) -> list[Tensor]:

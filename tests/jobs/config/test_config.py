@@ -24,6 +24,7 @@ JOBS = {
     "learning_rates": "ablation",
     "memory_seconds": "ablation",
     "ppo_claims": "ablation",
+    "ppo_event_set": "ablation",
     "taught_claims": "ablation",
     "taught": "ablation",
 }

@@ -24,9 +24,9 @@ CUDA = pytest.param(
 )
 
 
-@pytest.fixture(scope="module")
-def ppo():
-    return build_ppo(make_config(*SHORT, "model=event_image", "algo.entropy_coeff=0.03"))
+@pytest.fixture(scope="module", params=["event_image", "event_set"])
+def ppo(request):
+    return build_ppo(make_config(*SHORT, f"model={request.param}", "algo.entropy_coeff=0.03"))
 
 
 @pytest.fixture(scope="module")
