@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from jobs.analysis.tables import save_plot
 from jobs.evaluation.sweep_report import SweepFacts
-from jobs.reporting import camera_rates, encoder_seeds
+from jobs.reporting import camera_rates, encoder_seeds, sets_study
 from jobs.reporting.breaks import SweptEpisodes
 from jobs.reporting.planned_page import made_text, write_below_plan
 from jobs.reporting.sweep_data import read_data, read_sweep, write_data
@@ -46,6 +46,12 @@ STUDIES = {
         "A marker is one training, set a little aside of its rate, a line the mean of the three; dotted: the "
         "rate at which they were trained. Blue: `pixels`, red: `frames`, green: trained by `frames`, "
         "evaluated by `pixels`.",
+    ),
+    sets_study.SETS: TrainingStudy(
+        sets_study.results_text,
+        sets_study.draw,
+        "Success of every training under each condition, by a frozen encoder and by a network over sets",
+        "A small marker is one training, a stroke the mean of its group.",
     ),
 }
 

@@ -1,0 +1,115 @@
+"""Whether a network over sets of events, learnt with the actions, holds better than a frozen encoder.
+
+The study `+exp=ppo_event_set` trains both by PPO; docs/ppo_event_set.md has its plan.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.analysis.plots import MUTED, style_of, tidy
+from jobs.analysis.statistics import CONFIDENCE, Difference, Estimate, crossed_mean
+from jobs.analysis.tables import estimate_text, markdown_table
+from jobs.evaluation.group_stats import CHANGE, RATE, Condition, episode_values
+from jobs.evaluation.sweep_report import SweepFacts
+from jobs.reporting.breaks import SweptEpisodes
+from jobs.reporting.paper_claims import GAIN
+from jobs.reporting.words import condition_text
+
+SETS = "ppo_event_set"  # name of the experiment, and of what is published of it
+LEARNT, FROZEN = "event_set", "bytestream"  # its groups
+MEAN = "mean of these"
+HEAD = ("Condition", f"`{FROZEN}` [%]", f"`{LEARNT}` [%]", "Difference [points]")
+
+
+class Pair(NamedTuple):
+    """Success of both groups, float (trainings, corridors) each; row by row trainings of one seed."""
+
+    learnt: np.ndarray
+    frozen: np.ndarray
+
+    def difference(self) -> Difference:
+        """`LEARNT` minus `FROZEN`, by pairs of trainings in the same corridors."""
+        return crossed_mean(self.learnt - self.frozen, CHANGE)
+
+
+def pairs_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[Condition, Pair]:
+    """Condition -> success under it.
+
+    Args:
+        about: What made the study.
+        episodes: Of the study.
+
+    Raises:
+        ValueError: The groups have trainings of other seeds, or one of them is missing.
+    """
+    seeds = {group: about["groups"].get(group) for group in (LEARNT, FROZEN)}
+    if seeds[LEARNT] is None or seeds[LEARNT] != seeds[FROZEN]:
+        raise ValueError(f"both groups must have trainings of the same seeds, got {seeds}")
+    return {
+        at: Pair(*(episode_values(episodes[at, group], "success") for group in (LEARNT, FROZEN)))
+        for at in ((axis, value) for axis, points in about["axes"].items() for value in points)
+    }
+
+
+def overall(pairs: dict[Condition, Pair]) -> Pair:
+    """Mean success over all conditions."""
+    return Pair(*(np.mean(side, axis=0) for side in zip(*pairs.values(), strict=True)))
+
+
+def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
+    """What the results say, as Markdown: the test, and success under each condition."""
+    pairs = pairs_of(about, episodes)
+    mean = overall(pairs)
+    found = mean.difference()
+    means = [f"{100 * side.mean():.0f} %" for side in mean]
+    lines = [_row(condition_text(*at), pair) for at, pair in pairs.items()]
+    return "\n\n".join(
+        [
+            f"Over all {len(pairs)} conditions `{LEARNT}` succeeds in {means[0]} of its episodes and "
+            f"`{FROZEN}` in {means[1]}: {estimate_text(found, 100, '+.0f')} points. {verdict_text(found)}",
+            markdown_table(HEAD, [_row(MEAN, mean), *lines], 3).rstrip("\n"),
+            "Means with 95 % intervals by trainings and corridors, each alone. The first line is the test.",
+        ]
+    )
+
+
+def verdict_text(found: Difference) -> str:
+    """What the test says, in a sentence."""
+    certain = found.p is not None and found.p < 1.0 - CONFIDENCE
+    points = f"{100 * GAIN['success']:.0f} points"
+    if certain:
+        return f"The difference is certain: `{LEARNT if found.value > 0.0 else FROZEN}` holds better."
+    if found.interval is not None and max(map(abs, found.interval)) <= GAIN["success"]:
+        return f"None is seen, and the interval leaves out one of {points}."
+    return f"None is certain, and one of {points} is not left out."
+
+
+def _row(name: str, pair: Pair) -> tuple[str, ...]:
+    """Both groups and their difference as a row under `HEAD`."""
+    means = [Estimate(*crossed_mean(side, RATE)[:2]) for side in (pair.frozen, pair.learnt)]
+    texts = [estimate_text(one, 100, ".0f") for one in means]
+    return (name, *texts, estimate_text(pair.difference(), 100, "+.0f"))
+
+
+def draw(about: SweepFacts, episodes: SweptEpisodes) -> Figure:
+    """Draw the success of both groups under each condition, a small marker for each training."""
+    pairs = pairs_of(about, episodes)
+    names = [MEAN, *(condition_text(*at) for at in pairs)]
+    figure = Figure(figsize=(6.4, 1.0 + 0.34 * len(names)), layout="constrained")
+    panel = figure.subplots()
+    for row, pair in enumerate((overall(pairs), *pairs.values())):
+        for group, side, aside in ((FROZEN, pair.frozen, -0.15), (LEARNT, pair.learnt, 0.15)):
+            colour, marker = style_of(group)
+            each, height = 100 * side.mean(axis=1), row + aside
+            panel.plot(each, np.full(len(each), height), marker, color=colour, ms=3.5, alpha=0.4, mew=0)
+            (mean,) = panel.plot(each.mean(), height, "|", color=colour, ms=11, mew=2)
+            if not row:
+                mean.set_label(f"{group}: mean of {len(each)} trainings")
+    panel.axhline(0.5, color=MUTED, lw=0.8)
+    panel.set_yticks(range(len(names)), names)
+    panel.set(xlabel="Success [%]", xlim=(-3, 103), ylim=(len(names) - 0.4, -0.6))
+    figure.legend(frameon=False, fontsize=9, ncols=2, loc="outside upper center")
+    tidy(panel, "x")
+    return figure

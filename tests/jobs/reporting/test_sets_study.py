@@ -1,0 +1,67 @@
+import pytest
+
+from jobs.analysis.statistics import Difference, crossed_difference
+from jobs.reporting.sets_study import overall, pairs_of, results_text, verdict_text
+from jobs.reporting.sweep_data import read_sweep
+from tests.support.sweep_folders import write_ablation
+
+
+def study(folder, failed):
+    return read_sweep(write_ablation(folder, "ppo_event_set", failed))
+
+
+def more_among_textures(group, axis, value, seed):
+    """Sets lose 6 of 14 episodes more under one condition of sixteen; trainings of one seed lose alike."""
+    return seed % 3 + 6 * ((group, value) == ("event_set", "texture_change"))
+
+
+def test_a_condition_has_ten_trainings_of_each_group_in_the_same_corridors(tmp_path):
+    pairs = pairs_of(*study(tmp_path, lambda *_: 1))
+    assert ("nominal", "poles_eval") in pairs
+    assert len(pairs) == 16
+    assert {side.shape for pair in pairs.values() for side in pair} == {(10, 14)}
+
+
+def test_a_loss_under_one_condition_is_its_own_and_a_share_of_the_mean(tmp_path):
+    pairs = pairs_of(*study(tmp_path, more_among_textures))
+    differences = {at: pair.difference().value for at, pair in pairs.items()}
+    lost = differences.pop(("world", "texture_change"))
+    assert lost == pytest.approx(-6 / 14)
+    assert set(differences.values()) == {0.0}
+    assert overall(pairs).difference().value == pytest.approx(-6 / 14 / 16)
+
+
+def test_trainings_of_one_seed_are_compared(tmp_path):
+    """Seeds differ much and pairs not at all: unpaired, no such difference would be certain."""
+    found = overall(pairs_of(*study(tmp_path, lambda group, *at: at[-1] + (group == "event_set"))))
+    assert found.difference().value == pytest.approx(-1 / 14)
+    assert found.difference().p < 0.05 < crossed_difference(found.learnt, found.frozen).p
+
+
+def test_a_group_that_lacks_a_training_is_refused(tmp_path):
+    about, episodes = study(tmp_path, lambda *_: 0)
+    for groups in ({"event_set": [0, 1]}, {"bytestream": [0]}, {"bytestream": [0, 1], "event_set": [0]}):
+        with pytest.raises(ValueError, match="trainings of the same seeds"):
+            pairs_of({**about, "groups": groups}, episodes)
+
+
+@pytest.mark.parametrize(
+    ("interval", "p", "told"),
+    [
+        ((0.02, 0.2), 0.01, "`event_set` holds better"),
+        ((-0.2, -0.02), 0.01, "`bytestream` holds better"),
+        ((-0.03, 0.09), 0.3, "leaves out one of 10 points"),
+        ((-0.03, 0.11), 0.3, "one of 10 points is not left out"),
+        (None, None, "one of 10 points is not left out"),
+    ],
+)
+def test_the_verdict_follows_the_test_and_the_smallest_difference_that_matters(interval, p, told):
+    value = 0.0 if interval is None else sum(interval) / 2
+    assert told in verdict_text(Difference(value, interval, p))
+
+
+def test_the_page_has_a_row_for_each_condition_and_one_for_their_mean(tmp_path):
+    text = results_text(*study(tmp_path, lambda *_: 1))
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(rows) == 2 + 1 + 16
+    assert "in 93 % of its episodes" in text
