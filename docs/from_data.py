@@ -81,7 +81,7 @@ def ppo_claims(data: Path) -> dict[str, Figure]:
 
 
 def training_studies(data: Path, name: str) -> dict[str, Figure]:
-    """That of a study of what trainings depend on."""
+    """That of another planned study of trainings."""
     return {name: draw_training_study(data, name)}
 
 

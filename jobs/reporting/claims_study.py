@@ -25,6 +25,7 @@ from jobs.run.templates import render
 
 TAUGHT, BY_PPO = "taught_claims", "ppo_claims"  # names of the experiments, and of what is published of them
 SHORT = {TAUGHT: "Taught", BY_PPO: "By PPO"}  # as heads of columns
+WHAT = {TAUGHT: "policies that a planner taught", BY_PPO: "other policies by PPO"}  # they are of
 TEMPLATE = Path(__file__).parent / "templates" / "claims_study.md.j2"
 HEAD = ("The paper says of", "Against", "Finding", "Difference", "p (Holm)", "Trainings needed")
 

@@ -13,7 +13,7 @@ from jobs.evaluation.group_stats import RATE, Condition, episode_values
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, compared_pairs, drop_text, loses, replicated
 from jobs.reporting.claims_study import BY_PPO, TAUGHT, counted
-from jobs.reporting.paper_claims import CLAIMS, Claim, Finding
+from jobs.reporting.paper_claims import BYTESTREAMS, CLAIMS, Claim, Finding
 from jobs.reporting.words import condition_text
 
 # How the results page calls the studies of the claims that are published beside it.
@@ -28,6 +28,7 @@ NOTES = {
         "been evaluated in these corridors, too)"
     )
 }
+WORST = 3  # conditions that break most
 WEAK = 0.6  # success with nothing changed below which a group is said to have little to lose
 
 
@@ -43,7 +44,9 @@ def in_short(
         *_best_policy(about, episodes, changes),
         _worst_conditions(about, changes),
         _foretold(changes),
-        f"Of the paper's {len(findings)} claims: {counted(findings.values())}"
+        *_right(about, episodes),
+        f"The paper's {len({claim.text for claim in findings})} claims about its policies make "
+        f"{len(findings)} tests, since most are of two encoders: {counted(findings.values())}"
         f"{_decided(findings, weak_groups(about, episodes))}.",
         *(
             f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}{_decided(own, {})}."
@@ -95,30 +98,41 @@ def _lead(success: Mapping[str, np.ndarray], best: str) -> str:
     pairs = list(itertools.combinations(several, 2))
     found = [crossed_difference(several[one], several[other], RATE) for one, other in pairs]
     adjusted = holm([1.0 if one.p is None else one.p for one in found])
-    ahead = sum(p < 1 - CONFIDENCE for pair, p in zip(pairs, adjusted, strict=True) if best in pair)
+    sure = [pair for pair, p in zip(pairs, adjusted, strict=True) if p < 1 - CONFIDENCE]
+    behind = [f"`{group}`" for group in others if any({best, group} == set(pair) for pair in sure)]
     lead = crossed_difference(several[best], several[others[0]], RATE)
+    named = f" ({', '.join(behind)})" if behind else ""
     return (
-        f"Its lead is certain over {ahead} of the {len(others)} other groups with several trainings (Holm "
-        f"over all {len(pairs)} pairs of groups); over the next, `{others[0]}`, it is "
-        f"{estimate_text(lead, 100, '.0f')} points, with the interval of this pair alone."
+        f"Its lead over the next best, `{others[0]}`, is {estimate_text(lead, 100, '.0f')} points by the "
+        f"interval of this pair alone; after Holm over all {len(pairs)} pairs it is certain over "
+        f"{len(behind)} of the {len(others)} other groups with several trainings{named}."
     )
 
 
 def _worst_conditions(about: SweepFacts, changes: Sequence[Change]) -> str:
-    """The sentence on the three conditions in which most of the published trainings lose half or more."""
+    """The sentence on the conditions in which most of the shipped trainings lose half or more."""
     trained = {change.group for change in changes}
     every = sum(len(about["groups"][group]) for group in trained)
-    halved, broken = Counter[Condition](), Counter[Condition]()
+    halved, broken = Counter[tuple[Condition, Condition]](), Counter[tuple[Condition, Condition]]()
     for change in changes:
-        halved[change.condition] += int((change.success <= change.before / 2)[change.before > 0].sum())
-        broken[change.condition] += int(change.broken.sum())
+        pair = change.condition, change.baseline
+        halved[pair] += int((change.success <= change.before / 2)[change.before > 0].sum())
+        broken[pair] += int(change.broken.sum())
+    most = halved.most_common()
+    least = most[min(WORST, len(most)) - 1][1] if most else 0  # what ties with the last is named, too
     worst = [
-        f"{count} with {condition_text(*at)} ({broken[at]})" for at, count in halved.most_common(3) if count
+        f"{count} with {_against(*pair)} ({broken[pair]})" for pair, count in most if count >= max(least, 1)
     ]
     return (
-        f"What breaks most, by how many of the {every} published trainings lose half of their success or "
-        f"more (how many lose for certain): {'; '.join(worst) or 'nothing'}."
+        f"What breaks most: of the {every} shipped trainings lose half of their success or more (in "
+        f"brackets, how many lose for certain): {'; '.join(worst) or 'none'}."
     )
+
+
+def _against(condition: Condition, baseline: Condition) -> str:
+    """A condition in words, with its baseline where that is more than nothing changed."""
+    beside = "" if baseline[0] == NOMINAL else f" against {condition_text(*baseline)}"
+    return f"{condition_text(*condition)}{beside}"
 
 
 def _foretold(changes: Sequence[Change]) -> str:
@@ -129,12 +143,27 @@ def _foretold(changes: Sequence[Change]) -> str:
     if not certain:
         count = " or ".join(str(size) for size in sizes)
         of = f" of groups of {count} trainings" if sizes else ""
-        return f"What a further training would lose: none of {len(several)} changes{of} is certain among all."
+        return (
+            f"What a further training would lose is not known: none of {len(several)} changes{of} is certain."
+        )
     named = ", ".join(f"`{one.group}` with {drop_text(one)}" for one in certain)
     return (
         f"What a further training would lose for certain, {len(certain)} of {len(several)} changes of groups "
         f"with several trainings: {named}."
     )
+
+
+def _right(about: SweepFacts, episodes: SweptEpisodes) -> list[str]:
+    """The sentence on what the paper is about, policies on its encoder; none if none were evaluated."""
+    (value,) = about["axes"][NOMINAL]
+    unchanged = {
+        group: 100 * episode_values(episodes[(NOMINAL, value), group], "success").mean()
+        for group in BYTESTREAMS
+        if ((NOMINAL, value), group) in episodes
+    }
+    told = " and ".join(f"`{group}` succeeds in {rate:.0f} %" for group, rate in unchanged.items())
+    what = "The paper is right that policies learn to pass obstacles by the latent of a frozen event VAE"
+    return [f"{what}: with nothing changed {told} of its episodes."] if told else []
 
 
 def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> str:
@@ -158,7 +187,8 @@ def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> st
         for verdict in ("holds", "reversed")
     }
     holds, other = ("; ".join(claims) for claims in named.values())
-    return (f". It holds: {holds}" if holds else ". None holds") + (f". Reversed: {other}" if other else "")
+    opposite = f". Reversed, which means that the opposite is certain: {other}" if other else ""
+    return (f". It holds: {holds}" if holds else ". None holds") + opposite
 
 
 def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> dict[str, float]:

@@ -1,17 +1,18 @@
-"""Whether a network over sets of events, learnt with the actions, holds better than a frozen encoder.
+"""Whether a network over sets of events, learnt with the actions, does better than a frozen encoder.
 
 The study `+exp=ppo_event_set` trains both by PPO; docs/ppo_event_set.md has its plan.
 """
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jobs.analysis.plots import MUTED, style_of, tidy
-from jobs.analysis.statistics import CONFIDENCE, Difference, Estimate, crossed_mean
+from jobs.analysis.statistics import CONFIDENCE, Difference, Estimate, crossed_mean, rate_estimate
 from jobs.analysis.tables import estimate_text, markdown_table
-from jobs.evaluation.group_stats import CHANGE, RATE, Condition, episode_values
+from jobs.evaluation.group_stats import CHANGE, RATE, Condition, TrainingEpisodes, episode_values
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import SweptEpisodes
 from jobs.reporting.paper_claims import GAIN
@@ -20,7 +21,7 @@ from jobs.reporting.words import condition_text
 SETS = "ppo_event_set"  # name of the experiment, and of what is published of it
 LEARNT, FROZEN = "event_set", "bytestream"  # its groups
 MEAN = "mean of these"
-HEAD = ("Condition", f"`{FROZEN}` [%]", f"`{LEARNT}` [%]", "Difference [points]")
+HEAD = ("Condition", f"`{FROZEN}` [%]", f"`{LEARNT}` [%]", f"`{LEARNT}` minus `{FROZEN}` [points]")
 
 
 class Pair(NamedTuple):
@@ -42,18 +43,29 @@ def pairs_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[Condition, Pair
         episodes: Of the study.
 
     Raises:
-        ValueError: The groups have trainings of other seeds, or one of them is missing.
+        ValueError: The groups have trainings of other seeds or other corridors, or one of them is missing.
     """
-    seeds = {group: about["groups"].get(group) for group in (LEARNT, FROZEN)}
-    if seeds[LEARNT] is None or seeds[LEARNT] != seeds[FROZEN]:
+    seeds = {group: about["groups"].get(group, []) for group in (LEARNT, FROZEN)}
+    if not seeds[LEARNT] or seeds[LEARNT] != seeds[FROZEN]:
         raise ValueError(f"both groups must have trainings of the same seeds, got {seeds}")
     return {
-        at: Pair(*(episode_values(episodes[at, group], "success") for group in (LEARNT, FROZEN)))
-        for at in ((axis, value) for axis, points in about["axes"].items() for value in points)
+        (axis, value): _pair(episodes, (axis, value), seeds[LEARNT])
+        for axis, points in about["axes"].items()
+        for value in points
     }
 
 
-def overall(pairs: dict[Condition, Pair]) -> Pair:
+def _pair(episodes: SweptEpisodes, at: Condition, seeds: Sequence[int | None]) -> Pair:
+    """The trainings of both groups under one condition, in the order of the seeds."""
+    both = [(group, seed) for group in (LEARNT, FROZEN) for seed in seeds]
+    missing = [one for one in both if one[1] not in episodes.get((at, one[0]), {})]
+    if missing:
+        raise ValueError(f"every training must be evaluated under {at}; missing: {missing}")
+    rows: TrainingEpisodes = {rank: episodes[at, group][seed] for rank, (group, seed) in enumerate(both)}
+    return Pair(*np.split(episode_values(rows, "success"), 2))
+
+
+def overall(pairs: Mapping[Condition, Pair]) -> Pair:
     """Mean success over all conditions."""
     return Pair(*(np.mean(side, axis=0) for side in zip(*pairs.values(), strict=True)))
 
@@ -63,33 +75,38 @@ def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
     pairs = pairs_of(about, episodes)
     mean = overall(pairs)
     found = mean.difference()
-    means = [f"{100 * side.mean():.0f} %" for side in mean]
-    lines = [_row(condition_text(*at), pair) for at, pair in pairs.items()]
+    learnt, frozen = (f"{100 * side.mean():.0f} %" for side in mean)
+    means = [crossed_mean(side, RATE) for side in (mean.frozen, mean.learnt)]
+    lines = [
+        _row(condition_text(*at), pair, [rate_estimate(side) for side in (pair.frozen, pair.learnt)])
+        for at, pair in pairs.items()
+    ]
     return "\n\n".join(
         [
-            f"Over all {len(pairs)} conditions `{LEARNT}` succeeds in {means[0]} of its episodes and "
-            f"`{FROZEN}` in {means[1]}: {estimate_text(found, 100, '+.0f')} points. {verdict_text(found)}",
-            markdown_table(HEAD, [_row(MEAN, mean), *lines], 3).rstrip("\n"),
+            f"Over all {len(pairs)} conditions `{LEARNT}` succeeds in {learnt} of its episodes and "
+            f"`{FROZEN}` in {frozen}. The difference is {estimate_text(found, 100, '+.0f')} points. "
+            f"{verdict_text(found)}",
+            markdown_table(HEAD, [_row(MEAN, mean, means), *lines], 3).rstrip("\n"),
             "Means with 95 % intervals by trainings and corridors, each alone. The first line is the test.",
         ]
     )
 
 
 def verdict_text(found: Difference) -> str:
-    """What the test says, in a sentence."""
-    certain = found.p is not None and found.p < 1.0 - CONFIDENCE
-    points = f"{100 * GAIN['success']:.0f} points"
-    if certain:
-        return f"The difference is certain: `{LEARNT if found.value > 0.0 else FROZEN}` holds better."
-    if found.interval is not None and max(map(abs, found.interval)) <= GAIN["success"]:
-        return f"None is seen, and the interval leaves out one of {points}."
-    return f"None is certain, and one of {points} is not left out."
+    """What the test says, in a sentence; with the smallest difference that matters, where none is certain."""
+    if found.p is not None and found.p < 1.0 - CONFIDENCE:
+        return f"It is certain: `{LEARNT if found.value > 0.0 else FROZEN}` succeeds more often."
+    matters = GAIN["success"]
+    out = found.interval is not None and max(map(abs, found.interval)) <= matters
+    return (
+        f"It is not certain, and one of {100 * matters:.0f} points, the smallest that "
+        f"[matters](results.md#the-papers-claims), {'is' if out else 'cannot be'} ruled out."
+    )
 
 
-def _row(name: str, pair: Pair) -> tuple[str, ...]:
-    """Both groups and their difference as a row under `HEAD`."""
-    means = [Estimate(*crossed_mean(side, RATE)[:2]) for side in (pair.frozen, pair.learnt)]
-    texts = [estimate_text(one, 100, ".0f") for one in means]
+def _row(name: str, pair: Pair, rates: Sequence[Estimate | Difference]) -> tuple[str, ...]:
+    """The rates of both groups and their difference as a row under `HEAD`."""
+    texts = [estimate_text(one, 100, ".0f") for one in rates]
     return (name, *texts, estimate_text(pair.difference(), 100, "+.0f"))
 
 

@@ -1,4 +1,4 @@
-"""Pages of studies of what trainings depend on: the plan stands, what is below it is written anew."""
+"""Pages of planned studies of trainings: the plan stands, what is below it is written anew."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -51,7 +51,7 @@ GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
 # Of a minibatch, in the order in which `update_dense` returns them.
 FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
 MOST_THREADS = 8
-LARGE = nn.Conv2d, EventSet  # layers whose gradients are worth a GPU
+LARGE = nn.Conv2d, EventSet  # parts of a network whose gradients a GPU computes, if there is one
 MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
 # Of the learner's own settings: it multiplies rewards; episodes keep the true ones.
 REWARD_SCALE = "reward_scale"
@@ -257,7 +257,7 @@ class PlainPPOLearner(PPOTorchLearner):
         return dict(zip(FIGURES, means.tolist(), strict=True))
 
     def _on_gpu(self) -> GpuSteps | None:
-        """What takes the steps of a network over pictures or sets on a GPU; None: the processor does."""
+        """What takes the steps of a network over pictures or sets of events on a GPU; None: the processor."""
         module, device = self.module[DEFAULT_MODULE_ID].unwrapped(), learner_device()
         if device == "cpu" or not any(isinstance(layer, LARGE) for layer in module.trunk.modules()):
             return None

@@ -50,7 +50,7 @@ class EventSet(nn.Module):
         The fused form on a CPU, the plain one elsewhere.
 
         Raises:
-            ValueError: A row is no event of the sensor.
+            ValueError: A row is no event of the sensor; on a CPU.
         """
         if stacks.device.type != "cpu":
             return self.plain(stacks)
@@ -60,7 +60,7 @@ class EventSet(nn.Module):
         return self._joined((largest, total, number), stacks.shape[:2])
 
     def plain(self, stacks: Tensor) -> Tensor:
-        """The same features, row by row: what the fused form is tested against, and what is exported."""
+        """The same features, row by row: on a GPU, in exported files, and to test the fused form against."""
         kind, time, x, y = stacks.to(self.gate[0].weight)[..., None].unbind(-2)
         on = (kind == ROW_ON).to(kind) - (kind == ROW_OFF).to(kind)
         there = (kind != ROW_EMPTY).to(kind)
@@ -102,7 +102,7 @@ class EventSet(nn.Module):
 def along(place: Tensor, side: int) -> Tensor:
     """Fourier features (..., 1 + 2 OCTAVES) of places (..., 1) along a side of so many pixels."""
     scaled = place * (2.0 / max(side - 1, 1)) - 1.0
-    # Numbers and no tensor of them: that would travel to a GPU, which a recorded step must not wait for.
+    # Each factor is a Python number: a tensor of them would be copied to a GPU, which cannot be recorded.
     turns = torch.cat([scaled * (math.pi * 2.0 ** (octave - 1)) for octave in range(OCTAVES)], dim=-1)
     return torch.cat([scaled, turns.sin(), turns.cos()], dim=-1)
 

@@ -94,7 +94,7 @@ def test_the_trainings_by_ppo_are_those_of_the_plan():
     config = parse(compose(f"+exp={BY_PPO}", f"ablation.trained={policies}"))
     trained = trained_policies(config)
     assert len(trained) == 40
-    assert set(trained.values()) == {found.parent for found in policies.glob("*/policy.json")}
+    assert set(trained.values()) == {found.parent for found in policies.glob(f"{BY_PPO}_*/policy.json")}
 
 
 def test_the_page_shows_the_learning_rates_that_were_searched():

@@ -53,14 +53,42 @@ def test_a_policy_that_was_not_evaluated_unchanged_is_not_recommended(swept):
     assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("What breaks most")
 
 
+def test_the_success_of_policies_on_the_papers_encoder_is_told(swept):
+    sentence = in_short(ABOUT, swept, changes_of(ABOUT, swept), {}, {})[3]
+    assert "`bytestream` succeeds in 80 % of its episodes" in sentence
+    other = {(at, group.replace("bytestream", "ours")): own for (at, group), own in swept.items()}
+    about = {
+        **ABOUT,
+        "groups": {group.replace("bytestream", "ours"): own for group, own in ABOUT["groups"].items()},
+    }
+    assert not any("VAE" in one for one in in_short(about, other, changes_of(about, other), {}, {}))
+
+
 def test_a_group_that_has_little_to_lose_is_named_beside_a_claim_about_losses():
     about, swept = read_data(REPOSITORY / "docs" / "data", "robustness")
     findings = judge_claims(about, swept, [])
     (reversed_,) = [claim for claim, one in findings.items() if one.verdict == "reversed"]
     assert (reversed_.theirs, reversed_.change) == ("rgb", True)
     assert set(weak_groups(about, swept)) == {"rgb"}
-    sentence = in_short(about, swept, changes_of(about, swept), findings, {})[3]
+    sentence = in_short(about, swept, changes_of(about, swept), findings, {})[4]
     assert "`rgb`, which succeeds in 40 % with nothing changed and has little to lose" in sentence
+
+
+def test_conditions_that_tie_with_the_third_are_named_too_and_those_of_another_baseline_with_it(swept):
+    several = {f"0.{n}": {"faults.sparsity": n / 10} for n in range(2, 8)}
+    places = [("nominal", "poles_eval"), *(("sparsity", value) for value in several)]
+    about = {**ABOUT, "axes": {"nominal": {"poles_eval": {}}, "sparsity": several}}
+    about["compared"] = [
+        {"condition": at, "baseline": places[1] if at == places[6] else places[0], "same_as": at}
+        for at in places
+    ]
+    kept = {"0.2": 18, "0.3": 2, "0.4": 3, "0.5": 4, "0.6": 5, "0.7": 6}
+    flown = {(at, "bytestream"): {s: flights(kept.get(at[1], 20)) for s in (0, 1, 2)} for at in places}
+    sentence = in_short(about, flown, changes_of(about, flown), {}, {})[1]
+    for share in ("30", "40", "50", "60"):
+        assert f"3 with {share} % dead pixels (" in sentence
+    assert "3 with 70 % dead pixels against 20 % dead pixels (" in sentence
+    assert "with 20 % dead pixels (" not in sentence
 
 
 def recommended(won):
@@ -79,7 +107,8 @@ def test_a_lead_that_other_trainings_would_keep_is_told_apart_from_a_lucky_one()
     assert sure.startswith("Take [`ours`]")
     assert "certain over 1 of the 2 other groups" in sure
     assert "all 3 pairs" in sure
-    assert "next, `near`, it is 3 [" in sure
+    assert "next best, `near`, is 3 [" in sure
+    assert "(`far`)" in sure
     lucky = recommended({"ours": (20, 12, 4), "near": (17, 11, 6)})
     assert "certain over 0 of the 1 other groups" in lucky
 

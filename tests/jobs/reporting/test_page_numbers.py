@@ -92,7 +92,7 @@ def test_what_is_said_of_the_policy_that_holds_is_what_its_own_sweep_says(held, 
     assert said == [dense["200"], dense["25"]]
     if page == "README.md":
         worst = min(min(rates) for at, rates in held.items() if at in means)
-        assert said_numbers(r"the worst one (\d+) %", text) == [worst]
+        assert said_numbers(r"the lowest single training (\d+) %", text) == [worst]
 
 
 def test_the_taught_policy_in_the_first_table_does_as_in_its_own_sweep(held):

@@ -16,6 +16,7 @@ from jobs.training.gpu_steps import GpuSteps
 from jobs.training.inputs import check_inputs
 from jobs.training.ppo import build_ppo
 from jobs.training.ppo_learner import VALUE_WARMUP, PlainPPOLearner
+from models.policy.event_set import EventSet
 from tests.support.configs import SHORT, make_config
 
 MODULE = "default_policy"
@@ -174,10 +175,28 @@ def test_a_gpu_gives_the_same_digits_again(ppo, flights, monkeypatch):
     assert all(torch.equal(value, found[1][name]) for name, value in found[0].items())
 
 
-def test_dense_networks_stay_with_the_processor(flights, monkeypatch):
-    env, _ = flights
+def test_networks_over_pictures_and_sets_of_events_go_to_the_device(ppo, flights, monkeypatch):
+    monkeypatch.setattr(ppo_learner, "GpuSteps", lambda *told: told)
+    assert make_learner(ppo, flights[0], monkeypatch, "cuda")._gpu[-1] == "cuda"
+
+
+def test_dense_networks_stay_with_the_processor(monkeypatch):
     dense = build_ppo(make_config(*SHORT, "model=event_columns"))
-    assert make_learner(dense, env, monkeypatch, "cuda")._gpu is None
+    runner = PlainEnvRunner(config=dense, worker_index=0)
+    assert make_learner(dense, runner.env, monkeypatch, "cuda")._gpu is None
+    runner.stop()
+
+
+def test_what_a_gpu_computes_of_sets_makes_no_tensor_of_numbers(monkeypatch):
+    """It would be copied from the processor, which cannot be recorded."""
+
+    def refuse(*_, **__):
+        raise AssertionError("a tensor of Python numbers")
+
+    net, rows = EventSet(2, (16, 16)), torch.zeros((1, 2, 256, 4), dtype=torch.int16)
+    for place, name in ((torch, "tensor"), (torch, "as_tensor"), (torch.Tensor, "new_tensor")):
+        monkeypatch.setattr(place, name, refuse)
+    net.plain(rows).sum().backward()
 
 
 def test_a_gpu_that_is_not_there_is_refused(monkeypatch):
