@@ -183,7 +183,8 @@ def collision_figure(
         panel.vlines(length_m, -half_width_m, half_width_m, color=MUTED, lw=1.2, ls=":")
         panel.set(xlim=(-2, length_m + 2), ylim=(half_width_m + 1.5, -half_width_m - 1.5))
     figure.supxlabel(
-        "y, along the corridor [m]; large dots: nothing changed, small dots: all changes", fontsize=8
+        "y, along the corridor [m]; large dots: nothing changed, small dots: with changes in the same scene",
+        fontsize=8,
     )
     figure.supylabel("x, to the right [m]", fontsize=8)
     return figure
@@ -206,4 +207,4 @@ def _draw_contacts(panel: Axes, group: str, unchanged: np.ndarray, changed: np.n
     counts = f"unchanged {len(usual)} of {len(unchanged)}, changed {len(others)} of {len(changed)}"
     panel.set_title(f"{group}: contacts {counts}", loc="left", fontsize=9, color=INK)
     panel.spines[:].set_visible(False)
-    panel.tick_params(labelsize=8)
+    panel.tick_params(labelsize=8, labelbottom=True, labelleft=True)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import BLUE, GREEN, GREYS, INK, MUTED, RED, panel_grid, style_of, tidy
+from jobs.analysis.plots import AMBER, BLUE, GREEN, GREYS, INK, MUTED, RED, panel_grid, style_of, tidy
 from jobs.analysis.statistics import Difference
 from jobs.evaluation.group_stats import Condition, GroupResult
 from jobs.reporting.breaks import Change
@@ -16,7 +16,8 @@ from jobs.reporting.paper_claims import GAIN, Claim, Finding
 from jobs.rollout.agents import BASELINES
 
 UNITS = {"success": (100, "points of success"), "distance_m": (1, "m of distance")}
-VERDICT_COLOURS = {"holds": GREEN, "reversed": RED, "equivalent": BLUE}
+VERDICT_COLOURS = {"holds": GREEN, "reversed": RED, "equivalent": BLUE, "does not hold": AMBER}
+STACKED = 0.16  # rows between the dots of two trainings in a map
 
 
 def change_map(changes: Sequence[Change], groups: Sequence[str], labels: Mapping[Condition, str]) -> Figure:
@@ -45,9 +46,11 @@ def change_map(changes: Sequence[Change], groups: Sequence[str], labels: Mapping
         panel.text(
             column - 0.22, row, text, ha="center", va="center", color=colour, fontsize=9, weight=weight
         )
-        places = column + 0.05 + 0.4 * change.success
-        panel.plot(places, np.full(len(places), row), "o", color=colour, ms=2.5, alpha=0.8)
-    panel.set_xticks(range(len(columns)), columns, rotation=35, ha="left", fontsize=8)
+        places, count = column + 0.05 + 0.4 * change.success, len(change.success)
+        panel.plot(places, row + STACKED * (np.arange(count) - (count - 1) / 2), "o", color=colour, ms=2)
+    alone = {change.group for change in changes if len(change.success) == 1}
+    names = [f"{group} (1 training)" if group in alone else group for group in columns]
+    panel.set_xticks(range(len(columns)), names, rotation=35, ha="left", fontsize=8)
     panel.xaxis.tick_top()
     panel.set_yticks(range(len(rows)), [labels[at] for at in rows], fontsize=8)
     panel.spines[:].set_visible(False)
@@ -58,8 +61,9 @@ def change_map(changes: Sequence[Change], groups: Sequence[str], labels: Mapping
         "bold where the change is certain" if any(one.certain for one in changes) else "no change is certain"
     )
     note = (
-        f"Numbers: success [%]; {bold} for further trainings. Dots: each training, from 0 (left) to 100 %."
-        " Empty: this change cannot affect that policy, or is another row."
+        f"Numbers: success [%]; {bold} for further trainings. Dots: each training, one below the other, "
+        "from 0 (middle of the cell) to 100 % (right). Empty: the change cannot affect that policy, "
+        "or is another row."
     )
     figure.supxlabel(note, fontsize=8, color=MUTED)
     return figure
@@ -86,7 +90,7 @@ def claims_plot(findings: Mapping[Claim, Finding]) -> Figure:
         panel.set_yticks(range(len(own)), [_claim_label(claim) for claim, _ in own])
         panel.tick_params(axis="y", labelsize=7.5)
         panel.set_ylim(len(own) - 0.5, -0.5)
-        panel.set_xlabel(f"Difference [{unit}]; grey: too small to matter", fontsize=8)
+        panel.set_xlabel(f"Difference [{unit}]; above 0: as claimed; grey: too small to matter", fontsize=8)
         tidy(panel, "x")
     return figure
 

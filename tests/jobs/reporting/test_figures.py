@@ -19,10 +19,11 @@ from docs.from_data import (
     variant_results,
 )
 from envs.config import EnvConfig
+from jobs.analysis.statistics import Difference
 from jobs.analysis.tables import estimate_text, save_plot, write_csv
 from jobs.evaluation.group_stats import LABELS, episode_values
 from jobs.reporting import dose_response, report
-from jobs.reporting.breaks import changes_of
+from jobs.reporting.breaks import Change, changes_of
 from jobs.reporting.claims_study import TAUGHT
 from jobs.reporting.dose_response import write_dose_response
 from jobs.reporting.dose_taught import DOSES_TAUGHT
@@ -31,7 +32,7 @@ from jobs.reporting.headline import BEGIN, END
 from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_curves, read_trainings
 from jobs.reporting.paper_claims import CLAIMS, compare
 from jobs.reporting.report import write_results
-from jobs.reporting.summary_plots import still_going
+from jobs.reporting.summary_plots import change_map, still_going
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_sweep, read_sweep_episodes, write_data
 from jobs.rollout.episodes import write_episodes
 from jobs.rollout.policies import PRETRAINED
@@ -229,3 +230,15 @@ def test_what_taught_policies_say_of_cameras_and_autoencoders_is_that_of_their_e
         if claim.ours == "bytestream_xy":
             said = f"{cost[0]} [{cost[1]}, {cost[2]}]"
         assert (said or f"{round(100 * found.value)} points [{ends[0]}, +{ends[1]}]") in text
+
+
+def test_trainings_that_do_alike_have_a_dot_each_in_the_map():
+    success = np.array([1.0, 1.0, 0.5, 1.0, 1.0])
+    condition, baseline = ("sparsity", "0.5"), ("nominal", "poles_eval")
+    change = Change(
+        condition, baseline, "ours", success, success, Difference(0.0, None, None), False, success < 0
+    )
+    panel = change_map([change], ["ours"], {condition: "half"}).axes[0]
+    (dots,) = [line for line in panel.lines if line.get_marker() == "o"]
+    assert len({tuple(point) for point in dots.get_xydata()}) == len(success)
+    assert abs(dots.get_ydata()).max() < 0.5  # within the row
