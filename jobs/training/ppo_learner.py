@@ -26,7 +26,6 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.evaluation.postprocessing import Postprocessing
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
-from scipy.signal import lfilter
 from torch import Tensor, nn
 
 from jobs.run.device import learner_device
@@ -74,7 +73,11 @@ def advantages(
     values = values.astype(np.float64)
     values[-1] *= not terminated
     errors = rewards + gamma * values[1:] - values[:-1]
-    return lfilter([1.0], [1.0, -gamma * lambda_], errors[::-1])[::-1]
+    estimate, estimates = 0.0, []
+    for error in reversed(errors.tolist()):
+        estimate = error + gamma * lambda_ * estimate
+        estimates.append(estimate)
+    return np.array(estimates[::-1])
 
 
 def shaping(potentials: np.ndarray, terminated: bool, gamma: float) -> np.ndarray:
