@@ -213,7 +213,8 @@ class PlainPPOLearner(PPOTorchLearner):
         taken = np.ones(len(stacks), bool)
         taken[ends - 1] = False
         estimate = np.concatenate(estimates)
-        standard = (estimate - estimate.mean()) / max(MIN_DEVIATION, estimate.std())
+        with np.errstate(invalid="ignore"):  # an infinite reward ends with the gradients that it makes NaN
+            standard = (estimate - estimate.mean()) / max(MIN_DEVIATION, estimate.std())
         columns = {
             Columns.OBS: stacks[taken],
             PRIVILEGED: privileged[taken],
