@@ -173,22 +173,29 @@ def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> st
         findings: Of the claims.
         weak: Groups that have little to lose, and their success with nothing changed, 0..1.
     """
-    beside = {
-        group: f", which succeeds in {100 * rate:.0f} % with nothing changed and has little to lose"
-        for group, rate in weak.items()
-    }
-    named = {
-        verdict: [
-            f"`{claim.ours}` {claim.text} (against `{claim.theirs}`"
-            f"{beside.get(claim.theirs, '') if claim.change and verdict == 'reversed' else ''})"
-            for claim, one in findings.items()
-            if one.verdict == verdict
-        ]
-        for verdict in ("holds", "reversed")
-    }
-    holds, other = ("; ".join(claims) for claims in named.values())
-    opposite = f". Reversed, which means that the opposite is certain: {other}" if other else ""
-    return (f". It holds: {holds}" if holds else ". None holds") + opposite
+    holds = [
+        f"`{claim.ours}` {claim.text} (against `{claim.theirs}`)"
+        for claim, one in findings.items()
+        if one.verdict == "holds"
+    ]
+    against: dict[tuple[str, str, bool], list[str]] = {}  # of what the paper says of several groups alike
+    for claim, one in findings.items():
+        if one.verdict == "reversed":
+            against.setdefault((claim.theirs, claim.text, claim.change), []).append(f"`{claim.ours}`")
+    other = [
+        f"`{theirs}` certainly {'loses less' if change else 'does better'} than {' and '.join(ours)}, of "
+        f"which the paper says: {text}{_little(theirs, weak) if change else ''}"
+        for (theirs, text, change), ours in against.items()
+    ]
+    opposite = f". Reversed: {'; '.join(other)}" if other else ""
+    return (f". It holds: {'; '.join(holds)}" if holds else ". None holds") + opposite
+
+
+def _little(group: str, weak: Mapping[str, float]) -> str:
+    """What is to be said of a group that has little to lose; nothing of others."""
+    if group not in weak:
+        return ""
+    return f" (`{group}` succeeds in {100 * weak[group]:.0f} % with nothing changed, and has little to lose)"
 
 
 def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> dict[str, float]:

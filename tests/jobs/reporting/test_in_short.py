@@ -71,7 +71,19 @@ def test_a_group_that_has_little_to_lose_is_named_beside_a_claim_about_losses():
     assert (reversed_.theirs, reversed_.change) == ("rgb", True)
     assert set(weak_groups(about, swept)) == {"rgb"}
     sentence = in_short(about, swept, changes_of(about, swept), findings, {})[4]
-    assert "`rgb`, which succeeds in 40 % with nothing changed and has little to lose" in sentence
+    assert "`rgb` certainly loses less than `bytestream`, of which the paper says" in sentence
+    assert "(`rgb` succeeds in 40 % with nothing changed, and has little to lose)" in sentence
+
+
+def test_what_is_reversed_names_the_better_group_first_and_what_it_beats_alike_together():
+    about, swept = read_data(REPOSITORY / "docs" / "data", "taught_claims")
+    findings = judge_claims(about, swept, [])
+    assert sum(one.verdict == "reversed" for one in findings.values()) == 2
+    sentence = in_short(about, swept, changes_of(about, swept), findings, {})[-1]
+    assert (
+        "None holds. Reversed: `event_image` certainly loses less than `bytestream` and `bytestream_xy`, of "
+        "which the paper says: tolerates background activity." in sentence
+    )
 
 
 def test_conditions_that_tie_with_the_third_are_named_too_and_those_of_another_baseline_with_it(swept):
