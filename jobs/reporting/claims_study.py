@@ -52,8 +52,12 @@ def read_findings(data: Path, name: str) -> dict[Claim, Finding]:
 
 
 def study_trainings(data: Path, name: str) -> list[PublishedTraining]:
-    """How the trainings of a study learnt, from the learning curves beside its policies; empty without."""
-    return published_trainings(data / f"{name}_policies")
+    """How the trainings of a study learnt, from the learning curves beside its policies; empty without.
+
+    There a group has the study's name before its own.
+    """
+    every = published_trainings(data / f"{name}_policies")
+    return [one._replace(group=one.group.removeprefix(f"{name}_")) for one in every]
 
 
 def draw_study(data: Path, name: str) -> Figure:

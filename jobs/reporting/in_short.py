@@ -52,6 +52,7 @@ def in_short(
             f"Of {len(own)} of them {OF_STUDIES[name]}: {counted(own.values())}{_decided(own, {})}."
             for name, own in studies.items()
         ),
+        *_open(findings, studies),
     ]
 
 
@@ -196,6 +197,20 @@ def _little(group: str, weak: Mapping[str, float]) -> str:
     if group not in weak:
         return ""
     return f" (`{group}` succeeds in {100 * weak[group]:.0f} % with nothing changed, and has little to lose)"
+
+
+def _open(findings: Mapping[Claim, Finding], studies: Mapping[str, Mapping[Claim, Finding]]) -> list[str]:
+    """The sentence on the claims that neither the sweep nor a study decides; none without studies."""
+    left = [
+        f"`{claim.ours}` {claim.text} (against `{claim.theirs}`)"
+        for claim in findings
+        if all(own[claim].verdict == "undecided" for own in (findings, *studies.values()) if claim in own)
+    ]
+    if not studies:
+        return []
+    if not left:
+        return [f"Each of the {len(findings)} tests is decided by at least one of these."]
+    return [f"Undecided in each of these, {len(left)} of the {len(findings)} tests: {'; '.join(left)}."]
 
 
 def weak_groups(about: SweepFacts, episodes: SweptEpisodes) -> dict[str, float]:

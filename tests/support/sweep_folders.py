@@ -72,11 +72,11 @@ def write_sweep(folder):
     return folder
 
 
-def write_shipped(folder):
-    """Leave learning curves, of policies that are there, in `folder`; returns it."""
+def write_shipped(folder, before=""):
+    """Leave learning curves in `folder`, of policies that are there, named `before` first; returns it."""
     ends = {"bytestream": (0.8, 0.81), "event_image": (0.4, 0.41)}
     steps = np.array([0.0, 500_000.0])
-    curves = [Curve(exp, seed, steps, np.array([0.0, end]), steps)
+    curves = [Curve(f"{before}{exp}", seed, steps, np.array([0.0, end]), steps)
               for exp, both in ends.items() for seed, end in enumerate(both)]  # fmt: skip
     for curve in curves:
         write_json(folder / f"{curve.exp}-s{curve.seed}" / MANIFEST, {})

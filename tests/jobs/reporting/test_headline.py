@@ -1,14 +1,16 @@
 import csv
 import dataclasses
 import re
+from collections import Counter
 
 import pytest
 
+from jobs.config.conditions import NOMINAL
 from jobs.config.config import parse
 from jobs.evaluation.group_stats import episode_values
 from jobs.evaluation.sweep_plan import axes_of, same_simulations
 from jobs.reporting.breaks import changes_of
-from jobs.reporting.claims_study import TAUGHT, read_findings
+from jobs.reporting.claims_study import BY_PPO, TAUGHT, read_findings
 from jobs.reporting.dose_response import DOSES, compare_kinds, read_doses
 from jobs.reporting.dose_taught import (
     DOSES_TAUGHT,
@@ -152,6 +154,28 @@ def test_what_the_front_page_says_of_taught_policies_is_what_the_data_say():
     assert len(reversed_m) == 2
 
 
+def test_what_the_front_page_says_of_the_claims_by_ppo_is_what_the_data_say():
+    findings = read_findings(TRAININGS.parent, BY_PPO)
+    count = Counter(one.verdict for one in findings.values())
+    text = " ".join((REPOSITORY / "docs" / "index.md").read_text().split())
+    (turned,) = [(claim, one) for claim, one in findings.items() if one.verdict == "reversed"]
+    assert turned[0].ours == "bytestream_xy"
+    assert (
+        f"of {count['does not hold']} a gain that matters is excluded, {count['equivalent']} show no "
+        f"difference that matters, 1 is reversed (false events cost `bytestream_xy` "
+        f"{-turned[1].overall.value:.0f} m more than `event_image`), {count['undecided']} stay undecided."
+    ) in text
+    assert f"none of {len(findings)} tests of the paper's claims holds, either" in text
+    assert "holds" not in count
+    _, episodes = read_data(TRAININGS.parent, BY_PPO)
+    unchanged = (NOMINAL, "poles_eval")
+    ours, theirs = (
+        100 * episode_values(episodes[unchanged, group], "success").mean()
+        for group in ("bytestream", "event_image")
+    )
+    assert f"`bytestream` reaches {ours:.0f} % and `event_image` {theirs:.0f} %" in text
+
+
 def test_what_readme_and_front_page_say_of_kinds_of_wrong_events_is_what_the_data_say():
     broken = {}
     for change in changes_of(*read_data(TRAININGS.parent, DOSES), every=True):
@@ -244,15 +268,31 @@ def test_what_the_readme_says_of_the_papers_claims_is_what_the_results_say():
         readme,
     )
     assert said.groups() == counted.groups()
+    shown = REPOSITORY / "docs" / "results.md"
     taught = re.search(
         r"Of (\d+) of them \S+ taught policies\S+ (\d+) equivalent, (\d+) reversed, (\d+) undecided",
-        (REPOSITORY / "docs" / "results.md").read_text(),
+        shown.read_text(),
     )
     told = re.search(
-        r"decide (\d+) of (\d+): (\d+) show no difference that matters, and (\d+) are reversed", readme
+        r"taught by a planner, decide (\d+) of (\d+): (\d+) show no difference that matters, and (\d+) are "
+        "reversed",
+        readme,
     )
     total, equal, turned, open_ = map(int, taught.groups())
     assert tuple(map(int, told.groups())) == (total - open_, total, equal, turned)
+    by_ppo = re.search(
+        r"Of (\d+) of them \[by PPO\D+ (\d+) do not hold, (\d+) undecided, (\d+) equivalent, (\d+) reversed",
+        shown.read_text(),
+    )
+    told = re.search(
+        r"by PPO decide (\d+) of (\d+): (\d+) do not hold, (\d+) show no difference that matters, "
+        r"and (\d+) is reversed",
+        readme,
+    )
+    total, excluded, open_, equal, turned = map(int, by_ppo.groups())
+    assert tuple(map(int, told.groups())) == (total - open_, total, excluded, equal, turned)
+    assert "Undecided in each of these, 1 of the 20 tests:" in shown.read_text()
+    assert "One test is undecided in all three." in readme
     assert sum(map(int, said.groups()[2:])) == int(said[2])
 
 

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from jobs.reporting.breaks import changes_of
+from jobs.reporting.claims_study import BY_PPO, TAUGHT
 from jobs.reporting.figures import judge_claims
 from jobs.reporting.in_short import in_short, weak_groups
+from jobs.reporting.paper_claims import Finding
 from jobs.reporting.report import breaks_table
 from jobs.reporting.sweep_data import read_data, read_sweep_episodes
 from jobs.run.provenance import REPOSITORY
@@ -84,6 +86,21 @@ def test_what_is_reversed_names_the_better_group_first_and_what_it_beats_alike_t
         "None holds. Reversed: `event_image` certainly loses less than `bytestream` and `bytestream_xy`, of "
         "which the paper says: tolerates background activity." in sentence
     )
+
+
+def test_what_no_study_decides_is_named_last():
+    about, swept = read_data(REPOSITORY / "docs" / "data", "robustness")
+    findings = judge_claims(about, swept, [])
+    left = [claim for claim, one in findings.items() if one.verdict == "undecided"]
+    some, others = left[: len(left) // 2], left[len(left) // 2 :]
+    decided = Finding("equivalent", None, {})
+    studies = {TAUGHT: dict.fromkeys(others, decided), BY_PPO: dict.fromkeys(some[1:], decided)}
+    last = in_short(about, swept, changes_of(about, swept), findings, studies)[-1]
+    assert last.startswith(f"Undecided in each of these, 1 of the {len(findings)} tests: `{some[0].ours}` ")
+    assert some[0].text in last
+    studies[BY_PPO][some[0]] = decided
+    last = in_short(about, swept, changes_of(about, swept), findings, studies)[-1]
+    assert "decided by at least one" in last
 
 
 def test_conditions_that_tie_with_the_third_are_named_too_and_those_of_another_baseline_with_it(swept):
