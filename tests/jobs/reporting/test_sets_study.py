@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from jobs.analysis.statistics import Difference, crossed_difference
+from jobs.analysis.tables import estimate_text
 from jobs.config.config import as_dict, parse
 from jobs.evaluation.group_stats import episode_values
-from jobs.reporting.sets_study import overall, pairs_of, results_text, verdict_text
-from jobs.reporting.sweep_data import read_sweep, read_sweep_episodes
+from jobs.reporting.sets_study import SETS, overall, pairs_of, results_text, verdict_text
+from jobs.reporting.sweep_data import read_data, read_sweep, read_sweep_episodes
 from jobs.run.provenance import REPOSITORY
 from jobs.studies.ablation.ablation import variant_config
 from tests.support.configs import compose
@@ -100,6 +101,21 @@ def test_the_page_has_a_row_for_each_condition_and_one_for_their_mean(tmp_path):
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 2 + 1 + 16
     assert "in 93 % of its episodes" in text
+
+
+def test_what_the_front_page_says_is_what_the_data_say():
+    about, episodes = read_data(REPOSITORY / "docs" / "data", SETS)
+    pairs = pairs_of(about, episodes)
+    mean = overall(pairs)
+    found = mean.difference()
+    text = " ".join((REPOSITORY / "docs" / "index.md").read_text().split())
+    shares = (
+        f"{100 * mean.learnt.mean():.0f} and {100 * mean.frozen.mean():.0f} % over {len(pairs)} conditions"
+    )
+    assert (
+        f"{shares}, a difference of {estimate_text(found, 100, '+.0f').replace(' ', ' points ', 1)}" in text
+    )
+    assert "cannot be ruled out" in verdict_text(found)
 
 
 def test_both_learn_at_the_best_of_the_rates_that_were_searched():
