@@ -161,7 +161,7 @@ def test_what_the_front_page_says_of_the_claims_by_ppo_is_what_the_data_say():
     (turned,) = [(claim, one) for claim, one in findings.items() if one.verdict == "reversed"]
     assert turned[0].ours == "bytestream_xy"
     assert (
-        f"of {count['does not hold']} a gain that matters is excluded, {count['equivalent']} show no "
+        f"for {count['does not hold']} a gain that matters is excluded, {count['equivalent']} show no "
         f"difference that matters, 1 is reversed (false events cost `bytestream_xy` "
         f"{-turned[1].overall.value:.0f} m more than `event_image`), {count['undecided']} stay undecided."
     ) in text
