@@ -174,11 +174,7 @@ def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> st
         findings: Of the claims.
         weak: Groups that have little to lose, and their success with nothing changed, 0..1.
     """
-    holds = [
-        f"`{claim.ours}` {claim.text} (against `{claim.theirs}`)"
-        for claim, one in findings.items()
-        if one.verdict == "holds"
-    ]
+    holds = [_told(claim) for claim, one in findings.items() if one.verdict == "holds"]
     against: dict[tuple[str, str, bool], list[str]] = {}  # of what the paper says of several groups alike
     for claim, one in findings.items():
         if one.verdict == "reversed":
@@ -192,6 +188,11 @@ def _decided(findings: Mapping[Claim, Finding], weak: Mapping[str, float]) -> st
     return (f". It holds: {'; '.join(holds)}" if holds else ". None holds") + opposite
 
 
+def _told(claim: Claim) -> str:
+    """A claim in the paper's words, with the groups that it compares."""
+    return f"`{claim.ours}` {claim.text} (against `{claim.theirs}`)"
+
+
 def _little(group: str, weak: Mapping[str, float]) -> str:
     """What is to be said of a group that has little to lose; nothing of others."""
     if group not in weak:
@@ -202,7 +203,7 @@ def _little(group: str, weak: Mapping[str, float]) -> str:
 def _open(findings: Mapping[Claim, Finding], studies: Mapping[str, Mapping[Claim, Finding]]) -> list[str]:
     """The sentence on the claims that neither the sweep nor a study decides; none without studies."""
     left = [
-        f"`{claim.ours}` {claim.text} (against `{claim.theirs}`)"
+        _told(claim)
         for claim in findings
         if all(own[claim].verdict == "undecided" for own in (findings, *studies.values()) if claim in own)
     ]
