@@ -25,6 +25,7 @@ JOBS = {
     "memory_seconds": "ablation",
     "ppo_claims": "ablation",
     "ppo_event_set": "ablation",
+    "ppo_paper": "ablation",
     "taught_claims": "ablation",
     "taught": "ablation",
 }
