@@ -4,8 +4,8 @@ Run: python -m platform.launch +exp=report
 Expect: seconds; docs/results.md and docs/images/results_*.png of the newest sweep, docs/trade.md and
 docs/images/trade.png of the newest trade, docs/replay.html of the newest replay page, the results in
 docs/dose_response.md, docs/dose_response_taught.md, docs/taught_claims.md, docs/ppo_claims.md,
-docs/ppo_event_set.md, docs/encoder_seeds.md and docs/camera_rates.md of the newest studies of these names;
-with `resume` of what that run folder holds.
+docs/ppo_event_set.md, docs/ppo_paper.md, docs/encoder_seeds.md and docs/camera_rates.md of the newest
+studies of these names; with `resume` of what that run folder holds.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,4 @@
-"""Whether a network over sets of events, learnt with the actions, does better than a frozen encoder.
-
-The study `+exp=ppo_event_set` trains both by PPO; docs/ppo_event_set.md has its plan.
-"""
+"""Which of two groups of trainings succeeds more often over all conditions: one test, and a table."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,46 +15,51 @@ from jobs.reporting.breaks import SweptEpisodes
 from jobs.reporting.paper_claims import GAIN
 from jobs.reporting.words import condition_text
 
-SETS = "ppo_event_set"  # name of the experiment, and of what is published of it
-LEARNT, FROZEN = "event_set", "bytestream"  # its groups
 MEAN = "mean of these"
-HEAD = ("Condition", f"`{FROZEN}` [%]", f"`{LEARNT}` [%]", f"`{LEARNT}` minus `{FROZEN}` [points]")
+
+
+class Groups(NamedTuple):
+    """The names of the two groups: `tried` is compared with `usual`."""
+
+    tried: str
+    usual: str
 
 
 class Pair(NamedTuple):
     """Success of both groups, float (trainings, corridors) each; row by row trainings of one seed."""
 
-    learnt: np.ndarray
-    frozen: np.ndarray
+    tried: np.ndarray
+    usual: np.ndarray
 
     def difference(self) -> Difference:
-        """`LEARNT` minus `FROZEN`, by pairs of trainings in the same corridors."""
-        return crossed_mean(self.learnt - self.frozen, CHANGE)
+        """`tried` minus `usual`, by pairs of trainings in the same corridors."""
+        return crossed_mean(self.tried - self.usual, CHANGE)
 
 
-def pairs_of(about: SweepFacts, episodes: SweptEpisodes) -> dict[Condition, Pair]:
+def pairs_of(groups: Groups, about: SweepFacts, episodes: SweptEpisodes) -> dict[Condition, Pair]:
     """Condition -> success under it.
 
     Args:
+        groups: Which are compared.
         about: What made the study.
         episodes: Of the study.
 
     Raises:
         ValueError: The groups have trainings of other seeds or other corridors, or one of them is missing.
     """
-    seeds = {group: about["groups"].get(group, []) for group in (LEARNT, FROZEN)}
-    if not seeds[LEARNT] or seeds[LEARNT] != seeds[FROZEN]:
+    seeds = {group: about["groups"].get(group, []) for group in groups}
+    if not seeds[groups.tried] or seeds[groups.tried] != seeds[groups.usual]:
         raise ValueError(f"both groups must have trainings of the same seeds, got {seeds}")
     return {
-        (axis, value): _pair(episodes, (axis, value), seeds[LEARNT])
+        (axis, value): _pair(groups, episodes, (axis, value), seeds[groups.tried])
         for axis, points in about["axes"].items()
         for value in points
     }
 
 
-def _pair(episodes: SweptEpisodes, at: Condition, seeds: Sequence[int | None]) -> Pair:
+def _pair(groups: Groups, episodes: SweptEpisodes, at: Condition, seeds: Sequence[int | None]) -> Pair:
     """The trainings of both groups under one condition, in the order of the seeds."""
-    both = [(group, seed) for group in (LEARNT, FROZEN) for seed in seeds]
+    both = [(group, seed) for group in groups for seed in seeds]
     missing = [one for one in both if one[1] not in episodes.get((at, one[0]), {})]
     if missing:
         raise ValueError(f"every training must be evaluated under {at}; missing: {missing}")
@@ -70,32 +72,34 @@ def overall(pairs: Mapping[Condition, Pair]) -> Pair:
     return Pair(*(np.mean(side, axis=0) for side in zip(*pairs.values(), strict=True)))
 
 
-def results_text(about: SweepFacts, episodes: SweptEpisodes) -> str:
+def results_text(groups: Groups, about: SweepFacts, episodes: SweptEpisodes) -> str:
     """What the results say, as Markdown: the test, and success under each condition."""
-    pairs = pairs_of(about, episodes)
+    pairs = pairs_of(groups, about, episodes)
     mean = overall(pairs)
     found = mean.difference()
-    learnt, frozen = (f"{100 * side.mean():.0f} %" for side in mean)
-    means = [crossed_mean(side, RATE) for side in (mean.frozen, mean.learnt)]
+    tried, usual = (f"{100 * side.mean():.0f} %" for side in mean)
+    means = [crossed_mean(side, RATE) for side in (mean.usual, mean.tried)]
     lines = [
-        _row(condition_text(*at), pair, [rate_estimate(side) for side in (pair.frozen, pair.learnt)])
+        _row(condition_text(*at), pair, [rate_estimate(side) for side in (pair.usual, pair.tried)])
         for at, pair in pairs.items()
     ]
+    rates = [f"`{group}` [%]" for group in (groups.usual, groups.tried)]
+    head = ("Condition", *rates, f"`{groups.tried}` minus `{groups.usual}` [points]")
     return "\n\n".join(
         [
-            f"Over all {len(pairs)} conditions `{LEARNT}` succeeds in {learnt} of its episodes and "
-            f"`{FROZEN}` in {frozen}. The difference is {estimate_text(found, 100, '+.0f')} points. "
-            f"{verdict_text(found)}",
-            markdown_table(HEAD, [_row(MEAN, mean, means), *lines], 3).rstrip("\n"),
+            f"Over all {len(pairs)} conditions `{groups.tried}` succeeds in {tried} of its episodes and "
+            f"`{groups.usual}` in {usual}. The difference is {estimate_text(found, 100, '+.0f')} points. "
+            f"{verdict_text(groups, found)}",
+            markdown_table(head, [_row(MEAN, mean, means), *lines], 3).rstrip("\n"),
             "Means with 95 % intervals by trainings and corridors, each alone. The first line is the test.",
         ]
     )
 
 
-def verdict_text(found: Difference) -> str:
+def verdict_text(groups: Groups, found: Difference) -> str:
     """What the test says, in a sentence; with the smallest difference that matters, where none is certain."""
     if found.p is not None and found.p < 1.0 - CONFIDENCE:
-        return f"It is certain: `{LEARNT if found.value > 0.0 else FROZEN}` succeeds more often."
+        return f"It is certain: `{groups.tried if found.value > 0.0 else groups.usual}` succeeds more often."
     matters = GAIN["success"]
     out = found.interval is not None and max(map(abs, found.interval)) <= matters
     return (
@@ -105,19 +109,19 @@ def verdict_text(found: Difference) -> str:
 
 
 def _row(name: str, pair: Pair, rates: Sequence[Estimate | Difference]) -> tuple[str, ...]:
-    """The rates of both groups and their difference as a row under `HEAD`."""
+    """The rates of both groups, the usual first, and their difference as a row of the table."""
     texts = [estimate_text(one, 100, ".0f") for one in rates]
     return (name, *texts, estimate_text(pair.difference(), 100, "+.0f"))
 
 
-def draw(about: SweepFacts, episodes: SweptEpisodes) -> Figure:
+def draw(groups: Groups, about: SweepFacts, episodes: SweptEpisodes) -> Figure:
     """Draw the success of both groups under each condition, a small marker for each training."""
-    pairs = pairs_of(about, episodes)
+    pairs = pairs_of(groups, about, episodes)
     names = [MEAN, *(condition_text(*at) for at in pairs)]
     figure = Figure(figsize=(6.4, 1.0 + 0.34 * len(names)), layout="constrained")
     panel = figure.subplots()
     for row, pair in enumerate((overall(pairs), *pairs.values())):
-        for group, side, aside in ((FROZEN, pair.frozen, -0.15), (LEARNT, pair.learnt, 0.15)):
+        for group, side, aside in ((groups.usual, pair.usual, -0.15), (groups.tried, pair.tried, 0.15)):
             colour, marker = style_of(group)
             each, height = 100 * side.mean(axis=1), row + aside
             panel.plot(each, np.full(len(each), height), marker, color=colour, ms=3.5, alpha=0.4, mew=0)
