@@ -110,13 +110,16 @@ def test_pages_say_the_minutes_that_the_readme_measured():
         assert f"{quick} to {slow} minutes" in page_text(page), page
 
 
-def test_pages_give_the_numbers_of_both_hosts_on_the_readme():
+def test_pages_give_the_numbers_of_all_three_hosts_on_the_readme():
     readme = page_text("README.md")
-    told = re.search(r"sampled action \| `poles_eval` \| \*\*(\d+)\*\* (\[\d+, \d+\])", readme)
-    other = re.search(r"that host gave (\d+ \[\d+, \d+\])", readme)
+    rate = r"(\d+) (\[\d+, \d+\])"
+    first = re.search(r"sampled action \| `poles_eval` \| \*\*(\d+)\*\* (\[\d+, \d+\])", readme)
+    second = re.search(rf"that host gave {rate}", readme)
+    third = re.search(rf"a third \(.*?\) {rate}", readme)
     text = page_text("docs/representations.md")
-    assert f"succeeded in {told[1]} {told[2]} of 100 held-out corridors" in text
-    assert f"rounds differently, in {other[1]}" in text
+    assert f"succeeded in {first[1]} {first[2]} of 100 held-out corridors" in text
+    assert f"round differently, in {second[1]} {second[2]} and {third[1]} {third[2]}" in text
+    assert f"reached {first[1]}, {second[1]} and {third[1]} %" in page_text("docs/faq.md")
 
 
 def test_the_front_page_counts_the_shipped_policies():
