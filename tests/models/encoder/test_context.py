@@ -1,10 +1,11 @@
 import copy
+import itertools
 
 import numpy as np
 import pytest
 import torch
 
-from models.encoder.context import EventContextNetwork, Events, newest_first
+from models.encoder.context import EventContextNetwork, Events, MaxContext, newest_first
 from models.encoder.event_batch import EventBatch, Grid
 
 GRID = Grid(width=12, height=9, time_bins=32)
@@ -100,6 +101,31 @@ def test_of_equals_the_newest_comes_first_and_windows_stay_together():
     assert cell.tolist() == [1, 2, 0, 4, 3]
     assert bins.tolist() == [7, 5, 3, 2, 0]
     assert offsets.tolist() == [0, 3, 3, 5]
+
+
+def test_of_equal_sums_the_first_wins_in_windows_of_any_size():
+    """Few values make many equal sums; the gradient of the bias counts winners with a feature above 0."""
+    rng, sizes = np.random.default_rng(3), [*range(12), 40]
+    offsets = np.cumsum([0, *sizes])
+    cell, bins = rng.integers(0, 6, offsets[-1], dtype=np.int32), rng.integers(0, 5, offsets[-1])
+    h, weight, bias = torch.eye(6), torch.from_numpy(rng.integers(0, 3, (16, 6))).float(), torch.zeros(16)
+    codes = rng.integers(-2, 2, (5, 16)).astype(np.float32)
+    inputs = [value.requires_grad_() for value in (h, weight, bias)]
+    context, winning_bin = MaxContext.apply(*inputs, Events(cell, bins, offsets, codes), False)
+    context.sum().backward()
+    value = weight.detach().numpy().T[cell] + codes[bins]
+    counted = np.zeros((6, 16))
+    for b, (first, stop) in enumerate(itertools.pairwise(offsets)):
+        own = value[first:stop]
+        best, seen = own.max(0, initial=0), own.max(0, initial=0) > 0
+        assert np.array_equal(context[b].detach(), best)
+        for j in np.flatnonzero(seen):
+            winner = first + own[:, j].argmax()
+            assert winning_bin[b, j] == bins[winner]
+            counted[cell[winner], j] += weight[j, cell[winner]] > 0
+        assert not winning_bin[b][torch.from_numpy(~seen)].any()
+    assert np.array_equal(weight.grad.T, counted)
+    assert np.array_equal(bias.grad, counted.sum(0))
 
 
 @pytest.mark.parametrize("form", ["forward", "plain"])
