@@ -392,8 +392,8 @@ class ClusterConfig:
         num_cpus: How many cores jobs may use; None for all.
         storage: A folder that every node sees (NFS), or an address such as s3://bucket/evade;
             None for the run folder, where there is only one machine.
-        device: Where PPO computes the gradients of networks over pictures or sets of events; cuda: on
-            this machine's GPU. Digits differ between the two by rounding.
+        device: Where event VAEs learn, and where PPO computes the gradients of networks over pictures or sets
+            of events; cuda: on this machine's GPU. Digits differ between the two by rounding.
     """
 
     name: Literal["local", "ray"]

@@ -74,7 +74,7 @@ class GpuSteps:
     def values(self, module: nn.Module, told: Mapping[str, Tensor]) -> Tensor:
         """What `module.compute_values` gives, computed on the device; on the processor, float32 (B,)."""
         self._load_weights(module)
-        with _exact():
+        with exact():
             return self._module.compute_values({name: self._there(part) for name, part in told.items()}).cpu()
 
     def take(
@@ -108,7 +108,7 @@ class GpuSteps:
         count = len(next(iter(rows.values())))
         self._load_rows(rows)
         orders = self._there(orders)
-        with _exact():
+        with exact():
             recorded = self._record(orders[0, :minibatch_size], grad_clip, variant)
             self._load_weights(module)
             self._load_moments(optimizer)
@@ -220,7 +220,7 @@ def _tensors(module: nn.Module) -> list[Tensor]:
 
 
 @contextlib.contextmanager
-def _exact() -> Iterator[None]:
+def exact() -> Iterator[None]:
     """The same digits each time, in whole float32."""
     with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
         yield

@@ -6,8 +6,6 @@ the original is gone; the encoder is the policy's, so that nothing is collected 
 
 from pathlib import Path
 
-import torch
-
 from jobs.config.config import Config, ConfigError
 from jobs.config.errors import differences
 from jobs.rollout.policies import load_trained
@@ -23,13 +21,9 @@ def check_inputs(config: Config) -> None:
     """Check all that a training begins from, and its GPU, before anything is made.
 
     Raises:
-        ConfigError: `train.init` names no policy, or one that does not fit; or as `check_sources`; or torch
-            sees no GPU for `cluster.device=cuda`.
+        ConfigError: `train.init` names no policy, or one that does not fit; or as `check_sources`.
     """
     check_sources(config)
-    if config.cluster.device == "cuda" and not torch.cuda.is_available():
-        rule = "cuda needs a GPU and a build of torch with CUDA, and torch sees no GPU here; take cpu"
-        raise ConfigError(f"cluster.device: {rule}, got 'cuda'")
     folder = locate_run(config)
     if folder.config.train.init is not None:
         check_init(folder)

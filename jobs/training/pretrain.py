@@ -6,6 +6,7 @@ with its manifest, and `encoder/reconstructions.png`, in the run folder. A kille
 continues from its last checkpoint.
 """
 
+import copy
 import dataclasses
 import hashlib
 import io
@@ -27,6 +28,7 @@ from jobs.run.progress import console, progress
 from jobs.run.torch_threads import torch_threads
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.collect import check_collect, collect, data_file
+from jobs.training.gpu_steps import exact
 from models.encoder.evae import (
     EventVAE,
     appendix_beta,
@@ -79,11 +81,15 @@ def run(config: Config) -> dict[str, float]:
 
 
 def check_sources(config: Config) -> None:
-    """Check the files that collecting and pretraining begin from, before anything is made.
+    """Check the files that collecting and pretraining begin from, and the GPU, before anything is made.
 
     Raises:
-        ConfigError: `collect.policy`, `collect.recordings` or `pretrain.encoder` names one that does not fit.
+        ConfigError: `collect.policy`, `collect.recordings` or `pretrain.encoder` names one that does not fit;
+            or torch sees no GPU for `cluster.device=cuda`.
     """
+    if config.cluster.device == "cuda" and not torch.cuda.is_available():
+        rule = "cuda needs a GPU and a build of torch with CUDA, and torch sees no GPU here; take cpu"
+        raise ConfigError(f"cluster.device: {rule}, got 'cuda'")
     folder = locate_run(config)
     if KINDS[folder.config.model.name].encoder:
         check_collect(folder)
@@ -134,7 +140,8 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     (train, true), (validation, validation_true) = (
         read_split(folder, split, settings.denoise) for split in SPLITS
     )
-    training = EvaeTraining.begin(evae_settings(config), train, settings, (config.seed, 2), true)
+    seed, device = (config.seed, 2), config.cluster.device
+    training = EvaeTraining.begin(evae_settings(config), train, settings, seed, true, device)
     evae, first = training.evae, restore(folder.encoder, training)
     begin = initial_state(folder)  # none where a checkpoint was restored; a damaged one is gone by now
     if begin is not None:
@@ -142,12 +149,16 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     held_out = held_out_windows(validation, settings, evae.grid, validation_true)
     latest: dict[str, float] = {}
     title = "Pretrain the event VAE"
-    with torch_threads(THREADS), progress(title, settings.iterations, "iterations", done=first) as advance:
+    with (
+        torch_threads(THREADS),
+        exact(),
+        progress(title, settings.iterations, "iterations", done=first) as advance,
+    ):
         for iteration in range(first, settings.iterations):
             losses = training.step(iteration)
             last = iteration + 1 == settings.iterations
             if last or (iteration + 1) % settings.validate_every == 0:
-                before, latest = latest, held_out_figures(evae, held_out)
+                before, latest = latest, held_out_figures(on_processor(evae), held_out)
                 if latest["collapsed"] > before.get("collapsed", 0.0):
                     console.print(f"Iteration {iteration + 1}: {COLLAPSED}", markup=False)
                 tracker.log(
@@ -157,7 +168,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
                 save_checkpoint(folder.encoder, training, iteration + 1)
             measured = f", held out {latest['explained_loss_step']:.0%} explained" if latest else ""
             advance(1, note=f"loss {losses['loss']:.4f}{measured}")
-    return freeze(config, folder, tracker, evae, train.about, held_out)
+    return freeze(config, folder, tracker, on_processor(evae), train.about, held_out)
 
 
 def read_split(folder: Run, split: str, denoise: bool) -> tuple[Recording, Recording | None]:
@@ -208,8 +219,11 @@ class EvaeTraining:
         settings: PretrainConfig,
         seed: tuple[int, int],
         true: Recording | None = None,
+        device: str = "cpu",
     ) -> "EvaeTraining":
         """A training from random weights; `seed` is that of the experiment and the number of its stream.
+
+        On any `device`, as torch names it, it begins from the same weights and sees the same windows.
 
         Raises:
             ConfigError: Windows are to hold a number of events, and the recording has none.
@@ -220,7 +234,7 @@ class EvaeTraining:
             )
             raise ConfigError(f"pretrain.windows: {rule}")
         torch.manual_seed(seed[0])
-        evae = EventVAE.of(model)
+        evae = EventVAE.of(model).to(device)
         optimizer = torch.optim.Adam(
             evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
         )
@@ -235,8 +249,13 @@ class EvaeTraining:
         decoded = batch
         if self.true is not None:
             decoded = batch_windows(true_windows(self.true, windows, settings.window_events), evae.grid)
-        targets = event_targets(decoded, evae.target)
+        targets = event_targets(decoded, evae.target).to(evae.decoder[0].weight.device)
         return train_step(evae, self.optimizer, batch, targets, beta(settings, iteration), self.rng)
+
+
+def on_processor(evae: EventVAE) -> EventVAE:
+    """The model itself, or a copy of one that is on a GPU."""
+    return evae if evae.decoder[0].weight.device.type == "cpu" else copy.deepcopy(evae).cpu()
 
 
 def evae_settings(config: Config) -> EvaeSettings:
@@ -411,7 +430,7 @@ def restore(folder: Path, training: EvaeTraining) -> int:
             console.print(f"Checkpoint damaged, the one before it is taken: {path}", markup=False)
             path.unlink()
             continue
-        state = torch.load(io.BytesIO(content), weights_only=True)
+        state = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
         training.evae.load_state_dict(state["evae"])
         training.optimizer.load_state_dict(state["optimizer"])
         training.rng.bit_generator.state = state["rng"]

@@ -17,7 +17,8 @@ event that wins (the newest of equals) and has no gradient.
 the same function with the same parameters, gradients and running statistics, tens of times
 faster on a CPU (`jobs/bench/context.py`): x, y, p have only 2 H W values, so the layers run once
 per distinct value, with batch statistics weighted by how often each occurs. Only the order of the
-sums differs; `tests/models/encoder/test_context.py` states the bounds for float64 and float32.
+sums differs; `tests/models/encoder/test_context.py` states the bounds for float64 and float32. On a GPU
+the last layer and the maximum are torch's (`max_on_device`).
 """
 
 import itertools
@@ -31,6 +32,7 @@ from torch.nn import functional
 
 from models.encoder.embedding import embedding_table, eventnet_phase
 from models.encoder.event_batch import EventBatch, Grid, distinct
+from models.encoder.gpu_context import max_context
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -63,21 +65,18 @@ class EventContextNetwork(nn.Module):
     def forward(self, batch: EventBatch) -> Tensor:
         """Context (B, D) of a batch of windows, or (B, 2 D) by EventNet's coding.
 
-        The fused form on a CPU, the plain one elsewhere.
-
         Raises:
             ValueError: The batch was made for another grid, or has fewer than two events
                 to take batch statistics from, or the weights are not float32 or float64.
         """
-        if self.layers[0].weight.device.type != "cpu":
-            return self.plain(batch)
         cell, bins, embedding = self._address(batch)
         present, multiplicity, rank = distinct(cell)
         share = self._share(multiplicity, len(cell))
         h, weight, bias = self._last_layer(self._inputs(present), share, len(cell))
         events, squash = Events(rank, bins, batch.offsets, embedding), self.coding == "eventnet"
         ordered = newest_first(events) if squash else events
-        context, winning_bin = MaxContext.apply(h, weight, bias, ordered, squash)
+        form = MaxContext.apply if h.device.type == "cpu" else max_on_device
+        context, winning_bin = form(h, weight, bias, ordered, squash)
         return self._rotated(context, winning_bin) if squash else context
 
     def plain(self, batch: EventBatch) -> Tensor:
@@ -220,6 +219,15 @@ def newest_first(events: Events) -> Events:
     window = np.repeat(np.arange(len(events.offsets) - 1), np.diff(events.offsets))
     order = np.lexsort((-events.bin, window))
     return events._replace(cell=events.cell[order], bin=events.bin[order])
+
+
+def max_on_device(
+    h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool
+) -> tuple[Tensor, Tensor]:
+    """What `MaxContext` computes, by operations of torch on the device of its inputs."""
+    features = torch.relu(torch.addmm(bias, h, weight.T))
+    features = torch.tanh(features) if squash else features
+    return max_context(features, events.codes, (events.cell, events.bin), events.offsets)
 
 
 class MaxContext(torch.autograd.Function):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from models.encoder import context as room
 from models.encoder.context import EventContextNetwork, Events, MaxContext, newest_first
 from models.encoder.event_batch import EventBatch, Grid
 
@@ -47,6 +48,13 @@ def run(network, form, batches):
     return values | dict(network.named_buffers())
 
 
+@pytest.fixture(params=["processor", "device"])
+def fused_form(request, monkeypatch):
+    """Both fused forms, that of a device on the processor too."""
+    if request.param == "device":
+        monkeypatch.setattr(room.MaxContext, "apply", room.max_on_device)
+
+
 def relative_differences(network, batches):
     plain, fused = run(network, "plain", batches), run(network, "forward", batches)
     assert plain.keys() == fused.keys()
@@ -56,6 +64,7 @@ def relative_differences(network, batches):
     }
 
 
+@pytest.mark.usefixtures("fused_form")
 @pytest.mark.parametrize(("variant", "coding", "norm"), CASES)
 @pytest.mark.parametrize("training", [True, False])
 def test_the_fused_form_is_the_plain_formula_in_float64(variant, coding, norm, training):
@@ -64,6 +73,7 @@ def test_the_fused_form_is_the_plain_formula_in_float64(variant, coding, norm, t
     assert max(differences.values()) < 1e-10, differences
 
 
+@pytest.mark.usefixtures("fused_form")
 @pytest.mark.parametrize(("variant", "coding", "norm"), CASES)
 def test_the_fused_form_is_the_plain_formula_in_float32_to_its_rounding(variant, coding, norm):
     network = make_network(variant, norm, torch.float32, coding=coding)
@@ -72,6 +82,7 @@ def test_the_fused_form_is_the_plain_formula_in_float32_to_its_rounding(variant,
     assert max(differences.values()) < 5e-5, differences
 
 
+@pytest.mark.usefixtures("fused_form")
 @pytest.mark.parametrize("form", ["forward", "plain"])
 def test_eventnet_keeps_the_complex_number_of_largest_magnitude(form):
     network = make_network(coding="eventnet").eval()
@@ -135,6 +146,7 @@ def test_half_precision_is_refused(form, dtype):
         getattr(make_network(dtype=dtype), form)(make_batch(0))
 
 
+@pytest.mark.usefixtures("fused_form")
 def test_the_fused_form_of_float32_is_close_to_the_plain_formula_of_float64():
     network = make_network(dtype=torch.float32)
     exact = run(copy.deepcopy(network).double(), "plain", [make_batch(0)])
@@ -143,11 +155,13 @@ def test_the_fused_form_of_float32_is_close_to_the_plain_formula_of_float64():
     assert (exact["context"] - rounded["context"]).abs().max() < 1e-5
 
 
+@pytest.mark.usefixtures("fused_form")
 def test_the_appendix_sizes_agree_as_well():
     network = make_network(context=1024)
     assert max(relative_differences(network, [make_batch(3)]).values()) < 1e-10
 
 
+@pytest.mark.usefixtures("fused_form")
 @pytest.mark.parametrize("form", ["forward", "plain"])
 @pytest.mark.parametrize("coding", ["additive", "eventnet"])
 def test_an_empty_window_has_the_zero_context(form, coding):
@@ -157,6 +171,7 @@ def test_an_empty_window_has_the_zero_context(form, coding):
     assert context[0].any()
 
 
+@pytest.mark.usefixtures("fused_form")
 @pytest.mark.parametrize("form", ["forward", "plain"])
 @pytest.mark.parametrize(("coding", "size"), [("additive", 48), ("eventnet", 96)])
 def test_a_batch_of_empty_windows_alone_is_defined_in_eval_mode(form, coding, size):
