@@ -1,13 +1,17 @@
 import shutil
+from collections import Counter
 
 import pytest
 
 from jobs.config.config import as_dict, parse
 from jobs.reporting import two_groups
 from jobs.reporting.claims_study import BY_PPO, study_findings
+from jobs.reporting.learning_curves import read_curves
 from jobs.reporting.paper_claims import FASTER, OF_BOTH
 from jobs.reporting.paper_recipe import PAPER, RECIPES, recipe_findings, results_text
-from jobs.reporting.sweep_data import read_sweep
+from jobs.reporting.sweep_data import read_data, read_sweep
+from jobs.run.files import read_json
+from jobs.run.provenance import REPOSITORY
 from jobs.studies.ablation.ablation import variant_config
 from models.policy.policy import MANIFEST
 from tests.support.configs import compose
@@ -28,6 +32,11 @@ def learning_curves(data):
         shutil.copytree(folder / f"{BY_PPO}_bytestream-s{seed}", folder / f"{PAPER}_bytestream_paper-s{seed}")
         assert (folder / f"{PAPER}_bytestream_paper-s{seed}" / MANIFEST).is_file()
     return data
+
+
+def page_text(name):
+    """A page without its line breaks, which may stand anywhere."""
+    return " ".join((REPOSITORY / "docs" / f"{name}.md").read_text().split())
 
 
 def only_recipe_loses(group, axis, value, seed):
@@ -73,6 +82,36 @@ def test_the_claim_about_learning_is_tested_where_curves_are_published(tmp_path)
     assert {claim.text for claim in found} == without | {FASTER}
     (faster,) = (one for claim, one in found.items() if claim.text == FASTER)
     assert faster.overall.value == pytest.approx(0.2)
+
+
+def test_the_readme_says_how_much_both_recipes_succeed():
+    pairs = two_groups.pairs_of(RECIPES, *read_data(REPOSITORY / "docs" / "data", PAPER))
+    tried, usual = (f"{100 * side.mean():.0f}" for side in two_groups.overall(pairs))
+    text = " ".join((REPOSITORY / "README.md").read_text().split())
+    assert f"recipe succeed in {tried} % over {len(pairs)} conditions, ten by ours in {usual} (" in text
+
+
+def test_what_pages_say_of_the_recipe_is_what_the_data_say():
+    """How the claims end, how the ten trainings end, and what their encoders explain."""
+    data = REPOSITORY / "docs" / "data"
+    verdicts = Counter(one.verdict for one in recipe_findings(data, *read_data(data, PAPER)).values())
+    assert verdicts["holds"] == 0
+    front = page_text("index")
+    assert (
+        f"{sum(verdicts.values())} claims on it none holds, and {verdicts['reversed']} is reversed" in front
+    )
+    policies = sorted(data.glob(f"{BY_PPO}_policies/{PAPER}_bytestream_paper-s*"))
+    encoders = [read_json(policy / "encoder.json")["figures"] for policy in policies]
+    explained = [round(100 * one["explained_loss_step"]) for one in encoders if not one["collapsed"]]
+    assert len(policies) - len(explained) == 1
+    assert f"collapsed, and the others explain {min(explained)} to {max(explained)} %" in front
+    ends = [
+        round(100 * curve.success_rate[-1])
+        for (group, _), curve in read_curves(data / f"{BY_PPO}_policies").items()
+        if group == f"{PAPER}_bytestream_paper"
+    ]
+    assert len(ends) == len(policies)
+    assert f"end at {min(ends)} to {max(ends)} %" in page_text("representations")
 
 
 def test_the_page_has_the_test_of_the_recipes_and_a_row_for_each_claim(tmp_path):
