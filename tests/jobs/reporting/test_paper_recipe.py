@@ -3,6 +3,7 @@ from collections import Counter
 
 import pytest
 
+from jobs.analysis.tables import estimate_text
 from jobs.config.config import as_dict, parse
 from jobs.reporting import two_groups
 from jobs.reporting.claims_study import BY_PPO, study_findings
@@ -82,6 +83,14 @@ def test_the_claim_about_learning_is_tested_where_curves_are_published(tmp_path)
     assert {claim.text for claim in found} == without | {FASTER}
     (faster,) = (one for claim, one in found.items() if claim.text == FASTER)
     assert faster.overall.value == pytest.approx(0.2)
+
+
+def test_the_page_says_what_the_test_would_be_without_what_a_gpu_made():
+    pairs = two_groups.overall(two_groups.pairs_of(RECIPES, *read_data(REPOSITORY / "docs" / "data", PAPER)))
+    text = page_text(PAPER)
+    for first, says in ((9, "difference would be {} points {}, and"), (6, "processors alone {} {}.")):
+        found = two_groups.Pair(pairs.tried[:first], pairs.usual[:first]).difference()
+        assert says.format(*estimate_text(found, 100, "+.0f").split(" ", 1)) in text
 
 
 def test_the_readme_says_how_much_both_recipes_succeed():
