@@ -35,7 +35,6 @@ TRAININGS = "trainings.csv"  # of every published training, how it learnt
 # commit that shipped those which were evaluated.
 REPLACED = {
     "81ef066": {"bytestream_hold": "2991870"},  # docs/dose_response.md
-    "28420bd": {"bytestream_hold": "2991870"},  # docs/trade.md
 }
 EARLIER = (
     "[Results](results.md) were evaluated at a later commit, so that success with nothing changed is not the "
@@ -44,7 +43,6 @@ EARLIER = (
 # Commit of a published study -> what has changed since of what it measured.
 SINCE = {
     "81ef066": "The simulator was rewritten since: event errors are of the one before.",
-    "28420bd": "The simulator was rewritten since: speeds and event errors are of the one before.",
 }
 
 
