@@ -23,12 +23,11 @@ from jobs.reporting.dose_taught import (
 )
 from jobs.reporting.headline import BEGIN, COLUMNS, END, headline_table, with_headline
 from jobs.reporting.sweep_data import read_data, replaced_text
-from jobs.run.files import RunError, read_json
+from jobs.run.files import RunError
 from jobs.run.provenance import REPOSITORY
 from tests.support.configs import compose
 from tests.support.episodes import flights
 
-DATA = {"results": "robustness", "dose_response": DOSES}  # pages and the names of their data
 TRAININGS = REPOSITORY / "docs" / "data" / "robustness_trainings.csv"
 
 
