@@ -139,12 +139,7 @@ def write_trade(trade: Path, docs: Path) -> Path:
     if (trade / "settings.csv").is_file():  # trades of earlier versions have none
         (docs / "data").mkdir(exist_ok=True)
         write_atomic(docs / "data" / "trade_settings.csv", (trade / "settings.csv").read_text())
-    text = (trade / "trade.md").read_text()
-    if replaced := replaced_text(read_json(trade / "about.json").get("commit", "")):
-        title, made, rest = text.split("\n\n", 2)
-        rule = "Intervals are by the [rule of that commit](statistics.md#what-an-interval-says)."
-        text = "\n\n".join((title, f"{made} {replaced} {rule}", rest))
-    write_atomic(docs / "trade.md", text)
+    write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
     return docs / "trade.md"
 
 

@@ -7,7 +7,6 @@ import torch
 
 from envs.config import EnvConfig
 from jobs.config.config import ConfigError
-from jobs.config.schema import PretrainConfig
 from jobs.run.folder import open_run
 from jobs.training import pretrain
 from jobs.training.collect import record
@@ -15,23 +14,10 @@ from jobs.training.gpu_steps import exact
 from jobs.training.pretrain import EvaeTraining, check_sources, on_processor, restore, save_checkpoint
 from models.encoder.evae import EventVAE
 from models.kinds import EvaeSettings
-from tests.support.configs import small_config
+from tests.support.configs import make_config, small_config
 
 ON_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU here")
-SETTINGS = PretrainConfig(
-    encoder=None,
-    denoise=False,
-    iterations=100,
-    batch_windows=8,
-    window_events=500,
-    windows="mixed",
-    lr=1e-3,
-    weight_decay=1e-5,
-    beta=1e-5,
-    beta_schedule="constant",
-    validate_every=10,
-    checkpoint_every=10,
-)
+SETTINGS = dataclasses.replace(make_config().pretrain, batch_windows=8, window_events=500, weight_decay=1e-5)
 MODELS = [
     EvaeSettings(**{**dataclasses.asdict(EventVAE(context=64).settings), **changes})
     for changes in (
