@@ -34,7 +34,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench docs dist lock clean
+.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-costs test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench docs dist lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -88,6 +88,12 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine on
 
 test: setup ## the quick tests (4 minutes on two cores)
 	$(PYTEST) --dist worksteal $(ARGS)
+
+# Of a host's unit of work, see tests/support/costs.py.
+MOST_UNITS := 50
+test-costs: setup ## the quick tests one at a time, and which of them cost more than a quick test may (10 minutes)
+	$(BIN)/python -m tests.support.kernels
+	$(BIN)/python -m pytest --most-units $(MOST_UNITS) $(ARGS)
 
 test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the site, the notebooks (8 minutes)
 	$(PYTEST) -m "system and not slow" --dist loadfile $(ARGS)

@@ -9,14 +9,11 @@ import subprocess  # noqa: E402
 import sys  # noqa: E402
 from pathlib import Path  # noqa: E402
 
-import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
-from numba.core import event  # noqa: E402
+
+from tests.support.costs import Costs  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
-# A quick test takes at most this much processor time; EVADE_TEST_SECONDS is for slow machines.
-QUICK_S = float(os.environ.get("EVADE_TEST_SECONDS", "5"))
-NOT_QUICK = ("system", "slow", "benchmark", "faults", "cluster")
 
 # The first example of a property may compile kernels.
 settings.register_profile("patient", deadline=None)
@@ -33,45 +30,13 @@ def pytest_sessionstart(session):
         subprocess.run([sys.executable, "-m", "tests.support.kernels"], cwd=ROOT, check=False)
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item):
-    """Fail a quick test that is not quick.
-
-    It is processor time that counts, of this process and of children that have ended: what else the
-    machine does changes it little. What numba compiles here is not the test's: it is compiled once.
-    """
-    compiling.spent_s = 0.0
-    began = _processor_s()
-    with event.install_listener("numba:compile", compiling):
-        result = yield
-    spent = _processor_s() - began - compiling.spent_s
-    if spent > QUICK_S and not any(item.get_closest_marker(name) for name in NOT_QUICK):
-        kinds = "`system` (it starts Ray, the launcher or another process) or `slow`"
-        pytest.fail(
-            f"took {spent:.1f} s of the {QUICK_S:g} s of a quick test; make it cheaper, or mark it {kinds}"
-        )
-    return result
+def pytest_addoption(parser):
+    """Add the limit of `make test-costs`."""
+    text = "fail the run, after its last test, if a quick test takes more units than this"
+    parser.addoption("--most-units", type=float, default=None, metavar="N", help=text)
 
 
-class _Compiling(event.Listener):
-    """Adds up the processor time of compilations, which lie within each other."""
-
-    def __init__(self):
-        self.depth, self.began_s, self.spent_s = 0, 0.0, 0.0
-
-    def on_start(self, event):
-        if self.depth == 0:
-            self.began_s = _processor_s()
-        self.depth += 1
-
-    def on_end(self, event):
-        self.depth -= 1
-        if self.depth == 0:
-            self.spent_s += _processor_s() - self.began_s
-
-
-compiling = _Compiling()
-
-
-def _processor_s() -> float:
-    return sum(os.times()[:4])
+def pytest_configure(config):
+    """Measure the quick tests; a worker leaves their list to the process that started it."""
+    most_units = None if hasattr(config, "workerinput") else config.getoption("--most-units")
+    config.pluginmanager.register(Costs(most_units), "costs")

@@ -12,7 +12,7 @@ import pytest
 from tests.support.clusters import RATES, SMALL, TOKEN, on, slow_workers
 from tests.support.faults import FINE, TRAIN, check_complete, launch
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.cluster
 LOST = r"^evade: failed: Ray's head has not answered for 40 s: .* the same command continues$"
 
 

@@ -7,7 +7,7 @@ import pytest
 from tests.support.faults import ROOT, SWEEP
 from tests.support.machines import two_machines
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(1800)]
+pytestmark = pytest.mark.cluster
 WORDS = (*SWEEP, "~sweep.axes", "+sweep.axes.sparsity={faults.sparsity:[0.0]}", "sweep.policies=[straight]")
 HASTY = {"RAY_NUM_REDIS_GET_RETRIES": "1"}  # Ray would try 20 s long
 

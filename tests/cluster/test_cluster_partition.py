@@ -9,7 +9,7 @@ from tests.support.clusters import RATES, slow_workers
 from tests.support.faults import FINE, TRAIN, check_complete
 from tests.support.machines import lose_packets, two_machines
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.cluster
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ import pytest
 from jobs.tracking.tracker import open_store
 from tests.support.configs import sweep_config
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.cluster
 WRITERS = 8
 PROGRAMS = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
 

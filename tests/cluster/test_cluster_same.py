@@ -5,7 +5,7 @@ import pytest
 from tests.support.clusters import SMALL, on
 from tests.support.faults import SWEEP, launch
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.cluster
 AXIS = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}"
 WORDS = (*SWEEP, "~sweep.axes", AXIS, "sweep.policies=[straight,random]")
 

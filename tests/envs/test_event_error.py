@@ -150,7 +150,6 @@ SCENES = ["poles", "cones", "gates", "poles_dense", "poles_eval", "shape_change"
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_error_achieved_is_within_the_tolerance_asked_everywhere(scene):
     short = []

@@ -12,6 +12,7 @@ from envs.config import CameraConfig, EnvConfig, FidelityConfig
 from envs.fidelity import choose_renderer, make_renderer, plan_renders, sub_renders
 from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
+from tests.support.patience import HANG_S
 
 SCENE = make_scene("poles", np.random.default_rng(0))
 TRIANGLE = (
@@ -50,7 +51,7 @@ def test_a_plan_makes_its_renderer():
 def test_a_scene_without_a_mesh_never_loads_opengl():
     code = "import sys, envs.corridor as c; e = c.CorridorEnv(); e.reset(seed=0); e.step(0)"
     code += "; sys.exit(any(m in sys.modules for m in ('pyrender', 'OpenGL', 'trimesh')))"
-    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], timeout=HANG_S).returncode == 0
 
 
 def test_a_stricter_tolerance_never_takes_less():

@@ -20,12 +20,6 @@ def pytest_configure(config):
         os.environ.update(TOKEN)
 
 
-def pytest_collection_modifyitems(items):
-    for item in items:
-        if "tests/faults" in str(item.path):
-            item.add_marker(pytest.mark.timeout(3600))
-
-
 def pytest_sessionfinish(session):
     """A worker of pytest-xdist hands its rows to the process that prints the table."""
     if hasattr(session.config, "workeroutput"):

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.patience import HANG_S
+
 pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
 KERNEL = "import numba\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + {}\n"
@@ -25,7 +27,7 @@ def test_an_edited_kernel_is_compiled_again_also_where_a_file_of_another_package
 
     def run():
         words = [sys.executable, "-c", f"from {room}.high.outside import outer; print(outer(1.0))"]
-        return subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120).stdout
+        return subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=HANG_S).stdout
 
     def compiled():
         return sorted(path.name for path in package.rglob("*.nbi"))
@@ -52,7 +54,7 @@ def test_an_edit_compiles_the_kernels_again_that_reach_the_edited_file_and_no_ot
 
     def run():
         words = [sys.executable, "-c", calls]
-        out = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120).stdout
+        out = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=HANG_S).stdout
         return [float(line) for line in out.split()]
 
     def compiled():
@@ -86,10 +88,10 @@ with patch.multiple(compile, CACHE=folder, side_by_side=compile_parts):
 def test_of_processes_that_start_at_once_one_compiles_and_the_others_say_that_they_wait(tmp_path):
     words = [sys.executable, "-c", COMPILE, str(tmp_path)]
     both = [subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    said = [process.communicate(timeout=120)[0] for process in both]
+    said = [process.communicate(timeout=HANG_S)[0] for process in both]
     assert (tmp_path / "compiled_by").read_text() == "half half "
     assert sum("Compiled the kernels in" in text for text in said) == 1
     assert sum("waiting" in text for text in said) >= 1
     (tmp_path / "compiled").write_text("other sources")
-    subprocess.run(words, cwd=ROOT, check=True, timeout=120)
+    subprocess.run(words, cwd=ROOT, check=True, timeout=HANG_S)
     assert (tmp_path / "compiled_by").read_text() == "half half half half "

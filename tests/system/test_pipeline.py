@@ -17,7 +17,7 @@ from tests.support.faults import launch as start_job
 from tests.support.sockets import check_ray, listening
 
 # One run serves most tests of this file; make gives each worker whole files.
-pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
 SECTIONS = ("evae/", "train/", "eval/", "sim/", "perf/")
 

@@ -12,7 +12,7 @@ import pytest
 from models.policy import load_policy
 from models.policy.policy import PolicyFileError
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
 EVADE = Path(sys.executable).parent / "evade"
 PLUGIN = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL)[1]

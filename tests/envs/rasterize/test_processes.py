@@ -8,6 +8,7 @@ import pytest
 from envs.rasterize import PyrenderRenderer
 from envs.rasterize.renderer import PACKAGES
 from envs.scene import make_scene
+from tests.support.patience import HANG_S
 from tests.support.rendering import POSE, picture
 
 pytestmark = pytest.mark.system
@@ -23,7 +24,9 @@ def expected():
 
 
 def run_python(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=HANG_S
+    )
 
 
 def test_importing_the_renderer_loads_no_opengl():

@@ -5,15 +5,17 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.patience import HANG_S, breath_s
+
 ROOT = Path(__file__).resolve().parents[3]
 # In a process of its own, because the watch ends the process that it is in.
 WATCHED = """
 import time
 from jobs.run import head_watch
-head_watch.ASK_EVERY_S, head_watch.SILENCE_S, head_watch.LEAVE_S = 0.05, 1.0, 3.0
+head_watch.ASK_EVERY_S, head_watch.SILENCE_S, head_watch.LEAVE_S = 0.05, {silence}, 3 * {silence}
 answers = {answers}
 def ask(seconds):
-    assert seconds == 0.5
+    assert seconds == {silence} / 2
     return answers.pop(0) if answers else {then}
 try:
     with head_watch.watching_head(ask, lambda: {ended!r}):
@@ -24,11 +26,12 @@ except head_watch.HeadLostError as error:
     time.sleep({closing})
     print("closed")
 """
-FOREVER = "time.sleep(60)"
+SILENCE_S = breath_s()
+FOREVER = "time.sleep(3600)"
 DEAF = """
 while True:
     try:
-        time.sleep(60)
+        time.sleep(3600)
     except KeyboardInterrupt:
         pass
 """
@@ -38,18 +41,19 @@ pytestmark = pytest.mark.system
 
 def watched(work=FOREVER, answers=(), then=False, closing=0, ended="", sigint=signal.default_int_handler):
     indented = "\n".join(f"        {line}" for line in work.strip().splitlines())
-    script = WATCHED.format(answers=list(answers), then=then, work=indented, closing=closing, ended=ended)
+    told = {"answers": list(answers), "then": then, "closing": closing, "ended": ended}
+    script = WATCHED.format(work=indented, silence=SILENCE_S, **told)
     command = [sys.executable, "-c", script]
     before = signal.signal(signal.SIGINT, sigint)  # what is ignored here is ignored in the process too
     try:
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=50)
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=HANG_S)
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 def test_work_whose_head_is_silent_ends_with_the_reason():
     ended = watched()
-    assert ended.stdout.startswith("told Ray's head has not answered for 1 s: ")
+    assert ended.stdout.startswith(f"told Ray's head has not answered for {SILENCE_S} s: ")
     assert ended.stdout.endswith("the same command continues\nclosed\n")
     assert ended.stderr == ""
     assert ended.returncode == 0
@@ -58,7 +62,7 @@ def test_work_whose_head_is_silent_ends_with_the_reason():
 def test_work_in_the_background_of_a_script_is_told_too_and_goes_on_ignoring_ctrl_c_until_then():
     signals = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nprint('ignored')\n"
     ended = watched(signals + FOREVER, sigint=signal.SIG_IGN)
-    assert ended.stdout.startswith("ignored\ntold Ray's head has not answered for 1 s: ")
+    assert ended.stdout.startswith(f"ignored\ntold Ray's head has not answered for {SILENCE_S} s: ")
     assert ended.stdout.endswith("closed\n")
     assert (ended.stderr, ended.returncode) == ("", 0)
 
@@ -66,19 +70,19 @@ def test_work_in_the_background_of_a_script_is_told_too_and_goes_on_ignoring_ctr
 def test_work_that_waits_forever_for_a_lost_head_is_ended_with_the_same_reason():
     ended = watched(DEAF)
     assert ended.returncode == 1
-    assert ended.stderr.startswith("evade: failed: Ray's head has not answered for 1 s: ")
+    assert ended.stderr.startswith(f"evade: failed: Ray's head has not answered for {SILENCE_S} s: ")
     assert ended.stderr.count("\n") == 1
 
 
 def test_what_closes_forever_after_a_lost_head_is_ended_without_a_second_reason():
-    ended = watched(closing=60)
+    ended = watched(closing=3600)
     assert (ended.returncode, ended.stderr) == (1, "")
     assert "closed" not in ended.stdout
 
 
 def test_a_head_that_answers_or_answers_late_ends_nothing():
     for answers in ([], [False], [True, False, True, False]):
-        ended = watched("time.sleep(1.5)", answers, then=True)
+        ended = watched(f"time.sleep({1.5 * SILENCE_S})", answers, then=True)
         assert (ended.stdout, ended.stderr, ended.returncode) == ("done\n", "", 0)
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from jobs.run.files import RunError
 from jobs.run.locks import held_alone, locked, private_folder
+from tests.support.patience import HANG_S
 
 
 def work(folder, results, name):
@@ -21,7 +22,7 @@ def test_processes_hold_a_lock_one_after_the_other(tmp_path):
     processes = [context.Process(target=work, args=(tmp_path, results, name)) for name in "ab"]
     for process in processes:
         process.start()
-    order = [results.get(timeout=20) for _ in range(4)]
+    order = [results.get(timeout=HANG_S) for _ in range(4)]
     for process in processes:
         process.join()
     assert [place for _, place in order] == ["in", "out", "in", "out"]
@@ -33,7 +34,7 @@ def test_a_process_that_is_killed_lets_go(tmp_path):
     results = context.Queue()
     process = context.Process(target=work, args=(tmp_path, results, "a"))
     process.start()
-    assert results.get(timeout=20) == ("a", "in")
+    assert results.get(timeout=HANG_S) == ("a", "in")
     process.kill()
     process.join()
     with locked(tmp_path / "a.lock"):

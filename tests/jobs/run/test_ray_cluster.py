@@ -24,6 +24,7 @@ from jobs.run.ray_cluster import (
     storage,
     use_token,
 )
+from tests.support.patience import HANG_S
 from tests.support.sockets import beyond_loopback, listening
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -173,7 +174,7 @@ def join(address: str, environment: dict[str, str], **more: str) -> str:
         env=environment | more,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=HANG_S,
         check=False,
     )
     return client.stdout.strip() or client.stderr
@@ -198,7 +199,7 @@ def test_a_local_ray_is_reached_from_here_alone_by_who_has_its_token_and_keeps_i
             wrong = join(address, environment, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64)
             right = join(address, environment, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=token)
             head.stdin.close()
-            assert head.wait(60) == 0
+            assert head.wait(HANG_S) == 0
         private = Path(shared, f"evade-{os.getuid()}")
         assert all(Path(folder).is_relative_to(private / "ray") for folder in folders.split(os.pathsep))
         assert (private / "ray" / "session_latest" / "logs" / "raylet.out").exists()

@@ -123,17 +123,12 @@ def pages(store, tmp_path_factory):
             browser.close()
 
 
-browsed = pytest.mark.slow, pytest.mark.timeout(900)
 pictures_shown = (
     "[...document.images].filter(i => i.src.includes('get-artifact') && i.naturalWidth > 0).length"
 )
 
 
-def in_browser(test):
-    """Marks of a test that opens pages: it takes a minute or more."""
-    for mark in browsed:
-        test = mark(test)
-    return test
+in_browser = pytest.mark.slow  # it opens pages: a minute or more
 
 
 @in_browser

@@ -18,6 +18,7 @@ from jobs.training.ppo import EpisodeMetrics
 from jobs.training.train import TrainingError, read_metrics, reported_so_far
 from models.policy import load_policy
 from tests.support.configs import TINY, make_config
+from tests.support.patience import HANG_S
 from tests.support.sockets import check_ray, listening
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -164,7 +165,7 @@ def test_a_training_listens_on_loopback_alone_and_after_a_kill_goes_on_to_a_poli
     check_ray(found)
     before = reported_so_far(results)[0]
     assert 256 <= before < 1600
-    subprocess.run(command, cwd=ROOT, check=True, timeout=200)
+    subprocess.run(command, cwd=ROOT, check=True, timeout=HANG_S)
     steps = [json.loads(line)["env_steps"] for line in results.read_text().splitlines()]
     assert steps == sorted(set(steps))
     assert steps[-1] >= 1600

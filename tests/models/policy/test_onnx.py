@@ -12,6 +12,7 @@ from models.policy.features import Step
 from models.policy.networks import build_networks
 from models.policy.onnx import export_onnx
 from tests.support.encoders import EVENT
+from tests.support.patience import HANG_S
 from tests.support.policies import ABOUT, SIDE, TRAINED, kinds, make_networks, make_spec, save
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
@@ -113,7 +114,7 @@ def test_the_file_filters_the_events_of_each_step_as_the_policy_does(support, tm
 @pytest.mark.system
 def test_the_rest_of_the_package_does_without_onnx():
     code = "import models.policy.policy, models.policy.onnx, sys; sys.exit('onnx' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], timeout=HANG_S).returncode == 0
 
 
 def test_what_is_not_installed_is_named(tmp_path, monkeypatch):

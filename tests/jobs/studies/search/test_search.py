@@ -156,7 +156,6 @@ def test_a_trial_is_measured_in_validation_corridors_and_goes_on_from_its_checkp
 
 
 @pytest.mark.system
-@pytest.mark.timeout(900)
 def test_a_search_is_recorded_and_the_same_command_repeats_nothing(tmp_path):
     words = *SMALL, "model=event_columns", f"runs_dir={tmp_path / 'runs'}", "cluster.num_cpus=2"
     config = tune_config(*words, f"tracking.uri=sqlite:///{tmp_path}/m.db")

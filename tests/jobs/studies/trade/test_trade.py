@@ -85,7 +85,6 @@ def executor(monkeypatch):
 
 
 @pytest.mark.system
-@pytest.mark.timeout(900)  # where no kernel is compiled yet
 def test_the_job_leaves_table_figure_and_page_and_a_second_run_evaluates_only_what_failed(
     tmp_path, policy, executor
 ):
