@@ -22,6 +22,7 @@ JOBS = {
     "camera_rates": "ablation",
     "encoder_seeds": "ablation",
     "learning_rates": "ablation",
+    "training_lengths": "ablation",
     "memory_seconds": "ablation",
     "ppo_claims": "ablation",
     "ppo_event_set": "ablation",
