@@ -49,6 +49,7 @@ from models.kinds import KINDS, Model, model_keys, read_model
 __all__ = ["HELD_OUT_SCENE", "Config", "ConfigError", "as_dict", "known_keys", "parse"]
 
 HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
+TRAINED_SCENE = "poles"  # which it is held out of
 
 Part = TypeVar("Part")
 

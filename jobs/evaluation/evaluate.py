@@ -29,7 +29,7 @@ from jobs.analysis.tables import (
     summary_metrics,
 )
 from jobs.analysis.video import Decode, open_film
-from jobs.config.config import HELD_OUT_SCENE, Config, ConfigError, as_dict
+from jobs.config.config import HELD_OUT_SCENE, TRAINED_SCENE, Config, ConfigError, as_dict
 from jobs.rollout.agents import BASELINES, make_agent
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.episodes import Trajectory, TrajectoryRecorder, roll_out, write_episodes
@@ -123,13 +123,14 @@ def evaluate(
 
 
 def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationTask]:
-    """The held-out scene and the training scene: all agents with the first renderer, the policy with all.
+    """All agents in the held-out scene with the first renderer, and the policy with the others.
 
-    The policy is evaluated with both choices of action, because they can differ by tens of points;
-    the configured one comes first and is the one that metrics without a suffix belong to.
+    A training in another scene than `poles` is evaluated there too, of which `poles_eval` says nothing. The
+    policy is evaluated with both choices of action, because they can differ by tens of points; the configured
+    one comes first and is the one that metrics without a suffix belong to.
     """
     first, *others = config.evaluate.renderers
-    scenes = dict.fromkeys((HELD_OUT_SCENE, config.env.scene))
+    scenes = [HELD_OUT_SCENE, *{config.env.scene} - {HELD_OUT_SCENE, TRAINED_SCENE}]
     actions = sorted(ACTIONS, key=lambda action: action != config.evaluate.action)
     agents = [(policy, action) for action in actions]
     agents += [(published(name), "stochastic") for name in config.evaluate.beside]

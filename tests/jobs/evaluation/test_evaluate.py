@@ -201,19 +201,38 @@ def test_the_video_shows_a_success_if_there_is_one_else_the_longest_episode():
 
 
 def test_the_metrics_name_agent_scene_and_renderer(tmp_path):
-    labels = [
-        label_of(task) for task in plan_evaluation(small_config(tmp_path), read_policy(trained(tmp_path)))
-    ]
+    config = with_both_renderers(small_config(tmp_path))
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, scene="gates"))
+    labels = [label_of(task) for task in plan_evaluation(config, read_policy(trained(tmp_path)))]
     row = summarise(labels[0], roll_out(make_agent("straight"), HELD_OUT, [0, 1]))
     metrics = evaluation_metrics([dataclasses.replace(row, label=label) for label in labels])
     assert {
         "eval/success_rate",
-        "eval/success_rate_poles",
+        "eval/success_rate_gates",
         "eval/success_rate_pyrender",
         "eval/success_rate_oracle",
         "eval/distance_m_straight",
     } <= set(metrics)
     assert len(metrics) <= 40
+
+
+def with_both_renderers(config):
+    return dataclasses.replace(
+        config, evaluate=dataclasses.replace(config.evaluate, renderers=["raycast", "pyrender"])
+    )
+
+
+def test_a_scene_of_training_is_evaluated_unless_it_is_what_the_held_out_one_stands_for(tmp_path):
+    config, policy = small_config(tmp_path), read_policy("straight")
+
+    def scenes(trained_in):
+        env = dataclasses.replace(config.env, scene=trained_in)
+        return [
+            task.env.scene for task in plan_evaluation(dataclasses.replace(config, env=env), policy)[::5]
+        ]
+
+    assert scenes("poles") == scenes("poles_eval") == ["poles_eval"]
+    assert scenes("gates") == ["poles_eval", "gates"]
 
 
 def trained(tmp_path, name="bytestream"):
@@ -235,7 +254,7 @@ def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_
         assert evaluate(config, run, tracker, run_serially) == figures
     with (run.evaluation / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 5 * 2  # scenes, agents, corridors
+    assert len(rows) == 5 * 2  # agents, corridors
     agents = {"policy stochastic", "policy deterministic", "straight", "random", "oracle"}
     assert {row["Agent"] for row in rows} == agents
     assert (run.evaluation / "trajectories.png").stat().st_size > 10_000
@@ -243,7 +262,7 @@ def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_
     assert not list(run.evaluation.glob(".*"))
     measured = {key for key in figures if key.startswith("evae/")}
     plain = {f"evae/{part}" for part in DRIFT_METRICS}
-    others = {f"evae/drift_{row}" for row in ("deterministic", "poles", "deterministic_poles")}
+    others = {"evae/drift_deterministic"}
     assert measured == (plain | others if KINDS[name].encoder else set())
     assert len(figures) <= 40
     assert (
@@ -253,7 +272,7 @@ def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_
         more = dataclasses.replace(config, evaluate=dataclasses.replace(settings, episodes=3, video=False))
         evaluate(more, run, tracker, run_serially)
     with (run.evaluation / "episodes.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 2 * 5 * 3
+        assert len(list(csv.DictReader(file))) == 5 * 3
 
 
 def test_a_policy_acts_as_its_own_networks_say(policy):
@@ -276,30 +295,31 @@ def test_more_episodes_evaluate_only_the_new_corridors_and_another_policy_all_bu
     store, executor, policy = EpisodeStore(tmp_path), FakeExecutor(), read_policy(trained(tmp_path))
     tasks = plan_evaluation(config, policy)
     assert list(evaluate_all(tasks, store, executor)) == [label_of(task) for task in tasks]
-    assert len(executor.evaluated) == len(set(executor.evaluated)) == 10 * 2
+    assert len(executor.evaluated) == len(set(executor.evaluated)) == 5 * 2
     executor.evaluated.clear()
     evaluate_all(plan_evaluation(more, policy), store, executor)
     assert {seed for _, seed in executor.evaluated} == {2}
     executor.evaluated.clear()
     evaluate_all(plan_evaluation(more, dataclasses.replace(policy, identity="another")), store, executor)
-    assert len(executor.evaluated) == 4 * 3  # two choices of action in two scenes
+    assert len(executor.evaluated) == 2 * 3  # two choices of action
 
 
 def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_stops_with_the_reason(tmp_path):
-    executor, tasks = FakeExecutor(), plan_evaluation(small_config(tmp_path), read_policy(trained(tmp_path)))
+    config = with_both_renderers(small_config(tmp_path))
+    executor, tasks = FakeExecutor(), plan_evaluation(config, read_policy(trained(tmp_path)))
     executor.broken = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
     results = evaluate_all(tasks, EpisodeStore(tmp_path), executor)
     assert {label_of(task) for task in tasks} - set(results) == {
         ("policy stochastic", "poles_eval", "pyrender")
     }
-    executor.broken = {("poles", "raycast"): "ValueError: no"}
-    with pytest.raises(RuntimeError, match=r"poles raycast: .*ValueError: no"):
+    executor.broken = {("poles_eval", "raycast"): "ValueError: no"}
+    with pytest.raises(RuntimeError, match=r"poles_eval raycast: .*ValueError: no"):
         evaluate_all(tasks, EpisodeStore(tmp_path / "others"), executor)
 
 
 @pytest.mark.system
 def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path):
-    config = small_config(tmp_path)
+    config = with_both_renderers(small_config(tmp_path))
     settings = dataclasses.replace(config.evaluate, episodes=1, pyrender_episodes=1, video=False)
     config = dataclasses.replace(
         config, evaluate=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)
@@ -308,7 +328,7 @@ def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done
     save_training(run.policy, "a", 0, config.env, "event_columns")
     drawn = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
     with open_tracker(config, run) as tracker:
-        for broken, evaluated, missing in ((drawn, 10, 1), ({}, 11, 0), (drawn, 11, 0)):
+        for broken, evaluated, missing in ((drawn, 5, 1), ({}, 6, 0), (drawn, 6, 0)):
             executor.broken = broken
             evaluate(config, run, tracker, executor)
             assert (len(executor.evaluated), len(finished(run, "evaluate")["missing"])) == (
@@ -331,9 +351,9 @@ def test_a_published_policy_is_evaluated_beside_with_its_own_sensor_and_named(tm
     settings = dataclasses.replace(config.evaluate, beside=["bytestream_hold-s0"])
     tasks = plan_evaluation(dataclasses.replace(config, evaluate=settings), read_policy("straight"))
     beside = [task for task in tasks if label_of(task)[0] == "bytestream_hold s0"]
-    assert {task.condition for task in beside} == {(HELD_OUT_SCENE, "raycast"), ("poles", "raycast")}
+    assert {task.condition for task in beside} == {(HELD_OUT_SCENE, "raycast")}
     assert {task.env.filter_support for task in beside} == {1}
-    assert len(tasks) == len(plan_evaluation(config, read_policy("straight"))) + 2
+    assert len(tasks) == len(plan_evaluation(config, read_policy("straight"))) + 1
     with pytest.raises(
         ConfigError, match=r"^evaluate.beside: must be names in models/pretrained, got 'moon'"
     ):
