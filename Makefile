@@ -34,7 +34,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-costs test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench docs dist lock clean
+.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-costs test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench bench-clone docs dist lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -140,8 +140,11 @@ check: ## what must pass before a change is merged
 	$(MAKE) $* || $(MAKE) $* PYTEST='$(ALONE)' ARGS='--numprocesses 0 $(ARGS)'
 
 bench: setup ## measure the speed of the parts, and what accuracy of the simulator costs
-	for part in jobs/bench/*.py; do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
+	for part in $(filter-out %/from_clone.py,$(wildcard jobs/bench/*.py)); do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
 	$(LAUNCH) +exp=trade_simulator $(ARGS)
+
+bench-clone: setup ## measure how long a new user waits, from an empty clone to each first result, on an idle machine
+	$(BIN)/python -m jobs.bench.from_clone $(ARGS)
 
 docs: setup ## build this site in docs/_build/html; a broken link or docstring stops it
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html $(ARGS)
