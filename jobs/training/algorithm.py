@@ -101,6 +101,10 @@ class PPO(Trainable, RLlibPPO):
         self.learner_group.foreach_learner(lambda learner: learner.keep(found[LEARNER].arrays))
         set_generators(found[LEARNER].arrays)
 
+    def get_auto_filled_metrics(self, *told: Any, **named: Any) -> dict[str, object]:
+        """As Tune's, without the configuration: to copy and send it took a tenth of an iteration."""
+        return {**tune.Trainable.get_auto_filled_metrics(self, *told, **named), "config": {}}
+
     def restore_env_runners(self, env_runner_group: Any) -> list[int]:
         """Nothing: a round of sampling brings back whoever is missing."""
         return []

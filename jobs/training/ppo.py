@@ -172,6 +172,8 @@ def build_ppo(config: Config, encoder_path: str | Path | None = None, init: Path
             sample_timeout_s=SAMPLE_TIMEOUT_S,
             gym_env_vectorize_mode="vector_entry_point",
             env_runner_cls=env_runner(config),
+            merge_env_runner_states=False,  # of connectors, which these env runners have none of
+            broadcast_env_runner_states=False,
         )
         .resources(num_cpus_for_main_process=own_cpus)
         .learners(

@@ -82,7 +82,7 @@ def test_importing_the_rooms_is_light():
 
 TARGETS = (
     *("setup", "demo", "bytestream", "train-all", "sweep-robustness", "mlflow"),
-    *("lint", "check", "bench", "docs"),
+    *("lint", "check", "bench", "bench-clone", "docs", "test-costs"),
     *(
         "test",
         "test-system",

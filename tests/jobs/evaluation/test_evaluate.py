@@ -227,9 +227,7 @@ def test_a_scene_of_training_is_evaluated_unless_it_is_what_the_held_out_one_sta
 
     def scenes(trained_in):
         env = dataclasses.replace(config.env, scene=trained_in)
-        return [
-            task.env.scene for task in plan_evaluation(dataclasses.replace(config, env=env), policy)[::5]
-        ]
+        return [task.env.scene for task in plan_evaluation(dataclasses.replace(config, env=env), policy)[::5]]
 
     assert scenes("poles") == scenes("poles_eval") == ["poles_eval"]
     assert scenes("gates") == ["poles_eval", "gates"]
