@@ -60,7 +60,7 @@ class Costs:
     def pytest_terminal_summary(self, terminalreporter):
         """List the slowest tests, or all that cost too much."""
         slowest = self.too_costly() or sorted(self.seen, key=self.units, reverse=True)[:LISTED]
-        if len(self.seen) > LISTED or self.too_costly():
+        if len(self.seen) > 10 * LISTED or self.too_costly():
             limit = "" if self.most_units is None else f", of which a test may take {self.most_units:g}"
             terminalreporter.section(f"processor time of the slowest quick tests: seconds, units{limit}")
             for name in slowest:
