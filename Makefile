@@ -19,6 +19,8 @@ TRAINED = 'sweep.policies=[$(subst $() ,$(COMMA),$(strip $(POLICIES)) straight o
 
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+# What tests, lint, docs and releases need beside it; brought when first needed.
+DEVELOPING := $(VENV)/.installed-dev
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 LAUNCH := $(BIN)/python -m platform.launch
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4
@@ -34,21 +36,28 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo bytestream train-all sweep-robustness mlflow test test-costs test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench bench-clone docs dist lock clean
+.PHONY: help setup setup-all system-libraries demo bytestream train-all sweep-robustness mlflow test test-costs test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench bench-clone docs dist lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-17s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: $(INSTALLED) system-libraries ## create .venv with the pinned packages and this package, and compile the kernels
-	@$(BIN)/python -m jobs.run.compile
+# Imports leave bytecode, whatever the shell says: the first start then takes half as long.
+setup: $(INSTALLED) system-libraries ## create .venv with the pinned packages and this package, and compile what the default commands use
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m jobs.run.compile
+
+setup-all: setup ## compile the other kernels, too, which otherwise compile when they are first used
+	@$(BIN)/python -m jobs.run.compile all
 
 $(INSTALLED): requirements.lock pyproject.toml
 	@test -x $(BIN)/python -o -n "$(PYTHON)" || { echo "Evade needs Python 3.11, 3.12 or 3.13: see docs/install.md"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --requirement requirements.lock
-	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true # pip would compile on one core
+	$(BIN)/python platform/install.py requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $@
+
+$(DEVELOPING): requirements-dev.lock $(INSTALLED)
+	$(BIN)/python platform/install.py requirements.lock requirements-dev.lock
 	touch $@
 
 system-libraries: $(INSTALLED) # OpenGL without a screen, for renderer=pyrender
@@ -86,32 +95,32 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine on
 	$(MLFLOW_ENV) $(BIN)/mlflow server --workers 1 --host 127.0.0.1 --port 5000 \
 	    --backend-store-uri sqlite:///$(CURDIR)/mlflow.db $(ARGS)
 
-test: setup ## the quick tests (4 minutes on two cores)
+test: setup $(DEVELOPING) ## the quick tests (4 minutes on two cores)
 	$(PYTEST) --dist worksteal $(ARGS)
 
 # Of a host's unit of work, see tests/support/costs.py.
 MOST_UNITS := 50
-test-costs: setup ## the quick tests one at a time, and which of them cost more than a quick test may (10 minutes)
+test-costs: setup $(DEVELOPING) ## the quick tests one at a time, and which of them cost more than a quick test may (10 minutes)
 	$(BIN)/python -m tests.support.kernels
 	$(BIN)/python -m pytest --most-units $(MOST_UNITS) $(ARGS)
 
-test-system: setup ## whole jobs, Ray, the launcher, every kind of policy, the site, the notebooks (8 minutes)
+test-system: setup $(DEVELOPING) ## whole jobs, Ray, the launcher, every kind of policy, the site, the notebooks (8 minutes)
 	$(PYTEST) -m "system and not slow" --dist loadfile $(ARGS)
 
-test-slow: setup ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
+test-slow: setup $(DEVELOPING) ## what continuous integration leaves out for its length (an hour; Chromium for the pages)
 	$(PYTEST) -m slow --dist loadfile $(ARGS)
 
-test-faults: setup ## inject faults into running jobs and print what was lost (19 minutes)
+test-faults: setup $(DEVELOPING) ## inject faults into running jobs and print what was lost (19 minutes)
 	$(BIN)/python -m pytest -m faults tests/faults --numprocesses 3 --dist worksteal $(ARGS)
 
-test-cluster: setup ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (18 minutes)
+test-cluster: setup $(DEVELOPING) ## a Ray cluster and what it may lose, and eight sweeps at once into PostgreSQL (18 minutes)
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 \
 	|| { [ "$$(id -u)" = 0 ] && apt-get update && apt-get install --yes --no-install-recommends postgresql; } \
 	|| echo "warning: no PostgreSQL, so its test is skipped; apt-get install postgresql"
 	$(BIN)/python -c 'import psycopg' 2>/dev/null || $(BIN)/python -m pip install --quiet $(PSYCOPG)
 	$(BIN)/python -m pytest -m cluster -rs tests/cluster $(ARGS)
 
-test-soak: setup ## training, sweep and dashboard for an hour, with a fault every minute (ARGS="minutes=10 seed=1")
+test-soak: setup $(DEVELOPING) ## training, sweep and dashboard for an hour, with a fault every minute (ARGS="minutes=10 seed=1")
 	$(BIN)/python -m tests.soak.soak $(ARGS)
 
 # Interpreters are found as python3.X; pyenv, uv and Debian can install them.
@@ -125,13 +134,14 @@ test-pythons: ## the quick tests on each supported Python, in .venv-3.X (PYTHONS
 test-image: ## build the image by debootstrap and buildah, as root, and run its commands (ARGS="--build-arg ...")
 	docker/test_image.sh $(ARGS)
 
-lint: $(INSTALLED) ## check style, format, types, and who imports whom
+lint: $(DEVELOPING) ## check style, format, types, and who imports whom
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 check: ## what must pass before a change is merged
+	$(MAKE) $(DEVELOPING)
 	$(MAKE) --jobs 2 lint setup
 	$(MAKE) test-again
 	$(MAKE) test-system-again
@@ -139,25 +149,32 @@ check: ## what must pass before a change is merged
 %-again: # a suite, and what failed of it once more by itself
 	$(MAKE) $* || $(MAKE) $* PYTEST='$(ALONE)' ARGS='--numprocesses 0 $(ARGS)'
 
-bench: setup ## measure the speed of the parts, and what accuracy of the simulator costs
+bench: setup $(DEVELOPING) ## measure the speed of the parts, and what accuracy of the simulator costs
 	for part in $(filter-out %/from_clone.py,$(wildcard jobs/bench/*.py)); do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
 	$(LAUNCH) +exp=trade_simulator $(ARGS)
 
 bench-clone: setup ## measure how long a new user waits, from an empty clone to each first result, on an idle machine
 	$(BIN)/python -m jobs.bench.from_clone $(ARGS)
 
-docs: setup ## build this site in docs/_build/html; a broken link or docstring stops it
+docs: setup $(DEVELOPING) ## build this site in docs/_build/html; a broken link or docstring stops it
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html $(ARGS)
 
-dist: setup ## build the wheel dist/evade-*.whl: environment, camera, recordings, policies
+dist: setup-all $(DEVELOPING) ## build the wheel dist/evade-*.whl: environment, camera, recordings, policies, compiled kernels
 	rm -rf build
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist
 
-lock: setup ## update requirements.lock (ARGS=--upgrade: to the newest versions)
-	$(BIN)/pip-compile --quiet --extra jobs,meshes,dev,docs --strip-extras --allow-unsafe \
-	    --no-annotate --no-header --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
-	    --output-file requirements.lock $(ARGS) pyproject.toml
-	sed -i 's/+cpu$$//' requirements.lock # so that a CPU wheel satisfies the same pin
+COMPILE_LOCK := pip-compile --quiet --strip-extras --allow-unsafe --no-annotate --no-header \
+	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host
+
+# Without "+cpu", so that every build of torch satisfies the pin.
+lock: $(DEVELOPING) ## update requirements.lock and requirements-dev.lock (ARGS=--upgrade: to the newest versions)
+	$(BIN)/$(COMPILE_LOCK) --extra jobs,meshes --output-file requirements.lock $(ARGS) pyproject.toml
+	sed -i 's/+cpu$$//' requirements.lock
+	$(BIN)/$(COMPILE_LOCK) --extra jobs,meshes,dev,docs --constraint requirements.lock \
+	    --output-file requirements-dev.lock $(ARGS) pyproject.toml
+	sed -i 's/+cpu$$//; /^$$/d; /^#/d' requirements-dev.lock
+	grep --invert-match --line-regexp --fixed-strings --file requirements.lock requirements-dev.lock > $(VENV)/lock
+	mv $(VENV)/lock requirements-dev.lock
 
 clean: ## remove caches and build files; .venv, runs and results stay
 	rm -rf build dist *.egg-info .benchmarks .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache

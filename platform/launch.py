@@ -207,7 +207,7 @@ def full_disk(error: Exception) -> str | None:
 def raised_here(error: Exception) -> bool:
     """Whether the statement that raised is in this repository's own packages."""
     frames = traceback.extract_tb(error.__traceback__)
-    rooms = [ROOT / room for room in ("envs", "models", "jobs", "platform")]
+    rooms = [ROOT / room for room in ("envs", "models", "jobs", "native", "platform")]
     return bool(frames) and any(Path(frames[-1].filename).is_relative_to(room) for room in rooms)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, f, nct, sem, t
+import scipy  # `scipy.stats` loads when it is first used, which takes half a second
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -46,7 +46,7 @@ def wilson_interval(successes: int, trials: int) -> Interval:
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"need 0 <= successes <= trials and a trial, got {successes} of {trials}")
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    interval = scipy.stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
     return float(interval.low), float(interval.high)
 
 
@@ -65,7 +65,7 @@ def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval
         raise ValueError(f"values must be a list of finite numbers, got {values!r}; leave out what failed")
     if values.size == 1:
         return None
-    found = bootstrap([values], np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE,
+    found = scipy.stats.bootstrap([values], np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE,
                       method="percentile", rng=rng)  # fmt: skip
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
@@ -209,8 +209,10 @@ def _tested(value: float, parts: Sequence[tuple[float, int]], least: float, most
     error, freedom = _error(parts, least, most)
     if error == 0.0:
         return Difference(value, (value, value), float(value == 0.0))
-    half = float(t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
-    return Difference(value, (value - half, value + half), float(2 * t.sf(abs(value) / error, freedom)))
+    half = float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+    return Difference(
+        value, (value - half, value + half), float(2 * scipy.stats.t.sf(abs(value) / error, freedom))
+    )
 
 
 def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple[float, float]:
@@ -235,7 +237,7 @@ def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple
 def exact_pair_p(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Two-sided p of two policies' successes bool (n,) in the same corridors (McNemar's exact test)."""
     won, lost = int((ours > theirs).sum()), int((ours < theirs).sum())
-    return float(binomtest(won, won + lost).pvalue) if won + lost else 1.0
+    return float(scipy.stats.binomtest(won, won + lost).pvalue) if won + lost else 1.0
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -277,8 +279,8 @@ def trainings_needed(
         error, freedom = _error(parts, least, 2 * (count - 1))
         if error == 0.0:
             return 1.0
-        limit = t.isf((1 - CONFIDENCE) / family / 2, freedom)
-        return float(nct.sf(limit, freedom, min(gain / error, CERTAIN)))
+        limit = scipy.stats.t.isf((1 - CONFIDENCE) / family / 2, freedom)
+        return float(scipy.stats.nct.sf(limit, freedom, min(gain / error, CERTAIN)))
 
     low, high = 1, 2
     while power(high) < POWER:
@@ -344,7 +346,7 @@ def expected_half_width(ours: Spread, theirs: Spread, apart: float, trainings: i
         for one in (ours, theirs)
     ]
     error, freedom = _error([*parts, (apart**2 / corridors, corridors - 1)], 0.0, 2 * (trainings - 1))
-    return float(t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+    return float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
 
 
 class CrossedSpread(NamedTuple):
@@ -388,7 +390,7 @@ def _factor(values: np.ndarray, rest: float) -> tuple[float, float | None]:
     between = columns * float(values.mean(axis=1).var(ddof=1))
     spread = float(np.sqrt(max(between - rest, 0.0) / columns))
     if rest > 0:
-        return spread, float(f.sf(between / rest, rows - 1, (rows - 1) * (columns - 1)))
+        return spread, float(scipy.stats.f.sf(between / rest, rows - 1, (rows - 1) * (columns - 1)))
     return spread, 0.0 if between > 0 else None
 
 
@@ -404,7 +406,7 @@ def half_width(values: np.ndarray) -> np.ndarray:
     count = len(values)
     if count < 2:
         raise ValueError(f"an interval over trainings needs two of them, got {count}")
-    return t.ppf((1 + CONFIDENCE) / 2, count - 1) * sem(values, axis=0)
+    return scipy.stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) * scipy.stats.sem(values, axis=0)
 
 
 def _checked(values: np.ndarray, name: str) -> np.ndarray:

@@ -1,16 +1,23 @@
-"""Compiles the kernels into numba's cache, by using each once: python -m jobs.run.compile.
+"""Compiles the kernels into numba's cache, by using each once: python -m jobs.run.compile [all].
 
-What is compiled already is only loaded, and nothing is done while no source file has changed. One
-job compiles, in two processes; others that are started meanwhile wait for it. The rooms are imported only
-where there is something to compile, because that takes seconds.
+Without `all` it compiles what the default commands use: demonstration, training, evaluation. numba compiles
+the others when they are first used. What is compiled already is only loaded, and nothing is done while no
+source file has changed. A clone takes what another clone of the same sources has compiled on this machine.
+One job compiles, in two processes; others that are started meanwhile wait for it. The rooms are imported
+only where there is something to compile, because that takes seconds.
 """
 
+import contextlib
 import hashlib
 import os
+import re
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -25,8 +32,11 @@ from jobs.run.files import write_atomic
 from jobs.run.locks import locked
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
+from native import forget_stale_kernels
 
+ROOMS = ("envs", "models")
 CACHE = REPOSITORY / "envs" / "__pycache__"
+ARCHIVES = 8  # of compiled kernels, 10 MB each, that stay in the user's cache
 
 
 def compile_kernels() -> None:
@@ -34,37 +44,87 @@ def compile_kernels() -> None:
 
     Nothing is done where the folder of the source cannot be written: numba then compiles elsewhere.
     """
-    if not _is_current() and os.access(CACHE.parent, os.W_OK):
+    if not _is_current("first") and os.access(CACHE.parent, os.W_OK):
         subprocess.run([sys.executable, "-m", "jobs.run.compile"], cwd=REPOSITORY, check=False)
 
 
-def main() -> None:
-    """Compile what has changed since the last time, and say how long it took."""
+def main(which: str = "first") -> None:
+    """Compile what has changed since the last time, and say how long it took.
+
+    Args:
+        which: `first` for what the default commands use, `all` for every kernel.
+    """
     with locked(CACHE / "compile.lock", "Another process compiles the kernels; waiting for it ..."):
-        if _is_current():
+        if _is_current(which):
             return
-        now = _digest()
-        console.print("Compiling the kernels (a minute and a half at the first time) ...")
-        start = time.perf_counter()
-        side_by_side((draw, respond))
-        side_by_side((simulate, learn))  # a compiled step is made of what was drawn and responded by
-        console.print(f"Compiled the kernels in {time.perf_counter() - start:.0f} s.")
-        write_atomic(CACHE / "compiled", now)
+        now, start = _digest(), time.perf_counter()
+        archive = _archive(f"{now}-{which}")
+        if unpack(archive):
+            console.print("Took the kernels that another clone of the same sources compiled.")
+        else:
+            console.print("Compiling the kernels (about a minute at the first time) ...")
+            for parts in STAGES[which]:
+                side_by_side(parts)
+            console.print(f"Compiled the kernels in {time.perf_counter() - start:.0f} s.")
+            pack(archive)
+        write_atomic(CACHE / f"compiled_{which}", now)
 
 
-def _is_current() -> bool:
-    """Whether nothing has changed since all was compiled."""
-    compiled = CACHE / "compiled"
-    return compiled.is_file() and compiled.read_text() == _digest()
+def _is_current(which: str) -> bool:
+    """Whether nothing has changed since these kernels, or all, were compiled."""
+    now = _digest()
+    files = (CACHE / f"compiled_{name}" for name in {which, "all"})
+    return any(file.is_file() and file.read_text() == now for file in files)
 
 
 def _digest() -> str:
-    """A hash of all sources of kernels, of what is compiled of them, by which numba and where to."""
-    files = sorted(path for room in ("envs", "models") for path in (REPOSITORY / room).rglob("*.py"))
+    """A hash of the kernels' sources, of what is compiled of them, and of compiler, target and place."""
+    files = sorted(path for room in ROOMS for path in (REPOSITORY / room).rglob("*.py"))
     whole = hashlib.sha256(b"".join(path.read_bytes() for path in (Path(__file__), *files)))
-    python = sys.version_info[:2]  # each has machine code of its own
-    whole.update(f"{version('numba')} {python} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
+    compiler = [version("numba"), version("llvmlite"), sys.version_info[:2], sysconfig.get_platform()]
+    places = [os.environ.get(f"NUMBA_{name}") for name in ("CPU_NAME", "CPU_FEATURES", "CACHE_DIR")]
+    whole.update(repr([compiler, places]).encode())
     return whole.hexdigest()
+
+
+def _archive(name: str) -> Path:
+    """Where the kernels of one digest are kept for other clones of this user."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache, "evade", "kernels", f"{name}.zip")
+
+
+def pack(archive: Path) -> None:
+    """Keep what is compiled for other clones; without room or right to write, nothing is kept."""
+    part = archive.with_suffix(f".{os.getpid()}")
+    with contextlib.suppress(OSError):
+        archive.parent.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+            for room in ROOMS:
+                for path in sorted((REPOSITORY / room).rglob("__pycache__/*.nb[ci]")):
+                    file.write(path, path.relative_to(REPOSITORY))
+        part.replace(archive)
+        archives = sorted(archive.parent.glob("*.zip"), key=lambda path: path.stat().st_mtime)
+        for old in archives[:-ARCHIVES]:
+            old.unlink(missing_ok=True)
+
+
+def unpack(archive: Path) -> bool:
+    """Take what another clone has compiled; return whether there was something."""
+    for room in ROOMS:  # later it would take what is unpacked for stale
+        forget_stale_kernels(REPOSITORY / room)
+    try:
+        with zipfile.ZipFile(archive) as file:
+            # A kernel has one `.nbi`, which names its `.nbc`, and so comes after them.
+            for name in sorted(file.namelist()):
+                target = REPOSITORY / name
+                index = re.sub(r"(\.\d+\.nbc|\.nbi)$", ".nbi", target.name)
+                if target.with_name(index).exists():
+                    continue
+                target.parent.mkdir(exist_ok=True)
+                write_atomic(target, file.read(name))
+    except (OSError, zipfile.BadZipFile, zlib.error):
+        return False
+    return True
 
 
 def side_by_side(parts: Sequence[Callable[[], None]]) -> None:
@@ -82,38 +142,65 @@ def draw() -> None:
     RaycastRenderer(make_scene("poles", np.random.default_rng(0)), 16, 16).render(0.0, 0.0, 2.0)
 
 
-def respond() -> None:
-    """Let pixels see light change, in whole images and in columns; encode events, and write and read them."""
-    from envs.config import CameraConfig, FaultsConfig
-    from envs.events import EventCamera, RealSensor
+def look() -> None:
+    """Let columns of pixels see light change, and learn from events."""
+    from envs.config import CameraConfig
     from envs.events.crossings import make_room, named
     from envs.events.emission import Span
     from envs.events.ramps import ColumnCamera, Watch, events_of_ramps, look_at, make_ramps
 
+    columns = ColumnCamera(CameraConfig(width=16, height=16))
+    columns.reset(np.ones((16, 16), np.float32))
+    state, ramps, (model, memory) = columns.state, make_ramps(1000), named(*columns.state[:2])
+    watch = Watch(model, memory, np.zeros(16, np.int64), state[2], ramps, make_room(), columns.bandwidth)
+    _, kept, _ = look_at(np.full((16, 16), 0.5, np.float32), 0, 16, 1000, watch, 0)
+    events_of_ramps(watch, kept, Span(0, 1000))
+    encode()
+    learn()
+
+
+def act_alone() -> None:
+    """Move through a corridor, and measure the error of its events."""
+    from envs.config import CameraConfig, EnvConfig
+    from envs.corridor import CorridorEnv
+    from envs.event_error import measure_event_error
+
+    config = EnvConfig(camera=CameraConfig(width=16, height=16))
+    env = CorridorEnv(config)
+    env.reset(seed=0)
+    env.step(1)
+    measure_event_error(config, flights=1, steps=1)
+
+
+def act_together() -> None:
+    """Move through corridors side by side, and plan a way."""
+    from envs.config import CameraConfig
+    from envs.corridor import CorridorVectorEnv
+    from envs.scene.planning import cost_to_go
+
+    several = CorridorVectorEnv(2, camera=CameraConfig(width=16, height=16), window_capacity=None)
+    several.reset(seed=0)
+    several.step(np.zeros(2, np.int64))
+    cost_to_go(several.envs[0].scene, 0.3).of_actions(0.0, 0.0)
+
+
+def respond() -> None:
+    """Let pixels see whole images change, and write and read their events."""
+    from envs.config import CameraConfig
+    from envs.events import EventCamera
+
     light, config = np.ones((16, 16), np.float32), CameraConfig(width=16, height=16)
-    faults = FaultsConfig(background_activity=0.1, shot_noise_hz=10.0, leak_hz=1.0)
     for changed in ({"memory": "frame"}, {"refractory_us": 100}, {"cutoff_hz": 100.0, "readout_hz": 1e6}):
         camera = EventCamera(replace(config, **changed))
         camera.reset(light, 0)
         camera.step(0.5 * light, 1000)
-    columns = ColumnCamera(config)
-    columns.reset(light)
-    state, ramps, (model, memory) = columns.state, make_ramps(1000), named(*columns.state[:2])
-    watch = Watch(model, memory, np.zeros(16, np.int64), state[2], ramps, make_room(), columns.bandwidth)
-    _, kept, _ = look_at(0.5 * light, 0, 16, 1000, watch, 0)
-    rng = np.random.default_rng(0)
-    sensor = RealSensor(config, faults, (state, columns.pixels), rng, 0)
-    sensor.events(events_of_ramps(watch, kept, Span(0, 1000)), 0, 1000)
     record()
-    encode()
 
 
 def simulate() -> None:
-    """Move through a few corridors."""
+    """Move through corridors with other sensors, scenes and observations."""
     from envs.config import CameraConfig, EnvConfig, FaultsConfig
-    from envs.corridor import CorridorEnv, CorridorVectorEnv
-    from envs.event_error import measure_event_error
-    from envs.scene.planning import cost_to_go
+    from envs.corridor import CorridorEnv
 
     small = partial(CameraConfig, width=16, height=16)
     noisy = FaultsConfig(sparsity=0.1, background_activity=0.1, shot_noise_hz=10.0, leak_hz=1.0)
@@ -127,11 +214,6 @@ def simulate() -> None:
         env = CorridorEnv(config)
         env.reset(seed=0)
         env.step(1)
-    several = CorridorVectorEnv(2, camera=small(), window_capacity=None)
-    several.reset(seed=0)
-    several.step(np.zeros(2, np.int64))
-    cost_to_go(several.envs[0].scene, 0.3).of_actions(0.0, 0.0)
-    measure_event_error(EnvConfig(camera=small()), flights=1, steps=1)
 
 
 def record() -> None:
@@ -186,5 +268,8 @@ def some_events() -> np.ndarray:
     return events
 
 
+FIRST = (draw, look), (act_alone, act_together)  # a compiled step is made of what was drawn and looked by
+STAGES = {"first": FIRST, "all": (*FIRST, (respond, simulate))}
+
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -22,8 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-import pandas as pd
-
 from envs.checks import replaced
 from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
@@ -172,6 +170,8 @@ class Tracker:
         if f"{name}.json" not in written:
             self.client.log_table(self.run_id, dict(columns), f"{name}.json")
         else:  # to which MLflow would append
+            import pandas as pd  # takes half a second
+
             text = pd.DataFrame(dict(columns)).to_json(orient="split", index=False)
             self.client.log_text(self.run_id, text, f"{name}.json")
 

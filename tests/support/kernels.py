@@ -11,7 +11,7 @@ from tests.support.looks import HEIGHT, WIDTH, Looker
 
 def main() -> None:
     """Ask policies what to do, and call some kernels by themselves, which is compiled apart."""
-    compile.main()
+    compile.main("all")
     for threshold_mismatch in (0.0, 0.1):
         Looker(np.ones((HEIGHT, WIDTH), np.float32), threshold_mismatch=threshold_mismatch).look(
             (np.zeros((HEIGHT, WIDTH), np.float32), 0, WIDTH, 1000)

@@ -1,3 +1,4 @@
+import os
 import shutil
 import subprocess
 import sys
@@ -16,12 +17,20 @@ CALLER = (
 )
 
 
+def clone(folder):
+    """A package in a folder that prepares its kernels as `envs` does; that of models is the same."""
+    package = folder / "envs"
+    package.mkdir()
+    shutil.copy(ROOT / "envs" / "__init__.py", package)
+    shutil.copytree(ROOT / "native", folder / "native")
+    return package
+
+
 def test_an_edited_kernel_is_compiled_again_also_where_a_file_of_another_package_calls_it(tmp_path):
-    room, package = "envs", tmp_path / "envs"  # that of models is the same, see test_project.py
+    room, package = "envs", clone(tmp_path)
     for folder in ("low", "high"):
         (package / folder).mkdir(parents=True)
         (package / folder / "__init__.py").touch()
-    shutil.copy(ROOT / room / "__init__.py", package)
     (package / "low" / "inside.py").write_text(KERNEL.format(1.0))
     (package / "high" / "outside.py").write_text(CALLER.format(room))
 
@@ -41,9 +50,7 @@ def test_an_edited_kernel_is_compiled_again_also_where_a_file_of_another_package
 
 
 def test_an_edit_compiles_the_kernels_again_that_reach_the_edited_file_and_no_others(tmp_path):
-    room, package = "envs", tmp_path / "envs"  # that of models is the same, see test_project.py
-    package.mkdir()
-    shutil.copy(ROOT / room / "__init__.py", package)
+    room, package = "envs", clone(tmp_path)
     numbers = {"one": 1.0, "two": 2.0, "many": 3.0}
     for name, number in numbers.items():
         (package / f"{name}.py").write_text(f"VALUE = {number}\n")
@@ -87,11 +94,13 @@ with patch.multiple(compile, CACHE=folder, side_by_side=compile_parts):
 
 def test_of_processes_that_start_at_once_one_compiles_and_the_others_say_that_they_wait(tmp_path):
     words = [sys.executable, "-c", COMPILE, str(tmp_path)]
-    both = [subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    own = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    both = [subprocess.Popen(words, cwd=ROOT, env=own, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     said = [process.communicate(timeout=HANG_S)[0] for process in both]
     assert (tmp_path / "compiled_by").read_text() == "half half "
     assert sum("Compiled the kernels in" in text for text in said) == 1
     assert sum("waiting" in text for text in said) >= 1
-    (tmp_path / "compiled").write_text("other sources")
-    subprocess.run(words, cwd=ROOT, check=True, timeout=HANG_S)
+    (tmp_path / "compiled_first").write_text("other sources")
+    shutil.rmtree(tmp_path / "cache")
+    subprocess.run(words, cwd=ROOT, env=own, check=True, timeout=HANG_S)
     assert (tmp_path / "compiled_by").read_text() == "half half half half "

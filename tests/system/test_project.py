@@ -16,9 +16,11 @@ import jobs
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-LOCK = [line for line in (ROOT / "requirements.lock").read_text().splitlines() if line and line[0] != "#"]
+LOCKS = ("requirements.lock", "requirements-dev.lock")
+LOCK = [line for name in LOCKS for line in (ROOT / name).read_text().splitlines() if line and line[0] != "#"]
+DEFAULT = (ROOT / "requirements.lock").read_text().splitlines()
 LOCKED_EXTRAS = ("jobs", "meshes", "dev", "docs")
-ROOMS = ("envs", "models", "jobs")
+ROOMS = ("envs", "models", "jobs", "native")
 # Functions whose bodies have still 40 lines or more (file, name), and files that still use old words.
 SOURCES = ("*.*", "Makefile", ".ci/*", "conf/**/*.yaml", "docker/*", "docs/*.md", "[a-z]*/**/*.py")
 
@@ -41,6 +43,13 @@ def test_the_lock_holds_everything_that_the_project_needs_in_a_fitting_version()
     for text in [*PROJECT["dependencies"], *(text for extra in LOCKED_EXTRAS for text in extras[extra])]:
         needed = Requirement(text)
         assert needed.specifier.contains(locked()[normal(needed.name)]), text
+
+
+def test_the_default_commands_need_the_first_lock_alone():
+    extras, pinned = PROJECT["optional-dependencies"], {line.partition("==")[0] for line in DEFAULT}
+    first = [*PROJECT["dependencies"], *extras["jobs"], *extras["meshes"]]
+    assert {normal(Requirement(text).name) for text in first} <= pinned
+    assert pinned.isdisjoint({"furo", "mypy", "onnx", "onnxruntime", "pytest", "ruff", "stable-baselines3"})
 
 
 def test_the_lock_leaves_the_build_of_torch_open():
@@ -81,7 +90,7 @@ def test_importing_the_rooms_is_light():
 
 
 TARGETS = (
-    *("setup", "demo", "bytestream", "train-all", "sweep-robustness", "mlflow"),
+    *("setup", "setup-all", "demo", "bytestream", "train-all", "sweep-robustness", "mlflow"),
     *("lint", "check", "bench", "bench-clone", "docs", "test-costs"),
     *(
         "test",
@@ -221,7 +230,7 @@ def test_the_body_of_a_function_stays_below_forty_lines():
 
 def test_files_stand_in_packages_not_in_the_rooms_themselves():
     top = [path for room in ROOMS for path in (ROOT / room).glob("*.py")]
-    assert len(top) <= 16
+    assert len(top) <= 19
 
 
 def test_code_and_docs_use_the_words_of_the_field():
@@ -243,7 +252,7 @@ def test_few_values_are_of_any_type():
     assert sum(len(untyped.findall(text)) for text in texts) < 80
 
 
-def test_both_rooms_forget_stale_kernels_in_the_same_way():
+def test_both_rooms_prepare_their_kernels_in_the_same_way():
     envs, models = ((ROOT / room / "__init__.py").read_text().splitlines() for room in ("envs", "models"))
     assert envs[1:] == models[1:]
-    assert "_forget_stale_kernels()" in envs
+    assert {"fix_target()", "forget_stale_kernels(Path(__file__).parent)"} <= set(envs)
