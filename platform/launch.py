@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from jobs.config.registry import JOBS
+from jobs.run.libraries import hold
 from jobs.run.provenance import REPOSITORY as ROOT
-from jobs.run.threads import ONE_THREAD
 
 CONF = ROOT / "conf"
 
@@ -38,8 +38,7 @@ DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 
 def main() -> int:
     """Run the command line; return the exit status."""
-    for name, value in ONE_THREAD.items():
-        os.environ.setdefault(name, value)
+    hold()
     if importlib.util.find_spec("hydra") is None:
         print(
             f"evade: failed: {sys.executable} has not the packages of Evade; {ENVIRONMENT}", file=sys.stderr
