@@ -56,7 +56,7 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
 def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
     typing: Any, a: Any, i: Any, k: Any, panel: Any, depth: Any, out: Any, row: Any, column: Any
 ) -> Any:
-    """Continue the chains of the tile of `out` at (row, column) by `depth` numbers of a[i:, k:] and of `panel`.
+    """Continue the chains of the tile of `out` at (row, column) by `depth` numbers of a[i:, k:] and `panel`.
 
     Rows below the last one of `a` are taken to be that one. LLVM is given whole vectors, because it may not
     reorder the sums of a loop to fill them itself.
@@ -133,7 +133,9 @@ def add_product(a, b, out) -> None:  # type: ignore[no-untyped-def]
     in_line = out.strides[1] == out.itemsize
     near = b.strides[1] == b.itemsize and b.strides[0] * min(DEPTH, depths) <= NEAR
     room = np.empty((ROWS + 1 + min(DEPTH, depths)) * lanes, out.dtype)
-    room = room[-room.ctypes.data % LINE // out.itemsize :][: (ROWS + min(DEPTH, depths)) * lanes].reshape((-1, lanes))
+    room = room[-room.ctypes.data % LINE // out.itemsize :][: (ROWS + min(DEPTH, depths)) * lanes].reshape(
+        (-1, lanes)
+    )
     if columns % lanes:
         room[:] = 0.0  # numbers in columns that are not there could be slow ones
     corner, packed = room[:ROWS], room[ROWS:]
@@ -214,7 +216,7 @@ def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
 
 
 class Product(torch.autograd.Function):
-    """a (M, K) @ b (K, N), plus a bias (N,) if there is one, on the processor; gradients are such products too."""
+    """a (M, K) @ b (K, N), plus a bias (N,) if there is one, on the processor; so are its gradients."""
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
@@ -227,15 +229,12 @@ class Product(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of those that need one, in the layout of their memory."""
-        (a, b), found = ctx.saved_tensors, [None, None, None]
-        if ctx.needs_input_grad[0]:
-            found[0] = _product_like(a, gradient, b.T)
-        if ctx.needs_input_grad[1]:
-            found[1] = _product_like(b, a.T, gradient)
-        if ctx.needs_input_grad[2]:
-            found[2] = gradient.new_zeros(gradient.shape[1])
-            add_rows(gradient.contiguous().numpy(), found[2].numpy())
-        return tuple(found)
+        (a, b), (to_a, to_b, to_bias) = ctx.saved_tensors, ctx.needs_input_grad
+        of_bias = gradient.new_zeros(gradient.shape[1]) if to_bias else None
+        if of_bias is not None:
+            add_rows(gradient.contiguous().numpy(), of_bias.numpy())
+        of_a = _product_like(a, gradient, b.T) if to_a else None
+        return of_a, _product_like(b, a.T, gradient) if to_b else None, of_bias
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
@@ -260,7 +259,7 @@ def affine(inputs: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     ours = inputs.device.type == "cpu" and inputs.dtype == weight.dtype in (torch.float32, torch.float64)
     if not ours or torch.compiler.is_compiling():
         return functional.linear(inputs, weight, bias)
-    out = Product.apply(inputs.flatten(0, -2), weight.T, bias)
+    out = Product.apply(inputs.reshape(-1, weight.shape[1]), weight.T, bias)
     return out.reshape(*inputs.shape[:-1], len(weight))
 
 
@@ -275,9 +274,11 @@ class Linear(nn.Linear):
 def orthogonal_(weight: Tensor, gain: float, generator: torch.Generator | None = None) -> None:
     """Fill a weight (M, ...) as `torch.nn.init.orthogonal_` does, by the same draws.
 
-    LAPACK's QR rounds as its products do. Here Gram and Schmidt's, modified, runs in float64: rows or columns,
-    whichever are fewer, are orthonormal to the rounding of float32.
+    LAPACK's QR rounds as its products do. Here Gram and Schmidt's, modified, runs in float64: rows or
+    columns, whichever are fewer, are orthonormal to the rounding of float32.
     """
+    if weight.is_meta:  # only shapes are asked for
+        return
     drawn = torch.empty(len(weight), weight[0].numel()).normal_(generator=generator).double().numpy()
     tall = drawn.shape[0] >= drawn.shape[1]
     vectors = np.array(drawn.T if tall else drawn, order="C")

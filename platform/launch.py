@@ -1,6 +1,6 @@
 """Compose conf/ and the command line into one checked configuration, and run the job it names.
 
-Run: python -m platform.launch +exp=NAME [group=file] [key=value]
+Run: python -m platform.launch +exp=NAME [group=file] [key=value]; a first word NAME stands for +exp=NAME
 Expect: exit status 0 when the job is done, 2 with one message when a value is wrong, 1
 when the job fails, 130 after Ctrl+C.
 """
@@ -39,6 +39,8 @@ DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 def main() -> int:
     """Run the command line; return the exit status."""
     hold()
+    if len(sys.argv) > 1 and (CONF / "exp" / f"{sys.argv[1]}.yaml").is_file():
+        sys.argv[1] = f"+exp={sys.argv[1]}"
     if importlib.util.find_spec("hydra") is None:
         print(
             f"evade: failed: {sys.executable} has not the packages of Evade; {ENVIRONMENT}", file=sys.stderr

@@ -1,4 +1,4 @@
-"""What numerical libraries read from the environment when they load: how many threads, and which instructions.
+"""What numerical libraries read from the environment when they load: threads and instructions.
 
 Nothing is imported here but the standard library, because the launcher sets these variables before it imports
 anything that reads them. A value that the user has set stays.
@@ -8,8 +8,8 @@ import os
 from pathlib import Path
 
 # Two threads beside other busy processes ran ten times slower than one. Parts that take more set their number
-# (pretraining, a learner of a large network); those that wait must sleep: spinning beside one busy program made
-# a gradient three times slower.
+# (pretraining, a learner of a large network); those that wait must sleep: spinning beside one busy program
+# made a gradient three times slower.
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -32,12 +32,14 @@ NUMPY = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_bitalg", "AVX512_SPR": "avx
 
 
 def processor() -> dict[str, str]:
-    """What Linux says of the first processor: `vendor_id`, `model name`, `flags` and more; elsewhere nothing."""
+    """What Linux says of the first processor: `vendor_id`, `model name`, `flags` and more; else nothing."""
     try:
         first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")
     except OSError:
         return {}
-    return {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in first.splitlines())}
+    return {
+        name.strip(): value.strip() for name, _, value in (line.partition(":") for line in first.splitlines())
+    }
 
 
 def held(flags: set[str]) -> dict[str, str]:
@@ -55,6 +57,6 @@ def hold() -> None:
 
 
 def of_workers() -> dict[str, str]:
-    """The environment of processes on other machines: this one's instructions, and one thread whatever it has."""
+    """The environment of a Ray worker: the instructions of this process, but one thread."""
     names = [*SAME_DIGITS, "NPY_DISABLE_CPU_FEATURES"]
     return {name: os.environ[name] for name in names if name in os.environ} | ONE_THREAD

@@ -8,7 +8,7 @@ begins from what an earlier one made. Without a published file it is written.
 import dataclasses
 import hashlib
 import json
-import platform
+import os
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from typing import Any
@@ -74,7 +74,9 @@ def run(config: Config) -> dict[str, str]:
     console.print("\n".join(f"{name}: {value}" for name, value in machine().items()), markup=False)
     found = {name: digest(arrays) for name, arrays in stages(config)}
     if not PUBLISHED.is_file():
-        write_json(PUBLISHED, {"processors": [machine()["Processor"]], "versions": versions(), "stages": found})
+        write_json(
+            PUBLISHED, {"processors": [machine()["Processor"]], "versions": versions(), "stages": found}
+        )
     published = json.loads(PUBLISHED.read_text())
     rows = [(name, one, published["stages"].get(name, "none")) for name, one in found.items()]
     show_table("Fingerprint", ("Stage", "Here", "Published"), rows, 1, None)
@@ -90,7 +92,9 @@ def machine() -> dict[str, str]:
     """What this processor is, and what computes on it."""
     known = processor()
     flags = set(known.get("flags", "").split())
-    name = f"{known.get('vendor_id', platform.machine())} {known.get('model name', '')} ({get_host_cpu_name()})"
+    name = (
+        f"{known.get('vendor_id', os.uname().machine)} {known.get('model name', '')} ({get_host_cpu_name()})"
+    )
     return {
         "Processor": name,
         "Instructions": " ".join(flag for flag in FLAGS if flag in flags),
@@ -176,5 +180,3 @@ def learnt(config: Config) -> list[np.ndarray]:
         )
     runner.stop()
     return weights(learner.module["default_policy"].unwrapped())
-
-

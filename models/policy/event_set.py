@@ -39,9 +39,7 @@ class EventSet(nn.Module):
         """Make it for stacks of `stack` windows of a sensor of `size` (width, height) pixels."""
         super().__init__()
         self.grid = Grid(size[0], size[1], TIMES)
-        self.place = nn.Sequential(
-            Linear(4 * OCTAVES + 3, WIDTH), nn.ReLU(), Linear(WIDTH, WIDTH), nn.ReLU()
-        )
+        self.place = nn.Sequential(Linear(4 * OCTAVES + 3, WIDTH), nn.ReLU(), Linear(WIDTH, WIDTH), nn.ReLU())
         self.gate = nn.Sequential(Linear(1, WIDTH), nn.Sigmoid())
         self.join = nn.Sequential(Linear(stack * (2 * WIDTH + 1), OUTPUTS), nn.ReLU())
 
