@@ -86,7 +86,12 @@ def test_blocks_continue_the_chains_and_keep_to_the_bound(shape, dtype):
     a, b, out = numbers(rng, m, k, dtype=dtype), numbers(rng, k, n, dtype=dtype), np.zeros((m, n), dtype)
     add_product(a, b, out)
     exact = a.astype(np.longdouble) @ b.astype(np.longdouble)
-    bound = (k + 0.001) * np.finfo(dtype).eps / 2 * (np.abs(a).astype(np.longdouble) @ np.abs(b).astype(np.longdouble))
+    bound = (
+        (k + 0.001)
+        * np.finfo(dtype).eps
+        / 2
+        * (np.abs(a).astype(np.longdouble) @ np.abs(b).astype(np.longdouble))
+    )
     assert (np.abs(out - exact) <= bound).all()
     part = np.zeros_like(out)
     for begin, end in ((0, k // 3), (k // 3, k // 2), (k // 2, k)):  # the chains of the whole, in three links
