@@ -30,7 +30,7 @@ def test_the_first_stage_that_differs_is_named(published, monkeypatch):
     run(None)
     other = {**STAGES, "events": [np.nextafter(STAGES["events"][0], np.float32(2))], "weights": [np.ones(4)]}
     monkeypatch.setattr(fingerprint, "stages", lambda config: iter(other.items()))
-    with pytest.raises(FingerprintError, match="differ from stage 'events' on$"):
+    with pytest.raises(FingerprintError, match=r"differ from stage 'events' on$"):
         run(None)
 
 
