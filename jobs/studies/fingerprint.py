@@ -8,7 +8,9 @@ begins from what an earlier one made. Without a published file it is written.
 import dataclasses
 import hashlib
 import json
+import logging
 import os
+import warnings
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from typing import Any
@@ -27,7 +29,7 @@ from jobs.config.schema import ImitationConfig
 from jobs.rollout.agents import make_agent
 from jobs.rollout.episodes import roll_out
 from jobs.rollout.policies import PRETRAINED
-from jobs.run.files import RunError, write_json
+from jobs.run.files import RunError, write_atomic
 from jobs.run.libraries import processor
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
@@ -74,9 +76,8 @@ def run(config: Config) -> dict[str, str]:
     console.print("\n".join(f"{name}: {value}" for name, value in machine().items()), markup=False)
     found = {name: digest(arrays) for name, arrays in stages(config)}
     if not PUBLISHED.is_file():
-        write_json(
-            PUBLISHED, {"processors": [machine()["Processor"]], "versions": versions(), "stages": found}
-        )
+        first = {"processors": [machine()["Processor"]], "versions": versions(), "stages": found}
+        write_atomic(PUBLISHED, json.dumps(first, indent=2) + "\n")
     published = json.loads(PUBLISHED.read_text())
     rows = [(name, one, published["stages"].get(name, "none")) for name, one in found.items()]
     show_table("Fingerprint", ("Stage", "Here", "Published"), rows, 1, None)
@@ -168,8 +169,10 @@ def tabulated(evae: EventVAE) -> list[np.ndarray]:
 def learnt(config: Config) -> list[np.ndarray]:
     """The weights of a policy after two updates of the experiment's learner."""
     torch.manual_seed(0)
+    logging.getLogger("ray.rllib").setLevel(logging.ERROR)  # it calls its own settings outdated
     ppo = build_ppo(config)
-    runner = env_runner(config)(config=ppo, worker_index=0)
+    with warnings.catch_warnings(action="ignore"):  # the stage before has registered the same environment
+        runner = env_runner(config)(config=ppo, worker_index=0)
     learner = ppo.build_learner(env=runner.env)
     for count in (1, 2):
         learner.update(
