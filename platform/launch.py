@@ -1,6 +1,6 @@
 """Compose conf/ and the command line into one checked configuration, and run the job it names.
 
-Run: python -m platform.launch +exp=NAME [group=file] [key=value]
+Run: python -m platform.launch +exp=NAME [group=file] [key=value]; a first word NAME stands for +exp=NAME
 Expect: exit status 0 when the job is done, 2 with one message when a value is wrong, 1
 when the job fails, 130 after Ctrl+C.
 """
@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from jobs.config.registry import JOBS
+from jobs.run.libraries import hold
 from jobs.run.provenance import REPOSITORY as ROOT
-from jobs.run.threads import ONE_THREAD
 
 CONF = ROOT / "conf"
 
@@ -38,8 +38,9 @@ DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 
 def main() -> int:
     """Run the command line; return the exit status."""
-    for name, value in ONE_THREAD.items():
-        os.environ.setdefault(name, value)
+    hold()
+    if len(sys.argv) > 1 and (CONF / "exp" / f"{sys.argv[1]}.yaml").is_file():
+        sys.argv[1] = f"+exp={sys.argv[1]}"
     if importlib.util.find_spec("hydra") is None:
         print(
             f"evade: failed: {sys.executable} has not the packages of Evade; {ENVIRONMENT}", file=sys.stderr

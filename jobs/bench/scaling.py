@@ -34,9 +34,9 @@ from jobs.rollout.episodes import roll_out
 from jobs.rollout.executors import cached_agent
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import write_json
+from jobs.run.libraries import of_workers
 from jobs.run.provenance import git_commit, today
 from jobs.run.ray_cluster import QUIET, on_loopback, ray_folder, use_token
-from jobs.run.threads import ONE_THREAD
 from jobs.training.env_runner import PlainEnvRunner
 from jobs.training.ppo import build_ppo
 
@@ -189,7 +189,7 @@ def simulated(nodes: int, cores: int) -> Iterator[None]:
         try:
             for _ in range(nodes - 1):
                 cluster.add_node(num_cpus=cores, object_store_memory=OBJECT_STORE)
-            ray.init(cluster.address, runtime_env={"env_vars": ONE_THREAD}, log_to_driver=False)
+            ray.init(cluster.address, runtime_env={"env_vars": of_workers()}, log_to_driver=False)
             yield
         finally:
             ray.shutdown()

@@ -39,5 +39,6 @@ JOBS = {
     "tune": Job("jobs.studies.search.search", "Which settings a training learns best with"),
     "ablation": Job("jobs.studies.ablation.ablation", "What each part of a recipe contributes"),
     "numerics": Job("jobs.studies.numerics.numerics", "What the numbers do at the ends of their ranges"),
+    "fingerprint": Job("jobs.studies.fingerprint", "Whether this machine gives the published digits"),
     "probe": Job("jobs.studies.probe.probe", "What a representation of events tells an agent"),
 }

@@ -16,10 +16,10 @@ from jobs.config.schema import ClusterConfig
 from jobs.run.compile import compile_kernels
 from jobs.run.device import device_variables
 from jobs.run.head_watch import watching_head
+from jobs.run.libraries import of_workers
 from jobs.run.locks import locked, private_folder
 from jobs.run.ray_sessions import forget_sessions
 from jobs.run.same_code import check_machines
-from jobs.run.threads import ONE_THREAD
 
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -53,7 +53,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
 
     A local Ray listens on the loopback address alone, keeps its sockets and logs in a private folder,
     and asks every client for a token, which lies in a file that its owner alone can read; the home
-    folder is not touched. Workers run one thread each, see `jobs.run.threads`.
+    folder is not touched. Workers run one thread each, see `jobs.run.libraries`.
 
     Args:
         cluster: Where Ray runs.
@@ -81,7 +81,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     # It logs the traceback of a trial's error, which it also writes beside the trial and jobs report.
     logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
-        "runtime_env": with_plugins({"env_vars": ONE_THREAD | device_variables(cluster.device)}),
+        "runtime_env": with_plugins({"env_vars": of_workers() | device_variables(cluster.device)}),
         "log_to_driver": False,
         "logging_level": logging.ERROR,
         "configure_logging": True,

@@ -33,6 +33,7 @@ from torch.nn import functional
 from models.encoder.embedding import embedding_table, eventnet_phase
 from models.encoder.event_batch import EventBatch, Grid, distinct
 from models.encoder.gpu_context import max_context
+from models.products import Linear, affine, product
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -59,7 +60,7 @@ class EventContextNetwork(nn.Module):
         self.coding = coding if variant == "bytestream" else "none"
         sizes = [3 if self.uses_polarity else 2, 64, 128, context]
         bias = norm == "none"
-        self.layers = nn.ModuleList(nn.Linear(a, b, bias=bias) for a, b in itertools.pairwise(sizes))
+        self.layers = nn.ModuleList(Linear(a, b, bias=bias) for a, b in itertools.pairwise(sizes))
         self.norms = nn.ModuleList(nn.BatchNorm1d(size) for size in sizes[1:] if norm == "batch")
 
     def forward(self, batch: EventBatch) -> Tensor:
@@ -112,7 +113,7 @@ class EventContextNetwork(nn.Module):
         """Features (cells, D) >= 0 of every distinct event, by the running statistics."""
         cells = np.arange((2 if self.uses_polarity else 1) * self.grid.width * self.grid.height)
         h, weight, bias = self._last_layer(self._inputs(cells), None, 0)
-        features = torch.relu(torch.addmm(bias, h, weight.T))
+        features = torch.relu(affine(h, weight, bias))
         return torch.tanh(features) if self.coding == "eventnet" else features
 
     @property
@@ -166,7 +167,7 @@ class EventContextNetwork(nn.Module):
         *inner, last = self._pairs()
         for layer, norm in inner:
             h, weight, bias = folded(layer, norm, h, share, events)
-            h = torch.relu(torch.addmm(bias, h, weight.T))
+            h = torch.relu(affine(h, weight, bias))
         return folded(*last, h, share, events)
 
 
@@ -192,17 +193,17 @@ def folded(
     if norm is None:
         return h, layer.weight, layer.bias
     if share is None:
-        scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+        scale = norm.weight / (norm.running_var + norm.eps) ** 0.5
         return h, layer.weight * scale[:, None], norm.bias - norm.running_mean * scale
-    centre = share @ h
+    centre = product(share[None], h)[0]
     h = h - centre
-    covariance = (h * share[:, None]).T @ h
-    variance = ((layer.weight @ covariance) * layer.weight).sum(1).clamp_min(0)
+    covariance = product((h * share[:, None]).T, h)
+    variance = (product(layer.weight, covariance) * layer.weight).sum(1).clamp_min(0)
     with torch.no_grad():
         norm.num_batches_tracked += 1
-        norm.running_mean.lerp_(layer.weight @ centre, norm.momentum)
+        norm.running_mean.lerp_(product(layer.weight, centre[:, None])[:, 0], norm.momentum)
         norm.running_var.lerp_(variance * (events / (events - 1)), norm.momentum)
-    return h, layer.weight * (norm.weight / torch.sqrt(variance + norm.eps))[:, None], norm.bias
+    return h, layer.weight * (norm.weight / (variance + norm.eps) ** 0.5)[:, None], norm.bias
 
 
 class Events(NamedTuple):
@@ -225,7 +226,7 @@ def max_on_device(
     h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool
 ) -> tuple[Tensor, Tensor]:
     """What `MaxContext` computes, by operations of torch on the device of its inputs."""
-    features = torch.relu(torch.addmm(bias, h, weight.T))
+    features = torch.relu(affine(h, weight, bias))
     features = torch.tanh(features) if squash else features
     return max_context(features, events.codes, (events.cell, events.bin), events.offsets)
 
@@ -241,7 +242,7 @@ class MaxContext(torch.autograd.Function):
         ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool
     ) -> tuple[Tensor, Tensor]:
         """Context (B, D) and the bin (B, D) of the event it is from, 0 without one."""
-        activation = torch.addmm(bias, h, weight.T).relu_()
+        activation = affine(h, weight, bias).relu_()
         features = (activation.tanh_() if squash else activation).numpy()
         context = np.zeros((len(events.offsets) - 1, len(bias)), features.dtype)
         winner = np.full(context.shape, -1, np.int32)

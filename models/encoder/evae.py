@@ -24,6 +24,7 @@ from models.encoder.context import EventContextNetwork
 from models.encoder.event_batch import EventBatch, Grid
 from models.encoder.event_images import PictureContextNetwork, cell_counts, last_polarity, newest_time
 from models.kinds import EvaeSettings, checked
+from models.products import Linear
 
 CELLS = 8  # each way, of the target "counts"
 COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events
@@ -81,13 +82,13 @@ class EventVAE(nn.Module):
             else EventContextNetwork(self.grid, variant, context, norm, coding)
         )
         parts = 2 if coding == "eventnet" else 1  # real and imaginary
-        self.encoder = nn.Sequential(nn.Linear(parts * context, 256), nn.ReLU(), nn.Linear(256, 2 * latent))
+        self.encoder = nn.Sequential(Linear(parts * context, 256), nn.ReLU(), Linear(256, 2 * latent))
         self.decoder = nn.Sequential(
-            nn.Linear(latent, 256),
+            Linear(latent, 256),
             nn.ReLU(),
-            nn.Linear(256, 1024),
+            Linear(256, 1024),
             nn.ReLU(),
-            nn.Linear(1024, math.prod(target_shape(target, self.grid))),
+            Linear(1024, math.prod(target_shape(target, self.grid))),
         )
 
     @classmethod

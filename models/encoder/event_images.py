@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows
 from models.kinds import MIN_IMAGE
+from models.products import Linear, orthogonal_
 
 OFF_SHARE = 125.0 / 255.0  # of the picture value of ON (appendix D.1.2)
 
@@ -42,7 +43,7 @@ class PictureContextNetwork(nn.Module):
         self.layers = nn.Sequential(*nature_layers((1, grid.height, grid.width), context))
         for layer in self.layers:
             if isinstance(layer, nn.Conv2d | nn.Linear):  # torch's own weights let sparse pictures fade
-                nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
+                orthogonal_(layer.weight, math.sqrt(2.0))
                 nn.init.zeros_(layer.bias)
 
     def forward(self, batch: EventBatch) -> Tensor:
@@ -64,7 +65,7 @@ def nature_layers(shape: Sequence[int], outputs: int) -> list[nn.Module]:
         *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),
         *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),
         nn.Flatten(),
-        *(nn.Linear(64 * height * width, outputs), nn.ReLU()),
+        *(Linear(64 * height * width, outputs), nn.ReLU()),
     ]
 
 

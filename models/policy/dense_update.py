@@ -16,7 +16,9 @@ import numpy as np
 import torch
 from torch import nn
 
-compiled = numba.njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract"})
+from models.products import add_product, add_rows, aligned, dot, fma
+
+compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
 F32 = np.float32
 TANH_IS_ONE = F32(7.9053111)  # in float32, from here on
 # tanh(x) = x P(x^2) / Q(x^2), highest power first: the rational approximation of the library Eigen.
@@ -124,8 +126,10 @@ def update_dense(
     states = [_adam_state(optimizer, value) for value in parameters]
     ends = np.cumsum([value.numel() for value in parameters])
     kept = parameters, [one["exp_avg"] for one in states], [one["exp_avg_sq"] for one in states]
-    values, first, second = (torch.cat([part.detach().flatten() for part in parts]).numpy() for parts in kept)
-    adam = Adam(values, np.empty_like(values), first, second)
+    adam = Adam(*(aligned(ends[-1]) for _ in range(4)))
+    values, first, second = adam.values, adam.first, adam.second
+    for flat, parts in zip((values, first, second), kept, strict=True):
+        np.concatenate([part.detach().flatten().numpy() for part in parts], out=flat)
     pi, vf = _flat(networks, adam, min(settings.minibatch_size, len(rows.actions)))
     figures, taken = _take_steps(pi, vf, adam, rows, orders, settings, float(states[0]["step"]))
     for flat, parts in zip((values, first, second), kept, strict=True):
@@ -154,7 +158,7 @@ def _flat(networks: Sequence[nn.Sequential], adam: Adam, most: int) -> list[Netw
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]
         widths = np.array([layers[0].in_features, *(layer.out_features for layer in layers)])
         own = slice(begin, begin + sum(value.numel() for value in network.parameters()))
-        room = [np.empty(most * widths[1:].sum(), np.float32) for _ in range(2)]
+        room = [aligned(most * widths[1:].sum()) for _ in range(2)]
         made.append(Network(widths, adam.values[own], adam.gradient[own], *room))
         begin = own.stop
     return made
@@ -186,7 +190,7 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
             _add_losses(logits, values, of_logits, of_values, rows, picked, settings, figures)
             _backward(shown, pi)
             _backward(told, vf)
-            norm = math.sqrt(np.dot(adam.gradient, adam.gradient))
+            norm = math.sqrt(dot(adam.gradient, adam.gradient))
             if not math.isfinite(norm):
                 figures[Figure.NORM] = np.nan
                 return figures, taken
@@ -214,13 +218,11 @@ def _forward(inputs, network):  # type: ignore[no-untyped-def]
         out = _part(network.outputs, to, count, widths[k])
         of_out = _part(network.of_outputs, to, count, widths[k])
         to += out.size
-        np.dot(shown, weights.T, out)
         for b in range(count):
-            row = out[b]
-            for j in range(len(bias)):
-                row[j] += bias[j]
-            if k < len(widths) - 1:
-                tanh(row)
+            out[b] = bias
+        add_product(shown, weights.T, out)
+        if k < len(widths) - 1:
+            tanh(out.reshape(-1))
         shown = out
     return out, of_out
 
@@ -233,8 +235,8 @@ def tanh(values):  # type: ignore[no-untyped-def]
         x = -TANH_IS_ONE if x < -TANH_IS_ONE else x  # NaN stays
         x = TANH_IS_ONE if x > TANH_IS_ONE else x
         s = x * x
-        above = (((((P6 * s + P5) * s + P4) * s + P3) * s + P2) * s + P1) * s + P0
-        values[j] = x * above / (((Q3 * s + Q2) * s + Q1) * s + Q0)
+        above = fma(fma(fma(fma(fma(fma(P6, s, P5), s, P4), s, P3), s, P2), s, P1), s, P0)
+        values[j] = x * above / fma(fma(fma(Q3, s, Q2), s, Q1), s, Q0)
 
 
 @compiled
@@ -286,19 +288,18 @@ def _backward(inputs, network):  # type: ignore[no-untyped-def]
         at -= widths[k] * (widths[k - 1] + 1)
         before = to - count * widths[k - 1]
         shown = inputs if k == 1 else _part(network.outputs, before, count, widths[k - 1])
-        np.dot(slopes.T, shown, _part(network.gradient, at, widths[k], widths[k - 1]))
-        of_bias[:] = F32(0.0)
-        for b in range(count):
-            row = slopes[b]
-            for j in range(len(of_bias)):
-                of_bias[j] += row[j]
+        of_weights = _part(network.gradient, at, widths[k], widths[k - 1])
+        of_weights[:], of_bias[:] = F32(0.0), F32(0.0)
+        add_product(slopes.T, shown, of_weights)
+        add_rows(slopes, of_bias)
         if k > 1:
             below = _part(network.of_outputs, before, count, widths[k - 1])
-            np.dot(slopes, _part(network.values, at, widths[k], widths[k - 1]), below)
+            below[:] = F32(0.0)
+            add_product(slopes, _part(network.values, at, widths[k], widths[k - 1]), below)
             for b in range(count):
                 row, out = below[b], shown[b]
                 for j in range(len(row)):
-                    row[j] *= F32(1.0) - out[j] * out[j]
+                    row[j] *= fma(-out[j], out[j], F32(1.0))
 
 
 @compiled
@@ -311,6 +312,6 @@ def _step(adam, settings, scale, taken):  # type: ignore[no-untyped-def]
     values, gradient, first, second = adam.values, adam.gradient, adam.first, adam.second
     for j in range(len(values)):
         slope = scale * gradient[j]
-        first[j] = keep1 * first[j] + new1 * slope
-        second[j] = keep2 * second[j] + new2 * slope * slope
+        first[j] = fma(keep1, first[j], new1 * slope)
+        second[j] = fma(keep2, second[j], new2 * slope * slope)
         values[j] -= size * first[j] / (math.sqrt(second[j]) / two + eps)

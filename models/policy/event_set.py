@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from models.encoder.event_batch import ROW_EMPTY, ROW_OFF, ROW_ON, EventBatch, Grid, batch_rows, distinct
 from models.encoder.table import dense
+from models.products import Linear
 
 EVENTS = 256  # of a window that the network sees
 TIMES = 1024  # steps into which a window's time is rounded
@@ -38,11 +39,9 @@ class EventSet(nn.Module):
         """Make it for stacks of `stack` windows of a sensor of `size` (width, height) pixels."""
         super().__init__()
         self.grid = Grid(size[0], size[1], TIMES)
-        self.place = nn.Sequential(
-            nn.Linear(4 * OCTAVES + 3, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU()
-        )
-        self.gate = nn.Sequential(nn.Linear(1, WIDTH), nn.Sigmoid())
-        self.join = nn.Sequential(nn.Linear(stack * (2 * WIDTH + 1), OUTPUTS), nn.ReLU())
+        self.place = nn.Sequential(Linear(4 * OCTAVES + 3, WIDTH), nn.ReLU(), Linear(WIDTH, WIDTH), nn.ReLU())
+        self.gate = nn.Sequential(Linear(1, WIDTH), nn.Sigmoid())
+        self.join = nn.Sequential(Linear(stack * (2 * WIDTH + 1), OUTPUTS), nn.ReLU())
 
     def forward(self, stacks: Tensor) -> Tensor:
         """Each event's features times its gate; maximum, mean and number over each window.

@@ -10,6 +10,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from operator import contains
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from models.kinds import PolicySpec, resolve
 from models.policy.dense_update import tanh
 from models.policy.event_set import OUTPUTS, EventSet, EventTables
 from models.policy.features import feature_of
+from models.products import Linear, orthogonal_
 
 PARTS = ("trunk", "pi", "vf")
 # Of the last layer's weights; all other layers have sqrt(2) (stable-baselines' policies).
@@ -47,7 +49,7 @@ def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
         layers = [part for part in networks[name].modules() if isinstance(part, nn.Linear | nn.Conv2d)]
         for layer in layers:
             gain = LAST_GAIN.get(name, math.sqrt(2.0)) if layer is layers[-1] else math.sqrt(2.0)
-            nn.init.orthogonal_(layer.weight, gain, generator=generator)
+            orthogonal_(layer.weight, gain, generator)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
     return networks
@@ -99,16 +101,16 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     """Dense tanh layers and a linear head."""
     layers: list[nn.Module] = []
     for fan_in, fan_out in itertools.pairwise([inputs, *hidden]):
-        layers += [nn.Linear(fan_in, fan_out), nn.Tanh()]
-    return nn.Sequential(*layers, nn.Linear([inputs, *hidden][-1], outputs))
+        layers += [Linear(fan_in, fan_out), nn.Tanh()]
+    return nn.Sequential(*layers, Linear([inputs, *hidden][-1], outputs))
 
 
 def is_mlp(network: nn.Module) -> bool:
     """Whether `mlp` could have built it: what is compiled for such networks would compute others wrong."""
     layers = list(network) if isinstance(network, nn.Sequential) else []
-    kinds = [nn.Tanh if place % 2 else nn.Linear for place in range(len(layers))]
+    kinds = [(nn.Tanh,) if place % 2 else (nn.Linear, Linear) for place in range(len(layers))]
     biased = all(layer.bias is not None for layer in layers[::2] if isinstance(layer, nn.Linear))
-    return len(layers) % 2 == 1 and [type(layer) for layer in layers] == kinds and biased
+    return len(layers) % 2 == 1 and all(map(contains, kinds, map(type, layers))) and biased
 
 
 def widened(network: nn.Module, inputs: int) -> nn.Module:
@@ -127,13 +129,13 @@ def nature_cnn(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
     appendix D.1.2 names. Pictures need `models.kinds.MIN_IMAGE` pixels each way.
     """
     trunk = nn.Sequential(Bytes(), *nature_layers(shape, CNN_OUTPUTS))
-    return trunk, nn.Linear(CNN_OUTPUTS, spec.num_actions), nn.Linear(CNN_OUTPUTS, 1)
+    return trunk, Linear(CNN_OUTPUTS, spec.num_actions), Linear(CNN_OUTPUTS, 1)
 
 
 def event_set(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
     """A network over sets of events that policy and value share (`models.policy.event_set`)."""
     trunk = EventSet(shape[0], (spec.width, spec.height))
-    return trunk, nn.Linear(OUTPUTS, spec.num_actions), nn.Linear(OUTPUTS, 1)
+    return trunk, Linear(OUTPUTS, spec.num_actions), Linear(OUTPUTS, 1)
 
 
 def finetuned_mlps(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:

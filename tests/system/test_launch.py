@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from jobs.config.config import Config
+from jobs.run import libraries
+from jobs.run.libraries import held
 from tests.support.configs import compose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -184,13 +186,16 @@ def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folde
 
 
 def test_a_process_gets_one_thread_unless_the_user_says_otherwise(launch, launcher, job, monkeypatch):
-    for name in launcher.ONE_THREAD:
+    settings = held({"avx2", "fma", "avx512vl"})
+    for name in settings:
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(libraries, "processor", lambda: {"flags": "avx2 fma avx512vl"})
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     seen = []
-    job(lambda config: seen.append({name: os.environ[name] for name in launcher.ONE_THREAD}))
+    job(lambda config: seen.append({name: os.environ[name] for name in settings}))
     assert launch("+exp=train")[0] == 0
-    assert seen == [{**launcher.ONE_THREAD, "OMP_NUM_THREADS": "4"}]
+    assert seen == [{**settings, "OMP_NUM_THREADS": "4"}]
+    assert seen[0]["NPY_DISABLE_CPU_FEATURES"] == "X86_V4"
 
 
 def unknown_scene(config):
@@ -255,3 +260,11 @@ def test_the_launcher_says_so_when_conf_is_not_there(launch, launcher, monkeypat
     status, _, err = launch("+exp=train")
     assert status == 2
     assert "pip install -e ." in err
+
+
+@pytest.mark.system
+@pytest.mark.timeout(900)
+def test_this_machine_gives_the_published_digits():
+    result = shell(sys.executable, "-m", "platform.launch", "fingerprint")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.stdout.rstrip().endswith("equal")

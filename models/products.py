@@ -1,0 +1,299 @@
+"""Matrix products whose digits follow from this file alone, not from the processor or the number of threads.
+
+A library of linear algebra picks its kernels by the processor's maker and instructions, and each adds in an
+order of its own: the same training then ends with other weights. Here each element is one chain of fused
+multiply-adds in rising order of the inner index, from the element's first value:
+
+    out[i, j] = fma(a[i, K-1], b[K-1, j], ... fma(a[i, 1], b[1, j], fma(a[i, 0], b[0, j], out[i, j])))
+
+Vector registers hold neighbouring columns, blocks continue the chains of earlier ones, and threads share the
+rows or columns: none of this changes an order. Element by element it errs by at most K times the rounding
+error of sum |a| |b|, as any order does. The blocks are those of Goto and van de Geijn (2008).
+"""
+
+import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from torch import Tensor, nn
+from torch.nn import functional
+
+ROWS = 6  # of a tile: with a line of columns its sums fill the registers of AVX2
+LINE = 64  # bytes, one row of a tile
+DEPTH, HEIGHT = 256, 192  # of a block: a panel of it stays in the first cache, its rows in the second
+NEAR = 1 << 15  # bytes between its first and last line up to which a panel is not copied
+CHAINS = 64  # of a `dot`
+SHARED = 1 << 21  # products of numbers from which a second thread is worth waking
+
+
+def _emit_fma(builder: Any, *values: Any) -> Any:
+    """Emit a * b + c with one rounding, of numbers or vectors."""
+    kind = values[0].type
+    number, lanes = (kind.element, f"v{kind.count}") if isinstance(kind, ir.VectorType) else (kind, "")
+    name = f"llvm.fma.{lanes}{'f32' if number == ir.FloatType() else 'f64'}"
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
+    return builder.call(function, values)
+
+
+@intrinsic
+def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """Compute a * b + c with one rounding, of three floats of one type; on any processor the same."""
+
+    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return _emit_fma(builder, *values)
+
+    return (a(a, b, c), emit) if a == b == c and isinstance(a, types.Float) else None
+
+
+@intrinsic
+def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
+    typing: Any, a: Any, i: Any, k: Any, panel: Any, depth: Any, out: Any, row: Any, column: Any
+) -> Any:
+    """Continue the chains of the tile of `out` at (row, column) by `depth` numbers of a[i:, k:] and `panel`.
+
+    Rows below the last one of `a` are taken to be that one. LLVM is given whole vectors, because it may not
+    reorder the sums of a loop to fill them itself.
+    """
+    size, index = out.dtype.bitwidth // 8, types.intp
+
+    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        a_value, i, k, panel_value, depth, out_value, row, column = values
+        vector, word = ir.VectorType(context.get_value_type(out.dtype), LINE // size), depth.type
+        same = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
+
+        def opened(kind: Any, value: Any) -> tuple[Any, Any, list[Any]]:
+            array = context.make_array(kind)(context, builder, value)
+            shape, strides = (cgutils.unpack_tuple(builder, part, 2) for part in (array.shape, array.strides))
+            return shape[0], builder.bitcast(array.data, ir.IntType(8).as_pointer()), strides
+
+        def moved(start: Any, steps: Any, stride: Any, kind: Any) -> Any:
+            place = builder.gep(start, [builder.mul(steps, stride)])
+            return builder.bitcast(place, kind.as_pointer())
+
+        (rows, a_start, a_by), (_, panel_start, panel_by), (_, out_start, out_by) = (
+            opened(kind, value) for kind, value in ((a, a_value), (panel, panel_value), (out, out_value))
+        )
+        byte, last = ir.IntType(8), builder.sub(rows, word(1))
+        a_rows, places, sums = [], [], []
+        for r in range(ROWS):
+            there = builder.add(i, word(r))
+            there = builder.select(builder.icmp_signed("<", there, last), there, last)
+            a_rows.append(moved(moved(a_start, there, a_by[0], byte), k, a_by[1], byte))
+            out_row = moved(out_start, builder.add(row, word(r)), out_by[0], byte)
+            places.append(moved(out_row, column, out_by[1], vector))
+            sums.append(cgutils.alloca_once(builder, vector))
+            builder.store(builder.load(places[r], align=size), sums[r])
+        with cgutils.for_range(builder, depth) as loop:
+            line = builder.load(moved(panel_start, loop.index, panel_by[0], vector), align=size)
+            for start, total in zip(a_rows, sums, strict=True):
+                factor = builder.load(moved(start, loop.index, a_by[1], vector.element))
+                lane = builder.insert_element(vector(ir.Undefined), factor, ir.IntType(32)(0))
+                factors = builder.shuffle_vector(lane, vector(ir.Undefined), same)
+                builder.store(_emit_fma(builder, factors, line, builder.load(total)), total)
+        for place, total in zip(places, sums, strict=True):
+            builder.store(builder.load(total), place, align=size)
+        return context.get_dummy_value()
+
+    return types.void(a, index, index, panel, index, out, index, index), emit
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _copy(part, room) -> None:  # type: ignore[no-untyped-def]
+    """Copy a matrix into the first rows and columns of another, along the lines of memory of the first."""
+    if part.strides[0] < part.strides[1]:
+        for j in range(part.shape[1]):
+            for i in range(part.shape[0]):
+                room[i, j] = part[i, j]
+    else:
+        for i in range(part.shape[0]):
+            for j in range(part.shape[1]):
+                room[i, j] = part[i, j]
+
+
+def _of(number: Any) -> Any:
+    """The signature of `add_product` for matrices of a type of numbers, in any layout."""
+    matrix = types.Array(number, 2, "A")
+    return types.void(matrix, matrix, matrix)
+
+
+@numba.njit([_of(types.float32), _of(types.float64)], cache=True, error_model="numpy", nogil=True)
+def add_product(a, b, out) -> None:  # type: ignore[no-untyped-def]
+    """Add a (M, K) @ b (K, N) to `out` (M, N) by one thread, in the order that this file states.
+
+    Assumes the shapes, one type, float32 or float64, and that `out` shares no memory with the others.
+    """
+    rows, columns, depths, lanes = out.shape[0], out.shape[1], a.shape[1], LINE // out.itemsize
+    in_line = out.strides[1] == out.itemsize
+    near = b.strides[1] == b.itemsize and b.strides[0] * min(DEPTH, depths) <= NEAR
+    room = np.empty((ROWS + 1 + min(DEPTH, depths)) * lanes, out.dtype)
+    room = room[-room.ctypes.data % LINE // out.itemsize :][: (ROWS + min(DEPTH, depths)) * lanes].reshape(
+        (-1, lanes)
+    )
+    if columns % lanes:
+        room[:] = 0.0  # numbers in columns that are not there could be slow ones
+    corner, packed = room[:ROWS], room[ROWS:]
+    for begin in range(0, rows, HEIGHT):
+        end = min(begin + HEIGHT, rows)
+        for k in range(0, depths, DEPTH):
+            depth = min(DEPTH, depths - k)
+            for j in range(0, columns, lanes):
+                width = min(lanes, columns - j)
+                panel = b[k : k + depth, j : j + width]
+                if not near or width < lanes:
+                    _copy(panel, packed)
+                    panel = packed
+                for i in range(begin, end, ROWS):
+                    if in_line and i + ROWS <= end and width == lanes:
+                        _add_tile(a, i, k, panel, depth, out, i, j)
+                        continue
+                    there = out[i : min(i + ROWS, end), j : j + width]
+                    _copy(there, corner)
+                    _add_tile(a, i, k, panel, depth, corner, 0, 0)
+                    _copy(corner[: there.shape[0], :width], there)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def add_rows(rows, out) -> None:  # type: ignore[no-untyped-def]
+    """Add the rows of a matrix (M, N) to `out` (N,), one after the other."""
+    for i in range(len(rows)):
+        for j in range(len(out)):
+            out[j] += rows[i, j]
+
+
+def aligned(size: int) -> np.ndarray:
+    """An empty float32 (size,) that begins at a line of the cache: vectors of it never lie across two."""
+    room = np.empty(size + LINE // 4, np.float32)
+    return room[-room.ctypes.data % LINE // 4 :][:size]
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def dot(a, b):  # type: ignore[no-untyped-def]
+    """The sum of products of two vectors: CHAINS of them side by side, then one after the other."""
+    sums = np.zeros(CHAINS, a.dtype)
+    whole = len(a) // CHAINS * CHAINS
+    for k in range(0, whole, CHAINS):
+        for chain in range(CHAINS):
+            sums[chain] = fma(a[k + chain], b[k + chain], sums[chain])
+    for k in range(whole, len(a)):
+        sums[k - whole] = fma(a[k], b[k], sums[k - whole])
+    total = sums[0]
+    for chain in range(1, CHAINS):
+        total += sums[chain]
+    return total
+
+
+@functools.lru_cache(maxsize=1)
+def _helpers(threads: int) -> ThreadPoolExecutor:
+    """Threads that help the one that asks."""
+    return ThreadPoolExecutor(threads - 1)
+
+
+os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads do not follow
+
+
+def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    """As `add_product`, by as many threads as torch has, which share the rows or the columns of `out`."""
+    threads = torch.get_num_threads()
+    if threads == 1 or out.size * len(b) < SHARED:
+        add_product(a, b, out)
+        return
+    by_rows = out.shape[0] >= out.shape[1]
+    step = ROWS if by_rows else LINE // out.itemsize
+    size = -(-max(out.shape) // (threads * step)) * step
+    parts = [slice(begin, begin + size) for begin in range(0, max(out.shape), size)]
+    calls = [(a[part], b, out[part]) if by_rows else (a, b[:, part], out[:, part]) for part in parts]
+    others = [_helpers(threads).submit(add_product, *call) for call in calls[1:]]
+    add_product(*calls[0])
+    for other in others:
+        other.result()
+
+
+class Product(torch.autograd.Function):
+    """a (M, K) @ b (K, N), plus a bias (N,) if there is one, on the processor; so are its gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
+        """The product (M, N)."""
+        ctx.save_for_backward(a, b)
+        out = a.new_zeros(len(a), b.shape[1]) if bias is None else bias.detach().repeat(len(a), 1)
+        add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of those that need one, in the layout of their memory."""
+        (a, b), (to_a, to_b, to_bias) = ctx.saved_tensors, ctx.needs_input_grad
+        of_bias = gradient.new_zeros(gradient.shape[1]) if to_bias else None
+        if of_bias is not None:
+            add_rows(gradient.contiguous().numpy(), of_bias.numpy())
+        of_a = _product_like(a, gradient, b.T) if to_a else None
+        return of_a, _product_like(b, a.T, gradient) if to_b else None, of_bias
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Compute a (M, K) @ b (K, N), with gradients; on a GPU by torch."""
+    return Product.apply(a, b, None) if a.device.type == "cpu" else a @ b
+
+
+def _product_like(like: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Compute a @ b, with the columns next to each other in memory where those of `like` are."""
+    if like.stride(0) < like.stride(1):
+        return _product_like(like.T, b.T, a.T).T
+    out = a.new_zeros(len(a), b.shape[1])
+    add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy())
+    return out
+
+
+def affine(inputs: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """Compute inputs (..., K) @ weight (M, K).T + bias (M,), with gradients.
+
+    By torch on a GPU, in an exported file, and for other numbers than float32 and float64.
+    """
+    ours = inputs.device.type == "cpu" and inputs.dtype == weight.dtype in (torch.float32, torch.float64)
+    if not ours or torch.compiler.is_compiling():
+        return functional.linear(inputs, weight, bias)
+    out = Product.apply(inputs.reshape(-1, weight.shape[1]), weight.T, bias)
+    return out.reshape(*inputs.shape[:-1], len(weight))
+
+
+class Linear(nn.Linear):
+    """A dense layer whose outputs and gradients are `affine`'s."""
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Outputs (..., M) of inputs (..., K)."""
+        return affine(inputs, self.weight, self.bias)
+
+
+def orthogonal_(weight: Tensor, gain: float, generator: torch.Generator | None = None) -> None:
+    """Fill a weight (M, ...) as `torch.nn.init.orthogonal_` does, by the same draws.
+
+    LAPACK's QR rounds as its products do. Here Gram and Schmidt's, modified, runs in float64: rows or
+    columns, whichever are fewer, are orthonormal to the rounding of float32.
+    """
+    if weight.is_meta:  # only shapes are asked for
+        return
+    drawn = torch.empty(len(weight), weight[0].numel()).normal_(generator=generator).double().numpy()
+    tall = drawn.shape[0] >= drawn.shape[1]
+    vectors = np.array(drawn.T if tall else drawn, order="C")
+    _orthonormalise(vectors)
+    with torch.no_grad():
+        weight.copy_(torch.from_numpy(gain * (vectors.T if tall else vectors)).reshape(weight.shape))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _orthonormalise(vectors) -> None:  # type: ignore[no-untyped-def]
+    """Make the rows of a matrix orthonormal, each from those above it."""
+    for i in range(len(vectors)):
+        own = vectors[i]
+        own /= np.sqrt(dot(own, own))
+        for j in range(i + 1, len(vectors)):
+            share = dot(own, vectors[j])
+            for k in range(len(own)):
+                vectors[j, k] -= share * own[k]
