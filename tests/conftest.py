@@ -2,7 +2,6 @@ from jobs.run.libraries import hold
 
 hold()  # before anything else is imported
 
-import os  # noqa: E402
 import platform  # noqa: E402
 import subprocess  # noqa: E402
 import sys  # noqa: E402
