@@ -26,6 +26,7 @@ from envs.events.crossings import (
     Memory,
     Model,
     Room,
+    count_crossings,
     first_invalid,
     level_of,
     remember,
@@ -167,10 +168,8 @@ def look_at(image, first, last, t_us, watch, kept):
             return begin + bad, kept, 0
         filter_columns(flat, first, last, t_us, watch.seen_us, model.curve, watch.bandwidth)
         flat = watch.bandwidth.seen
-    low, high = memory.quiet_low[begin:end], memory.quiet_high[begin:end]
-    found = scan(flat[begin:end], low, high, flags, outside)
-    for j in range(found):
-        outside[j] += begin
+    seen, past = flat[begin:end], memory.previous[begin:end]
+    found = scan(seen, begin, model, memory, flags, outside)
     begun, room = kept, watch.room
     for start in range(0, found, BLOCK):
         pixels = outside[start : min(start + BLOCK, found)]
@@ -181,8 +180,8 @@ def look_at(image, first, last, t_us, watch, kept):
         kept = _keep(pixels, flat, t_us, watch, kept)
     lost = _lost(begun, kept, ramps)
     _advance(begun, kept, watch)
-    for i in range(begin, end):
-        memory.previous[i] = flat[i]
+    for i in range(seen.size):  # from 0 on: of other numbers numba asks whether they are negative
+        past[i] = seen[i]
     for column in range(first, last):
         watch.seen_us[column] = t_us
     return -1, kept, 0 if model.rule.carries else lost
@@ -260,14 +259,10 @@ def _advance(begun, kept, watch):
     for begin in range(begun, kept, BLOCK):
         pixels = ramps.pixels[begin : min(begin + BLOCK, kept)]
         for j in range(pixels.size):
-            i, crossings = pixels[j], ramps.crossings[begin + j]
-            crossed = ramps.sent[begin + j] if model.rule.carries else abs(crossings)
-            if crossings > 0:
-                memory.on_count[i] += crossed
-            else:
-                memory.off_count[i] += crossed
+            i, n = pixels[j], ramps.crossings[begin + j]
+            crossed = ramps.sent[begin + j] if model.rule.carries else abs(n)
             k = i if thresholds.on.size > 1 else 0
-            levels[j] = level_of(memory, i, thresholds.on[k], thresholds.off[k])
+            levels[j] = count_crossings(memory, i, crossed, n > 0, thresholds.on[k], thresholds.off[k])
         set_quiet_bands(pixels, levels, model, memory, watch.room)
 
 

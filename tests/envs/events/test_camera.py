@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from envs.config import CameraConfig, with_floor
 from envs.events import EVENT, EventCamera
+from envs.events.crossings import NEVER_QUIET
 
 FLOOR = 1e-9  # small enough to leave log(luminance) alone where luminance is about 1
 LUMINANCES = st.floats(0, np.finfo(np.float32).max, width=32, allow_subnormal=True)
@@ -119,8 +120,9 @@ def test_identical_frames_make_no_events_even_at_the_smallest_threshold():
 def test_a_still_pixel_never_fires_whatever_rounding_did_to_its_memory():
     camera = one_pixel()
     camera.reset(frame(2.0), 0)
-    lights, levels, _ = camera._memory
-    lights[1:], levels[0] = 0.0, levels[0] - 0.2
+    lights, levels, *_ = camera._memory
+    lights[1] = NEVER_QUIET
+    levels["first_level"] -= 0.2
     assert camera.step(frame(2.0), 1000).size == 0
 
 
