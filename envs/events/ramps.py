@@ -177,6 +177,7 @@ def look_at(image, first, last, t_us, watch, kept):
         if bad >= 0:
             return bad, begun, 0
         respond_at(pixels, memory.previous, model.curve, room.before, room)
+        _recall(pixels, model.thresholds, memory, room.levels)
         kept = _keep(pixels, flat, t_us, watch, kept)
     lost = _lost(begun, kept, ramps)
     _advance(begun, kept, watch)
@@ -197,6 +198,14 @@ def _lost(begun, kept, ramps):
 
 
 @kernel
+def _recall(pixels, thresholds, memory, levels):
+    """Write the remembered levels of `pixels`, in a loop without branches: reads then wait together."""
+    for j in range(pixels.size):
+        k = pixels[j] if thresholds.on.size > 1 else 0
+        levels[j] = level_of(memory, pixels[j], thresholds.on[k], thresholds.off[k])
+
+
+@kernel
 def _keep(pixels, flat, t_us, watch, kept):
     """Append the ramps of the pixels that fire; return how many there are now."""
     rule, thresholds = watch.model.rule, watch.model.thresholds
@@ -209,7 +218,7 @@ def _keep(pixels, flat, t_us, watch, kept):
             column += 1
         k = i if thresholds.on.size > 1 else 0
         on, off = thresholds.on[k], thresholds.off[k]
-        remembered, way = level_of(memory, i, on, off), room.after[j] - room.before[j]
+        remembered, way = room.levels[j], room.after[j] - room.before[j]
         change = room.after[j] - remembered
         step = on if change > 0.0 else -off
         count = np.int64((abs(change) + TOLERANCE) / abs(step))
