@@ -116,26 +116,23 @@ def resolve(
     _step(steps, frame.horizon, frame.floor - frame.sky + steps[-1])
     if place == BLOCK - 1 or column == last - 1:
         _sum_block(frame.sky, accumulators, image, column - place, place + 1)
-        for k in range(place + 1):
-            accumulators[k, Layer.STEPS : Layer.GROUND] = 0.0
 
 
 @kernel
 def _sum_block(sky: float, painted: np.ndarray, image: np.ndarray, first: int, count: int) -> None:
-    """Write columns `first` .. `first` + `count` - 1; places without one are summed for nothing."""
+    """Write columns `first` .. `first` + `count` - 1, and clear their places; others are summed for nothing."""
     one = two = three = four = sky
     for row in range(image.shape[0]):
         one += painted[0, Layer.STEPS, row]
         two += painted[1, Layer.STEPS, row]
         three += painted[2, Layer.STEPS, row]
         four += painted[3, Layer.STEPS, row]
-        image[row, first] = one + painted[0, Layer.PAINT, row]
-        if count > 1:
-            image[row, first + 1] = two + painted[1, Layer.PAINT, row]
-        if count > 2:
-            image[row, first + 2] = three + painted[2, Layer.PAINT, row]
-        if count > 3:
-            image[row, first + 3] = four + painted[3, Layer.PAINT, row]
+        painted[0, Layer.STEPS, row], painted[1, Layer.STEPS, row] = one, two
+        painted[2, Layer.STEPS, row], painted[3, Layer.STEPS, row] = three, four
+    for k in range(count):  # in wide instructions, for which the sums above have to wait too long
+        for row in range(image.shape[0]):
+            image[row, first + k] = painted[k, Layer.STEPS, row] + painted[k, Layer.PAINT, row]
+    painted[:, Layer.STEPS : Layer.GROUND] = 0.0
 
 
 @kernel
