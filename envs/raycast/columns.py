@@ -165,7 +165,6 @@ def _sweep(
     """
     frame, strip, seen, order = room.frames[0], room.strips[0], room.seen, room.order
     half, samples, focal, slopes = 0.5 * image.shape[1], frame.samples, frame.focal, strip.slopes
-    textured = frame.ground_texture.contrast > 0.0 or frame.wall_texture.contrast > 0.0
     known, passed = 0, 0
     while passed < len(cuts) and cuts[passed].position <= first + MIN_STRIP:
         known, total = _pass(order, known, total, cuts[passed])
@@ -175,7 +174,6 @@ def _sweep(
         painted = room.accumulators[(column - first) % BLOCK]
         canvas = Canvas(frame, strip, room.gaps, painted, noise, room.mixing, room.bends)
         left, edge = cell / samples, (cell + 1) / samples
-        middle = (0.5 * (left + edge) - half) / focal
         while edge - left > MIN_STRIP:
             right = edge
             if passed < len(cuts) and cuts[passed].position < edge - MIN_STRIP:
@@ -189,12 +187,20 @@ def _sweep(
             while passed < len(cuts) and cuts[passed].position <= left + MIN_STRIP:
                 known, total = _pass(order, known, total, cuts[passed])
                 passed += 1
-        if textured:
-            texture_cell(canvas, middle)
+        _texture(canvas, cell, half)
         if (cell + 1) % samples == 0:
-            if textured:
-                texture_column(canvas, (column + 0.5 - half) / focal, column)
             resolve(frame, room.accumulators, image, column, first, last)
+
+
+@inlined
+def _texture(canvas: Canvas, cell: int, half: float) -> None:
+    """Add the patterns of ground and walls to a cell, and to its column if it is the last one there."""
+    frame, samples, focal = canvas.frame, canvas.frame.samples, canvas.frame.focal
+    if frame.ground_texture.contrast > 0.0 or frame.wall_texture.contrast > 0.0:
+        column = cell // samples
+        texture_cell(canvas, (0.5 * (cell / samples + (cell + 1) / samples) - half) / focal)
+        if (cell + 1) % samples == 0:
+            texture_column(canvas, (column + 0.5 - half) / focal, column)
 
 
 @kernel

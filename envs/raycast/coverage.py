@@ -120,7 +120,7 @@ def resolve(
 
 @kernel
 def _sum_block(sky: float, painted: np.ndarray, image: np.ndarray, first: int, count: int) -> None:
-    """Write columns `first` .. `first` + `count` - 1, and clear their places; others are summed for nothing."""
+    """Write columns `first` .. `first` + `count` - 1 and clear all places; others are summed for nothing."""
     one = two = three = four = sky
     for row in range(image.shape[0]):
         one += painted[0, Layer.STEPS, row]

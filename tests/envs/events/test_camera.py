@@ -131,7 +131,7 @@ def test_a_still_pixel_never_fires_whatever_rounding_did_to_its_memory():
 @pytest.mark.parametrize("response", ["log", "lin_log"])
 @pytest.mark.parametrize("floor", [1e-9, 0.01, 1.0])
 def test_no_pixel_within_its_quiet_band_would_fire(threshold, off, response, floor):
-    fields = dict(luminance_floor=floor, response=response, max_events_per_pixel=3)
+    fields = {"luminance_floor": floor, "response": response, "max_events_per_pixel": 3}
     cameras = [
         EventCamera(64, 64, contrast_threshold=threshold, contrast_threshold_off=off, **fields)
         for _ in range(2)
