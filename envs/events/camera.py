@@ -96,7 +96,7 @@ class EventCamera:
             legacy=config.memory == "legacy",
         )
         curve = response_curve(config.response, config.luminance_floor or LUMINANCE_FLOOR)
-        thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if rule.legacy else 1)
+        thresholds = crossings.threshold_rows(*pixel_thresholds(config), 2 if rule.legacy else 1, curve)
         self._model = tuple(rule), tuple(curve), thresholds
         self._low_pass = low_pass(config.width * config.height) if config.cutoff_hz > 0.0 else None
         num_pixels = config.width * config.height

@@ -1,9 +1,14 @@
 """The event camera's kernels: which pixels crossed which levels between two frames, and when.
 
-A pixel whose luminance stays within its quiet band cannot fire, and costs two comparisons. The
-band is kept in linear luminance and lies inside [0, largest float32], so anything that is not a
-luminance falls outside it as well. Pixels outside their band are decided in float64, in blocks,
-so that their logarithms are computed in wide instructions.
+A pixel whose luminance stays within its quiet band cannot fire, and costs few operations. The band is
+computed in float32 from the light that the remembered level stands for: a share of that light up and
+down, narrower than exact by more than all rounding. Where each pixel has thresholds or noise of its own, both
+ends of its band are kept instead. It lies inside [0, largest float32], so anything that is not a luminance
+falls outside it as well. Pixels outside their band are decided in float64, in blocks, so that their
+logarithms are computed in wide instructions.
+
+So a frame reads and writes 8 bytes of each pixel (12 where bands are kept), and 16 more of those outside
+their band.
 
 `EventCamera` hands over `model` and `memory` as plain tuples of few arrays, which numba reads faster
 than named ones; `steps` and `remember` name them. Input is valid, except that `steps` and `first_invalid`
@@ -29,7 +34,15 @@ from envs.events.refractory import (
 
 MARGIN = 1e-9  # relative; far above the error of float64 exp
 HALF_ULP = 2.0**-23  # relative; above the rounding of a bound to float32
+BAND_MARGIN = 2.0**-21  # relative; above the rounding of a band that is computed in float32
+MOST_QUIET = 80.0  # a change of the response, by which the light still has a factor in float32
+LEAST_LIGHT = 1e-30  # of a remembered level; below it float32 would round more coarsely
+NEVER_QUIET = np.float32(-np.inf)  # the light of a level whose pixel is decided in every frame
+MOST_CROSSINGS = 2**30  # one frame adds fewer than 2**27: that many of the smallest thresholds is all light
 BLOCK = 1024  # pixels decided together
+
+# What is remembered of a level, read and written only where a pixel is outside its quiet band.
+LEVEL = np.dtype([("first_level", "f8"), ("on_count", "i4"), ("off_count", "i4")])
 
 
 class Rule(NamedTuple):
@@ -56,12 +69,16 @@ class Thresholds(NamedTuple):
     Attributes:
         on, off: Change of the response that fires an event.
         quiet_up, quiet_down: Change up to which a pixel cannot fire, rounding allowed for.
+        share_up, share_down: The like change of light, as a share of the light of the level, or of the knee
+            if that is more; less than exact by more than the rounding of a band in float32.
     """
 
     on: np.ndarray
     off: np.ndarray
     quiet_up: np.ndarray
     quiet_down: np.ndarray
+    share_up: np.ndarray
+    share_down: np.ndarray
 
 
 class Model(NamedTuple):
@@ -76,23 +93,28 @@ class Memory(NamedTuple):
     """What the N pixels remember; changed in place.
 
     The remembered level is `first_level` + `on_count` thresholds - `off_count` thresholds: a
-    count, unlike a sum, does not drift.
+    count, unlike a sum, does not drift. After 2**30 crossings of one pixel (at one each microsecond,
+    18 minutes) `count_crossings` begins again with a first level that is rounded once.
 
     Attributes:
         previous: Last frame, float32.
-        quiet_low, quiet_high: Quiet band of luminance, both ends included, float32.
+        level_light: Light of the remembered level, plus the curve's shift, float32; -inf: never quiet.
+        quiet_low, quiet_high: Quiet band of luminance, both ends included, float32; set where `is_banded`.
         first_level: Response at the first frame, or after the last refractory period, float64.
-        on_count, off_count: Thresholds crossed since, float64.
+        on_count, off_count: Thresholds crossed since, int32.
         refractory_end_us: End of the last refractory period, int64; of length 0 without any.
+        is_banded: Whether both ends of the bands are kept instead of `level_light`, bool (1,).
     """
 
     previous: np.ndarray
+    level_light: np.ndarray
     quiet_low: np.ndarray
     quiet_high: np.ndarray
     first_level: np.ndarray
     on_count: np.ndarray
     off_count: np.ndarray
     refractory_end_us: np.ndarray
+    is_banded: np.ndarray
 
 
 class Room(NamedTuple):
@@ -124,21 +146,29 @@ class Column(IntEnum):
     STRIDE = 7 * BLOCK  # time from one event to the next [us]
 
 
-def threshold_rows(on: np.ndarray, off: np.ndarray, reach: int) -> np.ndarray:
-    """Rows of `Thresholds`, float64 (4, N) or (4, 1).
+def threshold_rows(on: np.ndarray, off: np.ndarray, reach: int, curve: Curve) -> np.ndarray:
+    """Rows of `Thresholds`, float64 (6, N) or (6, 1).
+
+    By a change d of the response the light of the curve "log" gets exp(d) times as much. "lin_log" is, above
+    a light y, nowhere steeper than 1 / max(y, knee); below y, it is above the logarithm and its slope at
+    most 1 / knee.
 
     Args:
         on: ON thresholds, float64 (N,) or (1,).
         off: OFF thresholds, as many.
         reach: Thresholds to the first event: 1, or 2 where the first is lost ("legacy").
+        curve: Response curve.
     """
-    return np.stack((on, off, reach * on - TOLERANCE - MARGIN, reach * off - TOLERANCE - MARGIN))
+    up, down = reach * on - TOLERANCE - MARGIN, reach * off - TOLERANCE - MARGIN
+    most = np.minimum((up, down), MOST_QUIET)
+    shares = np.stack((np.expm1(most[0]) if curve.knee == 0.0 else most[0], -np.expm1(-most[1])))
+    return np.stack((on, off, up, down, *(shares - BAND_MARGIN * (1.0 + shares))))
 
 
-def memory_rows(num_pixels: int, has_refractory_period: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of a `Memory`, to be set by `remember`: float32 (3, N), float64 (3, N), and the last one."""
+def memory_rows(num_pixels: int, has_refractory_period: bool) -> tuple[np.ndarray, ...]:
+    """Rows of a `Memory`, to be set by `remember`: float32 (4, N), LEVEL (N,), and the last two."""
     ends = np.zeros(num_pixels if has_refractory_period else 0, np.int64)
-    return np.zeros((3, num_pixels), np.float32), np.zeros((3, num_pixels)), ends
+    return np.zeros((4, num_pixels), np.float32), np.zeros(num_pixels, LEVEL), ends, np.zeros(1, np.bool_)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -153,10 +183,13 @@ def make_room():
 def named(model, memory):
     """The model and the memory, with names."""
     rule, curve, limits = model
-    lights, levels, ends = memory
+    lights, levels, ends, is_banded = memory
+    thresholds = Thresholds(limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
+    light, low, high = lights[1], lights[2], lights[3]
+    counts = levels.on_count, levels.off_count
     return (
-        Model(Rule(*rule), Curve(*curve), Thresholds(limits[0], limits[1], limits[2], limits[3])),
-        Memory(lights[0], lights[1], lights[2], levels[0], levels[1], levels[2], ends),
+        Model(Rule(*rule), Curve(*curve), thresholds),
+        Memory(lights[0], light, low, high, levels.first_level, counts[0], counts[1], ends, is_banded),
     )
 
 
@@ -179,9 +212,10 @@ def remember(luminance, model, memory):
     """Start all memories from one frame, float32 (N,)."""
     model, memory = named(model, memory)
     memory.previous[:] = luminance
-    memory.on_count[:] = 0.0
-    memory.off_count[:] = 0.0
+    memory.on_count[:] = 0
+    memory.off_count[:] = 0
     memory.refractory_end_us[:] = np.iinfo(np.int64).min
+    memory.is_banded[0] = model.thresholds.on.size > 1
     _remember_levels(luminance, model, memory)
 
 
@@ -191,8 +225,10 @@ def _remember_levels(luminance, model, memory):
     room = make_room()
     for first in range(0, luminance.size, BLOCK):
         pixels = np.arange(first, min(first + BLOCK, luminance.size))
-        levels = memory.first_level[first : first + pixels.size]
+        levels = room.levels[: pixels.size]
         respond(model.curve, luminance[first : first + pixels.size], levels, room.exponents)
+        for j in range(pixels.size):
+            memory.first_level[first + j] = levels[j]
         set_quiet_bands(pixels, levels, model, memory, room)
 
 
@@ -200,6 +236,9 @@ def _remember_levels(luminance, model, memory):
 def set_quiet_bands(pixels, levels, model, memory, room):
     """Quiet bands of at most BLOCK `pixels` that remember `levels`."""
     low, high, thresholds = room.low[: pixels.size], room.high[: pixels.size], model.thresholds
+    if not memory.is_banded[0]:
+        _set_level_lights(pixels, levels, model.curve, memory, room)
+        return
     for j in range(pixels.size):
         k = pixels[j] if thresholds.on.size > 1 else 0
         low[j], high[j] = levels[j] - thresholds.quiet_down[k], levels[j] + thresholds.quiet_up[k]
@@ -214,6 +253,19 @@ def set_quiet_bands(pixels, levels, model, memory, room):
 def _bound(value, inwards):
     """A bound of the quiet band as float32, never further out than `value` and never invalid."""
     return np.float32(min(max(value * inwards, 0.0), MAX_LUMINANCE))
+
+
+@inlined
+def _set_level_lights(pixels, levels, curve, memory, room):
+    """Keep the lights that pixels respond to by `levels`, from which their bands are computed."""
+    lights = room.low[: pixels.size]
+    for j in range(pixels.size):
+        lights[j] = levels[j]
+    light_of(curve, lights, room.exponents)
+    for j in range(pixels.size):
+        light = lights[j] + curve.shift
+        usable = curve.knee > 0.0 or light > LEAST_LIGHT
+        memory.level_light[pixels[j]] = np.float32(light) if usable else NEVER_QUIET
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -258,7 +310,7 @@ def steps(frames, times_us, width, limit, model, memory, scratch):
 def _step(luminance, span, width, limit, model, memory, scratch):
     """One frame: (first invalid pixel or -1, events lost, events)."""
     flags, outside = scratch
-    found = scan(luminance, memory.quiet_low, memory.quiet_high, flags, outside)
+    found = scan(luminance, 0, model, memory, flags, outside)
     counts, times = np.empty((2, found), np.int64), np.empty((2, found))
     responses = np.empty((3, found if model.rule.refractory_us > 0 else 0))
     motions = Motions(responses[0], responses[1], responses[2])
@@ -279,21 +331,31 @@ def _step(luminance, span, width, limit, model, memory, scratch):
 
 
 @kernel
-def scan(luminance, low, high, flags, outside):
-    """Write the pixels outside their quiet band `low` .. `high`, in their order; return how many.
+def scan(luminance, begin, model, memory, flags, outside):
+    """Write the pixels outside their quiet band, from pixel `begin` on, in their order; return how many.
 
-    The first loop has no branch, so that it compiles to wide instructions; the second looks
+    The loops over pixels have no branch, so that they compile to wide instructions; the last looks
     at eight flags at a time.
     """
-    flag, found, words = flags.view(np.uint8), 0, (luminance.size + 7) // 8
-    for i in range(luminance.size):
-        flag[i] = not ((luminance[i] >= low[i]) & (luminance[i] <= high[i]))
+    flag, found, words, end = flags.view(np.uint8), 0, (luminance.size + 7) // 8, begin + luminance.size
+    if memory.is_banded[0]:
+        low, high = memory.quiet_low[begin:end], memory.quiet_high[begin:end]
+        for i in range(luminance.size):
+            flag[i] = not ((luminance[i] >= low[i]) & (luminance[i] <= high[i]))
+    else:
+        light, shift = memory.level_light[begin:end], np.float32(model.curve.shift)
+        knee, most = np.float32(model.curve.knee), np.float32(MAX_LUMINANCE)
+        up, down = np.float32(model.thresholds.share_up[0]), np.float32(model.thresholds.share_down[0])
+        for i in range(luminance.size):
+            raised, reach = luminance[i] + shift, max(light[i], knee)
+            quiet = (raised >= light[i] - down * reach) & (raised <= min(light[i] + up * reach, most))
+            flag[i] = not (quiet & (luminance[i] >= np.float32(0.0)))
     for i in range(luminance.size, 8 * words):
         flag[i] = False
     for word in range(words):
         if flags[word] != 0:
             for i in range(8 * word, 8 * word + 8):
-                outside[found] = i
+                outside[found] = begin + i
                 found += flag[i]
     return found
 
@@ -351,6 +413,19 @@ def level_of(memory, i, on, off):
     if on == off:
         return memory.first_level[i] + (memory.on_count[i] - memory.off_count[i]) * on
     return memory.first_level[i] + memory.on_count[i] * on - memory.off_count[i] * off
+
+
+@inlined
+def count_crossings(memory, i, crossed, rises, on, off):
+    """Count thresholds that a pixel crossed; the level from which it looks on."""
+    if rises:
+        memory.on_count[i] += crossed
+    else:
+        memory.off_count[i] += crossed
+    level = level_of(memory, i, on, off)
+    if max(memory.on_count[i], memory.off_count[i]) > MOST_CROSSINGS:  # they must not wrap
+        memory.first_level[i], memory.on_count[i], memory.off_count[i] = level, 0, 0
+    return level
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -417,18 +492,17 @@ def _advance(luminance, span, model, memory, trains, motions):
         return
     if rule.refractory_us > 0:
         pixels = pixels[: start_refractory_periods(trains, motions, span, rule.refractory_us, memory)]
-    else:
-        for j in range(pixels.size):
-            crossed = trains.sent[j] if rule.carries else abs(trains.crossings[j])
-            if trains.crossings[j] > 0:
-                memory.on_count[pixels[j]] += crossed
-            else:
-                memory.off_count[pixels[j]] += crossed
     room = make_room()
     levels = room.levels
     for first in range(0, pixels.size, BLOCK):
         block = pixels[first : min(first + BLOCK, pixels.size)]
         for j in range(block.size):
             k = block[j] if thresholds.on.size > 1 else 0
-            levels[j] = level_of(memory, block[j], thresholds.on[k], thresholds.off[k])
+            on, off = thresholds.on[k], thresholds.off[k]
+            if rule.refractory_us > 0:
+                levels[j] = level_of(memory, block[j], on, off)
+            else:
+                n = trains.crossings[first + j]
+                crossed = trains.sent[first + j] if rule.carries else abs(n)
+                levels[j] = count_crossings(memory, block[j], crossed, n > 0, on, off)
         set_quiet_bands(block, levels, model, memory, room)

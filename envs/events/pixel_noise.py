@@ -32,6 +32,7 @@ from envs.events.crossings import (
     BLOCK,
     Memory,
     Model,
+    count_crossings,
     level_of,
     make_room,
     named,
@@ -39,6 +40,7 @@ from envs.events.crossings import (
     set_quiet_bands,
 )
 from envs.events.emission import Span
+from envs.events.refractory import never_be_quiet
 
 DEFAULT_BANDWIDTH_HZ = 300.0  # of the noise where the photoreceptors have none: v2e's cutoff by day
 SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
@@ -243,8 +245,12 @@ class PixelNoise:
 
 @numba.njit(cache=True, error_model="numpy")
 def move_levels(model, memory, shares):
-    """Move all remembered levels by these shares of the ON threshold, and the quiet bands with them."""
+    """Move all remembered levels by these shares of the ON threshold, and the quiet bands with them.
+
+    From now on the bands are kept: noise moves levels on which the camera does not look until the light does.
+    """
     model, memory = named(model, memory)
+    memory.is_banded[0] = True
     room, on = make_room(), model.thresholds.on
     for first in range(0, shares.size, BLOCK):
         pixels = np.arange(first, min(first + BLOCK, shares.size))
@@ -307,7 +313,7 @@ def _restore(pixels, now_us, memory, noise):
             if noise.kept_us[i] < now_us and noise.kept[i] != 0.0:
                 if noise.kept_us[i] == memory.refractory_end_us[i]:
                     memory.first_level[i] += noise.kept[i]
-                    memory.quiet_low[i], memory.quiet_high[i] = 1.0, 0.0  # decided in the next frame
+                    never_be_quiet(memory, i)
                 noise.kept[i] = 0.0
 
 
@@ -427,8 +433,7 @@ def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
             memory.first_level[i] += gained
             low, high = low - gained, high + gained
         low, high = (low - on, high + on) if rises else (low + off, high - off)
-        memory.on_count[i] += rises
-        memory.off_count[i] += not rises
+        count_crossings(memory, i, 1, rises, on, off)
         t = np.float64(event_us)
         if refractory_us > 0:
             t, displaced = _rest(still, event_us, now_us, displaced, sigma, noisy, rng)
@@ -453,8 +458,8 @@ def _rest(still, event_us, now_us, displaced, sigma, noisy, rng):
     displaced = displaced * left + sigma * np.sqrt(1.0 - left * left) * rng.standard_normal()
     memory.refractory_end_us[i] = end_us
     if end_us <= now_us:
-        memory.first_level[i], memory.on_count[i], memory.off_count[i] = still.response + displaced, 0.0, 0.0
+        memory.first_level[i], memory.on_count[i], memory.off_count[i] = still.response + displaced, 0, 0
     else:
         noise.kept[i], noise.kept_us[i] = displaced, end_us
-        memory.quiet_low[i], memory.quiet_high[i] = 1.0, 0.0
+        never_be_quiet(memory, i)
     return np.float64(end_us), displaced

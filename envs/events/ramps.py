@@ -26,6 +26,7 @@ from envs.events.crossings import (
     Memory,
     Model,
     Room,
+    count_crossings,
     first_invalid,
     level_of,
     remember,
@@ -167,10 +168,8 @@ def look_at(image, first, last, t_us, watch, kept):
             return begin + bad, kept, 0
         filter_columns(flat, first, last, t_us, watch.seen_us, model.curve, watch.bandwidth)
         flat = watch.bandwidth.seen
-    low, high = memory.quiet_low[begin:end], memory.quiet_high[begin:end]
-    found = scan(flat[begin:end], low, high, flags, outside)
-    for j in range(found):
-        outside[j] += begin
+    seen, past = flat[begin:end], memory.previous[begin:end]
+    found = scan(seen, begin, model, memory, flags, outside)
     begun, room = kept, watch.room
     for start in range(0, found, BLOCK):
         pixels = outside[start : min(start + BLOCK, found)]
@@ -178,11 +177,12 @@ def look_at(image, first, last, t_us, watch, kept):
         if bad >= 0:
             return bad, begun, 0
         respond_at(pixels, memory.previous, model.curve, room.before, room)
+        _recall(pixels, model.thresholds, memory, room.levels)
         kept = _keep(pixels, flat, t_us, watch, kept)
     lost = _lost(begun, kept, ramps)
     _advance(begun, kept, watch)
-    for i in range(begin, end):
-        memory.previous[i] = flat[i]
+    for i in range(seen.size):  # from 0 on: of other numbers numba asks whether they are negative
+        past[i] = seen[i]
     for column in range(first, last):
         watch.seen_us[column] = t_us
     return -1, kept, 0 if model.rule.carries else lost
@@ -198,6 +198,14 @@ def _lost(begun, kept, ramps):
 
 
 @kernel
+def _recall(pixels, thresholds, memory, levels):
+    """Write the remembered levels of `pixels`, in a loop without branches: reads then wait together."""
+    for j in range(pixels.size):
+        k = pixels[j] if thresholds.on.size > 1 else 0
+        levels[j] = level_of(memory, pixels[j], thresholds.on[k], thresholds.off[k])
+
+
+@kernel
 def _keep(pixels, flat, t_us, watch, kept):
     """Append the ramps of the pixels that fire; return how many there are now."""
     rule, thresholds = watch.model.rule, watch.model.thresholds
@@ -210,7 +218,7 @@ def _keep(pixels, flat, t_us, watch, kept):
             column += 1
         k = i if thresholds.on.size > 1 else 0
         on, off = thresholds.on[k], thresholds.off[k]
-        remembered, way = level_of(memory, i, on, off), room.after[j] - room.before[j]
+        remembered, way = room.levels[j], room.after[j] - room.before[j]
         change = room.after[j] - remembered
         step = on if change > 0.0 else -off
         count = np.int64((abs(change) + TOLERANCE) / abs(step))
@@ -260,14 +268,10 @@ def _advance(begun, kept, watch):
     for begin in range(begun, kept, BLOCK):
         pixels = ramps.pixels[begin : min(begin + BLOCK, kept)]
         for j in range(pixels.size):
-            i, crossings = pixels[j], ramps.crossings[begin + j]
-            crossed = ramps.sent[begin + j] if model.rule.carries else abs(crossings)
-            if crossings > 0:
-                memory.on_count[i] += crossed
-            else:
-                memory.off_count[i] += crossed
+            i, n = pixels[j], ramps.crossings[begin + j]
+            crossed = ramps.sent[begin + j] if model.rule.carries else abs(n)
             k = i if thresholds.on.size > 1 else 0
-            levels[j] = level_of(memory, i, thresholds.on[k], thresholds.off[k])
+            levels[j] = count_crossings(memory, i, crossed, n > 0, thresholds.on[k], thresholds.off[k])
         set_quiet_bands(pixels, levels, model, memory, watch.room)
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from envs.compiled import inlined
 from envs.events.emission import moment
 
 # Two luminances rounded to float32 leave their log difference uncertain by this much: a level
@@ -78,11 +79,17 @@ def start_refractory_periods(trains, motions, span, refractory_us, memory):
             )
             memory.refractory_end_us[i] = end_us
             if end_us >= span.end_us:
-                memory.quiet_low[i], memory.quiet_high[i] = 1.0, 0.0
+                never_be_quiet(memory, i)
                 continue
             way = motions.after[j] - motions.before[j]
             remembered = motions.before[j] + way * ((end_us - span.start_us) / interval)
-        memory.first_level[i], memory.on_count[i], memory.off_count[i] = remembered, 0.0, 0.0
+        memory.first_level[i], memory.on_count[i], memory.off_count[i] = remembered, 0, 0
         trains.pixels[free] = i
         free += 1
     return free
+
+
+@inlined
+def never_be_quiet(memory, i):
+    """Decide a pixel in every frame, until its quiet band is set again."""
+    memory.level_light[i], memory.quiet_low[i], memory.quiet_high[i] = -np.inf, 1.0, 0.0

@@ -19,6 +19,7 @@ MIN_DEPTH = 1e-9  # [m]; so that a division is always defined
 MIN_BEND = 1e-3  # an outline that bends less is integrated as a parabola
 MAX_BULGE = 1e4  # [rows] an arc that bulges more is not seen
 OUTSIDE = 1e7  # [rows] far outside of any image
+SURELY = 1.0 + 1e-9  # a ratio of squares that no rounding of distances brings about
 
 
 class Section(NamedTuple):
@@ -89,14 +90,17 @@ def _silhouette(body: Record, frame: Record) -> tuple[float, float]:
 @kernel
 def _is_outside(body: Record, eye_z: float, cull: float) -> bool:
     """Whether the eye is outside the body, which is invisible from within, and at most `cull` away."""
-    distance = 0.0
+    distance, above = 0.0, max(0.0, eye_z - body.top, body.bottom - eye_z)
+    if body.kind != BOX and above == 0.0:  # mostly it is clear without roots
+        square, reach = body.right * body.right + body.forward * body.forward, cull + body.rx
+        if square > SURELY * body.rx * body.rx and SURELY * square < reach * reach:
+            return True
     if body.kind == BOX:
         beside_x = max(0.0, abs(body.dx) - body.rx)
         beside = math.hypot(beside_x, max(0.0, abs(body.dy) - body.ry))
     else:
         distance = math.hypot(body.right, body.forward)
         beside = max(0.0, distance - body.rx)
-    above = max(0.0, eye_z - body.top, body.bottom - eye_z)
     if beside > 0.0 or above > 0.0:
         return cull == math.inf or math.hypot(beside, above) <= cull
     if body.kind == CONE:

@@ -14,7 +14,7 @@ import numpy as np
 from envs.checks import LIMIT_M, LIMIT_S
 from envs.compiled import inlined, kernel
 from envs.raycast.bodies import MIN_DEPTH, corner, depths, is_before, outline, see_bodies
-from envs.raycast.coverage import LAYERS, PADDING, cover_ground, ends, put, resolve
+from envs.raycast.coverage import BLOCK, LAYERS, PADDING, cover_ground, ends, put, resolve
 from envs.raycast.curved import make_bends
 from envs.raycast.noise import make_mixing, turn_waves
 from envs.raycast.patterns import texture_cell, texture_column
@@ -52,7 +52,7 @@ class Workspace(NamedTuple):
         gaps: GAP, what nothing nearer covers of a strip.
         strips: (1,) STRIP.
         frames: (1,) FRAME, of the pose that is painted.
-        accumulators: (LAYERS, height + PADDING) float64, zero between two columns.
+        accumulators: (BLOCK, LAYERS, height + PADDING) float64, zero between two blocks of columns.
         mixing: For noise.
         bends: For bodies that bend.
     """
@@ -77,7 +77,7 @@ def make_workspace(num_bodies: int, height: int) -> Workspace:
         gaps=np.empty(max(height + PADDING, 2 * num_bodies + 32), GAP),
         strips=np.zeros(1, STRIP),
         frames=np.zeros(1, FRAME),
-        accumulators=np.zeros((LAYERS, height + PADDING)),
+        accumulators=np.zeros((BLOCK, LAYERS, height + PADDING)),
         mixing=make_mixing(height),
         bends=make_bends(height),
     )
@@ -139,8 +139,7 @@ def paint_columns(
     size, total = _find_cuts(frame, room.seen[:count], Part(half, first, last), room.cuts, room.order)
     _sort_cuts(room.cuts, size)
     turn_waves(noise, frame, room.mixing)
-    canvas = Canvas(frame, room.strips[0], room.gaps, room.accumulators, noise, room.mixing, room.bends)
-    _sweep(canvas, room.seen, room.order, total, room.cuts[:size], image, first, last)
+    _sweep(room, noise, total, room.cuts[:size], image, first, last)
 
 
 @kernel
@@ -158,33 +157,29 @@ def _sort_cuts(cuts: np.ndarray, size: int) -> None:
 
 @kernel
 def _sweep(
-    canvas: Canvas,
-    seen: np.ndarray,
-    order: np.ndarray,
-    total: int,
-    cuts: np.ndarray,
-    image: np.ndarray,
-    first: int,
-    last: int,
+    room: Workspace, noise: Noise, total: int, cuts: np.ndarray, image: np.ndarray, first: int, last: int
 ) -> None:
     """Paint the strips between cuts from left to right, with the bodies that are there in each.
 
-    `order` holds the `total` bodies that have begun at the left edge of column `first`.
+    `room.order` holds the `total` bodies that have begun at the left edge of column `first`.
     """
-    frame, slopes = canvas.frame, canvas.strip.slopes
-    half, samples, focal = 0.5 * image.shape[1], frame.samples, frame.focal
+    frame, strip, seen, order = room.frames[0], room.strips[0], room.seen, room.order
+    half, samples, focal, slopes = 0.5 * image.shape[1], frame.samples, frame.focal, strip.slopes
     known, passed = 0, 0
     while passed < len(cuts) and cuts[passed].position <= first + MIN_STRIP:
         known, total = _pass(order, known, total, cuts[passed])
         passed += 1
     for cell in range(first * samples, last * samples):
+        column = cell // samples
+        painted = room.accumulators[(column - first) % BLOCK]
+        canvas = Canvas(frame, strip, room.gaps, painted, noise, room.mixing, room.bends)
         left, edge = cell / samples, (cell + 1) / samples
-        middle = (0.5 * (left + edge) - half) / focal
         while edge - left > MIN_STRIP:
             right = edge
             if passed < len(cuts) and cuts[passed].position < edge - MIN_STRIP:
                 right = cuts[passed].position
-            _sort_new(frame, seen, order, known, total, (0.5 * (left + right) - half) / focal)
+            if known < total:
+                _sort_new(frame, seen, order, known, total, (0.5 * (left + right) - half) / focal)
             known = total
             put(slopes, Ends((left - half) / focal, (right - half) / focal))
             _paint_strip(canvas, seen, order[:known])
@@ -192,10 +187,20 @@ def _sweep(
             while passed < len(cuts) and cuts[passed].position <= left + MIN_STRIP:
                 known, total = _pass(order, known, total, cuts[passed])
                 passed += 1
-        texture_cell(canvas, middle)
+        _texture(canvas, cell, half)
         if (cell + 1) % samples == 0:
-            texture_column(canvas, (cell // samples + 0.5 - half) / focal, cell // samples)
-            resolve(frame, canvas.accumulators, image, cell // samples, first, last)
+            resolve(frame, room.accumulators, image, column, first, last)
+
+
+@inlined
+def _texture(canvas: Canvas, cell: int, half: float) -> None:
+    """Add the patterns of ground and walls to a cell, and to its column if it is the last one there."""
+    frame, samples, focal = canvas.frame, canvas.frame.samples, canvas.frame.focal
+    if frame.ground_texture.contrast > 0.0 or frame.wall_texture.contrast > 0.0:
+        column = cell // samples
+        texture_cell(canvas, (0.5 * (cell / samples + (cell + 1) / samples) - half) / focal)
+        if (cell + 1) % samples == 0:
+            texture_column(canvas, (column + 0.5 - half) / focal, column)
 
 
 @kernel

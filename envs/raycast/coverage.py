@@ -30,10 +30,9 @@ class Layer(IntEnum):
     GROUND = 2  # what shows of ground and walls, three layers each, see `cover`
     RIGHT_WALL = 5
     LEFT_WALL = 8
-    WAITING = 11  # columns that wait for being resolved: their STEPS, then their PAINT
 
 
-LAYERS = Layer.WAITING + 2 * BLOCK
+LAYERS = Layer.LEFT_WALL + 3
 
 
 @kernel
@@ -108,42 +107,32 @@ def fill(
 def resolve(
     frame: Record, accumulators: np.ndarray, image: np.ndarray, column: int, first: int, last: int
 ) -> None:
-    """Set the painted column aside; once there are `BLOCK`, or it is the last, write them into the image.
+    """Finish a painted column; once there are `BLOCK`, or it is the last, write them into the image.
 
-    Columns `first` .. `last` - 1 are painted.
+    Columns `first` .. `last` - 1 are painted, each into its place of the accumulators (BLOCK, LAYERS, ...).
     """
-    rows, place = image.shape[0] + 2, (column - first) % BLOCK
-    steps, paint, waiting = (
-        accumulators[Layer.STEPS],
-        accumulators[Layer.PAINT],
-        accumulators[Layer.WAITING :],
-    )
+    place = (column - first) % BLOCK
+    steps = accumulators[place, Layer.STEPS]
     _step(steps, frame.horizon, frame.floor - frame.sky + steps[-1])
-    for row in range(rows):
-        waiting[place, row] = steps[row]
-        waiting[BLOCK + place, row] = paint[row]
-        steps[row] = paint[row] = 0.0
-    steps[-1] = 0.0
     if place == BLOCK - 1 or column == last - 1:
-        _sum_block(frame.sky, waiting, image, column - place, place + 1)
+        _sum_block(frame.sky, accumulators, image, column - place, place + 1)
 
 
 @kernel
-def _sum_block(sky: float, waiting: np.ndarray, image: np.ndarray, first: int, count: int) -> None:
-    """Write columns `first` .. `first` + `count` - 1; those that are not waiting are summed for nothing."""
+def _sum_block(sky: float, painted: np.ndarray, image: np.ndarray, first: int, count: int) -> None:
+    """Write columns `first` .. `first` + `count` - 1 and clear all places; others are summed for nothing."""
     one = two = three = four = sky
     for row in range(image.shape[0]):
-        one += waiting[0, row]
-        two += waiting[1, row]
-        three += waiting[2, row]
-        four += waiting[3, row]
-        image[row, first] = one + waiting[4, row]
-        if count > 1:
-            image[row, first + 1] = two + waiting[5, row]
-        if count > 2:
-            image[row, first + 2] = three + waiting[6, row]
-        if count > 3:
-            image[row, first + 3] = four + waiting[7, row]
+        one += painted[0, Layer.STEPS, row]
+        two += painted[1, Layer.STEPS, row]
+        three += painted[2, Layer.STEPS, row]
+        four += painted[3, Layer.STEPS, row]
+        painted[0, Layer.STEPS, row], painted[1, Layer.STEPS, row] = one, two
+        painted[2, Layer.STEPS, row], painted[3, Layer.STEPS, row] = three, four
+    for k in range(count):  # in wide instructions, for which the sums above have to wait too long
+        for row in range(image.shape[0]):
+            image[row, first + k] = painted[k, Layer.STEPS, row] + painted[k, Layer.PAINT, row]
+    painted[:, Layer.STEPS : Layer.GROUND] = 0.0
 
 
 @kernel

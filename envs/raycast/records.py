@@ -146,7 +146,7 @@ class Canvas(NamedTuple):
         frame: A FRAME record.
         strip: A STRIP record.
         gaps: GAP records; how many of them are in use is passed along.
-        accumulators: (LAYERS, height + PADDING) float64, see `envs.raycast.coverage`.
+        accumulators: (LAYERS, height + PADDING) float64 of a column, see `envs.raycast.coverage`.
         noise: Of the scene.
         mixing: Room for it.
         bends: Room for bodies that bend.

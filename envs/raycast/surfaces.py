@@ -85,12 +85,20 @@ def enter_gap(frame: Record, strip: Record, gap: Record) -> None:
     strip.slope, strip.weight = 0.5 * (left + right), frame.focal * (right - left)
 
 
+@inlined
+def _is_same(one: Record, other: Record) -> bool:
+    """Whether two edges have the same rows."""
+    return one.left == other.left and one.right == other.right
+
+
 @kernel
-def _carve(canvas: Canvas, count: int, k: int, standing: bool) -> int:
-    """Take what is shown out of gap `k`; below what stands on the ground only the ground is left."""
+def _carve(canvas: Canvas, count: int, k: int, first: Ends, last: Ends, standing: bool) -> int:
+    """Take what is shown, from edge `first` to `last`, out of gap `k`.
+
+    Below what stands on the ground only the ground is left.
+    """
     frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
     gap = gaps[k]
-    first, last = _clip(gap, strip.cap), _clip(gap, strip.end)
     top, bottom = ends(gap.top), ends(gap.bottom)
     below = is_open(last, bottom) and count < len(gaps)
     if below and standing:
@@ -142,7 +150,7 @@ def show_walls(canvas: Canvas, count: int, limit: float) -> int:
                 if frame.wall_texture.contrast > 0.0:
                     layer = Layer.RIGHT_WALL if side > 0.0 else Layer.LEFT_WALL
                     coverage.cover(accumulators[layer : layer + 3], top, bottom, strip.weight, strip.slope)
-                count = _carve(canvas, count, k, True)
+                count = _carve(canvas, count, k, top, bottom, True)
         strip.wall_side, strip.wall_depth, strip.wall_after = -side, strip.wall_after, math.inf
     return count
 
@@ -239,14 +247,15 @@ def show_body(canvas: Canvas, body: Record, count: int) -> int:
     for k in range(count - 1, -1, -1):
         top, bottom = _clip(gaps[k], strip.cap), _clip(gaps[k], strip.end)
         if is_open(top, bottom):
-            first, last = _clip(gaps[k], strip.side), _clip(gaps[k], strip.under)
+            first = top if _is_same(strip.side, strip.cap) else _clip(gaps[k], strip.side)
+            last = bottom if _is_same(strip.under, strip.end) else _clip(gaps[k], strip.under)
             enter_gap(frame, strip, gaps[k])
             if varies:
                 _light_gap(frame, body, strip, mean_light)
             _paint_faces(canvas, body, top, first, last, bottom)
             # Under the belly of an ellipsoid more than the ground can be seen.
             standing = body.bottom <= MIN_DEPTH and body.kind != ELLIPSOID
-            count = _carve(canvas, count, k, standing)
+            count = _carve(canvas, count, k, top, bottom, standing)
     return count
 
 

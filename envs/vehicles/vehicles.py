@@ -95,12 +95,13 @@ class Vehicles:
                 parts[row] = self._sense(row, parts[row])
             np.cumsum([part.size for part in parts], out=self.ends[1:])
             self.events = np.concatenate(parts)
-        rows["num_events"][active] = np.diff(self.ends)[active]
+        counts = np.diff(self.ends)[active]
+        rows["num_events"][active] = self.num_seen[active] = counts
         self.seen, self.seen_ends = self.events, self.ends
         if self._support.any():
             filters = self._last_us, self._support, self._tau_us
             self.seen, self.seen_ends = filter_all(self.events, self.ends, *filters)
-        self.num_seen[active] = np.diff(self.seen_ends)[active]
+            self.num_seen[active] = np.diff(self.seen_ends)[active]
 
     def events_of(self, row: int) -> np.ndarray:
         """EVENT array of a vehicle in the last step of any; empty if it did not take part."""

@@ -83,13 +83,14 @@ class EncoderTable:
         grid = exact.grid._replace(time_bins=1) if coding == "none" else exact.grid
         embedding = time_code(bin_centres(grid.time_bins), features.shape[1], coding)
         features, embedding, scale = _rounded(features, embedding, precision, dtype)
+        rows = _read_only(np.concatenate((features, embedding)))  # large enough for large pages of memory
         first, _, last = exact.encoder
         hidden = _array(first.weight) * np.resize(scale, first.in_features), _array(first.bias)
         head = [_array(part)[: evae.settings.latent] for part in (last.weight, last.bias)]
         return cls(
             grid=grid,
-            features=_read_only(features),
-            embedding=_read_only(embedding),
+            features=rows[: len(features)],
+            embedding=rows[len(features) :],
             hidden=(_read_only(hidden[0], dtype), _read_only(hidden[1], dtype)),
             head=(_read_only(head[0], dtype), _read_only(head[1], dtype)),
             phase=eventnet_phase(grid.time_bins, dtype) if coding == "eventnet" else None,

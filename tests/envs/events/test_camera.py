@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from envs.config import CameraConfig, with_floor
 from envs.events import EVENT, EventCamera
+from envs.events.crossings import MOST_CROSSINGS, NEVER_QUIET
 
 FLOOR = 1e-9  # small enough to leave log(luminance) alone where luminance is about 1
 LUMINANCES = st.floats(0, np.finfo(np.float32).max, width=32, allow_subnormal=True)
@@ -119,9 +120,51 @@ def test_identical_frames_make_no_events_even_at_the_smallest_threshold():
 def test_a_still_pixel_never_fires_whatever_rounding_did_to_its_memory():
     camera = one_pixel()
     camera.reset(frame(2.0), 0)
-    lights, levels, _ = camera._memory
-    lights[1:], levels[0] = 0.0, levels[0] - 0.2
+    lights, levels, *_ = camera._memory
+    lights[1] = NEVER_QUIET
+    levels["first_level"] -= 0.2
     assert camera.step(frame(2.0), 1000).size == 0
+
+
+@pytest.mark.parametrize("threshold", [1e-6, 1e-3, 0.2, 3.0])
+@pytest.mark.parametrize("off", [None, 0.07])
+@pytest.mark.parametrize("response", ["log", "lin_log"])
+@pytest.mark.parametrize("floor", [1e-9, 0.01, 1.0])
+def test_no_pixel_within_its_quiet_band_would_fire(threshold, off, response, floor):
+    fields = {"luminance_floor": floor, "response": response, "max_events_per_pixel": 3}
+    cameras = [
+        EventCamera(64, 64, contrast_threshold=threshold, contrast_threshold_off=off, **fields)
+        for _ in range(2)
+    ]
+    rng = np.random.default_rng(0)
+    first = np.exp(rng.normal(np.log(floor), 4.0, (64, 64)))
+    for camera in cameras:
+        camera.reset(first.astype(np.float32), 0)
+    for k in range(1, 12):
+        levels = rng.choice([0.0, threshold, -(off or threshold)], (64, 64))  # as near as float32 comes
+        frame = (first + floor) * np.exp(levels) * (1.0 + rng.integers(-8, 9, (64, 64)) * 2.0**-25) - floor
+        if response == "lin_log":
+            frame = np.where(first > floor, frame + floor * (1.0 - np.exp(levels)), first + floor * levels)
+        frame = np.maximum(frame, 0.0).astype(np.float32)
+        cameras[1].state[1][0][1] = NEVER_QUIET  # each pixel is decided exactly
+        events = [camera.step(frame, 1000 * k) for camera in cameras]
+        assert events[0].tobytes() == events[1].tobytes()
+
+
+@pytest.mark.parametrize("off", [None, 2.0**-18])
+def test_a_count_that_is_full_begins_again_without_moving_the_level(off):
+    threshold = 2.0**-19
+    cameras = [one_pixel(contrast_threshold=threshold, contrast_threshold_off=off) for _ in range(2)]
+    for camera in cameras:
+        camera.reset(frame(1.0), 0)
+    level = cameras[1].state[1][1]
+    level["on_count"] = MOST_CROSSINGS
+    level["first_level"] -= MOST_CROSSINGS * threshold
+    for k, light in enumerate((1.0005, 1.002, 0.999, 1.0), 1):
+        expected, events = (camera.step(frame(light), 1000 * k) for camera in cameras)
+        assert np.array_equal(events["p"], expected["p"])
+        assert np.abs(events["t"] - expected["t"]).max() <= 1  # the first level was rounded
+        assert max(level["on_count"], level["off_count"]) < 10_000
 
 
 @pytest.mark.parametrize("parts", [2, 5, 10, 200])

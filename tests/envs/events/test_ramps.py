@@ -38,7 +38,7 @@ def test_looks_at_whole_images_fire_the_pixels_that_frames_fire(response, excess
         assert expected.size > 100
         assert np.array_equal(counts(events), counts(expected))
         assert lost == camera.dropped
-    for mine, theirs in zip(looker.camera.state[1], camera.state[1], strict=True):
+    for mine, theirs in zip(looker.camera.state[1][:2], camera.state[1][:2], strict=True):
         by_columns = theirs.reshape(-1, HEIGHT, WIDTH).swapaxes(1, 2)
         assert mine.tobytes() == by_columns.tobytes()
     assert looker.camera.last_frame.tobytes() == frames[-1].tobytes()
