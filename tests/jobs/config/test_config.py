@@ -66,12 +66,24 @@ def changed(values: dict, key: str, value: object) -> dict:
     return {**values, section: {**values[section], name: value}} if section else {**values, name: value}
 
 
-@pytest.mark.parametrize("budget", options("budget"))
+# Where the length of a training is chosen -> an experiment that chooses it there; the others as bytestream.
+OF_EACH_LENGTH = {"budget": "bytestream"} | {
+    match[1]: file.stem
+    for file in sorted((CONF / "exp").glob("*.yaml"))
+    if (match := re.search(r"(?:length: \$\{budget\}_|override /algo: )(\w+)", file.read_text()))
+}
+
+
 @pytest.mark.parametrize("exp", options("exp"))
-def test_every_experiment_is_accepted_with_every_budget(exp, budget):
-    config = parse(compose(f"+exp={exp}", f"budget={budget}"))
-    assert config.budget == budget
+def test_every_experiment_is_accepted_and_names_its_job(exp):
+    config = parse(compose(f"+exp={exp}"))
     assert config.job == JOBS.get(exp, "pipeline" if exp in POLICIES else exp)
+
+
+@pytest.mark.parametrize("budget", ["smoke", "paper"])
+@pytest.mark.parametrize("exp", OF_EACH_LENGTH.values(), ids=OF_EACH_LENGTH)
+def test_every_length_has_a_file_of_every_budget_or_takes_the_budgets_own(exp, budget):
+    assert parse(compose(f"+exp={exp}", f"budget={budget}")).budget == budget
 
 
 @pytest.mark.parametrize("choice", CHOICES)
@@ -209,7 +221,7 @@ def test_the_stages_of_an_experiment_share_its_run_folder():
 )
 def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_its_name(exp, name):
     jobs = ("pipeline", "train", "evaluate", "sweep")
-    configs = [parse(compose(f"+exp={exp}", f"job={job}", "budget=short")) for job in jobs]
+    configs = [parse({**compose(f"+exp={exp}", "budget=short"), "job": job}) for job in jobs]
     assert [(config.job, config.model.name) for config in configs] == [(job, name) for job in jobs]
     (folder,) = {run_name(config) for config in configs}
     assert folder.startswith(f"{exp}-short-s0-")

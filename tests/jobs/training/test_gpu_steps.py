@@ -19,6 +19,8 @@ from jobs.training.ppo_learner import VALUE_WARMUP, PlainPPOLearner
 from models.policy.event_set import EventSet
 from tests.support.configs import SHORT, make_config
 
+pytestmark = pytest.mark.system  # they build RLlib's algorithm many times
+
 MODULE = "default_policy"
 CUDA = pytest.param(
     "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU here")

@@ -61,6 +61,7 @@ def tensor_by_tensor(monkeypatch):
     monkeypatch.setattr(PlainPPOLearner, "_dense", False)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("training", [{}, {"grad_clip": 1e-3}, {"clip_param": 0.01}, {"vf_clip_param": 0.5}])
 def test_an_update_is_rllibs_own(ppo, flights, training, compiled, monkeypatch):

@@ -14,6 +14,8 @@ from jobs.training.rounds import Rounds
 from jobs.training.snapshots import generators, set_generators
 from tests.support.configs import SHORT, make_config
 
+pytestmark = pytest.mark.system  # they build RLlib's algorithm many times
+
 RUNNERS = (1, 2)
 SILENT = "silent"
 
@@ -158,7 +160,6 @@ def silent_for_too_long(taking, manager):
 FAULTS = {lost_in_its_work: 1, lost_twice: 1, started_again_unnoticed: 1, silent_for_too_long: 0, None: 0}
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_round_has_the_same_bytes_whatever_becomes_of_a_process(make, fault):
     told = []

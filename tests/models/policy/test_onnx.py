@@ -65,6 +65,7 @@ def folder(request, tmp_path_factory):
     return save_policy(path, make_networks(name), make_spec(name, coding=evae.settings.coding), ABOUT, evae)
 
 
+@pytest.mark.system
 def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(folder, tmp_path):
     policy = load_policy(folder)
     file = export_onnx(policy, tmp_path / "policy.onnx")
@@ -88,6 +89,7 @@ def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(fol
     assert np.ptp(np.array(expected), axis=0).max() > 0.01 * scale
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("support", [1, 3])
 def test_the_file_filters_the_events_of_each_step_as_the_policy_does(support, tmp_path):
     spec = make_spec("event_columns")
