@@ -148,6 +148,7 @@ def look() -> None:
     from envs.events.crossings import make_room, named
     from envs.events.emission import Span
     from envs.events.ramps import ColumnCamera, Watch, events_of_ramps, look_at, make_ramps
+    from envs.events.windows import event_image
 
     columns = ColumnCamera(CameraConfig(width=16, height=16))
     columns.reset(np.ones((16, 16), np.float32))
@@ -155,6 +156,7 @@ def look() -> None:
     watch = Watch(model, memory, np.zeros(16, np.int64), state[2], ramps, make_room(), columns.bandwidth)
     _, kept, _ = look_at(np.full((16, 16), 0.5, np.float32), 0, 16, 1000, watch, 0)
     events_of_ramps(watch, kept, Span(0, 1000))
+    event_image(some_events(), 16, 16)
     encode()
     learn()
 
@@ -178,7 +180,8 @@ def act_together() -> None:
     from envs.corridor import CorridorVectorEnv
     from envs.scene.planning import cost_to_go
 
-    several = CorridorVectorEnv(2, camera=CameraConfig(width=16, height=16), window_capacity=None)
+    camera = CameraConfig(width=16, height=16)
+    several = CorridorVectorEnv(2, camera=camera, window_capacity=None, filter_support=1)
     several.reset(seed=0)
     several.step(np.zeros(2, np.int64))
     cost_to_go(several.envs[0].scene, 0.3).of_actions(0.0, 0.0)
@@ -234,12 +237,14 @@ def record() -> None:
 def encode() -> None:
     """Encode a few events, as for a policy and as in the training of an encoder."""
     from models.encoder.evae import EventVAE
-    from models.encoder.event_batch import batch_windows
+    from models.encoder.event_batch import batch_packed, batch_windows
+    from models.encoder.event_images import last_polarity
     from models.encoder.frozen import encoder_of
 
     evae, events = EventVAE(context=64), some_events()
     evae.ecn(batch_windows([(events, 0, 5000)] * 2, evae.grid)).sum().backward()
     encoder_of(evae.freeze()).encode(events, 0, 5000)
+    last_polarity(batch_packed(np.zeros((2, 1, 4), np.int32), evae.grid))
 
 
 def learn() -> None:
