@@ -136,6 +136,7 @@ def mean_rate(sigmas: float) -> float:
     return float(np.mean(2.0 / (pair + pair[::-1]) + 4.0 * stays / outwards))
 
 
+@lru_cache(maxsize=16)
 def threshold_in_sigmas(events_per_tau: float) -> float:
     """How many sigmas a threshold is, for so many shot noise events per tau.
 
@@ -181,8 +182,40 @@ class Still(NamedTuple):
     high: float
 
 
+class PixelState(NamedTuple):
+    """The noise of one camera's pixels, as compiled code takes it.
+
+    Attributes:
+        rows: Arrays of a `Noise`, as `_noise` takes them; of no pixels if there is no noise.
+        process: `Process`.
+        rng: Source of all draws.
+        scratch: Two rooms for blocks of pixels, and room for numbers of pixels, int64.
+    """
+
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    process: Process
+    rng: np.random.Generator
+    scratch: tuple
+
+
+@lru_cache(maxsize=4)
+def _scratch(size: int) -> tuple:
+    """Scratch for `size` pixels, which all cameras of a process share: it stays in the cache."""
+    return make_room(), make_room(), np.empty(size, np.int64)
+
+
+def no_noise() -> PixelState:
+    """The state of a camera whose pixels have no noise."""
+    rows = np.zeros((0, 9)), np.zeros((2, 0), np.float32), np.zeros(0), np.zeros(0, np.int64)
+    return PixelState(rows, Process(0.0, 1.0, np.zeros(2), 0.0, 1.0), np.random.default_rng(0), _scratch(0))
+
+
 class PixelNoise:
-    """Leakage and shot noise of one camera's pixels."""
+    """Leakage and shot noise of one camera's pixels.
+
+    Attributes:
+        state: `PixelState`.
+    """
 
     def __init__(
         self,
@@ -207,7 +240,7 @@ class PixelNoise:
             ValueError: If `shot_noise_hz` cannot be had with the bandwidth of the pixels.
         """
         self._model, self._memory, _ = state
-        self._numbers, self._rng = numbers, rng
+        self._numbers = numbers
         size, alive = numbers.size, numbers >= 0
         tau_s = 1.0 / (2.0 * math.pi * (camera.cutoff_hz or DEFAULT_BANDWIDTH_HZ))
         spread = alive * 10.0 ** (faults.noise_spread * rng.standard_normal(size))
@@ -217,15 +250,14 @@ class PixelNoise:
             shot = spread
         rates = np.append(1.0 / np.maximum(passage_times(), 1.0 / PER_SIGMA), 0.0) * (1e-6 / tau_s)
         slice_us = 1e6 * SLICE / max(faults.leak_hz, 1e-9)
-        self._process = Process(sigma, 1e6 * tau_s, rates, faults.leak_jitter, slice_us)
+        process = Process(sigma, 1e6 * tau_s, rates, float(faults.leak_jitter), slice_us)
         leak = faults.leak_hz * spread
         rows, seen = np.zeros((size, 9)), np.zeros((2, size), np.float32)
         rows[:, 0] = leak / np.maximum(1.0 + faults.leak_jitter * rng.standard_normal(size), 0.1)
         rows[:, 1], rows[:, 2], rows[:, 3] = leak, shot, rng.standard_exponential(size)
         rows[:, 4], rows[:, 6], rows[:, 7], seen[1] = t_us, t_us, -np.inf, np.nan
         due_us, kept_us = np.full(size, float(t_us)), np.full(size, np.iinfo(np.int64).min)
-        self._rows = rows, seen, due_us, kept_us
-        self._scratch = make_room(), make_room(), np.empty(size, np.int64)
+        self.state = PixelState((rows, seen, due_us, kept_us), process, rng, _scratch(size))
         move_levels(self._model, self._memory, -rng.random(size) * alive)
 
     def events(self, t0_us: int, t1_us: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -234,11 +266,11 @@ class PixelNoise:
         Returns:
             Times [us], flat pixels y * W + x and polarities, int64 each.
         """
-        parts = 1 + int((t1_us - t0_us) / self._process.slice_us)
-        cuts = np.array([t0_us + (t1_us - t0_us) * part // parts for part in range(parts + 1)])
-        found = fire(cuts, self._model, self._memory, self._rows, self._process, self._rng, self._scratch)
-        times, pixels, polarities = found
-        return times, self._numbers[pixels], polarities
+        return self.of_image(fire(t0_us, t1_us, self._model, self._memory, self.state))
+
+    def of_image(self, fired: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `events`, of what `fire` returns."""
+        return fired[0], self._numbers[fired[1]], fired[2]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -254,28 +286,42 @@ def move_levels(model, memory, shares):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fire(cuts, model, memory, rows, process, rng, scratch):
-    """Events of the noise between times that are cut finely enough for leakage; see `PixelNoise.events`."""
+def fire(t0_us, t1_us, model, memory, state):
+    """Events of the noise in (t0_us, t1_us], after those of the light, which is that of t1_us.
+
+    Args:
+        t0_us: When the interval begins [us].
+        t1_us: When it ends [us].
+        model: Of the camera, as `EventCamera.state` has it.
+        memory: As there.
+        state: `PixelState`, changed in place.
+
+    Returns:
+        int64 (3, K): times [us], pixels of the memory, polarities.
+    """
+    (real, seen, due_us, kept_us), process, rng, scratch = state
     model, memory = named(model, memory)
-    noise, (room, spare, changed) = _noise(rows[0], rows[1], rows[2], rows[3]), scratch
+    noise, (room, spare, changed) = _noise(real, seen, due_us, kept_us), scratch
+    parts = 1 + np.int64((t1_us - t0_us) / process.slice_us)  # cut finely enough for leakage
     noisy = Noisy(model, memory, noise, process)
     fired = [(np.int64(0), np.int64(0), np.int64(0))]
-    for cut in range(cuts.size - 1):
-        span = Span(cuts[cut], cuts[cut + 1])
+    for part in range(parts):
+        begin_us = t0_us + (t1_us - t0_us) * part // parts
+        span = Span(begin_us, t0_us + (t1_us - t0_us) * (part + 1) // parts)
         found = _find(span, memory, noise, changed)
         for first in range(0, found, BLOCK):
             pixels = changed[first : min(first + BLOCK, found)]
-            _restore(pixels, cuts[-1], memory, noise)
+            _restore(pixels, t1_us, memory, noise)
             respond_at(pixels, memory.previous, model.curve, room.before, room)
             _wait(pixels, span, noisy, room)
             for j in range(pixels.size):
                 if room.after[j] > 0.0:
                     still = Still(pixels[j], room.before[j], room.lights[j], room.low[j], room.high[j])
-                    _fire_pixel(still, span, cuts[-1], noisy, rng, spare, fired)
+                    _fire_pixel(still, span, t1_us, noisy, rng, spare, fired)
     events = np.empty((3, len(fired) - 1), np.int64)
     for k in range(1, len(fired)):
         events[0, k - 1], events[1, k - 1], events[2, k - 1] = fired[k]
-    return events[0], events[1], events[2]
+    return events
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")

@@ -61,7 +61,7 @@ class Vehicles:
         vehicle["window_us"], vehicle["problem"] = clock_us(1, config.control_hz), GOOD
         self._set_delay(row, config.delay_steps)
         self._sensors[row] = sensor
-        corridor = scene.sections(config.camera_height_m), sensor.view()
+        corridor = scene.sections(config.camera_height_m), sensor.view(), sensor.pixel_noise()
         if self._corridors is None:
             self._corridors = corridor_list(corridor, len(self.rows))
         set_corridor(self._corridors, row, corridor)
@@ -84,7 +84,7 @@ class Vehicles:
         """
         rows = self.rows
         taken = self._exchange(actions, active)
-        self.events, self.ends = step_all(rows, self._corridors, taken, active)
+        self.events, self.ends, noise, noise_ends = step_all(rows, self._corridors, taken, active)
         wrong = active & (rows["problem"] != GOOD)
         if wrong.any():
             self._refuse(int(wrong.argmax()))
@@ -92,7 +92,7 @@ class Vehicles:
         if in_python:
             parts = [self.events_of(row) for row in range(len(rows))]
             for row in in_python:
-                parts[row] = self._sense(row, parts[row])
+                parts[row] = self._sense(row, parts[row], noise[:, noise_ends[row] : noise_ends[row + 1]])
             np.cumsum([part.size for part in parts], out=self.ends[1:])
             self.events = np.concatenate(parts)
         rows["num_events"][active] = np.diff(self.ends)[active]
@@ -161,14 +161,14 @@ class Vehicles:
                 self._last_us[:, : before.shape[1], : before.shape[2]] = before
             self._last_us[row] = NEVER
 
-    def _sense(self, row: int, events: np.ndarray) -> np.ndarray:
-        """Events of a step that the compiled call has not simulated to the end."""
+    def _sense(self, row: int, events: np.ndarray, fired: np.ndarray) -> np.ndarray:
+        """Events of a step that the compiled call has not simulated to the end, as far as it has."""
         vehicle, sensor = self.rows[row], self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
         start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
         try:
             if vehicle["by_looks"]:
-                events = sensor.with_faults(events, start_us, t_us)
+                events = sensor.with_faults(events, start_us, t_us, fired)
                 vehicle["dropped"] += sensor.lost
                 return events
             end = float(vehicle["x_m"]), float(vehicle["y_m"])
