@@ -19,7 +19,6 @@ from envs.events.photoreceptor import MAX_LUMINANCE, Curve, exponential, light_o
 # A photoreceptor is faster where it is brighter. v2e's filter: bandwidth ~ (grey + 20) / 275, of 255 greys.
 DARK_SHARE, WHITE_SHARE = 20.0 / 275.0, 255.0 / 275.0
 MOST_PERIODS = 60.0  # after which nothing is left of what was before
-SETTLED = 1e-7  # of the response; a photoreceptor that is nearer to it has arrived
 LITTLE = 1e-6  # of a period; in less the first order is exact to 1e-12 of the response
 
 
@@ -155,27 +154,9 @@ def _follow(filtered: np.ndarray, lights: tuple, responses: tuple, rates: tuple,
     for i in range(filtered.size):
         periods[i] = black + white * (0.5 * past[i] + 0.5 * light[i])
         decay[i] = -min(periods[i], MOST_PERIODS)
-    exponential(decay[: filtered.size], exponents)
+    exponential(decay, exponents)
     for i in range(filtered.size):
         filtered[i] = _followed(filtered[i], (before[i], after[i], periods[i]), decay[i])
-
-
-@inlined
-def _unsettled(luminance: np.ndarray, begin: int, end: int, bandwidth: ColumnFilter) -> tuple[int, int]:
-    """From which to which pixel of a column something changes: above and below nothing has for long."""
-    while begin < end and _is_settled(luminance, begin, bandwidth):
-        begin += 1
-    while begin < end and _is_settled(luminance, end - 1, bandwidth):
-        end -= 1
-    return begin, end
-
-
-@inlined
-def _is_settled(luminance: np.ndarray, i: int, bandwidth: ColumnFilter) -> bool:
-    """Whether a pixel is under the light to which its photoreceptor has settled, and was half-way too."""
-    pixels = bandwidth.pixels
-    rests = pixels.filtered[i] == pixels.response[i] and bandwidth.half[i] == pixels.filtered[i]
-    return rests and luminance[i] == pixels.light[i]
 
 
 @kernel
@@ -203,25 +184,22 @@ def filter_columns(
     middle, after = table[0], table[1]  # unpacked, their strides would be unknown, and no loop over them wide
     room, height = (table[2], table[3], exponents), exponents.size
     for column in range(first, last):
-        seconds = (t_us - seen_us[column]) * 0.5e-6  # of each half
-        begin, end = _unsettled(luminance, column * height, (column + 1) * height, bandwidth)
-        light, past = luminance[begin:end], pixels.light[begin:end]
-        response, filtered = pixels.response[begin:end], pixels.filtered[begin:end]
-        seen, rates = bandwidth.seen[begin:end], (black * seconds, white * seconds)
-        half, count = bandwidth.half[begin:end], end - begin
-        for i in range(count):
+        begin, seconds = column * height, (t_us - seen_us[column]) * 0.5e-6  # of each half
+        light, past = luminance[begin : begin + height], pixels.light[begin : begin + height]
+        response, filtered = pixels.response[begin : begin + height], pixels.filtered[begin : begin + height]
+        seen, rates = bandwidth.seen[begin : begin + height], (black * seconds, white * seconds)
+        half = bandwidth.half[begin : begin + height]
+        for i in range(height):
             seen[i] = np.float32(0.5) * past[i] + np.float32(0.5) * light[i]
         respond(curve, seen, middle, exponents)
         respond(curve, light, after, exponents)
         _follow(filtered, (past, seen), (response, middle), rates, room)
-        for i in range(count):
+        for i in range(height):
             half[i] = filtered[i]
         _follow(filtered, (seen, light), (middle, after), rates, room)
-        for i in range(count):
-            if abs(filtered[i] - after[i]) < SETTLED:
-                filtered[i] = after[i]
+        for i in range(height):
             response[i], middle[i] = after[i], filtered[i]
-        light_of(curve, middle[:count], exponents)
-        for i in range(count):
+        light_of(curve, middle, exponents)
+        for i in range(height):
             seen[i] = np.float32(min(max(middle[i], 0.0), MAX_LUMINANCE))
             past[i] = light[i]

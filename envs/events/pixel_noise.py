@@ -42,6 +42,7 @@ from envs.events.emission import Span
 
 DEFAULT_BANDWIDTH_HZ = 300.0  # of the noise where the photoreceptors have none: v2e's cutoff by day
 SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
+FIRED = 1024  # events, for which there is room at first
 PER_SIGMA = 64  # entries of the table of waiting rates
 MOST_SIGMAS, FEWEST_SIGMAS = 12.0, 0.5  # of a threshold
 SLICE = 1 / 32  # of a threshold, the most that a level leaks before the waiting times are taken anew
@@ -173,6 +174,7 @@ class Still(NamedTuple):
         response: To its light.
         light: Its luminance.
         low, high: Changes of the response down and up to its next events, at the end of the span.
+        from_us: From when on [us].
     """
 
     pixel: int
@@ -180,6 +182,7 @@ class Still(NamedTuple):
     light: float
     low: float
     high: float
+    from_us: float
 
 
 class PixelState(NamedTuple):
@@ -304,7 +307,7 @@ def fire(t0_us, t1_us, model, memory, state):
     noise, (room, spare, changed) = _noise(real, seen, due_us, kept_us), scratch
     parts = 1 + np.int64((t1_us - t0_us) / process.slice_us)  # cut finely enough for leakage
     noisy = Noisy(model, memory, noise, process)
-    fired = [(np.int64(0), np.int64(0), np.int64(0))]
+    fired, count = np.empty((3, FIRED), np.int64), 0
     for part in range(parts):
         begin_us = t0_us + (t1_us - t0_us) * part // parts
         span = Span(begin_us, t0_us + (t1_us - t0_us) * (part + 1) // parts)
@@ -314,14 +317,27 @@ def fire(t0_us, t1_us, model, memory, state):
             _restore(pixels, t1_us, memory, noise)
             respond_at(pixels, memory.previous, model.curve, room.before, room)
             _wait(pixels, span, noisy, room)
+            moved = 0
             for j in range(pixels.size):
                 if room.after[j] > 0.0:
-                    still = Still(pixels[j], room.before[j], room.lights[j], room.low[j], room.high[j])
-                    _fire_pixel(still, span, t1_us, noisy, rng, spare, fired)
-    events = np.empty((3, len(fired) - 1), np.int64)
-    for k in range(1, len(fired)):
-        events[0, k - 1], events[1, k - 1], events[2, k - 1] = fired[k]
-    return events
+                    i, begin_us = pixels[j], np.float64(span.start_us)
+                    still = Still(i, room.before[j], room.lights[j], room.low[j], room.high[j], begin_us)
+                    count, still = _fire_pixel(still, span, t1_us, noisy, rng, fired, count)
+                    while count == fired.shape[1]:
+                        fired = _with_more_room(fired)
+                        count, still = _fire_pixel(still, span, t1_us, noisy, rng, fired, count)
+                    spare.exponents[moved] = i
+                    moved += _is_free(i, t1_us, model, memory)
+            _set_bands(spare.exponents[:moved], noisy, spare.levels, room)
+    return fired[:, :count]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _with_more_room(fired):
+    """The same events, in twice the room."""
+    larger = np.empty((3, 2 * fired.shape[1]), np.int64)
+    larger[:, : fired.shape[1]] = fired
+    return larger
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -442,15 +458,21 @@ def _return_us(displaced, sigma, normal, process):
     return 0.5 * process.tau_us * np.log1p(ratio * ratio)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
-    """Append the events of one pixel in a span, one after the other, and set its level and its quiet band."""
+@kernel
+def _fire_pixel(still, span, now_us, noisy, rng, fired, count):
+    """Add the events of one pixel in a span, one after the other, and set its level.
+
+    Returns:
+        How many events there are in `fired`, and the pixel. If there is no more room, fire it again.
+    """
     model, memory, noise, process = noisy
     i, refractory_us = still.pixel, model.rule.refractory_us
     on, off = _thresholds(i, model)
-    low, high, t = still.low, still.high, np.float64(span.start_us)
+    low, high, t = still.low, still.high, still.from_us
     sigma = process.sigma * 0.5 * (on + off)
     while True:
+        if count == fired.shape[1]:
+            return count, Still(i, still.response, still.light, low, high, t)
         begin = max(t, _free_us(i, memory, noise))
         up, down = _rate(high, sigma, process), _rate(low, sigma, process)
         rate = (up + down) * _dimmed(noise.shot[i], still.light)
@@ -463,7 +485,8 @@ def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
             break
         event_us = np.int64(min(max(np.ceil(coming), span.start_us + 1), span.end_us))
         rises = high <= low if due else rng.random() * (up + down) < up
-        fired.append((event_us, i, np.int64(2 * rises - 1)))
+        fired[0, count], fired[1, count], fired[2, count] = event_us, i, 2 * rises - 1
+        count += 1
         displaced = 0.0 if due else max(high, 0.0) if rises else -max(low, 0.0)
         if not due:
             noise.budget[i] = rng.standard_exponential()
@@ -480,13 +503,29 @@ def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
             t, displaced = _rest(still, event_us, now_us, displaced, sigma, noisy, rng)
             low, high = off - displaced, on + displaced
         noise.rest_us[i] = t + _return_us(displaced, sigma, rng.standard_normal(), process)
-    if refractory_us == 0 or memory.refractory_end_us[i] <= now_us:
-        spare.levels[0], spare.exponents[1] = level_of(memory, i, on, off), i
-        set_quiet_bands(spare.exponents[1:2], spare.levels, model, memory, spare)
     _schedule(i, still.light, span.end_us, low, high, fall, rate, noisy)
+    return count, still
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inlined
+def _is_free(i, now_us, model, memory):
+    """Whether no refractory period of a pixel outlasts the last frame."""
+    return model.rule.refractory_us == 0 or memory.refractory_end_us[i] <= now_us
+
+
+@kernel
+def _set_bands(pixels, noisy, levels, room):
+    """Set the quiet bands of pixels that fired; together, for which exponentials are fast."""
+    model, memory, noise, _ = noisy
+    for j in range(pixels.size):
+        on, off = _thresholds(pixels[j], model)
+        levels[j] = level_of(memory, pixels[j], on, off)
+    set_quiet_bands(pixels, levels, model, memory, room)
+    for i in pixels:
+        noise.band[i] = memory.quiet_low[i]
+
+
+@kernel
 def _rest(still, event_us, now_us, displaced, sigma, noisy, rng):
     """Start a refractory period; when it ends [us], and how far the noise, and so the level, is off by then.
 
