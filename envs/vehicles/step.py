@@ -42,7 +42,10 @@ VEHICLE = np.dtype(
 
 @numba.njit(cache=True, error_model="numpy")
 def corridor_list(corridor, count):
-    """A list with `count` times the same corridor: sections of what stands there, `View`, `PixelState`."""
+    """A list with `count` times the same corridor: level sections of what stands there, and a `View`.
+
+    Or with the same `PixelState`.
+    """
     corridors = List()
     for _ in range(count):
         corridors.append(corridor)
@@ -56,12 +59,13 @@ def set_corridor(corridors, row, corridor):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def step_all(rows, corridors, actions, active):
+def step_all(rows, corridors, noisy, actions, active):
     """One control step of all active vehicles.
 
     Args:
         rows: (B,) VEHICLE, changed in place.
-        corridors: A list of B, see `corridor_list`; the noise of pixels is that of cameras that see by looks.
+        corridors: A list of B, see `corridor_list`.
+        noisy: A list of B `PixelState`, of cameras that see by looks.
         actions: int64 (B,).
         active: bool (B,).
 
@@ -74,12 +78,13 @@ def step_all(rows, corridors, actions, active):
     for row in range(rows.size):
         ends[row + 1], noise_ends[row + 1] = ends[row], noise_ends[row]
         if active[row]:
-            sections, view, pixels = corridors[row]
+            sections, view = corridors[row]
             _move(rows[row], actions[row], sections)
             if rows[row].by_looks and rows[row].problem == GOOD:
                 events = _look(rows[row], view)
                 found.append(events)
                 ends[row + 1] += events.size
+                pixels = noisy[row]
                 if pixels.rows[2].size > 0 and rows[row].problem == GOOD:  # while its memory is in the cache
                     fired = fire(rows[row].start_us, rows[row].t_us, view.model, view.memory, pixels)
                     noise.append(fired)
