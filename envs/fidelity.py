@@ -22,7 +22,7 @@ from envs.scene import CONE, ELLIPSOID, Scene
 RENDERERS = ("auto", "raycast", "pyrender")
 
 CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the error
-RENDERS_TEXTURED = 1.3  # times those of a plain scene
+RENDERS_TEXTURED = 1.3  # times those of a plain scene; at bodies only if their pattern has edges
 # How far an edge may move between two looks, at tolerance 0.05 in a control step of 0.1 m [pixels].
 UPRIGHT_PX = 0.48
 LEVEL_PX = 0.25
@@ -32,7 +32,7 @@ SHORT = 2.0  # time constants of a photoreceptor; in shorter control steps it ne
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 # Samples at tolerance 0.05 in a control step of 0.1 m. Straight edges are exact whatever the samples; the
 # light and the arcs of cones and ellipsoids and the patterns of textures converge with them.
-SAMPLES = {"straight": 0.5, "textured": 1.5, "curved": 1.95, "curved noise": 6.5, "curved pattern": 10.0}
+SAMPLES = {"straight": 0.5, "textured": 1.5, "curved": 1.95, "curved noise": 2.9, "curved pattern": 10.0}
 MAX_SAMPLES = 16
 PYRENDER_SAMPLES = ((0.3, 1), (0.15, 2), (0.0, 4))  # from which tolerance on how many do
 
@@ -152,7 +152,7 @@ def _max_shifts_px(config: EnvConfig, scene: Scene) -> Shifts:
     rest as in `_max_step_m`.
     """
     share = config.speed_mps / config.control_hz / 0.1
-    factor = _renders_factor(config) * (1.0 if scene.obstacle_texture.plain else RENDERS_TEXTURED)
+    factor = _renders_factor(config) * (RENDERS_TEXTURED if scene.obstacle_texture.sharp else 1.0)
     return Shifts(
         upright=UPRIGHT_PX / factor * max(1.0, share) ** 0.7,
         level=LEVEL_PX / factor * max(1.0, share) ** 0.25,

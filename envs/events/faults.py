@@ -19,9 +19,10 @@ from envs.config import ADDED_FAULTS, CameraConfig, FaultsConfig
 from envs.events.camera import MAX_EVENTS_PER_FRAME
 from envs.events.disturbances import disturb
 from envs.events.emission import EVENT
-from envs.events.pixel_noise import PixelNoise
+from envs.events.pixel_noise import PixelNoise, PixelState, no_noise
 from envs.events.readout import Readout
 
+NO_NOISE = no_noise()
 LABELLED = np.dtype([*EVENT.descr, ("is_noise", "?")])
 Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
 
@@ -108,12 +109,22 @@ class RealSensor:
             name: ADDED_FAULTS[name](amount, shape, rng) for name, amount in amounts if amount > 0.0
         }
 
-    def events(self, events: np.ndarray, t0_us: int, t1_us: int) -> np.ndarray:
+    @property
+    def pixel_noise(self) -> PixelState:
+        """The noise of the pixels; of none if they have none."""
+        return self._noise.state if self._noise is not None else NO_NOISE
+
+    def events(
+        self, events: np.ndarray, t0_us: int, t1_us: int, fired: np.ndarray | None = None
+    ) -> np.ndarray:
         """What leaves the sensor in (t0_us, t1_us], of what the light's changes fired in it.
 
-        The camera has seen the light of t1_us. As `apply_faults`, which also says what is raised.
+        The camera has seen the light of t1_us. `fired` is what `pixel_noise.fire` found of `pixel_noise` for
+        this interval, if that was called. As `apply_faults`, which also says what is raised.
         """
-        noise = self._noise.events(t0_us, t1_us) if self._noise is not None else None
+        noise = None
+        if self._noise is not None:
+            noise = self._noise.events(t0_us, t1_us) if fired is None else self._noise.of_image(fired)
         events, is_noise = _with_faults(events, (t0_us, t1_us), self._faults, self._pixels, self._rng, noise)
         for name, apply in self._added.items():
             before, events = events, apply(events, t0_us, t1_us)

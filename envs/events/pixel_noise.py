@@ -44,6 +44,7 @@ from envs.events.refractory import never_be_quiet
 
 DEFAULT_BANDWIDTH_HZ = 300.0  # of the noise where the photoreceptors have none: v2e's cutoff by day
 SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
+FIRED = 1024  # events, for which there is room at first
 PER_SIGMA = 64  # entries of the table of waiting rates
 MOST_SIGMAS, FEWEST_SIGMAS = 12.0, 0.5  # of a threshold
 SLICE = 1 / 32  # of a threshold, the most that a level leaks before the waiting times are taken anew
@@ -138,6 +139,7 @@ def mean_rate(sigmas: float) -> float:
     return float(np.mean(2.0 / (pair + pair[::-1]) + 4.0 * stays / outwards))
 
 
+@lru_cache(maxsize=16)
 def threshold_in_sigmas(events_per_tau: float) -> float:
     """How many sigmas a threshold is, for so many shot noise events per tau.
 
@@ -174,6 +176,7 @@ class Still(NamedTuple):
         response: To its light.
         light: Its luminance.
         low, high: Changes of the response down and up to its next events, at the end of the span.
+        from_us: From when on [us].
     """
 
     pixel: int
@@ -181,10 +184,43 @@ class Still(NamedTuple):
     light: float
     low: float
     high: float
+    from_us: float
+
+
+class PixelState(NamedTuple):
+    """The noise of one camera's pixels, as compiled code takes it.
+
+    Attributes:
+        rows: Arrays of a `Noise`, as `_noise` takes them; of no pixels if there is no noise.
+        process: `Process`.
+        rng: Source of all draws.
+        scratch: Two rooms for blocks of pixels, and room for numbers of pixels, int64.
+    """
+
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    process: Process
+    rng: np.random.Generator
+    scratch: tuple
+
+
+@lru_cache(maxsize=4)
+def _scratch(size: int) -> tuple:
+    """Scratch for `size` pixels, which all cameras of a process share: it stays in the cache."""
+    return make_room(), make_room(), np.empty(size, np.int64)
+
+
+def no_noise() -> PixelState:
+    """The state of a camera whose pixels have no noise."""
+    rows = np.zeros((0, 9)), np.zeros((2, 0), np.float32), np.zeros(0), np.zeros(0, np.int64)
+    return PixelState(rows, Process(0.0, 1.0, np.zeros(2), 0.0, 1.0), np.random.default_rng(0), _scratch(0))
 
 
 class PixelNoise:
-    """Leakage and shot noise of one camera's pixels."""
+    """Leakage and shot noise of one camera's pixels.
+
+    Attributes:
+        state: `PixelState`.
+    """
 
     def __init__(
         self,
@@ -209,7 +245,7 @@ class PixelNoise:
             ValueError: If `shot_noise_hz` cannot be had with the bandwidth of the pixels.
         """
         self._model, self._memory, _ = state
-        self._numbers, self._rng = numbers, rng
+        self._numbers = numbers
         size, alive = numbers.size, numbers >= 0
         tau_s = 1.0 / (2.0 * math.pi * (camera.cutoff_hz or DEFAULT_BANDWIDTH_HZ))
         spread = alive * 10.0 ** (faults.noise_spread * rng.standard_normal(size))
@@ -219,15 +255,14 @@ class PixelNoise:
             shot = spread
         rates = np.append(1.0 / np.maximum(passage_times(), 1.0 / PER_SIGMA), 0.0) * (1e-6 / tau_s)
         slice_us = 1e6 * SLICE / max(faults.leak_hz, 1e-9)
-        self._process = Process(sigma, 1e6 * tau_s, rates, faults.leak_jitter, slice_us)
+        process = Process(sigma, 1e6 * tau_s, rates, float(faults.leak_jitter), slice_us)
         leak = faults.leak_hz * spread
         rows, seen = np.zeros((size, 9)), np.zeros((2, size), np.float32)
         rows[:, 0] = leak / np.maximum(1.0 + faults.leak_jitter * rng.standard_normal(size), 0.1)
         rows[:, 1], rows[:, 2], rows[:, 3] = leak, shot, rng.standard_exponential(size)
         rows[:, 4], rows[:, 6], rows[:, 7], seen[1] = t_us, t_us, -np.inf, np.nan
         due_us, kept_us = np.full(size, float(t_us)), np.full(size, np.iinfo(np.int64).min)
-        self._rows = rows, seen, due_us, kept_us
-        self._scratch = make_room(), make_room(), np.empty(size, np.int64)
+        self.state = PixelState((rows, seen, due_us, kept_us), process, rng, _scratch(size))
         move_levels(self._model, self._memory, -rng.random(size) * alive)
 
     def events(self, t0_us: int, t1_us: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -236,11 +271,11 @@ class PixelNoise:
         Returns:
             Times [us], flat pixels y * W + x and polarities, int64 each.
         """
-        parts = 1 + int((t1_us - t0_us) / self._process.slice_us)
-        cuts = np.array([t0_us + (t1_us - t0_us) * part // parts for part in range(parts + 1)])
-        found = fire(cuts, self._model, self._memory, self._rows, self._process, self._rng, self._scratch)
-        times, pixels, polarities = found
-        return times, self._numbers[pixels], polarities
+        return self.of_image(fire(t0_us, t1_us, self._model, self._memory, self.state))
+
+    def of_image(self, fired: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `events`, of what `fire` returns."""
+        return fired[0], self._numbers[fired[1]], fired[2]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -260,28 +295,55 @@ def move_levels(model, memory, shares):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fire(cuts, model, memory, rows, process, rng, scratch):
-    """Events of the noise between times that are cut finely enough for leakage; see `PixelNoise.events`."""
+def fire(t0_us, t1_us, model, memory, state):
+    """Events of the noise in (t0_us, t1_us], after those of the light, which is that of t1_us.
+
+    Args:
+        t0_us: When the interval begins [us].
+        t1_us: When it ends [us].
+        model: Of the camera, as `EventCamera.state` has it.
+        memory: As there.
+        state: `PixelState`, changed in place.
+
+    Returns:
+        int64 (3, K): times [us], pixels of the memory, polarities.
+    """
+    (real, seen, due_us, kept_us), process, rng, scratch = state
     model, memory = named(model, memory)
-    noise, (room, spare, changed) = _noise(rows[0], rows[1], rows[2], rows[3]), scratch
+    noise, (room, spare, changed) = _noise(real, seen, due_us, kept_us), scratch
+    parts = 1 + np.int64((t1_us - t0_us) / process.slice_us)  # cut finely enough for leakage
     noisy = Noisy(model, memory, noise, process)
-    fired = [(np.int64(0), np.int64(0), np.int64(0))]
-    for cut in range(cuts.size - 1):
-        span = Span(cuts[cut], cuts[cut + 1])
+    fired, count = np.empty((3, FIRED), np.int64), 0
+    for part in range(parts):
+        begin_us = t0_us + (t1_us - t0_us) * part // parts
+        span = Span(begin_us, t0_us + (t1_us - t0_us) * (part + 1) // parts)
         found = _find(span, memory, noise, changed)
         for first in range(0, found, BLOCK):
             pixels = changed[first : min(first + BLOCK, found)]
-            _restore(pixels, cuts[-1], memory, noise)
+            _restore(pixels, t1_us, memory, noise)
             respond_at(pixels, memory.previous, model.curve, room.before, room)
             _wait(pixels, span, noisy, room)
+            moved = 0
             for j in range(pixels.size):
                 if room.after[j] > 0.0:
-                    still = Still(pixels[j], room.before[j], room.lights[j], room.low[j], room.high[j])
-                    _fire_pixel(still, span, cuts[-1], noisy, rng, spare, fired)
-    events = np.empty((3, len(fired) - 1), np.int64)
-    for k in range(1, len(fired)):
-        events[0, k - 1], events[1, k - 1], events[2, k - 1] = fired[k]
-    return events[0], events[1], events[2]
+                    i, begin_us = pixels[j], np.float64(span.start_us)
+                    still = Still(i, room.before[j], room.lights[j], room.low[j], room.high[j], begin_us)
+                    count, still = _fire_pixel(still, span, t1_us, noisy, rng, fired, count)
+                    while count == fired.shape[1]:
+                        fired = _with_more_room(fired)
+                        count, still = _fire_pixel(still, span, t1_us, noisy, rng, fired, count)
+                    spare.exponents[moved] = i
+                    moved += _is_free(i, t1_us, model, memory)
+            _set_bands(spare.exponents[:moved], noisy, spare.levels, room)
+    return fired[:, :count]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _with_more_room(fired):
+    """The same events, in twice the room."""
+    larger = np.empty((3, 2 * fired.shape[1]), np.int64)
+    larger[:, : fired.shape[1]] = fired
+    return larger
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -402,15 +464,21 @@ def _return_us(displaced, sigma, normal, process):
     return 0.5 * process.tau_us * np.log1p(ratio * ratio)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
-    """Append the events of one pixel in a span, one after the other, and set its level and its quiet band."""
+@kernel
+def _fire_pixel(still, span, now_us, noisy, rng, fired, count):
+    """Add the events of one pixel in a span, one after the other, and set its level.
+
+    Returns:
+        How many events there are in `fired`, and the pixel. If there is no more room, fire it again.
+    """
     model, memory, noise, process = noisy
     i, refractory_us = still.pixel, model.rule.refractory_us
     on, off = _thresholds(i, model)
-    low, high, t = still.low, still.high, np.float64(span.start_us)
+    low, high, t = still.low, still.high, still.from_us
     sigma = process.sigma * 0.5 * (on + off)
     while True:
+        if count == fired.shape[1]:
+            return count, Still(i, still.response, still.light, low, high, t)
         begin = max(t, _free_us(i, memory, noise))
         up, down = _rate(high, sigma, process), _rate(low, sigma, process)
         rate = (up + down) * _dimmed(noise.shot[i], still.light)
@@ -423,7 +491,8 @@ def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
             break
         event_us = np.int64(min(max(np.ceil(coming), span.start_us + 1), span.end_us))
         rises = high <= low if due else rng.random() * (up + down) < up
-        fired.append((event_us, i, np.int64(2 * rises - 1)))
+        fired[0, count], fired[1, count], fired[2, count] = event_us, i, 2 * rises - 1
+        count += 1
         displaced = 0.0 if due else max(high, 0.0) if rises else -max(low, 0.0)
         if not due:
             noise.budget[i] = rng.standard_exponential()
@@ -439,13 +508,29 @@ def _fire_pixel(still, span, now_us, noisy, rng, spare, fired):
             t, displaced = _rest(still, event_us, now_us, displaced, sigma, noisy, rng)
             low, high = off - displaced, on + displaced
         noise.rest_us[i] = t + _return_us(displaced, sigma, rng.standard_normal(), process)
-    if refractory_us == 0 or memory.refractory_end_us[i] <= now_us:
-        spare.levels[0], spare.exponents[1] = level_of(memory, i, on, off), i
-        set_quiet_bands(spare.exponents[1:2], spare.levels, model, memory, spare)
     _schedule(i, still.light, span.end_us, low, high, fall, rate, noisy)
+    return count, still
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inlined
+def _is_free(i, now_us, model, memory):
+    """Whether no refractory period of a pixel outlasts the last frame."""
+    return model.rule.refractory_us == 0 or memory.refractory_end_us[i] <= now_us
+
+
+@kernel
+def _set_bands(pixels, noisy, levels, room):
+    """Set the quiet bands of pixels that fired; together, for which exponentials are fast."""
+    model, memory, noise, _ = noisy
+    for j in range(pixels.size):
+        on, off = _thresholds(pixels[j], model)
+        levels[j] = level_of(memory, pixels[j], on, off)
+    set_quiet_bands(pixels, levels, model, memory, room)
+    for i in pixels:
+        noise.band[i] = memory.quiet_low[i]
+
+
+@kernel
 def _rest(still, event_us, now_us, displaced, sigma, noisy, rng):
     """Start a refractory period; when it ends [us], and how far the noise, and so the level, is off by then.
 

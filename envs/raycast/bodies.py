@@ -20,6 +20,7 @@ MIN_BEND = 1e-3  # an outline that bends less is integrated as a parabola
 MAX_BULGE = 1e4  # [rows] an arc that bulges more is not seen
 OUTSIDE = 1e7  # [rows] far outside of any image
 SURELY = 1.0 + 1e-9  # a ratio of squares that no rounding of distances brings about
+WIDE = 2.0  # [pixels] a body that bends and is wider may hide others
 
 
 class Section(NamedTuple):
@@ -68,6 +69,59 @@ def see_bodies(
         body.low, body.high = _silhouette(body, frame)
         count += body.low < high and body.high > low
     return count
+
+
+@kernel
+def drop_hidden(seen: np.ndarray, count: int, frame: Record) -> int:
+    """Leave out bodies behind a cone or an ellipsoid, which would only cut it into more strips.
+
+    A body is convex, and so is its image: it hides all between four corners that it hides.
+
+    Args:
+        seen: (N,) BODY, of which the first `count` are in view.
+        count: How many.
+        frame: FRAME record.
+
+    Returns:
+        How many are left, in the same order.
+    """
+    for k in range(count):
+        one = seen[k]
+        bends = one.kind == CONE or one.kind == ELLIPSOID
+        if bends and frame.focal * (one.high - one.low) > WIDE and one.forward > one.rx:
+            _mark_hidden(seen[:count], one, frame)
+    kept = 0
+    for i in range(count):
+        if seen[i].low < seen[i].high:
+            if kept < i:
+                seen[kept] = seen[i]
+            kept += 1
+    return kept
+
+
+@kernel
+def _mark_hidden(seen: np.ndarray, one: Record, frame: Record) -> None:
+    """Give bodies that one hides a right silhouette at minus infinity."""
+    for i in range(len(seen)):
+        other = seen[i]
+        if one.low < other.low < other.high < one.high and _hides(one, other, frame):
+            other.high = -math.inf
+
+
+@kernel
+def _hides(one: Record, other: Record, frame: Record) -> bool:
+    """Whether a body hides another, whose silhouettes are within its own."""
+    near = other.forward - math.hypot(other.rx, other.ry)
+    if near <= MIN_DEPTH or not is_before(one, other, frame, 0.5 * (other.low + other.high)):
+        return False
+    over, high = frame.eye_z - other.top, 2.0 * frame.horizon
+    top = frame.horizon + frame.focal * over / (near if over < 0.0 else other.forward + other.rx + other.ry)
+    bottom = frame.horizon + frame.focal * max(0.0, frame.eye_z - other.bottom) / near
+    for u in (other.low, other.high):
+        rows = section(one, frame, u, root(one, u))
+        if rows.cap > max(0.0, top) or rows.end < min(high, bottom):
+            return False
+    return True
 
 
 @kernel

@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.checks import LIMIT_M, LIMIT_S
 from envs.compiled import inlined, kernel
-from envs.raycast.bodies import MIN_DEPTH, corner, depths, is_before, outline, see_bodies
+from envs.raycast.bodies import MIN_DEPTH, corner, depths, drop_hidden, is_before, outline, see_bodies
 from envs.raycast.coverage import BLOCK, LAYERS, PADDING, cover_ground, ends, put, resolve
 from envs.raycast.curved import make_bends
 from envs.raycast.noise import make_mixing, turn_waves
@@ -23,7 +23,9 @@ from envs.raycast.surfaces import enter_gap, show_body, show_walls, wall_depth
 from envs.scene import BOX, CONE, ELLIPSOID
 
 MIN_STRIP = 1e-9  # [pixels] cuts nearer than this are one
-ARC_PARTS = 3  # strips of equal height at either end of an ellipsoid's outline
+ARC_PARTS = 3  # strips of equal height at either end of an ellipsoid's outline, of which there is
+ARC_ROWS = 1.0  # one for so many rows of the ellipsoid, if those are fewer
+MIN_ARC = 0.01  # [pixels] beside a cone's base, that a cut is worth
 GAPS = (701, 301, 132, 57, 23, 10, 4, 1)  # of the sort of cuts
 MAX_CUTS = 2 + 2 * max(2, ARC_PARTS)  # of one body: its ends, and corners or arcs
 
@@ -136,6 +138,7 @@ def paint_columns(
     frame, half = room.frames[0], 0.5 * image.shape[1]
     low, high = (first - half) / frame.focal, (last - half) / frame.focal
     count = see_bodies(bodies, frame, low, high, cull, room.seen)
+    count = drop_hidden(room.seen, count, frame)
     size, total = _find_cuts(frame, room.seen[:count], Part(half, first, last), room.cuts, room.order)
     _sort_cuts(room.cuts, size)
     turn_waves(noise, frame, room.mixing)
@@ -271,7 +274,9 @@ def _cone_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: 
         back = abs(k) * cosine
         ahead = forward - back * forward + sine * right
         u = (right - back * right - sine * forward) / max(MIN_DEPTH, ahead)
-        size = _add_cut(cuts, size, part, part.half + frame.focal * u, ahead > 0.0 and rest > 0.0)
+        narrow = k != 0 and frame.focal * min(abs(u - body.low), abs(u - body.high)) < MIN_ARC
+        shown = ahead > 0.0 and rest > 0.0 and not narrow
+        size = _add_cut(cuts, size, part, part.half + frame.focal * u, shown)
     return size
 
 
@@ -283,8 +288,10 @@ def _arc_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: i
     """
     low, high = body.low, body.high
     reach = min(0.5 * (high - low), 1.0 / (frame.samples * frame.focal))
-    for k in range(1, ARC_PARTS + 1):
-        bend = reach * (k / ARC_PARTS) ** 2
+    rows = frame.focal * (body.top - body.bottom) / max(MIN_DEPTH, body.forward)
+    parts = int(min(ARC_PARTS, 1.0 + rows / ARC_ROWS))
+    for k in range(1, parts + 1):
+        bend = reach * (k / parts) ** 2
         for u in (low + bend, high - bend):
             size = _add_cut(cuts, size, part, part.half + frame.focal * u, True)
     return size

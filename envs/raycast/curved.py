@@ -17,6 +17,7 @@ from envs.raycast.records import Bends, Canvas, Ends, Record
 from envs.scene import CONE
 
 GAUSS = 0.5 / math.sqrt(3.0)  # how far from the middle two points stand that stand for a length of 1
+LENGTH = 1.0 / (2.0 * GAUSS)  # of what two such points stand for, by their distance
 POINTS = 4  # of each row: two across, and at each of these two down
 LEAST = 1e-300  # instead of 0 in a denominator
 
@@ -96,7 +97,7 @@ class Place(NamedTuple):
 def make_bends(height: int) -> Bends:
     """Room for images of `height` rows."""
     rows = height + 4  # one cut at either end, and as many as a vector holds
-    return Bends(*np.zeros((3, POINTS * rows)))
+    return Bends(*np.zeros((5, POINTS * rows)))
 
 
 @inlined
@@ -143,7 +144,7 @@ def shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
     patch = Patch(left, wide, top, bottom, first, last - first, frame.horizon, 1.0 / frame.focal)
     base, shape = strip.weight * body.albedo, _quadric(body, frame)
     light = Light(frame.sun_right, frame.sun_forward, frame.sun_z, base * frame.ambient, base * frame.diffuse)
-    _light_points(shape, light, patch, lights)
+    _light_points(shape, light, patch, canvas.bends)
     if frame.body_texture.contrast > 0.0:
         _texture_rows(canvas, body, shape, patch)
     paint = canvas.accumulators[Layer.PAINT]
@@ -153,16 +154,28 @@ def shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
 
 @kernel
 def _texture_rows(canvas: Canvas, body: Record, shape: Quadric, patch: Patch) -> None:
-    """Multiply the lights of each row by the mean of the pattern over a parallelogram between four places."""
-    frame, lights, turns, ups = canvas.frame, canvas.bends.lights, canvas.bends.turns, canvas.bends.ups
-    _find_places(shape, patch, turns, ups)
+    """Multiply the lights of each row by the mean of the pattern over what shows of it.
+
+    The points at which a row is lit have the middle and the spread of what shows; so does the parallelogram
+    over which the pattern is averaged, and a row that an edge cuts has its pattern where the rest shows.
+    """
+    frame, bends = canvas.frame, canvas.bends
+    lights, turns, ups, talls = bends.lights, bends.turns, bends.ups, bends.talls
+    _find_turns(POINTS * patch.rows, turns, bends.aheads)
     facing, height = math.atan2(-body.dy, -body.dx), body.y + frame.eye_z - shape.over
     for j in range(0, POINTS * patch.rows, POINTS):
-        across, down = _back(turns[j + 1] - turns[j]), _back(turns[j + 3] - turns[j + 2])
-        s = body.x + body.turn * (facing + turns[j] + 0.5 * across)
-        q = height + 0.5 * (ups[j + 2] + ups[j + 3])
-        one, other = (body.turn * across, ups[j + 1] - ups[j]), (body.turn * down, ups[j + 3] - ups[j + 2])
-        factor = 1.0 + mean_pattern(canvas, frame.body_texture, s, q, Footprint(*one, *other))
+        left = talls[j] / max(1e-9, talls[j] + talls[j + 1])
+        right = 1.0 - left
+        one, other = 0.5 * _back(turns[j + 2] - turns[j]), 0.5 * _back(turns[j + 3] - turns[j + 1])
+        across = _back(turns[j + 1] - turns[j]) + other - one
+        up, up_other = 0.5 * (ups[j] + ups[j + 2]), 0.5 * (ups[j + 1] + ups[j + 3])
+        s = body.x + body.turn * (facing + turns[j] + one + right * across)
+        q = height + left * up + right * up_other
+        wide = LENGTH * 2.0 * math.sqrt(max(0.0, left * right))
+        turn = 2.0 * LENGTH * (left * one + right * other)
+        rise = LENGTH * (left * (ups[j + 2] - ups[j]) + right * (ups[j + 3] - ups[j + 1]))
+        sides = Footprint(body.turn * wide * across, wide * (up_other - up), body.turn * turn, rise)
+        factor = 1.0 + mean_pattern(canvas, frame.body_texture, s, q, sides)
         for k in range(j, j + POINTS):
             lights[k] *= factor
 
@@ -174,25 +187,10 @@ def _back(turn: float) -> float:
 
 
 @kernel
-def _find_places(shape: Quadric, patch: Patch, turns: np.ndarray, ups: np.ndarray) -> None:
-    """Fill where four rays of each row meet the body: left and right, above and below its middle.
-
-    As angles around its axis, from the direction to the eye [rad], and heights [m]. A loop without
-    branches, as `_light_points`.
-    """
-    high = min(patch.top.left, patch.top.right)
-    low = max(patch.bottom.left, patch.bottom.right)
-    for p in range(POINTS * (patch.rows + patch.rows % 2)):
-        row = float(patch.first + (p >> 2))
-        start, end = max(high, row), min(low, row + 1.0)
-        side, middle = float(p & 1), 0.5 * float((p >> 1) & 1)
-        x, y = side * (1.0 - 2.0 * middle) + middle, 0.5 + middle * (2.0 * side - 1.0)
-        u, fall = patch.left + x * patch.wide, (start + y * (end - start) - patch.horizon) * patch.per_row
-        nearest, farthest = _footprint(shape, u)
-        place = _meet(shape, u, fall, nearest, farthest)
-        ahead = -(place.right * shape.right + place.forward * shape.forward)
-        turns[p] = _angle(place.right * shape.forward - place.forward * shape.right, ahead)
-        ups[p] = place.up
+def _find_turns(points: int, turns: np.ndarray, aheads: np.ndarray) -> None:
+    """Replace sines in `turns`, whose cosines are in `aheads`, by their angles [rad]; without branches."""
+    for p in range(points):
+        turns[p] = _angle(turns[p], aheads[p])
 
 
 @inlined
@@ -209,13 +207,14 @@ def _angle(sine: float, cosine: float) -> float:
 
 
 @kernel
-def _light_points(shape: Quadric, light: Light, patch: Patch, lights: np.ndarray) -> None:
-    """Fill `lights` with the luminance at four points of each row, times their parts of the row.
+def _light_points(shape: Quadric, light: Light, patch: Patch, bends: Bends) -> None:
+    """Fill `bends.lights` with the luminance at four points of each row, times their parts of the row.
 
-    At each of two slopes, quarters of what two edges leave of a row. A loop without branches: rays
-    side by side take a vector's time.
+    At each of two slopes, quarters of what two edges leave of a row; the rest of `bends` is where that is. A
+    loop without branches: rays side by side take a vector's time.
     """
     top, bottom, horizon, per_row = patch.top, patch.bottom, patch.horizon, patch.per_row
+    lights, turns, aheads, ups, talls = bends
     fall_top, fall_bottom = top.right - top.left, bottom.right - bottom.left
     per_top, per_bottom = _inverse(fall_top), _inverse(fall_bottom)
     high, low = min(top.left, top.right), max(bottom.left, bottom.right)
@@ -246,6 +245,9 @@ def _light_points(shape: Quadric, light: Light, patch: Patch, lights: np.ndarray
         length = math.sqrt(max(LEAST, shape.size + shape.ratio * (shape.ratio - 1.0) * place.up * place.up))
         towards = place.right * light.right + place.forward * light.forward
         towards = (towards + shape.ratio * place.up * light.up) / length
+        turns[p] = place.right * shape.forward - place.forward * shape.right
+        aheads[p] = -(place.right * shape.right + place.forward * shape.forward)
+        ups[p], talls[p] = place.up, tall
         lights[p] = 0.5 * tall * share * (light.ambient + light.diffuse * min(1.0, max(0.0, towards)))
 
 

@@ -130,13 +130,17 @@ class Bends(NamedTuple):
 
     Attributes:
         lights: float64 (4 * R,), of the points of a row.
-        turns: float64 (8 * R,), angles around the axis, of the corners of a row's halves [rad].
-        ups: float64 (8 * R,), their heights [m].
+        turns, aheads: float64 (4 * R,), sines and cosines of their angles around the axis, from the direction
+            to the eye, times their distance from it and the eye's [m^2]; then the angles [rad].
+        ups: float64 (4 * R,), their heights [m].
+        talls: float64 (4 * R,), how much of the row shows at their slopes [rows].
     """
 
     lights: np.ndarray
     turns: np.ndarray
+    aheads: np.ndarray
     ups: np.ndarray
+    talls: np.ndarray
 
 
 class Canvas(NamedTuple):

@@ -196,12 +196,12 @@ def _is_curved(body: Record) -> bool:
 
 @kernel
 def _cut_for_body(canvas: Canvas, body: Record, count: int) -> int:
-    """Cut the gaps where a body's edges cross theirs, and in two for a pattern that bends around it."""
+    """Cut the gaps where a body's edges cross theirs, and in two for a pattern that bends around a pole."""
     gaps, strip = canvas.gaps, canvas.strip
     count = _cut_gaps(gaps, strip, count)
     broad = strip.slopes.right - strip.slopes.left > MAX_SHARE * (body.high - body.low)
     textured = canvas.frame.body_texture.contrast > 0.0
-    if textured and body.kind != BOX and broad and 2 * count < len(gaps):
+    if textured and body.kind == POLE and broad and 2 * count < len(gaps):
         for k in range(count):
             coverage.cut_gap(gaps, k, count + k, 0.5)
         count *= 2

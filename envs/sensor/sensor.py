@@ -7,8 +7,10 @@ import numpy as np
 from envs.checks import check_pose
 from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, RealSensor
+from envs.events.faults import NO_NOISE as NO_PIXEL_NOISE
 from envs.events.faults import has_readout
 from envs.events.lowpass import UNLIMITED
+from envs.events.pixel_noise import PixelState
 from envs.events.ramps import ColumnCamera
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
@@ -137,12 +139,18 @@ class Sensor:
         scratch = scratch_for(*size, len(scene[0]))
         return View(*scene, model, memory, self._seen_us, bandwidth, shifts, scratch)
 
-    def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
-        """The events of a step after the faults of this sensor."""
+    def pixel_noise(self) -> PixelState:
+        """What a compiled step needs to fire the noise of this sensor's pixels."""
+        return self._real.pixel_noise if self.sees_by_looks else NO_PIXEL_NOISE
+
+    def with_faults(
+        self, events: np.ndarray, start_us: int, end_us: int, fired: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The events of a step after the faults of this sensor; `fired` as `RealSensor.events` takes it."""
         self.true_events = events
         if not self.has_faults:
             return events
-        return self._real.events(events, start_us, end_us)
+        return self._real.events(events, start_us, end_us, fired)
 
     def _look_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
         """Events of a way, of which each column is looked at when something changes in it."""

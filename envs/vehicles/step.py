@@ -1,7 +1,8 @@
 """One control step of many vehicles in one compiled call.
 
 It moves each vehicle, finds contact and goal, and simulates the camera of every sensor that sees
-by looks (`envs.sensor`). Other sensors, and faults, take their turn in Python afterwards.
+by looks (`envs.sensor`), and the noise of its pixels. Other sensors, and all other faults, take
+their turn in Python afterwards.
 """
 
 import numba
@@ -9,6 +10,7 @@ import numpy as np
 from numba.typed import List
 
 from envs.events import EVENT
+from envs.events.pixel_noise import fire
 from envs.fidelity import parts_of
 from envs.kinematics import Lane, advance, clock_us, planned_position
 from envs.raycast.silhouettes import Way
@@ -40,7 +42,10 @@ VEHICLE = np.dtype(
 
 @numba.njit(cache=True, error_model="numpy")
 def corridor_list(corridor, count):
-    """A list with `count` times the same corridor: level sections of what stands there, and a `View`."""
+    """A list with `count` times the same corridor: level sections of what stands there, and a `View`.
+
+    Or with the same `PixelState`.
+    """
     corridors = List()
     for _ in range(count):
         corridors.append(corridor)
@@ -54,21 +59,24 @@ def set_corridor(corridors, row, corridor):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def step_all(rows, corridors, actions, active):
+def step_all(rows, corridors, noisy, actions, active):
     """One control step of all active vehicles.
 
     Args:
         rows: (B,) VEHICLE, changed in place.
         corridors: A list of B, see `corridor_list`.
+        noisy: A list of B `PixelState`, of cameras that see by looks.
         actions: int64 (B,).
         active: bool (B,).
 
     Returns:
-        EVENT of those that see by looks, vehicle after vehicle; int64 (B + 1,), where the events of each end.
+        EVENT of those that see by looks, vehicle after vehicle; int64 (B + 1,), where the events of each end;
+        and what the noise of their pixels fired, int64 (3, M) as `pixel_noise.fire` returns it, and its ends.
     """
     found, ends = [np.empty(0, EVENT)], np.zeros(rows.size + 1, np.int64)
+    noise, noise_ends = [np.empty((3, 0), np.int64)], np.zeros(rows.size + 1, np.int64)
     for row in range(rows.size):
-        ends[row + 1] = ends[row]
+        ends[row + 1], noise_ends[row + 1] = ends[row], noise_ends[row]
         if active[row]:
             sections, view = corridors[row]
             _move(rows[row], actions[row], sections)
@@ -76,12 +84,21 @@ def step_all(rows, corridors, actions, active):
                 events = _look(rows[row], view)
                 found.append(events)
                 ends[row + 1] += events.size
+                pixels = noisy[row]
+                if pixels.rows[2].size > 0 and rows[row].problem == GOOD:  # while its memory is in the cache
+                    fired = fire(rows[row].start_us, rows[row].t_us, view.model, view.memory, pixels)
+                    noise.append(fired)
+                    noise_ends[row + 1] += fired.shape[1]
             rows[row].over |= rows[row].problem != GOOD
     together, size = np.empty(ends[-1], EVENT), 0
     for events in found:
         together[size : size + events.size] = events
         size += events.size
-    return together, ends
+    all_noise, size = np.empty((3, noise_ends[-1]), np.int64), 0
+    for fired in noise:
+        all_noise[:, size : size + fired.shape[1]] = fired
+        size += fired.shape[1]
+    return together, ends, all_noise, noise_ends
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -7,6 +7,7 @@ import numpy as np
 from envs.config import EnvConfig
 from envs.events import EVENT
 from envs.events.neighbour_filter import NEVER, filter_all
+from envs.events.pixel_noise import PixelState
 from envs.kinematics import Outcome, clock_us
 from envs.scene import Scene
 from envs.sensor import Sensor, check_sensed
@@ -41,6 +42,8 @@ class Vehicles:
         self._sensors: list[Sensor | None] = [None] * count
         self._in_python: set[int] = set()
         self._corridors: Any = None
+        self._noise: Any = None  # of pixels
+        self._noise_of: list[PixelState | None] = [None] * count
         self._decided = np.zeros((count, 0), np.int64)  # actions not yet taken, the delay's steps in turn
         self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
         self._support, self._tau_us = np.zeros((2, count), np.int64)
@@ -61,10 +64,15 @@ class Vehicles:
         vehicle["window_us"], vehicle["problem"] = clock_us(1, config.control_hz), GOOD
         self._set_delay(row, config.delay_steps)
         self._sensors[row] = sensor
-        corridor = scene.sections(config.camera_height_m), sensor.view()
+        corridor, noise = (scene.sections(config.camera_height_m), sensor.view()), sensor.pixel_noise()
         if self._corridors is None:
             self._corridors = corridor_list(corridor, len(self.rows))
+            self._noise = corridor_list(noise, len(self.rows))
+            self._noise_of = [noise] * len(self.rows)
         set_corridor(self._corridors, row, corridor)
+        if noise is not self._noise_of[row]:  # numba takes milliseconds to find the type of a random stream
+            set_corridor(self._noise, row, noise)
+            self._noise_of[row] = noise
         self._set_filter(row, config)
         self._in_python.discard(row)
         if not sensor.sees_by_looks or sensor.has_faults:
@@ -84,7 +92,9 @@ class Vehicles:
         """
         rows = self.rows
         taken = self._exchange(actions, active)
-        self.events, self.ends = step_all(rows, self._corridors, taken, active)
+        self.events, self.ends, noise, noise_ends = step_all(
+            rows, self._corridors, self._noise, taken, active
+        )
         wrong = active & (rows["problem"] != GOOD)
         if wrong.any():
             self._refuse(int(wrong.argmax()))
@@ -92,7 +102,7 @@ class Vehicles:
         if in_python:
             parts = [self.events_of(row) for row in range(len(rows))]
             for row in in_python:
-                parts[row] = self._sense(row, parts[row])
+                parts[row] = self._sense(row, parts[row], noise[:, noise_ends[row] : noise_ends[row + 1]])
             np.cumsum([part.size for part in parts], out=self.ends[1:])
             self.events = np.concatenate(parts)
         counts = np.diff(self.ends)[active]
@@ -162,14 +172,14 @@ class Vehicles:
                 self._last_us[:, : before.shape[1], : before.shape[2]] = before
             self._last_us[row] = NEVER
 
-    def _sense(self, row: int, events: np.ndarray) -> np.ndarray:
-        """Events of a step that the compiled call has not simulated to the end."""
+    def _sense(self, row: int, events: np.ndarray, fired: np.ndarray) -> np.ndarray:
+        """Events of a step that the compiled call has not simulated to the end, as far as it has."""
         vehicle, sensor = self.rows[row], self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
         start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
         try:
             if vehicle["by_looks"]:
-                events = sensor.with_faults(events, start_us, t_us)
+                events = sensor.with_faults(events, start_us, t_us, fired)
                 vehicle["dropped"] += sensor.lost
                 return events
             end = float(vehicle["x_m"]), float(vehicle["y_m"])

@@ -212,6 +212,24 @@ def test_bent_bodies_are_lit_as_the_mean_of_a_much_finer_image(name):
         assert np.sqrt(((np.log(image) - truth) ** 2).mean()) < limit
 
 
+@pytest.mark.parametrize("kind", [CONE, ELLIPSOID])
+@pytest.mark.parametrize("texture", [Texture(), Texture("noise", 1.0, 0.8)])
+def test_a_body_that_a_bent_one_hides_changes_no_byte_and_one_that_shows_does(kind, texture):
+    near = body(kind, 0.0, 6.0, 2.5, 1.8, 2.5)
+
+    def image(*behind):
+        scene = Scene("hand", np.concatenate([near, *behind]), obstacle_texture=texture)
+        return RaycastRenderer(scene, 64, 64).render(0.0, 0.0, 2.0, 0.0)
+
+    alone = image()
+    hidden = [
+        body(other, x, 30.0, 1.0, 0.5, 1.0) for other, x in zip(KINDS, (-3.0, -1.0, 1.0, 3.0), strict=True)
+    ]
+    assert np.array_equal(image(*hidden), alone)
+    for x, z in ((0.0, 9.0), (9.0, 1.0), (-9.0, 1.0)):  # above it, and beside it on both sides
+        assert not np.array_equal(image(body(POLE, x, 30.0, z, 0.5, z)), alone)
+
+
 def test_bodies_beyond_the_culling_distance_are_left_out_and_no_others():
     scene = forest(KINDS, np.random.default_rng(4))
     o = scene.obstacles

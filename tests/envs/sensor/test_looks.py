@@ -3,9 +3,11 @@ import itertools
 import numpy as np
 import pytest
 
-from envs.config import CameraConfig, EnvConfig, FidelityConfig
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
+from envs.corridor import CorridorEnv
 from envs.event_error import event_error
 from envs.events import EventCamera
+from envs.events.pixel_noise import no_noise
 from envs.kinematics import Outcome, clock_us
 from envs.raycast import RaycastRenderer
 from envs.raycast.columns import aim, paint_columns
@@ -189,3 +191,19 @@ def test_steps_of_a_few_microseconds(step_us):
         sensor.step(start, Outcome(end, 1.0, 1.0, False, False), (k + 1) * step_us)
         assert sensor.events.size > 0
         assert k * step_us < sensor.events["t"].min() <= sensor.events["t"].max() <= (k + 1) * step_us
+
+
+@pytest.mark.parametrize("camera", [CameraConfig(), CameraConfig(cutoff_hz=30.0, threshold_mismatch=0.25)])
+def test_noise_of_pixels_is_the_same_fired_in_the_compiled_step_or_after_it(monkeypatch, camera):
+    config = EnvConfig(camera=camera, faults=FaultsConfig(shot_noise_hz=5.0, leak_hz=0.1, hot_pixel_hz=9.0))
+
+    def events():
+        env = CorridorEnv(config)
+        env.reset(seed=1)
+        return [(env.step(k % 3), env.events.tobytes())[1] for k in range(8)]
+
+    together, after = events(), Sensor.with_faults
+    assert sum(map(len, together)) > 0
+    monkeypatch.setattr(Sensor, "pixel_noise", lambda _: no_noise())
+    monkeypatch.setattr(Sensor, "with_faults", lambda sensor, *step: after(sensor, *step[:3]))
+    assert events() == together
