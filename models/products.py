@@ -54,17 +54,17 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 @intrinsic
 def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
-    typing: Any, a: Any, i: Any, k: Any, panel: Any, depth: Any, out: Any, row: Any, column: Any
+    typing: Any, a: Any, i: Any, k: Any, panel: Any, depth: Any, out: Any, row: Any, column: Any, anew: Any
 ) -> Any:
     """Continue the chains of the tile of `out` at (row, column) by `depth` numbers of a[i:, k:] and `panel`.
 
-    Rows below the last one of `a` are taken to be that one. LLVM is given whole vectors, because it may not
+    With `anew` they begin at 0. Rows below the last one of `a` are taken to be that one. LLVM is given whole vectors, because it may not
     reorder the sums of a loop to fill them itself.
     """
     size, index = out.dtype.bitwidth // 8, types.intp
 
     def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        a_value, i, k, panel_value, depth, out_value, row, column = values
+        a_value, i, k, panel_value, depth, out_value, row, column, anew = values
         vector, word = ir.VectorType(context.get_value_type(out.dtype), LINE // size), depth.type
         same = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
 
@@ -80,7 +80,7 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
         (rows, a_start, a_by), (_, panel_start, panel_by), (_, out_start, out_by) = (
             opened(kind, value) for kind, value in ((a, a_value), (panel, panel_value), (out, out_value))
         )
-        byte, last = ir.IntType(8), builder.sub(rows, word(1))
+        byte, last, zeros = ir.IntType(8), builder.sub(rows, word(1)), cgutils.alloca_once(builder, vector)
         a_rows, places, sums = [], [], []
         for r in range(ROWS):
             there = builder.add(i, word(r))
@@ -89,7 +89,8 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
             out_row = moved(out_start, builder.add(row, word(r)), out_by[0], byte)
             places.append(moved(out_row, column, out_by[1], vector))
             sums.append(cgutils.alloca_once(builder, vector))
-            builder.store(builder.load(places[r], align=size), sums[r])
+            source = builder.select(anew, zeros, places[r])
+            builder.store(builder.load(source, align=size), sums[r])
         with cgutils.for_range(builder, depth) as loop:
             line = builder.load(moved(panel_start, loop.index, panel_by[0], vector), align=size)
             for start, total in zip(a_rows, sums, strict=True):
@@ -101,7 +102,7 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
             builder.store(builder.load(total), place, align=size)
         return context.get_dummy_value()
 
-    return types.void(a, index, index, panel, index, out, index, index), emit
+    return types.void(a, index, index, panel, index, out, index, index, types.boolean), emit
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -120,14 +121,14 @@ def _copy(part, room) -> None:  # type: ignore[no-untyped-def]
 def _of(number: Any) -> Any:
     """The signature of `add_product` for matrices of a type of numbers, in any layout."""
     matrix = types.Array(number, 2, "A")
-    return types.void(matrix, matrix, matrix)
+    return types.void(matrix, matrix, matrix, types.boolean)
 
 
 @numba.njit([_of(types.float32), _of(types.float64)], cache=True, error_model="numpy", nogil=True)
-def add_product(a, b, out) -> None:  # type: ignore[no-untyped-def]
+def add_product(a, b, out, anew) -> None:  # type: ignore[no-untyped-def]
     """Add a (M, K) @ b (K, N) to `out` (M, N) by one thread, in the order that this file states.
 
-    Assumes the shapes, one type, float32 or float64, and that `out` shares no memory with the others.
+    With `anew` its chains begin at 0, whatever `out` holds. Assumes the shapes, one type, float32 or float64, and that `out` shares no memory with the others.
     """
     rows, columns, depths, lanes = out.shape[0], out.shape[1], a.shape[1], LINE // out.itemsize
     in_line = out.strides[1] == out.itemsize
@@ -141,7 +142,7 @@ def add_product(a, b, out) -> None:  # type: ignore[no-untyped-def]
     corner, packed = room[:ROWS], room[ROWS:]
     for begin in range(0, rows, HEIGHT):
         end = min(begin + HEIGHT, rows)
-        for k in range(0, depths, DEPTH):
+        for k in range(0, max(depths, 1), DEPTH):
             depth = min(DEPTH, depths - k)
             for j in range(0, columns, lanes):
                 width = min(lanes, columns - j)
@@ -151,11 +152,11 @@ def add_product(a, b, out) -> None:  # type: ignore[no-untyped-def]
                     panel = packed
                 for i in range(begin, end, ROWS):
                     if in_line and i + ROWS <= end and width == lanes:
-                        _add_tile(a, i, k, panel, depth, out, i, j)
+                        _add_tile(a, i, k, panel, depth, out, i, j, anew and not k)
                         continue
                     there = out[i : min(i + ROWS, end), j : j + width]
                     _copy(there, corner)
-                    _add_tile(a, i, k, panel, depth, corner, 0, 0)
+                    _add_tile(a, i, k, panel, depth, corner, 0, 0, anew and not k)
                     _copy(corner[: there.shape[0], :width], there)
 
 
@@ -198,19 +199,19 @@ def _helpers(threads: int) -> ThreadPoolExecutor:
 os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads do not follow
 
 
-def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray, anew: bool) -> None:
     """As `add_product`, by as many threads as torch has, which share the rows or the columns of `out`."""
     threads = torch.get_num_threads()
     if threads == 1 or out.size * len(b) < SHARED:
-        add_product(a, b, out)
+        add_product(a, b, out, anew)
         return
     by_rows = out.shape[0] >= out.shape[1]
     step = ROWS if by_rows else LINE // out.itemsize
     size = -(-max(out.shape) // (threads * step)) * step
     parts = [slice(begin, begin + size) for begin in range(0, max(out.shape), size)]
     calls = [(a[part], b, out[part]) if by_rows else (a, b[:, part], out[:, part]) for part in parts]
-    others = [_helpers(threads).submit(add_product, *call) for call in calls[1:]]
-    add_product(*calls[0])
+    others = [_helpers(threads).submit(add_product, *call, anew) for call in calls[1:]]
+    add_product(*calls[0], anew)
     for other in others:
         other.result()
 
@@ -222,8 +223,8 @@ class Product(torch.autograd.Function):
     def forward(ctx: Any, a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
         """The product (M, N)."""
         ctx.save_for_backward(a, b)
-        out = a.new_zeros(len(a), b.shape[1]) if bias is None else bias.detach().repeat(len(a), 1)
-        add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy())
+        out = a.new_empty(len(a), b.shape[1]) if bias is None else bias.detach().repeat(len(a), 1)
+        add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy(), bias is None)
         return out
 
     @staticmethod
@@ -246,8 +247,8 @@ def _product_like(like: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Compute a @ b, with the columns next to each other in memory where those of `like` are."""
     if like.stride(0) < like.stride(1):
         return _product_like(like.T, b.T, a.T).T
-    out = a.new_zeros(len(a), b.shape[1])
-    add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy())
+    out = a.new_empty(len(a), b.shape[1])
+    add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy(), True)
     return out
 
 
