@@ -218,7 +218,7 @@ def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray, anew: bool
     step = ROWS if by_rows else LINE // out.itemsize
     size = -(-max(out.shape) // (threads * step)) * step
     parts = [slice(begin, begin + size) for begin in range(0, max(out.shape), size)]
-    calls = [
+    calls: list[Any] = [
         (a[part], b, out[part], anew) if by_rows else (a, b[:, part], out[:, part], anew) for part in parts
     ]
     others = [_helpers(threads).submit(add_product, *call) for call in calls[1:]]
