@@ -27,8 +27,9 @@ from torch.nn import functional
 
 ROWS = 6  # of a tile: with a line of columns its sums fill the registers of AVX2
 LINE = 64  # bytes, one row of a tile
-DEPTH, HEIGHT = 256, 192  # of a block: a panel of it stays in the first cache, its rows in the second
+DEPTH, HEIGHT = 1024, 192  # of a block: it stays in the second cache
 NEAR = 1 << 15  # bytes between its first and last line up to which a panel is not copied
+LINES = 4  # of a block of columns, read together
 CHAINS = 64  # of a `dot`
 SHARED = 1 << 21  # products of numbers from which a second thread is worth waking
 
@@ -54,17 +55,17 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 @intrinsic
 def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
-    typing: Any, a: Any, i: Any, k: Any, panel: Any, depth: Any, out: Any, row: Any, column: Any
+    typing: Any, a: Any, i: Any, k: Any, panel: Any, depth: Any, out: Any, row: Any, column: Any, anew: Any
 ) -> Any:
     """Continue the chains of the tile of `out` at (row, column) by `depth` numbers of a[i:, k:] and `panel`.
 
-    Rows below the last one of `a` are taken to be that one. LLVM is given whole vectors, because it may not
-    reorder the sums of a loop to fill them itself.
+    With `anew` they begin at 0. Rows below the last one of `a` are taken to be that one. LLVM is given whole
+    vectors, because it may not reorder the sums of a loop to fill them itself.
     """
     size, index = out.dtype.bitwidth // 8, types.intp
 
     def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        a_value, i, k, panel_value, depth, out_value, row, column = values
+        a_value, i, k, panel_value, depth, out_value, row, column, anew = values
         vector, word = ir.VectorType(context.get_value_type(out.dtype), LINE // size), depth.type
         same = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
 
@@ -80,7 +81,7 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
         (rows, a_start, a_by), (_, panel_start, panel_by), (_, out_start, out_by) = (
             opened(kind, value) for kind, value in ((a, a_value), (panel, panel_value), (out, out_value))
         )
-        byte, last = ir.IntType(8), builder.sub(rows, word(1))
+        byte, last, zeros = ir.IntType(8), builder.sub(rows, word(1)), cgutils.alloca_once(builder, vector)
         a_rows, places, sums = [], [], []
         for r in range(ROWS):
             there = builder.add(i, word(r))
@@ -89,7 +90,8 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
             out_row = moved(out_start, builder.add(row, word(r)), out_by[0], byte)
             places.append(moved(out_row, column, out_by[1], vector))
             sums.append(cgutils.alloca_once(builder, vector))
-            builder.store(builder.load(places[r], align=size), sums[r])
+            source = builder.select(anew, zeros, places[r])
+            builder.store(builder.load(source, align=size), sums[r])
         with cgutils.for_range(builder, depth) as loop:
             line = builder.load(moved(panel_start, loop.index, panel_by[0], vector), align=size)
             for start, total in zip(a_rows, sums, strict=True):
@@ -101,7 +103,7 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
             builder.store(builder.load(total), place, align=size)
         return context.get_dummy_value()
 
-    return types.void(a, index, index, panel, index, out, index, index), emit
+    return types.void(a, index, index, panel, index, out, index, index, types.boolean), emit
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -120,43 +122,51 @@ def _copy(part, room) -> None:  # type: ignore[no-untyped-def]
 def _of(number: Any) -> Any:
     """The signature of `add_product` for matrices of a type of numbers, in any layout."""
     matrix = types.Array(number, 2, "A")
-    return types.void(matrix, matrix, matrix)
+    return types.void(matrix, matrix, matrix, types.boolean)
 
 
 @numba.njit([_of(types.float32), _of(types.float64)], cache=True, error_model="numpy", nogil=True)
-def add_product(a, b, out) -> None:  # type: ignore[no-untyped-def]
+def add_product(a, b, out, anew) -> None:  # type: ignore[no-untyped-def]  # noqa: C901 - loops over blocks
     """Add a (M, K) @ b (K, N) to `out` (M, N) by one thread, in the order that this file states.
 
-    Assumes the shapes, one type, float32 or float64, and that `out` shares no memory with the others.
+    With `anew` its chains begin at 0, whatever `out` holds. Assumes the shapes, one type, float32 or float64,
+    and that `out` shares no memory with the others.
     """
     rows, columns, depths, lanes = out.shape[0], out.shape[1], a.shape[1], LINE // out.itemsize
-    in_line = out.strides[1] == out.itemsize
-    near = b.strides[1] == b.itemsize and b.strides[0] * min(DEPTH, depths) <= NEAR
-    room = np.empty((ROWS + 1 + min(DEPTH, depths)) * lanes, out.dtype)
-    room = room[-room.ctypes.data % LINE // out.itemsize :][: (ROWS + min(DEPTH, depths)) * lanes].reshape(
-        (-1, lanes)
-    )
+    lines = 1 if b.strides[0] < b.strides[1] else max(1, min(LINES, -(-columns // lanes)))
+    most, wide = min(DEPTH, depths), lines * lanes
+    in_line, near = out.strides[1] == out.itemsize, b.strides[1] == b.itemsize and b.strides[0] * most <= NEAR
+    room = np.empty((ROWS + 1 + most) * wide, out.dtype)
     if columns % lanes:
         room[:] = 0.0  # numbers in columns that are not there could be slow ones
-    corner, packed = room[:ROWS], room[ROWS:]
+    room = room[-room.ctypes.data % LINE // out.itemsize :]
+    corner, packed = room[: ROWS * wide].reshape((ROWS, wide)), room[ROWS * wide : (ROWS + most) * wide]
+    far = a.strides[0] < a.strides[1] and a.strides[1] * most > NEAR
+    turned = np.empty((most if far else 0, min(HEIGHT, rows)), out.dtype)
     for begin in range(0, rows, HEIGHT):
         end = min(begin + HEIGHT, rows)
-        for k in range(0, depths, DEPTH):
+        for k in range(0, max(depths, 1), DEPTH):
             depth = min(DEPTH, depths - k)
-            for j in range(0, columns, lanes):
-                width = min(lanes, columns - j)
-                panel = b[k : k + depth, j : j + width]
-                if not near or width < lanes:
-                    _copy(panel, packed)
-                    panel = packed
+            own, top, first = a, 0, k
+            if far:
+                own, top, first = turned.T[: end - begin], begin, 0
+                _copy(a[begin:end, k : k + depth], own)
+            for left in range(0, columns, wide):
+                right = min(left + wide, columns)
+                block = b[k : k + depth, left:right]
+                if not near or (right - left) % lanes:
+                    block = packed.reshape((most, wide))
+                    _copy(b[k : k + depth, left:right], block)
                 for i in range(begin, end, ROWS):
-                    if in_line and i + ROWS <= end and width == lanes:
-                        _add_tile(a, i, k, panel, depth, out, i, j)
-                        continue
-                    there = out[i : min(i + ROWS, end), j : j + width]
-                    _copy(there, corner)
-                    _add_tile(a, i, k, panel, depth, corner, 0, 0)
-                    _copy(corner[: there.shape[0], :width], there)
+                    for j in range(left, right, lanes):
+                        panel = block[:, j - left :]
+                        if in_line and i + ROWS <= end and j + lanes <= right:
+                            _add_tile(own, i - top, first, panel, depth, out, i, j, anew and not k)
+                            continue
+                        there = out[i : min(i + ROWS, end), j : min(j + lanes, right)]
+                        _copy(there, corner)
+                        _add_tile(own, i - top, first, panel, depth, corner, 0, 0, anew and not k)
+                        _copy(corner[: there.shape[0], : there.shape[1]], there)
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -198,17 +208,19 @@ def _helpers(threads: int) -> ThreadPoolExecutor:
 os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads do not follow
 
 
-def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray, anew: bool) -> None:
     """As `add_product`, by as many threads as torch has, which share the rows or the columns of `out`."""
     threads = torch.get_num_threads()
     if threads == 1 or out.size * len(b) < SHARED:
-        add_product(a, b, out)
+        add_product(a, b, out, anew)
         return
     by_rows = out.shape[0] >= out.shape[1]
     step = ROWS if by_rows else LINE // out.itemsize
     size = -(-max(out.shape) // (threads * step)) * step
     parts = [slice(begin, begin + size) for begin in range(0, max(out.shape), size)]
-    calls = [(a[part], b, out[part]) if by_rows else (a, b[:, part], out[:, part]) for part in parts]
+    calls: list[Any] = [
+        (a[part], b, out[part], anew) if by_rows else (a, b[:, part], out[:, part], anew) for part in parts
+    ]
     others = [_helpers(threads).submit(add_product, *call) for call in calls[1:]]
     add_product(*calls[0])
     for other in others:
@@ -222,8 +234,8 @@ class Product(torch.autograd.Function):
     def forward(ctx: Any, a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
         """The product (M, N)."""
         ctx.save_for_backward(a, b)
-        out = a.new_zeros(len(a), b.shape[1]) if bias is None else bias.detach().repeat(len(a), 1)
-        add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy())
+        out = a.new_empty(len(a), b.shape[1]) if bias is None else bias.detach().repeat(len(a), 1)
+        add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy(), bias is None)
         return out
 
     @staticmethod
@@ -246,8 +258,8 @@ def _product_like(like: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Compute a @ b, with the columns next to each other in memory where those of `like` are."""
     if like.stride(0) < like.stride(1):
         return _product_like(like.T, b.T, a.T).T
-    out = a.new_zeros(len(a), b.shape[1])
-    add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy())
+    out = a.new_empty(len(a), b.shape[1])
+    add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy(), True)
     return out
 
 

@@ -169,7 +169,7 @@ def tabulated(evae: EventVAE) -> list[np.ndarray]:
 def learnt(config: Config) -> list[np.ndarray]:
     """The weights of a policy after two updates of the experiment's learner."""
     torch.manual_seed(0)
-    logging.getLogger("ray.rllib").setLevel(logging.ERROR)  # it calls its own settings outdated
+    logging.getLogger("ray").setLevel(logging.ERROR)  # it calls its own settings outdated
     ppo = build_ppo(config)
     with warnings.catch_warnings(action="ignore"):  # the stage before has registered the same environment
         runner = env_runner(config)(config=ppo, worker_index=0)

@@ -178,7 +178,8 @@ def folded(
 
     The batch mean and variance of W h follow from those of h: W mean(h) and diag(W cov(h) W^T).
     So the normalisation costs a small covariance instead of passes over all features, and
-    leaves the gradient of the output sparse.
+    leaves the gradient of the output sparse. The root is `rsqrt`'s: that of `sqrt` is MKL's, and not the same
+    on every processor.
 
     Args:
         layer: Without bias if `norm` is given.
@@ -193,7 +194,7 @@ def folded(
     if norm is None:
         return h, layer.weight, layer.bias
     if share is None:
-        scale = norm.weight / (norm.running_var + norm.eps) ** 0.5
+        scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
         return h, layer.weight * scale[:, None], norm.bias - norm.running_mean * scale
     centre = product(share[None], h)[0]
     h = h - centre
@@ -203,7 +204,7 @@ def folded(
         norm.num_batches_tracked += 1
         norm.running_mean.lerp_(product(layer.weight, centre[:, None])[:, 0], norm.momentum)
         norm.running_var.lerp_(variance * (events / (events - 1)), norm.momentum)
-    return h, layer.weight * (norm.weight / (variance + norm.eps) ** 0.5)[:, None], norm.bias
+    return h, layer.weight * (norm.weight * torch.rsqrt(variance + norm.eps))[:, None], norm.bias
 
 
 class Events(NamedTuple):

@@ -220,7 +220,7 @@ def _forward(inputs, network):  # type: ignore[no-untyped-def]
         to += out.size
         for b in range(count):
             out[b] = bias
-        add_product(shown, weights.T, out)
+        add_product(shown, weights.T, out, False)
         if k < len(widths) - 1:
             tanh(out.reshape(-1))
         shown = out
@@ -289,13 +289,12 @@ def _backward(inputs, network):  # type: ignore[no-untyped-def]
         before = to - count * widths[k - 1]
         shown = inputs if k == 1 else _part(network.outputs, before, count, widths[k - 1])
         of_weights = _part(network.gradient, at, widths[k], widths[k - 1])
-        of_weights[:], of_bias[:] = F32(0.0), F32(0.0)
-        add_product(slopes.T, shown, of_weights)
+        of_bias[:] = F32(0.0)
+        add_product(slopes.T, shown, of_weights, True)
         add_rows(slopes, of_bias)
         if k > 1:
             below = _part(network.of_outputs, before, count, widths[k - 1])
-            below[:] = F32(0.0)
-            add_product(slopes, _part(network.values, at, widths[k], widths[k - 1]), below)
+            add_product(slopes, _part(network.values, at, widths[k], widths[k - 1]), below, True)
             for b in range(count):
                 row, out = below[b], shown[b]
                 for j in range(len(row)):

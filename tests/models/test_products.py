@@ -73,8 +73,10 @@ def test_a_product_is_the_chains_of_its_elements_bit_for_bit(shape, seed, layout
     )
     expected = chains(a, b, np.ascontiguousarray(first))
     out = LAYOUTS[layouts[2]](first.copy())
-    add_product(a, b, out)
+    add_product(a, b, out, False)
     assert out.tobytes() == expected.tobytes()
+    add_product(a, b, out, True)
+    assert out.tobytes() == chains(a, b, np.zeros_like(first, order="C")).tobytes()
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
@@ -84,7 +86,7 @@ def test_a_product_is_the_chains_of_its_elements_bit_for_bit(shape, seed, layout
 def test_blocks_continue_the_chains_and_keep_to_the_bound(shape, dtype):
     rng, (m, k, n) = np.random.default_rng(0), shape
     a, b, out = numbers(rng, m, k, dtype=dtype), numbers(rng, k, n, dtype=dtype), np.zeros((m, n), dtype)
-    add_product(a, b, out)
+    add_product(a, b, out, False)
     exact = a.astype(np.longdouble) @ b.astype(np.longdouble)
     bound = (
         (k + 0.001)
@@ -95,7 +97,7 @@ def test_blocks_continue_the_chains_and_keep_to_the_bound(shape, dtype):
     assert (np.abs(out - exact) <= bound).all()
     part = np.zeros_like(out)
     for begin, end in ((0, k // 3), (k // 3, k // 2), (k // 2, k)):  # the chains of the whole, in three links
-        add_product(a[:, begin:end], b[begin:end], part)
+        add_product(a[:, begin:end], b[begin:end], part, False)
     assert part.tobytes() == out.tobytes()
 
 
@@ -106,7 +108,7 @@ def test_threads_change_no_byte(shape):
     for threads in (1, 2, 3):
         out = np.ones((m, n), np.float32)
         with torch_threads(threads):
-            add_product_shared(a, b, out)
+            add_product_shared(a, b, out, False)
         found.append(out.tobytes())
     assert found[0] == found[1] == found[2]
 
