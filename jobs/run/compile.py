@@ -252,9 +252,9 @@ def learn() -> None:
     import torch
     from torch import nn
 
+    from models.encoder.products import orthogonal_
     from models.policy.dense_update import Rows, Settings, update_dense
     from models.policy.networks import logits_by, mlp
-    from models.products import orthogonal_
 
     networks = [mlp(2, (2,), outputs) for outputs in (3, 1)]
     optimizer = torch.optim.Adam(nn.ModuleList(networks).parameters(), fused=True)

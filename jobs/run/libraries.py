@@ -21,7 +21,7 @@ ONE_THREAD = {
 
 # Each library picks its code by the processor, and rounds as that code does. These settings let it pick the
 # same on every x86-64 processor with AVX2. MKL obeys none but COMPATIBLE on AMD; what must be fast is not
-# MKL's (models/products.py).
+# MKL's (models/encoder/products.py).
 SAME_DIGITS = {
     "ATEN_CPU_CAPABILITY": "avx2",  # torch's own loops
     "ONEDNN_MAX_CPU_ISA": "AVX2",  # its convolutions

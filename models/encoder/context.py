@@ -33,7 +33,7 @@ from torch.nn import functional
 from models.encoder.embedding import embedding_table, eventnet_phase
 from models.encoder.event_batch import EventBatch, Grid, distinct
 from models.encoder.gpu_context import max_context
-from models.products import Linear, affine, product
+from models.encoder.products import Linear, affine, product
 
 DTYPES = (torch.float32, torch.float64)
 

@@ -23,8 +23,8 @@ from torch.nn import functional
 from models.encoder.context import EventContextNetwork
 from models.encoder.event_batch import EventBatch, Grid
 from models.encoder.event_images import PictureContextNetwork, cell_counts, last_polarity, newest_time
+from models.encoder.products import Linear
 from models.kinds import EvaeSettings, checked
-from models.products import Linear
 
 CELLS = 8  # each way, of the target "counts"
 COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows
+from models.encoder.products import Linear, orthogonal_
 from models.kinds import MIN_IMAGE
-from models.products import Linear, orthogonal_
 
 OFF_SHARE = 125.0 / 255.0  # of the picture value of ON (appendix D.1.2)
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from models.products import add_product, add_rows, aligned, dot, fma
+from models.encoder.products import add_product, add_rows, aligned, dot, fma
 
 compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
 F32 = np.float32

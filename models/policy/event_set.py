@@ -22,8 +22,8 @@ import torch
 from torch import Tensor, nn
 
 from models.encoder.event_batch import ROW_EMPTY, ROW_OFF, ROW_ON, EventBatch, Grid, batch_rows, distinct
+from models.encoder.products import Linear
 from models.encoder.table import dense
-from models.products import Linear
 
 EVENTS = 256  # of a window that the network sees
 TIMES = 1024  # steps into which a window's time is rounded

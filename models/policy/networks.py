@@ -18,12 +18,12 @@ from torch import Tensor, nn
 
 from models.encoder.event_images import nature_layers
 from models.encoder.finetuned import FinetunedEncoder
+from models.encoder.products import Linear, orthogonal_
 from models.encoder.table import dense
 from models.kinds import PolicySpec, resolve
 from models.policy.dense_update import tanh
 from models.policy.event_set import OUTPUTS, EventSet, EventTables
 from models.policy.features import feature_of
-from models.products import Linear, orthogonal_
 
 PARTS = ("trunk", "pi", "vf")
 # Of the last layer's weights; all other layers have sqrt(2) (stable-baselines' policies).

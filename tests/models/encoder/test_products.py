@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jobs.run.torch_threads import torch_threads
-from models.products import (
+from models.encoder.products import (
     DEPTH,
     HEIGHT,
     LINE,
@@ -26,7 +26,7 @@ from models.products import (
     product,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SIZES = st.sampled_from([0, 1, 2, 3, ROWS - 1, ROWS, ROWS + 1, 13, 15, 16, 17, 31, 33])
 LAYOUTS = {
     "rows": np.ascontiguousarray,
@@ -164,7 +164,7 @@ import numpy as np, torch
 from models.encoder.evae import EventVAE, event_targets, train_step
 from models.encoder.event_batch import EventBatch
 from models.policy.networks import mlp
-from models.products import orthogonal_
+from models.encoder.products import orthogonal_
 rng, evae = np.random.default_rng(0), EventVAE(context=64)
 with torch.no_grad():
     for value in evae.parameters():

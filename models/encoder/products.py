@@ -43,6 +43,11 @@ def _emit_fma(builder: Any, *values: Any) -> Any:
     return builder.call(function, values)
 
 
+def _emit_moved(builder: Any, start: Any, steps: Any, stride: Any, kind: Any) -> Any:
+    """Emit a pointer to a `kind`, so many strides of bytes behind another."""
+    return builder.bitcast(builder.gep(start, [builder.mul(steps, stride)]), kind.as_pointer())
+
+
 @intrinsic
 def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """Compute a * b + c with one rounding, of three floats of one type; on any processor the same."""
@@ -74,10 +79,7 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
             shape, strides = (cgutils.unpack_tuple(builder, part, 2) for part in (array.shape, array.strides))
             return shape[0], builder.bitcast(array.data, ir.IntType(8).as_pointer()), strides
 
-        def moved(start: Any, steps: Any, stride: Any, kind: Any) -> Any:
-            place = builder.gep(start, [builder.mul(steps, stride)])
-            return builder.bitcast(place, kind.as_pointer())
-
+        moved = functools.partial(_emit_moved, builder)
         (rows, a_start, a_by), (_, panel_start, panel_by), (_, out_start, out_by) = (
             opened(kind, value) for kind, value in ((a, a_value), (panel, panel_value), (out, out_value))
         )
