@@ -266,8 +266,8 @@ def _extremes(events: np.ndarray) -> tuple[int, int, int, int, int, int]:
 def unwrap(counter: np.ndarray, bits: int) -> np.ndarray:
     """Times [us] from a counter of a few bits that starts again at zero.
 
-    A step of at least half the counter's range backwards is read as a wrap, a smaller one as
-    disorder, so gaps of half the range or more cannot be told.
+    A step of at least half the counter's range backwards is read as a wrap, and so is one that would lead
+    before 0; a smaller one is disorder. So after a wrap, gaps of half the range or more cannot be told.
 
     Args:
         counter: Shape (N,), unsigned integers below 2**bits.
@@ -281,6 +281,7 @@ def unwrap(counter: np.ndarray, bits: int) -> np.ndarray:
     if len(t_us):
         t_us[1:] = (np.diff(t_us) + half) % (2 * half) - half
         np.cumsum(t_us, out=t_us)
+        t_us -= np.minimum.accumulate(t_us) // (2 * half) * (2 * half)
     return t_us
 
 

@@ -266,6 +266,7 @@ def decode_dat(words: np.ndarray, events: np.ndarray) -> None:
     for i in range(events.size):
         step = np.int64(words[i].t) - t
         t += (step + half & 2 * half - 1) - half if i else step
+        t += 2 * half if t < 0 else 0
         data, event = words[i].data, events[i]
         event.t, event.x, event.y = t, data & 0x3FFF, data >> 14 & 0x3FFF
         event.p = 2 * np.int8(data >> 28 & 1) - 1

@@ -225,6 +225,17 @@ def test_evt2_words_decode_as_by_the_published_table(tmp_path):
     assert found.events["t"][-1] > 2**34
 
 
+@pytest.mark.parametrize("t_us", [[5, 2**31 + 6], [0, 2**32 - 1], [7, 2**32 - 7, 2**32 + 7]])
+def test_a_gap_of_more_than_half_the_clock_is_told_until_it_wraps(t_us, tmp_path):
+    counter = np.array(t_us) % 2**32
+    np.testing.assert_array_equal(unwrap(counter.astype(np.uint32), 32), t_us)
+    events = np.zeros(len(t_us), EVENT)
+    events["t"], events["p"] = t_us, 1
+    if t_us[-1] < 2**32:
+        write_events(tmp_path / "events.dat", events, 1280, 720, "dat")
+        np.testing.assert_array_equal(read_events(tmp_path / "events.dat").events, events)
+
+
 @pytest.mark.parametrize(("format", "until_us"), [("dat", 2**32), ("evt2", 2**34), ("evt3", 2**24)])
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 300), dense=st.booleans())
 @settings(max_examples=25, deadline=None)
