@@ -35,9 +35,11 @@ def write_film(path: Path, recorded: RecordedEpisode, title: str, decode: Decode
     control_hz = recorded.env.control_hz
     fps = float(np.clip(round(control_hz / SLOWER), MIN_FPS, MAX_FPS))
     canvas = _background(recorded, f"{title}   {_pace(control_hz / fps)}")
+    latents = [moment.latent for moment in recorded.moments if moment.latent is not None]
+    largest = float(np.abs(latents).max(initial=0.0)) or 1.0
     with open_film(path, control_hz, None, fps) as film:
         for place in range(len(recorded.moments)):
-            film.add(np.asarray(_frame(canvas, recorded, place, decode)))
+            film.add(np.asarray(_frame(canvas, recorded, place, (decode, largest))))
     return path
 
 
@@ -87,8 +89,14 @@ def _background(recorded: RecordedEpisode, title: str) -> Image.Image:
     return picture
 
 
-def _frame(canvas: Image.Image, recorded: RecordedEpisode, place: int, decode: Decode | None) -> Image.Image:
-    """The picture of one moment; what has been passed stays on the canvas."""
+def _frame(
+    canvas: Image.Image, recorded: RecordedEpisode, place: int, shown: tuple[Decode | None, float]
+) -> Image.Image:
+    """The picture of one moment; what has been passed stays on the canvas.
+
+    `shown` is what draws the latent's picture, if anything, and the size of a full bar of the latent.
+    """
+    decode, largest = shown
     moment, moments = recorded.moments[place], recorded.moments
     before = moments[max(0, place - 1)]
     way = _on_plan(recorded, np.array([(before.x_m, before.y_m), (moment.x_m, moment.y_m)]))
@@ -108,8 +116,7 @@ def _frame(canvas: Image.Image, recorded: RecordedEpisode, place: int, decode: D
     right = WIDTH - GAP - left
     _draw_choice(draw, (left, HEAD, right, 150), moment)
     if moment.latent is not None:
-        largest = max(float(np.abs(own.latent).max()) for own in moments if own.latent is not None)
-        _draw_latent(draw, (left, HEAD + 160, right, SIDE + LINE - 160), moment.latent, largest or 1.0)
+        _draw_latent(draw, (left, HEAD + 160, right, SIDE + LINE - 160), moment.latent, largest)
     return picture
 
 
