@@ -68,8 +68,9 @@ def test_it_holds_the_packages_and_the_policies_and_nothing_else(wheel):
         names = archive.namelist()
         (metadata,) = (archive.read(name).decode() for name in names if name.endswith("/METADATA"))
     tops = {name.partition("/")[0] for name in names}
-    assert {top for top in tops if not top.endswith(".dist-info")} == {"envs", "models", "jobs"}
-    tracked = subprocess.check_output(["git", "ls-files", "models", "envs", "jobs"], cwd=ROOT, text=True)
+    rooms = "envs", "models", "jobs", "native"
+    assert {top for top in tops if not top.endswith(".dist-info")} == {*rooms}
+    tracked = subprocess.check_output(["git", "ls-files", *rooms], cwd=ROOT, text=True)
     assert set(tracked.splitlines()) <= set(names)
     needed = re.findall(r"^Requires-Dist: ([\w-]+)(?!.*extra ==).*$", metadata, re.MULTILINE)
     assert {"numpy", "numba", "torch", "gymnasium"} <= set(needed)
