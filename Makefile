@@ -98,8 +98,8 @@ mlflow: setup ## serve the results on http://127.0.0.1:5000, for this machine on
 test: setup $(DEVELOPING) ## the quick tests (4 minutes on two cores)
 	$(PYTEST) --dist worksteal $(ARGS)
 
-# Of a host's unit of work, see tests/support/costs.py.
-MOST_UNITS := 50
+# Some 5 s of a quick host; a unit is a piece of work, see tests/support/costs.py.
+MOST_UNITS := 100
 test-costs: setup $(DEVELOPING) ## the quick tests one at a time, and which of them cost more than a quick test may (10 minutes)
 	$(BIN)/python -m tests.support.kernels
 	$(BIN)/python -m pytest --most-units $(MOST_UNITS) $(ARGS)
