@@ -1,0 +1,132 @@
+"""Measure how well the pages read: words, sentence lengths, and Flesch's reading ease.
+
+Run from the repository root: python -m docs.reading [--check]
+Prints a row a page. With --check only the first pages are measured, and a page that breaks a limit stops it.
+"""
+
+import re
+import statistics
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import textstat
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+GENERATED = ("keys.md", "api.md", "changelog.md")  # tables of the schema, docstrings, the log of changes
+FIRST = ("README.md", *(f"docs/{name}.md" for name in ("index", "start", "task", "train", "sweep", "models")))
+MOST_MEDIAN, MOST_WORDS, LEAST_EASE = 18, 35, 45.0  # median and longest sentence [words], reading ease
+MOST_SITE_WORDS, MOST_LINKS = 32_000, 45
+BLOCKS = (
+    re.compile(r"^(`{3,}|:{3,}).*?^\1\s*$", re.MULTILINE | re.DOTALL),  # code and directives
+    re.compile(r"<(video|iframe)\b.*?</\1>", re.DOTALL),
+    re.compile(r"<!--.*?-->", re.DOTALL),
+    re.compile(r"^\s*\|.*$", re.MULTILINE),  # tables
+    re.compile(r"^#+ .*$", re.MULTILINE),
+    re.compile(r"^(?: {4}|\t)(?![-*\d]).*$", re.MULTILINE),  # indented code
+    re.compile(r"!\[[^\]]*\]\([^)]*\)"),
+    re.compile(r"<[^>]+>"),
+)
+TREE = re.compile(r"^```\{toctree\}\n(.*?)^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[([^\]]*)\]\([^)]*\)")
+ITEM = re.compile(r"^\s*(?:[-*]|\d+\.)\s+", re.MULTILINE)
+SENTENCE = re.compile(r"(?<=[.!?:])[*_)\"]*\s+(?=[\"(*_]*[A-Z0-9])|\n\s*\n")
+
+
+class Reading(NamedTuple):
+    """How a page reads.
+
+    Attributes:
+        words: All words of the file, as `wc -w` counts.
+        median: Of the words of a sentence; 0 without a sentence.
+        longest: Words of the longest sentence.
+        ease: Flesch's reading ease; 100 without a sentence.
+        sentence: The longest sentence.
+    """
+
+    words: int
+    median: float
+    longest: int
+    ease: float
+    sentence: str
+
+
+def sentences(text: str) -> list[str]:
+    """Return the sentences of a page's prose: without code, tables, headings, pictures and HTML."""
+    for block in BLOCKS:
+        text = block.sub("\n\n", text)
+    text = ITEM.sub("\n\n", LINK.sub(r"\1", text))
+    text = re.sub(r"`[^`]*`", "name", text.replace("&nbsp;", " "))
+    parts = (" ".join(part.split()).strip("*_ ") for part in SENTENCE.split(text))
+    return [part for part in parts if len(part.split()) > 2]
+
+
+def measure(text: str) -> Reading:
+    """Measure a page."""
+    found = sentences(text)
+    if not found:
+        return Reading(len(text.split()), 0, 0, 100.0, "")
+    longest = max(found, key=lambda one: len(one.split()))
+    prose = " ".join(one if one[-1] in ".!?" else f"{one}." for one in found)
+    lengths = [len(one.split()) for one in found]
+    return Reading(
+        len(text.split()),
+        statistics.median(lengths),
+        max(lengths),
+        textstat.flesch_reading_ease(prose),
+        longest,
+    )
+
+
+def broken(page: str, found: Reading) -> list[str]:
+    """Return what is wrong with one of the first pages, a line a limit."""
+    wrong = []
+    if found.median > MOST_MEDIAN:
+        wrong.append(f"{page}: median sentence of {found.median:g} words; at most {MOST_MEDIAN}")
+    if found.longest > MOST_WORDS:
+        wrong.append(f"{page}: a sentence of {found.longest} words; at most {MOST_WORDS}: {found.sentence}")
+    if found.ease < LEAST_EASE:
+        wrong.append(f"{page}: reading ease {found.ease:.0f}; at least {LEAST_EASE:.0f}: shorter words")
+    return wrong
+
+
+def site_words() -> int:
+    """Return the words of the site, without those that are generated from schema and docstrings."""
+    return sum(len(page.read_text().split()) for page in DOCS.glob("*.md") if page.name not in GENERATED)
+
+
+def sidebar_links() -> int:
+    """Return the number of pages in the sidebar: the entries of the contents on the first page."""
+    trees = re.findall(
+        r"^```\{toctree\}\n(.*?)^```", (DOCS / "index.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    return sum(bool(line) and not line.startswith(":") for tree in trees for line in tree.splitlines())
+
+
+def check() -> list[str]:
+    """Return what breaks a limit: sentences of the first pages, words and links of the site."""
+    wrong = [line for page in FIRST for line in broken(page, measure((ROOT / page).read_text()))]
+    if (words := site_words()) > MOST_SITE_WORDS:
+        wrong.append(f"the site has {words:,} words; at most {MOST_SITE_WORDS:,}")
+    if (links := sidebar_links()) > MOST_LINKS:
+        wrong.append(f"the sidebar has {links} links; at most {MOST_LINKS}")
+    return wrong
+
+
+def table() -> str:
+    """Return a row a page, and what the site has in all."""
+    pages = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+    lines = [f"{'page':28}{'words':>8}{'median':>8}{'longest':>8}{'ease':>6}"]
+    for page in pages:
+        one = measure(page.read_text())
+        lines.append(f"{page.name:28}{one.words:8,}{one.median:8g}{one.longest:8}{one.ease:6.0f}")
+    count = sum(page.name not in GENERATED for page in DOCS.glob("*.md"))
+    lines.append(f"{count} pages of {site_words():,} words, {sidebar_links()} links in the sidebar")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    if "--check" in sys.argv:
+        sys.exit("\n".join(check()) or 0)
+    sys.stdout.write(table())
