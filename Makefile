@@ -150,11 +150,11 @@ check: ## what must pass before a change is merged
 	$(MAKE) $* || $(MAKE) $* PYTEST='$(ALONE)' ARGS='--numprocesses 0 $(ARGS)'
 
 bench: setup $(DEVELOPING) ## measure the speed of the parts, and what accuracy of the simulator costs
-	for part in $(filter-out %/from_clone.py,$(wildcard jobs/bench/*.py)); do $(BIN)/python -m jobs.bench.$$(basename $$part .py) || exit 1; done
+	for part in $(filter-out %/from_clone.py,$(wildcard benchmarks/*.py)); do $(BIN)/python -m benchmarks.$$(basename $$part .py) || exit 1; done
 	$(LAUNCH) +exp=trade_simulator $(ARGS)
 
 bench-clone: setup ## measure how long a new user waits, from an empty clone to each first result, on an idle machine
-	$(BIN)/python -m jobs.bench.from_clone $(ARGS)
+	$(BIN)/python -m benchmarks.from_clone $(ARGS)
 
 docs: setup $(DEVELOPING) ## build this site in docs/_build/html; a broken link or docstring stops it
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html $(ARGS)

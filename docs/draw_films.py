@@ -15,7 +15,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 
-from jobs.bench.throughput import composed
+from benchmarks.throughput import composed
 from jobs.evaluation.demo import find_shown
 from jobs.rollout.episodes import roll_out
 

@@ -14,8 +14,11 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from jobs.bench.scaling_model import from_plain, plot_scaling
+from benchmarks.scaling_model import from_plain, plot_scaling
 from jobs.evaluation.group_stats import TrainingEpisodes, episode_values
+from jobs.measure.encoder.costs import read_costs
+from jobs.measure.encoder.plots import plot_encoding_costs
+from jobs.measure.trade.page import draw_settings
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
 from jobs.reporting.claims_study import published_text as claims_text
@@ -24,7 +27,6 @@ from jobs.reporting.dose_response import published_text as dose_response_text
 from jobs.reporting.dose_taught import DOSES_TAUGHT, draw_published
 from jobs.reporting.dose_taught import published_text as dose_taught_text
 from jobs.reporting.figures import group_results, results_figures
-from jobs.reporting.learning_curves import read_trainings
 from jobs.reporting.planned_page import below_plan
 from jobs.reporting.report import results_pages, write_figures
 from jobs.reporting.sweep_data import (
@@ -42,9 +44,7 @@ from jobs.reporting.words import condition_text
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json, write_atomic
 from jobs.studies.ablation.page import VariantResult, plot_variants, variant_result
-from jobs.studies.encoder.costs import read_costs
-from jobs.studies.encoder.plots import plot_encoding_costs
-from jobs.studies.trade.page import draw_settings
+from jobs.tools.curves import read_trainings
 
 DOCS = Path(__file__).resolve().parent
 ABLATIONS = "ablation", "ablation_more", "taught", "memory_seconds"  # each with a recipe of its own

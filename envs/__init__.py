@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from native import fix_target, forget_stale_kernels
+from core import fix_target, forget_stale_kernels
 
 fix_target()
 forget_stale_kernels(Path(__file__).parent)

@@ -2,7 +2,7 @@
 
 The tolerance is the accepted event error of `envs.event_error`. The rules below are fitted to
 that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
-(`python -m jobs.bench.fidelity`), with the constants rounded to the safe side.
+(`python -m benchmarks.fidelity`), with the constants rounded to the safe side.
 """
 
 import importlib

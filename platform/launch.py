@@ -155,6 +155,7 @@ def run(values: dict[str, object]) -> None:
         raise ConfigError("\n".join(errors))
     config = parse(values)
     print(f"If this is stopped, it continues with: {redacted(command(sys.argv[1:]))}", flush=True)
+    sys.path.append(str(ROOT))  # for `evade` in another folder: research/ is not installed
     importlib.import_module(JOBS[config.job].module).run(config)
 
 
@@ -208,7 +209,7 @@ def full_disk(error: Exception) -> str | None:
 def raised_here(error: Exception) -> bool:
     """Whether the statement that raised is in this repository's own packages."""
     frames = traceback.extract_tb(error.__traceback__)
-    rooms = [ROOT / room for room in ("envs", "models", "jobs", "native", "platform")]
+    rooms = [ROOT / room for room in ("core", "envs", "models", "jobs", "platform", "research")]
     return bool(frames) and any(Path(frames[-1].filename).is_relative_to(room) for room in rooms)
 
 

@@ -16,12 +16,12 @@ from jobs.evaluation.group_stats import episode_values, success_table
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import SweptEpisodes
 from jobs.reporting.figures import group_results, judge_claims
-from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_trainings
 from jobs.reporting.paper_claims import GAIN, UNITS, Claim, Finding
 from jobs.reporting.planned_page import made_text, write_below_plan
 from jobs.reporting.summary_plots import claims_plot
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_data, read_sweep, write_data
 from jobs.run.templates import render
+from jobs.tools.curves import PublishedTraining, published_trainings, read_trainings
 
 TAUGHT, BY_PPO = "taught_claims", "ppo_claims"  # names of the experiments, and of what is published of them
 SHORT = {TAUGHT: "Taught", BY_PPO: "By PPO"}  # as heads of columns

@@ -11,11 +11,11 @@ from jobs.evaluation.group_stats import Condition, GroupResult, summarise_group
 from jobs.evaluation.sweep_plots import collision_figure
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import Change, SweptEpisodes, changes_of, content, place
-from jobs.reporting.learning_curves import PublishedTraining
 from jobs.reporting.paper_claims import Claim, Finding, judge_all
 from jobs.reporting.summary_plots import Survival, axes_map, change_map, claims_plot, survival_plot
 from jobs.reporting.words import TITLES, condition_text
 from jobs.rollout.episodes import EPISODE
+from jobs.tools.curves import PublishedTraining
 
 
 def results_figures(

@@ -19,8 +19,8 @@ from jobs.reporting.claims_study import (
     read_findings,
     study_findings,
 )
-from jobs.reporting.learning_curves import PublishedTraining, published_trainings
 from jobs.reporting.paper_claims import Claim, Finding
+from jobs.tools.curves import PublishedTraining, published_trainings
 
 PAPER = "ppo_paper"  # name of the experiment, and of what is published of it
 RECIPES = two_groups.Groups("bytestream_paper", "bytestream")

@@ -46,10 +46,8 @@ from jobs.reporting.dose_taught import DOSES_TAUGHT, write_dose_taught
 from jobs.reporting.figures import group_results, judge_claims, results_figures
 from jobs.reporting.headline import headline_table, with_headline
 from jobs.reporting.in_short import WEAK, in_short, weak_groups
-from jobs.reporting.learning_curves import PublishedTraining, published_trainings
 from jobs.reporting.paper_claims import CLAIMS, GAIN, Claim, Finding
 from jobs.reporting.planned_page import coarse_text
-from jobs.reporting.replay_page import PAGE
 from jobs.reporting.sweep_data import (
     SWEEP,
     TRAININGS,
@@ -68,6 +66,8 @@ from jobs.run.files import read_json, write_atomic
 from jobs.run.folder import COMPARED_STEPS
 from jobs.run.progress import console
 from jobs.run.templates import render
+from jobs.tools.curves import PublishedTraining, published_trainings
+from jobs.tools.replay_page import PAGE
 
 TEMPLATES = Path(__file__).parent / "templates"
 

@@ -28,11 +28,11 @@ from pathlib import Path
 
 import numpy as np
 
+from core import forget_stale_kernels
 from jobs.run.files import write_atomic
 from jobs.run.locks import locked
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
-from native import forget_stale_kernels
 
 ROOMS = ("envs", "models")
 CACHE = REPOSITORY / "envs" / "__pycache__"

@@ -9,7 +9,7 @@ from jobs.config.config import ConfigError
 from jobs.config.plugins import plugin_digests
 from jobs.run.provenance import REPOSITORY
 
-ROOMS = ("envs", "models", "jobs", "native")
+ROOMS = ("core", "envs", "models", "jobs")
 PACKAGES = ("numba", "numpy", "torch")  # decide the digits; Ray compares itself and Python
 ANSWER_S = 600.0  # a busy machine starts a worker in minutes
 

@@ -15,7 +15,7 @@ event that wins (the newest of equals) and has no gradient.
 
 `EventContextNetwork.plain` is this formula, event by event. `EventContextNetwork.forward` is
 the same function with the same parameters, gradients and running statistics, tens of times
-faster on a CPU (`jobs/bench/context.py`): x, y, p have only 2 H W values, so the layers run once
+faster on a CPU (`benchmarks/context.py`): x, y, p have only 2 H W values, so the layers run once
 per distinct value, with batch statistics weighted by how often each occurs. Only the order of the
 sums differs; `tests/models/encoder/test_context.py` states the bounds for float64 and float32. On a GPU
 the last layer and the maximum are torch's (`max_on_device`).

@@ -413,7 +413,7 @@ def test_compiled_kernels_that_are_cut_are_compiled_again(room, tmp_path):
     package = tmp_path / room
     package.mkdir()
     shutil.copy(ROOT / room / "__init__.py", package)
-    shutil.copytree(ROOT / "native", tmp_path / "native")
+    shutil.copytree(ROOT / "core", tmp_path / "core")
     (package / "kernel.py").write_text(KERNEL)
     words = [sys.executable, "-c", f"from {room}.kernel import inner; print(inner(1.0))"]
 

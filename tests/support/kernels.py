@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from benchmarks.latency import random_policy
 from envs.raycast.renderer import sample_luminance
 from envs.scene import make_scene
-from jobs.bench.latency import random_policy
 from jobs.run import compile
 from tests.support.looks import HEIGHT, WIDTH, Looker
 

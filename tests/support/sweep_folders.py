@@ -12,10 +12,10 @@ from jobs.config.config import parse
 from jobs.config.env_keys import flat_env
 from jobs.evaluation.group_stats import LABELS
 from jobs.evaluation.sweep_plan import axes_of, baselines_of, same_simulations
-from jobs.reporting.learning_curves import as_csv
 from jobs.rollout.episodes import EPISODE, write_episodes
 from jobs.run.files import write_json
 from jobs.studies.ablation.ablation import seeds_of
+from jobs.tools.curves import as_csv
 from models.policy.policy import MANIFEST
 from tests.support.configs import compose
 from tests.support.episodes import flights

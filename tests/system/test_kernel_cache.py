@@ -22,7 +22,7 @@ def clone(folder):
     package = folder / "envs"
     package.mkdir()
     shutil.copy(ROOT / "envs" / "__init__.py", package)
-    shutil.copytree(ROOT / "native", folder / "native")
+    shutil.copytree(ROOT / "core", folder / "core")
     return package
 
 

@@ -46,7 +46,7 @@ SIMULATED = """
 import sys
 from pathlib import Path
 import ray
-from jobs.bench.scaling import ask_for_token, simulated
+from benchmarks.scaling import ask_for_token, simulated
 ask_for_token(Path(sys.argv[1]))
 with simulated(nodes=2, cores=1):
     print(ray.get_runtime_context().gcs_address, flush=True)

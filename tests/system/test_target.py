@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from native import target
+from core import target
 
 ROOT = Path(__file__).resolve().parents[2]
 KERNEL = "import numba\n\n@numba.njit(cache=True)\ndef double(x):\n    return 2.0 * x\n"
@@ -49,7 +49,7 @@ def test_a_copy_of_compiled_kernels_serves_another_processor(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     (first / "envs").mkdir(parents=True)
     shutil.copy(ROOT / "envs" / "__init__.py", first / "envs")
-    shutil.copytree(ROOT / "native", first / "native")
+    shutil.copytree(ROOT / "core", first / "core")
     (first / "envs" / "kernel.py").write_text(KERNEL)
     assert run_on(first, ZEN4) == (1, 0)
     shutil.copytree(first, second, copy_function=shutil.copy)  # with times of its own, as a clone or wheel

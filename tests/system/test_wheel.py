@@ -68,7 +68,7 @@ def test_it_holds_the_packages_and_the_policies_and_nothing_else(wheel):
         names = archive.namelist()
         (metadata,) = (archive.read(name).decode() for name in names if name.endswith("/METADATA"))
     tops = {name.partition("/")[0] for name in names}
-    rooms = "envs", "models", "jobs", "native"
+    rooms = "core", "envs", "models", "jobs"
     assert {top for top in tops if not top.endswith(".dist-info")} == {*rooms}
     tracked = subprocess.check_output(["git", "ls-files", *rooms], cwd=ROOT, text=True)
     assert set(tracked.splitlines()) <= set(names)

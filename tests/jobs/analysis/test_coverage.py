@@ -3,7 +3,7 @@ from pathlib import Path
 
 from jobs.analysis import coverage
 from jobs.analysis.coverage import SPREADS, change_coverage, true_rate
-from jobs.analysis.stopping import EFFECTS, MEAN
+from research.stopping import EFFECTS, MEAN
 
 PAGE = (Path(__file__).parents[3] / "docs" / "statistics.md").read_text()
 

@@ -29,13 +29,13 @@ from jobs.reporting.dose_response import write_dose_response
 from jobs.reporting.dose_taught import DOSES_TAUGHT
 from jobs.reporting.figures import contacts, survivals
 from jobs.reporting.headline import BEGIN, END
-from jobs.reporting.learning_curves import PublishedTraining, published_trainings, read_curves, read_trainings
 from jobs.reporting.paper_claims import CLAIMS, compare
 from jobs.reporting.report import write_results
 from jobs.reporting.summary_plots import change_map, still_going
 from jobs.reporting.sweep_data import SWEEP, TRAININGS, read_sweep, read_sweep_episodes, write_data
 from jobs.rollout.episodes import write_episodes
 from jobs.rollout.policies import PRETRAINED
+from jobs.tools.curves import PublishedTraining, published_trainings, read_curves, read_trainings
 from tests.support.episodes import flights
 from tests.support.sweep_folders import study_places, write_shipped, write_study, write_sweep
 

@@ -7,13 +7,13 @@ from jobs.analysis.tables import estimate_text
 from jobs.config.config import as_dict, parse
 from jobs.reporting import two_groups
 from jobs.reporting.claims_study import BY_PPO, study_findings
-from jobs.reporting.learning_curves import read_curves
 from jobs.reporting.paper_claims import FASTER, OF_BOTH
 from jobs.reporting.paper_recipe import PAPER, RECIPES, recipe_findings, results_text
 from jobs.reporting.sweep_data import read_data, read_sweep
 from jobs.run.files import read_json
 from jobs.run.provenance import REPOSITORY
 from jobs.studies.ablation.ablation import variant_config
+from jobs.tools.curves import read_curves
 from models.policy.policy import MANIFEST
 from tests.support.configs import compose
 from tests.support.sweep_folders import write_ablation, write_shipped

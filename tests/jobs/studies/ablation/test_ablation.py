@@ -9,13 +9,13 @@ import yaml
 
 from jobs.config.config import ConfigError, as_dict, parse
 from jobs.evaluation.sweep_plan import plan_sweep
-from jobs.reporting.publish import newest_trainings, publish
 from jobs.rollout.policies import read_policy
 from jobs.run.files import read_json
 from jobs.run.folder import COMPARED_STEPS, locate_run
 from jobs.studies.ablation import ablation
 from jobs.studies.ablation.ablation import paired, seeds_of, trained_policies, variant_config
 from jobs.studies.ablation.page import plot_variants, table_lines, table_row, variant_result
+from jobs.tools.publish import newest_trainings, publish
 from models.encoder.weights import with_checksum
 from models.kinds import KINDS
 from models.policy.policy import MANIFEST, read_policy_manifest

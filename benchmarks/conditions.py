@@ -1,0 +1,71 @@
+"""What a control step costs under each condition of the sweep, and so what the sweep pays for.
+
+Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.conditions
+Expect: a table in about five minutes, of one core: processor time of a control step and corridor with its
+events, without any policy, 7 corridors side by side, drawn actions, medians of rounds that take turns;
+and its share, if each condition takes as many seconds of simulated time. Conditions that are the same
+simulation stand once.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.throughput import composed
+from benchmarks.timing import interleaved
+from envs.config import EnvConfig
+from envs.corridor import CorridorVectorEnv
+from jobs.analysis.tables import show_table
+from jobs.config.conditions import axis_points
+from jobs.config.env_keys import env_with
+from jobs.evaluation.sweep_plan import value_text
+
+CORRIDORS = 7  # of a training and condition of the sweep
+SIMULATED_S = 0.5  # of each round
+ROUNDS = 3
+
+
+def main() -> None:
+    """Measure and print the table, the costliest first."""
+    conditions = conditions_of_sweep()
+    work = {name: stepping(env) for name, env in conditions.items()}
+    seconds = interleaved(work, ROUNDS, time.process_time)
+    steps = {name: CORRIDORS * round(SIMULATED_S * env.control_hz) for name, env in conditions.items()}
+    whole = sum(seconds.values())
+    rows = [
+        (name, f"{1e6 * seconds[name] / steps[name]:,.0f}", f"{seconds[name] / whole:.1%}")
+        for name in sorted(seconds, key=lambda name: -seconds[name])
+    ]
+    show_table(f"{len(rows)} conditions, one core", ("condition", "us/step", "of the simulation"), rows)
+
+
+def conditions_of_sweep() -> dict[str, EnvConfig]:
+    """Name -> environment of each condition of conf/sweep/robustness.yaml that is a simulation of its own."""
+    config = composed("+exp=robustness")
+    nominal = replace(config.env, scene=config.sweep.scene, split="eval", window_capacity=None)
+    found = {"nothing changed": nominal}
+    for axis, settings in config.sweep.axes.items():
+        for point in axis_points(settings):
+            env = env_with(nominal, point)
+            if env not in found.values():
+                found[f"{axis} {value_text(next(iter(point.values())))}"] = env
+    return found
+
+
+def stepping(config: EnvConfig) -> Callable[[], object]:
+    """Steps some corridors from their beginning, the same ones and by the same actions each time."""
+    env = CorridorVectorEnv(CORRIDORS, config)
+
+    def run() -> None:
+        rng = np.random.default_rng(0)
+        env.reset(seed=0)
+        for _ in range(round(SIMULATED_S * config.control_hz)):
+            env.step(rng.integers(3, size=CORRIDORS))
+
+    return run
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""What exact events cost: every knob of the simulator, its cost against its event error.
+
+Run: python -m platform.launch +exp=trade_simulator
+Expect: about a minute on one core. A table and a plot per scene with the default and what no other
+setting betters marked, and the events of each memory mode at each control rate, in the run folder
+under `trade/` and in MLflow. An event error is measured against the converged simulation of
+the same flights, see `envs.event_error`; a cost is process time of `CorridorEnv.step`.
+"""
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.config import EnvConfig
+from envs.corridor import CorridorEnv
+from envs.event_error import Accuracy, measure_event_error
+from jobs.analysis.tables import publish_plot, publish_table
+from jobs.config.conditions import env_with
+from jobs.config.config import Config
+from jobs.measure.front_plots import CostedSetting, pareto, plot_costs, plot_memory_modes
+from jobs.run.folder import Run, finish, open_run
+from jobs.run.progress import console, progress
+from jobs.tracking.tracker import Tracker, open_tracker
+
+Setting = Mapping[str, float | str]  # key of the simulation -> value
+MEMORIES = ("reference", "frame", "legacy")
+# Knob -> settings of it; every other setting is the default's. Renders are per default control step.
+KNOBS: dict[str, list[Setting]] = {
+    "tolerance": [{"fidelity.tolerance": value} for value in (0.01, 0.02, 0.1, 0.2, 0.5)],  # 0.05: default
+    "renders": [{"renders": value} for value in (1, 2, 3, 4, 6, 8, 16)],
+    "anti-aliasing": [{"fidelity.samples": value} for value in (1, 2, 4, 8)],
+    "pyrender": [{"renderer": "pyrender", "fidelity.samples": value} for value in (1, 2, 4)],
+    "encoding": [{"camera.encoding": value} for value in ("linear8", "gamma8")],
+    "culling": [{"fidelity.cull_m": value} for value in (20.0, 30.0, 50.0, 70.0)],
+    "memory": [{"camera.memory": value} for value in MEMORIES[1:]],
+}
+NOISE = 0.05  # share by which the cost of one simulation differs when it is measured again
+HEADINGS = ("Knob", "Setting", "Cost [us/step]", "Event error [%]", "Events/step", "Renders/step", "Best")
+
+
+class MeasuredSetting(NamedTuple):
+    """One setting of the simulator in one scene.
+
+    Attributes:
+        knob: What is varied; "default" for the unchanged simulation.
+        setting: To what.
+        cost_us: Process time of an environment step [us].
+        accuracy: What it achieves.
+    """
+
+    knob: str
+    setting: str
+    cost_us: float
+    accuracy: Accuracy
+
+
+def run(config: Config) -> dict[str, float]:
+    """Measure every setting; return the metrics of the default."""
+    folder = open_run(config)
+    config = folder.config
+    with open_tracker(config, folder) as tracker:
+        metrics: dict[str, float] = {}
+        for scene in config.trade_simulator.scenes:
+            metrics |= trade_scene(config, folder, tracker, scene)
+        metrics |= trade_memory(config, folder, tracker)
+        tracker.log(0, metrics)
+        console.print(tracker.dashboard(), markup=False)
+    return finish(folder, "trade_simulator", metrics)
+
+
+def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> dict[str, float]:
+    """Measure cost and error of every setting in one scene; return the metrics of the default."""
+    default = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
+    named = [("default", "", default)]
+    for knob, settings in KNOBS.items():
+        named += [(knob, setting_text(setting), changed(default, setting)) for setting in settings]
+    trade = config.trade_simulator
+    with progress(f"Trade in {scene}", len(named), "settings") as advance:
+        accuracies = []
+        for knob, _, simulation in named:
+            accuracies.append(measure_event_error(simulation, trade.flights, trade.steps))
+            advance(1, note=knob)
+    costs = step_costs_us([simulation for *_, simulation in named], trade.steps, trade.rounds)
+    rows = [
+        MeasuredSetting(knob, setting, cost, accuracy)
+        for (knob, setting, _), cost, accuracy in zip(named, costs, accuracies, strict=True)
+    ]
+    front = pareto([(row.cost_us, row.accuracy.error) for row in rows], NOISE)
+    title = f"Scene {scene}: one setting changed at a time; * no other is better"
+    lines = [setting_cells(row, place in front) for place, row in enumerate(rows)]
+    publish_table(folder, tracker, f"trade/{scene}", title, HEADINGS, lines, 2)
+    tracker.table(f"trade/{scene}", setting_columns(rows))
+    points = [CostedSetting(*row[:3], row.accuracy.error) for row in rows]
+    plot = plot_costs(scene, points, front, default.fidelity.tolerance)
+    publish_plot(folder, tracker, f"trade/{scene}", plot)
+    return {
+        f"sim/event_error_{scene}": rows[0].accuracy.error,
+        f"perf/env_step_us_{scene}": rows[0].cost_us,
+    }
+
+
+def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
+    """Measure events per second of flight at each control rate for each memory mode; return the metrics."""
+    trade = config.trade_simulator
+    rates_hz = trade.control_hz
+    events_hz: dict[str, list[float]] = {memory: [] for memory in MEMORIES}
+    with progress("Memory modes", len(rates_hz) * len(MEMORIES), "simulations") as advance:
+        for hz in rates_hz:
+            # The same way at every rate: as many steps as fit into the time of the slowest.
+            steps = max(1, round(trade.steps * hz / min(rates_hz) / 4))
+            for memory in MEMORIES:
+                default = dataclasses.replace(config.env, control_hz=hz, split="validation")
+                accuracy = measure_event_error(
+                    env_with(default, {"camera.memory": memory}), trade.flights, steps
+                )
+                events_hz[memory].append(accuracy.events[0] * hz)
+                advance(1, note=memory)
+    head = ["Memory", *(f"{hz:g} Hz" for hz in rates_hz)]
+    lines = [[memory, *(f"{value:,.0f}" for value in values)] for memory, values in events_hz.items()]
+    publish_table(folder, tracker, "trade/memory", "Events per second of flight", head, lines)
+    publish_plot(folder, tracker, "trade/memory", plot_memory_modes(rates_hz, events_hz))
+    return {
+        f"sim/events_per_second_{memory}_{hz:g}_hz": value
+        for memory, values in events_hz.items()
+        for hz, value in zip(rates_hz, values, strict=True)
+    }
+
+
+def step_costs_us(configs: Sequence[EnvConfig], steps: int, rounds: int) -> list[float]:
+    """Process time of an environment step [us] in each simulation: medians of interleaved rounds."""
+    envs = [CorridorEnv(config) for config in configs]
+    costs = np.empty((rounds + 1, len(envs)))  # the first round compiles
+    for turn in range(rounds + 1):
+        for place, env in enumerate(envs):
+            env.reset(seed=turn)
+            count = max(1, steps if turn else 2)
+            start = time.process_time()
+            for _ in range(count):
+                if any(env.step(0)[2:4]):
+                    env.reset()
+            costs[turn, place] = (time.process_time() - start) / count
+    for env in envs:
+        env.close()
+    return (1e6 * np.median(costs[1:], axis=0)).tolist()
+
+
+def changed(default: EnvConfig, setting: Setting) -> EnvConfig:
+    """The default with some settings replaced; "renders" is a number per control step."""
+    for key, value in setting.items():
+        if key == "renders":
+            step_m = default.speed_mps / default.control_hz
+            fidelity = dataclasses.replace(default.fidelity, max_step_m=step_m / float(value))
+            default = dataclasses.replace(default, fidelity=fidelity)
+        else:
+            default = env_with(default, {key: value})
+    return default
+
+
+def setting_text(setting: Setting) -> str:
+    """A setting as text, such as "tolerance 0.1"."""
+    return ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in setting.items())
+
+
+def setting_cells(row: MeasuredSetting, on_front: bool) -> tuple[str, ...]:
+    """A text for each of `HEADINGS`."""
+    accuracy = row.accuracy
+    numbers = (f"{row.cost_us:,.0f}", f"{100 * accuracy.error:.1f}", f"{accuracy.events[0]:.0f}")
+    return (row.knob, row.setting, *numbers, f"{accuracy.renders:.1f}", "*" if on_front else "")
+
+
+def setting_columns(rows: Sequence[MeasuredSetting]) -> dict[str, list[str | float]]:
+    """The columns of a tracker's table; the first is unique."""
+    return {
+        "setting": [f"{row.knob} {row.setting}".strip() for row in rows],
+        "cost_us": [row.cost_us for row in rows],
+        "event_error": [row.accuracy.error for row in rows],
+        "events_per_step": [row.accuracy.events[0] for row in rows],
+        "renders_per_step": [row.accuracy.renders for row in rows],
+    }

@@ -1,0 +1,371 @@
+"""The page that says which setting to choose: settings as rows, a verdict for each by a stated rule."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.analysis.statistics import Difference, Estimate, holm
+from jobs.analysis.tables import estimate_metrics, estimate_text, markdown_table, percent_text, short
+from jobs.measure.trade.plot import TradePoint, plot_trade
+from jobs.run.provenance import Provenance
+from jobs.run.templates import render
+
+TEMPLATE = Path(__file__).with_name("page.md.j2")  # it also states the rule of the verdicts
+DEFAULT, EXACT = "default", "most exact"
+ENCODER_KNOBS = ("precision", "time bins", "newest events")  # they change no event
+CAMERA_KNOB = "memory"  # another camera, not a coarser simulation of the same
+OTHER_CAMERAS = ("the paper's camera",)  # of the settings that change several things
+MARGIN = 0.1  # of success: what may be lost
+ALL = "all"  # in the published settings: all trainings together
+SETTING_FIELDS = (
+    "scene", "knob", "setting", "policies", "trainings", "episodes", "steps_per_s",
+    "speed", "speed_low", "speed_high", "event_error", "latent_error", "other_action",
+    "success_rate", "success_low", "success_high", "difference", "difference_low", "difference_high",
+    "verdict", "front",
+)  # fmt: skip
+Verdict = Literal["default", "as good", "worse", "undecided"]
+
+
+class TradeFacts(Provenance):
+    """What made the numbers of a trade: command, commit, machine and date, policies and corridors."""
+
+    run: str
+    command: str
+    date: str
+    policies: Mapping[str, int]  # group -> trainings
+    scenes: Sequence[str]
+    met: Mapping[str, Sequence[str]]  # group -> settings of fidelity that its trainings drew
+    action: str
+    trials: int
+    pyrender_trials: int
+    replays: int
+    failed: Mapping[str, str]  # setting -> why it was not evaluated
+
+
+class Outcome(NamedTuple):
+    """What trainings reach under a setting in the corridors of a scene.
+
+    Attributes:
+        trainings: How many.
+        episodes: Of all of them.
+        success: Rate of episodes that reach the goal.
+        difference: Of it, to the default with the same trainings in the same corridors.
+        other_action: Share of steps at which they choose another action than on converged events.
+    """
+
+    trainings: int
+    episodes: int
+    success: Estimate
+    difference: Difference
+    other_action: float
+
+
+class TradedSetting(NamedTuple):
+    """One setting of the simulator or the encoder in one scene.
+
+    Attributes:
+        scene: Where.
+        knob: What is varied.
+        setting: To what.
+        step_us: Process time of an environment step with the policy's choice, median [us].
+        speed: Times that of the default, with the interval over repeated timings.
+        event_error: Against converged events.
+        latent_error: Root mean square, in standard deviations of the exact latents.
+        outcomes: Group -> what its trainings reach; under `ALL` those of all.
+    """
+
+    scene: str
+    knob: str
+    setting: str
+    step_us: float
+    speed: Estimate
+    event_error: float
+    latent_error: float
+    outcomes: Mapping[str, Outcome]
+
+    @property
+    def name(self) -> str:
+        """Knob and setting in one, such as "precision int8"; the knob is not said twice."""
+        return self.setting if self.knob in self.setting else f"{self.knob} {self.setting}".strip()
+
+    @property
+    def steps_per_s(self) -> float:
+        """Environment steps a second on one core, with the policy's choice."""
+        return 1e6 / self.step_us
+
+    @property
+    def known_error(self) -> float | None:
+        """Event error; None for a setting that changes no event."""
+        return None if self.knob in ENCODER_KNOBS else self.event_error
+
+    @property
+    def together(self) -> Outcome:
+        """What all trainings reach."""
+        return self.outcomes[ALL]
+
+
+def verdicts(rows: Sequence[TradedSetting]) -> list[Verdict]:
+    """A verdict for each row, by the rule that the page states; `rows` are the family of the tests."""
+    tested = [row.together.difference.p for row in rows if row.knob != DEFAULT]
+    adjusted = iter(holm([1.0 if p is None else p for p in tested]))
+    return [_verdict(row, 1.0 if row.knob == DEFAULT else next(adjusted)) for row in rows]
+
+
+def _verdict(row: TradedSetting, p: float) -> Verdict:
+    if row.knob == DEFAULT:
+        return "default"
+    difference = row.together.difference
+    low, _ = difference.interval or (-1.0, 1.0)
+    worst = min(outcome.difference.value for outcome in row.outcomes.values())
+    if low > -MARGIN and worst > -MARGIN:
+        return "as good"
+    return "worse" if difference.value < 0.0 and p < 0.05 else "undecided"
+
+
+def on_front(rows: Sequence[TradedSetting]) -> list[bool]:
+    """Which settings of a scene no other one beats: more exact or as exact, and faster beyond doubt."""
+    return [
+        row.known_error is not None
+        and not any(
+            other.known_error is not None
+            and other.known_error <= row.event_error
+            and _low(other.speed) > _high(row.speed)
+            for other in rows
+        )
+        for row in rows
+    ]
+
+
+def _low(speed: Estimate) -> float:
+    """Lower end of a speed's interval; of a single timing nothing is known."""
+    return 0.0 if speed.interval is None else speed.interval[0]
+
+
+def _high(speed: Estimate) -> float:
+    return float("inf") if speed.interval is None else speed.interval[1]
+
+
+def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
+    """What is published of each setting, by `SETTING_FIELDS`: a line for each group and one for all."""
+    fronts = [front for own in by_scene(rows) for front in on_front(own)]
+    found = []
+    for row, verdict, front in zip(rows, verdicts(rows), fronts, strict=True):
+        for group, outcome in row.outcomes.items():
+            numbers = (
+                outcome.trainings, outcome.episodes, row.steps_per_s,
+                row.speed.value, _low(row.speed), _high(row.speed),
+                row.known_error, row.latent_error, outcome.other_action,
+                outcome.success.value, *(outcome.success.interval or (0.0, 1.0)),
+                outcome.difference.value, *(outcome.difference.interval or (-1.0, 1.0)),
+            )  # fmt: skip
+            words = ["" if number is None else f"{float(number):.10g}" for number in numbers]
+            values = (row.scene, row.knob, row.setting, group, *words, verdict, "yes" if front else "no")
+            found.append(dict(zip(SETTING_FIELDS, values, strict=True)))
+    return found
+
+
+def by_scene(rows: Sequence[TradedSetting]) -> list[list[TradedSetting]]:
+    """The rows of each scene."""
+    scenes = dict.fromkeys(row.scene for row in rows)
+    return [[row for row in rows if row.scene == scene] for scene in scenes]
+
+
+def draw_settings(settings: Sequence[Mapping[str, str]]) -> Figure:
+    """Draw what settings cost and give, from their published values (`setting_values`)."""
+    points = [
+        TradePoint(
+            scene=one["scene"],
+            knob=one["knob"],
+            name=one["setting"].rpartition(" ")[2] or one["knob"],
+            speed=(float(one["speed"]), float(one["speed_low"]), float(one["speed_high"])),
+            error=100 * float(one["event_error"] or "nan"),
+            difference=(_points(one, ""), _points(one, "_low"), _points(one, "_high")),
+            groups=tuple(
+                _points(other, "")
+                for other in settings
+                if other["policies"] != ALL
+                and all(other[name] == one[name] for name in ("scene", "knob", "setting"))
+            ),
+            front=one["front"] == "yes",
+        )
+        for one in settings
+        if one["policies"] == ALL
+    ]
+    return plot_trade(points, 100 * MARGIN)
+
+
+def _points(setting: Mapping[str, str], end: str) -> float:
+    return 100 * float(setting[f"difference{end}"])
+
+
+def headings(groups: Sequence[str]) -> tuple[str, ...]:
+    """Of a scene's table."""
+    costs = ("Knob", "Setting", "Steps/s", "Speed [times the default's]")
+    errors = ("Event error [%]", "Latent error [% of sd]", "Other action [%]")
+    reached = [f"{word} `{group}`" for group in groups for word in ("Success [%]", "- default [points]")]
+    return (*costs, *errors, *reached, "All - default [points]", "Verdict")
+
+
+def trade_lines(rows: Sequence[TradedSetting], groups: Sequence[str]) -> list[tuple[str, ...]]:
+    """The rows as text, one for each of `headings`; all rows are the family of the verdicts."""
+    return [
+        (
+            row.knob,
+            row.setting,
+            f"{row.steps_per_s:,.0f}",
+            estimate_text(row.speed, 1, ".2f"),
+            "-" if row.known_error is None else short(100 * row.known_error),
+            short(100 * row.latent_error),
+            short(100 * row.together.other_action),
+            *(text for group in groups for text in _reached(row, group)),
+            "" if row.knob == DEFAULT else points_text(row.together.difference),
+            verdict,
+        )
+        for row, verdict in zip(rows, verdicts(rows), strict=True)
+    ]
+
+
+def _reached(row: TradedSetting, group: str) -> tuple[str, str]:
+    outcome = row.outcomes.get(group)
+    if outcome is None:
+        return "-", "-"
+    return percent_text(outcome.success), "" if row.knob == DEFAULT else points_text(outcome.difference)
+
+
+def points_text(difference: Difference) -> str:
+    """A difference of rates in points, with its interval."""
+    return estimate_text(difference, 100, "+.0f")
+
+
+def trade_metrics(row: TradedSetting, group: str = ALL) -> dict[str, float]:
+    """The metrics of a row under the names that trackers know; what was not measured is left out."""
+    outcome = row.outcomes[group]
+    values = {
+        "perf/env_steps_per_second": row.steps_per_s,
+        **estimate_metrics("perf/speed_ratio", row.speed),
+        "evae/latent_error": row.latent_error,
+        "eval/other_action": outcome.other_action,
+        **estimate_metrics("eval/success_rate", outcome.success),
+        **estimate_metrics("eval/success_difference", outcome.difference),
+    }
+    if row.known_error is not None:
+        values["sim/event_error"] = row.known_error
+    return {name: value for name, value in values.items() if value == value}
+
+
+class Choice(NamedTuple):
+    """One setting in all scenes: its rows, and what they say together.
+
+    Attributes:
+        rows: One for each scene.
+        verdict: "as good" where it is in each scene, "worse" where it is in one, else "undecided".
+    """
+
+    rows: tuple[TradedSetting, ...]
+    verdict: Verdict
+
+    @property
+    def name(self) -> str:
+        """As `TradedSetting.name`."""
+        return self.rows[0].name
+
+    @property
+    def speed(self) -> float:
+        """Geometric mean over the scenes of the speed, times the default's."""
+        return float(np.exp(np.mean([np.log(row.speed.value) for row in self.rows])))
+
+    @property
+    def is_faster(self) -> bool:
+        """Beyond doubt, in each scene."""
+        return all(_low(row.speed) > 1.0 for row in self.rows)
+
+
+def choices(rows: Sequence[TradedSetting]) -> list[Choice]:
+    """The settings, each over all scenes, in the order of the rows; those that a scene lacks are left out."""
+    found: dict[tuple[str, str], list[tuple[TradedSetting, Verdict]]] = {}
+    for row, verdict in zip(rows, verdicts(rows), strict=True):
+        found.setdefault((row.knob, row.setting), []).append((row, verdict))
+    whole = [own for own in found.values() if len(own) == len(by_scene(rows))]
+    return [Choice(tuple(row for row, _ in own), _joined([verdict for _, verdict in own])) for own in whole]
+
+
+def _joined(several: Sequence[Verdict]) -> Verdict:
+    if len(set(several)) == 1:
+        return several[0]
+    return "worse" if "worse" in several else "undecided"
+
+
+class Advice(NamedTuple):
+    """Which settings to choose, and which not.
+
+    Attributes:
+        fastest: The fastest that is as good as the default, with the same camera; None: none is faster.
+        coarsest: Of the default and those as good, the one with the largest event error, same camera.
+        encoder: The fastest setting of the encoder that is as good; None: none is faster.
+        cameras: Settings that are another camera.
+        worse: Settings that are known to cost success.
+        undecided: Settings of which too little is known.
+    """
+
+    fastest: Choice | None
+    coarsest: Choice
+    encoder: Choice | None
+    cameras: list[Choice]
+    worse: list[Choice]
+    undecided: list[Choice]
+
+
+def advise(rows: Sequence[TradedSetting]) -> Advice:
+    """Choose among the settings by their verdicts."""
+    every = choices(rows)
+    cameras = [
+        one for one in every if one.rows[0].knob == CAMERA_KNOB or one.rows[0].setting in OTHER_CAMERAS
+    ]
+    same = [one for one in every if one.verdict in ("default", "as good") and one not in cameras]
+    faster = [one for one in same if one.is_faster]
+    return Advice(
+        fastest=max(faster, key=lambda one: one.speed, default=None),
+        coarsest=max(same, key=lambda one: max(row.known_error or 0.0 for row in one.rows)),
+        encoder=max(
+            (one for one in faster if one.rows[0].knob in ENCODER_KNOBS),
+            key=lambda one: one.speed,
+            default=None,
+        ),
+        cameras=cameras,
+        worse=[one for one in every if one.verdict == "worse"],
+        undecided=[one for one in every if one.verdict == "undecided"],
+    )
+
+
+def trade_page(about: TradeFacts, rows: Sequence[TradedSetting]) -> str:
+    """The page: what was evaluated, plot, advice, a table for each scene; every number is a row's.
+
+    Args:
+        about: What made the numbers.
+        rows: Scene after scene, as everywhere here; in each the default first, the most exact last.
+    """
+    scenes, groups = by_scene(rows), list(about["policies"])
+    lines = trade_lines(rows, groups)
+    tables = {}
+    for own in scenes:
+        tables[own[0].scene], lines = (
+            markdown_table(headings(groups), lines[: len(own)], 2),
+            lines[len(own) :],
+        )
+    return render(
+        TEMPLATE,
+        about=about,
+        defaults=[own[0] for own in scenes],
+        exacts=[(own[0], own[-1]) for own in scenes],
+        **advise(rows)._asdict(),
+        count=sum(row.knob != DEFAULT for row in rows),
+        margin=f"{100 * MARGIN:.0f}",
+        percent_text=percent_text,
+        points_text=points_text,
+        ratio_text=lambda estimate: estimate_text(estimate, 1, ".2f"),
+        short=short,
+        tables=tables,
+    )

@@ -1,0 +1,186 @@
+"""The settings of the simulated camera with which it does what a recorded one did, as a file of conf/camera.
+
+Run: python -m platform.launch +exp=calibrate calibrate.recording=events.txt calibrate.frames=images.txt
+Expect: seconds to minutes. A table of settings with their intervals, the file `calibrate/camera.yaml` and the
+hot pixels in the run folder, and with frames a table and a figure of simulated events beside the recorded
+ones.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from envs.config import LUMINANCE_FLOOR, CameraConfig, FaultsConfig, with_floor
+from envs.recordings.event_file import EventFile
+from jobs.analysis.plots import AMBER, BLUE, GREEN, INK, tidy
+from jobs.analysis.tables import save_plot, show_table
+from jobs.config.config import Config, ConfigError
+from jobs.run.files import write_atomic
+from jobs.run.folder import open_run
+from jobs.run.progress import console
+from jobs.run.provenance import REPOSITORY
+from jobs.tools.calibrate.camera_file import camera_text, unit
+from jobs.tools.calibrate.estimate import (
+    Calibration,
+    Footage,
+    estimate,
+    settings,
+    simulate,
+    still_footage,
+)
+from jobs.tools.calibrate.found import Found
+from jobs.tools.calibrate.likeness import INTERVALS_MS, Likeness, likeness
+from jobs.tools.calibrate.sources import read_frames, read_recording
+
+HEADINGS = ("Setting", "Value", "95 % interval", "Not found, because")
+SIMULATED = (
+    *("Events", "per pixel [Hz]", "ON [%]", "Same polarity [%]", "Median interval [ms]"),
+    *("Neighbours, r", "Recorded, r"),
+)
+
+
+def run(config: Config) -> Calibration:
+    """Calibrate against `calibrate.recording`; return what was found.
+
+    Raises:
+        ConfigError: The recording or its frames are refused, or have too few events.
+    """
+    chosen, camera = config.calibrate, config.env.camera
+    try:
+        frames = read_frames(chosen.frames, chosen.frame_delay_us) if chosen.frames else None
+        file = read_recording(chosen.recording, frames)
+        footage = frames or _still(file, chosen.luminance)
+        footage = within(footage, file.events)
+        taken = assumed(camera, footage.is_still)
+        calibration = estimate(file.events, footage, taken, config.seed)
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"calibrate.recording: {chosen.recording}: {error}") from error
+    name = Path(chosen.recording).name
+    show_table(
+        f"The camera of {name}", HEADINGS, [line(*pair) for pair in calibration.found.items()], words=4
+    )
+    folder = open_run(config).path / "calibrate"
+    folder.mkdir(parents=True, exist_ok=True)
+    text = camera_text(calibration, name, taken)
+    write_atomic(folder / "camera.yaml", text)
+    y, x = np.nonzero(calibration.hot)
+    write_atomic(
+        folder / "hot_pixels.csv", "x,y\n" + "".join(f"{a},{b}\n" for a, b in zip(x, y, strict=True))
+    )
+    if frames is not None and len(footage.times_us) > 2:
+        _compare(config, calibration, footage, file.events, folder)
+    if chosen.camera is not None:
+        write_atomic(REPOSITORY / "conf" / "camera" / f"{chosen.camera}.yaml", text)
+        console.print(f"Take it with: camera={chosen.camera}", markup=False)
+    console.print(f"Written: {folder / 'camera.yaml'}", markup=False)
+    return calibration
+
+
+def line(name: str, part: Found) -> tuple[str, ...]:
+    """A text for each of `HEADINGS`."""
+    if part.value is None:
+        return name, "-", "-", part.reason
+    return name + unit(name), f"{part.value:.3g}", f"{part.low:.3g} to {part.high:.3g}", ""
+
+
+def _still(file: EventFile, luminance: float) -> Footage:
+    """The frames of a still scene that lasts as long as the events."""
+    if not len(file.events) or file.height is None or file.width is None:
+        raise ValueError("has no events")
+    span_us = int(file.events["t"][0]) - 1, int(file.events["t"][-1])
+    return still_footage((file.height, file.width), luminance, span_us)
+
+
+def within(footage: Footage, events: np.ndarray) -> Footage:
+    """The frames during which events were recorded.
+
+    Raises:
+        ValueError: Fewer than two.
+    """
+    first, last = (int(events["t"][k]) for k in (0, -1)) if len(events) else (0, -1)
+    kept = (footage.times_us >= first - 1) & (footage.times_us <= last)
+    if kept.sum() < 2:
+        raise ValueError(
+            f"must have two frames between its first and last event, {first} and {last} us; "
+            f"got {kept.sum()}, of frames from {footage.times_us[0]} to {footage.times_us[-1]} us"
+        )
+    return Footage(footage.luminance[kept], footage.times_us[kept])
+
+
+def assumed(camera: CameraConfig, still: bool) -> CameraConfig:
+    """What of the configured camera is taken as it is; all else is found, or is that of an ideal camera.
+
+    That is how light becomes a response, and of a still scene the thresholds and the refractory period.
+    """
+    usual = CameraConfig(response=camera.response, luminance_floor=camera.luminance_floor)
+    if not still:
+        return usual
+    return dataclasses.replace(
+        usual,
+        contrast_threshold=camera.contrast_threshold,
+        contrast_threshold_off=camera.contrast_threshold_off,
+        refractory_us=camera.refractory_us,
+    )
+
+
+def compared(calibration: Calibration, camera: CameraConfig, faults: FaultsConfig) -> dict[str, tuple]:
+    """Name -> camera and faults of the sensors that are simulated: ideal, as configured, calibrated."""
+    height, width = calibration.hot.shape
+    size = {"height": height, "width": width}
+    sensors = {"ideal": (with_floor(CameraConfig(**size), LUMINANCE_FLOOR), FaultsConfig())}
+    configured = dataclasses.replace(camera, **size), faults
+    if configured != sensors["ideal"]:
+        sensors["as configured"] = configured
+    taken = dataclasses.replace(assumed(camera, still=False), **size)
+    return {**sensors, "calibrated": settings(taken, calibration.found)}
+
+
+def _compare(
+    config: Config, calibration: Calibration, footage: Footage, events: np.ndarray, folder: Path
+) -> None:
+    """Simulate the frames with each camera; show and draw how like the recording that is."""
+    shape, times_us = calibration.hot.shape, footage.times_us[1:]  # levels settle in the first interval
+    inside = events[(events["t"] > times_us[0]) & (events["t"] <= times_us[-1])]
+    rows = {"recorded": likeness(inside, inside, times_us, shape)}
+    for name, (camera, faults) in compared(calibration, config.env.camera, config.env.faults).items():
+        made = simulate(footage, camera, faults, config.seed)
+        made = made[made["t"] > times_us[0]]
+        rows[name] = likeness(made, inside, times_us, shape)
+    show_table(
+        "Recorded and simulated events", SIMULATED, [(name, *texts(row)) for name, row in rows.items()]
+    )
+    save_plot(folder / "likeness.png", plot_likeness(rows))
+    console.print(f"Drawn: {folder / 'likeness.png'}", markup=False)
+
+
+def texts(row: Likeness) -> tuple[str, ...]:
+    """A text for each of `SIMULATED` but the first."""
+    return (
+        f"{row.rate_hz:.2f}", f"{100 * row.on_share:.1f}", f"{100 * row.same_share:.1f}",
+        f"{row.median_ms:.1f}", f"{row.neighbours:.2f}", f"{row.real:.3f}",
+    )  # fmt: skip
+
+
+def plot_likeness(rows: Mapping[str, Likeness]) -> Figure:
+    """Draw the intervals between events of a pixel, and the shares of ON and of same polarities."""
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1.6, 1.0))
+    colours = {"recorded": INK, "ideal": AMBER, "as configured": GREEN, "calibrated": BLUE}
+    for name, row in rows.items():
+        left.stairs(100 * row.intervals, INTERVALS_MS, color=colours[name], lw=1.8, label=name)
+    left.set(xscale="log", xlabel="Interval between two events of a pixel [ms]", ylabel="Share [%]")
+    left.legend(frameon=False, fontsize=9)
+    shown = ("ON", "same polarity\nas before", "neighbours,\n100 r")
+    width = 0.8 / len(rows)
+    for place, (name, row) in enumerate(rows.items()):
+        heights = [100 * row.on_share, 100 * row.same_share, 100 * row.neighbours]
+        right.bar(
+            np.arange(3) + width * (place - (len(rows) - 1) / 2), heights, 0.9 * width, color=colours[name]
+        )
+    right.set(xticks=range(3), xticklabels=shown, ylabel="[%]", ylim=(0, 100))
+    for panel in (left, right):
+        tidy(panel, "y")
+    return figure

@@ -1,0 +1,63 @@
+"""What was found, as a file of conf/camera."""
+
+from envs.config import CameraConfig
+from jobs.tools.calibrate.estimate import DEAD, OFF, ON, Calibration
+from jobs.tools.calibrate.found import Found
+
+UNITS = {"hz": " [Hz]", "us": " [us]"}
+
+
+def camera_text(calibration: Calibration, source: str, taken: CameraConfig) -> str:
+    """A file that `camera=NAME` takes from conf/camera; what was not found is named, and keeps its default.
+
+    Args:
+        calibration: What was found.
+        source: Of what, for the file's first line.
+        taken: The camera that was assumed.
+    """
+    height, width = calibration.hot.shape
+    absent = [
+        f"# {name}: not found, {part.reason}"
+        for name, part in calibration.found.items()
+        if part.value is None
+    ]
+    groups: dict[str, list[str]] = {
+        "camera": [f"  width: {width}  # [pixels]", f"  height: {height}  # [pixels]"],
+        "faults": [],
+    }
+    groups["camera"] += [f"  {key}: {value}  # assumed" for key, value in assumptions(calibration, taken)]
+    for name, part in calibration.found.items():
+        if part.value is not None:
+            group, key = name.split(".")
+            groups[group].append(
+                f"  {key}: {value_text(name, part)}  # 95 %: {part.low:.3g} to {part.high:.3g}{unit(key)}"
+            )
+    lines = ["# @package _global_", f"# Found in {source} by +exp=calibrate.", *absent]
+    lines += ["defaults: [paper@camera, _self_]  # what is not named here"]
+    for group, rows in groups.items():
+        lines += [f"{group}:", *rows] if rows else []
+    return "\n".join(lines) + "\n"
+
+
+def assumptions(calibration: Calibration, taken: CameraConfig) -> list[tuple[str, object]]:
+    """Keys and values of what was assumed and not found."""
+    keys = ["response", "luminance_floor"]
+    if calibration.found[ON].value is None:
+        keys += [
+            name.removeprefix("camera.") for name in (ON, OFF, DEAD) if calibration.found[name].value is None
+        ]
+    values = [(key, getattr(taken, key)) for key in keys]
+    return [(key, "null" if value is None else value) for key, value in values]
+
+
+def value_text(name: str, part: Found) -> str:
+    """A value as YAML: whole microseconds, else three digits."""
+    if name == DEAD:
+        return str(round(part.value or 0.0))
+    text = f"{part.value:.3g}"
+    return text if any(mark in text for mark in ".e") else f"{text}.0"
+
+
+def unit(key: str) -> str:
+    """The unit that a key ends with, in brackets."""
+    return UNITS.get(key.rsplit("_", 1)[-1], "")

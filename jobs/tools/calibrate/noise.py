@@ -1,0 +1,109 @@
+"""Leakage and shot noise of pixels whose light rests: the rates with which the simulated pixel does the same.
+
+Of a still pixel leakage makes ON events, shot noise ON and OFF in turns, and a refractory period or
+thresholds that differ change how much of both is seen. So both rates are found together: pixels under the
+same light are simulated, and the rates changed until their ON and OFF events are as frequent as those of the
+recording.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.config import CameraConfig, FaultsConfig
+from envs.events import EventCamera, RealSensor
+from envs.events.pixel_noise import SHOT_NOISE_FALL
+from jobs.tools.calibrate.footage import Trains
+from jobs.tools.calibrate.found import Found, missing
+
+BURN_IN = 0.25  # of the time: levels are where noise takes them only after a while
+FEWEST_PIXELS = 16
+SIMULATED_PIXELS = 5000
+ROUNDS, NUDGE = 3, 0.2
+LEAST_NUDGE_HZ = 0.01
+HIDDEN = 1e-3  # of the slopes' determinant
+HIDDEN_REASON = "leakage and shot noise look the same behind this refractory period"
+STEP_US = 250_000
+
+
+class Rates(NamedTuple):
+    """ON and OFF events of a still pixel per second [Hz], and how uncertain they are.
+
+    Attributes:
+        mean: float64 (2,).
+        covariance: Of the mean, float64 (2, 2).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def still_rates(trains: Trains, still: np.ndarray, span_us: tuple[int, int]) -> Rates:
+    """Of the still pixels, bool (P,), in the later three quarters of a span [us]."""
+    begin = span_us[0] + BURN_IN * (span_us[1] - span_us[0])
+    late = trains.t_us > begin
+    counts = np.stack(
+        [
+            np.bincount(trains.pixel[late & (trains.p == sign)], minlength=still.size)[still]
+            for sign in (1, -1)
+        ]
+    )
+    seconds = (span_us[1] - begin) * 1e-6
+    covariance = (np.cov(counts) + np.eye(2) / counts.shape[1]) / counts.shape[
+        1
+    ]  # that of one event at least
+    return Rates(counts.mean(axis=1) / seconds, covariance / seconds**2)
+
+
+def simulated_rates(
+    leak_hz: float, shot_hz: float, camera: CameraConfig, luminance: float, span_us: tuple[int, int]
+) -> Rates:
+    """The same of simulated pixels; equal arguments give equal numbers."""
+    side = math.isqrt(SIMULATED_PIXELS)
+    camera = dataclasses.replace(camera, width=side, height=side)
+    eye, frame = EventCamera(camera), np.full((side, side), luminance, np.float32)
+    eye.reset(frame, span_us[0])
+    faults = FaultsConfig(leak_hz=leak_hz, shot_noise_hz=shot_hz)
+    sensor = RealSensor(camera, faults, (eye.state, eye.pixels), np.random.default_rng(0), span_us[0])
+    pixel, t_us, p = [], [], []
+    for begin in range(*span_us, STEP_US):
+        end = min(begin + STEP_US, span_us[1])
+        events = sensor.events(eye.step(frame, end), begin, end)
+        pixel.append(events["y"].astype(np.int64) * side + events["x"])
+        t_us.append(events["t"])
+        p.append(events["p"].astype(np.float64))
+    trains = Trains(*(np.concatenate(parts) for parts in (pixel, t_us, p)))
+    return still_rates(trains, np.ones(side * side, bool), span_us)
+
+
+def noise_rates(
+    seen: Rates, camera: CameraConfig, luminance: float, span_us: tuple[int, int]
+) -> tuple[Found, Found]:
+    """`leak_hz` and `shot_noise_hz` [Hz] behind the rates of still pixels under a light, white = 1.
+
+    The interval is that of the rates seen and of those simulated, through the slope of one against
+    the other.
+    """
+    ratio = (camera.contrast_threshold_off or camera.contrast_threshold) / camera.contrast_threshold
+    on, off = seen.mean
+    values = np.array([max(on - ratio * off, 0.0), 2.0 * off / (1.0 - SHOT_NOISE_FALL * min(luminance, 1.0))])
+
+    def simulated(rates: np.ndarray) -> Rates:
+        return simulated_rates(float(rates[0]), float(rates[1]), camera, luminance, span_us)
+
+    for _ in range(ROUNDS):
+        made, nudges = simulated(values), np.diag(NUDGE * values + LEAST_NUDGE_HZ)
+        slope = np.stack(
+            [(simulated(values + nudge).mean - made.mean) / nudge.sum() for nudge in nudges], axis=1
+        )
+        if abs(np.linalg.det(slope)) < HIDDEN:
+            return missing(HIDDEN_REASON), missing(HIDDEN_REASON)
+        step = np.linalg.solve(slope, seen.mean - made.mean)
+        values = np.clip(values + step, 0.2 * values, 5.0 * values + LEAST_NUDGE_HZ)
+    inverse = np.linalg.inv(slope)
+    error = 1.96 * np.sqrt(np.diag(inverse @ (seen.covariance + made.covariance) @ inverse.T))
+    pairs = zip(values.tolist(), error.tolist(), strict=True)
+    leak, shot = (Found(value, max(value - half, 0.0), value + half) for value, half in pairs)
+    return leak, shot

@@ -1,0 +1,113 @@
+"""A recording and the frames beside it, as files have them."""
+
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from envs.recordings import read_events
+from envs.recordings.event_file import EventFile
+from envs.recordings.light import light_of_grey
+from jobs.tools.calibrate.estimate import Footage
+
+MAX_PIXELS = 1 << 28  # of all frames together: 1 GiB
+EIGHT_BITS = ("L", "LA", "P", "RGB", "RGBA")  # of Pillow's modes
+# What Pillow raises of files that are damaged, or too large to be decoded.
+BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
+BARE_ROW = re.compile(rb"\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")  # of the data set of Mueggler et al. (IJRR 2017)
+
+
+def read_frames(path: str | Path, delay_us: int) -> Footage:
+    """Frames named by a text file with a line "seconds picture" each, as Mueggler et al. (2017) have them.
+
+    Pictures have 8 bits and are decoded from sRGB, which fits the frames of a DAVIS best (docs/camera.md).
+
+    Args:
+        path: The text file; pictures are beside it.
+        delay_us: From the time of a frame to the light that it shows, half of its exposure [us].
+
+    Raises:
+        ValueError: A line, a picture or a time is not as it should be, or there are fewer than two frames.
+    """
+    greys, times_us = read_greys(path), _frame_rows(Path(path))[0] + delay_us
+    return Footage(light_of_grey("srgb")[greys], times_us)
+
+
+def read_greys(path: str | Path) -> np.ndarray:
+    """The pictures of such a text file, uint8 (K, H, W); raises as `read_frames`."""
+    path, left, pictures = Path(path), MAX_PIXELS, []
+    for name in _frame_rows(path)[1]:
+        pictures.append(_picture(path.parent / name, left))
+        left -= pictures[-1].size
+    if len({picture.shape for picture in pictures}) > 1:
+        raise ValueError(f"{path}: pictures must all have one size")
+    return np.stack(pictures)
+
+
+def _frame_rows(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Times [us], int64 (K,), and names of the pictures."""
+    rows = [line.split() for line in path.read_text().splitlines() if line.strip() and line[0] != "#"]
+    if len(rows) < 2 or any(len(row) != 2 for row in rows):
+        raise ValueError(f'{path}: must have a line "seconds picture" for each of two frames or more')
+    try:
+        times_us = np.array([round(1e6 * float(row[0])) for row in rows], np.int64)
+    except (ValueError, OverflowError):
+        raise ValueError(f'{path}: must have a line "seconds picture" for each frame') from None
+    if not (np.diff(times_us) > 0).all():
+        raise ValueError(f"{path}: times must increase from line to line")
+    return times_us, [row[1] for row in rows]
+
+
+def _picture(path: Path, left: int) -> np.ndarray:
+    """Greys of a picture of so many pixels at most, uint8 (H, W)."""
+    try:
+        with Image.open(path) as picture:
+            unfit = _unfit(picture, left)
+            grey = np.empty(0, np.uint8) if unfit else np.asarray(picture.convert("L"))
+    except BROKEN as error:
+        raise ValueError(
+            f"{path}: is no picture that can be read ({error}); save it again, as a PNG of 8 bits"
+        ) from None
+    if unfit:
+        raise ValueError(f"{path}: {unfit}")
+    return grey
+
+
+def _unfit(picture: Image.Image, left: int) -> str:
+    """Why a picture is refused by its header, before it takes memory; empty: it is not."""
+    if picture.mode not in EIGHT_BITS:
+        return f"must have 8 bits a value, got mode {picture.mode}; convert it to a grey picture of 8 bits"
+    width, height = picture.size
+    if width * height > left:
+        return (
+            f"must leave all pictures at {MAX_PIXELS} pixels or fewer together, got {width}x{height} after "
+            f"{MAX_PIXELS - left}; leave lines out"
+        )
+    return ""
+
+
+def read_recording(path: str | Path, frames: Footage | None) -> EventFile:
+    """The events of any format of `envs.recordings`; a text of bare rows is read as "seconds x y polarity".
+
+    Raises:
+        ValueError: The file is refused, does not say its sensor's size where there are no frames, or has
+            another than these.
+    """
+    with Path(path).open("rb") as file:
+        bare = BARE_ROW.match(file.read(100)) is not None
+    size = dict(zip(("height", "width"), frames.luminance.shape[1:], strict=True)) if frames else {}
+    if bare:
+        return read_events(path, "txt", columns=("t", "x", "y", "p"), time_unit="s", **size)
+    found = read_events(path)
+    shape = (found.height, found.width) if None not in (found.height, found.width) else None
+    if frames is None and shape is None:
+        raise ValueError(
+            f"{path}: does not say its sensor's size; write it with envs.recordings.write_events"
+        )
+    if frames is not None and shape not in (None, frames.luminance.shape[1:]):
+        raise ValueError(
+            f"{path}: has {shape} pixels and its frames {frames.luminance.shape[1:]}; (H, W) must agree"
+        )
+    return found if shape else read_events(path, **size)  # which refuses events beside the frames

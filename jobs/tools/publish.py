@@ -1,0 +1,119 @@
+"""Put trained policies where a fresh clone finds them, and draw their learning curves.
+
+Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=ship
+Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each
+experiment, length and seed in `runs_dir` with the configured budget, 0.1 to 2 megabytes each
+(weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`; what was published
+before stays. A group is an experiment; trainings of another length than the one that all are
+compared at have its thousands of steps behind their name: bytestream_1500k. Each becomes a
+version in MLflow's model registry.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from envs.config import settings_hash
+from jobs.analysis.plots import Curve, plot_learning_curves
+from jobs.analysis.tables import save_plot
+from jobs.config.config import Config, ConfigError
+from jobs.rollout.policies import PRETRAINED
+from jobs.run.files import read_json, read_json_lines, write_atomic
+from jobs.run.folder import group_name, open_run
+from jobs.run.progress import console
+from jobs.run.provenance import REPOSITORY
+from jobs.tools.curves import as_csv, read_curves
+from jobs.tracking.model_registry import register_training
+from jobs.tracking.tracker import open_tracker
+from models.policy import load_policy
+from models.policy.policy import save_lean_policy
+
+PLOT = REPOSITORY / "docs" / "images" / "learning.png"
+MAX_POINTS = 50  # of a curve
+
+
+@dataclass(frozen=True)
+class Training:
+    """A finished training: its run folder, what it is one training of, its seed, and what made it."""
+
+    path: Path
+    group: str
+    seed: int
+    about: dict[str, object]
+
+    @property
+    def name(self) -> str:
+        """The name of its policy's folder."""
+        return f"{self.group}-s{self.seed}"
+
+
+def run(config: Config) -> dict[str, int]:
+    """Publish the finished trainings; return how many of each group.
+
+    Raises:
+        ConfigError: There is none, or the budget is one that learns nothing.
+    """
+    if config.budget == "smoke":
+        raise ConfigError("budget: smoke learns nothing, and would replace what is published; choose another")
+    runs_dir = Path(config.runs_dir).resolve()
+    trainings = newest_trainings(runs_dir, config.budget)
+    if not trainings:
+        raise ConfigError(f"runs_dir: no finished training with budget={config.budget} in {str(runs_dir)!r}")
+    for training in trainings:
+        target = publish(training, PRETRAINED)
+        size = sum(file.stat().st_size for file in target.iterdir())
+        console.print(f"{target.relative_to(REPOSITORY)}: {size / 1024:,.0f} KiB", markup=False)
+    published = read_curves(PRETRAINED)  # also of trainings elsewhere, or whose run folders are gone
+    published |= {(training.group, training.seed): learning_curve(training) for training in trainings}
+    curves = [published[key] for key in sorted(published)]
+    write_atomic(PRETRAINED / "curves.csv", as_csv(curves))
+    plot = plot_learning_curves(curves)
+    save_plot(PLOT, plot)
+    folder = open_run(config)
+    with open_tracker(folder.config, folder) as tracker:
+        tracker.figure("train/learning.png", plot)
+        tracker.text("train/curves.csv", as_csv(curves))
+        for training in trainings:
+            register_training(tracker.of(training.path), training.path)
+    return dict(Counter(training.group for training in trainings))
+
+
+def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
+    """The training of each group and seed that was finished last, by group and seed."""
+    found: dict[tuple[str, int], Training] = {}
+    markers = sorted(runs_dir.glob("*/stages/train.json"), key=lambda marker: marker.stat().st_mtime_ns)
+    for marker in markers:
+        path = marker.parent.parent
+        config = read_json(path / "config.json")
+        if config["budget"] != budget or not (path / "policy" / "policy.json").is_file():
+            continue
+        group, seed = group_name(config), int(config["seed"])
+        about = {
+            "exp": group,
+            "run": path.name,
+            "commit": read_json(marker)["commit"],
+            "config_hash": settings_hash(config),
+            **{name: config[name] for name in ("train", "pretrain", "collect")},
+        }
+        found[group, seed] = Training(path, group, seed, about)
+    return [found[key] for key in sorted(found)]
+
+
+def publish(training: Training, folder: Path) -> Path:
+    """Write the policy of a training into `folder`, with what made it in its manifest; return its folder."""
+    target = folder / training.name
+    save_lean_policy(training.path / "policy", target, training.about)
+    load_policy(target)
+    return target
+
+
+def learning_curve(training: Training) -> Curve:
+    """The success and distance of a training at about `MAX_POINTS` of its iterations."""
+    lines = read_json_lines(training.path / "train" / "results.jsonl")
+    rows = [row for row in lines if row["train/success_rate"] is not None]
+    kept = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(int))
+    names = ("env_steps", "train/success_rate", "train/distance_m")
+    values = [[rows[place][name] for name in names] for place in kept]
+    return Curve(training.group, training.seed, *np.array(values, float).reshape(-1, 3).T)

@@ -1,0 +1,235 @@
+"""Search for settings that a training learns best with (Optuna's TPE; ASHA: Li et al. 2020).
+
+Run: python -m platform.launch +exp=tune model=event_columns
+Expect: trials as trainings on one core each, side by side on all; in the run folder under `tune-HASH/` every
+measurement, a figure of all curves and a table; in MLflow a child run for each trial. All are measured in
+the same validation corridors, in which nothing is trained or evaluated. The same command continues a stopped
+search.
+"""
+
+import os
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from matplotlib.figure import Figure
+from ray import tune
+from ray.tune.schedulers import ASHAScheduler
+from ray.tune.search.optuna import OptunaSearch
+
+from envs.checks import naming
+from envs.config import settings_hash
+from jobs.analysis.plots import BLUE, GREYS, INK, tidy
+from jobs.analysis.tables import publish_plot, publish_table
+from jobs.config.config import Config, ConfigError, as_dict
+from jobs.run.files import json_lines, read_json_lines, whole_lines
+from jobs.run.folder import Run, finish, locate_run, open_run
+from jobs.run.progress import console, progress
+from jobs.run.ray_cluster import fit, holds, start_ray, storage
+from jobs.run.tune_state import mend_state
+from jobs.tools.search.space import (
+    encoder_facts,
+    extremes,
+    read_settings,
+    search_space,
+    space_errors,
+    with_settings,
+)
+from jobs.tools.search.trial import Files, SearchTrial
+from jobs.tracking.child_runs import ChildRun, write_child_runs
+from jobs.tracking.tracker import Tracker, open_tracker
+from jobs.training.inputs import check_inputs, prepare_inputs
+from jobs.training.train import CHECKPOINTS_KEPT, MAX_FAILURES, Relay, TrainingError, relayed_to, stopped
+from models.policy.policy import ENCODER_FILES, NETWORKS
+
+LISTENER = "tune"
+REDUCTION = 3  # of the trials that reach a step of ASHA, one in so many goes on
+METRIC = "distance_m"  # success is 0 for long, and would tell nothing early
+HEADINGS = ("trial", "settings", "steps", "distance [m]", "success [%]")
+Row = dict[str, Any]  # one measurement: trial, env_steps, settings, distance_m, success_rate, metrics
+
+
+def run(config: Config) -> dict[str, float]:
+    """Search, from where it stopped if it did; return the best trial's measurement.
+
+    Raises:
+        ConfigError: A key cannot be searched, or one of its values would be refused.
+        TrainingError: No trial got as far as a measurement.
+    """
+    errors = list(dict.fromkeys(space_errors(locate_run(config).config)))
+    if errors:
+        raise ConfigError("\n".join(errors))
+    check_inputs(config)
+    folder = open_run(config)
+    config = folder.config
+    name = f"tune-{settings_hash(as_dict(config)['tune'])[:8]}"  # type: ignore[arg-type]
+    with open_tracker(config, folder, key=name) as tracker:
+        tracker.tags({"kind": "tune"})
+        files = _inputs(config, folder, tracker)
+        rows = search(config, folder.path / name, files, tracker)
+        best = report(folder, name, rows, tracker)
+        console.print(tracker.dashboard(), markup=False)
+    figures = {key: float(best[key]) for key in ("distance_m", "success_rate", "env_steps")}
+    return finish(folder, name, figures)
+
+
+def _inputs(config: Config, folder: Run, tracker: Tracker) -> Files:
+    """The encoder that trials share, unless each has its own; the policy that they begin from."""
+    facts = encoder_facts(config)
+    points = [{key: value} for key, values in config.tune.space.items() for value in extremes(values)]
+    if facts is not None and any(encoder_facts(with_settings(config, point)) != facts for point in points):
+        console.print("The space changes the encoder: each trial collects and pretrains its own.")
+        return {}
+    encoder = prepare_inputs(config, folder, tracker)
+    files = [] if encoder is None else [encoder.with_name(name) for name in ENCODER_FILES]
+    files += [folder.init / NETWORKS] if config.train.init is not None else []
+    return {file.name: file.read_bytes() for file in files}
+
+
+def search(config: Config, place: Path, files: Files, tracker: Tracker) -> list[Row]:
+    """Run the trials that are missing; every measurement of all, in the order in which they came."""
+    start_ray(config.cluster, place.parent)
+    place.mkdir(exist_ok=True)
+    file = place / "results.jsonl"
+    if file.is_file():
+        os.truncate(file, len(whole_lines(file)))  # a kill can leave half a line
+    rows: list[Row] = read_json_lines(file) if file.is_file() else []
+    known, total = {(row["trial"], row["env_steps"]) for row in rows}, config.tune.trials
+    with progress("Tune", total, "trials", done=len({row["trial"] for row in rows})) as advance:
+
+        def listen(result: Mapping[str, Any]) -> None:
+            row = measurement(result)
+            if (row["trial"], row["env_steps"]) in known:
+                return
+            new = row["trial"] not in {one["trial"] for one in rows}
+            known.add((row["trial"], row["env_steps"]))
+            rows.append(row)
+            with naming(file), file.open("a") as lines:
+                lines.write(json_lines([row]))
+            write_child_runs(tracker, "trial", [child_run(of_trial(rows, row["trial"]))])
+            advance(int(new), note=f"{row['trial']}: {row['distance_m']:.1f} m at {row['env_steps']:,} steps")
+
+        with relayed_to(LISTENER, listen):
+            results = fit(_tuner(config, place, files))
+    if not rows and results.errors:
+        raise TrainingError(stopped(results.errors[0]))
+    return rows
+
+
+def _tuner(config: Config, place: Path, files: Files) -> tune.Tuner:
+    """The search in its folder: continued if it is there, else new."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    path, most = storage(config.cluster, place), config.train.env_steps
+    trial = tune.with_resources(tune.with_parameters(SearchTrial, base=config, files=files), {"cpu": 1})
+    said = mend_state(place)
+    if said:
+        console.print(said, markup=False)
+    if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
+        return tune.Tuner.restore(path, trial, resume_unfinished=True, resume_errored=True)
+    scheduler = ASHAScheduler(
+        time_attr="env_steps",
+        grace_period=min(config.tune.report_steps, most),
+        max_t=most,
+        reduction_factor=REDUCTION,
+    )
+    return tune.Tuner(
+        trial,
+        param_space=search_space(config.tune.space),
+        tune_config=tune.TuneConfig(
+            metric=METRIC,
+            mode="max",
+            num_samples=config.tune.trials,
+            search_alg=OptunaSearch(seed=config.seed),
+            scheduler=scheduler,
+        ),
+        run_config=tune.RunConfig(
+            name=place.name,
+            storage_path=path.rpartition("/")[0],
+            verbose=0,
+            callbacks=[Relay(LISTENER)],
+            failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
+            checkpoint_config=tune.CheckpointConfig(checkpoint_frequency=1, num_to_keep=CHECKPOINTS_KEPT),
+        ),
+    )
+
+
+def measurement(result: Mapping[str, Any]) -> Row:
+    """What is kept of a result of Tune's."""
+    kept = {name: result[name] for name in ("env_steps", "distance_m", "success_rate", "metrics")}
+    return {"trial": result["trial_id"], "settings": read_settings(result["config"]), **kept}
+
+
+def of_trial(rows: Sequence[Row], trial: str) -> list[Row]:
+    """The measurements of one trial, by steps."""
+    return sorted((row for row in rows if row["trial"] == trial), key=lambda row: row["env_steps"])
+
+
+def ranked(rows: Sequence[Row]) -> list[Row]:
+    """The last measurement of each trial: those that were trained longest first, of these the best first."""
+    last = [of_trial(rows, trial)[-1] for trial in dict.fromkeys(row["trial"] for row in rows)]
+    return sorted(last, key=lambda row: (row["env_steps"], row["distance_m"]), reverse=True)
+
+
+def child_run(rows: Sequence[Row]) -> ChildRun:
+    """A trial as a finished run in MLflow, with its curves over environment steps."""
+    settings, curves = rows[-1]["settings"], {}
+    for name in ("distance_m", "success_rate"):
+        curves[f"tune/{name}"] = {row["env_steps"]: row[name] for row in rows}
+    for name in rows[-1]["metrics"]:
+        curves[name] = {row["env_steps"]: row["metrics"][name] for row in rows if name in row["metrics"]}
+    # Parameters are texts, which MLflow sorts as such: numbers are metrics too.
+    numbers = {
+        f"tune/{key}": float(value)
+        for key, value in settings.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+    trial, steps = rows[-1]["trial"], {"env_steps": str(rows[-1]["env_steps"])}
+    return ChildRun(f"trial {trial}", settings, steps, numbers, curves)
+
+
+def words(settings: Mapping[str, Any]) -> str:
+    """Settings as words of a command line."""
+    texts = {
+        key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in settings.items()
+    }
+    return " ".join(shlex.quote(f"{key}={re.sub(r' ', '', text)}") for key, text in texts.items())
+
+
+def report(folder: Run, name: str, rows: Sequence[Row], tracker: Tracker) -> Row:
+    """Print, plot and record the trials; return the best."""
+    order = ranked(rows)
+    lines = [_cells(row) for row in order]
+    episodes = folder.config.tune.episodes
+    caption = (
+        f"Means over the same {episodes} validation corridors; the best of many measured so looks too good"
+    )
+    publish_table(folder, tracker, f"{name}/table", "Trials, the best first", HEADINGS, lines, 2, caption)
+    publish_plot(folder, tracker, f"{name}/curves", plot_curves(rows, order))
+    best = order[0]
+    tracker.log_once(best["env_steps"], {f"tune/{key}": best[key] for key in ("distance_m", "success_rate")})
+    console.print(f"Best: {words(best['settings'])}", markup=False)
+    return best
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    """A text for each of `HEADINGS`."""
+    figures = f"{row['env_steps']:,}", f"{row['distance_m']:.1f}", f"{100 * row['success_rate']:.0f}"
+    return (row["trial"], words(row["settings"]), *figures)
+
+
+def plot_curves(rows: Sequence[Row], order: Sequence[Row]) -> Figure:
+    """Each trial's distance over its steps; the best in colour, the others in grey."""
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    panel = figure.subplots()
+    for place, last in reversed(list(enumerate(order))):
+        curve = of_trial(rows, last["trial"])
+        steps, metres = ([row[name] for row in curve] for name in ("env_steps", "distance_m"))
+        best = place == 0
+        panel.plot(steps, metres, "o-", ms=3, lw=2 if best else 1, color=BLUE if best else GREYS[0])
+    panel.set_title(f"Best: {words(order[0]['settings'])}", loc="left", fontsize=8, color=INK)
+    panel.set(xlabel="Environment steps", ylabel="Distance in validation corridors [m]", ylim=(0, None))
+    tidy(panel)
+    return figure

@@ -1,0 +1,270 @@
+"""What an agent can read from a representation of events: bearing and proximity of the obstacles ahead.
+
+Run: python -m platform.launch +exp=probe
+Expect: beyond the run's own encoder 32 short trainings, an hour on one core, and their probes, a
+quarter of an hour; the trainings are kept in the run folder, so that a killed job continues. One table
+and one plot, in the run folder under `probe/` and in MLflow.
+"""
+
+import dataclasses
+import functools
+import re
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from envs.config import Split
+from jobs.analysis.plots import BROWN, COLOURS, CYAN, GREYS, INK, MUTED, VIOLET, tidy
+from jobs.analysis.tables import publish_plot, publish_table
+from jobs.config.config import Config, ConfigError
+from jobs.measure.encoder.trials import kept, trial_settings
+from jobs.run.folder import Run, finish, locate_run, open_run
+from jobs.run.progress import progress
+from jobs.tracking.tracker import open_tracker
+from jobs.training.pretrain import encoder_file, prepare_encoder
+from models.encoder.evae import EventVAE
+from models.encoder.weights import load_encoder
+from models.kinds import KINDS
+from research.probe.dataset import (
+    ALARM_M,
+    CELLS,
+    ProbeData,
+    cell_features,
+    column_features,
+    latents,
+    nothing,
+    record_probe_data,
+    stacked,
+)
+from research.probe.readout import Interval, Scores, probe, scores
+
+OWN = "run's encoder"
+# Colour and dashes [points] of each representation without a latent size; the targets have other colours.
+LEVEL_LOOKS = (
+    (GREYS[0], (0, (6, 3))),  # nothing
+    (BROWN, (0, (2, 2))),  # image columns
+    (CYAN, (0, (6, 2, 1, 2))),  # few cells
+    (VIOLET, (0, (10, 2))),  # many cells
+    (INK, (0, (1, 2))),  # the run's encoder
+)
+
+
+class Representation(NamedTuple):
+    """A representation of events.
+
+    Attributes:
+        name: As in the table.
+        represent: ProbeData -> float32 (N, D), one function per training.
+        place: Latent size and target of an event VAE trained here, or None.
+    """
+
+    name: str
+    represent: Sequence[Callable[[ProbeData], np.ndarray]]
+    place: tuple[int, str] | None = None
+
+
+class ProbeResult(NamedTuple):
+    """How much one representation holds.
+
+    Attributes:
+        representation: Which.
+        numbers: Numbers for each step [-].
+        scores: Of each number of steps that are read together.
+    """
+
+    representation: Representation
+    numbers: int
+    scores: dict[int, Scores]
+
+
+def run(config: Config) -> dict[str, float]:
+    """Train the run's encoder if there is none yet, then probe it and its rivals; return the metrics.
+
+    Raises:
+        ConfigError: The policy has no event VAE.
+    """
+    name = locate_run(config).config.model.name
+    if not KINDS[name].encoder:
+        raise ConfigError(
+            f"model: {name} has no event VAE to probe; choose bytestream, bytestream_xy or event_image_vae"
+        )
+    folder = open_run(config)
+    config = folder.config
+    with open_tracker(config, folder) as tracker:
+        prepare_encoder(config, folder, tracker)
+        own, _ = load_encoder(encoder_file(folder))
+        train, held_out = record_both(config)
+        rows = probe_representations(config, representations(config, folder, own), train, held_out)
+        title = (
+            f"Proximity read from each representation [%], and error of the bearing of obstacles within "
+            f"{ALARM_M:g} m; {len(np.unique(held_out.episode))} episodes, 95 % intervals"
+        )
+        shown = config.model.stack
+        lines = [result_cells(row, shown) for row in rows]
+        publish_table(folder, tracker, "probe/table", title, headings(rows[0], shown), lines)
+        tracker.table("probe/results", result_columns(rows))
+        publish_plot(folder, tracker, "probe/probe", plot_probes(rows))
+        read = {f"evae/probe_r2_{key(row)}": row.scores[shown].network[0] for row in rows}
+        turned = {f"evae/probe_bearing_deg_{key(row)}": row.scores[shown].bearing_deg[0] for row in rows}
+        tracker.log(0, read)
+        tracker.log(0, turned)
+    metrics = {name: value for name, value in (read | turned).items() if np.isfinite(value)}
+    return finish(folder, "probe", metrics)
+
+
+def record_both(config: Config) -> tuple[ProbeData, ProbeData]:
+    """Record episodes to fit the probes to, and others in validation corridors to judge them by."""
+    env = dataclasses.replace(config.env, observation="events")
+    sizes: dict[Split, int] = {
+        "train": config.probe.num_steps,
+        "validation": config.probe.num_validation_steps,
+    }
+    with progress("Record probe data", sum(sizes.values()), "steps") as advance:
+        train, held_out = (
+            record_probe_data(dataclasses.replace(env, split=split), steps, config.seed, advance)
+            for split, steps in sizes.items()
+        )
+    return train, held_out
+
+
+def representations(config: Config, folder: Run, own: EventVAE) -> list[Representation]:
+    """The representations to compare; the event VAEs among them are trained, or read if they were before."""
+    grid, settings = own.grid, config.probe
+    compared = [
+        Representation("nothing", [nothing]),
+        Representation("image columns", [functools.partial(column_features, grid=grid)]),
+    ]
+    for across in CELLS:
+        counted = functools.partial(cell_features, grid=grid, across=across)
+        compared.append(Representation(f"{across} x {across} cells", [counted]))
+    compared.append(Representation(OWN, [functools.partial(latents, evae=own)]))
+    for target in settings.targets:
+        for latent in settings.latents:
+            models = [trained(config, folder, latent, target, seed) for seed in range(settings.seeds)]
+            represent = [functools.partial(latents, evae=evae) for evae in models]
+            compared.append(Representation(f"{target}, latent {latent}", represent, (latent, target)))
+    return compared
+
+
+def trained(config: Config, folder: Run, latent: int, target: str, seed: int) -> EventVAE:
+    """An event VAE of that latent size and target, trained briefly; the same seed gives the same windows."""
+    iterations = config.probe.iterations
+    file = folder.path / "probe" / "encoders" / f"{target}-{latent}-s{seed}-{iterations}.safetensors"
+    settings = trial_settings(config, {"latent": latent, "target": target})
+    return kept(config, folder, file, settings, seed, iterations)
+
+
+def probe_representations(
+    config: Config, compared: Sequence[Representation], train: ProbeData, held_out: ProbeData
+) -> list[ProbeResult]:
+    """Fit the probes to every representation, for every number of steps read together."""
+    stacks = sorted({*config.probe.stacks, config.model.stack})
+    rows = []
+    fits = len(stacks) * sum(len(one.represent) for one in compared)
+    with progress("Probe", fits, "fits") as advance:
+        for one in compared:
+            features = [[represent(part) for part in (train, held_out)] for represent in one.represent]
+            found = {}
+            for stack in stacks:
+                errors = []
+                for seed, (x, x_held_out) in enumerate(features):
+                    inputs = stacked(x, train.episode, stack), stacked(x_held_out, held_out.episode, stack)
+                    errors.append(probe(inputs[0], train, inputs[1], held_out, seed))
+                    advance(1, note=one.name)
+                found[stack] = scores(errors, held_out)
+            rows.append(ProbeResult(one, features[0][0].shape[1], found))
+    return rows
+
+
+def headings(row: ProbeResult, shown: int) -> tuple[str, ...]:
+    """The headings of the table, which shows ridge and bearing for one number of steps."""
+    networks = [f"Network, {_steps(stack)}" for stack in row.scores]
+    linear, bearing = f"Ridge, {_steps(shown)}", f"Bearing, {_steps(shown)} [deg]"
+    return "Representation", "Numbers a step", linear, *networks, bearing
+
+
+def result_cells(row: ProbeResult, shown: int) -> tuple[str, ...]:
+    """A text for each of `headings`."""
+    networks = [_percent(part.network) for part in row.scores.values()]
+    bearing, low, high = row.scores[shown].bearing_deg
+    turned = f"{bearing:.1f} [{low:.1f}, {high:.1f}]"
+    return row.representation.name, str(row.numbers), _percent(row.scores[shown].ridge), *networks, turned
+
+
+def result_columns(rows: Sequence[ProbeResult]) -> dict[str, list[str | float]]:
+    """All scores as columns of a tracker's table; the first is unique."""
+    pairs = [(row, stack) for row in rows for stack in row.scores]
+    table: dict[str, list[str | float]] = {
+        "representation": [f"{row.representation.name}, {_steps(stack)}" for row, stack in pairs],
+        "numbers": [row.numbers * stack for row, stack in pairs],
+    }
+    for score in Scores._fields:
+        for place, end in enumerate(("", "_low", "_high")):
+            table[score + end] = [getattr(row.scores[stack], score)[place] for row, stack in pairs]
+    return table
+
+
+def key(row: ProbeResult) -> str:
+    """The name of a representation as a part of a metric's name."""
+    return re.sub(r"[^a-z0-9]+", "_", row.representation.name.replace("'", ""))
+
+
+def plot_probes(rows: Sequence[ProbeResult]) -> Figure:
+    """Draw proximity read and error of the bearing against the latent size, a column per number of steps."""
+    stacks = list(rows[0].scores)
+    figure = Figure(figsize=(4.2 * len(stacks) + 0.8, 7.2), layout="constrained")
+    grid = figure.subplots(2, len(stacks), squeeze=False, sharex=True, sharey="row")
+    for column, stack in zip(grid.T, stacks, strict=True):
+        _draw(column[0], rows, [_scaled(row.scores[stack].network, 100) for row in rows])
+        _draw(column[1], rows, [row.scores[stack].bearing_deg for row in rows])
+        column[0].set_title(f"{_steps(stack)} read together", loc="left", fontsize=10)
+        column[1].set_xlabel("Latent size")
+    grid[0, 0].set_ylabel("Proximity read by the network, R2 [%]")
+    grid[1, 0].set_ylabel(f"Error of the bearing within {ALARM_M:g} m [deg]")
+    handles, entries = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, entries, loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    return figure
+
+
+def _draw(panel: Axes, rows: Sequence[ProbeResult], values: Sequence[Interval]) -> None:
+    """Draw a line per target over the latent sizes, and a level per representation without training."""
+    pairs = list(zip(rows, values, strict=True))
+    levels = [(row.representation.name, value) for row, value in pairs if row.representation.place is None]
+    for (name, value), (colour, dashes) in zip(levels, LEVEL_LOOKS, strict=True):
+        if name != OWN:
+            panel.axhspan(*value[1:], color=colour, alpha=0.08, lw=0)
+        panel.axhline(value[0], color=colour, lw=1.6, ls=dashes, label=name)
+    placed = [
+        (*row.representation.place, value) for row, value in pairs if row.representation.place is not None
+    ]
+    targets = list(dict.fromkeys(target for _, target, _ in placed))
+    for shift, target in enumerate(targets):
+        sizes, points = zip(*((size, value) for size, own, value in placed if own == target), strict=True)
+        middle, low, high = np.transpose(points)
+        x = np.array(sizes) * 1.04 ** (shift - (len(targets) - 1) / 2)  # so that intervals stand apart
+        spread = (middle - low, high - middle)
+        panel.errorbar(
+            x, middle, yerr=spread, label=target, marker="o", ms=5, capsize=3, color=COLOURS[target]
+        )
+    shown = sorted({size for size, _, _ in placed})
+    panel.set_xscale("log", base=2)
+    panel.set_xticks(shown, [str(size) for size in shown])
+    panel.set_xticks([], minor=True)
+    panel.tick_params(colors=MUTED)
+    tidy(panel, "y")
+
+
+def _steps(stack: int) -> str:
+    return f"{stack} step" + ("s" if stack > 1 else "")
+
+
+def _scaled(value: Interval, factor: float) -> Interval:
+    return value[0] * factor, value[1] * factor, value[2] * factor
+
+
+def _percent(value: Interval) -> str:
+    middle, low, high = _scaled(value, 100)
+    return f"{middle:.0f} [{low:.0f}, {high:.0f}]"

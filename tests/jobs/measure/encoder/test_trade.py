@@ -1,0 +1,246 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.encoder import compare
+from jobs.analysis.tables import write_csv
+from jobs.config.config import ConfigError
+from jobs.measure.encoder import costs as encoder_costs
+from jobs.measure.encoder import trade as trade_encoder
+from jobs.measure.encoder.costs import (
+    UNCHANGED,
+    Encoding,
+    EncodingCost,
+    costs_us,
+    default_encodings,
+    encode_in_chunks,
+    encode_newest,
+    encode_whole,
+    exact_latents,
+    explained,
+    read_costs,
+    repeats,
+)
+from jobs.measure.encoder.plots import plot_encoding_costs
+from jobs.measure.encoder.trade import cost_cells, cost_columns, percent
+from jobs.measure.encoder.trials import MAX_EVENTS, spread, squeezed
+from jobs.run.folder import locate_run
+from jobs.run.provenance import REPOSITORY
+from models.encoder.evae import EventVAE, event_targets, reconstruct
+from models.encoder.event_batch import EventBatch, batch_windows
+from models.encoder.table import EncoderTable
+from models.kinds import DenseModel
+from tests.support.configs import small_config
+from tests.support.encoders import WINDOW_US, make_evae, make_events
+
+WINDOWS = [(make_events(count, seed=count), 0, WINDOW_US) for count in (0, 1, 40, 300)]
+
+
+def make_row(knob="default", cost=10.0, error=0.01, share=0.2, setting=""):
+    return EncodingCost(knob, setting, cost / 2, cost, 2 * error, error, share)
+
+
+@pytest.mark.parametrize("coding", ["additive", "none"])
+def test_exact_latents_are_those_of_a_table_of_very_many_bins(coding):
+    evae = make_evae(dtype=torch.float64, coding=coding)
+    mu, deviation = exact_latents(evae, WINDOWS)
+    table = EncoderTable.from_evae(evae, time_bins=65536)
+    near = np.stack([table.encode(*window) for window in WINDOWS])
+    assert np.abs(mu - near).max() < 1e-4
+    logvar = evae(batch_windows(WINDOWS, evae.grid))[2].numpy()
+    assert np.allclose(deviation, np.exp(0.5 * logvar), rtol=0.05)
+
+
+def test_exact_latents_of_complex_contexts_are_refused():
+    with pytest.raises(ValueError, match="got 'eventnet'"):
+        exact_latents(make_evae(coding="eventnet"), WINDOWS)
+
+
+def test_every_form_but_the_coarse_ones_gives_the_default_latent():
+    evae = make_evae()
+    forms = {(form.knob, form.setting): form.encode for form in default_encodings(evae)}
+    default = np.stack([forms["default", ""](window) for window in WINDOWS])
+    for key in [("chunks", text) for text in ("1", "2", "5", "20", "per event")] + [("newest events", "500")]:
+        assert np.array_equal(np.stack([forms[key](window) for window in WINDOWS]), default), key
+    assert np.abs(np.stack([forms["torch", "plain network"](w) for w in WINDOWS]) - default).max() < 2e-6
+    for key in [("precision", "int8"), ("time bins", "16"), ("newest events", "250")]:
+        assert not np.array_equal(np.stack([forms[key](window) for window in WINDOWS]), default), key
+
+
+def test_the_newest_events_are_the_last_ones():
+    table = EncoderTable.from_evae(make_evae())
+    events = make_events(300)
+    expected = table.encode(events[-7:], 0, WINDOW_US)
+    assert np.array_equal(encode_newest(table, 7)((events, 0, WINDOW_US)), expected)
+
+
+def test_more_chunks_cost_more():
+    evae = make_evae()
+    table = EncoderTable.from_evae(evae)
+    forms = [
+        Encoding("", "", encode, evae) for encode in (encode_whole(table), encode_in_chunks(table, None))
+    ]
+    costs = costs_us(forms, (WINDOWS[-1:], WINDOWS[2:3]), rounds=3)
+    assert costs.shape == (2, 2)
+    assert (costs[1] > 5 * costs[0]).all()
+    assert costs[1, 0] > 3 * costs[1, 1]  # 300 events against 40
+
+
+def test_what_is_explained_is_zero_for_the_mean_picture_and_one_for_perfection(monkeypatch):
+    evae = make_evae(target="occupancy")
+    batch = batch_windows(WINDOWS, evae.grid)
+    targets = event_targets(batch, "occupancy")
+    for picture, expected in ((targets, 1.0), (targets.mean(0).expand_as(targets), 0.0)):
+        monkeypatch.setattr(encoder_costs, "reconstruct", lambda logits, target, p=picture: p)
+        assert explained(evae, batch) == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_is_explained_follows_the_latents_that_are_given():
+    evae = make_evae(target="occupancy")
+    batch = batch_windows(WINDOWS, evae.grid)
+    own = evae(batch)[1]
+    assert explained(evae, batch, own) == pytest.approx(explained(evae, batch), abs=1e-6)
+    assert explained(evae, batch, own + 5.0) != pytest.approx(explained(evae, batch), abs=1e-3)
+    targets = event_targets(batch, "occupancy")
+    error = (reconstruct(evae(batch)[0], "occupancy") - targets).square().sum()
+    total = (targets - targets.mean(0)).square().sum()
+    assert explained(evae, batch) == pytest.approx(float(1 - error / total), abs=1e-6)
+
+
+def test_ages_are_squeezed_in_place():
+    evae = EventVAE(width=4, height=4, context=8, time_bins=100)
+    batch = EventBatch(evae.grid, np.zeros(100, np.int32), np.arange(100, dtype=np.int32), np.array([0, 100]))
+    old, new = squeezed(batch, 0.9, 1.0), squeezed(batch, 0.0, 0.2)
+    assert np.bincount(old.bin).tolist() == 10 * [10]
+    assert np.bincount(new.bin).tolist() == 80 * [0] + 20 * [5]
+    assert (np.diff(old.bin) >= 0).all()
+    assert np.array_equal(squeezed(batch, 0.0, 1.0).bin, batch.bin)
+    assert np.array_equal(old.code, batch.code)
+
+
+def test_a_spread_is_students_interval_of_the_mean():
+    mean, half = spread([0.1, 0.2, 0.3])
+    assert mean == pytest.approx(0.2)
+    assert half == pytest.approx(4.303 * 0.1 / np.sqrt(3), rel=1e-3)
+    assert np.isnan(spread([0.1])[1])
+    assert (percent((0.123, 0.04)), percent(spread([0.1]))) == ("12 ± 4", "10")
+
+
+def test_only_what_computes_the_same_as_the_default_repeats_its_timing():
+    rows = [
+        make_row(),
+        make_row("chunks", setting="1"),
+        make_row("chunks", setting="2"),
+        make_row("newest events", setting=str(MAX_EVENTS)),
+        make_row("time bins", setting="1024", error=0.02),  # of a model of other bins
+        make_row("context", setting="1024"),
+    ]
+    assert repeats(rows) == [rows[0], rows[1], rows[3]]
+
+
+def test_rows_that_compute_the_same_give_the_same_latents():
+    evae = make_evae(time_bins=1024)
+    forms = [form for form in default_encodings(evae) if (form.knob, form.setting) in UNCHANGED]
+    assert len(forms) == len(UNCHANGED)
+    latents = [np.stack([form.encode(window) for window in WINDOWS]) for form in forms]
+    assert all(np.array_equal(latents[0], other) for other in latents)
+
+
+def test_costs_are_read_as_they_were_written(tmp_path):
+    rows = [make_row(), make_row("torch", cost=1234.5), make_row("time bins", setting="16", error=1 / 3)]
+    write_csv(tmp_path / "costs.csv", EncodingCost._fields, rows)
+    assert read_costs(tmp_path / "costs.csv") == rows
+
+
+def test_the_figure_of_costs_has_no_line_and_its_axis_of_shares_begins_at_zero():
+    rows = [make_row(), make_row("time bins", setting="16", cost=8.0, error=0.5)]
+    rows += [make_row("context", cost=cost, share=share) for cost, share in ((4.0, 0.19), (9.0, 0.2))]
+    left, right = plot_encoding_costs(rows).axes
+    joined = [line for panel in (left, right) for line in panel.get_lines() if line.get_linestyle() != "None"]
+    assert [list(line.get_ydata()) for line in joined] == [[0, 0]]  # of the axis
+    assert right.get_ylim()[0] <= 0
+
+
+def test_the_published_costs_are_those_of_the_page():
+    page = (REPOSITORY / "docs" / "encoder_accuracy.md").read_text().split("## ")[0]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
+    published = read_costs(REPOSITORY / "docs" / "data" / "encoder_costs.csv")
+    cells = [list(cost_cells(row, published[1].dense_us)) for row in published]
+    for row in (*lines, *cells):
+        del row[4]  # a quotient, which whole microseconds do not give to the digit
+    assert lines[2:] == cells
+
+
+def test_a_row_becomes_text_and_columns():
+    row = EncodingCost("precision", "int16", 60.4, 250.0, 0.0123, 0.001, 0.234)
+    expected = ("precision", "int16", "60", "250", "100", "0.1", "1.2", "23.4")
+    assert cost_cells(row, 25_000.0) == expected
+    assert cost_cells(make_row(error=12.5), 10.0)[5:7] == ("1,250", "2,500")
+    assert cost_columns([row]) == {
+        "form": ["precision int16"],
+        "step_us": [60.4],
+        "dense_us": [250.0],
+        "error_max": [0.0123],
+        "error_mean": [0.001],
+        "explained": [0.234],
+    }
+
+
+@pytest.mark.system
+def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(trade_encoder, "CONTEXTS", (16, 32))
+    monkeypatch.setattr(trade_encoder, "CODING_CONTEXT", 16)
+    monkeypatch.setattr(encoder_costs, "TIME_BINS", (16, 64))
+    config = small_config(tmp_path, job="trade_encoder")
+    config = dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, context=32),
+        collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
+        pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
+        trade_encoder=dataclasses.replace(config.trade_encoder, iterations=1, seeds=2, windows=4),
+    )
+    metrics = trade_encoder.run(config)
+    folder = locate_run(config).path / "trade"
+    pictures = {"inference", "coding", "coding_pictures", "embedding", "interpolation", "scenes"}
+    assert {path.stem for path in folder.glob("*.png")} == pictures
+    assert len(list((folder / "encoders").glob("*.safetensors"))) == 2 + 2 * 3 - 1
+    lines = [line.split("|") for line in (folder / "inference.md").read_text().splitlines()[2:]]
+    assert [line[1].strip() for line in lines].count("newest events") == 5
+    assert lines[0][1].strip() == "default"
+    assert len(read_costs(folder / "inference.csv")) == len(lines)
+    assert (folder / "coding.md").read_text().count("±") == 3 * 7
+    assert metrics["perf/encode_step_us"] > 0
+    assert {
+        f"evae/explained_r2_{coding}_dense" for coding in ("additive", "eventnet", "none")
+    } <= metrics.keys()
+
+    def refuse(*arguments):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr("jobs.measure.encoder.trials.train_short", refuse)
+    again = trade_encoder.run(config)
+    assert {name: value for name, value in again.items() if name.startswith("evae/")} == {
+        name: value for name, value in metrics.items() if name.startswith("evae/")
+    }
+
+
+@pytest.mark.benchmark
+def test_the_table_is_tens_of_times_faster_than_the_network_and_as_fast_as_memory():
+    found = compare("additive")
+    assert found["times_faster_than_network"] >= 60
+    assert found["us_300_events"] < 100
+    assert found["of_copying"] < 2
+
+
+def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(tmp_path):
+    model = DenseModel(name="event_columns", stack=3, hidden=[64, 64])
+    config = dataclasses.replace(small_config(tmp_path, job="trade_encoder"), model=model)
+    with pytest.raises(ConfigError, match="event_columns has no encoder of single events"):
+        trade_encoder.run(config)
+    full = small_config(tmp_path, job="trade_encoder")
+    config = dataclasses.replace(full, model=dataclasses.replace(full.model, coding="eventnet"))
+    with pytest.raises(ConfigError, match=r"model\.coding: must be additive or none.*got 'eventnet'"):
+        trade_encoder.run(config)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+
+from envs.recordings import read_events
+from jobs.config.config import ConfigError, parse
+from jobs.tools import video_events
+from tests.support.configs import compose
+from tests.support.image_folders import quietly, random_frames, save
+
+SMALL = ("camera.width=16", "camera.height=12")
+
+
+def converted(tmp_path, *words):
+    config = parse(compose("+exp=video_events", f"runs_dir={tmp_path / 'runs'}", *SMALL, *words))
+    return config, video_events.run(config)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return save(tmp_path / "images", random_frames(), ".png")
+
+
+def test_the_file_has_the_events_and_labels_that_the_camera_of_the_command_line_gives(tmp_path, folder):
+    words = ("camera=dvs128", *SMALL, "light=night", "seed=5", "video.fps=50", f"video.path={folder}")
+    config, path = converted(tmp_path, *words)
+    assert path.name == "events.npz"
+    assert config.env.faults.shot_noise_hz > 0
+    expected = quietly(
+        folder, config.env.camera, config.env.faults, fps=50.0, rng=np.random.default_rng(config.seed)
+    )
+    written = read_events(path)
+    assert expected.events.size > 1000
+    assert expected.is_noise.any()
+    assert (written.width, written.height) == (16, 12)
+    assert written.events.tobytes() == expected.events.tobytes()
+    assert written.is_noise.tobytes() == expected.is_noise.tobytes()
+
+
+def test_a_format_without_labels_is_written_and_the_job_says_so(tmp_path, folder, capsys):
+    words = ("video.fps=50", f"video.path={folder}", f"video.output={tmp_path / 'made' / 'ride.aedat4'}")
+    config, path = converted(tmp_path, *words)
+    assert "npz" in capsys.readouterr().out
+    written = read_events(path)
+    assert written.events.tobytes() == quietly(folder, config.env.camera, fps=50.0).events.tobytes()
+    assert written.is_noise is None
+
+
+def test_a_grey_step_in_black_fires_no_event_unless_the_floor_of_the_video_is_low(tmp_path):
+    """Frames of 8 bits that are linear in light, where grey 1 may be noise."""
+    black = np.zeros((2, 12, 16, 3), np.uint8)
+    black[1] = 1
+    words = (f"video.path={save(tmp_path / 'black', black, '.png')}", "video.fps=50", "video.transfer=linear")
+    _, usual = converted(
+        tmp_path, *words, "camera.luminance_floor=1e-4", f"video.output={tmp_path / 'a.npz'}"
+    )
+    low = ("video.luminance_floor=1e-3", f"video.output={tmp_path / 'b.npz'}")
+    assert read_events(usual).events.size == 0
+    assert read_events(converted(tmp_path, *words, *low)[1]).events.size == 7 * 12 * 16
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (("video.output=ride.mp4",), "video.output"),
+        (("video.path=nowhere.mp4",), "video.path"),
+        ((), "video.path"),  # the folder has no times, and no fps is given
+    ],
+)
+def test_what_cannot_be_read_or_written_is_refused_with_its_key_and_leaves_no_file(
+    tmp_path, folder, words, key
+):
+    with pytest.raises(ConfigError, match=f"^{key}: "):
+        converted(tmp_path, f"video.path={folder}", *words)
+    assert not list(tmp_path.rglob("*.npz"))
