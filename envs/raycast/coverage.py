@@ -218,22 +218,3 @@ def cut_gap(gaps: np.ndarray, k: int, new: int, part: float) -> None:
     _cut_ends(left.top, right.top, part)
     _cut_ends(left.bottom, right.bottom, part)
     _cut_ends(left.reach, right.reach, part)
-
-
-@inlined
-def left_of_row(top: Ends, bottom: Ends, start: float, end: float) -> tuple[float, float]:
-    """From where to where in the strip, of 0 .. 1, two edges leave something of rows start .. end."""
-    left, right = 0.0, 1.0
-    if top.left != top.right:  # below the upper edge
-        crossing = (end - top.left) / (top.right - top.left)
-        if top.left < top.right:
-            right = min(right, max(0.0, crossing))
-        else:
-            left = max(left, min(1.0, crossing))
-    if bottom.left != bottom.right:  # above the lower edge
-        crossing = (start - bottom.left) / (bottom.right - bottom.left)
-        if bottom.left > bottom.right:
-            right = min(right, max(0.0, crossing))
-        else:
-            left = max(left, min(1.0, crossing))
-    return left, max(left, right)

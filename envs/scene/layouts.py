@@ -16,12 +16,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
+from envs.scene.obstacles import OBSTACLE
+from envs.scene.shapes import SHAPES
 from envs.scene.textures import Texture
 
 SPAWN_RANGE_M = (-10.0, 10.0)  # appendix D.1
-SHAPES = {"pole": POLE, "box": BOX, "cone": CONE, "ellipsoid": ELLIPSOID, "gate": BOX}
-GATE_BAR_M = 0.4  # thickness of a gate's posts, lintel and sill
 TRIES_PER_OBSTACLE = 200
 MAX_COVERED = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
 PLAIN_SURFACE = Texture()
@@ -60,12 +59,13 @@ class Layout:
     """Obstacles of one shape at random places of a lane between two walls.
 
     Attributes:
-        shape: "pole", "cone", "ellipsoid" (all on the ground, round seen from above), "box" (on the
-            ground, square seen from above) or "gate" (a frame across the lane, from the ground up).
+        shape: A row of `envs.scene.shapes`: "pole", "cone", "ellipsoid" (round seen from above), "box"
+            (square seen from above), "gate" (a frame across the lane) or "tree" (a crown on a trunk).
+            All stand on the ground.
         num_obstacles: How many.
         radius_min_m, radius_max_m: Radii are uniform between these [m]: of poles, of the
-            base of cones, the level half-axis of ellipsoids, half the side of boxes, half the inside
-            width of gates.
+            base of cones, the level half-axis of ellipsoids and crowns, half the side of boxes, half the
+            inside width of gates.
         height_m: Height of every obstacle [m].
         min_gap_m: Smallest distance between two axes [m].
         first_y_m, last_y_m: The axes stand at y uniform between these [m].
@@ -98,11 +98,11 @@ class Layout:
     def __post_init__(self) -> None:
         """Check the values; ValueError names the rule and what was given."""
         check_types(self)
-        half_x = self.radius_max_m + (GATE_BAR_M if self.shape == "gate" else 0.0)
-        half_y = {"gate": 0.5 * GATE_BAR_M, "box": half_x}.get(self.shape, 0.0)
-        size = math.hypot(half_x, half_y)
+        refuse_unless({f"shape must be one of {sorted(SHAPES)}": self.shape in SHAPES}, "layout", self)
+        shape = SHAPES[self.shape]
+        half_x = self.radius_max_m + shape.bar_m
+        size = math.hypot(half_x, shape.half_y_m(self.radius_max_m))
         rules = {
-            f"shape must be one of {sorted(SHAPES)}": self.shape in SHAPES,
             "num_obstacles must be a whole number": float(self.num_obstacles).is_integer(),
             "radius_min_m must be > 0 and <= radius_max_m": 0 < self.radius_min_m <= self.radius_max_m,
             f"min_gap_m must be >= {2 * size:.6g}, or obstacles overlap": self.min_gap_m >= 2 * size,
@@ -110,8 +110,7 @@ class Layout:
             > max(SPAWN_RANGE_M[1] - SPAWN_RANGE_M[0], 2 * half_x),
             "first_y_m must be <= last_y_m": self.first_y_m <= self.last_y_m,
             "height_m and wall_height_m must be > 0": self.height_m > 0 and self.wall_height_m > 0,
-            f"height_m of a gate must be > {2 * GATE_BAR_M}": self.shape != "gate"
-            or self.height_m > 2 * GATE_BAR_M,
+            f"height_m of a {self.shape} must be > {shape.min_height_m}": self.height_m > shape.min_height_m,
             "albedo_min must be <= albedo_max <= 1": self.albedo_min <= self.albedo_max <= 1,
         }
         refuse_unless(rules, "layout", self)
@@ -207,14 +206,14 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
     """Obstacles inside the lane with axes `min_gap_m` apart, by rejection with a bounded number of tries.
 
     Returns:
-        (N,) OBSTACLE; a gate is four of them.
+        (M,) OBSTACLE, place by place; a gate is four of them.
 
     Raises:
         ValueError: If so many do not fit.
     """
     count = int(layout.num_obstacles)
-    bar = GATE_BAR_M if layout.shape == "gate" else 0.0
-    half = 0.5 * layout.width_m - layout.radius_max_m - bar
+    shape = SHAPES[layout.shape]
+    half = 0.5 * layout.width_m - layout.radius_max_m - shape.bar_m
     if _share_covered(layout, half) > MAX_COVERED:  # asked first: the tries would take minutes
         raise ValueError(
             f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart; "
@@ -230,12 +229,12 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
             "lower num_obstacles or min_gap_m, or widen the lane"
         )
     bodies = np.zeros(count, OBSTACLE)
-    bodies["kind"] = SHAPES[layout.shape]
+    bodies["kind"] = shape.kind
     bodies["x"], bodies["y"] = kept.T
     bodies["rx"] = bodies["ry"] = rng.uniform(layout.radius_min_m, layout.radius_max_m, count)
     bodies["z"] = bodies["rz"] = 0.5 * layout.height_m
     bodies["albedo"] = rng.uniform(layout.albedo_min, layout.albedo_max, count)
-    return _gates(bodies) if layout.shape == "gate" else bodies
+    return shape.compose(bodies)
 
 
 def _share_covered(layout: Layout, half: float) -> float:
@@ -243,15 +242,3 @@ def _share_covered(layout: Layout, half: float) -> float:
     gap = layout.min_gap_m
     width, length = 2 * half + gap, layout.last_y_m - layout.first_y_m + gap
     return layout.num_obstacles * 0.25 * math.pi * gap * gap / (width * length)
-
-
-def _gates(openings: np.ndarray) -> np.ndarray:
-    """Left posts, right posts, lintels and sills, (4 N,) OBSTACLE, around openings of half-width rx."""
-    bar = 0.5 * GATE_BAR_M
-    parts = np.tile(openings, (4, 1))
-    parts["ry"] = bar
-    parts["x"][:2] += np.array([[-1.0], [1.0]]) * (openings["rx"] + bar)
-    parts["rx"][:2] = bar
-    parts["z"][2] = 2.0 * openings["rz"] - bar
-    parts["z"][3] = parts["rz"][2:] = bar
-    return parts.T.ravel()

@@ -5,23 +5,18 @@ A ray is the way of a point, and ends where that point first touches a section
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
 from envs.scene.collision import first_contact
-
-if TYPE_CHECKING:
-    from envs.scene.scene import Scene
+from envs.scene.scene import Scene
 
 MAX_RANGE_M = 100.0  # obstacles farther away count as none
 NEAR_M = 10.0  # proximity falls by e with each such distance: half a second of flight at 20 m/s
 
 
-def proximity(
-    scene: "Scene", pose: tuple[float, float, float, float], bearings_rad: np.ndarray
-) -> np.ndarray:
+def proximity(scene: Scene, pose: tuple[float, float, float, float], bearings_rad: np.ndarray) -> np.ndarray:
     """How near the first obstacle in each bearing is: exp(-distance / NEAR_M), 0 if there is none.
 
     The exponential keeps the measure in [0, 1] and lets what is too far to matter weigh

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -33,9 +33,6 @@ from envs.scene.layouts import (
 )
 from envs.scene.mesh_file import is_mesh_path, read_mesh
 from envs.scene.textures import Texture
-
-if TYPE_CHECKING:
-    import trimesh
 
 # The sun stands behind the start and to the right, so that the sides of a pole differ.
 SUN = (0.4, -0.5, math.sqrt(0.59))
@@ -176,25 +173,6 @@ class Scene:
         first, last = (x_m / CELL_M for x_m in self.spawn_range_m)
         inside = starts[max(middle + math.floor(first), 0) : middle + math.ceil(last) + 1]
         return bool(inside.all())
-
-    def to_trimesh(self, sections: int = 32) -> "trimesh.Scene":
-        """The scene as one merged mesh; a level section of a round body has `sections` corners.
-
-        Vertices carry their baked luminance twice: as grey `vertex_colors` (8 bits) and
-        exactly, as float32, in `vertex_attributes["luminance"]`. Textures are not baked: a
-        surface has its mean luminance. The ground ends 100 km away.
-        """
-        # Imported here because the ray caster's workers never need it.
-        import trimesh
-
-        from envs.scene.triangles import scene_mesh
-
-        vertices, faces, luminance = scene_mesh(self, sections)
-        grey = np.clip(np.rint(luminance * 255.0), 0, 255).astype(np.uint8)
-        colors = np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=1)
-        mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
-        mesh.vertex_attributes["luminance"] = luminance.astype(np.float32)
-        return trimesh.Scene([mesh])
 
 
 def make_scene(

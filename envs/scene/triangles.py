@@ -10,16 +10,34 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from envs.scene.obstacles import BOX, CONE, ELLIPSOID, POLE
+from envs.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from envs.scene.scene import Scene
+    import trimesh
 
 Part = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices (V, 3) [m], faces (F, 3), luminance (V,)
 NEAR_M, FAR_M = 300.0, 1e5  # half-widths of the fine and of the whole ground
 QUAD = np.array([(0, 1, 2), (0, 2, 3)])
 
 
-def scene_mesh(scene: "Scene", sections: int = 32) -> Part:
+def to_trimesh(scene: Scene, sections: int = 32) -> "trimesh.Scene":
+    """Return the scene as one merged mesh; a level section of a round body has `sections` corners.
+
+    Vertices carry their baked luminance twice: as grey `vertex_colors` (8 bits) and exactly, as float32,
+    in `vertex_attributes["luminance"]`. Textures are not baked: a surface has its mean luminance. The ground
+    ends 100 km away.
+    """
+    import trimesh  # a heavy import that only this function needs
+
+    vertices, faces, luminance = scene_mesh(scene, sections)
+    grey = np.clip(np.rint(luminance * 255.0), 0, 255).astype(np.uint8)
+    colors = np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=1)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
+    mesh.vertex_attributes["luminance"] = luminance.astype(np.float32)
+    return trimesh.Scene([mesh])
+
+
+def scene_mesh(scene: Scene, sections: int = 32) -> Part:
     """All of `scene` as one mesh: obstacles, ground, both sides of the walls, its own mesh.
 
     Args:
@@ -49,7 +67,7 @@ def join(parts: list[Part]) -> Part:
     )
 
 
-def body_mesh(scene: "Scene", body: np.void, sections: int) -> Part:
+def body_mesh(scene: Scene, body: np.void, sections: int) -> Part:
     """One obstacle, closed from all sides; see `envs.scene.obstacles` for the kinds."""
     if body["kind"] == BOX:
         return box_mesh(scene, body)
@@ -68,7 +86,7 @@ def body_mesh(scene: "Scene", body: np.void, sections: int) -> Part:
     return join([side, _disc(scene, body, height, sections), _disc(scene, body, -height, sections)])
 
 
-def box_mesh(scene: "Scene", box: np.void) -> Part:
+def box_mesh(scene: Scene, box: np.void) -> Part:
     """The six faces of a box, each with its own four corners, in the order x-, x+, y-, y+, z-, z+."""
     centre = np.array([box["x"], box["y"], box["z"]])
     half = np.array([box["rx"], box["ry"], box["rz"]])
@@ -84,7 +102,7 @@ def box_mesh(scene: "Scene", box: np.void) -> Part:
     return join(parts)
 
 
-def ground_mesh(scene: "Scene") -> Part:
+def ground_mesh(scene: Scene) -> Part:
     """The ground, z = 0, as two squares around the origin.
 
     One triangle to the horizon would interpolate its depth in float32 so coarsely that the
@@ -97,7 +115,7 @@ def ground_mesh(scene: "Scene") -> Part:
     return np.concatenate([corners * NEAR_M, corners * FAR_M]), np.concatenate([QUAD, *ring]), np.full(8, up)
 
 
-def wall_meshes(scene: "Scene") -> list[Part]:
+def wall_meshes(scene: Scene) -> list[Part]:
     """Both walls, each once for each side, so that back faces can be culled."""
     near, far = scene.walls_y_m
     height, half = scene.wall_height_m, 0.5 * scene.width_m
@@ -115,7 +133,7 @@ def mean_radius(corners: int) -> float:
     return (math.pi / corners) / math.sin(math.pi / corners)
 
 
-def _lathe(scene: "Scene", body: np.void, radii: np.ndarray, heights: np.ndarray, sections: int) -> Part:
+def _lathe(scene: Scene, body: np.void, radii: np.ndarray, heights: np.ndarray, sections: int) -> Part:
     """The round side of `body` through rings (M,) of `radii` at `heights`, from -1 at the bottom to 1."""
     n, m = sections, len(radii)
     centre = np.array([body["x"], body["y"], body["z"]])
@@ -143,7 +161,7 @@ def _lathe(scene: "Scene", body: np.void, radii: np.ndarray, heights: np.ndarray
     return (unit * half + centre).reshape(-1, 3), np.concatenate(faces), light
 
 
-def _disc(scene: "Scene", body: np.void, height_m: float, sections: int) -> Part:
+def _disc(scene: Scene, body: np.void, height_m: float, sections: int) -> Part:
     """The level face of `body` at `height_m` above its centre: seen from below if that is negative."""
     n = sections
     angle = np.arange(n) * (2.0 * math.pi / n)

@@ -11,6 +11,7 @@ from envs.raycast import sample_luminance
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture, make_scene
 from envs.scene.obstacles import KINDS
 from envs.scene.textures import PATTERNS
+from envs.scene.triangles import to_trimesh
 
 EMPTY = np.zeros(0, OBSTACLE)
 PLACES = [(x, y) for y in range(8, 90, 9) for x in (-10, -3, 4, 11)]
@@ -155,7 +156,7 @@ def test_more_bodies_than_one_kind_hide_each_other(renderer):
 def test_the_exported_mesh_drawn_as_a_mesh_is_the_same_picture(renderer):
     rng = np.random.default_rng(5)
     scene = Scene(name="test", obstacles=bodies((POLE, CONE, ELLIPSOID, BOX), rng))
-    mesh = scene.to_trimesh(sections=128).dump()[0]
+    mesh = to_trimesh(scene, sections=128).dump()[0]
     part = (np.array(mesh.vertices), np.array(mesh.faces), np.array(mesh.vertex_attributes["luminance"]))
     alone = Scene(name="mesh", obstacles=EMPTY, mesh=part, wall_height_m=1e-6)
     for pose in poses(rng, 6):

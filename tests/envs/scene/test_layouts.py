@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from envs.scene import BOX, LAYOUTS, Layout, Texture
-from envs.scene.layouts import GATE_BAR_M, MeshLayout, draw_obstacles, with_overrides
+from envs.scene.layouts import MeshLayout, draw_obstacles, with_overrides
 from envs.scene.obstacles import body_sections
+from envs.scene.shapes.gate import BAR_M
 
 ROUND = [name for name, layout in LAYOUTS.items() if layout.shape != "gate"]
 
@@ -52,7 +53,7 @@ def test_a_gate_is_a_frame_around_an_opening():
         assert post["z"] + post["rz"] == pytest.approx(layout.height_m)
     assert sill["z"] - sill["rz"] == pytest.approx(0.0)
     assert (lintel["z"] - lintel["rz"] > sill["z"] + sill["rz"]).all()
-    assert (bodies["ry"] == GATE_BAR_M / 2).all()
+    assert (bodies["ry"] == BAR_M / 2).all()
     assert (bodies["albedo"].reshape(-1, 4) == left["albedo"][:, None]).all()
     assert (np.abs(bodies["x"]) + bodies["rx"] <= layout.width_m / 2).all()
 

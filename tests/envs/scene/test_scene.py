@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from envs.scene import BOX, CONE, ELLIPSOID, LAYOUTS, OBSTACLE, POLE, Layout, Scene, Texture, make_scene
+from envs.scene.triangles import to_trimesh
 
 
 def scene_of(*discs: tuple[float, float, float], **fields) -> Scene:
@@ -175,7 +176,7 @@ def test_a_flight_to_nowhere_is_refused(bad):
 
 def test_the_mesh_is_one_part_whose_normals_point_out_of_the_poles():
     scene = make_scene("poles", np.random.default_rng(0), num_obstacles=7)
-    parts = scene.to_trimesh(sections=16).dump()
+    parts = to_trimesh(scene, sections=16).dump()
     assert len(parts) == 1
     mesh = parts[0]
     pole = scene.obstacles[0]

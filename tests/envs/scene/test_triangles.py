@@ -6,7 +6,7 @@ import trimesh
 
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene
 from envs.scene.obstacles import KINDS
-from envs.scene.triangles import body_mesh, scene_mesh
+from envs.scene.triangles import body_mesh, scene_mesh, to_trimesh
 
 BODIES = np.array(
     [
@@ -88,6 +88,6 @@ def test_the_mesh_of_a_scene_holds_every_part_once_and_its_own_mesh_as_it_is():
     np.testing.assert_array_equal(vertices[faces[-1]], own[0])
     np.testing.assert_array_equal(luminance[faces[-1]], own[2])
     assert len(faces) == sum(len(body_mesh(scene, body, 16)[1]) for body in BODIES) + 10 + 8 + 1
-    mesh = scene.to_trimesh(16).dump()[0]
+    mesh = to_trimesh(scene, 16).dump()[0]
     np.testing.assert_array_equal(mesh.vertex_attributes["luminance"], luminance.astype(np.float32))
     assert len(scene_mesh(Scene(name="empty", obstacles=BODIES[:0]))[1]) == 18

@@ -1,0 +1,26 @@
+"""Shapes of obstacles: one file each, and one row in `SHAPES`.
+
+A new shape is a file with a function that composes it from poles, cones, ellipsoids and boxes (`tree.py` is
+the shortest), a row below, and a test. Renderers, collisions, passability and the planner know these four
+kinds of body, so nothing else changes: a gate is four boxes, a tree is an ellipsoid on a pole. Bodies may
+touch but not overlap; one may float above another. A body that cannot be composed of the four is a mesh
+(`envs.scene.layouts.MeshLayout`), which pyrender draws.
+
+A plug-in adds a row: `SHAPES["arch"] = Shape(BOX, compose_arches)`.
+"""
+
+from envs.scene.shapes.gate import GATES
+from envs.scene.shapes.shape import Shape
+from envs.scene.shapes.single import BOXES, CONES, ELLIPSOIDS, POLES
+from envs.scene.shapes.tree import TREES
+
+SHAPES: dict[str, Shape] = {
+    "pole": POLES,
+    "box": BOXES,
+    "cone": CONES,
+    "ellipsoid": ELLIPSOIDS,
+    "gate": GATES,
+    "tree": TREES,
+}
+
+__all__ = ["SHAPES", "Shape"]
