@@ -30,6 +30,7 @@ Side = Annotated[int, Field(ge=1, le=4096)]
 Context = Annotated[int, Field(ge=2, le=8192, multiple_of=2)]
 Latent = Annotated[int, Field(ge=1, le=256)]
 TimeBins = Annotated[int, Field(ge=1, le=65536)]
+PoolRank = Annotated[int, Field(ge=1, le=8)]
 Stack = Annotated[int, Field(ge=1, le=32)]
 Size = Annotated[int, Field(ge=1, le=65536)]
 TimesMs = Annotated[list[Annotated[float, Field(gt=0, le=1e6)]], Field(max_length=16)]
@@ -60,10 +61,11 @@ class EvaeSettings:
     target: Target
     time_bins: TimeBins
     coding: Coding
+    pool_rank: PoolRank = 1
 
     @pydantic.model_validator(mode="after")
-    def _has_time(self) -> "EvaeSettings":
-        _check_coding(self.variant, self.coding)
+    def _fits_its_variant(self) -> "EvaeSettings":
+        _check_coding(self.variant, self.coding, self.pool_rank)
         return self
 
 
@@ -73,7 +75,7 @@ class EncoderModel:
 
     Attributes:
         name: The kind, also the variant of the event VAE.
-        context, latent, norm, target, time_bins, coding: As `EvaeSettings`.
+        context, latent, norm, target, time_bins, coding, pool_rank: As `EvaeSettings`.
         encoder: What PPO does with the pretrained encoder.
         stack: Latest latents that the policy sees.
         hidden: Neurons of each dense layer.
@@ -94,10 +96,11 @@ class EncoderModel:
     stack: Stack
     hidden: list[Size]
     memory_ms: TimesMs = dataclasses.field(default_factory=list)
+    pool_rank: PoolRank = 1
 
     @pydantic.model_validator(mode="after")
     def _fits_its_kind(self) -> "EncoderModel":
-        _check_coding(self.name, self.coding)
+        _check_coding(self.name, self.coding, self.pool_rank)
         if self.encoder == "finetuned":
             if not KINDS[self.name].finetuning:
                 able = ", ".join(name for name, kind in KINDS.items() if kind.finetuning)
@@ -114,7 +117,7 @@ class EncoderModel:
     def evae(self, width: int, height: int) -> EvaeSettings:
         """Settings of its event VAE on a sensor of so many pixels."""
         own = (self.context, self.latent, self.norm, self.target, self.time_bins, self.coding)
-        return EvaeSettings(cast(Variant, self.name), width, height, *own)
+        return EvaeSettings(cast(Variant, self.name), width, height, *own, pool_rank=self.pool_rank)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -213,7 +216,7 @@ KINDS = {
     ),
 }
 # Settings that older files lack, each with the value that does what was done before it existed.
-ADDED_MODEL_SETTINGS: dict[str, object] = {"memory_ms": []}
+ADDED_MODEL_SETTINGS: dict[str, object] = {"memory_ms": [], "pool_rank": 1}
 RENAMED = {
     "brp_full": "bytestream",
     "brp_xy": "bytestream_xy",
@@ -373,10 +376,13 @@ def resolve(reference: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _check_coding(name: str, coding: str) -> None:
-    """Raises ValueError for a code of time that an encoder without time cannot have."""
+def _check_coding(name: str, coding: str, pool_rank: int) -> None:
+    """Raise ValueError for a code of time or a rank that this encoder cannot have."""
     if coding == "eventnet" and name != "bytestream":
         raise ValueError(f"coding must be additive or none for {name}, which has no time, got 'eventnet'")
+    if pool_rank > 1 and (coding == "eventnet" or name == "event_image_vae"):
+        pooled = "coding=eventnet, whose phase is the largest value's" if coding == "eventnet" else name
+        raise ValueError(f"pool_rank must be 1 for {pooled}, got {pool_rank}")
 
 
 def _one_line(problem: Mapping[str, Any]) -> str:

@@ -5,6 +5,9 @@
 ECN is three per-event layers (64, 128, context), each with batch normalisation and ReLU.
 ReLU floors the context at 0, which is therefore the identity of the maximum.
 
+With `pool_rank` r > 1 a context holds the r-th largest value of each feature instead, 0 of fewer than r
+events: r - 1 false events alone cannot raise it. An event that occurs twice then counts twice.
+
 With EventNet's coding (appendix A.2, equation 4) an event has a complex number per feature,
 
     a = [ tanh(ECN(x, y, p)) - age ]_+ exp(-i 2 pi age),   age = 1 - t
@@ -48,16 +51,26 @@ class EventContextNetwork(nn.Module):
         norm: "batch" or "none". With "batch" the layers have no bias: the normalisation
             subtracts it again, and its gradient would be rounding noise that Adam amplifies.
         coding: Of time, one of `models.encoder.embedding.CODINGS`; "bytestream_xy" has none.
+        pool_rank: Which value over the events is the context: 1, the largest, or the second, third, ...
 
     A frozen network (parameters that need no gradient) never moves its running statistics,
     not even in train mode.
     """
 
-    def __init__(self, grid: Grid, variant: str, context: int, norm: str, coding: str = "additive") -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        variant: str,
+        context: int,
+        norm: str,
+        coding: str = "additive",
+        pool_rank: int = 1,
+    ) -> None:
         super().__init__()
         self.grid = grid
         self.uses_polarity = variant == "bytestream"
         self.coding = coding if variant == "bytestream" else "none"
+        self.pool_rank = pool_rank
         sizes = [3 if self.uses_polarity else 2, 64, 128, context]
         bias = norm == "none"
         self.layers = nn.ModuleList(Linear(a, b, bias=bias) for a, b in itertools.pairwise(sizes))
@@ -77,7 +90,7 @@ class EventContextNetwork(nn.Module):
         events, squash = Events(rank, bins, batch.offsets, embedding), self.coding == "eventnet"
         ordered = newest_first(events) if squash else events
         form = MaxContext.apply if h.device.type == "cpu" else max_on_device
-        context, winning_bin = form(h, weight, bias, ordered, squash)
+        context, winning_bin = form(h, weight, bias, ordered, squash, self.pool_rank)
         return self._rotated(context, winning_bin) if squash else context
 
     def plain(self, batch: EventBatch) -> Tensor:
@@ -99,7 +112,7 @@ class EventContextNetwork(nn.Module):
         h = torch.tanh(h) if self.coding == "eventnet" else h
         value = torch.relu(h + torch.from_numpy(embedding[bins]).to(h.device))  # (N, D)
         sizes = np.diff(batch.offsets).tolist()
-        best = torch.stack([v.max(0).values if len(v) else v.sum(0) for v in value.split(sizes)])
+        best = torch.stack([_largest(part, self.pool_rank) for part in value.split(sizes)])
         if self.coding != "eventnet":
             return best
         times = torch.from_numpy(bins).to(h.device)[:, None].expand_as(value)
@@ -223,24 +236,29 @@ def newest_first(events: Events) -> Events:
     return events._replace(cell=events.cell[order], bin=events.bin[order])
 
 
+def _largest(values: Tensor, rank: int) -> Tensor:
+    """Return the rank-th largest (D,) of values (N, D) >= 0 of events; 0 of fewer events than that."""
+    return values.topk(rank, 0).values[-1] if len(values) >= rank else values[:0].sum(0)
+
+
 def max_on_device(
-    h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool
+    h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
 ) -> tuple[Tensor, Tensor]:
     """What `MaxContext` computes, by operations of torch on the device of its inputs."""
     features = torch.relu(affine(h, weight, bias))
     features = torch.tanh(features) if squash else features
-    return max_context(features, events.codes, (events.cell, events.bin), events.offsets)
+    return max_context(features, events.codes, (events.cell, events.bin), events.offsets, rank)
 
 
 class MaxContext(torch.autograd.Function):
-    """context = max over events of ReLU(f(h W^T + b)[cell] + code[bin]), sparse backward.
+    """context = rank-th largest over events of ReLU(f(h W^T + b)[cell] + code[bin]), sparse backward.
 
     f is ReLU, or tanh(ReLU) if `squash`.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool
+        ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
     ) -> tuple[Tensor, Tensor]:
         """Context (B, D) and the bin (B, D) of the event it is from, 0 without one."""
         activation = affine(h, weight, bias).relu_()
@@ -248,7 +266,11 @@ class MaxContext(torch.autograd.Function):
         context = np.zeros((len(events.offsets) - 1, len(bias)), features.dtype)
         winner = np.full(context.shape, -1, np.int32)
         winning_bin = np.zeros(context.shape, np.int32)
-        _maximum(features, events, context, winner, winning_bin)
+        if rank == 1:
+            _maximum(features, events, context, winner)
+        else:
+            _ranked(features, events, rank, context, winner)
+        _attribute(features, events, winner, winning_bin)
         ctx.slope = _tanh_slope(features, winner) if squash else None
         ctx.save_for_backward(h, weight, torch.from_numpy(winner))
         found = torch.from_numpy(context), torch.from_numpy(winning_bin)
@@ -264,7 +286,7 @@ class MaxContext(torch.autograd.Function):
         outputs = torch.zeros_like(h), torch.zeros_like(weight), weight.new_zeros(len(weight))
         arrays = [tensor.detach().contiguous().numpy() for tensor in (gradient, winner, h, weight)]
         _scatter(*arrays, *(tensor.numpy() for tensor in outputs))
-        return *outputs, None, None
+        return *outputs, None, None, None
 
 
 def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
@@ -275,12 +297,11 @@ def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _maximum(features, events, context, winner, winning_bin) -> None:  # type: ignore[no-untyped-def]
-    """Raise `context` (B, D) to the events' maximum, the first of equals.
+def _maximum(features, events, context, winner) -> None:  # type: ignore[no-untyped-def]
+    """Raise `context` (B, D) to the events' maximum; `winner` becomes its event, the first of equals.
 
-    `winner` becomes its cell, -1 where it has no gradient; `winning_bin` its bin. Four events at a time, so
-    that context and winner are read and written a quarter as often; the last four may hold the last event
-    several times, which changes nothing.
+    Four events at a time, so that context and winner are read and written a quarter as often; the last
+    four may hold the last event several times, which changes nothing.
     """
     cell, bins, offsets, codes = events.cell, events.bin, events.offsets, events.codes
     for b in range(context.shape[0]):
@@ -306,11 +327,45 @@ def _maximum(features, events, context, winner, winning_bin) -> None:  # type: i
                 better = value > best[j]
                 best[j] = value if better else best[j]
                 who[j] = event if better else who[j]
-        for j in range(len(best)):
-            if who[j] >= 0:
-                winning_bin[b, j] = bins[who[j]]
-                u = cell[who[j]]
-                who[j] = u if features[u, j] > 0 else -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _ranked(features, events, rank, context, winner) -> None:  # type: ignore[no-untyped-def]
+    """As `_maximum`, with the rank-th largest value of the events and 0, of equals the later.
+
+    Each event is sorted into the `rank` largest so far; a value that one level gives up goes to the next.
+    """
+    size = context.shape[1]
+    given, of_event, moved = np.empty(size, context.dtype), np.empty(size, np.int32), np.empty(size, np.bool_)
+    for b in range(context.shape[0]):
+        best, who = np.zeros((rank, size), context.dtype), np.full((rank, size), -1, np.int32)
+        for n in range(events.offsets[b], events.offsets[b + 1]):
+            feature, code = features[events.cell[n]], events.codes[events.bin[n]]
+            for j in range(size):
+                given[j], of_event[j], moved[j] = feature[j] + code[j], n, False
+            for level in range(rank):
+                value, event = best[level], who[level]
+                for j in range(size):
+                    moves = moved[j] | (given[j] > value[j])
+                    own, its_event, other, its_other = value[j], event[j], given[j], of_event[j]
+                    value[j] = other if moves else own
+                    event[j] = its_other if moves else its_event
+                    given[j] = own if moves else other
+                    of_event[j] = its_event if moves else its_other
+                    moved[j] = moves
+        context[b], winner[b] = best[rank - 1], who[rank - 1]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _attribute(features, events, winner, winning_bin) -> None:  # type: ignore[no-untyped-def]
+    """Replace each winning event by its cell, -1 where it has no gradient, and write its bin."""
+    for b in range(winner.shape[0]):
+        for j in range(winner.shape[1]):
+            event = winner[b, j]
+            if event >= 0:
+                winning_bin[b, j] = events.bin[event]
+                u = events.cell[event]
+                winner[b, j] = u if features[u, j] > 0 else -1
 
 
 @numba.njit(cache=True, error_model="numpy")

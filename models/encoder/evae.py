@@ -51,6 +51,8 @@ class EventVAE(nn.Module):
         coding: How the time of an event enters the context: "additive" (sines and cosines),
             "eventnet" (decay and rotation, twice the numbers) or "none"; "bytestream_xy" has no time
             and takes "additive" as "none".
+        pool_rank: Which value of a feature over the events becomes its context: 1, the largest (appendix A.1),
+            or the second, third, ... largest, which that many events less one cannot change.
 
     Raises:
         ValueError: A setting outside its range; the message names it.
@@ -67,11 +69,13 @@ class EventVAE(nn.Module):
         target: str = "signed",
         time_bins: int = 1024,
         coding: str = "additive",
+        pool_rank: int = 1,
     ) -> None:
         super().__init__()
         values = {
             "variant": variant, "width": width, "height": height, "context": context,
             "latent": latent, "norm": norm, "target": target, "time_bins": time_bins, "coding": coding,
+            "pool_rank": pool_rank,
         }  # fmt: skip
         self.settings = checked(EvaeSettings, values)
         self.grid = Grid(width, height, time_bins)
@@ -79,7 +83,7 @@ class EventVAE(nn.Module):
         self.ecn: nn.Module = (
             PictureContextNetwork(self.grid, context)
             if variant == "event_image_vae"
-            else EventContextNetwork(self.grid, variant, context, norm, coding)
+            else EventContextNetwork(self.grid, variant, context, norm, coding, pool_rank)
         )
         parts = 2 if coding == "eventnet" else 1  # real and imaginary
         self.encoder = nn.Sequential(Linear(parts * context, 256), nn.ReLU(), Linear(256, 2 * latent))

@@ -102,7 +102,7 @@ class PolicyGraph(nn.Module):
         elif policy.encoder is not None:
             table = policy.encoder
             self.time_bins, self.turns = table.grid.time_bins, table.phase is not None
-            self.most_events = table.most_events
+            self.most_events, self.rank = table.most_events, table.pool_rank
             arrays = {"features": table.features, "embedding": table.embedding}
             for name, (weight, bias) in {"hidden": table.hidden, "head": table.head}.items():
                 arrays |= {f"{name}_weight": weight, f"{name}_bias": bias}
@@ -163,14 +163,14 @@ def _filtered(chosen: EventFilter, events: Tensor, last_us: Tensor) -> tuple[Ten
 
 
 def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """Maximum over the events of table rows, then the encoder's dense layers (appendix C)."""
+    """Largest (or `pool_rank`-th) table row over the events, then the encoder's dense layers (appendix C)."""
     there = torch.ones_like(events[:, :1], dtype=torch.bool)
     if policy.most_events is not None:
         events, there = _thinned(events, policy.most_events)
     bins = _bins(events[:, 0], window_us, policy.time_bins)
     rows = policy.features[_code(policy, events) % len(policy.features)] + policy.embedding[bins]
-    rows = torch.cat([torch.where(there, rows, 0.0), torch.zeros(1, rows.shape[1])])
-    context = rows.amax(0)  # 0 without events
+    rows = torch.cat([torch.where(there, rows, 0.0), torch.zeros(policy.rank, rows.shape[1])])
+    context = rows.amax(0) if policy.rank == 1 else rows.topk(policy.rank, 0).values[-1]  # 0 without events
     if policy.turns:  # EventNet's coding: the phase of the newest event of this magnitude
         times = torch.cat([bins, torch.zeros(1, dtype=bins.dtype)])
         newest = torch.where(rows == context, times[:, None], 0).amax(0)

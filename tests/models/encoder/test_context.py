@@ -6,16 +6,18 @@ import pytest
 import torch
 
 from models.encoder import context as room
-from models.encoder.context import EventContextNetwork, Events, MaxContext, newest_first
+from models.encoder.context import EventContextNetwork, Events, newest_first
 from models.encoder.event_batch import EventBatch, Grid
 
 GRID = Grid(width=12, height=9, time_bins=32)
 SIZES = [40, 0, 1, 300, 7, 0]
-KINDS = [
-    ("bytestream", "additive"),
-    ("bytestream", "eventnet"),
-    ("bytestream", "none"),
-    ("bytestream_xy", "additive"),
+KINDS = [  # variant, coding, pool rank
+    ("bytestream", "additive", 1),
+    ("bytestream", "eventnet", 1),
+    ("bytestream", "none", 1),
+    ("bytestream_xy", "additive", 1),
+    ("bytestream", "additive", 2),
+    ("bytestream_xy", "additive", 3),
 ]
 CASES = [(*kind, norm) for kind in KINDS for norm in ("batch", "none")]
 
@@ -27,9 +29,9 @@ def make_batch(seed, sizes=SIZES, grid=GRID):
     return EventBatch(grid, code, rng.integers(0, grid.time_bins, offsets[-1], dtype=np.int32), offsets)
 
 
-def make_network(variant="bytestream", norm="batch", dtype=torch.float64, context=48, coding="additive"):
+def make_network(variant="bytestream", norm="batch", dtype=torch.float64, context=48, coding="additive", rank=1):
     torch.manual_seed(1)
-    network = EventContextNetwork(GRID, variant, context, norm, coding).to(dtype)
+    network = EventContextNetwork(GRID, variant, context, norm, coding, rank).to(dtype)
     for normalisation in network.norms:
         torch.nn.init.uniform_(normalisation.weight, 0.5, 1.5)
         torch.nn.init.uniform_(normalisation.bias, -0.3, 0.3)
@@ -65,18 +67,18 @@ def relative_differences(network, batches):
 
 
 @pytest.mark.usefixtures("fused_form")
-@pytest.mark.parametrize(("variant", "coding", "norm"), CASES)
+@pytest.mark.parametrize(("variant", "coding", "rank", "norm"), CASES)
 @pytest.mark.parametrize("training", [True, False])
-def test_the_fused_form_is_the_plain_formula_in_float64(variant, coding, norm, training):
-    network = make_network(variant, norm, coding=coding).train(training)
+def test_the_fused_form_is_the_plain_formula_in_float64(variant, coding, rank, norm, training):
+    network = make_network(variant, norm, coding=coding, rank=rank).train(training)
     differences = relative_differences(network, [make_batch(0), make_batch(1, [500, 3])])
     assert max(differences.values()) < 1e-10, differences
 
 
 @pytest.mark.usefixtures("fused_form")
-@pytest.mark.parametrize(("variant", "coding", "norm"), CASES)
-def test_the_fused_form_is_the_plain_formula_in_float32_to_its_rounding(variant, coding, norm):
-    network = make_network(variant, norm, torch.float32, coding=coding)
+@pytest.mark.parametrize(("variant", "coding", "rank", "norm"), CASES)
+def test_the_fused_form_is_the_plain_formula_in_float32_to_its_rounding(variant, coding, rank, norm):
+    network = make_network(variant, norm, torch.float32, coding=coding, rank=rank)
     differences = relative_differences(network, [make_batch(0)])
     assert differences["context"] < 5e-6
     assert max(differences.values()) < 5e-5, differences
@@ -114,7 +116,9 @@ def test_of_equals_the_newest_comes_first_and_windows_stay_together():
     assert offsets.tolist() == [0, 3, 3, 5]
 
 
-def test_of_equal_sums_the_first_wins_in_windows_of_any_size():
+@pytest.mark.usefixtures("fused_form")
+@pytest.mark.parametrize("rank", [1, 2, 3, 8])
+def test_of_equal_sums_the_first_wins_in_windows_of_any_size(rank):
     """Few values make many equal sums; the gradient of the bias counts winners with a feature above 0."""
     rng, sizes = np.random.default_rng(3), [*range(12), 40]
     offsets = np.cumsum([0, *sizes])
@@ -122,21 +126,39 @@ def test_of_equal_sums_the_first_wins_in_windows_of_any_size():
     h, weight, bias = torch.eye(6), torch.from_numpy(rng.integers(0, 3, (16, 6))).float(), torch.zeros(16)
     codes = rng.integers(-2, 2, (5, 16)).astype(np.float32)
     inputs = [value.requires_grad_() for value in (h, weight, bias)]
-    context, winning_bin = MaxContext.apply(*inputs, Events(cell, bins, offsets, codes), False)
+    events = Events(cell, bins, offsets, codes)
+    context, winning_bin = room.MaxContext.apply(*inputs, events, False, rank)
     context.sum().backward()
     value = weight.detach().numpy().T[cell] + codes[bins]
     counted = np.zeros((6, 16))
     for b, (first, stop) in enumerate(itertools.pairwise(offsets)):
         own = value[first:stop]
-        best, seen = own.max(0, initial=0), own.max(0, initial=0) > 0
+        order = np.argsort(-own, axis=0, kind="stable")
+        winners = order[rank - 1] if len(own) >= rank else np.zeros(16, int)
+        best = own[winners, np.arange(16)].clip(0) if len(own) >= rank else np.zeros(16)
         assert np.array_equal(context[b].detach(), best)
-        for j in np.flatnonzero(seen):
-            winner = first + own[:, j].argmax()
+        for j in np.flatnonzero(best > 0):
+            winner = first + winners[j]
             assert winning_bin[b, j] == bins[winner]
             counted[cell[winner], j] += weight[j, cell[winner]] > 0
-        assert not winning_bin[b][torch.from_numpy(~seen)].any()
+        assert not winning_bin[b][torch.from_numpy(best <= 0)].any()
     assert np.array_equal(weight.grad.T, counted)
     assert np.array_equal(bias.grad, counted.sum(0))
+
+
+@pytest.mark.parametrize("form", ["forward", "plain"])
+@pytest.mark.parametrize("rank", [2, 3])
+def test_fewer_false_events_than_the_rank_raise_no_feature_above_the_largest_of_the_others(form, rank):
+    network = make_network(dtype=torch.float32, rank=rank).eval()
+    largest = make_network(dtype=torch.float32).eval()
+    events, false = make_batch(0, [60]), make_batch(1, [rank - 1])
+    both = EventBatch(
+        GRID, np.append(events.code, false.code), np.append(events.bin, false.bin), np.array([0, 59 + rank])
+    )
+    clean, seen = getattr(network, form)(events), getattr(network, form)(both)
+    assert (seen >= clean).all()
+    assert (seen <= getattr(largest, form)(events)).all()
+    assert (getattr(largest, form)(both) > getattr(largest, form)(events)).any()
 
 
 @pytest.mark.parametrize("form", ["forward", "plain"])
@@ -212,9 +234,9 @@ def test_in_eval_mode_an_event_repeated_2000_times_is_the_event_once():
     assert torch.equal(network(single), network(many))
 
 
-@pytest.mark.parametrize("coding", ["additive", "eventnet", "none"])
-def test_the_order_of_events_in_a_window_does_not_matter(coding):
-    network, batch = make_network(dtype=torch.float32, coding=coding).eval(), make_batch(0, [300])
+@pytest.mark.parametrize(("coding", "rank"), [("additive", 1), ("additive", 3), ("eventnet", 1), ("none", 1)])
+def test_the_order_of_events_in_a_window_does_not_matter(coding, rank):
+    network, batch = make_network(dtype=torch.float32, coding=coding, rank=rank).eval(), make_batch(0, [300])
     order = np.random.default_rng(2).permutation(300)
     assert torch.equal(
         network(batch), network(EventBatch(GRID, batch.code[order], batch.bin[order], batch.offsets))

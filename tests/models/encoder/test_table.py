@@ -26,17 +26,20 @@ def module_mu(evae, events, form="plain"):
     return context[0].numpy(), evae.encoder(context).chunk(2, dim=-1)[0][0].numpy()
 
 
-KINDS = [
-    ("bytestream", "additive"),
-    ("bytestream", "eventnet"),
-    ("bytestream", "none"),
-    ("bytestream_xy", "additive"),
+KINDS = [  # variant, coding, pool rank
+    ("bytestream", "additive", 1),
+    ("bytestream", "eventnet", 1),
+    ("bytestream", "none", 1),
+    ("bytestream_xy", "additive", 1),
+    ("bytestream", "additive", 2),
+    ("bytestream_xy", "additive", 3),
 ]
 
 
-@pytest.fixture(params=KINDS, ids="-".join)
+@pytest.fixture(params=KINDS, ids=str)
 def evae(request):
-    return make_evae(request.param[0], coding=request.param[1])
+    variant, coding, rank = request.param
+    return make_evae(variant, coding=coding, pool_rank=rank)
 
 
 @pytest.fixture(params=PRECISIONS)
@@ -44,13 +47,13 @@ def table(evae, request):
     return EncoderTable.from_evae(evae, request.param)
 
 
-@pytest.mark.parametrize(("variant", "coding"), KINDS)
+@pytest.mark.parametrize(("variant", "coding", "rank"), KINDS)
 @pytest.mark.parametrize("norm", ["batch", "none"])
 @pytest.mark.parametrize(
     ("dtype", "context_bound", "mu_bound"), [("float64", 1e-12, 1e-13), ("float32", 1e-5, 2e-6)]
 )
-def test_the_table_is_the_module(variant, coding, norm, dtype, context_bound, mu_bound):
-    evae = make_evae(variant, getattr(torch, dtype), norm=norm, coding=coding)
+def test_the_table_is_the_module(variant, coding, rank, norm, dtype, context_bound, mu_bound):
+    evae = make_evae(variant, getattr(torch, dtype), norm=norm, coding=coding, pool_rank=rank)
     table = EncoderTable.from_evae(evae)
     for count in (0, 1, 2, 300):
         events = make_events(count, seed=count)
@@ -58,20 +61,23 @@ def test_the_table_is_the_module(variant, coding, norm, dtype, context_bound, mu
         updated = table.update(table.empty(), events, 0, WINDOW_US)
         latent = table.encode(events, 0, WINDOW_US)
         assert updated.dtype == latent.dtype == np.dtype(dtype)
-        if coding == "eventnet":
+        if rank > 1:
+            assert (np.diff(updated, axis=0) <= 0).all()
+            updated = updated[-1]
+        elif coding == "eventnet":
             updated = (updated[0] * table.phase[:, updated[1].astype(int)]).ravel()
         assert np.abs(updated - context).max() <= context_bound
         assert np.abs(latent - mu).max() <= mu_bound
 
 
 @pytest.mark.parametrize(("precision", "bound"), [("int16", 2.0**-11), ("int8", 0.06)])
-@pytest.mark.parametrize(("variant", "coding"), KINDS)
-def test_a_rounded_table_is_off_by_one_unit_at_the_most_and_smaller(variant, coding, precision, bound):
-    evae = make_evae(variant, coding=coding)
+@pytest.mark.parametrize(("variant", "coding", "rank"), KINDS)
+def test_a_rounded_table_is_off_by_one_unit_at_the_most_and_smaller(variant, coding, rank, precision, bound):
+    evae = make_evae(variant, coding=coding, pool_rank=rank)
     exact, rounded = EncoderTable.from_evae(evae), EncoderTable.from_evae(evae, precision)
     assert rounded.features.nbytes * (2 if precision == "int16" else 4) == exact.features.nbytes
     highest = exact.features.max() + 1.0
-    for count in (1, 7, 300):
+    for count in (rank, 7, 300):
         events = make_events(count, seed=count)
         context, mu = (exact.update(exact.empty(), events, 0, WINDOW_US), exact.encode(events, 0, WINDOW_US))
         # What one unit is worth follows from the weights that take a context in units.
@@ -187,8 +193,8 @@ def test_the_order_of_events_does_not_matter_bit_for_bit(table):
     assert np.array_equal(table.encode(events, 0, WINDOW_US), table.encode(shuffled, 0, WINDOW_US))
 
 
-def test_an_event_2000_times_is_the_event_once_bit_for_bit(table):
-    event = make_events(1)
+def test_an_event_2000_times_is_the_event_as_often_as_the_rank_bit_for_bit(table):
+    event = make_events(1).repeat(table.pool_rank)
     assert np.array_equal(table.encode(event, 0, WINDOW_US), table.encode(event.repeat(2000), 0, WINDOW_US))
 
 
