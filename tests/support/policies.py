@@ -72,7 +72,8 @@ def make_spec(name, **changes):
         "latent": 8,
         "norm": "batch",
     }
-    own |= {"target": "signed", "time_bins": 32, "coding": "additive", "encoder": "frozen", **changes}
+    own |= {"target": "signed", "time_bins": 32, "coding": "additive", "pool_rank": 1, "encoder": "frozen"}
+    own |= changes
     return PolicySpec(read_model(**{key: own[key] for key in model_keys(name)}), SIDE, SIDE, 3)
 
 

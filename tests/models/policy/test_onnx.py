@@ -48,21 +48,25 @@ def fly_exported(file, shown, shape, dtype):
     return np.array(logits)
 
 
-@pytest.fixture(scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet", "memory"]))
+@pytest.fixture(scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet", "ranked", "memory"]))
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
     if name == "memory":
         spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0])
         return save_policy(path, build_networks(spec, seed=3), spec, ABOUT)
-    if name not in ("bytestream_xy", "eventnet"):
+    changes = {
+        "bytestream_xy": {"variant": "bytestream_xy"},
+        "eventnet": {"coding": "eventnet"},
+        "ranked": {"pool_rank": 3},
+    }.get(name)
+    if changes is None:
         return save(path, name)
     torch.manual_seed(0)
-    changes = {"variant": "bytestream_xy"} if name == "bytestream_xy" else {"coding": "eventnet"}
     evae = EventVAE(width=SIDE, height=SIDE, context=64, time_bins=32, **changes).freeze()
     for parameter in evae.ecn.layers.parameters():  # so that magnitudes outlive many ages
         parameter.data.mul_(3.0)
-    name = evae.settings.variant
-    return save_policy(path, make_networks(name), make_spec(name, coding=evae.settings.coding), ABOUT, evae)
+    name, own = evae.settings.variant, {key: getattr(evae.settings, key) for key in ("coding", "pool_rank")}
+    return save_policy(path, make_networks(name), make_spec(name, **own), ABOUT, evae)
 
 
 @pytest.mark.system
