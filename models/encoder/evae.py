@@ -51,8 +51,8 @@ class EventVAE(nn.Module):
         coding: How the time of an event enters the context: "additive" (sines and cosines),
             "eventnet" (decay and rotation, twice the numbers) or "none"; "bytestream_xy" has no time
             and takes "additive" as "none".
-        pool_rank: Which value of a feature over the events becomes its context: 1, the largest (appendix A.1),
-            or the second, third, ... largest, which that many events less one cannot change.
+        pool_rank: Which value of a feature over the events the context holds: 1, the largest (appendix A.1),
+            or the second, third, ... largest, so that single false events cannot raise it.
 
     Raises:
         ValueError: A setting outside its range; the message names it.

@@ -239,53 +239,65 @@ def _raise_to(features, embedding, code, bins, offsets, contexts) -> None:  # ty
 
 @functools.cache
 def raise_largest(rank: int) -> Callable[..., None]:
-    """Return `_raise_to` for the `rank` largest sums: contexts (B, rank, D), in falling order.
-
-    The rank is a constant of the compiled function, so that its loop is unrolled, and a block of features
-    keeps its largest sums in registers while four events are sorted into them. Without a fourth event
-    a row of zeros is sorted in, which changes nothing.
-    """
+    """Return `_raise_to` for the `rank` largest sums: contexts (B, rank, D), in falling order."""
+    sort_in = _sorting(rank)
 
     @numba.njit(cache=True, error_model="numpy")
     def raise_ranks(features, embedding, code, bins, offsets, contexts) -> None:  # type: ignore[no-untyped-def]
-        cells, size, unit = len(features), features.shape[1], contexts.dtype.type
+        cells, size = len(features), features.shape[1]
         none = np.zeros(size, features.dtype)
         blocks = np.zeros(((size + BLOCK - 1) // BLOCK, rank, BLOCK), contexts.dtype)
         for b in range(len(contexts)):
-            for k in range(rank):
-                for j in range(size):
-                    blocks[j // BLOCK, k, j % BLOCK] = contexts[b, k, j]
-            last = offsets[b + 1] - 1
-            for n in range(offsets[b], last + 1, 4):
-                second, third, fourth = min(n + 1, last), min(n + 2, last), min(n + 3, last)
-                feature_1, code_1 = features[code[n] % cells], embedding[bins[n]]
-                feature_2, code_2 = features[code[second] % cells], embedding[bins[second]]
-                feature_3, code_3 = features[code[third] % cells], embedding[bins[third]]
-                feature_4, code_4 = features[code[fourth] % cells], embedding[bins[fourth]]
-                if second == n:
-                    feature_2, code_2 = none, none
-                if third == second:
-                    feature_3, code_3 = none, none
-                if fourth == third:
-                    feature_4, code_4 = none, none
-                for block in range(len(blocks)):
-                    first, top = block * BLOCK, blocks[block]
-                    for i in range(min(BLOCK, size - first)):
-                        j = first + i
-                        value_1, value_2 = unit(feature_1[j] + code_1[j]), unit(feature_2[j] + code_2[j])
-                        value_3, value_4 = unit(feature_3[j] + code_3[j]), unit(feature_4[j] + code_4[j])
-                        for k in range(rank):
-                            largest = top[k, i]
-                            largest, value_1 = max(largest, value_1), min(largest, value_1)
-                            largest, value_2 = max(largest, value_2), min(largest, value_2)
-                            largest, value_3 = max(largest, value_3), min(largest, value_3)
-                            largest, value_4 = max(largest, value_4), min(largest, value_4)
-                            top[k, i] = largest
-            for k in range(rank):
-                for j in range(size):
-                    contexts[b, k, j] = blocks[j // BLOCK, k, j % BLOCK]
+            for j in range(size):
+                blocks[j // BLOCK, :, j % BLOCK] = contexts[b, :, j]
+            whole = offsets[b + 1] - (offsets[b + 1] - offsets[b]) % 4
+            for n in range(offsets[b], whole, 4):
+                event_1 = features[code[n] % cells], embedding[bins[n]]
+                event_2 = features[code[n + 1] % cells], embedding[bins[n + 1]]
+                event_3 = features[code[n + 2] % cells], embedding[bins[n + 2]]
+                event_4 = features[code[n + 3] % cells], embedding[bins[n + 3]]
+                sort_in(blocks, event_1, event_2, event_3, event_4)
+            for n in range(whole, offsets[b + 1]):
+                event_1 = features[code[n] % cells], embedding[bins[n]]
+                sort_in(blocks, event_1, (none, none), (none, none), (none, none))
+            for j in range(size):
+                contexts[b, :, j] = blocks[j // BLOCK, :, j % BLOCK]
 
     return raise_ranks
+
+
+@functools.cache
+def _sorting(rank: int) -> Callable[..., None]:
+    """Return a function that sorts four events (row, code) into the largest sums (blocks, rank, BLOCK).
+
+    The rank is a constant of the compiled function, so that its loop is unrolled, and a block's largest sums
+    stay in registers. A row of zeros with a code of zeros changes nothing.
+    """
+
+    @numba.njit(cache=True, error_model="numpy")
+    def sort_in(blocks, event_1, event_2, event_3, event_4):  # type: ignore[no-untyped-def]
+        unit = blocks.dtype.type
+        (row_1, code_1), (row_2, code_2), (row_3, code_3), (row_4, code_4) = (
+            event_1,
+            event_2,
+            event_3,
+            event_4,
+        )
+        for block in range(len(blocks)):
+            first, top = block * BLOCK, blocks[block]
+            for i in range(min(BLOCK, len(row_1) - first)):
+                j = first + i
+                value_1, value_2 = unit(row_1[j] + code_1[j]), unit(row_2[j] + code_2[j])
+                value_3, value_4 = unit(row_3[j] + code_3[j]), unit(row_4[j] + code_4[j])
+                for k in range(rank):
+                    largest = top[k, i]
+                    largest, value_1 = max(largest, value_1), min(largest, value_1)
+                    largest, value_2 = max(largest, value_2), min(largest, value_2)
+                    largest, value_3 = max(largest, value_3), min(largest, value_3)
+                    largest, value_4 = max(largest, value_4), min(largest, value_4)
+                    top[k, i] = largest
+
+    return sort_in
 
 
 @numba.njit(cache=True, error_model="numpy")

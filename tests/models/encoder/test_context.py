@@ -29,7 +29,9 @@ def make_batch(seed, sizes=SIZES, grid=GRID):
     return EventBatch(grid, code, rng.integers(0, grid.time_bins, offsets[-1], dtype=np.int32), offsets)
 
 
-def make_network(variant="bytestream", norm="batch", dtype=torch.float64, context=48, coding="additive", rank=1):
+def make_network(
+    variant="bytestream", norm="batch", dtype=torch.float64, context=48, coding="additive", rank=1
+):
     torch.manual_seed(1)
     network = EventContextNetwork(GRID, variant, context, norm, coding, rank).to(dtype)
     for normalisation in network.norms:
