@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 
 from jobs.config.config import Config
 from jobs.config.env_keys import ENV_KEYS, fields_of
+from jobs.config.registry import JOBS, Job
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 FILES = {  # where the comments stand: the section that a file begins in
@@ -96,7 +97,8 @@ def documented(cls: type) -> dict[str, str]:
 def _said() -> Mapping[str, str]:
     """What is said of each key: the first comment in conf/."""
     found: dict[str, str] = {}
-    for name, section in FILES.items():
+    files = FILES | {f"job/{name}.yaml": "" for name in JOBS}
+    for name, section in files.items():
         found = comments(CONF / name, section) | found
     return found
 
@@ -106,6 +108,8 @@ def _defaults() -> Mapping[str, object]:
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         composed = OmegaConf.to_container(hydra.compose("config", ["+exp=bytestream"]), resolve=True)
     flat: dict[str, object] = {}
+    for name, job in JOBS.items():
+        flat |= {f"{name}.{key}": value for key, value in job.values().get(name, {}).items()}
     for name, value in typing.cast(Mapping[str, object], composed).items():
         inner = value.items() if isinstance(value, Mapping) else ()
         flat |= {f"{name}.{key}": own for key, own in inner} or {name: value}
@@ -132,6 +136,7 @@ def _as_yaml(value: object) -> str:
 def kinds() -> dict[str, dict[str, tuple[object, str]]]:
     """Type and documentation of all keys, by section; the one without a name holds what is in none."""
     hints = typing.get_type_hints(Config, include_extras=True)
+    del hints["own"]
     found: dict[str, dict[str, tuple[object, str]]] = {
         "": {},
         "env": {},
@@ -151,7 +156,12 @@ def kinds() -> dict[str, dict[str, tuple[object, str]]]:
         elif name != "env":
             found[""][name] = kind, ""
     found[""]["name"] = str | None, ""
-    return found
+    return found | {name: _own(name, job) for name, job in JOBS.items() if job.own_keys()}
+
+
+def _own(name: str, job: Job) -> dict[str, tuple[object, str]]:
+    """Return type and documentation of the keys that only this job has."""
+    return {f"{name}.{key}": _field(job.settings(), key) for key in job.own_keys()}
 
 
 def _field(owner: typing.Any, name: str) -> tuple[object, str]:

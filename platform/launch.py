@@ -19,11 +19,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jobs.config.registry import JOBS
+from jobs.config.command_line import experiments, hydra_words
+from jobs.config.registry import CONF, JOBS
 from jobs.run.libraries import hold
 from jobs.run.provenance import REPOSITORY as ROOT
-
-CONF = ROOT / "conf"
 
 ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
 SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
@@ -31,16 +30,15 @@ OPEN_GROUPS = (
     "env.layout",
     "faults.added",
     "sweep.axes",
-    "tune.space",
+    "search.space",
 )  # take entries that conf/ does not have
+JOBS_HERE = "    <jobs>"  # in conf/hydra/help
 DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 
 
 def main() -> int:
     """Run the command line; return the exit status."""
     hold()
-    if len(sys.argv) > 1 and (CONF / "exp" / f"{sys.argv[1]}.yaml").is_file():
-        sys.argv[1] = f"+exp={sys.argv[1]}"
     if importlib.util.find_spec("hydra") is None:
         print(
             f"evade: failed: {sys.executable} has not the packages of Evade; {ENVIRONMENT}", file=sys.stderr
@@ -81,6 +79,7 @@ def compose(words: list[str]) -> dict[str, object] | None:
 
     from jobs.config.errors import ConfigError, redacted
 
+    words = hydra_words(words)
     errors = word_errors(words)
     if errors:
         raise ConfigError("\n".join(errors))
@@ -90,19 +89,28 @@ def compose(words: list[str]) -> dict[str, object] | None:
     def keep(config: Any) -> None:
         composed.append(OmegaConf.to_container(config, resolve=False))
 
-    verbose = os.environ.get("HYDRA_FULL_ERROR")
+    given, verbose = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing and leaving
+    sys.argv = [given[0], *words]
     try:
         with contextlib.redirect_stdout(answer):
             hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(keep)()
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(explain(error, words)) from error
     finally:
-        print(redacted(answer.getvalue()), end="")
+        sys.argv = given
+        print(redacted(with_jobs(answer.getvalue())), end="")
         os.environ.pop("HYDRA_FULL_ERROR")
         if verbose is not None:
             os.environ["HYDRA_FULL_ERROR"] = verbose
     return composed[0] if composed else None
+
+
+def with_jobs(answer: str) -> str:
+    """Return Hydra's help with the list of jobs in its place; other answers as they are."""
+    if JOBS_HERE not in answer:
+        return answer
+    return answer.replace(JOBS_HERE, "\n".join(f"    {name:<16} {job.summary}" for name, job in JOBS.items()))
 
 
 def word_errors(words: list[str]) -> list[str]:
@@ -120,15 +128,14 @@ def word_errors(words: list[str]) -> list[str]:
 
 def explain(error: Exception, words: list[str]) -> str:
     """Hydra's error about a command line, in one line with the nearest key or the choices."""
-    from jobs.config.config import known_keys
-    from jobs.config.errors import nearest
+    from jobs.config.config import keys_of_jobs, unknown_key
 
     text = str(error)
     unknown = re.match(r"Could not override '([^']+)'\.\nTo append to your config use \+(.*)", text)
     if unknown and not unknown[1].startswith(OPEN_GROUPS):
         cause = re.search(r"full_key: (\S+)", str(error.__cause__))
-        key = cause[1] if cause else unknown[1]
-        return f"{key}: no such key, got {unknown[2]}{nearest(key, known_keys())}"
+        key = cause[1] if cause and unknown[1] not in keys_of_jobs() else unknown[1]
+        return f"{key}: no such key, got {unknown[2]}{unknown_key(key)}"
     choice = re.match(
         r"In '.+': Could not find '([^'/]+)/([^']*)'\n\nAvailable options in .+:\n((\t.+\n)+)", text
     )
@@ -169,8 +176,7 @@ def value_errors(values: object, key: str = "") -> Iterator[str]:
             else:
                 yield from value_errors(value, inner)
     elif values == "???":
-        names = sorted(path.stem for path in (CONF / "exp").glob("*.yaml"))
-        yield f"exp: not given; name an experiment with +exp=NAME, one of {', '.join(names)}"
+        yield f"exp: not given; name an experiment with +exp=NAME, one of {', '.join(experiments())}"
     elif isinstance(values, str) and "${" in values:
         yield f"{key}: must be the value itself, not a reference to another, got {values!r}"
 

@@ -7,7 +7,7 @@ with a line for each wrong key. Nothing has been started or written by then.
 import dataclasses
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 from pydantic import AfterValidator, Field
@@ -24,25 +24,14 @@ from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
     AblationConfig,
     AlgoConfig,
-    CalibrateConfig,
     ClusterConfig,
     CollectConfig,
-    DemoConfig,
     EvaluateConfig,
     Name,
     PretrainConfig,
-    ProbeConfig,
-    ReplayConfig,
-    ReplayPageConfig,
-    SlidingConfig,
     SweepConfig,
     TrackingConfig,
-    TradeConfig,
-    TradeEncoderConfig,
-    TradeSimulatorConfig,
     TrainConfig,
-    TuneConfig,
-    VideoConfig,
 )
 from models.kinds import KINDS, Model, model_keys, read_model
 
@@ -62,7 +51,12 @@ def _job(name: str) -> str:
 
 @dataclass(frozen=True, config=STRICT)
 class Config:
-    """One experiment, checked. `env` is the simulation as it is handed on to whatever needs one."""
+    """One experiment, checked: what every job shares, and the settings of its own job.
+
+    Attributes:
+        env: The simulation, with camera, faults, fidelity and renderer.
+        own: The settings of the job alone, a `Settings` of the job's module; None if it has none.
+    """
 
     job: Annotated[str, AfterValidator(_job)]
     exp: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
@@ -73,26 +67,16 @@ class Config:
     env: EnvConfig
     model: Model
     algo: AlgoConfig
-    demo: DemoConfig
-    replay: ReplayConfig
-    video: VideoConfig
-    calibrate: CalibrateConfig
-    sliding: SlidingConfig
-    replay_page: ReplayPageConfig
     collect: CollectConfig
     pretrain: PretrainConfig
     train: TrainConfig
     evaluate: EvaluateConfig
     sweep: SweepConfig
-    trade: TradeConfig
-    trade_simulator: TradeSimulatorConfig
-    trade_encoder: TradeEncoderConfig
-    probe: ProbeConfig
-    tune: TuneConfig
     ablation: AblationConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
     plugins: list[Name]
+    own: Any = None
 
 
 SECTIONS = {
@@ -116,7 +100,9 @@ def parse(values: Mapping[str, object]) -> Config:
     parts: dict[str, object] = {"env": _env(values, errors)}
     parts |= {name: _section(section, values.get(name), name, errors) for name, section in SECTIONS.items()}
     parts["model"] = _section(read_model, values.get("model"), "model", errors)
-    top = {name: value for name, value in values.items() if name not in (*BESIDE_ENV, "name")}
+    job = str(values.get("job"))
+    parts |= {"own": _own(job, values, errors)} if has_own(job) else {}
+    top = {name: value for name, value in values.items() if name not in (*BESIDE_ENV, "name", job)}
     top |= {} if values.get("name") is None else {"exp": values["name"]}
     wrong = [name for name, part in parts.items() if part is None]
     config = _build(Config, {**top, **parts}, "", errors, skip=wrong)
@@ -140,15 +126,40 @@ def as_dict(config: Config) -> dict[str, object]:
     values: dict[str, object] = {}
     for name, value in dataclasses.asdict(dataclasses.replace(config, tracking=tracking)).items():
         values |= flat_env(config.env) if name == "env" else {name: value}
-    return values
+    own = values.pop("own")
+    return values if own is None else {**values, config.job: own}
 
 
 def known_keys() -> list[str]:
-    """Every key that a configuration may have."""
-    keys = [*fields_of(Config), "name", *ENV_GROUPS, *ENV_KEYS]
+    """Return every key that all configurations have, whatever the job."""
+    core = [name for name in fields_of(Config) if name != "own"]
+    keys = [*core, "name", *ENV_GROUPS, *ENV_KEYS]
     for name, section in SECTIONS.items():
         keys += [f"{name}.{field}" for field in fields_of(section)]
     return keys + [f"model.{name}" for name in model_keys()]
+
+
+def has_own(job: str) -> bool:
+    """Whether a job has settings of its own, in a section with the job's name."""
+    return job in JOBS and bool(JOBS[job].own_keys())
+
+
+def keys_of_jobs() -> dict[str, str]:
+    """Return the keys that only one job has: key -> job."""
+    return {f"{name}.{key}": name for name, job in JOBS.items() for key in job.own_keys()}
+
+
+def _own(job: str, values: Mapping[str, object], errors: list[str]) -> object:
+    """Return the job's own section; None if it is wrong, with the reasons added to `errors`."""
+    section = JOBS[job].settings()
+    if section is None:
+        errors.append(f"job: conf/job/{job}.yaml has settings, and {JOBS[job].module} has no class Settings")
+        return None
+    if values.get(job) is None:
+        rule = f"needs its settings, which an experiment adds by `- override /job: {job}` in its defaults"
+        errors.append(f"job: {job} {rule}")
+        return None
+    return _section(section, values[job], job, errors)
 
 
 def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:
@@ -193,12 +204,18 @@ def _build(
 def _line(problem: ErrorDetails, key: str) -> str:
     """What pydantic found, as key, rule and value."""
     if problem["type"] == "unexpected_keyword_argument":
-        keys = known_keys()
-        hint = "; this kind of model has none" if key in keys else nearest(key, keys)
+        hint = "; this kind of model has none" if key in known_keys() else unknown_key(key)
         return f"{key}: no such key, got {problem['input']!r}{hint}"
     if problem["type"] in ("missing", "missing_argument", "value_error"):
         return f"{key}: {problem['msg'].removeprefix('Value error, ')}"
     return f"{key}: {problem['msg']}, got {problem['input']!r}"
+
+
+def unknown_key(key: str) -> str:
+    """Return the remedy for a key that the configuration does not have: the nearest key, or the key's job."""
+    of_jobs = keys_of_jobs()
+    job = of_jobs.get(key) or (key if has_own(key) else None)
+    return f"; a setting of the job {job}" if job else nearest(key, [*known_keys(), *of_jobs])
 
 
 def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
@@ -206,8 +223,8 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
     yield "env.scene", config.env.scene
     yield "sweep.scene", config.sweep.scene
     yield "evaluate", HELD_OUT_SCENE
-    for job in ("trade", "trade_simulator", "replay_page", "collect"):
-        yield from ((f"{job}.scenes", name) for name in getattr(config, job).scenes)
+    yield from (("collect.scenes", name) for name in config.collect.scenes)
+    yield from ((f"{config.job}.scenes", name) for name in getattr(config.own, "scenes", ()))
     for key, conditions in (
         ("train.conditions", config.train.conditions),
         ("collect.conditions", config.collect.conditions),

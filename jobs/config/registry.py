@@ -1,6 +1,21 @@
-"""The jobs that `job=NAME` can run: which module does each, and what it is for."""
+"""The jobs that `job=NAME` can run.
 
-from typing import NamedTuple
+A job is two files. `conf/job/NAME.yaml` names it and holds the values of its settings. The module NAME of a
+room of jobs/ (or of research/) has `run(config)` and, if the job has settings of its own, their class
+`Settings`. Nothing else lists jobs: help, dashboard and the tables of keys are derived from these two files.
+"""
+
+import importlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+CONF = ROOT / "conf"
+# Jobs whose module has another name or another place.
+ELSEWHERE = {
+    "trade_encoder": "jobs.measure.encoder.trade",
+    "trade_simulator": "jobs.measure.simulator",
+}
 
 
 class Job(NamedTuple):
@@ -8,37 +23,59 @@ class Job(NamedTuple):
 
     Attributes:
         module: Its `run(config)` does the job.
-        summary: What comes of it, as the dashboard says it.
+        file: Its file in conf/job.
     """
 
     module: str
-    summary: str
+    file: Path | None = None
+
+    @property
+    def summary(self) -> str:
+        """Return the first line of the module's docstring, without importing the module."""
+        file = ROOT.joinpath(*self.module.split(".")).with_suffix(".py")
+        with file.open(encoding="utf-8") as text:
+            return text.readline().strip().strip('"').rstrip(".")
+
+    def values(self) -> dict[str, Any]:
+        """Return what its file says; empty without one."""
+        import yaml  # a Python without the packages of Evade still says so
+
+        return dict(yaml.safe_load(self.file.read_text(encoding="utf-8"))) if self.file else {}
+
+    def own_keys(self) -> list[str]:
+        """Return the names of the job's own settings."""
+        values = self.values()
+        return list(values.get(values["job"], ())) if values else []
+
+    def settings(self) -> type[Any] | None:
+        """Import the module and return the class of the job's own settings; None if it has none."""
+        return getattr(importlib.import_module(self.module), "Settings", None)
+
+
+def module_of(name: str) -> str | None:
+    """Return the module of a job: jobs.NAME, jobs.ROOM.NAME or jobs.ROOM.NAME.NAME, or the same in research.
+
+    None without one: an installation may leave research/ out.
+
+    Raises:
+        LookupError: If there is more than one.
+    """
+    if name in ELSEWHERE:
+        return ELSEWHERE[name]
+    places = (
+        f"jobs/{name}.py",
+        f"jobs/*/{name}.py",
+        f"jobs/*/{name}/{name}.py",
+        f"research/{name}/{name}.py",
+    )
+    found = [path for place in places for path in ROOT.glob(place)]
+    if len(found) > 1:
+        raise LookupError(f"job {name}: must have one module {name}.py, got {', '.join(map(str, found))}")
+    return ".".join(found[0].relative_to(ROOT).with_suffix("").parts) if found else None
 
 
 JOBS = {
-    "pipeline": Job("jobs.pipeline", "From nothing to an evaluated policy"),
-    "collect": Job("jobs.training.collect", "Recordings of flights, to pretrain on"),
-    "pretrain": Job("jobs.training.pretrain", "An event VAE, whose frozen encoder a policy sees by"),
-    "train": Job("jobs.training.train", "A policy trained by PPO"),
-    "evaluate": Job("jobs.evaluation.evaluate", "A policy and its baselines in corridors never trained on"),
-    "sweep": Job(
-        "jobs.evaluation.sweep",
-        "Policies at other rates and thresholds, in other worlds, with sensor faults",
-    ),
-    "report": Job("jobs.reporting.report", "The page of results, written from the newest sweep"),
-    "demo": Job("jobs.evaluation.demo", "A film of one episode of a policy"),
-    "replay": Job("jobs.tools.replay", "What a policy makes of a real camera's recording"),
-    "video_events": Job("jobs.tools.video_events", "The events of a video, as a camera would report them"),
-    "calibrate": Job("jobs.tools.calibrate.calibrate", "The settings of the camera that made a recording"),
-    "sliding": Job("research.sliding.sliding", "What a probe of the simulation reads of a recording"),
-    "replay_page": Job("jobs.tools.replay_page", "A page to scrub through recorded episodes"),
-    "ship": Job("jobs.tools.publish", "The trained policies of models/pretrained, and how they learnt"),
-    "trade": Job("jobs.measure.trade.trade", "What exactness costs from end to end"),
-    "trade_simulator": Job("jobs.measure.simulator", "What exact events cost"),
-    "trade_encoder": Job("jobs.measure.encoder.trade", "What an exact encoder costs"),
-    "tune": Job("jobs.tools.search.search", "Which settings a training learns best with"),
-    "ablation": Job("jobs.studies.ablation.ablation", "What each part of a recipe contributes"),
-    "numerics": Job("jobs.studies.numerics.numerics", "What the numbers do at the ends of their ranges"),
-    "fingerprint": Job("jobs.tools.fingerprint", "Whether this machine gives the published digits"),
-    "probe": Job("research.probe.probe", "What a representation of events tells an agent"),
+    file.stem: Job(module, file)
+    for file in sorted((CONF / "job").glob("*.yaml"))
+    if (module := module_of(file.stem)) is not None
 }

@@ -1,5 +1,11 @@
-"""The settings of each part of an experiment: names, types, ranges. Their values and units are in conf/."""
+"""The settings that all jobs share, by section: names, types, ranges. Their values and units are in conf/.
 
+A field that is added to a section of a training (`jobs.run.identity.TRAINED_BY`) needs a default that does
+what was done before: older run folders lack the field. The settings of one job alone are the class `Settings`
+of its module.
+"""
+
+import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -8,8 +14,8 @@ from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
-from jobs.config.conditions import Axis, AxisName, Conditions, Searched
-from models.kinds import Latent, Stack, Target, checked
+from jobs.config.conditions import Axis, AxisName, Conditions
+from models.kinds import checked
 
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -71,11 +77,11 @@ class AlgoConfig:
     reward_scale: Positive
     num_envs_per_env_runner: Count
     num_env_runners: Annotated[int, Field(ge=0, le=10_000)]
-    critic: Literal["observation", "teacher"]
-    shaping: NonNegative
-    imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)]
-    mirrored: bool
-    teacher_sight_m: Positive | None
+    critic: Literal["observation", "teacher"] = "observation"
+    shaping: NonNegative = 0.0
+    imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)] = None
+    mirrored: bool = False
+    teacher_sight_m: Positive | None = None
 
     @pydantic.model_validator(mode="after")
     def _minibatch_fits(self) -> "AlgoConfig":
@@ -92,104 +98,6 @@ class AlgoConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
-class DemoConfig:
-    """Whose episode is shown: a name in models/pretrained, "newest", or a path."""
-
-    policy: Name
-
-
-@dataclass(frozen=True, config=STRICT)
-class ReplayConfig:
-    """Which recording which policy looks at.
-
-    Attributes:
-        recording: An event file, of any format that `envs.recordings.read_events` knows.
-        policy: A name in models/pretrained, "newest", or a path.
-    """
-
-    recording: Name
-    policy: Name
-
-
-@dataclass(frozen=True, config=STRICT)
-class VideoConfig:
-    """Which video becomes events. The camera is that of the environment, and so are its size and its faults.
-
-    Attributes:
-        path: A video, or a folder of images, as `envs.recordings.video_steps` reads them.
-        output: The event file, of the format that its suffix names; None: events.npz in the run folder.
-        fps: Frames per second, in place of the times that the video or the folder has [Hz].
-        transfer: How values become light; None: floating point is linear, whole numbers are sRGB.
-        interpolate: What is taken to be between two frames.
-        luminance_floor: Of the camera, in place of its own, white = 1; None: what is right for the frames
-            (`envs.recordings.light.usual_floor`).
-    """
-
-    path: Name
-    output: Name | None
-    fps: Annotated[float, Field(gt=0)] | None
-    transfer: Literal["srgb", "linear"] | None
-    interpolate: Literal["linear", "flow"]
-    luminance_floor: Annotated[float, Field(ge=1e-9, le=1)] | None
-
-
-@dataclass(frozen=True, config=STRICT)
-class CalibrateConfig:
-    """Which recording a camera is calibrated against.
-
-    Attributes:
-        recording: An event file, of any format that `envs.recordings.read_events` knows.
-        frames: Text file with a line "seconds picture" for each frame of the same sensor, on the clock of the
-            events; None: the scene was still and uniform.
-        frame_delay_us: From the time of a frame to the middle of its exposure [us].
-        luminance: Of a still scene, white = 1.
-        camera: Name of the file in conf/camera that is written; None: only that in the run folder.
-    """
-
-    recording: Name
-    frames: Name | None
-    frame_delay_us: Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
-    luminance: Annotated[float, Field(gt=0, le=1)]
-    camera: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] | None
-
-
-@dataclass(frozen=True, config=STRICT)
-class SlidingConfig:
-    """Which recording of a sliding camera is read, and by a probe of which encoder.
-
-    Attributes:
-        folder: Holds images.txt, calib.txt, groundtruth.txt, as Mueggler et al. (IJRR 2017) made them.
-        events: The event file in it.
-        frame_delay_us: From the time of a frame to the middle of its exposure [us].
-        policy: A name in models/pretrained, "newest", or a path.
-        episodes: Simulated, to fit the probe to.
-    """
-
-    folder: Name
-    events: Name
-    frame_delay_us: Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
-    policy: Name
-    episodes: Annotated[int, Field(ge=8)]
-
-
-@dataclass(frozen=True, config=STRICT)
-class ReplayPageConfig:
-    """The episodes of the replay page: each policy in each scene, at each rate, with each noise.
-
-    Attributes:
-        policies: Each a name in models/pretrained, "newest", or a path.
-        scenes: Layouts.
-        background_activity: False events per true event.
-        control_hz: Actions per second [Hz].
-    """
-
-    policies: Annotated[list[Name], Field(min_length=1, max_length=4)]
-    scenes: Annotated[list[Name], Field(min_length=1, max_length=4)]
-    background_activity: Annotated[list[NonNegative], Field(min_length=1, max_length=4)]
-    control_hz: Annotated[list[Positive], Field(min_length=1, max_length=4)]
-
-
-@dataclass(frozen=True, config=STRICT)
 class CollectConfig:
     """What the data set of the event VAE is made of; scenes and recordings get equal shares of the steps.
 
@@ -202,12 +110,12 @@ class CollectConfig:
     """
 
     scenes: list[Name]
-    recordings: list[Name]
     num_steps: Count
     num_validation_steps: Count
     policy: str | None
     policy_share: Fraction
-    conditions: Conditions
+    recordings: list[Name] = dataclasses.field(default_factory=list)
+    conditions: Conditions = dataclasses.field(default_factory=lambda: [{}])
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -219,7 +127,6 @@ class PretrainConfig:
     """
 
     encoder: str | None
-    denoise: bool
     iterations: Count
     batch_windows: Count
     window_events: Count
@@ -230,6 +137,7 @@ class PretrainConfig:
     beta_schedule: Literal["appendix", "constant"]
     validate_every: Count
     checkpoint_every: Count
+    denoise: bool = False
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -245,9 +153,9 @@ class TrainConfig:
 
     env_steps: Count
     checkpoint_every: Count
-    init: str | None
-    value_warmup: Annotated[int, Field(ge=0)]
-    conditions: Conditions
+    init: str | None = None
+    value_warmup: Annotated[int, Field(ge=0)] = 20_000
+    conditions: Conditions = dataclasses.field(default_factory=lambda: [{}])
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -289,52 +197,6 @@ class SweepConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
-class TradeConfig:
-    """Which policies are evaluated under every setting of simulator and encoder, and in how many corridors.
-
-    Attributes:
-        policies: Groups and names in models/pretrained, "newest", or paths.
-        scenes: Where.
-        trials: Corridors of each training under each setting.
-        pyrender_trials: Corridors under the settings that pyrender draws.
-        replays: Episodes of each training on which costs and errors are measured.
-    """
-
-    policies: Annotated[list[Name], Field(min_length=1)]
-    scenes: Annotated[list[Name], Field(min_length=1)]
-    trials: Count
-    pyrender_trials: Count
-    replays: Count
-
-
-@dataclass(frozen=True, config=STRICT)
-class TradeSimulatorConfig:
-    """Where the simulator's event error is measured, and how often its cost.
-
-    Attributes:
-        flights: Corridors in which errors are measured.
-        steps: Control steps in each of them, and in each round of timing.
-        rounds: Rounds of timing.
-    """
-
-    scenes: Annotated[list[Name], Field(min_length=1)]
-    control_hz: Annotated[list[Positive], Field(min_length=1)]
-    flights: Count
-    steps: Count
-    rounds: Count
-
-
-@dataclass(frozen=True, config=STRICT)
-class TradeEncoderConfig:
-    """How long the compared encoders are trained, and on how many windows they are measured."""
-
-    iterations: Count
-    seeds: Count
-    windows: Annotated[int, Field(ge=4)]
-    rounds: Count
-
-
-@dataclass(frozen=True, config=STRICT)
 class AblationConfig:
     """Which parts of an experiment are changed, one at a time.
 
@@ -351,36 +213,6 @@ class AblationConfig:
     seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]
     variants: dict[AxisName, dict[str, Any]]
     trained: str | None = None
-
-
-@dataclass(frozen=True, config=STRICT)
-class ProbeConfig:
-    """On how many steps representations are probed, and which event VAEs are trained for it."""
-
-    num_steps: Count
-    num_validation_steps: Count
-    iterations: Count
-    seeds: Count
-    latents: Annotated[list[Latent], Field(min_length=1, max_length=8)]
-    targets: Annotated[list[Target], Field(min_length=1, max_length=4)]
-    stacks: Annotated[list[Stack], Field(min_length=1, max_length=8)]
-
-
-@dataclass(frozen=True, config=STRICT)
-class TuneConfig:
-    """Which settings are searched, and how much each trial of some may cost.
-
-    Attributes:
-        space: Key -> a list of values, or a range as in `jobs.config.conditions`.
-        trials: Trainings that are begun; most are stopped early.
-        report_steps: Environment steps between two measurements; the first is the earliest end of a trial.
-        episodes: Validation corridors of a measurement.
-    """
-
-    space: Annotated[dict[str, Searched], Field(min_length=1)]
-    trials: Count
-    report_steps: Count
-    episodes: Count
 
 
 @dataclass(frozen=True, config=STRICT)

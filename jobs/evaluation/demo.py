@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pydantic.dataclasses import dataclass
 
-from envs.config import EnvConfig
+from envs.config import STRICT, EnvConfig
 from jobs.analysis.demo_film import write_film
 from jobs.analysis.tables import events_texts, show_table
 from jobs.config.config import Config
+from jobs.config.schema import Name
 from jobs.evaluation.evaluate import latent_decoder
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
@@ -33,6 +35,13 @@ HEADINGS = (
     *("Policy", "Scene", "Corridor", "Success", "Ends by"),
     *("Distance [m]", "Steps", "Events/step", "Dropped", "Time [s]"),
 )
+
+
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Whose episode is shown: a name in models/pretrained, "newest", or a path."""
+
+    policy: Name
 
 
 class Shown(NamedTuple):
@@ -55,7 +64,7 @@ def find_shown(config: Config) -> Shown:
     Raises:
         ConfigError: There is no such policy.
     """
-    policy = find_one_policy("demo.policy", config.demo.policy, config, locate_run(config))
+    policy = find_one_policy("demo.policy", config.own.policy, config, locate_run(config))
     env = with_own_filter(policy, dataclasses.replace(config.env, split="eval"))
     return Shown(policy, env, PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic"))
 

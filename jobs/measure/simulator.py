@@ -10,16 +10,19 @@ the same flights, see `envs.event_error`; a cost is process time of `CorridorEnv
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-from envs.config import EnvConfig
+from envs.config import STRICT, EnvConfig, Positive
 from envs.corridor import CorridorEnv
 from envs.event_error import Accuracy, measure_event_error
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import env_with
 from jobs.config.config import Config
+from jobs.config.schema import Count, Name
 from jobs.measure.front_plots import CostedSetting, pareto, plot_costs, plot_memory_modes
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.progress import console, progress
@@ -39,6 +42,23 @@ KNOBS: dict[str, list[Setting]] = {
 }
 NOISE = 0.05  # share by which the cost of one simulation differs when it is measured again
 HEADINGS = ("Knob", "Setting", "Cost [us/step]", "Event error [%]", "Events/step", "Renders/step", "Best")
+
+
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Where the simulator's event error is measured, and how often its cost.
+
+    Attributes:
+        flights: Corridors in which errors are measured.
+        steps: Control steps in each of them, and in each round of timing.
+        rounds: Rounds of timing.
+    """
+
+    scenes: Annotated[list[Name], Field(min_length=1)]
+    control_hz: Annotated[list[Positive], Field(min_length=1)]
+    flights: Count
+    steps: Count
+    rounds: Count
 
 
 class MeasuredSetting(NamedTuple):
@@ -63,7 +83,7 @@ def run(config: Config) -> dict[str, float]:
     config = folder.config
     with open_tracker(config, folder) as tracker:
         metrics: dict[str, float] = {}
-        for scene in config.trade_simulator.scenes:
+        for scene in config.own.scenes:
             metrics |= trade_scene(config, folder, tracker, scene)
         metrics |= trade_memory(config, folder, tracker)
         tracker.log(0, metrics)
@@ -77,7 +97,7 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
     named = [("default", "", default)]
     for knob, settings in KNOBS.items():
         named += [(knob, setting_text(setting), changed(default, setting)) for setting in settings]
-    trade = config.trade_simulator
+    trade = config.own
     with progress(f"Trade in {scene}", len(named), "settings") as advance:
         accuracies = []
         for knob, _, simulation in named:
@@ -104,7 +124,7 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
 
 def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     """Measure events per second of flight at each control rate for each memory mode; return the metrics."""
-    trade = config.trade_simulator
+    trade = config.own
     rates_hz = trade.control_hz
     events_hz: dict[str, list[float]] = {memory: [] for memory in MEMORIES}
     with progress("Memory modes", len(rates_hz) * len(MEMORIES), "simulations") as advance:

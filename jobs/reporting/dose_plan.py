@@ -15,7 +15,7 @@ from jobs.evaluation.sweep_plan import axes_of
 from jobs.evaluation.sweep_report import SweepFacts
 from jobs.reporting.breaks import SweptEpisodes
 from jobs.run.files import read_json
-from jobs.run.folder import ADDED_SETTINGS
+from jobs.run.identity import ADDED_SETTINGS
 from jobs.run.provenance import REPOSITORY
 from models.policy.policy import MANIFEST
 

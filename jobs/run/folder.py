@@ -12,35 +12,14 @@ from typing import Any, TypeVar
 
 import yaml
 
-from envs.config import LATER_SETTINGS, CameraConfig, settings_hash
+from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
-from jobs.config.plugins import plugin_digests
 from jobs.run.files import RunError, read_json, write_atomic, write_json
+from jobs.run.identity import TRAINED_BY, identity
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
-from models.kinds import ADDED_MODEL_SETTINGS, RENAMED, model_keys, renamed
+from models.kinds import RENAMED, renamed
 
-# Sections that do not change what is trained, but by rounding: where a run is computed and recorded, and what
-# is done with its policy afterwards.
-NOT_IN_RUN_NAME = (
-    "job", "resume", "runs_dir", "plugins", "cluster", "tracking",
-    "evaluate", "sweep", "trade", "trade_simulator", "trade_encoder", "probe", "tune", "ablation",
-    "demo", "replay_page", "calibrate", "sliding",
-)  # fmt: skip
-# Settings that older run folders lack, each with the value that does what was done before it existed.
-ADDED_SETTINGS: dict[str, dict[str, object]] = {
-    "model": ADDED_MODEL_SETTINGS,
-    "algo": {
-        **{"imitation": None, "critic": "observation", "shaping": 0.0},
-        **{"mirrored": False, "teacher_sight_m": None},
-    },
-    "env": {"filter_support": 0, "filter_tau_us": 5_000},
-    "camera": {name: getattr(CameraConfig, name) for name in LATER_SETTINGS},
-    "faults": {"added": {}, "displaced": 0.0, "flipped": 0.0, "leak_jitter": 0.0, "noise_spread": 0.0},
-    "collect": {"recordings": [], "conditions": [{}]},
-    "pretrain": {"denoise": False},
-    "train": {"conditions": [{}], "init": None, "value_warmup": 20_000},
-}
 COMPARED_STEPS = 500_000  # length of the trainings that are compared with each other; the paper's
 
 Results = TypeVar("Results", bound=Mapping[str, object])
@@ -106,7 +85,7 @@ def locate_run(config: Config) -> Run:
 
 
 def reopen(path: Path, config: Config) -> Run:
-    """An existing run folder with its stored configuration; `NOT_IN_RUN_NAME` is taken from `config`.
+    """An existing run folder: `TRAINED_BY` is taken from its stored configuration, the rest from `config`.
 
     Raises:
         ConfigError: If `path` is no run folder, or was made with a model that has another name now.
@@ -117,7 +96,6 @@ def reopen(path: Path, config: Config) -> Run:
             f"resume: must be a run folder (one that holds config.json), got {str(path)!r}; "
             f"run folders are in {str(Path(config.runs_dir).resolve())!r}"
         )
-    here = {name: value for name, value in as_dict(config).items() if name in NOT_IN_RUN_NAME}
     values = read_json(stored)
     model = values["model"]["name"]
     if model in RENAMED:
@@ -127,29 +105,13 @@ def reopen(path: Path, config: Config) -> Run:
         )
     # Older versions wrote null for the settings that a kind of model does not have.
     values["model"] = {name: value for name, value in values["model"].items() if value is not None}
-    for section, added in ADDED_SETTINGS.items():
-        if section in values:
-            own = model_keys(model) if section == "model" else added
-            values[section] = {**{name: added[name] for name in added if name in own}, **values[section]}
-    run = parse({**values, **here})
+    run = parse({**as_dict(config), **{name: values.get(name) for name in TRAINED_BY}})
     return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
 
 
 def run_name(config: Config) -> str:
-    """`<exp>-<budget>-s<seed>-<hash>`; the hash covers every setting that can change what is trained.
-
-    `ADDED_SETTINGS` count only where they change something, so that older folders keep their names. Of
-    plug-ins the content counts: another version of one is another experiment.
-    """
-    settings: dict[str, Any] = {
-        name: value for name, value in as_dict(config).items() if name not in NOT_IN_RUN_NAME
-    }
-    for section, added in ADDED_SETTINGS.items():
-        values = settings[section].items()
-        settings[section] = {name: value for name, value in values if added.get(name, ...) != value}
-    if config.plugins:
-        settings["plugins"] = plugin_digests()
-    return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(settings)[:8]}"
+    """Return `<exp>-<budget>-s<seed>-<hash>`; the hash is that of `identity`."""
+    return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(identity(config))[:8]}"
 
 
 def group_name(settings: Mapping[str, Any]) -> str:

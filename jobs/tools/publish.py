@@ -1,6 +1,6 @@
 """Put trained policies where a fresh clone finds them, and draw their learning curves.
 
-Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=ship
+Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=publish
 Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each
 experiment, length and seed in `runs_dir` with the configured budget, 0.1 to 2 megabytes each
 (weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`; what was published

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pydantic.dataclasses import dataclass
 
-from envs.config import EnvConfig
+from envs.config import STRICT, EnvConfig
 from jobs.analysis.tables import show_table
 from jobs.analysis.video import coloured, frame, last_polarity, open_film
 from jobs.config.config import Config, ConfigError
+from jobs.config.schema import Name
 from jobs.rollout.policies import find_one_policy
 from jobs.run.files import write_atomic
 from jobs.run.folder import locate_run, open_run
@@ -27,6 +29,19 @@ from models.policy import Policy, load_policy
 ACTIONS = ("forward", "left", "right")
 HEADINGS = ("Recording", "Policy", "Steps", "Events/step", "Forward", "Left", "Right", "p50", "p95", "p99")
 FILM_FPS, SLOWEST_FPS = 50.0, 5.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Which recording which policy looks at.
+
+    Attributes:
+        recording: An event file, of any format that `envs.recordings.read_events` knows.
+        policy: A name in models/pretrained, "newest", or a path.
+    """
+
+    recording: Name
+    policy: Name
 
 
 class Choice(NamedTuple):
@@ -52,13 +67,13 @@ def run(config: Config) -> list[Choice]:
     Raises:
         ConfigError: There is no such policy, or it sees no events; or the recording is refused.
     """
-    found = find_one_policy("replay.policy", config.replay.policy, config, locate_run(config))
+    found = find_one_policy("replay.policy", config.own.policy, config, locate_run(config))
     policy = load_policy(found.agent)
     if policy.feature.from_events is None:
-        raise ConfigError(f"replay.policy: must see events, got {config.replay.policy!r}")
+        raise ConfigError(f"replay.policy: must see events, got {config.own.policy!r}")
     env = EnvConfig(**policy.env_fields)
     try:
-        recorded = read_whole(config.replay.recording, env)
+        recorded = read_whole(config.own.recording, env)
     except (ValueError, OSError) as error:
         raise ConfigError(f"replay.recording: {error}") from error
     choices, name = choose(policy, recorded), f"{found.group}-s{found.training}"

@@ -13,12 +13,17 @@ import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
+from envs.config import STRICT, Positive
 from envs.events.windows import GREY_ON
 from jobs.analysis.ground_plan import ground_plan
 from jobs.config.config import Config
+from jobs.config.schema import Name, NonNegative
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
 from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, with_own_filter
@@ -40,13 +45,30 @@ CHOICES = ("policy", "scene", "noise", "rate")
 Cell = tuple[EvaluatedPolicy, str, float, float]  # policy, scene, noise, rate
 
 
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """The episodes of the replay page: each policy in each scene, at each rate, with each noise.
+
+    Attributes:
+        policies: Each a name in models/pretrained, "newest", or a path.
+        scenes: Layouts.
+        background_activity: False events per true event.
+        control_hz: Actions per second [Hz].
+    """
+
+    policies: Annotated[list[Name], Field(min_length=1, max_length=4)]
+    scenes: Annotated[list[Name], Field(min_length=1, max_length=4)]
+    background_activity: Annotated[list[NonNegative], Field(min_length=1, max_length=4)]
+    control_hz: Annotated[list[Positive], Field(min_length=1, max_length=4)]
+
+
 def run(config: Config) -> dict[str, int]:
     """Record the episodes, write the page and track it; return how many there are, and reach the goal.
 
     Raises:
         ConfigError: If a policy is not there.
     """
-    asked, place = config.replay_page, locate_run(config)
+    asked, place = config.own, locate_run(config)
     policies = [find_one_policy("replay_page.policies", name, config, place) for name in asked.policies]
     folder = open_run(config)
     cells = list(itertools.product(policies, asked.scenes, asked.background_activity, asked.control_hz))

@@ -10,16 +10,19 @@ import dataclasses
 import functools
 import re
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-from envs.config import Split
+from envs.config import STRICT, Split
 from jobs.analysis.plots import BROWN, COLOURS, CYAN, GREYS, INK, MUTED, VIOLET, tidy
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.config import Config, ConfigError
+from jobs.config.schema import Count
 from jobs.measure.encoder.trials import kept, trial_settings
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
@@ -27,7 +30,7 @@ from jobs.tracking.tracker import open_tracker
 from jobs.training.pretrain import encoder_file, prepare_encoder
 from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder
-from models.kinds import KINDS
+from models.kinds import KINDS, Latent, Stack, Target
 from research.probe.dataset import (
     ALARM_M,
     CELLS,
@@ -50,6 +53,19 @@ LEVEL_LOOKS = (
     (VIOLET, (0, (10, 2))),  # many cells
     (INK, (0, (1, 2))),  # the run's encoder
 )
+
+
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """On how many steps representations are probed, and which event VAEs are trained for it."""
+
+    num_steps: Count
+    num_validation_steps: Count
+    iterations: Count
+    seeds: Count
+    latents: Annotated[list[Latent], Field(min_length=1, max_length=8)]
+    targets: Annotated[list[Target], Field(min_length=1, max_length=4)]
+    stacks: Annotated[list[Stack], Field(min_length=1, max_length=8)]
 
 
 class Representation(NamedTuple):
@@ -119,8 +135,8 @@ def record_both(config: Config) -> tuple[ProbeData, ProbeData]:
     """Record episodes to fit the probes to, and others in validation corridors to judge them by."""
     env = dataclasses.replace(config.env, observation="events")
     sizes: dict[Split, int] = {
-        "train": config.probe.num_steps,
-        "validation": config.probe.num_validation_steps,
+        "train": config.own.num_steps,
+        "validation": config.own.num_validation_steps,
     }
     with progress("Record probe data", sum(sizes.values()), "steps") as advance:
         train, held_out = (
@@ -132,7 +148,7 @@ def record_both(config: Config) -> tuple[ProbeData, ProbeData]:
 
 def representations(config: Config, folder: Run, own: EventVAE) -> list[Representation]:
     """The representations to compare; the event VAEs among them are trained, or read if they were before."""
-    grid, settings = own.grid, config.probe
+    grid, settings = own.grid, config.own
     compared = [
         Representation("nothing", [nothing]),
         Representation("image columns", [functools.partial(column_features, grid=grid)]),
@@ -151,7 +167,7 @@ def representations(config: Config, folder: Run, own: EventVAE) -> list[Represen
 
 def trained(config: Config, folder: Run, latent: int, target: str, seed: int) -> EventVAE:
     """An event VAE of that latent size and target, trained briefly; the same seed gives the same windows."""
-    iterations = config.probe.iterations
+    iterations = config.own.iterations
     file = folder.path / "probe" / "encoders" / f"{target}-{latent}-s{seed}-{iterations}.safetensors"
     settings = trial_settings(config, {"latent": latent, "target": target})
     return kept(config, folder, file, settings, seed, iterations)
@@ -161,7 +177,7 @@ def probe_representations(
     config: Config, compared: Sequence[Representation], train: ProbeData, held_out: ProbeData
 ) -> list[ProbeResult]:
     """Fit the probes to every representation, for every number of steps read together."""
-    stacks = sorted({*config.probe.stacks, config.model.stack})
+    stacks = sorted({*config.own.stacks, config.model.stack})
     rows = []
     fits = len(stacks) * sum(len(one.represent) for one in compared)
     with progress("Probe", fits, "fits") as advance:

@@ -10,18 +10,21 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-from envs.config import CameraConfig, EnvConfig, FaultsConfig
+from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig
 from envs.recordings import downscale_events
 from envs.scene.range_scan import NEAR_M
 from jobs.analysis.plots import AMBER, BLUE, INK, tidy
 from jobs.analysis.statistics import CONFIDENCE
 from jobs.analysis.tables import markdown_table, save_plot, show_table
 from jobs.config.config import Config, ConfigError
+from jobs.config.schema import Name
 from jobs.rollout.policies import find_one_policy
 from jobs.run.files import write_atomic
 from jobs.run.folder import locate_run, open_run
@@ -49,6 +52,25 @@ HEADINGS = ("Events", "Camera", "Read from", "r", "r of the means over time", "E
 
 
 Key = tuple[str, str, str]  # events, camera, what is read
+
+
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Which recording of a sliding camera is read, and by a probe of which encoder.
+
+    Attributes:
+        folder: Holds images.txt, calib.txt, groundtruth.txt, as Mueggler et al. (IJRR 2017) made them.
+        events: The event file in it.
+        frame_delay_us: From the time of a frame to the middle of its exposure [us].
+        policy: A name in models/pretrained, "newest", or a path.
+        episodes: Simulated, to fit the probe to.
+    """
+
+    folder: Name
+    events: Name
+    frame_delay_us: Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
+    policy: Name
+    episodes: Annotated[int, Field(ge=8)]
 
 
 class Truth(NamedTuple):
@@ -89,7 +111,7 @@ def run(config: Config) -> dict[str, Score]:
     Raises:
         ConfigError: A file of the folder is refused, or the policy has no event VAE.
     """
-    chosen = config.sliding
+    chosen = config.own
     found = find_one_policy("sliding.policy", chosen.policy, config, locate_run(config))
     env = EnvConfig(**load_policy(found.agent).env_fields)
     evae = load_encoder(Path(found.agent) / "encoder.safetensors")[0]

@@ -8,6 +8,7 @@ from pathlib import Path
 import hydra
 from omegaconf import OmegaConf
 
+from jobs.config.command_line import hydra_words
 from jobs.config.config import Config, parse
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -29,7 +30,7 @@ TINY = (
 @functools.cache
 def _composed(*words: str) -> dict:
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(hydra.compose("config", list(words)), resolve=True)
+        return OmegaConf.to_container(hydra.compose("config", hydra_words(words)), resolve=True)
 
 
 def compose(*words: str) -> dict:
@@ -39,7 +40,8 @@ def compose(*words: str) -> dict:
 
 def small_config(tmp_path: Path, **changes: object) -> Config:
     """A checked configuration whose runs lie in a folder of the test's own."""
-    values = compose("+exp=bytestream", "budget=smoke", "evaluate.beside=[]")
+    job = f"job={changes.get('job', 'pipeline')}"
+    values = compose("+exp=bytestream", "budget=smoke", "evaluate.beside=[]", job)
     return parse({**values, "runs_dir": str(tmp_path / "runs"), **changes})
 
 
@@ -51,7 +53,7 @@ def make_config(*overrides: str) -> Config:
 
 def tune_config(*overrides: str) -> Config:
     """The checked configuration of a search."""
-    return parse(compose("+exp=tune", *overrides))
+    return parse(compose("+exp=search", *overrides))
 
 
 def sweep_config(tmp_path, trials=2, policies=("straight",), axes=AXES, **changes):

@@ -44,6 +44,6 @@ def job(launcher, monkeypatch):
         module = types.ModuleType("jobs_under_test")
         module.run = function
         monkeypatch.setitem(sys.modules, "jobs_under_test", module)
-        monkeypatch.setitem(launcher.JOBS, "train", Job("jobs_under_test", ""))
+        monkeypatch.setitem(launcher.JOBS, "train", Job("jobs_under_test"))
 
     return replace

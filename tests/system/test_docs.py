@@ -18,7 +18,7 @@ from docs.keys import HEAD, kinds, row, tables
 from docs.run_notebooks import execute
 from envs.events import EVENT
 from envs.recordings import write_events
-from jobs.config.config import known_keys, parse
+from jobs.config.config import keys_of_jobs, known_keys, parse
 from jobs.rollout.policies import PRETRAINED
 from tests.support.configs import compose
 from tests.support.filled_store import fill
@@ -124,9 +124,11 @@ def test_every_key_has_a_row_that_says_what_it_is():
     said = {key: row(key, *about) for keys in kinds().values() for key, about in keys.items()}
     groups = {name for key in said for name in [key.partition(".")[0]] if "." in key}
     models = {key for key in known_keys() if key.startswith("model.")}
-    assert set(known_keys()) - groups - models == set(said) - {
+    of_jobs = {*keys_of_jobs()}
+    assert set(known_keys()) - groups - models == set(said) - of_jobs - {
         key for key in said if key.startswith("model.")
     }
+    assert of_jobs <= set(said)
     assert [key for key, cells in said.items() if not (cells.meaning and cells.allowed)] == []
     assert {len(line.split(" | ")) for line in tables().splitlines() if line.startswith("| `")} == {len(HEAD)}
 

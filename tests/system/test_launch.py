@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from jobs.config.command_line import experiments
 from jobs.config.config import Config
 from jobs.run import libraries
 from jobs.run.libraries import held
@@ -38,7 +39,7 @@ def test_a_job_begins_before_anything_heavy_is_imported():
 import sys, types, jobs
 from jobs.config.registry import JOBS, Job
 sys.modules["stub"] = types.SimpleNamespace(run=lambda config: print(*sys.modules))
-JOBS["train"] = Job("stub", "")
+JOBS["train"] = Job("stub")
 sys.argv = ["evade", "+exp=train"]
 sys.exit(jobs.main())
 """
@@ -55,6 +56,8 @@ def test_help_names_every_job_experiment_and_budget(launch, launcher):
     for group in ("exp", "budget"):
         for file in (ROOT / "conf" / group).glob("*.yaml"):
             assert f"\n  {file.stem} " in out
+    for name, job in launcher.JOBS.items():
+        assert f"\n    {name:<16} {job.summary}\n" in out
     assert out.count("\n  evade +exp=") == 7
     assert "$" not in out
 
@@ -113,7 +116,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["+env.split=eval"], "env.split: no such key, got 'eval'; every job chooses it itself"),
         (["seed=null"], "seed: Input should be a valid integer, got None"),
         (["seed="], "seed: Input should be a valid integer, got ''"),
-        (["job=os.system"], "job: must be one of pipeline, collect, "),
+        (["job=os.system"], "job: must be one of ablation, calibrate, "),
         (["budget=huge"], "budget: must be one of paper, short, smoke, got 'huge'"),
         (["env=3"], "env=3: "),
         (["seed=[1"], "seed=[1: "),
@@ -251,8 +254,7 @@ def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):
 def test_every_job_has_a_module_and_an_experiment_that_runs_it(launcher):
     missing = [job.module for job in launcher.JOBS.values() if importlib.util.find_spec(job.module) is None]
     assert missing == []
-    experiments = [file.stem for file in (ROOT / "conf" / "exp").glob("*.yaml")]
-    assert {compose(f"+exp={exp}")["job"] for exp in experiments} == set(launcher.JOBS)
+    assert {compose(f"+exp={exp}")["job"] for exp in experiments()} == set(launcher.JOBS)
 
 
 def test_the_launcher_says_so_when_conf_is_not_there(launch, launcher, monkeypatch, tmp_path):

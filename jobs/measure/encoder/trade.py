@@ -9,13 +9,18 @@ and plots of what the latent holds, in the run folder under `trade/` and in MLfl
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
+from envs.config import STRICT
 from envs.recordings import read_recording
 from jobs.analysis.tables import publish_plot, publish_table, short, write_csv
 from jobs.config.config import Config, ConfigError
+from jobs.config.schema import Count
 from jobs.measure.encoder.costs import (
     EncodingCost,
     default_encodings,
@@ -57,6 +62,16 @@ HEADINGS = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """How long the compared encoders are trained, and on how many windows they are measured."""
+
+    iterations: Count
+    seeds: Count
+    windows: Annotated[int, Field(ge=4)]
+    rounds: Count
+
+
 def run(config: Config) -> dict[str, float]:
     """Train the run's encoder if there is none yet, then measure; return the metrics.
 
@@ -85,7 +100,7 @@ def run(config: Config) -> dict[str, float]:
 
 def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
     """Measure cost against error of every way to encode; return the metrics of the default."""
-    trade = config.trade_encoder
+    trade = config.own
     models = [trained(config, folder, {"context": size}, 0) for size in CONTEXTS]
     validation = read_recording(data_file(folder, "validation"))
     usual = draw(config, validation, "mixed", MAX_EVENTS, trade.windows)
@@ -112,7 +127,7 @@ def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVA
 
 def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     """Train each coding of time side by side; return what each explains, as means over seeds."""
-    trade = config.trade_encoder
+    trade = config.own
     validation = read_recording(data_file(folder, "validation"))
     shares: dict[str, dict[str, list[float]]] = {coding: {} for coding in CODINGS}
     models: dict[str, EventVAE] = {}
@@ -149,7 +164,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
     publish_plot(folder, tracker, "trade/interpolation", plot_pictures(between(evae, batch), heads))
     names = [*config.collect.scenes, *(Path(path).name for path in config.collect.recordings)]
     scenes = {" and ".join(names): batch}
-    steps = 10 * config.trade_encoder.windows
+    steps = 10 * config.own.windows
     with progress("Record other scenes", steps * len(OTHER_SCENES), "steps") as advance:
         for scene in OTHER_SCENES:
             world = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")

@@ -32,7 +32,7 @@ def trained(config: Config, folder: Run, changes: Mapping[str, Any], seed: int) 
     before is read from the run folder.
     """
     settings = trial_settings(config, changes)
-    iterations = config.trade_encoder.iterations
+    iterations = config.own.iterations
     name = f"{settings.variant}-{settings.coding}-{settings.context}-s{seed}-{iterations}"
     file = folder.path / "trade" / "encoders" / f"{name}.safetensors"
     return kept(config, folder, file, settings, seed, iterations)

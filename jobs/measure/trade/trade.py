@@ -12,17 +12,20 @@ import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Annotated, NamedTuple, cast
 
 import numpy as np
 import pydantic
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-from envs.config import EnvConfig, settings_hash
+from envs.config import STRICT, EnvConfig, settings_hash
 from envs.corridor import CorridorEnv
 from envs.event_error import converged
 from jobs.analysis.statistics import Estimate, crossed_mean, half_width, rate_estimate
 from jobs.analysis.tables import publish_plot, publish_table, write_csv
 from jobs.config.config import Config, ConfigError
+from jobs.config.schema import Count, Name
 from jobs.measure.encoder.costs import CAPS, TIME_BINS
 from jobs.measure.encoder.trade import EVENT_ENCODERS
 from jobs.measure.replays import Measured, measure_settings
@@ -80,6 +83,25 @@ TOGETHER: dict[str, tuple[Setting, Setting]] = {
 }
 
 
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Which policies are evaluated under every setting of simulator and encoder, and in how many corridors.
+
+    Attributes:
+        policies: Groups and names in models/pretrained, "newest", or paths.
+        scenes: Where.
+        trials: Corridors of each training under each setting.
+        pyrender_trials: Corridors under the settings that pyrender draws.
+        replays: Episodes of each training on which costs and errors are measured.
+    """
+
+    policies: Annotated[list[Name], Field(min_length=1)]
+    scenes: Annotated[list[Name], Field(min_length=1)]
+    trials: Count
+    pyrender_trials: Count
+    replays: Count
+
+
 def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     """Evaluate and measure every setting, and say what to choose; return the first default's metrics.
 
@@ -94,15 +116,13 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     policies = find_encoder_policies(config)
     folder = open_run(config)
     config = folder.config
-    plans = [
-        plan(config, policy, scene) for scene in dict.fromkeys(config.trade.scenes) for policy in policies
-    ]
+    plans = [plan(config, policy, scene) for scene in dict.fromkeys(config.own.scenes) for policy in policies]
     every = [task for own in plans for task in own.tasks]
     place = folder.path / "trade"
     store, executor = EpisodeStore(place), executor or default_executor(config.cluster, place)
     identity = settings_hash({"cells": [[task.key, len(task.seeds)] for task in every]})
     with open_tracker(config, folder, key=f"trade {identity[:8]}") as tracker:
-        tracker.tags({"kind": "trade", "policy": ", ".join(config.trade.policies)})
+        tracker.tags({"kind": "trade", "policy": ", ".join(config.own.policies)})
         slowest_first = sorted(every, key=lambda task: task.condition[0] not in (EXACT, "pyrender"))
         results, failed = evaluate_tasks(slowest_first, store, executor, "Trade", measure_accuracy=False)
         reasons = {
@@ -148,7 +168,7 @@ def find_encoder_policies(config: Config) -> list[EvaluatedPolicy]:
         ConfigError: If `trade.policies` names none, or one without a frozen encoder of single events.
     """
     found: dict[str, EvaluatedPolicy] = {}
-    for name in config.trade.policies:
+    for name in config.own.policies:
         for policy in find_policies("trade.policies", name, config, locate_run(config)):
             file = Path(policy.agent) / ENCODER
             evae = load_encoder(file)[0] if file.is_file() else None
@@ -213,7 +233,7 @@ def exact_env(env: EnvConfig) -> EnvConfig:
 def _task(
     config: Config, policy: EvaluatedPolicy, condition: tuple[str, str], env: EnvConfig, table: Setting
 ) -> EvaluationTask:
-    trade = config.trade
+    trade = config.own
     trials = min(trade.trials, trade.pyrender_trials) if env.renderer == "pyrender" else trade.trials
     return make_task(condition, policy, config.evaluate.action, env, trials, tuple(table.items()))
 
@@ -223,12 +243,12 @@ def measure_plans(
 ) -> list[list[TradedSetting]]:
     """The rows of each scene: what was evaluated, and cost and errors on recorded episodes."""
     able = [own._replace(tasks=[task for task in own.tasks if task.key in results]) for own in plans]
-    seeds = range(config.trade.replays)
+    seeds = range(config.own.replays)
     total = len(seeds) * sum(len(own.tasks) for own in able)
     with torch_threads(1), progress("Replay", total, "episodes") as advance:
         measured = [_measured(own, seeds, advance) for own in able]
     found = []
-    for scene in dict.fromkeys(config.trade.scenes):
+    for scene in dict.fromkeys(config.own.scenes):
         here = [(own, costs) for own, costs in zip(able, measured, strict=True) if own.scene == scene]
         conditions = dict.fromkeys(task.condition for own, _ in here for task in own.tasks)
         order = sorted(conditions, key=lambda condition: condition[0] == EXACT)  # that of a plan is the last
@@ -306,7 +326,7 @@ def facts_of(
     config: Config, folder: Run, policies: Sequence[EvaluatedPolicy], failed: Mapping[str, str]
 ) -> TradeFacts:
     """What made the numbers."""
-    trade = config.trade
+    trade = config.own
     return {
         "run": folder.path.name,
         "command": command(),

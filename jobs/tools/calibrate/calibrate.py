@@ -9,15 +9,19 @@ ones.
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from matplotlib.figure import Figure
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-from envs.config import LUMINANCE_FLOOR, CameraConfig, FaultsConfig, with_floor
+from envs.config import LUMINANCE_FLOOR, STRICT, CameraConfig, FaultsConfig, with_floor
 from envs.recordings.event_file import EventFile
 from jobs.analysis.plots import AMBER, BLUE, GREEN, INK, tidy
 from jobs.analysis.tables import save_plot, show_table
 from jobs.config.config import Config, ConfigError
+from jobs.config.schema import Name
 from jobs.run.files import write_atomic
 from jobs.run.folder import open_run
 from jobs.run.progress import console
@@ -42,13 +46,33 @@ SIMULATED = (
 )
 
 
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Which recording a camera is calibrated against.
+
+    Attributes:
+        recording: An event file, of any format that `envs.recordings.read_events` knows.
+        frames: Text file with a line "seconds picture" for each frame of the same sensor, on the clock of the
+            events; None: the scene was still and uniform.
+        frame_delay_us: From the time of a frame to the middle of its exposure [us].
+        luminance: Of a still scene, white = 1.
+        camera: Name of the file in conf/camera that is written; None: only that in the run folder.
+    """
+
+    recording: Name
+    frames: Name | None
+    frame_delay_us: Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
+    luminance: Annotated[float, Field(gt=0, le=1)]
+    camera: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] | None
+
+
 def run(config: Config) -> Calibration:
     """Calibrate against `calibrate.recording`; return what was found.
 
     Raises:
         ConfigError: The recording or its frames are refused, or have too few events.
     """
-    chosen, camera = config.calibrate, config.env.camera
+    chosen, camera = config.own, config.env.camera
     try:
         frames = read_frames(chosen.frames, chosen.frame_delay_us) if chosen.frames else None
         file = read_recording(chosen.recording, frames)

@@ -1,30 +1,35 @@
 """Search for settings that a training learns best with (Optuna's TPE; ASHA: Li et al. 2020).
 
-Run: python -m platform.launch +exp=tune model=event_columns
+Run: python -m platform.launch +exp=search model=event_columns
 Expect: trials as trainings on one core each, side by side on all; in the run folder under `tune-HASH/` every
 measurement, a figure of all curves and a table; in MLflow a child run for each trial. All are measured in
 the same validation corridors, in which nothing is trained or evaluated. The same command continues a stopped
 search.
 """
 
+import dataclasses
 import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import optuna
 from matplotlib.figure import Figure
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from ray import tune
 from ray.tune.schedulers import ASHAScheduler
 from ray.tune.search.optuna import OptunaSearch
 
 from envs.checks import naming
-from envs.config import settings_hash
+from envs.config import STRICT, settings_hash
 from jobs.analysis.plots import BLUE, GREYS, INK, tidy
 from jobs.analysis.tables import publish_plot, publish_table
-from jobs.config.config import Config, ConfigError, as_dict
+from jobs.config.conditions import Searched
+from jobs.config.config import Config, ConfigError
+from jobs.config.schema import Count
 from jobs.run.files import json_lines, read_json_lines, whole_lines
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import console, progress
@@ -52,6 +57,23 @@ HEADINGS = ("trial", "settings", "steps", "distance [m]", "success [%]")
 Row = dict[str, Any]  # one measurement: trial, env_steps, settings, distance_m, success_rate, metrics
 
 
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Which settings are searched, and how much each trial of some may cost.
+
+    Attributes:
+        space: Key -> a list of values, or a range as in `jobs.config.conditions`.
+        trials: Trainings that are begun; most are stopped early.
+        report_steps: Environment steps between two measurements; the first is the earliest end of a trial.
+        episodes: Validation corridors of a measurement.
+    """
+
+    space: Annotated[dict[str, Searched], Field(min_length=1)]
+    trials: Count
+    report_steps: Count
+    episodes: Count
+
+
 def run(config: Config) -> dict[str, float]:
     """Search, from where it stopped if it did; return the best trial's measurement.
 
@@ -65,7 +87,7 @@ def run(config: Config) -> dict[str, float]:
     check_inputs(config)
     folder = open_run(config)
     config = folder.config
-    name = f"tune-{settings_hash(as_dict(config)['tune'])[:8]}"  # type: ignore[arg-type]
+    name = f"tune-{settings_hash(dataclasses.asdict(config.own))[:8]}"  # as when the job was called tune
     with open_tracker(config, folder, key=name) as tracker:
         tracker.tags({"kind": "tune"})
         files = _inputs(config, folder, tracker)
@@ -79,7 +101,7 @@ def run(config: Config) -> dict[str, float]:
 def _inputs(config: Config, folder: Run, tracker: Tracker) -> Files:
     """The encoder that trials share, unless each has its own; the policy that they begin from."""
     facts = encoder_facts(config)
-    points = [{key: value} for key, values in config.tune.space.items() for value in extremes(values)]
+    points = [{key: value} for key, values in config.own.space.items() for value in extremes(values)]
     if facts is not None and any(encoder_facts(with_settings(config, point)) != facts for point in points):
         console.print("The space changes the encoder: each trial collects and pretrains its own.")
         return {}
@@ -97,7 +119,7 @@ def search(config: Config, place: Path, files: Files, tracker: Tracker) -> list[
     if file.is_file():
         os.truncate(file, len(whole_lines(file)))  # a kill can leave half a line
     rows: list[Row] = read_json_lines(file) if file.is_file() else []
-    known, total = {(row["trial"], row["env_steps"]) for row in rows}, config.tune.trials
+    known, total = {(row["trial"], row["env_steps"]) for row in rows}, config.own.trials
     with progress("Tune", total, "trials", done=len({row["trial"] for row in rows})) as advance:
 
         def listen(result: Mapping[str, Any]) -> None:
@@ -131,17 +153,17 @@ def _tuner(config: Config, place: Path, files: Files) -> tune.Tuner:
         return tune.Tuner.restore(path, trial, resume_unfinished=True, resume_errored=True)
     scheduler = ASHAScheduler(
         time_attr="env_steps",
-        grace_period=min(config.tune.report_steps, most),
+        grace_period=min(config.own.report_steps, most),
         max_t=most,
         reduction_factor=REDUCTION,
     )
     return tune.Tuner(
         trial,
-        param_space=search_space(config.tune.space),
+        param_space=search_space(config.own.space),
         tune_config=tune.TuneConfig(
             metric=METRIC,
             mode="max",
-            num_samples=config.tune.trials,
+            num_samples=config.own.trials,
             search_alg=OptunaSearch(seed=config.seed),
             scheduler=scheduler,
         ),
@@ -202,7 +224,7 @@ def report(folder: Run, name: str, rows: Sequence[Row], tracker: Tracker) -> Row
     """Print, plot and record the trials; return the best."""
     order = ranked(rows)
     lines = [_cells(row) for row in order]
-    episodes = folder.config.tune.episodes
+    episodes = folder.config.own.episodes
     caption = (
         f"Means over the same {episodes} validation corridors; the best of many measured so looks too good"
     )

@@ -9,14 +9,14 @@ from typing import Any
 from ray import tune
 
 from jobs.config.config import Config, ConfigError, as_dict, parse
-from jobs.config.env_keys import OPEN_KEYS, flat_env
-from jobs.run.folder import NOT_IN_RUN_NAME
+from jobs.config.env_keys import OPEN_KEYS, fields_of, flat_env
+from jobs.run.identity import TRAINED_BY
 from jobs.training.pretrain import evae_settings
 from models.kinds import KINDS
 
 # What a search is called, and what all its trials must have in common to be compared; what is no part of a
 # training is no part of a trial either.
-FIXED = (*NOT_IN_RUN_NAME, "exp", "budget")
+FIXED = {*fields_of(Config), "search", "exp", "budget"} - ({*TRAINED_BY} - {"exp", "budget"})
 FIXED_KEYS = ("train.env_steps", "algo.num_env_runners", "algo.lr_schedule")
 
 
@@ -60,15 +60,15 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
 
 def space_errors(config: Config) -> Iterator[str]:
     """One line for each key that cannot be searched, and for each of its values that would be refused."""
-    for key, values in config.tune.space.items():
+    for key, values in config.own.space.items():
         if key.partition(".")[0] in FIXED or key in FIXED_KEYS:
-            yield f"tune.space: {key} must be the same for all trials"
+            yield f"search.space: {key} must be the same for all trials"
             continue
         for value in extremes(values):
             try:
                 with_settings(config, {key: value})
             except ConfigError as error:
-                yield f"tune.space: {error}"
+                yield f"search.space: {error}"
 
 
 def extremes(values: Any) -> list[Any]:

@@ -67,7 +67,7 @@ class SearchTrial(Trainable):
     def step(self) -> dict[str, Any]:
         """Train up to the next measurement, and measure; a training that has diverged ends at 0 m."""
         asked = self._experiment
-        until = min(self._steps + asked.tune.report_steps, asked.train.env_steps)
+        until = min(self._steps + asked.own.report_steps, asked.train.env_steps)
         metrics: dict[str, float] = {}
         try:
             while self._steps < until:
@@ -94,7 +94,7 @@ class SearchTrial(Trainable):
             self.save_checkpoint(str(checkpoint))
             export_policy(asked, checkpoint, self._encoder, policy, {})
             agent = make_agent(str(policy), asked.evaluate.action)
-            episodes = roll_out(agent, env, range(asked.tune.episodes), SIDE_BY_SIDE)
+            episodes = roll_out(agent, env, range(asked.own.episodes), SIDE_BY_SIDE)
         means = ("distance_m", episodes["distance_m"]), ("success_rate", episodes["success"])
         return {name: float(values.mean()) for name, values in means}
 

@@ -6,10 +6,12 @@ import pytest
 import yaml
 
 from envs.config import EnvConfig
+from jobs.config.command_line import hydra_words
 from jobs.config.conditions import axis_points
 from jobs.config.config import ConfigError, as_dict, known_keys, parse
 from jobs.config.env_keys import env_with, flat_env
 from jobs.config.errors import SET_BY_JOBS
+from jobs.config.registry import JOBS as JOBS_THERE
 from jobs.run.folder import run_name
 from models.kinds import KINDS, model_keys
 from tests.support.configs import CONF, compose
@@ -52,7 +54,10 @@ def options(group: str) -> list[str]:
 
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 CHOICES = [
-    f"{group}={option}" for group in GROUPS if group not in ("exp", "length") for option in options(group)
+    f"{group}={option}"
+    for group in GROUPS
+    if group not in ("exp", "length", "job")
+    for option in options(group)
 ]
 
 
@@ -78,6 +83,58 @@ OF_EACH_LENGTH = {"budget": "bytestream"} | {
 def test_every_experiment_is_accepted_and_names_its_job(exp):
     config = parse(compose(f"+exp={exp}"))
     assert config.job == JOBS.get(exp, "pipeline" if exp in POLICIES else exp)
+
+
+def test_every_job_has_a_module_whose_settings_are_those_of_its_file():
+    for name, job in JOBS_THERE.items():
+        keys, settings = job.own_keys(), job.settings()
+        fields = [] if settings is None else [field.name for field in dataclasses.fields(settings)]
+        assert (name, sorted(keys)) == (name, sorted(fields))
+        assert callable(importlib.import_module(job.module).run)
+        text = job.file.read_text()
+        assert not keys or f"Fields: {job.module}.Settings." in text.splitlines()[1]
+        said = text.rpartition(f"\n{name}:\n")[2].splitlines() if keys else []
+        assert [line for line in said if "#" not in line and not line.endswith(" space:")] == []
+        assert job.summary
+
+
+@pytest.mark.parametrize("budget", ["smoke", "short"])
+@pytest.mark.parametrize("name", [name for name, job in JOBS_THERE.items() if job.own_keys()])
+def test_a_configuration_is_the_core_and_the_section_of_its_job(name, budget):
+    values = compose("+exp=event_columns", f"job={name}", f"budget={budget}")
+    others = [other for other, job in JOBS_THERE.items() if job.own_keys() and other != name]
+    assert [key for key in others if key in values] == []
+    config = parse(values)
+    assert dataclasses.asdict(config.own) == values[name]
+    assert parse(as_dict(config)) == config
+    assert (config.job, config.exp) == (name, "event_columns")
+
+
+def test_a_setting_of_another_job_is_refused_by_the_name_of_that_job():
+    with pytest.raises(ConfigError, match=r"^trade: no such key, got .*; a setting of the job trade$"):
+        parse({**compose("+exp=demo"), "trade": {"trials": 3}})
+    with pytest.raises(ConfigError, match=r"^job: demo needs its settings, .*`- override /job: demo`"):
+        parse({**compose("+exp=train"), "job": "demo"})
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["demo", "seed=1"], ["job=demo", "seed=1"]),
+        (["train"], ["+exp=train"]),
+        (["+exp=trade", "trade.trials=3"], ["job=trade", "trade.trials=3"]),
+        (["+exp=tune", "~tune.space", "+tune.space={}"], ["job=search", "~search.space", "+search.space={}"]),
+        (["ship"], ["job=publish"]),
+        (["+exp=event_columns", "job=tune"], ["+exp=event_columns", "job=search"]),
+        (["video_events", "video.path=a.mp4"], ["job=video_events", "video_events.path=a.mp4"]),
+        (["seed"], ["seed"]),
+        (["--help"], ["--help"]),
+        (["+exp=mine", "-cd", "here"], ["+exp=mine", "-cd", "here"]),
+        ([], []),
+    ],
+)  # fmt: skip
+def test_a_job_is_called_by_its_name_and_by_the_names_that_it_had(words, meant):
+    assert hydra_words(words) == meant
 
 
 @pytest.mark.parametrize("budget", ["smoke", "paper"])
@@ -117,7 +174,7 @@ def test_no_key_is_given_without_being_checked_nor_checked_without_being_given(v
 def test_every_value_says_its_unit_or_source_in_a_comment(file):
     lines = file.read_text().splitlines()
     assert lines[0].startswith("#")
-    if file.parent != CONF and file.parent.name not in ("budget", "length"):
+    if file.parent != CONF and file.parent.name not in ("budget", "length", "job"):
         assert [line for line in lines[1:] if ": " in line and "#" not in line and "name:" not in line] == []
 
 
@@ -173,6 +230,7 @@ OF_EXPERIMENTS = (
     "_claims",
     "_compared",
     "_hold",
+    *(f"_{job}" for job in JOBS_THERE),
 )  # lengths that name an experiment instead of an algorithm
 
 

@@ -69,9 +69,9 @@ def test_the_job_leaves_tables_and_figures_and_a_second_run_replaces_them(tmp_pa
     monkeypatch.setattr(trade_simulator, "KNOBS", knobs)
     config = small_config(tmp_path, job="trade_simulator", exp="trade_simulator")
     trade = dataclasses.replace(
-        config.trade_simulator, scenes=["poles"], control_hz=[200.0], flights=1, steps=3, rounds=1
+        config.own, scenes=["poles"], control_hz=[200.0], flights=1, steps=3, rounds=1
     )
-    config = dataclasses.replace(config, trade_simulator=trade)
+    config = dataclasses.replace(config, own=trade)
     metrics = trade_simulator.run(config)
     assert trade_simulator.run(config).keys() == metrics.keys()
     folder = locate_run(config).path / "trade"

@@ -13,14 +13,13 @@ from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
 from jobs.run.files import RunError, read_json, write_json
 from jobs.run.folder import (
-    ADDED_SETTINGS,
-    NOT_IN_RUN_NAME,
     finish,
     finished,
     latest_policies,
     open_run,
     run_name,
 )
+from jobs.run.identity import ADDED_SETTINGS, TRAINED_BY, identity
 from jobs.run.locks import held_alone
 from jobs.run.provenance import REPOSITORY, git_commit
 from models.kinds import KINDS, RENAMED
@@ -131,6 +130,7 @@ def test_one_process_works_in_a_run_folder_and_lets_go_when_it_is_killed(config)
     code = f"""
 import sys
 from pathlib import Path
+from jobs.run.identity import ADDED_SETTINGS, TRAINED_BY, identity
 from jobs.run.locks import held_alone
 with held_alone(Path({str(run.path)!r})):
     print("in", flush=True)
@@ -158,12 +158,13 @@ def test_a_run_folder_outlives_settings_that_came_later_under_its_old_name(confi
     run = open_run(config)
     stored = read_json(run.path / "config.json")
     for section, added in ADDED_SETTINGS.items():
-        for name in added:
+        for name in added.keys() & stored[section].keys():
             del stored[section][name]
     write_json(run.path / "config.json", stored)
     assert open_run(dataclasses.replace(config, resume=str(run.path))).config.train == config.train
-    settings = {name: value for name, value in stored.items() if name not in NOT_IN_RUN_NAME}
-    assert run.path.name.endswith(settings_hash(settings)[:8])
+    first = {name: stored[name] for name in TRAINED_BY}
+    jobs = {name: value for name, value in identity(config).items() if name in ("replay", "video")}
+    assert run.path.name.endswith(settings_hash(first | jobs)[:8])
     noisy = dataclasses.replace(config.train, conditions=[{"faults.sparsity": 0.5}])
     assert run_name(dataclasses.replace(config, train=noisy)) != run.path.name
 
@@ -205,8 +206,8 @@ def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_k
 def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):
     run = open_run(config)
     stored = read_json(run.path / "config.json")
-    del stored["probe"]
     stored["sweep"] = {"axes": "of another version"}
+    stored["a_job_of_another_version"] = {"trials": 3}
     write_json(run.path / "config.json", stored)
     again = open_run(dataclasses.replace(config, resume=str(run.path), seed=7))
     assert again.config == dataclasses.replace(config, resume=str(run.path))

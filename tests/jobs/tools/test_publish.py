@@ -105,13 +105,13 @@ def test_curves_are_read_back_as_written_if_their_policies_are_still_there(tmp_p
 
 def test_nothing_to_publish_is_said_with_where_it_was_sought(tmp_path):
     with pytest.raises(ConfigError, match="runs_dir: no finished training with budget=paper in"):
-        publishing.run(small_config(tmp_path, job="ship", exp="ship", budget="paper"))
+        publishing.run(small_config(tmp_path, job="publish", exp="ship", budget="paper"))
 
 
 def test_trainings_that_learn_nothing_are_not_published(tmp_path):
     finish_training(tmp_path, "run")
     with pytest.raises(ConfigError, match="budget: smoke learns nothing"):
-        publishing.run(small_config(tmp_path, job="ship", exp="ship"))
+        publishing.run(small_config(tmp_path, job="publish", exp="ship"))
 
 
 @pytest.mark.system  # it fills a store, which takes seconds
@@ -122,7 +122,7 @@ def test_the_job_writes_policies_curves_and_their_plot(tmp_path, monkeypatch):
     for seed in (0, 1):
         finish_training(tmp_path, f"run{seed}", seed=seed, budget="paper")
     finish_training(tmp_path, "rival", exp="event_set", budget="paper")
-    assert publishing.run(small_config(tmp_path, job="ship", exp="ship", budget="paper")) == {
+    assert publishing.run(small_config(tmp_path, job="publish", exp="ship", budget="paper")) == {
         "bytestream": 2,
         "event_set": 1,
     }

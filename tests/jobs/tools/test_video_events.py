@@ -21,7 +21,14 @@ def folder(tmp_path):
 
 
 def test_the_file_has_the_events_and_labels_that_the_camera_of_the_command_line_gives(tmp_path, folder):
-    words = ("camera=dvs128", *SMALL, "light=night", "seed=5", "video.fps=50", f"video.path={folder}")
+    words = (
+        "camera=dvs128",
+        *SMALL,
+        "light=night",
+        "seed=5",
+        "video_events.fps=50",
+        f"video_events.path={folder}",
+    )
     config, path = converted(tmp_path, *words)
     assert path.name == "events.npz"
     assert config.env.faults.shot_noise_hz > 0
@@ -37,7 +44,11 @@ def test_the_file_has_the_events_and_labels_that_the_camera_of_the_command_line_
 
 
 def test_a_format_without_labels_is_written_and_the_job_says_so(tmp_path, folder, capsys):
-    words = ("video.fps=50", f"video.path={folder}", f"video.output={tmp_path / 'made' / 'ride.aedat4'}")
+    words = (
+        "video_events.fps=50",
+        f"video_events.path={folder}",
+        f"video_events.output={tmp_path / 'made' / 'ride.aedat4'}",
+    )
     config, path = converted(tmp_path, *words)
     assert "npz" in capsys.readouterr().out
     written = read_events(path)
@@ -49,11 +60,15 @@ def test_a_grey_step_in_black_fires_no_event_unless_the_floor_of_the_video_is_lo
     """Frames of 8 bits that are linear in light, where grey 1 may be noise."""
     black = np.zeros((2, 12, 16, 3), np.uint8)
     black[1] = 1
-    words = (f"video.path={save(tmp_path / 'black', black, '.png')}", "video.fps=50", "video.transfer=linear")
-    _, usual = converted(
-        tmp_path, *words, "camera.luminance_floor=1e-4", f"video.output={tmp_path / 'a.npz'}"
+    words = (
+        f"video_events.path={save(tmp_path / 'black', black, '.png')}",
+        "video_events.fps=50",
+        "video_events.transfer=linear",
     )
-    low = ("video.luminance_floor=1e-3", f"video.output={tmp_path / 'b.npz'}")
+    _, usual = converted(
+        tmp_path, *words, "camera.luminance_floor=1e-4", f"video_events.output={tmp_path / 'a.npz'}"
+    )
+    low = ("video_events.luminance_floor=1e-3", f"video_events.output={tmp_path / 'b.npz'}")
     assert read_events(usual).events.size == 0
     assert read_events(converted(tmp_path, *words, *low)[1]).events.size == 7 * 12 * 16
 
@@ -61,14 +76,14 @@ def test_a_grey_step_in_black_fires_no_event_unless_the_floor_of_the_video_is_lo
 @pytest.mark.parametrize(
     ("words", "key"),
     [
-        (("video.output=ride.mp4",), "video.output"),
-        (("video.path=nowhere.mp4",), "video.path"),
-        ((), "video.path"),  # the folder has no times, and no fps is given
+        (("video_events.output=ride.mp4",), "video_events.output"),
+        (("video_events.path=nowhere.mp4",), "video_events.path"),
+        ((), "video_events.path"),  # the folder has no times, and no fps is given
     ],
 )
 def test_what_cannot_be_read_or_written_is_refused_with_its_key_and_leaves_no_file(
     tmp_path, folder, words, key
 ):
     with pytest.raises(ConfigError, match=f"^{key}: "):
-        converted(tmp_path, f"video.path={folder}", *words)
+        converted(tmp_path, f"video_events.path={folder}", *words)
     assert not list(tmp_path.rglob("*.npz"))

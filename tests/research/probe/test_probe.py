@@ -33,7 +33,7 @@ def small_probe(tmp_path, **changes):
         model=dataclasses.replace(config.model, context=32),
         collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
         pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
-        probe=dataclasses.replace(config.probe, **{**settings, **changes}),
+        own=dataclasses.replace(config.own, **{**settings, **changes}),
     )
 
 
@@ -75,7 +75,7 @@ def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, 
     monkeypatch.setattr("jobs.measure.encoder.trials.train_short", refuse)
     assert probe.run(config) == metrics
     with pytest.raises(AssertionError, match="trained again"):
-        probe.run(dataclasses.replace(config, probe=dataclasses.replace(config.probe, iterations=2)))
+        probe.run(dataclasses.replace(config, own=dataclasses.replace(config.own, iterations=2)))
 
 
 def test_a_policy_without_an_event_vae_is_refused_before_anything_is_written(tmp_path):

@@ -199,7 +199,7 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
         model=dataclasses.replace(config.model, context=32),
         collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
         pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
-        trade_encoder=dataclasses.replace(config.trade_encoder, iterations=1, seeds=2, windows=4),
+        own=dataclasses.replace(config.own, iterations=1, seeds=2, windows=4),
     )
     metrics = trade_encoder.run(config)
     folder = locate_run(config).path / "trade"

@@ -19,8 +19,8 @@ from tests.support.runs import trial_storage, write_encoder
 SMALL = (
     *("budget=smoke", "env.time_limit_s=0.1", "algo.num_envs_per_env_runner=2"),
     *("algo.train_batch_size_per_learner=64", "algo.minibatch_size=32", "train.env_steps=256"),
-    *("tune.report_steps=64", "tune.trials=3", "~tune.space"),
-    "+tune.space={algo.lr: {low: 1.0e-4, high: 1.0e-2, log: true}, model.hidden: [[8], [16, 16]]}",
+    *("search.report_steps=64", "search.trials=3", "~search.space"),
+    "+search.space={algo.lr: {low: 1.0e-4, high: 1.0e-2, log: true}, model.hidden: [[8], [16, 16]]}",
 )
 
 

@@ -11,7 +11,7 @@ WORDS = "budget=smoke", "model=event_columns"
 
 
 def searching(space: str, *words: str):
-    return tune_config(*WORDS, "~tune.space", f"+tune.space={space}", *words)
+    return tune_config(*WORDS, "~search.space", f"+search.space={space}", *words)
 
 
 def test_what_is_drawn_lies_in_the_space_and_comes_back_as_it_was_written():
@@ -48,12 +48,12 @@ def test_a_trial_differs_from_its_experiment_in_its_settings_alone():
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        ("{algo.lrr: [0.1]}", "tune.space: algo.lrr: no such key, got 0.1; did you mean algo.lr?"),
-        ("{algo.lr: [0.1, -1.0]}", "tune.space: algo.lr: Input should be greater than 0"),
-        ("{algo.gamma: {low: 0.5, high: 1.5}}", "tune.space: algo.gamma: "),
-        ("{train.env_steps: [10]}", "tune.space: train.env_steps must be the same for all trials"),
-        ("{evaluate.action: [stochastic]}", "tune.space: evaluate.action must be the same for all trials"),
-        ("{nothing.lr: [0.1]}", "tune.space: nothing.lr: no such key"),
+        ("{algo.lrr: [0.1]}", "search.space: algo.lrr: no such key, got 0.1; did you mean algo.lr?"),
+        ("{algo.lr: [0.1, -1.0]}", "search.space: algo.lr: Input should be greater than 0"),
+        ("{algo.gamma: {low: 0.5, high: 1.5}}", "search.space: algo.gamma: "),
+        ("{train.env_steps: [10]}", "search.space: train.env_steps must be the same for all trials"),
+        ("{evaluate.action: [stochastic]}", "search.space: evaluate.action must be the same for all trials"),
+        ("{nothing.lr: [0.1]}", "search.space: nothing.lr: no such key"),
     ],
 )
 def test_what_cannot_be_searched_is_told_before_anything_starts(space, message):

@@ -1,0 +1,90 @@
+"""Which settings name a run folder. A folder of any older version keeps its name."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
+from jobs.config.config import Config, as_dict
+from jobs.config.env_keys import ENV_FIELDS
+from jobs.config.plugins import plugin_digests
+from jobs.config.schema import AlgoConfig, CollectConfig, PretrainConfig, TrainConfig
+from models.kinds import ADDED_MODEL_SETTINGS
+
+# The settings that can change what is trained: not the job, nor where a run is computed and recorded.
+TRAINED_BY = (
+    *("exp", "budget", "seed", "env", "camera", "faults", "renderer", "fidelity"),
+    *("model", "algo", "collect", "pretrain", "train"),
+)
+# The hash has always covered these fields, also at their defaults. Every other field counts only where it
+# differs from its default, so a field that is added to a class renames no folder and needs no row here.
+FIRST = {
+    "env": "scene layout control_hz speed_mps action_delay_ms vehicle_radius_m camera_height_m time_limit_s "
+    "window_capacity",
+    "camera": "width height fov_deg contrast_threshold contrast_threshold_off memory luminance_floor "
+    "max_events_per_pixel response threshold_mismatch threshold_seed refractory_us excess encoding",
+    "faults": "sparsity background_activity background_activity_hz event_dropout shot_noise_hz leak_hz "
+    "hot_pixel_share hot_pixel_hz",
+    "fidelity": "tolerance max_step_m samples cull_m",
+}
+CLASSES: dict[str, type[Any]] = {
+    "env": EnvConfig,
+    "camera": CameraConfig,
+    "faults": FaultsConfig,
+    "fidelity": FidelityConfig,
+    "algo": AlgoConfig,
+    "collect": CollectConfig,
+    "pretrain": PretrainConfig,
+    "train": TrainConfig,
+}
+# Settings of two jobs, which older versions hashed for every run: section -> name in the hash, values.
+ALWAYS: dict[str, tuple[str, Mapping[str, object]]] = {
+    "replay": ("replay", {"recording": "events.raw", "policy": "bytestream_hold-s0"}),
+    "video_events": (
+        "video",
+        {"path": "video.mp4", "output": None, "fps": None, "transfer": None, "interpolate": "linear"}
+        | {"luminance_floor": None},
+    ),
+}
+
+
+def _later(section: str, cls: type[Any]) -> Iterator[tuple[str, object]]:
+    """Yield name and default of each field of a section that `FIRST` does not name."""
+    first = FIRST.get(section, "").split()
+    for field in dataclasses.fields(cls):
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        elsewhere = section == "env" and field.name not in ENV_FIELDS
+        if field.name not in first and not elsewhere and default is not dataclasses.MISSING:
+            yield field.name, default
+
+
+# Section -> the fields that older run folders lack, each with the value that does what was done before.
+ADDED_SETTINGS = {name: dict(_later(name, cls)) for name, cls in CLASSES.items()}
+ADDED_SETTINGS["model"] = ADDED_MODEL_SETTINGS
+
+
+def identity(config: Config) -> dict[str, Any]:
+    """Return the settings whose hash names the run folder.
+
+    Of plug-ins the content counts: another version of a plug-in is another experiment. The settings of a job
+    alone never count, but for those of `ALWAYS`.
+    """
+    values = as_dict(config)
+    settings: dict[str, Any] = {name: values[name] for name in TRAINED_BY}
+    for section, added in ADDED_SETTINGS.items():
+        own = settings[section].items()
+        settings[section] = {name: value for name, value in own if added.get(name, ...) != value}
+    for job, (name, usual) in ALWAYS.items():
+        settings[name] = _of_older_versions(usual, values.get(job))
+    if config.plugins:
+        settings["plugins"] = plugin_digests()
+    return settings
+
+
+def _of_older_versions(usual: Mapping[str, object], given: object) -> dict[str, object]:
+    """Return the values that the older fields have; newer fields count where they are not null."""
+    if not isinstance(given, Mapping):
+        return dict(usual)
+    return {**usual, **{name: value for name, value in given.items() if name in usual or value is not None}}
