@@ -32,7 +32,7 @@ OPEN_GROUPS = (
     "sweep.axes",
     "search.space",
 )  # take entries that conf/ does not have
-JOBS_HERE = "    <jobs>"  # in conf/hydra/help
+JOBS_HERE = "  <jobs>"  # in conf/hydra/help
 DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
 
 
@@ -110,7 +110,7 @@ def with_jobs(answer: str) -> str:
     """Return Hydra's help with the list of jobs in its place; other answers as they are."""
     if JOBS_HERE not in answer:
         return answer
-    return answer.replace(JOBS_HERE, "\n".join(f"    {name:<16} {job.summary}" for name, job in JOBS.items()))
+    return answer.replace(JOBS_HERE, "\n".join(f"  {name:<16} {job.summary}" for name, job in JOBS.items()))
 
 
 def word_errors(words: list[str]) -> list[str]:

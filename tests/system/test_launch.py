@@ -57,7 +57,7 @@ def test_help_names_every_job_experiment_and_budget(launch, launcher):
         for file in (ROOT / "conf" / group).glob("*.yaml"):
             assert f"\n  {file.stem} " in out
     for name, job in launcher.JOBS.items():
-        assert f"\n    {name:<16} {job.summary}\n" in out
+        assert f"\n  {name:<16} {job.summary}\n" in out
     assert out.count("\n  evade +exp=") == 7
     assert "$" not in out
 
