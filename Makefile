@@ -36,7 +36,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-all system-libraries demo bytestream train-all sweep-robustness mlflow test test-costs test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench bench-clone docs dist lock clean
+.PHONY: help setup setup-all system-libraries demo bytestream train-all sweep-robustness mlflow test test-costs test-system test-slow test-faults test-cluster test-soak test-pythons test-image lint check bench bench-clone lines numerics docs dist lock clean
 
 help: ## list these commands
 	@echo "make TARGET [ARGS=\"key=value ...\"]"
@@ -139,6 +139,12 @@ lint: $(DEVELOPING) ## check style, format, types, and who imports whom
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+lines: ## count the lines of code of each room
+	@$(BIN)/python .ci/lines.py
+
+numerics: setup $(DEVELOPING) ## measure the numbers at the ends of their ranges, and write docs/numerics.md
+	$(BIN)/python -m tests.numerics.page
 
 check: ## what must pass before a change is merged
 	$(MAKE) $(DEVELOPING)

@@ -12,7 +12,7 @@ uniform, which is the worst case for caches. It prints as JSON
   plain torch takes for the context alone (Conv1d 3-64-128-features, batch norm, ReLU, maximum), and
   nanoseconds per event as a multiple of only loading the same words of the same rows;
 - `batch_us_per_window`: 32 windows of 20 to 280 events and 256 features, in one call and one by one;
-- `neighbour_filter_ns_per_event`: of `envs.events.neighbour_filter`, at 64 x 64 pixels.
+- `neighbour_filter_ns_per_event`: of `core.neighbour_filter`, at 64 x 64 pixels.
 """
 
 import itertools
@@ -27,10 +27,10 @@ import torch
 from torch import nn
 
 from benchmarks.timing import interleaved
+from core.neighbour_filter import filter_neighbours, quiet_sensor
 from envs.events import EVENT
-from envs.events.neighbour_filter import filter_neighbours, quiet_sensor
 from envs.events.windows import pack_window
-from jobs.measure.encoder.costs import encode_by_network
+from jobs.measure.encodings import encode_by_network
 from jobs.training.pretrain import Window
 from models.encoder.embedding import CODINGS
 from models.encoder.evae import EventVAE

@@ -7,9 +7,9 @@ and of those that the sensor invented, which pass with k = 1, 2 and 3 of 8 neigh
 
 import numpy as np
 
+from core.neighbour_filter import filter_neighbours, quiet_sensor
 from envs.config import EnvConfig
 from envs.corridor import CorridorVectorEnv
-from envs.events.neighbour_filter import filter_neighbours, quiet_sensor
 from jobs.analysis.tables import show_table
 from jobs.config.env_keys import env_with
 

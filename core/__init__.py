@@ -1,9 +1,14 @@
-"""Compiled kernels: the processor they are compiled for, and that none is older than its sources.
+"""What `envs` and `models` share: pixel values, the neighbour filter, files, how kernels are compiled.
 
-`envs` and `models` may not import each other; both import this package, which imports neither, and not numba.
+`envs` and `models` may not import each other; both import this package, which imports neither. Importing the
+package itself does not import numba.
 """
+
+from pathlib import Path
 
 from core.sources import forget_stale_kernels
 from core.target import fix_target
 
 __all__ = ["fix_target", "forget_stale_kernels"]
+
+forget_stale_kernels(Path(__file__).parent)

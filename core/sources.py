@@ -13,12 +13,13 @@ IMPORT = r"(?:from|import) +({}(?:\.\w+)*)(?: +import +(\([^)]*\)|[^\n]*))?"
 
 
 def forget_stale_kernels(folder: Path) -> None:
-    """Delete compiled kernels that are cut, or whose file or what it imports from its package has changed.
+    """Delete compiled kernels that are truncated, or whose sources have changed.
 
-    numba checks the file of a kernel alone, not the files of the kernels that it calls, nor of the types
-    of its arguments, which its annotations import: after an edit there, it would go on running the old
-    machine code. It writes the name of a kernel before the kernel: a full disk or a kill in between would
-    leave the new name with the old machine code. And it raises where a file is empty or ends too early.
+    The sources of a kernel are its file, the files of its package that this file imports, directly or not,
+    and this package. numba checks the kernel's own file alone: after an edit of a kernel that it calls, or of
+    an argument's type, numba would run the old machine code. numba also writes the name of a kernel
+    before the kernel: a full disk or a kill in between would leave the new name with the old machine code.
+    And numba raises an error if a file is empty or truncated.
 
     Args:
         folder: The package, such as `envs`. Its `__pycache__/kernels.json` holds the hashes of the sources.
@@ -44,7 +45,8 @@ def forget_stale_kernels(folder: Path) -> None:
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """For each file of a package a hash of it and of what it imports from there, directly or not."""
+    """Return a hash for each file of a package: of the file, of what it imports from there, and of `core`."""
+    core = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     sources = {path: path.read_bytes() for path in folder.rglob("*.py")}
     imports = {path: _imports(folder, text.decode()) & sources.keys() for path, text in sources.items()}
     hashes = {path: hashlib.sha256(text).digest() for path, text in sources.items()}
@@ -55,13 +57,13 @@ def _digests(folder: Path) -> dict[str, str]:
             new = imports[ahead.pop()] - reached
             reached |= new
             ahead += new
-        parts = b"".join(hashes[source] for source in sorted(reached))
+        parts = core + b"".join(hashes[source] for source in sorted(reached))
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(parts).hexdigest()
     return digests
 
 
 def _imports(folder: Path, text: str) -> set[Path]:
-    """Files that the import statements of a text may mean, wherever they stand."""
+    """Return the files that the import statements of a text may name."""
     modules: set[str] = set()
     for module, names in re.findall(IMPORT.format(folder.name), text):
         modules.update((module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))))
@@ -70,7 +72,7 @@ def _imports(folder: Path, text: str) -> set[Path]:
 
 
 def _is_whole(compiled: Path) -> bool:
-    """Whether a file, which is a pickle, has its end; a file that is gone counts as whole."""
+    """Whether a pickle file has its end; a missing file counts as whole."""
     with contextlib.suppress(FileNotFoundError), compiled.open("rb") as file:
         try:
             file.seek(-1, os.SEEK_END)

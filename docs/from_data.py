@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 
 from benchmarks.scaling_model import from_plain, plot_scaling
 from jobs.evaluation.group_stats import TrainingEpisodes, episode_values
-from jobs.measure.encoder.costs import read_costs
-from jobs.measure.encoder.plots import plot_encoding_costs
-from jobs.measure.trade.page import draw_settings
+from jobs.measure.encoding_plots import plot_encoding_costs
+from jobs.measure.encodings import read_costs
+from jobs.measure.trade_page import draw_settings
 from jobs.reporting.breaks import changes_of
 from jobs.reporting.claims_study import BY_PPO, TAUGHT, draw_study
 from jobs.reporting.claims_study import published_text as claims_text

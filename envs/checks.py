@@ -1,10 +1,6 @@
-"""What several rooms share: argument checks of both renderers, and files that are written whole."""
+"""Argument checks of both renderers."""
 
-import contextlib
 import math
-import os
-from collections.abc import Iterator
-from pathlib import Path
 
 LIMIT_M = 1e6  # how far from the origin a pose may be
 LIMIT_S = 1e9
@@ -30,32 +26,3 @@ def check_pose(pose: tuple[float, float, float, float], t_s: float = 0.0) -> Non
         raise ValueError(f"pose (x, y, z, yaw) must be finite, z >= 0 and within {LIMIT_M:g} m, got {pose}")
     if not abs(t_s) <= LIMIT_S:
         raise ValueError(f"t_s must be within +-{LIMIT_S:g} s; got {t_s!r}.")
-
-
-@contextlib.contextmanager
-def replaced(path: Path) -> Iterator[Path]:
-    """Yield a path to write to; the file takes its final name when the block ends without an error.
-
-    This holds on the disk too: the content is stored before its name, and a full disk leaves the old file.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with naming(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            yield part
-            with part.open("rb") as file:
-                os.fsync(file.fileno())
-            part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Let an error of the operating system name the file: that of a write alone does not."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = str(path)
-        raise

@@ -226,7 +226,7 @@ class EnvConfig:
         window_capacity: Most events that one window holds; the oldest beyond it are
             dropped and counted. None: a window is as long as its step has events.
         filter_support: An event is observed only if at least so many of its 8 neighbours fired shortly
-            before (`envs.events.neighbour_filter`); 0: every event is.
+            before (`core.neighbour_filter`); 0: every event is.
         filter_tau_us: How long before, at most [us].
         split: Which corridors: those of one split never occur in another, whatever the seed.
         renderer: "raycast", "pyrender", or "auto": the cheapest that can draw the scene.

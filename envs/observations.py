@@ -3,10 +3,9 @@
 import numpy as np
 from gymnasium import spaces
 
+from core.pictures import GREY_OFF, GREY_ON, grey_picture
 from envs.config import EnvConfig
 from envs.events import EVENT, event_image
-from envs.events.photoreceptor import GAMMA
-from envs.events.windows import GREY_OFF, GREY_ON
 
 ZOOM = 4
 ON_RGB, OFF_RGB = (96, 165, 250), (249, 115, 22)  # events in every picture for people
@@ -64,7 +63,7 @@ def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
         uint8 (4 H, 8 W, 3).
     """
     height, width = luminance.shape
-    grey = np.rint(255.0 * np.clip(luminance, 0.0, 1.0) ** (1.0 / GAMMA)).astype(np.uint8)
+    grey = grey_picture(luminance)
     polarity = event_image(events, width, height)
     image = np.repeat(np.concatenate((grey, np.zeros_like(polarity)), axis=1)[:, :, None], 3, axis=2)
     image[:, width:][polarity == GREY_ON] = ON_RGB

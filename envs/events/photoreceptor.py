@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from core.pictures import GAMMA
 from envs.compiled import kernel
 
 MAX_LUMINANCE = float(np.finfo(np.float32).max)
 ROOT_HALF = 0x3FE6A09E667F3BCD  # the bits of sqrt(1/2)
 INVERSE_LN2 = 1.4426950408889634
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # sum: ln 2; k * HIGH is exact
-GAMMA = 2.2
 
 
 class Curve(NamedTuple):

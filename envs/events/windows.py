@@ -5,9 +5,9 @@ import itertools
 import numba
 import numpy as np
 
+from core.pictures import GREY_OFF, GREY_ON
 from envs.events.camera import EVENT
 
-GREY_ON, GREY_OFF = 255, 125  # of an event picture (appendix D.1.2)
 MAX_WINDOW_US = 2**31 - 1
 
 

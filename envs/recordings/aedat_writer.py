@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.checks import replaced
+from core.files import replaced
 from envs.recordings.aedat import EVENT_PACKET, MAGIC_4, PACKED_EVENT, PACKET_TABLE
 
 MAX_PIXELS = 1 << 15  # a coordinate is a signed 16-bit integer

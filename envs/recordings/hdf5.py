@@ -21,7 +21,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from envs.checks import replaced
+from core.files import replaced
 from envs.events import EVENT
 from envs.recordings.ecf import FILTER_ECF, MAX_CHUNK_EVENTS, decode_ecf
 from envs.recordings.event_file import (

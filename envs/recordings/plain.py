@@ -9,7 +9,7 @@ from typing import IO
 
 import numpy as np
 
-from envs.checks import replaced
+from core.files import replaced
 from envs.recordings.event_file import EventFile, Request, assemble, finish, unwrap
 
 US_PER = {"s": 1_000_000.0, "ms": 1000.0, "us": 1.0, "ns": 0.001}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.checks import replaced
+from core.files import replaced
 from envs.events import EVENT
 from envs.recordings.event_file import EventFile, Request, finish
 from envs.recordings.evt_decoders import COLUMNS, decode_dat, decode_evt2, decode_evt3

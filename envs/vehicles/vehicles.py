@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from core.neighbour_filter import NEVER, filter_all
 from envs.config import EnvConfig
 from envs.events import EVENT
-from envs.events.neighbour_filter import NEVER, filter_all
 from envs.events.pixel_noise import PixelState
 from envs.kinematics import Outcome, clock_us
 from envs.scene import Scene

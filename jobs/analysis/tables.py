@@ -11,7 +11,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from envs.checks import replaced
+from core.files import replaced
 from jobs.analysis.statistics import Difference, Estimate, bootstrap_interval, wilson_interval
 from jobs.run.files import write_atomic
 from jobs.run.folder import Run

@@ -9,9 +9,9 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from envs.checks import replaced
+from core.files import replaced
+from core.pictures import GREY_OFF, GREY_ON
 from envs.events import event_image
-from envs.events.windows import GREY_OFF, GREY_ON
 from jobs.analysis.plots import EVENT_COLOURS, INK
 from jobs.run.files import RunError
 from models.policy.features import grey_picture

@@ -11,11 +11,6 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = ROOT / "conf"
-# Jobs whose module has another name or another place.
-ELSEWHERE = {
-    "trade_encoder": "jobs.measure.encoder.trade",
-    "trade_simulator": "jobs.measure.simulator",
-}
 
 
 class Job(NamedTuple):
@@ -60,12 +55,11 @@ def module_of(name: str) -> str | None:
     Raises:
         LookupError: If there is more than one.
     """
-    if name in ELSEWHERE:
-        return ELSEWHERE[name]
     places = (
         f"jobs/{name}.py",
         f"jobs/*/{name}.py",
         f"jobs/*/{name}/{name}.py",
+        f"research/{name}.py",
         f"research/{name}/{name}.py",
     )
     found = [path for place in places for path in ROOT.glob(place)]

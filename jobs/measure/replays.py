@@ -14,7 +14,7 @@ from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from envs.event_error import TIME_SHARE, event_error
 from envs.events import EVENT, unpack_window
-from jobs.measure.encoder.costs import exact_latents
+from jobs.measure.encodings import exact_latents
 from jobs.rollout.agents import PolicyAgent
 from models.encoder.evae import EventVAE
 from models.encoder.event_batch import cut_packed

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from envs.checks import replaced
+from core.files import replaced
 from jobs.analysis.tables import write_csv
 from jobs.config.errors import ConfigError
 from jobs.evaluation.group_stats import LABELS, Condition, GroupResult

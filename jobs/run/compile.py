@@ -34,7 +34,7 @@ from jobs.run.locks import locked
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
 
-ROOMS = ("envs", "models")
+ROOMS = ("core", "envs", "models")
 CACHE = REPOSITORY / "envs" / "__pycache__"
 ARCHIVES = 8  # of compiled kernels, 10 MB each, that stay in the user's cache
 

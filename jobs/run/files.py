@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from envs.checks import replaced
+from core.files import write_atomic as write_atomic  # for the jobs, with the rest of this file
 from envs.config import settings_hash
 
 CHECKSUM = "checksum"  # of the other values of a JSON object; files of older versions have none
@@ -87,9 +87,3 @@ def whole_lines(path: Path) -> bytes:
     """A file's content up to its last line end; nothing without a file."""
     content = path.read_bytes() if path.is_file() else b""
     return content[: content.rfind(b"\n") + 1]
-
-
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader sees the old content or the new one, never a part."""
-    with replaced(path) as part:
-        part.write_bytes(content.encode() if isinstance(content, str) else content)

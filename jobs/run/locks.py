@@ -9,7 +9,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from envs.checks import naming
+from core.files import naming
 from jobs.run.files import RunError
 from jobs.run.progress import console
 

@@ -19,8 +19,8 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from core.pictures import GREY_ON
 from envs.config import STRICT, Positive
-from envs.events.windows import GREY_ON
 from jobs.analysis.ground_plan import ground_plan
 from jobs.config.config import Config
 from jobs.config.schema import Name, NonNegative

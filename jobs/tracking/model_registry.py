@@ -98,17 +98,17 @@ def _add_version(tracker: Tracker, policy: Path, name: str, manifest: Mapping[st
 
     client = tracker.client
     with tempfile.TemporaryDirectory() as place:
-        code, files = Path(place) / "models", Path(place) / "model"
-        shutil.copytree(
-            REPOSITORY / "models", code, ignore=shutil.ignore_patterns("pretrained", "__pycache__")
-        )
+        code, files = [str(Path(place) / room) for room in ("core", "models")], Path(place) / "model"
+        for copy in code:
+            unused = shutil.ignore_patterns("pretrained", "__pycache__")
+            shutil.copytree(REPOSITORY / Path(copy).name, copy, ignore=unused)
         with warnings.catch_warnings():  # it asks for an example, to check the signature by
             warnings.simplefilter("ignore", UserWarning)
             pyfunc.save_model(
                 files,
                 python_model=str(REPOSITORY / "jobs" / "tracking" / "served_policy.py"),
                 artifacts={"policy": str(policy)},
-                code_paths=[str(code)],
+                code_paths=code,
                 signature=signature(manifest),
                 pip_requirements=[f"{package}=={importlib.metadata.version(package)}" for package in NEEDED],
             )

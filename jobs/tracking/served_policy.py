@@ -1,6 +1,6 @@
 """A registered policy as MLflow runs it: the observations of one episode in, an action per control step out.
 
-MLflow keeps this script and the package `models` beside the policy's files and runs them where the
+MLflow stores this script and the packages `core` and `models` with the policy's files and runs them where the
 model is loaded ("model from code"); nothing is pickled. A prediction is one episode from its start,
 so that the same input gives the same answer.
 """

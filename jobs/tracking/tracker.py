@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from envs.checks import replaced
+from core.files import replaced
 from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
 from jobs.config.errors import redacted

@@ -22,7 +22,7 @@ import torch
 from ray import tune
 from ray.rllib.core.rl_module.rl_module import RLModule
 
-from envs.checks import naming
+from core.files import naming
 from jobs.config.config import Config, ConfigError
 from jobs.config.plugins import with_culprit
 from jobs.rollout.diagnostics import DRIFT_METRICS

@@ -15,11 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from core.pictures import GREY_OFF, GREY_ON
 from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows
 from models.encoder.products import Linear, orthogonal_
 from models.kinds import MIN_IMAGE
 
-OFF_SHARE = 125.0 / 255.0  # of the picture value of ON (appendix D.1.2)
+OFF_SHARE = GREY_OFF / GREY_ON
 
 
 class PictureContextNetwork(nn.Module):

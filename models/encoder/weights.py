@@ -20,6 +20,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from core.files import write_atomic
 from models.encoder.evae import EventVAE
 from models.kinds import EvaeSettings, checked, renamed
 
@@ -241,20 +242,3 @@ def read_limited(path: Path, limit: int) -> bytes:
         is_link = error.errno == errno.ELOOP
         reason = "a link, which could name any file; copy the file itself" if is_link else error.strerror
         raise EncoderFileError(f"{path}: cannot be read: {reason}") from None
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write beside `path`, flush to disk, then rename: a reader sees the old file or the new one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        if error.errno is not None and error.filename is None:  # that of a write names no file
-            error.filename = str(path)
-        raise
-    finally:
-        temporary.unlink(missing_ok=True)

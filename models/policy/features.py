@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from core.pictures import GREY_OFF, GREY_ON, grey_picture
 from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows, event_rows, thin
 from models.encoder.event_images import draw_last
 from models.encoder.finetuned import EVENTS as ENCODED_EVENTS
@@ -16,8 +17,6 @@ from models.encoder.frozen import Encoder
 from models.kinds import PolicySpec, resolve
 from models.policy.event_set import EVENTS, TIMES
 
-PICTURE_ON, PICTURE_OFF = 255, 125  # values of a pixel in an event image (appendix D.1.2)
-GAMMA = 2.2
 Windows = np.ndarray | Sequence[np.ndarray]  # packed ones, of one length or of several
 
 
@@ -93,22 +92,8 @@ def event_picture(code: np.ndarray, width: int, height: int) -> np.ndarray:
     `models.encoder.event_batch.EventBatch`.
     """
     picture = np.zeros(width * height, np.uint8)
-    draw_last(code, picture, PICTURE_ON, PICTURE_OFF)
+    draw_last(code, picture, GREY_ON, GREY_OFF)
     return picture.reshape(height, width)
-
-
-def grey_picture(luminance: np.ndarray) -> np.ndarray:
-    """Linear luminance as a camera stores it: gamma 2.2, 8 bits; uint8 of the same shape, 1 is white.
-
-    The paper's policy sees 8-bit RGB images (appendix D.1.2). This world is grey, so where
-    three equal channels would carry no more than one. Brighter than white becomes white.
-
-    Raises:
-        ValueError: The luminance is NaN or infinite.
-    """
-    if not np.isfinite(luminance).all():
-        raise ValueError("luminance must be finite, got NaN or infinity")
-    return np.rint(255.0 * np.clip(luminance, 0.0, 1.0) ** (1.0 / GAMMA)).astype(np.uint8)
 
 
 def _grid(spec: PolicySpec, time_bins: int = 1) -> Grid:

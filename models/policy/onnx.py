@@ -27,12 +27,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from core.neighbour_filter import NEVER
+from core.pictures import GAMMA, GREY_OFF, GREY_ON
 from models.encoder.event_batch import ROW_OFF, ROW_ON
 from models.encoder.event_images import OFF_SHARE, PictureEncoder
 from models.kinds import KINDS, resolve
-from models.policy.event_filter import NEVER, EventFilter, filter_of
+from models.policy.event_filter import EventFilter, filter_of
 from models.policy.event_set import EVENTS, TIMES, EventSet
-from models.policy.features import GAMMA, PICTURE_OFF, PICTURE_ON
 from models.policy.policy import Policy
 
 NEEDED = ("onnx", "onnxscript")
@@ -182,7 +183,7 @@ def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tens
 def picture_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
     """Mean of the latent of the event image, with OFF as a share of ON."""
     picture = event_image(policy, events, window_us)
-    shares = torch.where(picture == PICTURE_ON, 1.0, torch.where(picture == PICTURE_OFF, OFF_SHARE, 0.0))
+    shares = torch.where(picture == GREY_ON, 1.0, torch.where(picture == GREY_OFF, OFF_SHARE, 0.0))
     return policy.layers(shares[None, None])[0, : policy.latent]
 
 
@@ -225,7 +226,7 @@ def event_image(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tenso
     numbered = 2 * torch.ones_like(p).cumsum(0) + (p > 0)
     none = torch.zeros(policy.size[0] * policy.size[1], dtype=torch.int64)
     last = none.scatter_reduce(0, y * policy.size[1] + x, numbered, "amax")
-    return torch.where(last == 0, 0, torch.where(last % 2 == 1, PICTURE_ON, PICTURE_OFF)).reshape(policy.size)
+    return torch.where(last == 0, 0, torch.where(last % 2 == 1, GREY_ON, GREY_OFF)).reshape(policy.size)
 
 
 def grey(policy: PolicyGraph, luminance: Tensor) -> Tensor:

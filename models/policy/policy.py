@@ -18,6 +18,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from core.files import write_atomic
 from models.encoder.evae import EventVAE
 from models.encoder.finetuned import EVENTS
 from models.encoder.frozen import Encoder, encoder_of, tabulate
@@ -31,7 +32,6 @@ from models.encoder.weights import (
     save_encoder,
     with_checksum,
     without_checksum,
-    write_atomic,
 )
 from models.kinds import PolicySpec, needed_plugins, read_spec
 from models.policy.event_filter import filter_of

@@ -3,10 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from core.neighbour_filter import filter_neighbours, quiet_sensor
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import EVENT
-from envs.events.neighbour_filter import filter_neighbours, quiet_sensor
 
 SMALL = CameraConfig(width=16, height=16)
 EMPTY = {"layout": {"num_obstacles": 0}, "camera": SMALL}

@@ -92,7 +92,7 @@ def test_importing_the_rooms_is_light():
 
 TARGETS = (
     *("setup", "setup-all", "demo", "bytestream", "train-all", "sweep-robustness", "mlflow"),
-    *("lint", "check", "bench", "bench-clone", "docs", "test-costs"),
+    *("lint", "check", "bench", "bench-clone", "docs", "test-costs", "lines", "numerics"),
     *(
         "test",
         "test-system",

@@ -23,7 +23,7 @@ from ray import tune
 from ray.tune.schedulers import ASHAScheduler
 from ray.tune.search.optuna import OptunaSearch
 
-from envs.checks import naming
+from core.files import naming
 from envs.config import STRICT, settings_hash
 from jobs.analysis.plots import BLUE, GREYS, INK, tidy
 from jobs.analysis.tables import publish_plot, publish_table

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from core.pictures import GREY_OFF, GREY_ON
 from docs.browser import CHROMIUM, Browser
 from envs.config import FaultsConfig
-from envs.events.windows import GREY_OFF, GREY_ON
 from jobs.config.config import ConfigError, parse
 from jobs.reporting.report import find_study, write_replay
 from jobs.rollout.agents import PolicyAgent, make_agent

@@ -7,8 +7,8 @@ import torch
 
 from envs.event_error import NO_CULLING_M
 from jobs.config.config import ConfigError
+from jobs.measure import trade
 from jobs.measure.replays import Measured
-from jobs.measure.trade import trade
 from jobs.rollout.executors import evaluate_part
 from jobs.rollout.policies import read_policy
 from jobs.rollout.store import TaskResult

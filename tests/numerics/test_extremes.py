@@ -1,10 +1,15 @@
-"""Each extreme with its defined result, and how far the code is from it at worst."""
+"""Numbers at the ends of their ranges: each extreme with its defined result and the worst error found.
+
+`python -m tests.numerics.page` runs these tests and writes docs/numerics.md from the recorded properties.
+"""
 
 import copy
+import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
@@ -24,29 +29,28 @@ from models.policy.memory import remember
 
 MAX_T_US = 2**51  # of an episode [us], 71 years
 FLOOR = 1e-3  # the camera's default luminance floor
+EXTREMES: list[Any] = []
 
 
-class Extreme(NamedTuple):
-    """One extreme.
+def extreme(part: str, what: str, result: str, unit: str, bound: float, slow: bool = False) -> Callable:
+    """Decorate a function that returns the worst error of an extreme.
 
-    Attributes:
-        part: Of the platform.
+    Args:
+        part: Part of the platform.
         what: The extreme input.
-        result: What is defined to come of it.
-        unit: Of the error.
-        bound: The largest error that is accepted.
-        worst: Measures the worst error; 0 where the result is as defined, and 1 where it is not if there is
-            nothing in between.
-        test: File of tests that hold it.
+        result: The defined result.
+        unit: Unit of the error.
+        bound: Largest accepted error. An extreme that is only right or wrong counts what is wrong.
+        slow: Whether the measurement belongs to the system tests.
     """
 
-    part: str
-    what: str
-    result: str
-    unit: str
-    bound: float
-    worst: Callable[[], float]
-    test: str
+    def add(worst: Callable[[], float]) -> Callable[[], float]:
+        row = {"part": part, "what": what, "result": result, "unit": unit, "bound": bound}
+        marks = pytest.mark.system if slow else ()
+        EXTREMES.append(pytest.param(row, worst, id=f"{part}: {what}", marks=marks))
+        return worst
+
+    return add
 
 
 def events_between(before: float, after: float, dt_us: int = 1000, **fields: Any) -> tuple[np.ndarray, int]:
@@ -68,6 +72,20 @@ def refused(values: Iterable[float], use: Callable[[float], object]) -> float:
     return float(accepted)
 
 
+def windows() -> Iterator[tuple[np.ndarray, int]]:
+    """Windows of no event, of one, of an event 1,000 times, and of 100,000; events and length [us]."""
+    rng = np.random.default_rng(0)
+    for count, window_us in ((0, 5_000), (1, 1), (1_000, 5_000), (100_000, 10**6)):
+        events = np.zeros(count, EVENT)
+        events["t"] = np.sort(rng.integers(1, window_us + 1, count))
+        events["x"], events["y"] = (rng.integers(0, 64, count) for _ in range(2))
+        events["p"] = rng.choice([-1, 1], count)
+        if count == 1_000:
+            events[:] = events[0]
+        yield events, window_us
+
+
+@extreme("camera", "a step of k thresholds, 0.001 to 10, k to 100", "k events", "events", 0)
 def thresholds() -> float:
     """Counts of a step of k thresholds, up and down, for thresholds of the whole range."""
     wrong = 0
@@ -79,6 +97,9 @@ def thresholds() -> float:
     return float(wrong)
 
 
+@extreme(
+    "camera", "black to 1e-45 .. 3.4e38 and back", "the whole part of log ratio / threshold", "events", 0
+)
 def greys() -> float:
     """Counts between black and greys up to the largest float32, against the logarithm in float64."""
     wrong = 0
@@ -92,6 +113,7 @@ def greys() -> float:
     return float(wrong)
 
 
+@extreme("camera", "20,000 steps up and down", "as many ON as OFF events", "events", 0)
 def drift() -> float:
     """Events too many or too few after a million steps up and down."""
     camera = EventCamera(1, 1, contrast_threshold=0.2)
@@ -104,6 +126,7 @@ def drift() -> float:
     return float(abs(counts[0] + counts[1]))
 
 
+@extreme("camera", "ramps of 0.1 ms to 1 s", "events at the crossings, in whole microseconds", "us", 1.0)
 def event_times() -> float:
     """Time of events on a ramp of the logarithm against the exact crossing, rounded up [us]."""
     worst = 0.0
@@ -117,6 +140,7 @@ def event_times() -> float:
     return worst
 
 
+@extreme("camera", "caps of 1 to 1,000 events a pixel", "what is over the cap is counted", "events", 0)
 def kept_or_counted() -> float:
     """Events that are neither there nor counted as dropped, at caps of 1 to 1,000 a pixel."""
     whole, _ = events_between(1e-3, 2.0, contrast_threshold=1e-3)
@@ -127,6 +151,7 @@ def kept_or_counted() -> float:
     return float(lost)
 
 
+@extreme("camera", "NaN, infinite or negative light", "refused, the pixel named", "values accepted", 0)
 def bad_light() -> float:
     """Frames that are no light and yet accepted."""
     camera = EventCamera(3, 2)
@@ -140,25 +165,33 @@ def bad_light() -> float:
     return refused((np.nan, np.inf, -np.inf, -1.0, -1e-45), see)
 
 
-def clocks() -> float:
-    """Time of a control step against the exact quotient, after up to 10**12 steps [us]."""
-    steps = (1, 3, 1000, 10**6, 10**9)
-    rates = (0.1, 45.0, 200.0, 12_345.6, 1e6)
-    exact = [(step, rate, step * 1e6 / np.longdouble(rate)) for step in steps for rate in rates]
-    within = [(step, rate, time) for step, rate, time in exact if time < MAX_T_US]
-    return max(float(abs(clock_us(step, rate) - time)) for step, rate, time in within)
+@extreme(
+    "faults",
+    "more than 16 million false events a step, rates that are no number",
+    "refused",
+    "values accepted",
+    0,
+)
+def too_many_faults() -> float:
+    """Rates of false events beyond memory that are accepted."""
+    none, rng = np.zeros(0, EVENT), np.random.default_rng(0)
+
+    def add(rate: float) -> None:
+        faults = FaultsConfig(background_activity_hz=rate)
+        pixels = draw_pixel_faults((64, 64), faults, rng)
+        apply_faults(none, 0, 10**7, faults, pixels, rng)
+
+    return refused((1e4, 1e5, 1e6, 1e7, np.nan, np.inf, -1.0), add)
 
 
-def positions() -> float:
-    """Place after a million steps against the exact one [m]."""
-    errors = []
-    for forward, left, right in ((10**6, 0, 0), (0, 10**6, 0), (333_333, 333_333, 333_334)):
-        x, y = planned_position(0.0, (forward, left, right), (20.0, 200.0))
-        half = np.sqrt(np.longdouble(0.5))
-        errors += [abs(x - (right - left) * half / 10), abs(y - (forward + (left + right) * half) / 10)]
-    return float(max(errors))
-
-
+@extreme(
+    "renderer",
+    "poses in, on, over and far from poles, along the axes",
+    "finite light within the surfaces'",
+    "of white",
+    1e-06,
+    slow=True,
+)
 def light_of_poses() -> float:
     """Light of renders that is not finite, or outside what the scene's surfaces can show [1 is white]."""
     rng, worst = np.random.default_rng(0), 0.0
@@ -177,6 +210,7 @@ def light_of_poses() -> float:
     return float(worst)
 
 
+@extreme("renderer", "edges of poles", "the mean light over each pixel", "of white, mean", 0.001, slow=True)
 def coverage_of_pixels() -> float:
     """Light of pixels against 96 x 96 point samples each, the mean over a picture [1 is white]."""
     scene = make_scene("poles", np.random.default_rng(3))
@@ -188,6 +222,14 @@ def coverage_of_pixels() -> float:
     return worst
 
 
+@extreme(
+    "simulator",
+    "seven settings of world, rate (45 to 800 Hz) and tolerance (0.5 to 20 %)",
+    "an event error within the tolerance",
+    "of the tolerance",
+    1.0,
+    slow=True,
+)
 def error_over_tolerance() -> float:
     """Event error achieved, as a share of the one that was asked, over scenes, rates and tolerances."""
     worst = 0.0
@@ -200,19 +242,14 @@ def error_over_tolerance() -> float:
     return worst
 
 
-def windows() -> Iterator[tuple[np.ndarray, int]]:
-    """Windows of no event, of one, of an event 1,000 times, and of 100,000; events and length [us]."""
-    rng = np.random.default_rng(0)
-    for count, window_us in ((0, 5_000), (1, 1), (1_000, 5_000), (100_000, 10**6)):
-        events = np.zeros(count, EVENT)
-        events["t"] = np.sort(rng.integers(1, window_us + 1, count))
-        events["x"], events["y"] = (rng.integers(0, 64, count) for _ in range(2))
-        events["p"] = rng.choice([-1, 1], count)
-        if count == 1_000:
-            events[:] = events[0]
-        yield events, window_us
-
-
+@extreme(
+    "encoder",
+    "windows of 0, 1, 1,000 equal and 100,000 events, of 1 us to 1 s",
+    "the network's latent",
+    "of the latent",
+    1e-05,
+    slow=True,
+)
 def latents() -> float:
     """Latents of the table in float32 against the network in float64, in units of the latent."""
     torch.manual_seed(0)
@@ -229,6 +266,7 @@ def latents() -> float:
     return worst
 
 
+@extreme("encoder", "the same windows in any order", "the same bits", "latents", 0, slow=True)
 def order_of_events() -> float:
     """Latents that another order of the same events changes by any bit."""
     torch.manual_seed(0)
@@ -240,6 +278,13 @@ def order_of_events() -> float:
     return float(changed)
 
 
+@extreme(
+    "policy",
+    "steps of 1 us to 11 days, memories of 1 ms to 17 minutes",
+    "means within what was seen",
+    "of a feature",
+    0,
+)
 def memories() -> float:
     """Decaying means outside what was seen, for short and long steps and time constants."""
     spec = PolicySpec(DenseModel(name="event_columns", stack=1, hidden=[4], memory_ms=[1.0, 1e6]), 1, 1)
@@ -252,6 +297,37 @@ def memories() -> float:
     return worst
 
 
+@extreme(
+    "clock", "up to 10^9 steps at 0.1 Hz to 1 MHz, at most 71 years", "the exact time, rounded", "us", 0.5
+)
+def clocks() -> float:
+    """Time of a control step against the exact quotient, after up to 10**12 steps [us]."""
+    steps = (1, 3, 1000, 10**6, 10**9)
+    rates = (0.1, 45.0, 200.0, 12_345.6, 1e6)
+    exact = [(step, rate, step * 1e6 / np.longdouble(rate)) for step in steps for rate in rates]
+    within = [(step, rate, time) for step, rate, time in exact if time < MAX_T_US]
+    return max(float(abs(clock_us(step, rate) - time)) for step, rate, time in within)
+
+
+@extreme("vehicle", "a million steps", "the exact place: counts times step", "m", 1e-09)
+def positions() -> float:
+    """Place after a million steps against the exact one [m]."""
+    errors = []
+    for forward, left, right in ((10**6, 0, 0), (0, 10**6, 0), (333_333, 333_333, 333_334)):
+        x, y = planned_position(0.0, (forward, left, right), (20.0, 200.0))
+        half = np.sqrt(np.longdouble(0.5))
+        errors += [abs(x - (right - left) * half / 10), abs(y - (forward + (left + right) * half) / 10)]
+    return float(max(errors))
+
+
+@extreme(
+    "corridor",
+    "0.1 Hz to 1 MHz, 1e-6 to 1e6 m/s, thresholds 1e-6 to 10, 1 x 1 pixel, all pixels dead",
+    "finite observations and rewards",
+    "steps",
+    0,
+    slow=True,
+)
 def corridors() -> float:
     """Steps at extreme rates, speeds, thresholds and sensors in which a number is not finite."""
     tiny, bad = CameraConfig(8, 8), 0
@@ -275,18 +351,7 @@ def corridors() -> float:
     return float(bad)
 
 
-def too_many_faults() -> float:
-    """Rates of false events beyond memory that are accepted."""
-    none, rng = np.zeros(0, EVENT), np.random.default_rng(0)
-
-    def add(rate: float) -> None:
-        faults = FaultsConfig(background_activity_hz=rate)
-        pixels = draw_pixel_faults((64, 64), faults, rng)
-        apply_faults(none, 0, 10**7, faults, pixels, rng)
-
-    return refused((1e4, 1e5, 1e6, 1e7, np.nan, np.inf, -1.0), add)
-
-
+@extreme("statistics", "0 % and 100 %, 1 to 10,000 episodes", "intervals within 0 and 1", "intervals", 0)
 def rates_of_all() -> float:
     """Ends of intervals of rates outside 0..1 or not finite, from one episode to ten thousand."""
     bad = 0
@@ -299,153 +364,16 @@ def rates_of_all() -> float:
     return float(bad)
 
 
-CAMERA_TESTS = "tests/envs/events/test_extremes.py"
-EXTREMES = (
-    Extreme(
-        "camera",
-        "a step of k thresholds, 0.001 to 10, k to 100",
-        "k events",
-        "events",
-        0,
-        thresholds,
-        CAMERA_TESTS,
-    ),
-    Extreme(
-        "camera",
-        "black to 1e-45 .. 3.4e38 and back",
-        "the whole part of log ratio / threshold",
-        "events",
-        0,
-        greys,
-        CAMERA_TESTS,
-    ),
-    Extreme(
-        "camera", "20,000 steps up and down", "as many ON as OFF events", "events", 0, drift, CAMERA_TESTS
-    ),
-    Extreme(
-        "camera",
-        "ramps of 0.1 ms to 1 s",
-        "events at the crossings, in whole microseconds",
-        "us",
-        1.0,
-        event_times,
-        "tests/envs/events/test_camera.py",
-    ),
-    Extreme(
-        "camera",
-        "caps of 1 to 1,000 events a pixel",
-        "what is over the cap is counted",
-        "events",
-        0,
-        kept_or_counted,
-        CAMERA_TESTS,
-    ),
-    Extreme(
-        "camera",
-        "NaN, infinite or negative light",
-        "refused, the pixel named",
-        "values accepted",
-        0,
-        bad_light,
-        CAMERA_TESTS,
-    ),
-    Extreme(
-        "faults",
-        "more than 16 million false events a step, rates that are no number",
-        "refused",
-        "values accepted",
-        0,
-        too_many_faults,
-        "tests/envs/events/test_faults.py",
-    ),
-    Extreme(
-        "renderer",
-        "poses in, on, over and far from poles, along the axes",
-        "finite light within the surfaces'",
-        "of white",
-        1e-6,
-        light_of_poses,
-        "tests/envs/raycast/test_renderer.py",
-    ),
-    Extreme(
-        "renderer",
-        "edges of poles",
-        "the mean light over each pixel",
-        "of white, mean",
-        1e-3,
-        coverage_of_pixels,
-        "tests/envs/raycast/test_renderer.py",
-    ),
-    Extreme(
-        "simulator",
-        "seven settings of world, rate (45 to 800 Hz) and tolerance (0.5 to 20 %)",
-        "an event error within the tolerance",
-        "of the tolerance",
-        1.0,
-        error_over_tolerance,
-        "tests/envs/test_event_error.py",
-    ),
-    Extreme(
-        "encoder",
-        "windows of 0, 1, 1,000 equal and 100,000 events, of 1 us to 1 s",
-        "the network's latent",
-        "of the latent",
-        1e-5,
-        latents,
-        "tests/models/encoder/test_table.py",
-    ),
-    Extreme(
-        "encoder",
-        "the same windows in any order",
-        "the same bits",
-        "latents",
-        0,
-        order_of_events,
-        "tests/models/encoder/test_table.py",
-    ),
-    Extreme(
-        "policy",
-        "steps of 1 us to 11 days, memories of 1 ms to 17 minutes",
-        "means within what was seen",
-        "of a feature",
-        0,
-        memories,
-        "tests/models/policy/test_memory.py",
-    ),
-    Extreme(
-        "clock",
-        "up to 10^9 steps at 0.1 Hz to 1 MHz, at most 71 years",
-        "the exact time, rounded",
-        "us",
-        0.5,
-        clocks,
-        "tests/envs/test_corridor.py",
-    ),
-    Extreme(
-        "vehicle",
-        "a million steps",
-        "the exact place: counts times step",
-        "m",
-        1e-9,
-        positions,
-        "tests/envs/test_corridor.py",
-    ),
-    Extreme(
-        "corridor",
-        "0.1 Hz to 1 MHz, 1e-6 to 1e6 m/s, thresholds 1e-6 to 10, 1 x 1 pixel, all pixels dead",
-        "finite observations and rewards",
-        "steps",
-        0,
-        corridors,
-        "tests/envs/test_extremes.py",
-    ),
-    Extreme(
-        "statistics",
-        "0 % and 100 %, 1 to 10,000 episodes",
-        "intervals within 0 and 1",
-        "intervals",
-        0,
-        rates_of_all,
-        "tests/jobs/analysis/test_statistics.py",
-    ),
-)
+@pytest.mark.parametrize(("row", "worst"), EXTREMES)
+def test_the_worst_error_is_within_the_accepted_bound(row, worst, record_property):
+    error = worst()
+    for name, value in {**row, "error": error}.items():
+        record_property(name, value)
+    assert not math.isnan(error)
+    assert 0 <= error <= row["bound"]
+
+
+def test_the_measurements_can_fail():
+    found, dropped = events_between(0.1, 0.9, contrast_threshold=0.2, max_events_per_pixel=3)
+    assert (len(found), dropped) == (3, 7)
+    assert refused((1.0, -1.0, 2.0), lambda value: range(int(value)) or [].index(value)) == 2.0

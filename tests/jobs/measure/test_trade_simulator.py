@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from envs.config import EnvConfig
 from envs.event_error import Accuracy, measure_event_error
-from jobs.measure import simulator as trade_simulator
+from jobs.measure import trade_simulator
 from jobs.measure.front_plots import pareto
-from jobs.measure.simulator import MeasuredSetting, setting_columns, step_costs_us
+from jobs.measure.trade_simulator import MeasuredSetting, setting_columns, step_costs_us
 from jobs.run.folder import locate_run
 from tests.support.configs import small_config
 

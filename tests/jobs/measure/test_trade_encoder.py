@@ -7,9 +7,10 @@ import torch
 from benchmarks.encoder import compare
 from jobs.analysis.tables import write_csv
 from jobs.config.config import ConfigError
-from jobs.measure.encoder import costs as encoder_costs
-from jobs.measure.encoder import trade as trade_encoder
-from jobs.measure.encoder.costs import (
+from jobs.measure import encodings as encoder_costs
+from jobs.measure import trade_encoder
+from jobs.measure.encoding_plots import plot_encoding_costs
+from jobs.measure.encodings import (
     UNCHANGED,
     Encoding,
     EncodingCost,
@@ -23,13 +24,12 @@ from jobs.measure.encoder.costs import (
     read_costs,
     repeats,
 )
-from jobs.measure.encoder.plots import plot_encoding_costs
-from jobs.measure.encoder.trade import cost_cells, cost_columns, percent
-from jobs.measure.encoder.trials import MAX_EVENTS, spread, squeezed
+from jobs.measure.trade_encoder import cost_cells, cost_columns
+from jobs.measure.trials import MAX_EVENTS
 from jobs.run.folder import locate_run
 from jobs.run.provenance import REPOSITORY
-from models.encoder.evae import EventVAE, event_targets, reconstruct
-from models.encoder.event_batch import EventBatch, batch_windows
+from models.encoder.evae import event_targets, reconstruct
+from models.encoder.event_batch import batch_windows
 from models.encoder.table import EncoderTable
 from models.kinds import DenseModel
 from tests.support.configs import small_config
@@ -109,25 +109,6 @@ def test_what_is_explained_follows_the_latents_that_are_given():
     assert explained(evae, batch) == pytest.approx(float(1 - error / total), abs=1e-6)
 
 
-def test_ages_are_squeezed_in_place():
-    evae = EventVAE(width=4, height=4, context=8, time_bins=100)
-    batch = EventBatch(evae.grid, np.zeros(100, np.int32), np.arange(100, dtype=np.int32), np.array([0, 100]))
-    old, new = squeezed(batch, 0.9, 1.0), squeezed(batch, 0.0, 0.2)
-    assert np.bincount(old.bin).tolist() == 10 * [10]
-    assert np.bincount(new.bin).tolist() == 80 * [0] + 20 * [5]
-    assert (np.diff(old.bin) >= 0).all()
-    assert np.array_equal(squeezed(batch, 0.0, 1.0).bin, batch.bin)
-    assert np.array_equal(old.code, batch.code)
-
-
-def test_a_spread_is_students_interval_of_the_mean():
-    mean, half = spread([0.1, 0.2, 0.3])
-    assert mean == pytest.approx(0.2)
-    assert half == pytest.approx(4.303 * 0.1 / np.sqrt(3), rel=1e-3)
-    assert np.isnan(spread([0.1])[1])
-    assert (percent((0.123, 0.04)), percent(spread([0.1]))) == ("12 ± 4", "10")
-
-
 def test_only_what_computes_the_same_as_the_default_repeats_its_timing():
     rows = [
         make_row(),
@@ -191,7 +172,6 @@ def test_a_row_becomes_text_and_columns():
 @pytest.mark.system
 def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_path, monkeypatch):
     monkeypatch.setattr(trade_encoder, "CONTEXTS", (16, 32))
-    monkeypatch.setattr(trade_encoder, "CODING_CONTEXT", 16)
     monkeypatch.setattr(encoder_costs, "TIME_BINS", (16, 64))
     config = small_config(tmp_path, job="trade_encoder")
     config = dataclasses.replace(
@@ -199,27 +179,22 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
         model=dataclasses.replace(config.model, context=32),
         collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
         pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
-        own=dataclasses.replace(config.own, iterations=1, seeds=2, windows=4),
+        own=dataclasses.replace(config.own, iterations=1, windows=4),
     )
     metrics = trade_encoder.run(config)
     folder = locate_run(config).path / "trade"
-    pictures = {"inference", "coding", "coding_pictures", "embedding", "interpolation", "scenes"}
-    assert {path.stem for path in folder.glob("*.png")} == pictures
-    assert len(list((folder / "encoders").glob("*.safetensors"))) == 2 + 2 * 3 - 1
+    assert {path.stem for path in folder.glob("*.png")} == {"inference"}
+    assert len(list((folder / "encoders").glob("*.safetensors"))) == 2
     lines = [line.split("|") for line in (folder / "inference.md").read_text().splitlines()[2:]]
     assert [line[1].strip() for line in lines].count("newest events") == 5
     assert lines[0][1].strip() == "default"
     assert len(read_costs(folder / "inference.csv")) == len(lines)
-    assert (folder / "coding.md").read_text().count("±") == 3 * 7
     assert metrics["perf/encode_step_us"] > 0
-    assert {
-        f"evae/explained_r2_{coding}_dense" for coding in ("additive", "eventnet", "none")
-    } <= metrics.keys()
 
     def refuse(*arguments):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr("jobs.measure.encoder.trials.train_short", refuse)
+    monkeypatch.setattr("jobs.measure.trials.train_short", refuse)
     again = trade_encoder.run(config)
     assert {name: value for name, value in again.items() if name.startswith("evae/")} == {
         name: value for name, value in metrics.items() if name.startswith("evae/")

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 
 from jobs.analysis.statistics import Difference, Estimate, holm
 from jobs.analysis.tables import estimate_metrics, estimate_text, markdown_table, percent_text, short
-from jobs.measure.trade.plot import TradePoint, plot_trade
+from jobs.measure.trade_plot import TradePoint, plot_trade
 from jobs.run.provenance import Provenance
 from jobs.run.templates import render
 
-TEMPLATE = Path(__file__).with_name("page.md.j2")  # it also states the rule of the verdicts
+TEMPLATE = Path(__file__).with_name("trade_page.md.j2")  # it also states the rule of the verdicts
 DEFAULT, EXACT = "default", "most exact"
 ENCODER_KNOBS = ("precision", "time bins", "newest events")  # they change no event
 CAMERA_KNOB = "memory"  # another camera, not a coarser simulation of the same

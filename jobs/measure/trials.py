@@ -1,7 +1,7 @@
-"""Short trainings of the event VAE side by side, and the held-out windows they are compared on."""
+"""Short trainings of event VAEs, and the held-out windows on which they are compared."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,20 +9,16 @@ import numpy as np
 
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
-from jobs.analysis.statistics import half_width
 from jobs.config.config import Config
 from jobs.run.folder import Run
 from jobs.run.progress import progress
 from jobs.training.collect import data_file
 from jobs.training.pretrain import EvaeTraining, Window, cut_window, evae_settings, sample_windows
 from models.encoder.evae import EventVAE
-from models.encoder.event_batch import EventBatch, Grid, batch_windows
 from models.encoder.weights import load_encoder, save_encoder
 from models.kinds import EvaeSettings
 
-MAX_EVENTS, DENSE_EVENTS, SPARSE_EVENTS = 4096, 2000, 200
-OLDER_THAN = (0.5, 0.8, 0.9)
-NEWEST = 0.2
+MAX_EVENTS = 4096
 
 
 def trained(config: Config, folder: Run, changes: Mapping[str, Any], seed: int) -> EventVAE:
@@ -88,34 +84,3 @@ def control_steps(recording: Recording, count: int) -> list[Window]:
     chosen = np.random.default_rng(1).choice(len(start), count)
     spans = [(int(start[step]), int(end[step] - start[step])) for step in chosen]
     return [cut_window(recording, first, span, MAX_EVENTS) for first, span in spans]
-
-
-def held_out(config: Config, recording: Recording, grid: Grid, count: int) -> dict[str, EventBatch]:
-    """`count` windows for each condition under which codings of time are compared.
-
-    "usual": of all lengths, as in training; "sparse" and "dense": of 200 and 2,000 events; then
-    the dense ones with their ages squeezed into the oldest or newest part of the window.
-    """
-    drawn = {
-        "usual": draw(config, recording, "mixed", MAX_EVENTS, count),
-        "sparse": draw(config, recording, "count", SPARSE_EVENTS, count),
-        "dense": draw(config, recording, "count", DENSE_EVENTS, count),
-    }
-    batches = {name: batch_windows(windows, grid) for name, windows in drawn.items()}
-    for age in OLDER_THAN:
-        batches[f"age over {age:g}"] = squeezed(batches["dense"], age, 1.0)
-    return batches | {"newest fifth": squeezed(batches["dense"], 0.0, NEWEST)}
-
-
-def squeezed(batch: EventBatch, youngest: float, oldest: float) -> EventBatch:
-    """The same events in the same order, their ages 0..1 squeezed linearly to `youngest`..`oldest`."""
-    bins = batch.grid.time_bins
-    age = 1.0 - (batch.bin + 0.5) / bins
-    times = 1.0 - (youngest + age * (oldest - youngest))
-    return dataclasses.replace(batch, bin=np.clip(times * bins, 0, bins - 1).astype(np.int32))
-
-
-def spread(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval (Student's t); NaN for a single value."""
-    half = float(half_width(np.array(values))) if len(values) > 1 else float("nan")
-    return float(np.mean(values)), half

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies
 
+from core.neighbour_filter import filter_all, filter_neighbours, quiet_sensor
 from envs.events import EVENT
-from envs.events.neighbour_filter import filter_all, filter_neighbours, quiet_sensor
 from models.policy.event_filter import EventFilter
 from tests.support.event_files import some_events
 

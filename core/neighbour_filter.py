@@ -1,9 +1,9 @@
-"""Spatio-temporal correlation filter: an event without recent events beside it is taken for noise.
+"""Spatio-temporal correlation filter: an event without recent events at neighbouring pixels is noise.
 
 An event passes if at least `support` of its 8 neighbours fired, in either polarity, at most `tau_us`
-earlier. Its own pixel says nothing, so that a hot pixel alone never passes. What is refused counts as
-a neighbour all the same. Of events at one time those before it in the stream count, those after it do not:
-what passes depends on the order of the stream, and not on how it is cut into pieces.
+earlier. Its own pixel does not count, so a hot pixel alone never passes. A removed event still counts as
+a neighbour of later ones. Among simultaneous events only those earlier in the stream count: the result
+depends on the order of the stream, but not on how the stream is cut into pieces.
 
 Source: the background activity filter of Delbruck, "Frame-free dynamic digital vision" (2008).
 """
@@ -23,9 +23,10 @@ def filter_neighbours(events: np.ndarray, last_us: np.ndarray, support: int, tau
     """The events that pass, in their order.
 
     Args:
-        events: EVENT in time order, within the sensor, t >= 0 and not before those of earlier calls.
-        last_us: As of `quiet_sensor` at the start of an episode; it is brought up to date.
-        support: Neighbours needed, 0 to 8; 0 passes every event, and leaves `last_us` as it was.
+        events: Events with fields t [us], x, y, in time order and within the sensor; t >= 0 and not before
+            the events of earlier calls.
+        last_us: From `quiet_sensor` at the start of an episode; updated in place.
+        support: Neighbours needed, 0 to 8; 0 passes every event and does not update `last_us`.
         tau_us: How long ago they may have fired [us], at least 0.
 
     Raises:
@@ -33,7 +34,10 @@ def filter_neighbours(events: np.ndarray, last_us: np.ndarray, support: int, tau
     """
     if not 0 <= support <= 8 or tau_us < 0:
         raise ValueError(f"support must be in 0..8 and tau_us >= 0; got {support} and {tau_us}.")
-    return events if support == 0 else events[_passing(events, last_us, support, tau_us)]
+    if support == 0:
+        return events
+    x, y = (events[name].astype(np.int64) for name in "xy")
+    return events[passing(events["t"], x, y, last_us, support, tau_us)]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -65,13 +69,14 @@ def filter_all(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _passing(events: np.ndarray, last_us: np.ndarray, support: int, tau_us: int) -> np.ndarray:
-    """Which events pass, bool (N,)."""
-    passing = np.empty(events.size, np.bool_)
-    for i in range(events.size):
-        event = events[i]
-        passing[i] = is_supported(np.int64(event.x), np.int64(event.y), event.t, last_us, support, tau_us)
-    return passing
+def passing(
+    t_us: np.ndarray, x: np.ndarray, y: np.ndarray, last_us: np.ndarray, support: int, tau_us: int
+) -> np.ndarray:
+    """Return which events pass, bool (N,). Arguments as in `filter_neighbours`, int64 (N,) each."""
+    passes = np.empty(t_us.size, np.bool_)
+    for i in range(t_us.size):
+        passes[i] = is_supported(x[i], y[i], t_us[i], last_us, support, tau_us)
+    return passes
 
 
 @numba.njit(cache=True, error_model="numpy")

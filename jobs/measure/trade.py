@@ -26,11 +26,10 @@ from jobs.analysis.statistics import Estimate, crossed_mean, half_width, rate_es
 from jobs.analysis.tables import publish_plot, publish_table, write_csv
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count, Name
-from jobs.measure.encoder.costs import CAPS, TIME_BINS
-from jobs.measure.encoder.trade import EVENT_ENCODERS
+from jobs.measure.encodings import CAPS, TIME_BINS
 from jobs.measure.replays import Measured, measure_settings
-from jobs.measure.simulator import KNOBS, Setting, changed, setting_text
-from jobs.measure.trade.page import (
+from jobs.measure.trade_encoder import EVENT_ENCODERS
+from jobs.measure.trade_page import (
     ALL,
     DEFAULT,
     EXACT,
@@ -46,6 +45,7 @@ from jobs.measure.trade.page import (
     trade_page,
     verdicts,
 )
+from jobs.measure.trade_simulator import KNOBS, Setting, changed, setting_text
 from jobs.rollout.agents import PolicyAgent, make_agent
 from jobs.rollout.executors import Executor
 from jobs.rollout.policies import EvaluatedPolicy, find_policies, with_sensor

@@ -2,7 +2,7 @@ import pytest
 from matplotlib.collections import PathCollection
 
 from jobs.analysis.statistics import Difference, Estimate
-from jobs.measure.trade.page import (
+from jobs.measure.trade_page import (
     ALL,
     SETTING_FIELDS,
     Outcome,

@@ -1,1 +1,0 @@
-"""Encoders compared: what each costs, and what it keeps."""

@@ -1,1 +1,0 @@
-"""Speed against accuracy, from one end to the other."""

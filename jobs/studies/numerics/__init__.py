@@ -1,1 +1,0 @@
-"""What the numbers do at the ends of their ranges."""
