@@ -11,4 +11,5 @@ from core.target import fix_target
 
 __all__ = ["fix_target", "forget_stale_kernels"]
 
+fix_target()
 forget_stale_kernels(Path(__file__).parent)
