@@ -19,10 +19,11 @@ import numpy as np
 
 from benchmarks.timing import interleaved
 from envs.rasterize import PyrenderRenderer
-from envs.raycast import RaycastRenderer, sample_luminance
+from envs.raycast import RaycastRenderer
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture
 from envs.scene.obstacles import KINDS
 from jobs.analysis.tables import show_table
+from tests.support.point_samples import sample_luminance
 
 ROUNDS = 9
 PATH_M = np.linspace(0.0, 90.0, 30)

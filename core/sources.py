@@ -6,13 +6,14 @@ import json
 import os
 import pickle
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 INDEX = "kernels.json"  # in the `__pycache__` of a package
 IMPORT = r"(?:from|import) +({}(?:\.\w+)*)(?: +import +(\([^)]*\)|[^\n]*))?"
 
 
-def forget_stale_kernels(folder: Path) -> None:
+def forget_stale_kernels(folder: Path, *used: Path) -> None:
     """Delete compiled kernels that are truncated, or whose sources have changed.
 
     The sources of a kernel are its file, the files of its package that this file imports, directly or not,
@@ -23,9 +24,10 @@ def forget_stale_kernels(folder: Path) -> None:
 
     Args:
         folder: The package, such as `envs`. Its `__pycache__/kernels.json` holds the hashes of the sources.
+        used: Other packages; an edit in one of them concerns every kernel of `folder`.
     """
     index = folder / "__pycache__" / INDEX
-    now = _digests(folder)
+    now = _digests(folder, (Path(__file__).parent, *used))
     # Another process may be faster, or the folder not ours: numba then decides.
     with contextlib.suppress(OSError):
         try:
@@ -44,9 +46,9 @@ def forget_stale_kernels(folder: Path) -> None:
             part.replace(index)
 
 
-def _digests(folder: Path) -> dict[str, str]:
-    """Return a hash for each file of a package: of the file, of what it imports from there, and of `core`."""
-    core = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+def _digests(folder: Path, used: Sequence[Path]) -> dict[str, str]:
+    """Return a hash for each file of a package: of the file, its imports from there, and all of `used`."""
+    shared = b"".join(path.read_bytes() for room in used for path in sorted(room.rglob("*.py")))
     sources = {path: path.read_bytes() for path in folder.rglob("*.py")}
     imports = {path: _imports(folder, text.decode()) & sources.keys() for path, text in sources.items()}
     hashes = {path: hashlib.sha256(text).digest() for path, text in sources.items()}
@@ -57,7 +59,7 @@ def _digests(folder: Path) -> dict[str, str]:
             new = imports[ahead.pop()] - reached
             reached |= new
             ahead += new
-        parts = core + b"".join(hashes[source] for source in sorted(reached))
+        parts = shared + b"".join(hashes[source] for source in sorted(reached))
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(parts).hexdigest()
     return digests
 

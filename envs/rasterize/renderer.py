@@ -6,7 +6,7 @@ only the OpenGL context; `envs.rasterize.context` says what is replaced in it. O
 imported before a renderer is made. A renderer belongs to the process that made it; it may be
 used from any thread, one at a time.
 
-At the same sample points the picture is that of `raycast.sample_luminance` but for the edges,
+At the same sample points the picture equals that of `tests.support.point_samples` but for the edges,
 which a rasteriser rounds to 1/256 pixel, and for the polygons that stand for the rims of poles
 and the outlines of ellipsoids. `raycast` says what is seen from where.
 """

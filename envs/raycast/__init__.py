@@ -1,5 +1,5 @@
 """The analytic renderer: exact coverage of every pixel, column by column, without a GPU."""
 
-from envs.raycast.renderer import RaycastRenderer, sample_luminance
+from envs.raycast.renderer import RaycastRenderer
 
-__all__ = ["RaycastRenderer", "sample_luminance"]
+__all__ = ["RaycastRenderer"]

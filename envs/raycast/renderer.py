@@ -19,7 +19,6 @@ import numpy as np
 from envs.checks import check_image, check_pose
 from envs.raycast.columns import make_workspace, render_way
 from envs.raycast.noise import NO_NOISE, tabulate_ground, waves_of
-from envs.raycast.point_samples import shade_hits, trace_scene
 from envs.raycast.records import BODY, FRAME, Noise
 from envs.scene import CONE, ELLIPSOID, Scene, Texture
 from envs.scene.textures import PATTERNS, around
@@ -187,26 +186,3 @@ class RaycastRenderer:
             x_m, y_m, z_m, yaw_rad, t_s = poses[bad].tolist()
             check_pose((x_m, y_m, z_m, yaw_rad), t_s)
         return np.ascontiguousarray(columns.swapaxes(1, 2))
-
-
-def sample_luminance(
-    scene: Scene,
-    pose: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    fov_deg: float = 90.0,
-    samples: int = 1,
-    t_s: float = 0.0,
-) -> np.ndarray:
-    """Mean of samples x samples point samples per pixel, without anti-aliasing; 1: pixel centres.
-
-    Args and result as for `RaycastRenderer.render`, with `pose` = (x, y, z [m], yaw [rad]).
-    What any rasteriser computes at the same points, and the limit the exact image must agree
-    with; each ray is intersected with each body, by code that shares nothing with it.
-    """
-    check_image(width, height, fov_deg, samples)
-    check_pose(pose, t_s)
-    _check_scene(scene)
-    focal = focal_length(width * samples, fov_deg)
-    points = shade_hits(scene, trace_scene(scene, pose, width * samples, height * samples, focal), t_s)
-    return points.reshape(height, samples, width, samples).mean(axis=(1, 3)).astype(np.float32)

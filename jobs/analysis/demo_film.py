@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from core.pictures import grey_picture
 from jobs.analysis.ground_plan import ground_plan
 from jobs.analysis.plots import COLOURS, INK
 from jobs.analysis.video import Decode, coloured, open_film, signs
 from jobs.rollout.episodes import outcome_of
 from jobs.rollout.recorded import Moment, RecordedEpisode
-from models.policy.features import grey_picture
 
 WIDTH, SIDE, GAP, HEAD, LINE = 1248, 320, 16, 44, 26  # pixels
 MARGIN_M, SIDES_M = 2.0, 14.0  # shown before start and behind goal; beside the way

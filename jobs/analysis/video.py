@@ -10,11 +10,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from core.files import replaced
-from core.pictures import GREY_OFF, GREY_ON
+from core.pictures import GREY_OFF, GREY_ON, grey_picture
 from envs.events import event_image
 from jobs.analysis.plots import EVENT_COLOURS, INK
 from jobs.run.files import RunError
-from models.policy.features import grey_picture
 
 ZOOM, GAP, BAR = 5, 12, 40
 FILM_FPS, FRAMES_PER_FLIGHT_S = 25, 50

@@ -18,7 +18,7 @@ from envs.event_error import measure_event_error
 from envs.events import EVENT, EventCamera, apply_faults, draw_pixel_faults
 from envs.events.photoreceptor import MAX_LUMINANCE
 from envs.kinematics import clock_us, planned_position
-from envs.raycast import RaycastRenderer, sample_luminance
+from envs.raycast import RaycastRenderer
 from envs.scene import make_scene
 from jobs.analysis.statistics import crossed_difference, rate_estimate
 from models.encoder.evae import EventVAE
@@ -26,6 +26,7 @@ from models.encoder.event_batch import batch_windows
 from models.encoder.table import EncoderTable
 from models.kinds import DenseModel, PolicySpec
 from models.policy.memory import remember
+from tests.support.point_samples import sample_luminance
 
 MAX_T_US = 2**51  # of an episode [us], 71 years
 FLOOR = 1e-3  # the camera's default luminance floor

@@ -3,10 +3,10 @@
 import numpy as np
 
 from benchmarks.latency import random_policy
-from envs.raycast.renderer import sample_luminance
 from envs.scene import make_scene
 from jobs.run import compile
 from tests.support.looks import HEIGHT, WIDTH, Looker
+from tests.support.point_samples import sample_luminance
 
 
 def main() -> None:

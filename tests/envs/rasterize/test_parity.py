@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 from envs.rasterize import PyrenderRenderer
-from envs.raycast import sample_luminance
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture, make_scene
 from envs.scene.obstacles import KINDS
 from envs.scene.textures import PATTERNS
 from envs.scene.triangles import to_trimesh
+from tests.support.point_samples import sample_luminance
 
 EMPTY = np.zeros(0, OBSTACLE)
 PLACES = [(x, y) for y in range(8, 90, 9) for x in (-10, -3, 4, 11)]

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from envs.raycast import RaycastRenderer, sample_luminance
+from envs.raycast import RaycastRenderer
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture, make_scene
+from tests.support.point_samples import sample_luminance
 
 KINDS = (POLE, CONE, ELLIPSOID, BOX)
 AHEAD = ((0.3, 0.0, 2.0, 0.0), (-4.0, 30.0, 2.0, 0.2), (6.0, 55.0, 1.0, -0.5), (0.0, 60.0, 2.0, 3.0))

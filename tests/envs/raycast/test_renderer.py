@@ -4,8 +4,9 @@ import math
 import numpy as np
 import pytest
 
-from envs.raycast import RaycastRenderer, sample_luminance
+from envs.raycast import RaycastRenderer
 from envs.scene import OBSTACLE, Scene, make_scene
+from tests.support.point_samples import sample_luminance
 
 
 def poles(*rows: tuple[float, float, float, float]) -> np.ndarray:
@@ -181,8 +182,6 @@ def test_a_scene_or_an_image_that_cannot_be_drawn_is_refused():
     )
     with pytest.raises(ValueError, match="pyrender"):
         RaycastRenderer(Scene("hand", poles(), mesh=triangle), 8, 8)
-    with pytest.raises(ValueError, match="pyrender"):
-        sample_luminance(Scene("hand", poles(), mesh=triangle), (0, 0, 2, 0), 8, 8)
     with pytest.raises(ValueError, match="cull_m"):
         RaycastRenderer(Scene("hand", poles()), 8, 8, cull_m=math.nan)
     with pytest.raises(ValueError, match="t_s"):

@@ -4,8 +4,9 @@ import math
 import numpy as np
 import pytest
 
-from envs.raycast import RaycastRenderer, sample_luminance
+from envs.raycast import RaycastRenderer
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture
+from tests.support.point_samples import sample_luminance
 
 PATTERNS = ("checker", "stripes", "rings", "noise")
 POSES = ((0.3, 0.0, 2.0, 0.0), (-4.0, 14.0, 2.5, 0.4), (3.0, 40.0, 1.0, -2.2), (-13.0, 20.0, 5.0, 1.3))

@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from envs.raycast.point_samples import BODY, trace_scene
 from envs.scene import OBSTACLE, POLE, Scene, make_scene
 from envs.scene.range_scan import MAX_RANGE_M, NEAR_M, proximity, sector_bearings
+from tests.support.point_samples import BODY, trace_scene
 
 
 def pole(x, y, radius=0.5):

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from envs.raycast import RaycastRenderer, sample_luminance
+from envs.raycast import RaycastRenderer
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Layout, Scene, make_scene
 from envs.scene.layouts import draw_obstacles
 from envs.scene.shapes import SHAPES, Shape
+from tests.support.point_samples import sample_luminance
 
 each_shape = pytest.mark.parametrize("shape", SHAPES)
 

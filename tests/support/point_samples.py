@@ -7,14 +7,19 @@ with the column renderer, which is why it serves as its truth. Input is assumed 
 """
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
+import envs
+from core import forget_stale_kernels
+from envs.raycast.renderer import focal_length
 from envs.scene import CONE, ELLIPSOID, POLE, Scene
 from envs.scene.textures import around, pattern_points
 
+forget_stale_kernels(Path(__file__).parent, Path(envs.__file__).parent)
 SKY, GROUND, WALL, BODY = range(4)  # what a ray hits
 kernel = numba.njit(cache=True, error_model="numpy")
 
@@ -281,3 +286,22 @@ def _coordinates(scene: Scene, hits: Hits, where: np.ndarray) -> tuple[np.ndarra
         s = np.where(sides, bodies["x"] + turns[hits.thing[where]] * azimuth, s)
         q = np.where(sides, bodies["y"] + z, q)
     return s, q
+
+
+def sample_luminance(
+    scene: Scene,
+    pose: tuple[float, float, float, float],
+    width: int,
+    height: int,
+    fov_deg: float = 90.0,
+    samples: int = 1,
+    t_s: float = 0.0,
+) -> np.ndarray:
+    """Return the mean of samples x samples point samples per pixel, without anti-aliasing; 1: pixel centres.
+
+    Arguments and result as for `RaycastRenderer.render`, with `pose` = (x, y, z [m], yaw [rad]). A rasteriser
+    computes the same at the same points, and the exact image agrees in the limit of many samples.
+    """
+    focal = focal_length(width * samples, fov_deg)
+    points = shade_hits(scene, trace_scene(scene, pose, width * samples, height * samples, focal), t_s)
+    return points.reshape(height, samples, width, samples).mean(axis=(1, 3)).astype(np.float32)
