@@ -34,7 +34,7 @@ the sweep.
 rules. `numba` kernels that decide an event use no fast-math, clocks and sums have 64 bits, and luminance is
 float32.
 
-`python -m tests.numerics.page` wrote this page on {date} at commit {commit}.
+Measured on {date} at commit {commit}; `python -m tests.numerics.page` (`make numerics`) measures again.
 """
 
 
