@@ -50,7 +50,7 @@ setup-all: setup ## compile the other kernels, too, which otherwise compile when
 	@$(BIN)/python -m jobs.run.compile all
 
 $(INSTALLED): requirements.lock pyproject.toml
-	@test -x $(BIN)/python -o -n "$(PYTHON)" || { echo "Evade needs Python 3.11, 3.12 or 3.13: see docs/install.md"; exit 1; }
+	@test -x $(BIN)/python -o -n "$(PYTHON)" || { echo "Evade needs Python 3.11, 3.12 or 3.13: see docs/start.md#install"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python platform/install.py requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
@@ -162,7 +162,9 @@ bench: setup $(DEVELOPING) ## measure the speed of the parts, and what accuracy 
 bench-clone: setup ## measure how long a new user waits, from an empty clone to each first result, on an idle machine
 	$(BIN)/python -m benchmarks.from_clone $(ARGS)
 
-docs: setup $(DEVELOPING) ## build this site in docs/_build/html; a broken link or docstring stops it
+docs: setup $(DEVELOPING) ## build this site in docs/_build/html; a broken link, a stale table or a long sentence stops it
+	$(BIN)/python -m docs.tables --check
+	$(BIN)/python -m docs.reading --check
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html $(ARGS)
 
 dist: setup-all $(DEVELOPING) ## build the wheel dist/evade-*.whl: environment, camera, recordings, policies, compiled kernels

@@ -9,7 +9,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from docs.keys import allowed, tables  # noqa: E402
+from docs.contents import BELOW, CONTENTS, toctree  # noqa: E402
+from docs.keys import allowed  # noqa: E402
 
 project = "Evade"
 copyright = "The Evade authors"
@@ -30,7 +31,6 @@ autodoc_typehints_format = "short"
 maximum_signature_line_length = 80
 napoleon_use_ivar = True
 html_extra_path = ["replay.html", "films"]  # written by commands, as the figures are
-WRITTEN_LATER = ("install", "camera", "tune", "plugins", "results_tables", "dose_response", "ablation")
 exclude_patterns = ["_build", "_templates"]
 
 
@@ -68,19 +68,22 @@ def _is_settings(obj):
 
 
 def _fill_in(app, docname, source):
-    """Put the tables of keys, which the schema gives, into their page; list pages that are there."""
-    if docname == "keys":
-        source[0] += tables()
+    """Add the contents to the pages that head them; lead the table of modules to the site's own pages."""
+    there = app.env.found_docs
     if docname == "index":
-        lines = source[0].splitlines()
-        source[0] = "\n".join(
-            line for line in lines if line not in WRITTEN_LATER or line in app.env.found_docs
-        )
+        trees = [
+            toctree(tuple(page for page in own if page in there), name) for name, own in CONTENTS.items()
+        ]
+        source[0] += "\n" + "\n".join(trees)
+    elif docname in BELOW:
+        source[0] += "\n\n" + toctree(tuple(page for page in BELOW[docname] if page in there))
+    if docname == "api":
+        source[0] = re.sub(r"\[`([\w.]+)`\]\(\.\./[^)]+\)", r"[`\1`](api/\1.rst)", source[0])
 
 
 def _read_again(*_):
-    """The contents, which depend on what other pages there are, and the keys, on the schema."""
-    return ["index", "keys"]
+    """The contents, which depend on what other pages there are."""
+    return ["index", *BELOW]
 
 
 def setup(app):

@@ -1,4 +1,4 @@
-"""Roll out shipped policies for docs/gallery.md, and keep the films small.
+"""Roll out shipped policies for docs/watch.md, and keep the films small.
 
 Run from the repository root: python -m docs.draw_films [NAME ...]
 Writes docs/films/NAME.mp4, 720 pixels wide, and docs/images/demo.gif for
@@ -35,8 +35,8 @@ FAILURES = {
     "fails_late": ("env.action_delay_ms=100",),
 }
 AT_ONCE, CORRIDORS = 20, 100  # in which a failure is looked for
-# Of the frames of a demo, 50 a second, keep each fifth and show 10 a second: the same speed.
-SMALL = ("-vf", "select=not(mod(n\\,5)),setpts=N/10/TB,scale=720:-2", "-r", "10", "-crf", "33", "-an")
+# 10 frames a second at the speed of the demo, whatever its own rate; the last frame stays.
+SMALL = ("-vf", "tpad=stop_mode=clone:stop_duration=0.3,fps=10,scale=720:-2", "-crf", "33", "-an")
 MOVING = (
     "select=not(mod(n\\,6)),setpts=N*0.12/TB,scale=600:-2,split[a][b];[a]palettegen=max_colors=40:stats_mode=diff[p];"
     "[b][p]paletteuse=dither=none:diff_mode=rectangle"
@@ -56,6 +56,9 @@ def main() -> None:
             (film,) = Path(place).glob("*/demo/*.mp4")
             small = [ffmpeg, "-v", "error", "-y", "-i", str(film)]
             subprocess.run([*small, *SMALL, str(DOCS / "films" / f"{name}.mp4")], check=True)
+            still = ("-frames:v", "1", "-q:v", "5", str(DOCS / "_static" / f"{name}.jpg"))
+            cut = [ffmpeg, "-v", "error", "-y", "-ss", "1", "-i", str(DOCS / "films" / f"{name}.mp4")]
+            subprocess.run([*cut, *still], check=True)
             if name == "poles":
                 subprocess.run(
                     [*small, "-vf", MOVING, "-r", "25/3", str(DOCS / "images" / "demo.gif")], check=True

@@ -1,4 +1,4 @@
-"""Draw every scene for docs/scenes.md and print the numbers of its table.
+"""Draw every scene for docs/task.md#worlds and print the numbers of its table.
 
 Run from the repository root: python docs/draw_scenes.py [NAME ...]
 Writes docs/images/scene_NAME.png, three panels each: the corridor from above the start, what

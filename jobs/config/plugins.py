@@ -2,7 +2,7 @@
 
 A plug-in is a file, the folder of a package, or an installed module. Importing it adds rows to `LAYOUTS`,
 `ADDED_FAULTS` and `KINDS`, in which every job looks names up. The key `plugins` names them; Ray ships their
-code to each worker, which imports them before it does anything else (docs/plugins.md).
+code to each worker, which imports them before it does anything else (docs/extend.md).
 """
 
 import hashlib

@@ -73,7 +73,7 @@ def _best_policy(about: SweepFacts, episodes: SweptEpisodes, changes: Sequence[C
     least = int(by_condition.argmin())
     unchanged = 100 * episode_values(episodes[nominal, best], "success").mean()
     return [
-        f"Take [`{best}`](policies.md){NOTES.get(best, '')}: {unchanged:.0f} % with nothing changed, "
+        f"Take [`{best}`](train.md){NOTES.get(best, '')}: {unchanged:.0f} % with nothing changed, "
         f"{by_condition.mean():.0f} % as the mean of all conditions; its worst is "
         f"{condition_text(*every[least])}, {by_condition[least]:.0f} %. "
         f"{_lead({group: own.mean(axis=0) for group, own in rates.items()}, best)}"

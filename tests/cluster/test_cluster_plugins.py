@@ -9,7 +9,7 @@ from tests.support.clusters import SMALL, on
 from tests.support.faults import SWEEP, launch
 
 pytestmark = pytest.mark.cluster
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "extend.md"
 AXES = "+sweep.axes={spot: {faults.added.blind_spot: [0.0, 0.5]}, world: {env.scene: [forest]}}"
 WORDS = (*SWEEP, "~sweep.axes", AXES, "sweep.policies=[bytestream-s0,straight]")
 

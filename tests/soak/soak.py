@@ -32,9 +32,8 @@ from tests.soak.processes import adopt_orphans, end_all, living, reap
 from tests.soak.report import Event, Summary, markdown, write_page
 from tests.soak.watch import Watch, plot, size_mb, slope_mb_per_hour
 from tests.soak.workload import End, Lane
-from tests.support.faults import ROOT, descendants
+from tests.support.faults import descendants
 
-PICTURE = "![Memory, open files and disk over the soak](images/soak.png)"
 GOING_ON_S = 420.0  # after a fault; a server that was away, and a Ray that starts again, take minutes
 ROUND_S = 1800.0  # of an undisturbed round, at most, and until the last rounds are complete
 DISK_MIB = 256  # of the file system that the runs are on
@@ -360,8 +359,7 @@ def close(soak: Soak, out: Path, given: dict[str, str]) -> int:
     figure.savefig(out / "soak.png", dpi=120)
     (out / "report.md").write_text(text)
     if given["page"]:
-        write_page(Path(given["page"]), f"{text}\n{PICTURE}\n")
-        shutil.copy(out / "soak.png", ROOT / "docs" / "images" / "soak.png")
+        write_page(Path(given["page"]), text)
     print(text, flush=True)
     wrong = bool(findings) or not all(event.well for event in soak.events)
     return int(wrong)

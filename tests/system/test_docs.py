@@ -26,9 +26,10 @@ from tests.support.filled_store import fill
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
-# `+exp=NAME` and words behind it, up to what ends a command on a page.
+# `+exp=NAME` or `evade NAME`, and words behind it, up to what ends a command on a page.
 WORD = r"(?:'[^']*'|\"[^\"]*\"|[^\s`#|;)'\"])+"
-LAUNCHED = re.compile(rf"(?<!\w)(\+exp=[a-z_]+(?:[ \t]+(?=[\w.~+'\"]+[=.]){WORD})*)")
+WORDS = rf"(?:[ \t]+(?=[\w.~+'\"]+[=.]){WORD})*"
+LAUNCHED = re.compile(rf"(?<!\w)(\+exp=[a-z_]+{WORDS})|(?:^|`|\n)evade ([a-z][a-z_]+{WORDS})")
 MADE = {"bytestream": "+exp=bytestream", "sweep-robustness": "+exp=robustness", "demo": "+exp=demo"}
 ARGS = re.compile(r"make (bytestream|sweep-robustness|demo)(?: train=true)? ARGS=\"([^\"]*)\"")
 NAMES = re.compile(r"`((?:envs|models|jobs)(?:\.\w+)+)`")
@@ -51,7 +52,7 @@ def commands() -> list[str]:
     found: dict[str, None] = {}
     for page in PAGES:
         text = page.read_text().replace("\\\n", " ")
-        found |= dict.fromkeys(match[1].strip() for match in LAUNCHED.finditer(text))
+        found |= dict.fromkeys((match[1] or f"+exp={match[2]}").strip() for match in LAUNCHED.finditer(text))
         found |= dict.fromkeys(f"{MADE[target]} {words}" for target, words in ARGS.findall(text))
     return [words for words in found if "plugins=" not in words]  # tests/system/test_plugins.py gives those
 

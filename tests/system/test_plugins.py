@@ -15,7 +15,7 @@ from models.policy.policy import PolicyFileError
 pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
 EVADE = Path(sys.executable).parent / "evade"
-PLUGIN = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL)[1]
+PLUGIN = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "extend.md").read_text(), re.DOTALL)[1]
 TRAIN = (
     *("+exp=event_columns", "name=halves", "model.name=halves", "model.hidden=[]"),
     *("env.scene=forest", "+faults.added.blind_spot=0.3", "env.time_limit_s=1.0"),

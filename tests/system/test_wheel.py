@@ -11,7 +11,7 @@ import pytest
 
 pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLE = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "install.md").read_text(), re.DOTALL)[1]
+EXAMPLE = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
 # Raised before a meta path finder is asked, as if the package were not installed.
 ABSENT = (
     "ray",

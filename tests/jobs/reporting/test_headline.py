@@ -1,31 +1,14 @@
 import csv
-import dataclasses
 import re
-from collections import Counter
 
 import pytest
 
-from jobs.config.conditions import NOMINAL
-from jobs.config.config import parse
 from jobs.evaluation.group_stats import episode_values
-from jobs.evaluation.sweep_plan import axes_of, same_simulations
 from jobs.reporting.breaks import changes_of
-from jobs.reporting.claims_study import BY_PPO, TAUGHT, read_findings
-from jobs.reporting.dose_response import DOSES, compare_kinds, read_doses
-from jobs.reporting.dose_taught import (
-    DOSES_TAUGHT,
-    ERRORS,
-    FILTERS,
-    error_changes,
-    filter_changes,
-    judge,
-    mean_success,
-)
 from jobs.reporting.headline import BEGIN, COLUMNS, END, headline_table, with_headline
 from jobs.reporting.sweep_data import read_data, replaced_text
 from jobs.run.files import RunError
 from jobs.run.provenance import REPOSITORY
-from tests.support.configs import compose
 from tests.support.episodes import flights
 
 TRAININGS = REPOSITORY / "docs" / "data" / "robustness_trainings.csv"
@@ -76,8 +59,8 @@ def test_a_page_without_its_marks_is_refused(tmp_path):
         with_headline(page, "| new |\n")
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/robustness.md"])
-def test_published_rows_are_those_of_the_published_data(page):
+def test_published_rows_are_those_of_the_published_data():
+    page = "docs/robustness.md"
     rates = {}
     with TRAININGS.open() as file:
         for row in csv.DictReader(file):
@@ -94,18 +77,6 @@ def test_published_rows_are_those_of_the_published_data(page):
                 assert span == (ends if len(ends) > 1 else []), (group, heading)
 
 
-@pytest.mark.parametrize(
-    "page", ["README.md", "docs/index.md", "docs/start.md", "docs/robustness.md", "docs/commands.md"]
-)
-def test_pages_say_how_many_conditions_of_the_sweep_differ(page):
-    config = parse(compose("+exp=robustness"))
-    env = dataclasses.replace(config.env, scene=config.sweep.scene)
-    differ = set(same_simulations(env, axes_of(config.sweep)).values())
-    assert f"under {len(differ)} conditions" in (REPOSITORY / page).read_text().replace(
-        "policies under", "under"
-    )
-
-
 @pytest.fixture(scope="module")
 def sweep():
     """The published sweep: what made it, and its episodes."""
@@ -118,104 +89,6 @@ def success(sweep, at, group):
 
 def trained(about):
     return {group for group, seeds in about["groups"].items() if None not in seeds}
-
-
-def test_what_the_readme_says_below_its_table_is_what_the_data_say(sweep):
-    """Noise costs the five groups that never met it; nine of eleven fail on textures; one holds."""
-    about, _ = sweep
-    groups = trained(about)
-    faults = {"sparsity", "background_activity", "sensor_noise"}
-    met = {group for axis, _, group in about["met"] if axis in faults}
-    unprepared = {one for one in groups - met if one.startswith("bytestream") or one == "event_set"}
-    assert len(unprepared) == 5
-    for group in unprepared:
-        noisy = [success(sweep, COLUMNS[name], group) for name in ("10 % false events", "noise by night")]
-        assert min(noisy) < success(sweep, COLUMNS["nothing changed"], group) / 2, group
-    below = [success(sweep, COLUMNS["other textures"], group) < 0.5 for group in groups]
-    assert (sum(below), len(below)) == (9, 11)
-    held = {name: success(sweep, at, "bytestream_hold") for name, at in COLUMNS.items()}
-    assert round(100 * held.pop("actions 100 ms late")) == 66
-    assert min(held.values()) > 0.94
-
-
-def test_what_the_front_page_says_of_taught_policies_is_what_the_data_say():
-    findings = read_findings(TRAININGS.parent, TAUGHT)
-    verdicts = [one.verdict for one in findings.values()]
-    reversed_m = [-one.overall.value for one in findings.values() if one.verdict == "reversed"]
-    text = " ".join((REPOSITORY / "docs" / "index.md").read_text().split())
-    assert (
-        f"{verdicts.count('equivalent')} of {len(findings)} tests of the paper's claims show no difference"
-        in text
-    )
-    assert "none holds, and 2 are reversed" in text
-    assert "holds" not in verdicts
-    assert f"lose {min(reversed_m):.0f} and {max(reversed_m):.0f} m more" in text
-    assert len(reversed_m) == 2
-
-
-def test_what_the_front_page_says_of_the_claims_by_ppo_is_what_the_data_say():
-    findings = read_findings(TRAININGS.parent, BY_PPO)
-    count = Counter(one.verdict for one in findings.values())
-    text = " ".join((REPOSITORY / "docs" / "index.md").read_text().split())
-    (turned,) = [(claim, one) for claim, one in findings.items() if one.verdict == "reversed"]
-    assert turned[0].ours == "bytestream_xy"
-    assert (
-        f"for {count['does not hold']} a gain that matters is excluded, {count['equivalent']} show no "
-        f"difference that matters, 1 is reversed (false events cost `bytestream_xy` "
-        f"{-turned[1].overall.value:.0f} m more than `event_image`), {count['undecided']} stay undecided."
-    ) in text
-    assert f"none of {len(findings)} tests of the paper's claims holds, either" in text
-    assert "holds" not in count
-    _, episodes = read_data(TRAININGS.parent, BY_PPO)
-    unchanged = (NOMINAL, "poles_eval")
-    ours, theirs = (
-        100 * episode_values(episodes[unchanged, group], "success").mean()
-        for group in ("bytestream", "event_image")
-    )
-    assert f"`bytestream` reaches {ours:.0f} % and `event_image` {theirs:.0f} %" in text
-
-
-def test_what_readme_and_front_page_say_of_kinds_of_wrong_events_is_what_the_data_say():
-    broken = {}
-    for change in changes_of(*read_data(TRAININGS.parent, DOSES), every=True):
-        broken.setdefault(change.condition[0], []).extend(change.broken.tolist())
-    assert (sum(broken["invented"]), len(broken["invented"])) == (42, 88)
-    others = [lost for kind in ("lost", "displaced", "flipped") for lost in broken[kind]]
-    assert (sum(others), len(others)) == (0, 264)
-    text = " ".join((REPOSITORY / "docs" / "index.md").read_text().split())
-    assert all(said in text for said in ("42 of 88", "none of 264"))
-
-
-def test_what_is_said_of_displaced_and_invented_events_is_what_ten_taught_trainings_say():
-    success = mean_success(*read_data(TRAININGS.parent, DOSES_TAUGHT))
-    changes, filters = error_changes(success), filter_changes(success)
-    errors, filtered = judge(changes, ERRORS), judge(filters, FILTERS)
-    lost = {group: -100 * one.difference.value for (group, kind), one in errors.items() if kind == "invented"}
-    others = [one for (_, kind), one in errors.items() if kind != "invented"]
-    assert {one.verdict for one in others} == {"free"}
-    assert min(one.difference.interval[0] for one in others) > -0.06
-    said = (
-        f"lose on average {lost['event_image']:.0f} points (`event_image`), "
-        f"{lost['bytestream']:.0f} (`bytestream`) and"
-    )
-    doses = read_doses(TRAININGS.parent / f"{DOSES_TAUGHT}_doses.csv")
-    latest = max(100 * dose.measured for dose in doses if dose.kind == "jittered")
-    gained = [100 * one.difference.value for one in filtered.values() if one.verdict == "helps"]
-    harmless = [one.verdict for (_, kind), one in filtered.items() if kind != "invented"]
-    assert set(harmless) == {"equal"}
-    verdicts = [one.verdict for one in (*errors.values(), *filtered.values(), *compare_kinds(changes))]
-    pages = {
-        name: " ".join((REPOSITORY / name).read_text().split()) for name in ("README.md", "docs/index.md")
-    }
-    for text in pages.values():
-        assert f"{said} {lost['bytestream_xy']:.0f} (`bytestream_xy`)" in text
-        assert f"with as many lost, displaced or flipped, or up to {latest:.0f} % late" in text
-        assert "fewer than 6, if any," in text
-    front = pages["docs/index.md"]
-    assert f"gives back {min(gained):.0f} to {max(gained):.0f} of these points" in front
-    assert len(gained) == 3
-    assert "undecided" not in verdicts
-    assert f"All {len(verdicts)} tests are decided" in front
 
 
 def test_what_is_left_to_the_policy_that_holds_is_what_the_data_say(sweep):
@@ -253,74 +126,9 @@ def test_the_losses_that_the_page_calls_certain_are_those_of_the_data(sweep):
     assert not [one for one in changes_of(*sweep) if one.certain]
 
 
-def test_what_the_readme_says_of_the_papers_claims_is_what_the_results_say():
-    counted = re.search(
-        r"The paper's (\d+) claims .* make (\d+) tests, .*?: (\d+) undecided, (\d+) do not hold, "
-        r"(\d+) reversed\. None holds\.",
-        (REPOSITORY / "docs" / "results.md").read_text(),
-    )
-    readme = " ".join((REPOSITORY / "README.md").read_text().split())
-    said = re.search(
-        r"Of the paper's (\d+) claims, which make (\d+) tests, \[none is confirmed\]\S+ "
-        r"(\d+) tests are undecided by three "
-        r"trainings a kind, (\d+) do not hold, (\d+) is reversed\.",
-        readme,
-    )
-    assert said.groups() == counted.groups()
-    shown = REPOSITORY / "docs" / "results.md"
-    taught = re.search(
-        r"Of (\d+) of them \S+ taught policies\S+ (\d+) equivalent, (\d+) reversed, (\d+) undecided",
-        shown.read_text(),
-    )
-    told = re.search(
-        r"taught by a planner, decide (\d+) of (\d+): (\d+) show no difference that matters, and (\d+) are "
-        "reversed",
-        readme,
-    )
-    total, equal, turned, open_ = map(int, taught.groups())
-    assert tuple(map(int, told.groups())) == (total - open_, total, equal, turned)
-    by_ppo = re.search(
-        r"Of (\d+) of them \[by PPO\D+ (\d+) do not hold, (\d+) undecided, (\d+) equivalent, (\d+) reversed",
-        shown.read_text(),
-    )
-    told = re.search(
-        r"by PPO decide (\d+) of (\d+): (\d+) do not hold, (\d+) show no difference that matters, "
-        r"and (\d+) is reversed",
-        readme,
-    )
-    total, excluded, open_, equal, turned = map(int, by_ppo.groups())
-    assert tuple(map(int, told.groups())) == (total - open_, total, excluded, equal, turned)
-    assert "Undecided in each of these, 1 of the 20 tests:" in shown.read_text()
-    assert "One test is undecided in all three." in readme
-    assert sum(map(int, said.groups()[2:])) == int(said[2])
-
-
 def test_a_page_about_trainings_that_have_been_replaced_says_so():
     commit, text = "81ef066", (REPOSITORY / "docs" / "dose_response.md").read_text()
     assert commit in text
     assert replaced_text(commit)
     assert replaced_text(commit) in text
     assert replaced_text("0000000") == ""
-
-
-def test_the_front_page_says_of_the_coarse_simulation_what_the_trade_says():
-    """The setting that the trade recommends for speed, in the scene where it gains most."""
-    rows = list(csv.DictReader((TRAININGS.parent / "trade_settings.csv").read_text().splitlines()))
-    text = " ".join((REPOSITORY / "docs" / "index.md").read_text().split())
-    chosen = re.search(
-        r"choose the setting \*(\w+) (.+?)\*", (REPOSITORY / "docs" / "trade.md").read_text()
-    ).groups()
-    (row,) = (
-        row
-        for row in rows
-        if (row["scene"], row["policies"]) == ("shape_change", "all")
-        and (row["knob"], row["setting"]) == chosen
-    )
-    names = ("difference", "difference_low", "difference_high")
-    change, low, high = (100 * float(row[name]) for name in names)
-    said = (
-        f"with {100 * float(row['event_error']):.0f} % of the events wrong, {float(row['speed']):.1f} times "
-        f"as fast in `shape_change`, changes the success of {row['trainings']} trainings (of `bytestream` "
-        f"and `bytestream_hold`) by {change:+.0f} [{low:+.0f}, {high:+.0f}] points"
-    )
-    assert said in text

@@ -39,17 +39,17 @@ def test_policies_are_recommended_by_the_same_conditions_whatever_changes_them(s
         swept[at, "event_image"] = {0: flights(10 if at == MANY else 20)}
     swept[FEW, "bytestream"][0]["steps"][0] += 1
     first = in_short(ABOUT, swept, changes_of(ABOUT, swept), {}, {})[0]
-    assert first.startswith("Take [`event_image`](policies.md): 100 % with nothing changed, 75 % as the mean")
+    assert first.startswith("Take [`event_image`](train.md): 100 % with nothing changed, 75 % as the mean")
 
 
 def test_a_policy_that_was_not_evaluated_unchanged_is_not_recommended(swept):
     about = {**ABOUT, "compared": [*ABOUT["compared"][:2],
                                    {**ABOUT["compared"][2], "baseline": ["sparsity", "0.2"]}]}  # fmt: skip
     first = in_short(about, swept, changes_of(about, swept), {}, {})[0]
-    assert first.startswith("Take [`bytestream`](policies.md): 80 %")
+    assert first.startswith("Take [`bytestream`](train.md): 80 %")
     del swept[NOMINAL, "bytestream"]
     changes = changes_of(about, swept)
-    assert in_short(about, swept, changes, {}, {})[0].startswith("Take [`event_image`](policies.md): 20 %")
+    assert in_short(about, swept, changes, {}, {})[0].startswith("Take [`event_image`](train.md): 20 %")
     assert "| `bytestream` | - |" in breaks_table(about, changes)
     del swept[NOMINAL, "event_image"]
     assert in_short(about, swept, changes_of(about, swept), {}, {})[0].startswith("What breaks most")

@@ -22,7 +22,7 @@ from models.policy.policy import MANIFEST, read_policy_manifest
 from tests.support.configs import CONF, SHORT, compose, make_config
 from tests.support.policies import save_training
 
-# As docs/policies.md says, rounded up.
+# As docs/train.md says, rounded up.
 STEP_BYTES = {"event_columns": 1_600, "event_set": 6_500, "event_image": 12_400, "rgb": 12_400}
 
 

@@ -1,0 +1,151 @@
+"""Write the tables that code and data decide into the pages, so that GitHub shows them as the site does.
+
+Run from the repository root: python -m docs.tables [--check]
+Between `<!-- NAME -->` and `<!-- /NAME -->` of a page stands what the function of that name returns. With
+--check nothing is written, and a page that lags behind stops it.
+"""
+
+import ast
+import csv
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+from docs.keys import tables as key_tables
+from jobs.analysis.tables import markdown_table
+from jobs.reporting.models import models_tables
+from jobs.run.files import write_atomic
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "docs" / "data"
+MODULES = {
+    "The world and its events": (
+        "envs.corridor", "envs.config", "envs.scene", "envs.scene.layouts", "envs.scene.obstacles",
+        "envs.scene.textures", "envs.scene.range_scan", "envs.scene.planning", "envs.raycast",
+        "envs.rasterize", "envs.events", "envs.events.faults", "envs.observations", "envs.kinematics", "envs.fidelity", "envs.event_error", "envs.recordings",
+        "envs.recordings.video",
+    ),
+    "From events to actions": (
+        "models.kinds", "models.encoder.embedding", "models.encoder.context", "models.encoder.evae",
+        "models.encoder.table", "models.encoder.weights", "models.encoder.event_images",
+        "models.encoder.finetuned", "models.policy", "models.policy.features", "models.policy.memory",
+        "models.policy.networks", "models.policy.event_set", "models.policy.onnx",
+    ),
+    "What both use": ("core.neighbour_filter", "core.pictures", "core.files"),
+    "Experiments": (
+        "jobs.config.config", "jobs.config.schema", "jobs.config.conditions", "jobs.rollout.agents",
+        "jobs.rollout.episodes", "jobs.rollout.policies", "jobs.rollout.recorded",
+        "jobs.analysis.statistics", "jobs.analysis.tables", "jobs.tracking.tracker",
+        "jobs.tracking.child_runs", "jobs.tracking.model_registry",
+    ),
+}  # fmt: skip
+# Heading of the README's table -> the condition of the sweep; then its rows.
+CONDITIONS = {
+    "nominal": ("nominal", "poles_eval"),
+    "45 Hz": ("control_hz", "45"),
+    "10 % false events": ("background_activity", "0.1"),
+    "night noise": ("sensor_noise", "5"),
+    "new textures": ("world", "texture_change"),
+    "100 ms late": ("action_delay", "100"),
+}
+POLICIES = {
+    "bytestream_hold": "`bytestream_hold` (imitation, domain randomization)",
+    "bytestream_robust": "`bytestream_robust` (PPO, domain randomization)",
+    "bytestream": "`bytestream` (PPO, frozen event VAE)",
+    "event_image": "`event_image` (PPO, CNN on event images)",
+    "straight": "straight ahead",
+}
+
+
+def source_of(module: str) -> Path:
+    """Return the file of a module, relative to the repository root."""
+    path = Path(*module.split("."))
+    return path.with_suffix(".py") if (ROOT / path.with_suffix(".py")).is_file() else path / "__init__.py"
+
+
+def api_table() -> str:
+    """Return the modules of the API with the first line of each docstring, linked to their sources."""
+    text = []
+    for section, modules in MODULES.items():
+        rows = []
+        for module in modules:
+            said = ast.get_docstring(ast.parse((ROOT / source_of(module)).read_text())) or ""
+            rows.append((f"[`{module}`](../{source_of(module)})", said.partition("\n")[0]))
+        text += [f"## {section}\n", markdown_table(("module", "what it does"), rows, 2)]
+    return "\n".join(text)
+
+
+def modules_page() -> str:
+    """Return the page from which the site makes a page of each module."""
+    blocks = [
+        f"{section}\n{'-' * len(section)}\n\n.. autosummary::\n   :toctree: api\n\n"
+        + "\n".join(f"   {module}" for module in modules)
+        for section, modules in MODULES.items()
+    ]
+    return "\n\n".join(["All modules\n===========", *blocks]) + "\n"
+
+
+def success_table() -> str:
+    """Return the README's table: success [%] of some groups under some conditions, means over seeds."""
+    rates: dict[tuple[str, ...], list[float]] = defaultdict(list)
+    with (DATA / "robustness_trainings.csv").open() as file:
+        for row in csv.DictReader(file):
+            rates[row["Axis"], row["Value"], row["Group"]].append(100 * float(row["success_rate"]))
+    means = {at: sum(own) / len(own) for at, own in rates.items()}
+    rows = [
+        (named, *(f"{means[(*at, group)]:.0f}" for at in CONDITIONS.values()))
+        for group, named in POLICIES.items()
+    ]
+    return markdown_table(("policy", *CONDITIONS), rows)
+
+
+TABLES: dict[str, dict[str, Callable[[], str]]] = {
+    "README.md": {"success": success_table},
+    "docs/keys.md": {"keys": key_tables},
+    "docs/api.md": {"modules": api_table},
+    "docs/models.md": {name: lambda name=name: models_tables()[name] for name in ("robustness", "taught")},  # type: ignore[misc]
+}
+
+
+def filled(text: str, name: str, table: str) -> str:
+    """Return a page with a table between its marks.
+
+    Raises:
+        ValueError: The page lacks the marks.
+    """
+    found = re.subn(
+        f"(<!-- {name} -->\n).*?(<!-- /{name} -->)",
+        lambda marks: f"{marks[1]}\n{table.strip()}\n\n{marks[2]}",
+        text,
+        flags=re.DOTALL,
+    )
+    if found[1] != 1:
+        raise ValueError(
+            f"the page must have <!-- {name} --> and <!-- /{name} --> once, got {found[1]} times"
+        )
+    return found[0]
+
+
+def pages() -> dict[str, str]:
+    """Return each page with tables, as it has to be: path -> text."""
+    found = {"docs/modules.rst": modules_page()}
+    for page, tables in TABLES.items():
+        text = (ROOT / page).read_text()
+        for name, table in tables.items():
+            text = filled(text, name, table())
+        found[page] = text
+    return found
+
+
+def stale() -> list[str]:
+    """Return the pages whose tables are not those of today's code and data."""
+    return [page for page, text in pages().items() if (ROOT / page).read_text() != text]
+
+
+if __name__ == "__main__":
+    if "--check" in sys.argv:
+        sys.exit("\n".join(f"{page}: run python -m docs.tables" for page in stale()) or 0)
+    for page, text in pages().items():
+        write_atomic(ROOT / page, text)

@@ -1,0 +1,184 @@
+"""Numbers of the README and of the first pages are those of data, configuration and code."""
+
+import csv
+import gzip
+import json
+import re
+from collections import defaultdict
+
+import pytest
+
+from docs.tables import DATA, ROOT, stale
+from envs.recordings import write_events
+from jobs.config.config import parse
+from jobs.evaluation.sweep_plan import plan_sweep
+from jobs.reporting.models import MANIFEST, shipped_groups, success_rates
+from jobs.rollout.policies import BASELINES, PRETRAINED, find_sweep_policies
+from jobs.run.folder import locate_run
+from models.kinds import KINDS
+from tests.support.configs import compose
+
+TIMES = json.loads((DATA / "times.json").read_text())
+# Command -> the pages that say how long it takes.
+TIMED = {
+    "make setup": ("README.md", "docs/index.md", "docs/start.md"),
+    "make demo": ("README.md", "docs/index.md", "docs/start.md", "docs/experiments.md"),
+    "make bytestream": (
+        "README.md", "docs/index.md", "docs/start.md", "docs/experiments.md", "docs/train.md",
+        "docs/troubleshooting.md", "docs/differences.md", "Makefile", "conf/hydra/help/evade.yaml",
+    ),
+    "make sweep-robustness": ("README.md", "docs/experiments.md", "docs/sweep.md"),
+}  # fmt: skip
+FINDINGS = ("README.md", "docs/index.md")
+
+
+def text_of(page):
+    """Return a page without its line breaks, which may stand anywhere."""
+    return " ".join((ROOT / page).read_text().split())
+
+
+def said(pattern, page):
+    """Return the groups of a pattern, which must be on the page, as whole numbers."""
+    found = re.search(pattern, text_of(page))
+    assert found, (page, pattern)
+    return [int(number.replace(",", "")) for number in found.groups()]
+
+
+def success(name):
+    """Return success [%] of a file of episodes: (axis, value, group) -> seed -> mean over corridors."""
+    wins = defaultdict(lambda: defaultdict(list))
+    with gzip.open(DATA / f"{name}_episodes.csv.gz", "rt", newline="") as file:
+        for row in csv.DictReader(file):
+            wins[row["Axis"], row["Value"], row["Group"]][row["Training"]].append(row["success"] == "True")
+    return {
+        at: {seed: 100 * sum(own) / len(own) for seed, own in seeds.items()} for at, seeds in wins.items()
+    }
+
+
+def mean(values):
+    values = list(values)
+    return sum(values) / len(values)
+
+
+def planned(*words):
+    """Return the groups of a command's sweep, its corridors, and its episodes; shared ones count once."""
+    config = parse(compose(*words))
+    sweep = plan_sweep(config, find_sweep_policies(config, locate_run(config)))
+    episodes = {(task.key, seed) for task in sweep.tasks for seed in task.seeds}
+    return sweep.groups, len(sweep.tasks[0].seeds), len(episodes)
+
+
+def test_the_tables_of_the_pages_are_those_of_today():
+    assert stale() == []
+
+
+@pytest.mark.parametrize("command", TIMED)
+def test_pages_say_the_measured_time_of_a_command(command):
+    for page in TIMED[command]:
+        assert TIMES[command] in text_of(page), page
+
+
+def test_no_page_says_another_time_of_a_first_command():
+    known = [time for command, time in TIMES.items() if command.startswith("make")]
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for line in page.read_text().splitlines():
+            if re.search(r"make (bytestream|sweep-robustness|demo)\b", line):
+                times = re.findall(r"\d+ to \d+ minutes|\b\d+ seconds", line)
+                assert [time for time in times if time not in known] == [], (page.name, line)
+
+
+def test_the_first_pages_count_policies_and_kinds():
+    shipped = len(list(PRETRAINED.glob(f"*/{MANIFEST}")))
+    assert said(r"(\d+) trained policies \(`evade models`", "README.md") == [shipped]
+    assert said(r"any of \[(\d+) trained policies\]", "docs/index.md") == [shipped]
+    assert said(r"(\d+) trained policies come with", "docs/models.md") == [shipped]
+    assert "**Policies.** Seven kinds" in text_of("README.md")
+    assert len(KINDS) == 7
+    beyond = len(list(DATA.glob(f"*_policies/*/{MANIFEST}")))
+    assert said(r"(\d+) more policies, of the studies", "docs/models.md") == [beyond]
+
+
+def test_the_first_pages_count_conditions_and_episodes():
+    (conditions,) = {own.conditions for own in success_rates(DATA / "robustness_episodes.csv.gz").values()}
+    for page in ("README.md", "docs/index.md", "docs/start.md"):
+        assert f"under {conditions} conditions" in text_of(page), page
+    groups, corridors, episodes = planned("+exp=robustness")
+    seeds = [len(own) for group, own in groups.items() if group not in BASELINES]
+    assert said(r"flies (\d+) corridors under each", "docs/sweep.md") == [corridors]
+    assert said(r"has ([\d,]+) episodes of (\d+) policies and two", "docs/sweep.md") == [episodes, sum(seeds)]
+    assert len(groups) - len(seeds) == 2
+
+
+@pytest.mark.parametrize("page", FINDINGS)
+def test_the_paper_has_eleven_claims_and_one_is_reversed_with_ten_seeds(page):
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in (ROOT / "docs" / "claims.md").read_text().splitlines()
+        if line.startswith("| `")
+    ]
+    claims = {row[0].partition(":")[2] for row in rows}
+    assert said(r"None of the paper's (\d+) claims is confirmed", page) == [len(claims)]
+    assert not [row for row in rows if "holds" in row[2:]]
+    turned = {row[0].partition(":")[2] for row in rows if "reversed" in row[3:]}
+    assert turned == {" tolerates background activity"}
+    undecided = [row for row in rows if row[2:] == ["undecided"] * 3]
+    assert len(undecided) == 1
+    assert "One test is undecided in all three studies" in text_of("docs/claims.md")
+
+
+def test_false_events_cost_what_the_front_page_says_and_other_errors_little():
+    rates = success("dose_response_taught")
+    lost = defaultdict(dict)
+    for group in ("event_image", "bytestream", "bytestream_xy"):
+        nominal = mean(rates["nominal", "poles_eval", group].values())
+        for kind in ("invented", "lost", "displaced", "flipped", "jittered"):
+            own = [mean(seeds.values()) for (axis, _, other), seeds in rates.items()
+                   if (axis, other) == (kind, group)]  # fmt: skip
+            lost[kind][group] = nominal - mean(own)
+            assert len(own) == 4
+    false = lost.pop("invented").values()
+    found = said(r"lose (\d+) to (\d+) points of success when (\d+) to (\d+) %", "docs/index.md")
+    assert found[:2] == [round(min(false)), round(max(false))]
+    assert {len(seeds) for (axis, _, _), seeds in rates.items() if axis == "invented"} == {10}
+    (most,) = said(r"lose fewer than (\d+) points when as many are lost", "docs/index.md")
+    assert max(value for own in lost.values() for value in own.values()) < most
+
+
+def test_the_robust_policy_does_as_the_pages_say():
+    means = {at[:2]: round(mean(seeds.values())) for at, seeds in success("hold").items()}
+    dense = {rate: means.pop(("control_hz_dense", rate)) for rate in ("200", "25")}
+    expected = [min(means.values()), max(means.values()), len(means)]
+    assert said(r"reaches (\d+) to (\d+) % under (\d+) conditions", "docs/index.md") == expected
+    assert said(r"each: (\d+) to (\d+) % under (\d+) conditions", "docs/train.md") == expected
+    assert said(r"(\d+) % in `poles_dense` and (\d+) % there at 25 Hz", "docs/train.md") == [
+        dense["200"],
+        dense["25"],
+    ]
+    late = mean(success("robustness")["action_delay", "100", "bytestream_hold"].values())
+    assert said(r"With actions 100 ms late it reaches (\d+) %", "docs/index.md") == [round(late)]
+
+
+def test_the_readme_counts_the_formats_that_can_be_written(tmp_path):
+    with pytest.raises(ValueError, match="format") as error:
+        write_events(tmp_path / "a.unknown", [], 1, 1, "unknown")
+    formats = re.findall(r"\b(npz|hdf5|txt|csv|aedat4|evt3|evt2|dat)\b", str(error.value))
+    words = {8: "eight", 9: "nine", 10: "ten"}
+    assert f"Write {words[len(set(formats))]} formats" in text_of("README.md")
+
+
+def test_what_the_gallery_says_of_other_textures_is_what_the_data_say():
+    with gzip.open(DATA / "robustness_episodes.csv.gz", "rt", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["Value"] == "texture_change"]
+    trained = {group.name for group in shipped_groups(PRETRAINED)}
+    rows = [row for row in rows if row["Group"] in trained]
+    first = [row for row in rows if row["seed"] == "0"]
+    failed = [row for row in first if row["success"] == "False"]
+    early = [row for row in first if float(row["distance_m"]) < 20]
+    distances = sorted(float(row["distance_m"]) for row in rows)
+    half = (distances[(len(rows) - 1) // 2] + distances[len(rows) // 2]) / 2
+    found = said(
+        r"(\d+) of (\d+) shipped policies fail, (\d+) of them within 20 m. "
+        r"Over all (\d+) corridors half of the episodes end within (\d+) m",
+        "docs/watch.md",
+    )
+    assert found == [len(failed), len(first), len(early), len(rows) // len(first), round(half)]
