@@ -84,7 +84,7 @@ train-all: setup ## train every policy with three seeds into models/pretrained (
 	    case " $(TAUGHT) " in *" $$exp "*) steps=$(STEPS);; *) steps=$(or $(STEPS),$(COMPARED_STEPS));; esac; \
 	    $(LAUNCH) +exp=$$exp job=train seed=$$seed $${steps:+train.env_steps=$$steps} $(ARGS) || exit 1; \
 	done; done
-	$(LAUNCH) +exp=ship $(ARGS)
+	$(LAUNCH) publish $(ARGS)
 
 # `train=true` first trains $(POLICIES), as train-all does, and evaluates the new policies.
 sweep-robustness: $(if $(filter true,$(train)),train-all,setup) ## evaluate trained policies at other rates and thresholds, in other worlds, with faults

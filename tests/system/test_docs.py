@@ -54,7 +54,7 @@ def commands() -> list[str]:
         text = page.read_text().replace("\\\n", " ")
         found |= dict.fromkeys((match[1] or f"+exp={match[2]}").strip() for match in LAUNCHED.finditer(text))
         found |= dict.fromkeys(f"{MADE[target]} {words}" for target, words in ARGS.findall(text))
-    # tests/system/test_plugins.py gives those with a plug-in; a reader's own calibration makes the camera `mine`.
+    # tests/system/test_plugins.py gives those with a plug-in; a reader's calibration makes the camera `mine`.
     return [words.replace("camera=mine ", "camera=dvs128 ") for words in found if "plugins=" not in words]
 
 
