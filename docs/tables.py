@@ -24,8 +24,8 @@ MODULES = {
     "The world and its events": (
         "envs.corridor", "envs.config", "envs.scene", "envs.scene.layouts", "envs.scene.obstacles",
         "envs.scene.textures", "envs.scene.range_scan", "envs.scene.planning", "envs.raycast",
-        "envs.rasterize", "envs.events", "envs.events.faults", "envs.observations", "envs.kinematics", "envs.fidelity", "envs.event_error", "envs.recordings",
-        "envs.recordings.video",
+        "envs.rasterize", "envs.events", "envs.events.faults", "envs.observations", "envs.kinematics",
+        "envs.fidelity", "envs.event_error", "envs.recordings", "envs.recordings.video",
     ),
     "From events to actions": (
         "models.kinds", "models.encoder.embedding", "models.encoder.context", "models.encoder.evae",
