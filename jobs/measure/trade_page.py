@@ -178,23 +178,23 @@ def draw_settings(settings: Sequence[Mapping[str, str]]) -> Figure:
     points = [
         TradePoint(
             scene=one["scene"],
-            knob=one["knob"],
-            name=one["setting"].rpartition(" ")[2] or one["knob"],
+            name=_label(one["knob"], one["setting"]),
             speed=(float(one["speed"]), float(one["speed_low"]), float(one["speed_high"])),
             error=100 * float(one["event_error"] or "nan"),
             difference=(_points(one, ""), _points(one, "_low"), _points(one, "_high")),
-            groups=tuple(
-                _points(other, "")
-                for other in settings
-                if other["policies"] != ALL
-                and all(other[name] == one[name] for name in ("scene", "knob", "setting"))
-            ),
             front=one["front"] == "yes",
         )
         for one in settings
         if one["policies"] == ALL
     ]
     return plot_trade(points, 100 * MARGIN)
+
+
+def _label(knob: str, setting: str) -> str:
+    """Return a setting in words: what is varied stands before a bare value."""
+    return (
+        f"{knob} {setting}" if setting and " " not in setting and knob in ENCODER_KNOBS else setting or knob
+    )
 
 
 def _points(setting: Mapping[str, str], end: str) -> float:
@@ -341,31 +341,46 @@ def advise(rows: Sequence[TradedSetting]) -> Advice:
 
 
 def trade_page(about: TradeFacts, rows: Sequence[TradedSetting]) -> str:
-    """The page: what was evaluated, plot, advice, a table for each scene; every number is a row's.
+    """Return the page: advice, plot, the settings that the advice names, what was evaluated.
 
     Args:
         about: What made the numbers.
         rows: Scene after scene, as everywhere here; in each the default first, the most exact last.
     """
-    scenes, groups = by_scene(rows), list(about["policies"])
-    lines = trade_lines(rows, groups)
-    tables = {}
-    for own in scenes:
-        tables[own[0].scene], lines = (
-            markdown_table(headings(groups), lines[: len(own)], 2),
-            lines[len(own) :],
-        )
+    advice = advise(rows)
     return render(
         TEMPLATE,
         about=about,
-        defaults=[own[0] for own in scenes],
-        exacts=[(own[0], own[-1]) for own in scenes],
-        **advise(rows)._asdict(),
+        **advice._asdict(),
         count=sum(row.knob != DEFAULT for row in rows),
         margin=f"{100 * MARGIN:.0f}",
-        percent_text=percent_text,
         points_text=points_text,
-        ratio_text=lambda estimate: estimate_text(estimate, 1, ".2f"),
         short=short,
-        tables=tables,
+        table=advice_table(advice, choices(rows)),
     )
+
+
+def advice_table(advice: Advice, every: Sequence[Choice]) -> str:
+    """Return a row for the default, each setting that the advice names, and the most exact one."""
+    named = [
+        advice.fastest,
+        advice.encoder,
+        advice.coarsest,
+        *advice.cameras,
+        *advice.worse,
+        *advice.undecided,
+    ]
+    shown = [one for one in every if one in named or one in (every[0], every[-1])]
+    scenes = [row.scene for row in every[0].rows]
+    columns = ("speed", "events that differ [%]", "success [points]")
+    head = ("setting", *(f"{column}, `{scene}`" for scene in scenes for column in columns), "verdict")
+    lines = [
+        (one.name, *(text for row in one.rows for text in _scene_texts(row)), one.verdict) for one in shown
+    ]
+    return markdown_table(head, lines)
+
+
+def _scene_texts(row: TradedSetting) -> tuple[str, str, str]:
+    error = "-" if row.known_error is None else short(100 * row.known_error)
+    change = "" if row.knob == DEFAULT else points_text(row.together.difference)
+    return estimate_text(row.speed, 1, ".2f"), error, change

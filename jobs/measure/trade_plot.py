@@ -1,18 +1,18 @@
-"""The plot of a trade: speed against event error, and against the change of success; a row for each scene."""
+"""The plot of a trade: a row for each setting, with its speed, its event error and the change of success."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import COLOURS, INK, MUTED, tidy
+from jobs.analysis.plots import INK, MUTED, tidy
 
-MARKERS = {"default": "*", "most exact": "D", "precision": "s", "time bins": "s", "newest events": "s"}
-RATIOS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 Range = tuple[float, float, float]  # a value and the ends of its interval
+STYLES = (("o", "#2563eb"), ("^", "#d97706"), ("s", "#111827"))  # of scenes, told apart without colour too
+APART = 0.3  # of the scenes within a row
+HEADINGS = ("Speed, times the default's", "Events that differ [%]", "Success minus the default's [points]")
 
 
 class TradePoint(NamedTuple):
@@ -20,81 +20,66 @@ class TradePoint(NamedTuple):
 
     Attributes:
         scene: Where.
-        knob: What is varied.
-        name: To what, in a word.
+        name: The setting.
         speed: Times the default's.
         error: Share of events that differ [%], NaN where none changes.
         difference: Of success, to the default's [points].
-        groups: The same of each group of policies.
         front: Whether no other setting beats it.
     """
 
     scene: str
-    knob: str
     name: str
     speed: Range
     error: float
     difference: Range
-    groups: tuple[float, ...]
     front: bool
 
 
 def plot_trade(points: Sequence[TradePoint], margin: float) -> Figure:
     """Draw all settings; `margin` is what success may lose [points]."""
+    names = list(dict.fromkeys(point.name for point in points))
     scenes = list(dict.fromkeys(point.scene for point in points))
-    figure = Figure(figsize=(11.0, 4.4 * len(scenes) + 0.6), layout="constrained")
-    every = figure.subplots(len(scenes), 2, squeeze=False)
-    for scene, (errors, changes) in zip(scenes, every, strict=True):
-        own = [point for point in points if point.scene == scene]
-        _draw_errors(errors, [point for point in own if point.error == point.error])
-        _draw_changes(changes, own, margin)
-        errors.set_title(f"Scene {scene}", loc="left", fontsize=10, color=INK)
-    known: dict[str, Artist] = {}
-    for axes in every.flat:
-        known |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-    figure.legend(list(known.values()), list(known), loc="outside lower center", ncols=7, frameon=False)
+    figure = Figure(figsize=(10.0, 1.3 + 0.27 * len(names)), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    for number, scene in enumerate(scenes):
+        own = {point.name: point for point in points if point.scene == scene}
+        rows = np.array([names.index(name) for name in own]) + APART * (number - (len(scenes) - 1) / 2)
+        marker, colour = STYLES[number % len(STYLES)]
+        errors = [(point.error, point.error, point.error) for point in own.values()]
+        for panel, values in zip(
+            panels,
+            ([one.speed for one in own.values()], errors, [one.difference for one in own.values()]),
+            strict=True,
+        ):
+            _dots(panel, rows, values, marker, colour, scene)
+    _dress(panels, names, {point.name for point in points if point.front}, margin)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=3, frameon=False)
     return figure
 
 
-def _draw_errors(axes: Axes, points: Sequence[TradePoint]) -> None:
-    """Event error over speed; what no setting beats is ringed."""
-    front = [(point.speed[0], point.error) for point in points if point.front]
-    axes.plot(*np.array(front).T, "o", ms=12, mfc="none", mec=MUTED, zorder=1, label="beaten by none")
-    _scatter(axes, points, [(point.error,) * 3 for point in points])
-    axes.set_yscale("symlog", linthresh=1.0)
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_ylim(-0.1, 1.6 * max(point.error for point in points))
-    axes.set_ylabel("Events that differ [%]")
+def _dots(
+    panel: Axes, rows: np.ndarray, values: Sequence[Range], marker: str, colour: str, label: str
+) -> None:
+    """Draw the values of a scene with their intervals, filled; NaN leaves a row empty."""
+    middle, low, high = np.array(values).T
+    panel.hlines(rows, low, high, color=colour, lw=1.2, alpha=0.6)
+    panel.scatter(middle, rows, marker=marker, s=26, color=colour, label=label, zorder=3)
 
 
-def _draw_changes(axes: Axes, points: Sequence[TradePoint], margin: float) -> None:
-    """Change of success over speed, with what may be lost."""
-    axes.axhline(0.0, color=MUTED, lw=0.8)
-    axes.axhline(-margin, color=MUTED, lw=0.8, ls=":", label="what may be lost")
-    for point in points:
-        axes.plot([point.speed[0]] * len(point.groups), point.groups, "_", color=MUTED, ms=7, zorder=2)
-    _scatter(axes, points, [point.difference for point in points])
-    axes.set_ylabel("Success minus the default's [points]")
-
-
-def _scatter(axes: Axes, points: Sequence[TradePoint], values: Sequence[Range]) -> None:
-    """Points of all settings at their speed, with both intervals, named."""
-    for point, (value, low, high) in zip(points, values, strict=True):
-        speed, slow, fast = point.speed
-        colour, usual = COLOURS[point.knob], point.knob == "default"
-        axes.errorbar(
-            speed, value, [[value - low], [high - value]], [[speed - slow], [fast - speed]],
-            fmt="none", ecolor=colour, elinewidth=0.8, alpha=0.4, zorder=2,
-        )  # fmt: skip
-        size, marker = (240, "*") if usual else (34, MARKERS.get(point.knob, "o"))
-        axes.scatter([speed], [value], marker=marker, s=size, color=colour, label=point.knob, zorder=3)
-        if not usual:
-            axes.annotate(
-                point.name, (speed, value), (4, 3), textcoords="offset points", fontsize=6, color=INK
-            )
-    axes.set(xscale="log", xlabel="Speed, times the default's")
-    ends = [end for point in points for end in point.speed]
-    ticks = [tick for tick in RATIOS if 0.8 * min(ends) < tick < 1.25 * max(ends)]
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    axes.set_xticks([], minor=True)
-    tidy(axes)
+def _dress(panels: Sequence[Axes], names: Sequence[str], front: set[str], margin: float) -> None:
+    """Name rows and axes, and mark the default's values and what success may lose."""
+    for panel, heading, usual in zip(panels, HEADINGS, (1.0, None, 0.0), strict=True):
+        panel.set_xlabel(heading)
+        if usual is not None:
+            panel.axvline(usual, color=MUTED, lw=0.8)
+        panel.grid(axis="y", color="#e5e7eb", lw=0.6)
+        tidy(panel)
+    panels[0].set_xscale("log")
+    panels[0].set_xticks([0.05, 0.1, 0.2, 0.5, 1, 2], ["0.05", "0.1", "0.2", "0.5", "1", "2"])
+    panels[0].set_xticks([], minor=True)
+    panels[1].set_xscale("symlog", linthresh=1.0)
+    panels[1].set_xticks([0, 1, 3, 10, 30, 100], ["0", "1", "3", "10", "30", "100"])
+    panels[2].axvline(-margin, color=MUTED, lw=0.8, ls=":")
+    panels[0].set_yticks(range(len(names)), [f"{name} *" if name in front else name for name in names])
+    panels[0].tick_params(axis="y", labelcolor=INK, length=0)
+    panels[0].set_ylim(len(names) - 0.4, -0.6)
