@@ -2,7 +2,7 @@
 
 Run: python -m platform.launch +exp=NAME [group=file] [key=value]; a first word NAME stands for +exp=NAME
 Expect: exit status 0 when the job is done, 2 with one message when a value is wrong, 1
-when the job fails, 130 after Ctrl+C.
+when the job fails, 130 after Ctrl+C, 143 after SIGTERM, 129 after SIGHUP.
 """
 
 import contextlib
@@ -13,32 +13,46 @@ import io
 import os
 import re
 import shlex
+import signal
 import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jobs.config.command_line import experiments, hydra_words
+from jobs.config.command_line import experiments, given_keys, hydra_words, once_per_value
 from jobs.config.registry import CONF, JOBS
 from jobs.run.libraries import hold
 from jobs.run.provenance import REPOSITORY as ROOT
+from jobs.run.signals import end_on_signals
+from jobs.run.undo import undo
 
 ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
-SWEEP = "several runs are the sweep job's work: +exp=robustness with sweep.axes"
 OPEN_GROUPS = (
     "env.layout",
     "faults.added",
     "sweep.axes",
     "search.space",
 )  # take entries that conf/ does not have
+UNWRITABLE = {  # what the operating system says: what to do
+    errno.ENOSPC: "make room there",
+    errno.EDQUOT: "make room there",
+    errno.EACCES: "give yourself the right to use it",
+    errno.EPERM: "give yourself the right to use it",
+    errno.EROFS: "make the file system writable",
+}
 JOBS_HERE = "  <jobs>"  # in conf/hydra/help
-DONE, FAILED, WRONG_VALUE, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_VALUE = 0, 1, 2
+ENDED = 128  # and the number of the signal
 
 
 def main() -> int:
     """Run the command line; return the exit status."""
     hold()
+    end_on_signals()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that takes ASCII alone shows a question mark
     if importlib.util.find_spec("hydra") is None:
         print(
             f"evade: failed: {sys.executable} has not the packages of Evade; {ENVIRONMENT}", file=sys.stderr
@@ -48,9 +62,12 @@ def main() -> int:
         values = compose(sys.argv[1:])
         if values is not None:
             run(values)
-    except KeyboardInterrupt:
-        print("evade: interrupted; the same command continues where it stopped", file=sys.stderr)
-        return INTERRUPTED
+    except KeyboardInterrupt as error:
+        number = getattr(error, "number", signal.SIGINT)
+        ended = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+        with contextlib.suppress(OSError):  # a terminal that is closed
+            print(f"evade: {ended}; the same command continues where it stopped", file=sys.stderr)
+        return ENDED + number
     except Exception as error:
         return report(error)
     return DONE
@@ -120,7 +137,7 @@ def word_errors(words: list[str]) -> list[str]:
     errors = []
     for word in words:
         if word in ("-m", "--multirun") or re.match(r"\+*hydra\.(mode|sweep)", word):
-            errors.append(f"{word}: {SWEEP}")
+            errors.append(f"{word}: {once_per_value(words)}")
         elif re.match(r"[+~]*hydra[./=@]|--experimental-rerun", word):
             errors.append(f"{word}: Hydra's own settings are fixed; results go to runs_dir")
     return errors
@@ -142,7 +159,7 @@ def explain(error: Exception, words: list[str]) -> str:
     if choice:
         return f"{choice[1]}: must be one of {', '.join(choice[3].split())}, got {choice[2]!r}"
     if text.startswith("Ambiguous value"):
-        return f"{text.splitlines()[0]}: write [a,b] for a list; {SWEEP}"
+        return f"{text.splitlines()[0]}: write [a,b] for a list; {once_per_value(words)}"
     lines = [line.strip() for line in text.split("\nConfig search path")[0].splitlines()]
     message = " ".join(line for line in lines if line and not line.startswith("See https"))
     return message if any(word in message for word in words) else f"{' '.join(words)}: {message}"
@@ -156,13 +173,22 @@ def run(values: dict[str, object]) -> None:
     """
     from jobs.config.config import ConfigError, parse
     from jobs.config.errors import redacted
+    from jobs.run.resumed import check_resumed
+    from jobs.tracking.store import of_environment, store_uri
 
     errors = dict.fromkeys(value_errors(values))
     if errors:
         raise ConfigError("\n".join(errors))
-    config = parse(values)
-    print(f"If this is stopped, it continues with: {redacted(command(sys.argv[1:]))}", flush=True)
     sys.path.append(str(ROOT))  # for `evade` in another folder: research/ is not installed
+    words = hydra_words(sys.argv[1:])
+    said = of_environment(values, words, os.environ)
+    config = parse(values)
+    store_uri(config)
+    check_resumed(config, given_keys(words))
+    print(
+        "\n".join([*said, f"If this is stopped, it continues with: {redacted(command(sys.argv[1:]))}"]),
+        flush=True,
+    )
     importlib.import_module(JOBS[config.job].module).run(config)
 
 
@@ -193,6 +219,8 @@ def report(error: Exception) -> int:
 
     ours = raised_here(error)
     wrong_value = isinstance(error, ValueError) and ours
+    if wrong_value:
+        undo()
     full = full_disk(error)
     documented = wrong_value or (isinstance(error, RuntimeError) and ours) or full is not None
     if os.environ.get("HYDRA_FULL_ERROR") == "1" or not documented:
@@ -204,12 +232,12 @@ def report(error: Exception) -> int:
 
 
 def full_disk(error: Exception) -> str | None:
-    """What to say of an error that a full disk or a used-up quota caused; None if it is another error."""
-    if not isinstance(error, OSError) or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    """Return what to say of a file system's error that its user can mend; None for another error."""
+    if not isinstance(error, OSError) or error.errno not in UNWRITABLE:
         return None
     where = error.filename2 or error.filename  # the second is what was copied to
     file = f"{where}: " if where else ""
-    return f"{file}{os.strerror(error.errno)}; make room there, and the same command continues"
+    return f"{file}{os.strerror(error.errno)}; {UNWRITABLE[error.errno]}, and the same command continues"
 
 
 def raised_here(error: Exception) -> bool:

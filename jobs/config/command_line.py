@@ -1,7 +1,9 @@
 """How a user's words become the words that Hydra composes: experiments, jobs, and names that changed."""
 
 import re
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from jobs.config.registry import CONF, JOBS
 
@@ -20,6 +22,61 @@ def hydra_words(words: Sequence[str], jobs: Mapping[str, object] = JOBS) -> list
     known = RENAMED_JOBS.get(named, named) in jobs or (CONF / "exp" / f"{named}.yaml").is_file()
     first = [f"+exp={named}" if known else named] if words else []
     return [_job(_section(word), jobs) for word in [*first, *words[1:]]]
+
+
+def given_keys(words: Sequence[str]) -> set[str]:
+    """Return the keys whose values the words for Hydra give: of a group's file, the keys that it holds."""
+    keys: set[str] = set()
+    for word in words:
+        match = re.match(r"[+~]*([\w./]+)(?:@[\w.]*)?(?:=(.*))?$", word, re.DOTALL)
+        if match is None or match[1] == "job":
+            continue
+        file = CONF / match[1] / f"{match[2]}.yaml"
+        if match[1] == "exp":
+            keys |= _experiment(file)
+        else:
+            keys |= {*_leaves(file)} if file.is_file() else {"exp" if match[1] == "name" else match[1]}
+    return keys
+
+
+def _experiment(file: Path) -> set[str]:
+    """Return {"exp"} for the experiment of a policy; a stage or a study takes the experiment of the run."""
+    policy = (
+        file.is_file() and f"\nexp: {file.stem}\n" in file.read_text() and "/job:" not in file.read_text()
+    )
+    return {"exp"} if policy else set()
+
+
+def _leaves(file: Path) -> Iterator[str]:
+    """Yield the keys of a file of a group, as the command line spells them."""
+    import yaml
+
+    text = file.read_text(encoding="utf-8")
+    package = "" if "@package _global_" in text else f"{file.parent.name}."
+
+    def of(values: Mapping[str, object], prefix: str) -> Iterator[str]:
+        for key, value in values.items():
+            if isinstance(value, Mapping) and value:
+                yield from of(value, f"{prefix}{key}.")
+            elif key != "defaults":
+                yield f"{prefix}{key}"
+
+    yield from of(yaml.safe_load(text) or {}, package)
+
+
+def once_per_value(words: Sequence[str]) -> str:
+    """Return the remedy for a command line that asks for several runs: a loop over the first list."""
+    plain = [word for word in words if word not in ("-m", "--multirun") and not word.startswith("hydra.")]
+    several = next(
+        (word for word in plain if re.fullmatch(r"\+*[\w.]+=[^\[\]{}\"']+,[^\[\]{}\"']+", word)), None
+    )
+    rule = "one command is one run"
+    if several is None:
+        return f"{rule}; give it once per value, or name conditions of an evaluation in sweep.axes"
+    key, _, values = several.partition("=")
+    kept = shlex.join(word for word in plain if word is not several)
+    loop = f'for value in {shlex.join(values.split(","))}; do evade {kept} {key}="$value"; done'
+    return f"{rule}; give it once per value: {loop}"
 
 
 def experiments() -> list[str]:

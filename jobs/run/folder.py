@@ -4,9 +4,13 @@ A folder is named after the configuration that fills it, so that the same comman
 the same folder and continues there. Each finished stage leaves a marker with its results.
 """
 
+import contextlib
 import dataclasses
+import shutil
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,8 +22,11 @@ from jobs.run.files import RunError, read_json, write_atomic, write_json
 from jobs.run.identity import TRAINED_BY, identity
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
+from jobs.run.undo import keep_what_was_made, undo_if_refused
 from models.kinds import RENAMED, renamed
 
+# What a run folder holds before any result.
+NEW_FILES = ("config.yaml", "config.json", "tracking.json", ".lock")
 COMPARED_STEPS = 500_000  # length of the trainings that are compared with each other; the paper's
 
 Results = TypeVar("Results", bound=Mapping[str, object])
@@ -71,6 +78,7 @@ def open_run(config: Config) -> Run:
     """
     run = locate_run(config)
     if not (run.path / "config.json").exists():
+        undo_if_refused(partial(_remove_new, run.path))
         values = as_dict(config)
         write_atomic(run.path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         write_json(run.path / "config.json", values)
@@ -81,7 +89,42 @@ def locate_run(config: Config) -> Run:
     """As `open_run`, but nothing is written: for jobs that check more before they start."""
     if config.resume is not None:
         return reopen(Path(config.resume), config)
-    return Run(Path(config.runs_dir).resolve() / run_name(config), config)
+    path = Path(config.runs_dir).resolve() / run_name(config)
+    if not path.exists():
+        check_writable("runs_dir", path.parent)
+    return Run(path, config)
+
+
+def check_writable(key: str, folder: Path) -> None:
+    """Check that files can be made in a folder, and the folder if it is missing; leave nothing there.
+
+    Raises:
+        ConfigError: They cannot, with the reason.
+    """
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        rule = f"must be in a folder that you can write, got {str(folder)!r} ({error.strerror})"
+        raise ConfigError(f"{key}: {rule}; give another, such as runs_dir=/tmp/evade/runs") from None
+    finally:
+        for place in missing:
+            with contextlib.suppress(OSError):
+                place.rmdir()
+
+
+def _remove_new(path: Path) -> None:
+    """Remove a run folder that holds its configuration and no results."""
+    for file in [path / name for name in NEW_FILES]:
+        file.unlink(missing_ok=True)
+    curves = path / "train" / "results.jsonl"
+    if curves.is_file() and not curves.stat().st_size:
+        curves.unlink()
+    shutil.rmtree(path / ".ray", ignore_errors=True)
+    for place in (path / "train", path, path.parent):  # folders that hold anything else stay
+        with contextlib.suppress(OSError):
+            place.rmdir()
 
 
 def reopen(path: Path, config: Config) -> Run:
@@ -135,6 +178,7 @@ def finish(run: Run, stage: str, results: Results) -> Results:
     Raises:
         ValueError: If a result is NaN or infinite.
     """
+    keep_what_was_made()
     write_json(run.path / "stages" / f"{stage}.json", {"figures": results, **provenance()})
     return results
 

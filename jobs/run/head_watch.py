@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from jobs.run.signals import Ended
+
 # Ray waits 60 s for a head that is gone, and then ends the process in the middle of what it does.
 SILENCE_S = 40.0
 ASK_EVERY_S = 5.0
@@ -40,8 +42,8 @@ def watching_head(
     try:
         with _heard(watch.lost):
             yield
-    except KeyboardInterrupt:
-        if not watch.lost.is_set():
+    except KeyboardInterrupt as error:
+        if isinstance(error, Ended) or not watch.lost.is_set():
             raise
         watch.told.set()
         raise HeadLostError(watch.reason) from None

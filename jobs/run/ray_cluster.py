@@ -6,7 +6,7 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,10 @@ from jobs.run.device import device_variables
 from jobs.run.head_watch import watching_head
 from jobs.run.libraries import of_workers
 from jobs.run.locks import locked, private_folder
+from jobs.run.provenance import REPOSITORY
 from jobs.run.ray_sessions import forget_sessions
 from jobs.run.same_code import check_machines
+from jobs.run.signals import keeping_handlers
 
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -82,19 +84,35 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
         "runtime_env": with_plugins({"env_vars": of_workers() | device_variables(cluster.device)}),
+        "job_config": _job_config(),
         "log_to_driver": False,
         "logging_level": logging.ERROR,
         "configure_logging": True,
     }
-    if cluster.name == "local":
-        os.environ["RAY_TMPDIR"] = str(ray_folder())  # of its workers, too
-        # Two processes that started Ray within seconds of each other have waited for each other forever.
-        with locked(ray_folder() / "start-ray.lock"):
-            forget_sessions(ray_folder())
-            _start_local({"num_cpus": cluster.num_cpus, **settings})
-        return
-    _join(cluster.address or "auto", settings)
+    with keeping_handlers():
+        if cluster.name == "local":
+            os.environ["RAY_TMPDIR"] = str(ray_folder())  # of its workers, too
+            # Two processes that started Ray within seconds of each other have waited for each other forever.
+            with locked(ray_folder() / "start-ray.lock"):
+                forget_sessions(ray_folder())
+                _start_local({"num_cpus": cluster.num_cpus, **settings})
+            return
+        _join(cluster.address or "auto", settings)
     check_machines()
+
+
+class _Path(list[str]):
+    """Folders that Ray cannot add to."""
+
+    def extend(self, folders: Iterable[str]) -> None:
+        """Leave out the current folder: its own `envs`, `models` or `jobs` would come before ours."""
+
+
+def _job_config() -> Any:
+    """Return Ray's settings of a job whose workers import this repository's packages from any folder."""
+    from ray.job_config import JobConfig
+
+    return JobConfig(_py_driver_sys_path=_Path([str(REPOSITORY)]))
 
 
 def _join(address: str, settings: Mapping[str, object]) -> None:

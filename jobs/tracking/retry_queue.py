@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
 
-from jobs.run.files import json_lines, read_json_lines, write_atomic
+from jobs.run.files import json_lines, read_json_lines, whole_lines, write_atomic
 
 RETRY_AFTER_S = 30.0  # so that a store that does not answer does not hold up the work
 # How often MLflow's calls try a server that does not answer.
@@ -54,6 +54,16 @@ class RetryQueue:
     file: Path
     _retry_at_s: float = field(default=0.0, repr=False)
 
+    @property
+    def record(self) -> Path:
+        """The file of all steps, delivered or not, as lines of JSON."""
+        return self.file.with_name(f"metrics-{self.file.name.removeprefix('undelivered-')}")
+
+    def recorded(self) -> list[LoggedStep]:
+        """Read all steps, delivered or not; of the same metrics of a step only the last."""
+        rows: list[LoggedStep] = read_json_lines(self.record)
+        return list({(row["step"], *sorted(row["metrics"])): row for row in rows}.values())
+
     def rows(self) -> list[LoggedStep]:
         """Read the steps that wait; half a line that a kill left is dropped.
 
@@ -65,6 +75,8 @@ class RetryQueue:
     def deliver(self, new: LoggedStep, send: Callable[[LoggedStep], None]) -> str | None:
         """Send the steps that wait and the new one, in order; keep those that could not be sent.
 
+        Each step is also written to `record`, for another MLflow run of the same folder.
+
         Args:
             new: The step to send after those that wait.
             send: Sends one, or raises StoreUnavailable; may get the same step twice.
@@ -72,6 +84,9 @@ class RetryQueue:
         Returns:
             Why steps wait from now on; None if none wait, or if some waited before.
         """
+        with self.record.open("ab") as lines:
+            lines.truncate(len(whole_lines(self.record)))  # a kill can leave half a line
+            lines.write(json_lines([new]).encode())
         waited = self.rows()
         rows = [*waited, new]
         if waited and time.monotonic() < self._retry_at_s:

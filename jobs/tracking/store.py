@@ -1,8 +1,11 @@
 """The address of the tracking store, and checks of what is written to it."""
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
 
 from jobs.config.config import Config, ConfigError
 from jobs.config.errors import HIDDEN, redacted
@@ -11,6 +14,8 @@ from jobs.run.provenance import REPOSITORY
 SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep", "tune")
 MAX_METRICS = 40  # of one call; a page with hundreds of charts can be neither read nor drawn
 MAX_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
+SCHEMES = ("sqlite:///", "http://", "https://", "postgresql", "mysql")  # of stores that MLflow keeps runs in
+RULE = "must begin with sqlite:/// or http:// or https://"
 LOCAL_PAGE = "http://127.0.0.1:5000"
 
 
@@ -29,12 +34,49 @@ def store_uri(config: Config) -> str:
         )
         raise ConfigError(f"tracking.uri: must hold the password itself, got {uri!r}; {remedy}")
     if uri.startswith("sqlite:///"):
-        return f"sqlite:///{Path(config.runs_dir).resolve().parent / uri.removeprefix('sqlite:///')}"
-    if uri.startswith(("http://", "https://", "postgresql", "mysql")):
+        folder = quoted(str(Path(config.runs_dir).resolve().parent))
+        return f"sqlite:///{Path(folder, uri.removeprefix('sqlite:///'))}"
+    if uri.startswith(SCHEMES):
         return uri
-    raise ConfigError(
-        f"tracking.uri: must begin with sqlite:/// or http:// or https://, got {redacted(uri)!r}"
-    )
+    raise ConfigError(f"tracking.uri: {RULE}, got {redacted(uri)!r}")
+
+
+def quoted(path: str) -> str:
+    """Return a path as an address holds it: a `%` or `?` in it would begin something else there."""
+    return path.replace("%", "%25").replace("?", "%3F")
+
+
+def sqlite_file(uri: str) -> Path | None:
+    """Return the file of an SQLite store; None for an address of another kind."""
+    if not uri.startswith("sqlite:///"):
+        return None
+    return Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
+
+
+def of_environment(values: dict[str, Any], words: Sequence[str], variables: Mapping[str, str]) -> list[str]:
+    """Let MLflow's own variables name the store and the experiment, unless the command line does.
+
+    Args:
+        values: A composed configuration, which is changed.
+        words: The command line's words.
+        variables: The environment.
+
+    Returns:
+        A line for the user for each variable: that it is used, or that it is not, and why.
+    """
+    lines = []
+    for variable, name in (("MLFLOW_TRACKING_URI", "uri"), ("MLFLOW_EXPERIMENT_NAME", "experiment")):
+        value, key = variables.get(variable), f"tracking.{name}"
+        if not value:
+            continue
+        if any(re.match(rf"\+*(?:{re.escape(key)}|tracking)=", word) for word in words):
+            lines.append(f"{variable} is not used: the command line gives {key}")
+        elif name == "uri" and not value.startswith(SCHEMES):
+            lines.append(f"{variable} is not used: {RULE}, got {redacted(value)!r}")
+        else:
+            values["tracking"][name] = value
+            lines.append(f"{variable} sets {key}={redacted(value)}")
+    return lines
 
 
 def page(uri: str) -> str:
@@ -44,7 +86,7 @@ def page(uri: str) -> str:
 
 def dashboard_command(uri: str) -> str:
     """The command that serves a store to browsers of this machine only."""
-    return "make mlflow" if uri == f"sqlite:///{REPOSITORY / 'mlflow.db'}" else server_command(uri)
+    return "make mlflow" if uri == f"sqlite:///{quoted(str(REPOSITORY))}/mlflow.db" else server_command(uri)
 
 
 def server_command(uri: str) -> str:

@@ -14,10 +14,14 @@ import json
 import logging
 import math
 import os
+import re
+import shlex
+import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -27,10 +31,11 @@ from envs.config import settings_hash
 from jobs.config.config import Config, as_dict
 from jobs.config.errors import redacted
 from jobs.run.files import read_json, write_json
-from jobs.run.folder import Run
+from jobs.run.folder import Run, check_writable
 from jobs.run.locks import held_alone, locked, private_folder
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
+from jobs.run.undo import undo_if_refused
 from jobs.tracking.clock import now_ms
 from jobs.tracking.pages import (
     NOTE,
@@ -54,11 +59,20 @@ from jobs.tracking.retry_queue import (
     StoreUnavailable,
     calling_with,
 )
-from jobs.tracking.store import check_metrics, dashboard_command, flatten, page, store_uri
+from jobs.tracking.store import (
+    check_metrics,
+    dashboard_command,
+    flatten,
+    page,
+    quoted,
+    sqlite_file,
+    store_uri,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from mlflow import MlflowClient
+    from mlflow.exceptions import MlflowException
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
 KNOWN_RUNS = "tracking.json"  # in a run folder
@@ -67,6 +81,11 @@ REMEDIES = {  # what SQLite says: what to do
     "disk I/O error": "make room there; ",
     "malformed": "the file is damaged: move it away for a new one; ",
     "not a database": "the file is damaged: move it away for a new one; ",
+}
+REFUSALS = {  # what MLflow says, as a regular expression: what to do
+    "UNAUTHENTICATED|code 401": "set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD",
+    "PERMISSION_DENIED|code 403": "ask its owner for permission, or name your own tracking.experiment=NAME",
+    "active' state|INVALID_STATE": "restore it in MLflow's page, or name another tracking.experiment=NAME",
 }
 UNAVAILABLE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE")  # MLflow's codes after which a retry may help
 
@@ -287,9 +306,20 @@ def _answering(uri: str, folder: Run) -> Iterator[None]:
         reason = _reason(error)
         remedy = next((remedy for sign, remedy in REMEDIES.items() if sign in reason), "")
         if isinstance(error, MlflowException) and error.error_code not in UNAVAILABLE and not remedy:
-            raise
+            raise _refusal(error, uri, folder) or error from error
         rest = f"{remedy}what was computed is in {folder.path}, the same command records it"
         raise TrackingError(f"tracking.uri: {redacted(uri)} does not answer ({reason}); {rest}") from error
+
+
+def _refusal(error: "MlflowException", uri: str, folder: Run) -> "TrackingError | None":
+    """Return what to say of a store that answers and refuses; None for a refusal without a known remedy."""
+    said = redacted(" ".join(str(error).split())[:200])
+    signs = (sign for sign in REFUSALS if re.search(sign, f"{error.error_code} {said}"))
+    remedy = REFUSALS.get(next(signs, ""))
+    if remedy is None:
+        return None
+    rest = f"what was computed is in {folder.path}, the same command records it"
+    return TrackingError(f"tracking.uri: {redacted(uri)} refuses ({said}); {remedy}; {rest}")
 
 
 def _reason(error: Exception) -> str:
@@ -339,8 +369,13 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
             if error.error_code in UNAVAILABLE:
                 raise
     run = near.client.create_run(near.experiment_id, now_ms(), tags=tags, run_name=name)
+    undo_if_refused(partial(near.client.delete_run, run.info.run_id))
     write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})
-    return dataclasses.replace(near, run_id=run.info.run_id)
+    created = dataclasses.replace(near, run_id=run.info.run_id)
+    for row in near.retry_queue.recorded():  # in a run that was deleted, or in another store
+        created._send(row)
+    near.retry_queue.file.unlink(missing_ok=True)  # these rows are among them
+    return created
 
 
 def _known_runs(path: Path) -> dict[str, str]:
@@ -368,19 +403,38 @@ def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
     logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # tracebacks of what it raises
-    name, file = quote(experiment, safe=""), Path(uri.removeprefix("sqlite:///"))
-    if uri.startswith("sqlite:///"):
+    name, file = quote(experiment, safe=""), sqlite_file(uri)
+    if file is not None:
         lock, location = file.with_suffix(".lock"), (file.parent / "mlartifacts" / name).as_uri()
     else:
         lock, location = private_folder() / f"store-{settings_hash({'uri': uri})[:8]}.lock", None
     if storage is not None:
         location = f"{storage.rstrip('/')}/mlartifacts/{name}"
     with locked(lock):
-        if uri.startswith("sqlite:///"):
+        if file is not None:
             _create_or_check(file)
         client = MlflowClient(tracking_uri=uri)
+        if file is not None:
+            _remove_stray(uri, file)
         known = client.get_experiment_by_name(experiment)
+        if known is not None and known.lifecycle_stage != "active":
+            raise TrackingError(_deleted(redacted(uri), experiment, known.experiment_id))
         return client, known.experiment_id if known else client.create_experiment(experiment, location)
+
+
+def _deleted(uri: str, experiment: str, experiment_id: str) -> str:
+    """Return what to say of an experiment that was deleted in MLflow, with the command that restores it."""
+    restore = f"MLFLOW_TRACKING_URI={shlex.quote(uri)} mlflow experiments restore -x {experiment_id}"
+    remedy = f"restore it with `{restore}`, or name another one: tracking.experiment={experiment}_2"
+    return f"tracking.experiment: {experiment!r} was deleted in {uri}; {remedy}"
+
+
+def _remove_stray(uri: str, file: Path) -> None:
+    """Remove the empty folders that MLflow makes where an address, taken for a path, leads elsewhere."""
+    taken = Path(uri.removeprefix("sqlite:///")).parent
+    if taken != file.parent:
+        with contextlib.suppress(OSError):
+            os.removedirs(taken)
 
 
 def _create_or_check(file: Path) -> None:
@@ -403,5 +457,12 @@ def _create_or_check(file: Path) -> None:
             remedy = "restore a copy, or move it away, and the same command records into a new one"
             raise TrackingError(f"tracking.uri: {file}: damaged ({said.splitlines()[-1]}); {remedy}")
         return
+    check_writable("tracking.uri", file.parent)
+    artifacts = file.parent / "mlartifacts"
+    if not artifacts.exists():
+        undo_if_refused(partial(shutil.rmtree, artifacts, ignore_errors=True))
+    undo_if_refused(partial(file.with_suffix(".lock").unlink, missing_ok=True))
+    undo_if_refused(partial(file.unlink, missing_ok=True))
     with replaced(file) as part:
-        MlflowClient(tracking_uri=f"sqlite:///{part}").search_experiments(max_results=1)
+        address = f"sqlite:///{quoted(str(part))}"
+        MlflowClient(tracking_uri=address).search_experiments(max_results=1)

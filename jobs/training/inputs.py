@@ -6,6 +6,8 @@ the original is gone; the encoder is the policy's, so that nothing is collected 
 
 from pathlib import Path
 
+from ray._private.utils import get_num_cpus
+
 from jobs.config.config import Config, ConfigError
 from jobs.config.errors import differences
 from jobs.rollout.policies import load_trained
@@ -24,9 +26,22 @@ def check_inputs(config: Config) -> None:
         ConfigError: `train.init` names no policy, or one that does not fit; or as `check_sources`.
     """
     check_sources(config)
+    check_cpus(config)
     folder = locate_run(config)
     if folder.config.train.init is not None:
         check_init(folder)
+
+
+def check_cpus(config: Config) -> None:
+    """Check that a local Ray has a CPU for each env runner: Tune would wait for them forever.
+
+    Raises:
+        ConfigError: It has not.
+    """
+    needed, cpus = config.algo.num_env_runners, config.cluster.num_cpus or get_num_cpus()
+    if config.cluster.name == "local" and needed > cpus:
+        rule = f"needs as many CPUs, and Ray has {cpus} (algo=ppo needs one)"
+        raise ConfigError(f"algo.num_env_runners: {rule}, got {needed}")
 
 
 def prepare_inputs(config: Config, folder: Run, tracker: Tracker) -> Path | None:

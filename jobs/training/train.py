@@ -17,13 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow.fs
-import ray
 import torch
 from ray import tune
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from core.files import naming
-from jobs.config.config import Config, ConfigError
+from jobs.config.config import Config
 from jobs.config.plugins import with_culprit
 from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
@@ -37,7 +36,7 @@ from jobs.tracking.tracker import open_tracker
 from jobs.training.algorithm import NOTICE, PPO
 from jobs.training.env_runner import RolloutError
 from jobs.training.imitation import AGREEMENT_KEY
-from jobs.training.inputs import check_inputs, prepare_inputs
+from jobs.training.inputs import check_cpus, check_inputs, prepare_inputs
 from jobs.training.ppo import build_ppo, policy_about, policy_spec
 from models.encoder.weights import EncoderManifest, load_encoder
 from models.policy import save_policy
@@ -145,8 +144,8 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     """
     if finished(folder, "train") is not None:
         return folder.policy
-    start_ray(config.cluster, folder.path)
     check_cpus(config)
+    start_ray(config.cluster, folder.path)
     init = folder.init / NETWORKS if config.train.init else None
     algorithm = build_ppo(config, encoder_path, init)
     with _listening(config, folder, on_result) as last:
@@ -174,14 +173,6 @@ def last_line(error: Exception | str) -> str:
     raised = f"{RolloutError.__module__}.{RolloutError.__qualname__}: "  # as Ray writes it before the message
     said = lines[-1].strip().removeprefix(raised) if lines else type(error).__name__
     return with_culprit(said, str(error))
-
-
-def check_cpus(config: Config) -> None:
-    """Refuse more env runners than a local Ray has CPUs for: Tune would wait for them forever."""
-    needed, cpus = config.algo.num_env_runners, int(ray.cluster_resources().get("CPU", 0))
-    if config.cluster.name == "local" and needed > cpus:
-        rule = f"needs as many CPUs, and Ray has {cpus} (algo=ppo needs one)"
-        raise ConfigError(f"algo.num_env_runners: {rule}, got {config.algo.num_env_runners}")
 
 
 def export_policy(

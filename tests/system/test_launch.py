@@ -1,3 +1,4 @@
+import errno
 import importlib.util
 import os
 import re
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from jobs.config.command_line import experiments
-from jobs.config.config import Config
+from jobs.config.config import Config, parse
 from jobs.run import libraries
 from jobs.run.libraries import held
 from tests.support.configs import compose
@@ -121,10 +122,18 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["env=3"], "env=3: "),
         (["seed=[1"], "seed=[1: "),
         (["seed"], "Error parsing override 'seed'"),
-        (["seed=1,2"], "'seed=1,2': write [a,b] for a list; several runs are the sweep job's work"),
-        (["--multirun", "seed=1,2"], "--multirun: several runs are the sweep job's work"),
-        (["-m"], "-m: several runs are the sweep job's work: +exp=robustness"),
-        (["hydra.mode=MULTIRUN"], "hydra.mode=MULTIRUN: several runs are the sweep job's work"),
+        (["seed=1,2"], "'seed=1,2': write [a,b] for a list; one command is one run; give it once per value"),
+        (
+            ["--multirun", "seed=1,2"],
+            "--multirun: one command is one run; give it once per value: for value in 1 2;",
+        ),
+        (["-m"], "-m: one command is one run; give it once per value"),
+        (["hydra.mode=MULTIRUN"], "hydra.mode=MULTIRUN: one command is one run"),
+        (["trade.trials=3"], "trade.trials: no such key, got trade.trials=3; a setting of the job trade"),
+        (
+            ["tracking.uri=nowhere"],
+            "tracking.uri: must begin with sqlite:/// or http:// or https://, got 'nowhere'",
+        ),
         (["hydra.run.dir=elsewhere"], "hydra.run.dir=elsewhere: Hydra's own settings are fixed"),
         (["+hydra.callbacks.x._target_=os.system"], "Hydra's own settings are fixed"),
         (["+env.layout._target_=os.system"], "env.layout._target_: such keys make Hydra call code"),
@@ -172,7 +181,7 @@ def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folde
         "+env.layout.num_obstacles=60",
         "seed=3",
         "renderer=raycast",
-        "resume=runs/x",
+        "runs_dir=elsewhere",
     ]
     status, out, err = launch("+exp=train", *words)
     assert (status, err) == (0, "")
@@ -182,7 +191,12 @@ def test_the_job_gets_the_checked_configuration_and_nothing_is_left_in_the_folde
     assert shlex.split(command) == [sys.executable, "-m", "platform.launch", "+exp=train", *words]
     (config,) = given
     assert isinstance(config, Config)
-    assert (config.job, config.seed, config.env.renderer, config.resume) == ("train", 3, "raycast", "runs/x")
+    assert (config.job, config.seed, config.env.renderer, config.runs_dir) == (
+        "train",
+        3,
+        "raycast",
+        "elsewhere",
+    )
     assert config.env.layout == {"num_obstacles": 60.0}
     assert list(tmp_path.iterdir()) == []
     assert "HYDRA_FULL_ERROR" not in os.environ
@@ -237,6 +251,65 @@ def test_the_traceback_of_a_wrong_value_is_shown_if_hydra_full_error_is_1(
     assert status == 2
     assert ("Traceback" in err) == shown
     assert os.environ["HYDRA_FULL_ERROR"] == value
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_ends_with_its_status_and_one_line(launch, job, number, status):
+    before = signal.getsignal(number)
+    job(lambda config: signal.raise_signal(number))
+    try:
+        ended, _, err = launch("+exp=train")
+    finally:
+        signal.signal(number, before)
+    assert ended == status
+    assert err == f"evade: ended by {number.name}; the same command continues where it stopped\n"
+
+
+def test_the_remedy_for_several_seeds_runs_each_seed_once(launch, tmp_path):
+    _, _, err = launch("-m", "+exp=event_columns", "seed=0,1", "budget=smoke")
+    loop = err[err.index("for value in") :].strip()
+    told = tmp_path / "evade"
+    told.write_text('#!/bin/sh\necho "$@"\n')
+    told.chmod(0o755)
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    said = subprocess.run(["bash", "-c", loop], env=path, capture_output=True, text=True, check=True).stdout
+    assert said.splitlines() == [f"+exp=event_columns budget=smoke seed={seed}" for seed in (0, 1)]
+    assert [parse(compose(*line.split())).seed for line in said.splitlines()] == [0, 1]
+
+
+def test_a_terminal_that_takes_ascii_alone_shows_question_marks(tmp_path):
+    code = "import sys, types, jobs\nfrom jobs.config.registry import JOBS, Job\n"
+    code += "from jobs.run.progress import console\n"
+    code += "sys.modules['stub'] = types.SimpleNamespace(run=lambda config: console.print('a · b'))\n"
+    code += "JOBS['train'] = Job('stub'); sys.argv = ['evade', '+exp=train']; sys.exit(jobs.main())"
+    settings = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=settings, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, b"a ? b")
+
+
+def test_a_refusal_by_the_job_leaves_nothing_in_the_folder(launch, job, tmp_path):
+    def refuse(config):
+        from jobs.run.folder import open_run
+
+        assert open_run(config).path.is_dir()
+        unknown_scene(config)
+
+    job(refuse)
+    assert launch("+exp=train")[0] == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_used_is_named_with_what_to_do(launch, job):
+    def denied(config):
+        raise PermissionError(errno.EACCES, "Permission denied", "/elsewhere/file")
+
+    job(denied)
+    status, _, err = launch("+exp=train")
+    assert status == 1
+    rule = "give yourself the right to use it, and the same command continues"
+    assert err == f"evade: failed: /elsewhere/file: Permission denied; {rule}\n"
 
 
 def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):

@@ -215,3 +215,11 @@ def test_a_run_folder_outlives_changes_of_what_acts_after_training(config):
     write_json(run.path / "config.json", stored)
     with pytest.raises(ConfigError, match="algo: must be a group of settings"):
         open_run(dataclasses.replace(config, resume=str(run.path)))
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_made(config, tmp_path):
+    (tmp_path / "file").write_text("")
+    for runs_dir in ("/proc/nope/runs", str(tmp_path / "file" / "runs")):
+        with pytest.raises(ConfigError, match=r"^runs_dir: must be in a folder that you can write, "):
+            open_run(dataclasses.replace(config, runs_dir=runs_dir))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -1,24 +1,32 @@
 import dataclasses
 import json
 import math
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
 from mlflow.exceptions import MlflowException
-from mlflow.protos.databricks_pb2 import INTERNAL_ERROR
+from mlflow.protos.databricks_pb2 import INTERNAL_ERROR, INVALID_STATE, PERMISSION_DENIED, UNAUTHENTICATED
 from PIL import Image
 
 from jobs.config.config import ConfigError
 from jobs.run.files import RunError
-from jobs.run.folder import Run, open_run
+from jobs.run.folder import Run, finish, open_run
 from jobs.run.locks import held_alone
+from jobs.run.signals import Ended
+from jobs.run.undo import undo
 from jobs.tracking import retry_queue as retry_queue
 from jobs.tracking import tracker as tracking
 from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.pages import PAGE_WIDTH, chart_view
-from jobs.tracking.store import check_metrics, flatten, store_uri
+from jobs.tracking.store import check_metrics, flatten, of_environment, store_uri
 from jobs.tracking.tracker import TrackingError, open_store, open_tracker
 from tests.support.configs import small_config
 
@@ -229,3 +237,112 @@ def test_a_second_process_is_kept_out_of_the_run_folder(folder):
         open_tracker(folder.config, folder),
     ):
         pass
+
+
+def test_a_run_that_was_deleted_in_mlflow_is_recorded_again_with_all_its_curves(tmp_path):
+    folder = open_run(small_config(tmp_path))
+    with open_tracker(folder.config, folder) as tracker:
+        for step, distance in ((10, 1.0), (20, 2.0), (20, 2.5)):
+            tracker.log(step, {"eval/distance_m": distance, "eval/success_rate": math.nan})
+    tracker.client.delete_run(tracker.run_id)
+    with open_tracker(folder.config, folder) as again:
+        again.log(30, {"eval/distance_m": 3.0})
+    assert again.run_id != tracker.run_id
+    points = again.client.get_metric_history(again.run_id, "eval/distance_m")
+    assert [(point.step, point.value) for point in points] == [(10, 1.0), (20, 2.5), (30, 3.0)]
+    elsewhere = dataclasses.replace(folder.config.tracking, uri="sqlite:///other.db")
+    with open_tracker(dataclasses.replace(folder.config, tracking=elsewhere), folder) as other:
+        pass
+    points = other.client.get_metric_history(other.run_id, "eval/distance_m")
+    assert [point.step for point in points] == [10, 20, 30]
+
+
+def test_an_experiment_that_was_deleted_is_named_with_a_command_that_restores_it(tmp_path):
+    folder = open_run(small_config(tmp_path))
+    client, experiment_id = open_store(store_uri(folder.config), "evade")
+    client.delete_experiment(experiment_id)
+    with (
+        pytest.raises(TrackingError, match=r"^tracking\.experiment: 'evade' was deleted") as error,
+        open_tracker(folder.config, folder),
+    ):
+        pass
+    variable, *words = shlex.split(re.search("`(.*)`", str(error.value))[1])
+    settings = {**os.environ, **dict([variable.split("=", 1)])}
+    subprocess.run([sys.executable, "-m", *words], env=settings, check=True, capture_output=True)
+    another = re.search(r"tracking\.experiment=(\w+)", str(error.value))[1]
+    named = dataclasses.replace(folder.config.tracking, experiment=another)
+    for config in (folder.config, dataclasses.replace(folder.config, tracking=named)):
+        with open_tracker(config, folder) as tracker:
+            assert tracker.client.get_experiment(tracker.experiment_id).lifecycle_stage == "active"
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "remedy"),
+    [
+        (UNAUTHENTICATED, "API request failed with error code 401", "MLFLOW_TRACKING_USERNAME"),
+        (PERMISSION_DENIED, "Permission denied", "tracking.experiment=NAME"),
+        (INVALID_STATE, "The run 7 must be in the 'active' state", "tracking.experiment=NAME"),
+    ],
+)
+def test_a_store_that_refuses_is_told_in_one_line_with_its_remedy(tmp_path, code, said, remedy):
+    folder = open_run(small_config(tmp_path))
+    with pytest.raises(TrackingError) as error, open_tracker(folder.config, folder):
+        raise MlflowException(said, error_code=code)
+    assert len(str(error.value).splitlines()) == 1
+    assert "refuses" in str(error.value)
+    assert remedy in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["job%2Fmain", "100%25done", "a?b", "a#b", "a b&c=d"])
+def test_a_store_lies_in_a_folder_of_any_name(tmp_path, name):
+    folder = open_run(small_config(tmp_path / name))
+    with open_tracker(folder.config, folder) as tracker:
+        tracker.log(1, {"eval/distance_m": 1.0})
+        tracker.text("eval/table.md", "| a |")
+    assert (tmp_path / name / "mlflow.db").stat().st_size
+    assert tracker.client.get_run(tracker.run_id).data.metrics == {"eval/distance_m": 1.0}
+    assert any((tmp_path / name / "mlartifacts").rglob("table.md"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+
+
+def test_a_job_that_a_signal_ends_is_killed_in_mlflow(tmp_path):
+    folder = open_run(small_config(tmp_path))
+    with pytest.raises(Ended), open_tracker(folder.config, folder) as tracker:
+        raise Ended(signal.SIGTERM)
+    assert tracker.client.get_run(tracker.run_id).info.status == "KILLED"
+
+
+def test_a_refusal_leaves_neither_run_folder_nor_store(tmp_path):
+    folder = open_run(small_config(tmp_path))
+    with pytest.raises(ConfigError), open_tracker(folder.config, folder):
+        raise ConfigError("algo.num_env_runners: too many")
+    undo()
+    assert list(tmp_path.iterdir()) == []
+    folder = open_run(small_config(tmp_path))
+    with open_tracker(folder.config, folder):
+        finish(folder, "train", {"eval/distance_m": 1.0})
+    undo()
+    assert (folder.path / "stages" / "train.json").is_file()
+    assert (tmp_path / "mlflow.db").is_file()
+
+
+URI, EXPERIMENT = "MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"
+
+
+@pytest.mark.parametrize(
+    ("variables", "words", "uri", "said"),
+    [
+        ({URI: "sqlite:///team.db"}, [], "sqlite:///team.db", "sets tracking.uri=sqlite:///team.db"),
+        ({URI: "http://u:secret@host"}, [], "http://u:secret@host", "sets tracking.uri=http://***@host"),
+        ({URI: "http://h"}, ["tracking.uri=sqlite:///a.db"], "sqlite:///mlflow.db", "the command line gives"),
+        ({URI: "databricks"}, [], "sqlite:///mlflow.db", "is not used: must begin with"),
+        ({EXPERIMENT: "team"}, [], "sqlite:///mlflow.db", "sets tracking.experiment=team"),
+    ],
+)  # fmt: skip
+def test_the_variables_of_mlflow_are_used_or_named_as_unused(variables, words, uri, said):
+    values = {"tracking": {"uri": "sqlite:///mlflow.db", "experiment": "evade"}}
+    (line,) = of_environment(values, words, variables)
+    assert values["tracking"]["uri"] == uri
+    assert said in line
+    assert values["tracking"]["experiment"] == variables.get(EXPERIMENT, "evade")
+    assert of_environment(values, words, {}) == []

@@ -1,0 +1,43 @@
+"""Signals that end a job as Ctrl+C does: with one message, its runs marked as killed, and Ray stopped."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+# docker stop, Slurm and Kubernetes send SIGTERM, a terminal that closes SIGHUP.
+ENDING = (signal.SIGTERM, signal.SIGHUP)
+
+
+class Ended(KeyboardInterrupt):
+    """The process was asked to end by the signal `number`."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(signal.Signals(number).name)
+
+
+def end_on_signals() -> None:
+    """Raise `Ended` in the main thread on SIGTERM and SIGHUP; an ignored signal (nohup) stays ignored."""
+    if threading.current_thread() is threading.main_thread():
+        for number in ENDING:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, _end)
+
+
+@contextlib.contextmanager
+def keeping_handlers() -> Iterator[None]:
+    """Restore the handlers of this process after a block: Ray replaces them when it starts."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                if callable(handler):
+                    signal.signal(number, handler)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    raise Ended(number)
