@@ -12,7 +12,7 @@ CONTENTS = {
     ),
     "Results": ("results", "claims", "studies", "data"),
     "Engineering": ("simulator", "encoder_accuracy", "trade", "numerics", "performance", "reliability"),
-    "Reference": ("environment", "keys", "api", "code"),
+    "Reference": ("environment", "vehicles", "keys", "api", "code"),
     "Project": ("differences", "alternatives", "contributing", "security", "citation"),
 }  # fmt: skip
 # A page of the sidebar -> pages below it, which it lists itself.

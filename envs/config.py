@@ -39,12 +39,31 @@ Value = Annotated[Any, PlainValidator(_layout_value)]
 # Faults that plug-ins add: name -> what makes one at the start of an episode, see `envs.events.faults`.
 ADDED_FAULTS: dict[str, Callable[..., Any]] = {}
 
+# Vehicles and tasks: name -> "module:attribute", see `envs.vehicles.dynamics` and `envs.vehicles.task`.
+VEHICLES: dict[str, str] = {
+    "kinematic": "envs.vehicles.dynamics:make_kinematic",
+    "point_mass": "envs.vehicles.point_mass:make_point_mass",
+    "crazyflie": "envs.vehicles.point_mass:make_crazyflie",
+}
+TASKS: dict[str, str] = {"corridor": ""}  # judged within the compiled step
+
 
 def _of_a_fault(name: str) -> str:
     if name not in ADDED_FAULTS:
         known = f"one of {', '.join(ADDED_FAULTS)}" if ADDED_FAULTS else "of a plug-in, and none is loaded"
         raise ValueError(f"must be {known}, got {name!r}")
     return name
+
+
+def _row_of(table: Mapping[str, object]) -> AfterValidator:
+    """Return a check that a name is a row of this table, plug-ins' rows included."""
+
+    def check(name: str) -> str:
+        if name not in table:
+            raise ValueError(f"must be one of {', '.join(table)}, got {name!r}")
+        return name
+
+    return AfterValidator(check)
 
 
 AddedFault = Annotated[str, AfterValidator(_of_a_fault)]
@@ -203,6 +222,8 @@ LATER_SETTINGS = (
     *("cutoff_hz", "cutoff_grows_with_light"),
     *("latency_us", "latency_jitter_us", "readout_hz"),
 )
+# Of the environment, with the values that do what was done before they existed.
+LATER_ENV_SETTINGS: dict[str, object] = {"vehicle": "kinematic", "body": {}, "task": "corridor"}
 SECTIONS: dict[str, Any] = {"camera": CameraConfig, "faults": FaultsConfig, "fidelity": FidelityConfig}
 
 
@@ -215,7 +236,11 @@ class EnvConfig:
         layout: Values that replace the layout's own, such as {"num_obstacles": 60, "shape": "box",
             "ground_texture": {"pattern": "rings"}}; keys are the layout's fields.
         control_hz: Actions (and event windows) per second [Hz].
-        speed_mps: Constant speed [m/s]; the way of one step is speed_mps / control_hz.
+        speed_mps: Speed [m/s]: constant of a kinematic vehicle, whose way of one step is
+            speed_mps / control_hz; at the start of any other.
+        vehicle: A row of `VEHICLES`: what turns an action into motion (`envs.vehicles.dynamics`).
+        body: Values that replace the vehicle's own, such as {"tau_s": 0.3}.
+        task: A row of `TASKS`: reward and end of an episode (`envs.vehicles.task`).
         action_delay_ms: An action is taken in the first control step that begins so long after its choice
             [ms]; until then the vehicle follows earlier choices, at first straight ahead.
         vehicle_radius_m: The vehicle is a disc of this radius [m].
@@ -236,6 +261,9 @@ class EnvConfig:
     layout: dict[str, Value] = dataclasses.field(default_factory=dict)
     control_hz: Annotated[float, Field(ge=0.1, le=1e6)] = 200.0
     speed_mps: Annotated[float, Field(gt=0, le=1e6)] = 20.0
+    vehicle: Annotated[str, _row_of(VEHICLES)] = "kinematic"
+    body: dict[str, Value] = dataclasses.field(default_factory=dict)
+    task: Annotated[str, _row_of(TASKS)] = "corridor"
     action_delay_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     vehicle_radius_m: Annotated[float, Field(ge=0, le=10)] = 0.3
     camera_height_m: Annotated[float, Field(ge=0, le=1000)] = 2.0
@@ -266,6 +294,15 @@ class EnvConfig:
     @classmethod
     def _rendered(cls, value: CameraConfig) -> CameraConfig:
         return with_floor(value)
+
+
+def hashed_settings(config: EnvConfig) -> dict[str, Any]:
+    """Return all settings as plain containers, to be hashed.
+
+    `LATER_ENV_SETTINGS` count only where they change something, so that older hashes stay valid.
+    """
+    settings = dataclasses.asdict(config)
+    return {name: value for name, value in settings.items() if LATER_ENV_SETTINGS.get(name, ...) != value}
 
 
 def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:

@@ -1,9 +1,10 @@
 """The corridor as a Gymnasium environment, single and vectorised (appendix D.1).
 
 The vehicle moves at constant speed, one of three directions a step, while its camera keeps
-looking along +y. What ends a step early is decided along the way of the step: the vehicle
-stops where it first touches an obstacle or a wall, or at the goal line, whichever comes
-first; both at the same place is a collision, and so is a start in contact.
+looking along +y; `EnvConfig.vehicle` names others (`envs.vehicles.dynamics`). What ends a step
+early is decided along the way of the step: the vehicle stops where it first touches an obstacle
+or a wall, or at the goal line, whichever comes first; both at the same place is a collision,
+and so is a start in contact.
 
 Time and way are counted in whole steps, so neither drifts. Each episode draws from streams
 of its own, made of (split, seed, episode): a corridor of one split never occurs in another.
@@ -27,6 +28,7 @@ from envs.observations import observation_space, observe, picture
 from envs.scene import make_scene
 from envs.sensor import Sensor
 from envs.vehicles import StepError, Vehicles
+from envs.vehicles.dynamics import make_dynamics, number_type, planned_config, wrong_actions
 
 Draw = Callable[[EnvConfig, np.random.Generator], EnvConfig]  # the settings of an episode, drawn
 
@@ -99,9 +101,10 @@ class CorridorEnv(gymnasium.Env):
         self._draw = draw
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.config.control_hz}
-        self.action_space = spaces.Discrete(kinematics.NUM_ACTIONS)
+        self._dynamics = make_dynamics(self.config)
+        self.action_space = self._dynamics.action_space
         self.observation_space = observation_space(self.config)
-        self._sensor = Sensor(self.config)
+        self._sensor = Sensor(self.config, planned_config(self.config, self._dynamics))
         self.series: tuple[int | None, int] = None, 0
         self._vehicles, self._row = Vehicles(1), 0
 
@@ -142,15 +145,17 @@ class CorridorEnv(gymnasium.Env):
         self.scene = make_scene(config.scene, scene_rng, *vehicle, **config.layout)
         spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
         self._sensor.reset(self.scene, (spawn_x, 0.0), faults_rng)
-        self._vehicles.start(self._row, config, self.scene, self._sensor, spawn_x)
+        spawn = spawn_x, 0.0
+        self._vehicles.start(self._row, config, self.scene, self._sensor, spawn, self._dynamics)
 
     def _set_config(self, config: EnvConfig) -> None:
         """Take other settings, before an episode begins."""
         if config != self.config:
             self._sensor.close()
-            self.config, self._sensor = config, Sensor(config)
+            self.config, self._dynamics = config, make_dynamics(config)
+            self._sensor = Sensor(config, planned_config(config, self._dynamics))
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, Info]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Simulate one control step.
 
         Raises:
@@ -161,12 +166,15 @@ class CorridorEnv(gymnasium.Env):
         row = self._row
         if self._vehicles.rows["over"][row]:
             raise ResetNeeded("The episode is over or has not begun; call reset() before step().")
-        if not self.action_space.contains(action):
-            raise ValueError(_bad_action(action))
+        own, space = np.asarray(action), self.action_space
+        if own.shape != space.shape or wrong_actions(space, own[None]).any():
+            raise ValueError(_bad_action(space, action))
         active = np.zeros(len(self._vehicles.rows), bool)
         active[row] = True
+        actions = np.zeros((active.size, *own.shape), number_type(space))
+        actions[row] = own
         try:
-            self._vehicles.step(np.full(active.size, action, np.int64), active)
+            self._vehicles.step(actions, active)
         except StepError as error:
             raise ValueError(f"{self.name_step()}: {error}") from error
         info, vehicle = self.info(), self._vehicles.rows[row]
@@ -217,6 +225,9 @@ class CorridorEnv(gymnasium.Env):
         vehicle = self._vehicles.rows[self._row]
         if not vehicle["delay"]:
             return self.camera_pose()[:2]
+        if vehicle["parts"]:
+            x_m, y_m = self._vehicles.state_of_action(self._row)[:2]
+            return float(x_m), float(y_m)
         left, right = ((self._vehicles.decided(self._row) == action).sum() for action in (1, 2))
         forward = vehicle["delay"] - left - right
         moves = vehicle["forward"] + forward, vehicle["left"] + left, vehicle["right"] + right
@@ -226,8 +237,7 @@ class CorridorEnv(gymnasium.Env):
     def name_step(self) -> str:
         """Episode, step and seed, for an error."""
         vehicle, (seed, number) = self._vehicles.rows[self._row], self.series
-        steps = vehicle["forward"] + vehicle["left"] + vehicle["right"]
-        return f"episode {number}, step {steps}, seed {seed}"
+        return f"episode {number}, step {vehicle['steps']}, seed {seed}"
 
     def _observation(self) -> np.ndarray:
         """What is observed of the last step."""
@@ -286,6 +296,10 @@ class CorridorVectorEnv(VectorEnv):
         self.metadata = {**self.metadata, "render_fps": self.envs[0].metadata["render_fps"]}
         self.single_observation_space = self.envs[0].observation_space
         self.single_action_space = self.envs[0].action_space
+        if any(env.action_space != self.single_action_space for env in self.envs):
+            raise ValueError(
+                f"configs must have one action space; got {[env.action_space for env in self.envs]}."
+            )
         self._vehicles = Vehicles(num_envs)
         for row, env in enumerate(self.envs):
             env.join(self._vehicles, row)
@@ -336,7 +350,7 @@ class CorridorVectorEnv(VectorEnv):
         """Step some environments and leave the others as they are; as `step`, but nothing is reset.
 
         Args:
-            actions: Integers (n,).
+            actions: (n,) integers, or (n, C) of a Box.
             some: Numbers of the environments, int (n,), ascending. What is returned is theirs alone.
 
         Raises:
@@ -344,9 +358,9 @@ class CorridorVectorEnv(VectorEnv):
             ValueError: The number of actions is not that of these environments; or as `step`.
         """
         own, active = np.asarray(actions), np.zeros(self.num_envs, bool)
-        if own.shape != some.shape:
+        if own.shape[:1] != some.shape:
             raise ValueError(f"actions must number {len(some)}; got {own.size}.")
-        taken = np.zeros(self.num_envs, own.dtype)
+        taken = np.zeros((self.num_envs, *own.shape[1:]), own.dtype)
         active[some], taken[some] = True, own
         self._step_active(taken, active)
         return self._results(some)
@@ -361,16 +375,16 @@ class CorridorVectorEnv(VectorEnv):
 
     def _step_active(self, taken: np.ndarray, active: np.ndarray) -> None:
         """One control step of the active environments."""
-        rows = self._vehicles.rows
-        if taken.shape != (self.num_envs,):
-            raise ValueError(f"actions must number {self.num_envs}; got {len(taken)}.")
+        rows, space = self._vehicles.rows, self.single_action_space
+        if taken.shape != (self.num_envs, *(space.shape or ())):
+            raise ValueError(f"actions must number {self.num_envs} of {space}; got shape {taken.shape}.")
         if (rows["over"] & active).any():
             raise ResetNeeded("An episode is over or has not begun; call reset() before step().")
-        wrong = active & ((taken < 0) | (taken >= kinematics.NUM_ACTIONS) | (taken.dtype.kind not in "iu"))
+        wrong = active & wrong_actions(space, taken)
         if wrong.any():
-            raise ValueError(_bad_action(taken[wrong.argmax()]))
+            raise ValueError(_bad_action(space, taken[wrong.argmax()]))
         try:
-            self._vehicles.step(taken.astype(np.int64), active)
+            self._vehicles.step(taken.astype(number_type(space)), active)
         except StepError as error:
             raise ValueError(f"{self.envs[error.row].name_step()}: {error}") from error
 
@@ -383,7 +397,7 @@ class CorridorVectorEnv(VectorEnv):
         return infos | dict.fromkeys([f"_{name}" for name in infos], np.ones(len(some), bool))
 
     def replay(
-        self, episodes: Sequence[tuple[int, int, Sequence[int]]]
+        self, episodes: Sequence[tuple[int, int, Sequence[Any]]]
     ) -> tuple[Any, np.ndarray, dict[str, np.ndarray]]:
         """Lead each environment to where its actions led before; what follows has the same bytes too.
 
@@ -403,7 +417,7 @@ class CorridorVectorEnv(VectorEnv):
                 if self._over[row]:
                     where = f"environment {row}, seed {seed}, episode {number}"
                     raise ValueError(f"actions must not outlast the episode; {where} ended at step {step}.")
-                observation, _, terminated, truncated, _ = env.step(int(action))
+                observation, _, terminated, truncated, _ = env.step(action)
                 self._over[row] = terminated or truncated
             observations.append(observation)
         return self._batch(observations), self._over.copy(), self.infos()
@@ -454,8 +468,10 @@ def _infos_of(envs: Sequence[CorridorEnv], vehicles: Vehicles, some: np.ndarray)
     }
 
 
-def _bad_action(action: object) -> str:
-    return f"action must be an integer in [0, {kinematics.NUM_ACTIONS - 1}]; got {action!r}."
+def _bad_action(space: spaces.Space, action: object) -> str:
+    if isinstance(space, spaces.Discrete):
+        return f"action must be an integer in [0, {space.n - 1}]; got {action!r}."
+    return f"action must be in {space}; got {action!r}."
 
 
 # Gymnasium imports what stands before the colon: make("envs.corridor:evade/Corridor-v0").

@@ -9,9 +9,11 @@ import numpy as np
 from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig, FidelityConfig
 from envs.events import EVENT
 from envs.fidelity import plan_renders
-from envs.kinematics import DIAGONAL, Outcome, Point, clock_us
+from envs.kinematics import DIAGONAL, NUM_ACTIONS, Point
 from envs.scene import Scene, make_scene
 from envs.sensor import Sensor
+from envs.vehicles import Vehicles
+from envs.vehicles.dynamics import make_dynamics
 
 # The converged simulation: at least so many times the renders of the tolerance 0.05, and in a control step;
 # outlines may move as far as at this tolerance; and this anti-aliasing.
@@ -22,6 +24,20 @@ TIME_SHARE = 0.05  # of a control step: how far apart in time two equal events m
 MAX_KEPT = 64  # converged flights: several settings are measured against the same
 _CONVERGED: dict[str, np.ndarray] = {}
 ENTROPY = 20_210_608  # the corridors measured in are those of no split
+
+
+class Flight(NamedTuple):
+    """A straight flight of the kinematic vehicle that passes through everything.
+
+    Attributes:
+        start: Where it begins, x and y [m].
+        action: The action that is taken in every step.
+        steps: Control steps.
+    """
+
+    start: Point
+    action: int
+    steps: int
 
 
 class Accuracy(NamedTuple):
@@ -45,7 +61,8 @@ def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, se
     anti-aliasing, the number of renders, no culling, a camera that remembers and gets linear
     luminance. Thresholds and other properties of the camera are those of `config`, its
     faults are left out. Each flight has a corridor of its own and goes straight or at 45
-    degrees, where nothing is in its way.
+    degrees, where nothing is in its way, by the compiled step that episodes take. It flies the kinematic
+    vehicle at `config.speed_mps`, whatever `config.vehicle` is.
 
     Args:
         config: The simulation.
@@ -93,8 +110,8 @@ def error_between(config: EnvConfig, other: EnvConfig, flights: int = 6, steps: 
         raise ValueError(f"both must have the same {', '.join(way)}; got {config!r} and {other!r}")
     streams = []
     for i in range(flights):
-        scene, places = _flight(config, steps, np.random.default_rng([ENTROPY, 0, i]))
-        streams.append([_events_along(Sensor(one), one, scene, places)[0] for one in (config, other)])
+        scene, flight = _flight(config, steps, np.random.default_rng([ENTROPY, 0, i]))
+        streams.append([_events_of(one, scene, flight)[0] for one in (config, other)])
     tolerance_us = TIME_SHARE * 1e6 / config.control_hz
     weights = [ours.size + theirs.size for ours, theirs in streams]
     errors = [event_error(ours, theirs, tolerance_us) for ours, theirs in streams]
@@ -119,49 +136,46 @@ def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
 
 def _measure_flight(
     config: EnvConfig, steps: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Events of one flight as `config` has it and converged, and the renders of the first."""
-    scene, way = _flight(config, steps, rng)
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the events of one flight with `config`, those of the converged simulation, and its renders."""
+    scene, flight = _flight(config, steps, rng)
     config = dataclasses.replace(config, faults=FaultsConfig())
-    events, renders = _events_along(Sensor(config), config, scene, way)
+    events, renders = _events_of(config, scene, flight)
     exact = converged(config, scene)
-    key = f"{exact!r} {way}"
+    key = f"{exact!r} {flight}"
     if key not in _CONVERGED:
         if len(_CONVERGED) == MAX_KEPT:
             _CONVERGED.clear()
-        _CONVERGED[key] = _events_along(Sensor(exact), config, scene, way)[0]
+        _CONVERGED[key] = _events_of(exact, scene, flight)[0]
     return events, _CONVERGED[key], renders
 
 
-def _flight(config: EnvConfig, steps: int, rng: np.random.Generator) -> tuple[Scene, list[Point]]:
-    """A corridor, and a way through it."""
+def _flight(config: EnvConfig, steps: int, rng: np.random.Generator) -> tuple[Scene, Flight]:
+    """Draw a corridor, and a straight flight in it that touches nothing, if there is one."""
     scene = make_scene(config.scene, rng, config.vehicle_radius_m, config.camera_height_m, **config.layout)
-    return scene, _free_way(config, scene, steps, rng)
-
-
-def _free_way(config: EnvConfig, scene: Scene, steps: int, rng: np.random.Generator) -> list[Point]:
-    """Places at the ends of control steps on a straight way that touches nothing, if there is one."""
-    step_m = config.speed_mps / config.control_hz
+    way_m = steps * config.speed_mps / config.control_hz
     for _ in range(100):
-        heading = rng.integers(3)
-        dx, dy = ((0.0, 1.0), (-DIAGONAL, DIAGONAL), (DIAGONAL, DIAGONAL))[heading]
+        action = int(rng.integers(NUM_ACTIONS))
+        dx, dy = ((0.0, 1.0), (-DIAGONAL, DIAGONAL), (DIAGONAL, DIAGONAL))[action]
         x, y = rng.uniform(*scene.spawn_range_m), rng.uniform(0.0, scene.length_m)
-        way = [(x + dx * step_m * k, y + dy * step_m * k) for k in range(steps + 1)]
-        if not scene.collides(way[0], way[-1], config.vehicle_radius_m, config.camera_height_m):
+        end = x + dx * way_m, y + dy * way_m
+        if not scene.collides((x, y), end, config.vehicle_radius_m, config.camera_height_m):
             break
-    return way
+    return scene, Flight((x, y), action, steps)
 
 
-def _events_along(
-    sensor: Sensor, config: EnvConfig, scene: Scene, way: list[Point]
-) -> tuple[np.ndarray, int]:
-    """All events of a flight along `way`, and the number of renders."""
-    sensor.reset(scene, way[0], np.random.default_rng(0))
-    batches, renders = [np.empty(0, EVENT)], 0
-    for k in range(1, len(way)):
-        sensor.step(way[k - 1], Outcome(way[k], 1.0, 0.0, False, False), clock_us(k, config.control_hz))
-        batches.append(sensor.events)
-        renders += sensor.renders
+def _events_of(config: EnvConfig, scene: Scene, flight: Flight) -> tuple[np.ndarray, float]:
+    """Return all events of a flight, and the number of renders."""
+    config = dataclasses.replace(config, vehicle="kinematic", body={}, action_delay_ms=0.0, task="corridor")
+    sensor, vehicles = Sensor(config), Vehicles(1)
+    sensor.reset(scene, flight.start, np.random.default_rng(0))
+    vehicles.start(0, config, scene, sensor, flight.start, make_dynamics(config))
+    vehicles.pass_through(0)
+    batches, renders, active = [np.empty(0, EVENT)], 0.0, np.ones(1, bool)
+    for _ in range(flight.steps):
+        vehicles.step(np.array([flight.action]), active)
+        batches.append(vehicles.events)
+        renders += float(vehicles.rows["renders"][0])
     sensor.close()
     return np.concatenate(batches), renders
 

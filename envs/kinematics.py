@@ -123,11 +123,13 @@ def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> O
         lane: `Lane`.
         sections: (M, 7), what stands in it, as `envs.scene.Scene.sections` gives it.
         start: x and y [m].
-        planned: x and y [m], farther ahead.
+        planned: x and y [m].
     """
     segment = start[0], start[1], planned[0], planned[1]
     contact = first_contact(segment, lane.radius_m, lane.half_width_m, sections)
-    goal = (lane.length_m - start[1]) / (planned[1] - start[1])
+    goal = math.inf
+    if planned[1] > start[1]:  # a vehicle that stands or flies back does not reach it
+        goal = (lane.length_m - start[1]) / (planned[1] - start[1])
     share = min(contact, goal, 1.0)
     collision = contact <= share
     success = not collision and goal <= 1.0
@@ -138,3 +140,23 @@ def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> O
         end = (end[0], lane.length_m)
     reward = end[1] - start[1] + GOAL_REWARD * success + COLLISION_REWARD * collision
     return Outcome(end, share, reward, success, collision)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def follow(lane: Lane, sections: np.ndarray, way: np.ndarray) -> Outcome:
+    """Move along straight parts of equal time until the first contact or the goal line, as `advance` does.
+
+    Args:
+        lane: `Lane`.
+        sections: (M, 7), as of `advance`.
+        way: (N + 1, 2), places at the ends of the N parts [m].
+    """
+    last, parts = len(way) - 1, 0
+    outcome = advance(lane, sections, (way[0, 0], way[0, 1]), (way[1, 0], way[1, 1]))
+    while parts < last - 1 and not (outcome.success or outcome.collision):
+        parts += 1
+        start = way[parts, 0], way[parts, 1]
+        outcome = advance(lane, sections, start, (way[parts + 1, 0], way[parts + 1, 1]))
+    end, success, collision = outcome.end, outcome.success, outcome.collision
+    reward = end[1] - way[0, 1] + GOAL_REWARD * success + COLLISION_REWARD * collision
+    return Outcome(end, (parts + outcome.share) / last, reward, success, collision)

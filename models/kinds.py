@@ -10,7 +10,6 @@ The ranges of all settings stand here; configurations, encoder files and policy 
 """
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, cast
 
@@ -368,12 +367,6 @@ def checked(section: Callable[..., T], values: Mapping[str, object]) -> T:
         return section(**values)
     except pydantic.ValidationError as error:
         raise ValueError("; ".join(map(_one_line, error.errors()))) from None
-
-
-def resolve(reference: str) -> Any:
-    """The object of a "module:attribute"."""
-    module, _, name = reference.partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 def _check_coding(name: str, coding: str, pool_rank: int) -> None:

@@ -144,7 +144,7 @@ def sense_way(view, way, parts):
         lost, columns = lost + more, columns + looked
         if ends:
             more_events = events_of_ramps(watch, kept, Span(begun_us, end_us))
-            events = more_events if number == stretches else _joined(events, more_events)
+            events = more_events if number == stretches else joined(events, more_events)
             begun_us, kept = end_us, np.int64(0)
     return -1, lost, columns, events
 
@@ -218,7 +218,7 @@ def _is_near(way):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _joined(events, more):
+def joined(events, more):
     """Two EVENT arrays as one."""
     joined = np.empty(events.size + more.size, EVENT)
     joined[: events.size] = events

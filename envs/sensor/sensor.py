@@ -19,7 +19,7 @@ from envs.raycast.records import BODY, FRAME
 from envs.raycast.silhouettes import Way
 from envs.raycast.stretches import Shifts
 from envs.scene import Scene
-from envs.sensor.looks import BAD_POSE, View, scratch_for, sense_way
+from envs.sensor.looks import BAD_POSE, View, scratch_for
 
 FAULTLESS = FaultsConfig()
 MAX_PIXELS_TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 MiB
@@ -31,8 +31,8 @@ class Sensor:
     Only what is observed is simulated: with observation "luminance" one render a step and no event
     camera, with "none" a clock alone.
 
-    A step that is seen by looks needs no more than `view`, so that `envs.vehicles` can take those of many
-    sensors together; such a sensor is not stepped by itself then, and its clock stands still.
+    A sensor that sees by looks is not stepped here: the compiled step of `envs.vehicles` takes its `view`,
+    together with the views of many other sensors, and `with_faults` completes the events.
 
     Attributes:
         events: EVENT array of the last step, faults included; empty where no camera is simulated.
@@ -44,14 +44,19 @@ class Sensor:
         plan: How the scene is simulated, `envs.fidelity.RenderPlan`.
     """
 
-    def __init__(self, config: EnvConfig) -> None:
-        """Make the sensor that `config` describes."""
-        self._config = config
+    def __init__(self, config: EnvConfig, planned: EnvConfig | None = None) -> None:
+        """Make the sensor that `config` describes.
+
+        Its renders are planned for the speed and rate of `planned`, which differ from `config` for a vehicle
+        that may fly faster than `config.speed_mps`. None: both are those of `config`.
+        """
+        self._config, self._planned = config, planned or config
         self._camera: Any = EventCamera(config.camera)  # or a `ColumnCamera`, where it sees by looks
         self._together = max(1, MAX_PIXELS_TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
         self._seen_us = np.zeros(config.camera.width, np.int64)
+        self._way: tuple[np.ndarray, float] | None = None  # of the last step, and its share flown
         self.true_events = np.empty(0, EVENT)
         self.plan: RenderPlan
 
@@ -75,8 +80,8 @@ class Sensor:
             state = self._camera.state, self._camera.pixels
             self._real = RealSensor(camera, self._config.faults, state, rng, t_us)
 
-    def step(self, start: Point, outcome: Outcome, end_us: int) -> None:
-        """Simulate one control step: render the part that the vehicle moved, and set the events.
+    def step(self, start: Point, outcome: Outcome, end_us: int, way: np.ndarray | None = None) -> None:
+        """Simulate one control step from whole images: render what the vehicle flew, and set the events.
 
         Parts are never shorter than the clock's microsecond. A vehicle stopped by contact
         or goal stands still for the rest of the step and sees nothing new. Where no event camera is
@@ -86,6 +91,8 @@ class Sensor:
             start: Where the step began, x and y [m].
             outcome: Where it ended.
             end_us: When the control step ends [us].
+            way: (N + 1, 2), the planned places at the ends of N parts of the step of equal time, if it is not
+                straight [m].
 
         Raises:
             ValueError: The renderer gave something that is not luminance.
@@ -101,12 +108,12 @@ class Sensor:
                 self.luminance = self._picture(outcome.end, start_us + moving_us)
             self.t_us = end_us
             return
+        self._way = None if way is None else (way, outcome.share)
         way_m = outcome.share * self._config.speed_mps / self._config.control_hz
+        if way is not None:
+            way_m = outcome.share * float(np.hypot(*np.diff(way, axis=0).T).sum())
         self.renders = min(sub_renders(way_m, self.plan.max_step_m), moving_us) if moving_us else 0
-        if self.plan.by_looks:
-            events = self._look_along(start, outcome.end, moving_us)
-        else:
-            events = self._render_along(start, outcome.end, moving_us)
+        events = self._render_along(start, outcome.end, moving_us)
         self.t_us = end_us
         self.events = self.with_faults(events, start_us, end_us)
         self.dropped += self.lost
@@ -152,17 +159,6 @@ class Sensor:
             return events
         return self._real.events(events, start_us, end_us, fired)
 
-    def _look_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
-        """Events of a way, of which each column is looked at when something changes in it."""
-        self.dropped = 0
-        if not moving_us:
-            return np.empty(0, EVENT)
-        way, view = Way(*start, *end, self._config.camera_height_m, self.t_us, moving_us), self.view()
-        bad, self.dropped, columns, events = sense_way(view, way, self.renders)
-        check_sensed(bad, way, view.scratch.columns)
-        self.renders = columns / self._config.camera.width
-        return events
-
     def _render_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
         """Events of a way from whole images."""
         start_us = self.t_us
@@ -193,15 +189,20 @@ class Sensor:
     def _poses(self, start: Point, end: Point, part: np.ndarray, t_us: np.ndarray) -> np.ndarray:
         """(K, 5) x, y, z [m], yaw [rad] and time [s] after each part of the way."""
         poses = np.zeros((part.size, 5))
-        poses[:, 0] = start[0] + (end[0] - start[0]) * part
-        poses[:, 1] = start[1] + (end[1] - start[1]) * part
+        if self._way is None:
+            poses[:, 0] = start[0] + (end[0] - start[0]) * part
+            poses[:, 1] = start[1] + (end[1] - start[1]) * part
+        else:
+            way, share = self._way
+            for axis in range(2):
+                poses[:, axis] = np.interp(part * share * (len(way) - 1), np.arange(len(way)), way[:, axis])
         poses[:, 2] = self._config.camera_height_m
         poses[:, 4] = t_us * 1e-6
         return poses
 
     def _set_renderer(self, scene: Scene) -> None:
         """Keep the renderer from episode to episode while its settings stay the same."""
-        chosen, camera = plan_renders(self._config, scene), self._config.camera
+        chosen, camera = plan_renders(self._planned, scene), self._config.camera
         same = self._renderer is not None
         same = same and (chosen.renderer, chosen.samples) == (self.plan.renderer, self.plan.samples)
         self.plan = chosen

@@ -2,8 +2,11 @@
 
 It moves each vehicle, finds contact and goal, and simulates the camera of every sensor that sees
 by looks (`envs.sensor`), and the noise of its pixels. Other sensors, and all other faults, take
-their turn in Python afterwards.
+their turn in Python afterwards. A kinematic vehicle is moved here; others come with the way of their step
+(`envs.vehicles.bodies`).
 """
+
+import math
 
 import numba
 import numpy as np
@@ -12,21 +15,24 @@ from numba.typed import List
 from envs.events import EVENT
 from envs.events.pixel_noise import fire
 from envs.fidelity import parts_of
-from envs.kinematics import Lane, advance, clock_us, planned_position
+from envs.kinematics import Lane, advance, clock_us, follow, planned_position
 from envs.raycast.silhouettes import Way
-from envs.sensor import sense_way
+from envs.sensor import joined, sense_way
 
 GOOD, BAD_REWARD = -1, -10
 
 _FLOATS = (
-    *("spawn_x_m", "x_m", "y_m"),
+    *("spawn_x_m", "spawn_y_m", "x_m", "y_m"),
+    *("vx_mps", "vy_mps"),  # of a vehicle with a body
     *("speed_mps", "control_hz", "radius_m", "height_m", "half_width_m", "length_m"),
     *("max_step_m", "limit_us"),  # way between two renders, and when the time is up
     # The last step: where it began, the share of it that it moved, its reward, its renders.
     *("start_x_m", "start_y_m", "share", "reward", "renders"),
 )
 _WHOLE = (
+    "steps",  # of the episode so far
     *("forward", "left", "right"),  # how often each action was taken
+    "parts",  # straight parts of the way of a step; 0: the vehicle is kinematic
     "delay",  # steps from a decision to its action
     *("start_us", "t_us"),  # when the last step began and ended
     "window_us",  # its length; before the first step, the length of that
@@ -59,14 +65,15 @@ def set_corridor(corridors, row, corridor):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def step_all(rows, corridors, noisy, actions, active):
+def step_all(rows, corridors, noisy, actions, ways, active):
     """One control step of all active vehicles.
 
     Args:
         rows: (B,) VEHICLE, changed in place.
         corridors: A list of B, see `corridor_list`.
         noisy: A list of B `PixelState`, of cameras that see by looks.
-        actions: int64 (B,).
+        actions: int64 (B,), of kinematic vehicles.
+        ways: float64 (B, N, 2), the planned places of vehicles with bodies, `Bodies.ways`.
         active: bool (B,).
 
     Returns:
@@ -79,9 +86,9 @@ def step_all(rows, corridors, noisy, actions, active):
         ends[row + 1], noise_ends[row + 1] = ends[row], noise_ends[row]
         if active[row]:
             sections, view = corridors[row]
-            _move(rows[row], actions[row], sections)
+            _move(rows[row], actions[row], sections, ways[row])
             if rows[row].by_looks and rows[row].problem == GOOD:
-                events = _look(rows[row], view)
+                events = _look(rows[row], view, ways[row])
                 found.append(events)
                 ends[row + 1] += events.size
                 pixels = noisy[row]
@@ -102,20 +109,26 @@ def step_all(rows, corridors, noisy, actions, active):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _move(vehicle, action, sections):
-    """Move a vehicle, and say what that brought."""
-    vehicle.forward += action == 0
-    vehicle.left += action == 1
-    vehicle.right += action == 2
-    moves, step_m = (vehicle.forward, vehicle.left, vehicle.right), (vehicle.speed_mps, vehicle.control_hz)
+def _move(vehicle, action, sections, way):
+    """Move a vehicle, and note the result in its record."""
+    vehicle.steps += 1
     lane = Lane(vehicle.radius_m, vehicle.half_width_m, vehicle.length_m)
     start = vehicle.x_m, vehicle.y_m
-    outcome = advance(lane, sections, start, planned_position(vehicle.spawn_x_m, moves, step_m))
+    if vehicle.parts == 0:
+        vehicle.forward += action == 0
+        vehicle.left += action == 1
+        vehicle.right += action == 2
+        moves = vehicle.forward, vehicle.left, vehicle.right
+        step_m = vehicle.speed_mps, vehicle.control_hz
+        x_m, y_m = planned_position(vehicle.spawn_x_m, moves, step_m)
+        outcome = advance(lane, sections, start, (x_m, vehicle.spawn_y_m + y_m))
+    else:
+        outcome = follow(lane, sections, way[: vehicle.parts + 1])
     vehicle.start_x_m, vehicle.start_y_m = start
     vehicle.x_m, vehicle.y_m = outcome.end
     vehicle.share, vehicle.reward = outcome.share, outcome.reward
     vehicle.success, vehicle.collision = outcome.success, outcome.collision
-    vehicle.start_us, vehicle.t_us = vehicle.t_us, clock_us(sum(moves), vehicle.control_hz)
+    vehicle.start_us, vehicle.t_us = vehicle.t_us, clock_us(vehicle.steps, vehicle.control_hz)
     vehicle.window_us = vehicle.t_us - vehicle.start_us
     vehicle.dropped, vehicle.renders = 0, 0.0
     ended = outcome.success or outcome.collision
@@ -126,20 +139,45 @@ def _move(vehicle, action, sections):
 
 @numba.njit(cache=True, error_model="numpy")
 def way_of(vehicle):
-    """The `Way` of the last step, up to where the vehicle stopped."""
+    """Return the `Way` of the last step of a kinematic vehicle, up to where it stopped."""
     moving_us = round(vehicle.share * vehicle.window_us)
     place = vehicle.start_x_m, vehicle.start_y_m, vehicle.x_m, vehicle.y_m
     return Way(place[0], place[1], place[2], place[3], vehicle.height_m, vehicle.start_us, moving_us)
 
 
+@numba.njit(cache=True, error_model="numpy")
+def way_of_part(vehicle, way, part):
+    """Return the `Way` of one part of the last step, as far as the vehicle moved in it."""
+    begin_us = vehicle.start_us + vehicle.window_us * part // vehicle.parts
+    end_us = vehicle.start_us + vehicle.window_us * (part + 1) // vehicle.parts
+    share = min(1.0, max(0.0, vehicle.share * vehicle.parts - part))
+    end = (way[part + 1, 0], way[part + 1, 1]) if share == 1.0 else (vehicle.x_m, vehicle.y_m)
+    moving_us = round(share * (end_us - begin_us))
+    return Way(way[part, 0], way[part, 1], end[0], end[1], vehicle.height_m, begin_us, moving_us)
+
+
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _look(vehicle, view):
-    """Events of the last step of a vehicle; it stands still, and sees nothing, once it has stopped."""
-    way = way_of(vehicle)
+def _look(vehicle, view, way):
+    """Events of the last step of a vehicle, sorted."""
+    events = _look_along(vehicle, view, way, 0)
+    for part in range(1, vehicle.parts):
+        if vehicle.problem == GOOD:
+            events = joined(events, _look_along(vehicle, view, way, part))
+    return events
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _look_along(vehicle, view, places, part):
+    """Events of a part of the last step; a vehicle that has stopped stands still and sees nothing."""
+    if vehicle.parts == 0:
+        way, way_m = way_of(vehicle), vehicle.share * vehicle.speed_mps / vehicle.control_hz
+    else:
+        way = way_of_part(vehicle, places, part)
+        way_m = math.hypot(way.end_x - way.start_x, way.end_y - way.start_y)
     if way.moving_us == 0:
         return np.empty(0, EVENT)
-    way_m = vehicle.share * vehicle.speed_mps / vehicle.control_hz
     parts = min(parts_of(way_m, vehicle.max_step_m), way.moving_us)
-    vehicle.problem, vehicle.dropped, columns, events = sense_way(view, way, parts)
-    vehicle.renders = columns / view.seen_us.size
+    vehicle.problem, dropped, columns, events = sense_way(view, way, parts)
+    vehicle.dropped += dropped
+    vehicle.renders += columns / view.seen_us.size
     return events

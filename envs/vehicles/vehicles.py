@@ -8,10 +8,16 @@ from core.neighbour_filter import NEVER, filter_all
 from envs.config import EnvConfig
 from envs.events import EVENT
 from envs.events.pixel_noise import PixelState
-from envs.kinematics import Outcome, clock_us
+from envs.kinematics import Outcome, Point, clock_us
 from envs.scene import Scene
 from envs.sensor import Sensor, check_sensed
+from envs.vehicles import task
+from envs.vehicles.bodies import Bodies
+from envs.vehicles.dynamics import Dynamics
 from envs.vehicles.step import BAD_REWARD, GOOD, VEHICLE, corridor_list, set_corridor, step_all, way_of
+
+NOTHING = np.zeros((0, 7))  # sections of a scene in which nothing stands
+NOTHING.flags.writeable = False  # as the sections of a scene, so that numba sees one type
 
 
 class StepError(ValueError):
@@ -44,25 +50,39 @@ class Vehicles:
         self._corridors: Any = None
         self._noise: Any = None  # of pixels
         self._noise_of: list[PixelState | None] = [None] * count
+        self._bodies = Bodies(count)
+        self._judges: dict[int, task.Judge] = {}  # of the rows whose task is not the corridor's
         self._decided = np.zeros((count, 0), np.int64)  # actions not yet taken, the delay's steps in turn
         self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
         self._support, self._tau_us = np.zeros((2, count), np.int64)
         self.num_seen = np.zeros(count, np.int64)
         self.forget_events()
 
-    def start(self, row: int, config: EnvConfig, scene: Scene, sensor: Sensor, spawn_x_m: float) -> None:
-        """Put a vehicle at the start of a scene that its sensor has been reset to."""
+    def start(
+        self,
+        row: int,
+        config: EnvConfig,
+        scene: Scene,
+        sensor: Sensor,
+        spawn: Point,
+        dynamics: Dynamics,
+    ) -> None:
+        """Put a vehicle at a place, x and y [m], in a scene that its sensor has been reset to."""
         vehicle = self.rows[row : row + 1]
         vehicle[:] = np.zeros(1, VEHICLE)
         self.num_seen[row] = 0
-        vehicle["spawn_x_m"] = vehicle["x_m"] = spawn_x_m
+        vehicle["spawn_x_m"] = vehicle["x_m"] = spawn[0]
+        vehicle["spawn_y_m"] = vehicle["y_m"] = spawn[1]
+        vehicle["parts"] = self._bodies.start(row, config, dynamics, spawn)
+        vehicle["vx_mps"], vehicle["vy_mps"] = dynamics.state[2:4]
         vehicle["speed_mps"], vehicle["control_hz"] = config.speed_mps, config.control_hz
         vehicle["radius_m"], vehicle["height_m"] = config.vehicle_radius_m, config.camera_height_m
         vehicle["half_width_m"], vehicle["length_m"] = 0.5 * scene.width_m, scene.length_m
         vehicle["limit_us"], vehicle["by_looks"] = config.time_limit_s * 1e6, sensor.sees_by_looks
         vehicle["max_step_m"] = sensor.plan.max_step_m if sensor.sees_by_looks else np.inf
         vehicle["window_us"], vehicle["problem"] = clock_us(1, config.control_hz), GOOD
-        self._set_delay(row, config.delay_steps)
+        self._set_delay(row, config.delay_steps, dynamics.straight)
+        self._set_task(row, config.task)
         self._sensors[row] = sensor
         corridor, noise = (scene.sections(config.camera_height_m), sensor.view()), sensor.pixel_noise()
         if self._corridors is None:
@@ -80,11 +100,19 @@ class Vehicles:
         if len(self.rows) == 1:
             self.forget_events()
 
+    def pass_through(self, row: int) -> None:
+        """Let a started vehicle fly through everything, walls and the goal line included."""
+        sensor = self._sensors[row]
+        assert sensor is not None  # noqa: S101  for the type checker
+        self.rows["half_width_m"][row] = self.rows["length_m"][row] = np.inf
+        set_corridor(self._corridors, row, (NOTHING, sensor.view()))
+
     def step(self, actions: np.ndarray, active: np.ndarray) -> None:
         """One control step of the active vehicles; `rows`, `events` and `ends` tell what it brought.
 
         Args:
-            actions: int64 (B,), valid; decided now, and taken when the delay of each vehicle is over.
+            actions: int64 (B,) or float64 (B, C), valid; decided now, and taken when the delay of each
+                vehicle is over.
             active: bool (B,); others stay as they are, without events. At least one vehicle has started.
 
         Raises:
@@ -92,9 +120,17 @@ class Vehicles:
         """
         rows = self.rows
         taken = self._exchange(actions, active)
+        headings, ways = taken, self._bodies.ways
+        if self._bodies:
+            self._bodies.move(taken, active)
+            headings = np.zeros(len(rows), np.int64)
+            self._bodies.note_velocities(rows, active)
         self.events, self.ends, noise, noise_ends = step_all(
-            rows, self._corridors, self._noise, taken, active
+            rows, self._corridors, self._noise, headings, ways, active
         )
+        for judge in set(self._judges.values()):
+            own = [self._judges.get(row) is judge for row in range(len(rows))]
+            task.loop_over(judge)(rows, active & own)
         wrong = active & (rows["problem"] != GOOD)
         if wrong.any():
             self._refuse(int(wrong.argmax()))
@@ -133,21 +169,37 @@ class Vehicles:
         return sensor.true_events
 
     def decided(self, row: int) -> np.ndarray:
-        """Actions that a vehicle has decided and not yet taken, int64 (its delay in steps,), in any order."""
-        return self._decided[row, : self.rows["delay"][row]].copy()
+        """Return the actions that a vehicle has decided and not yet taken, the next one first."""
+        delay = self.rows["delay"][row]
+        turns = (self.rows["steps"][row] + np.arange(delay)) % max(1, delay)
+        return self._decided[row, turns]
+
+    def state_of_action(self, row: int) -> np.ndarray:
+        """Return the state of a vehicle with a body when its next decision is taken, float64 (S,)."""
+        return self._bodies.state_after(row, self.decided(row))
 
     def forget_events(self) -> None:
         """Begin anew with a step that had no events."""
         self.events, self.ends = np.empty(0, EVENT), np.zeros(len(self.rows) + 1, np.int64)
         self.seen, self.seen_ends = self.events, self.ends
 
-    def _set_delay(self, row: int, steps: int) -> None:
+    def _set_delay(self, row: int, steps: int, straight: Any) -> None:
         """Begin an episode with decisions to move straight ahead, as many as are under way."""
         self.rows["delay"][row] = steps
+        action = np.asarray(straight)
+        if self._decided.shape[2:] != action.shape or self._decided.dtype != action.dtype:
+            self._decided = np.zeros((len(self.rows), 0, *action.shape), action.dtype)
         missing = steps - self._decided.shape[1]
         if missing > 0:
-            self._decided = np.pad(self._decided, ((0, 0), (0, missing)))
-        self._decided[row] = 0
+            self._decided = np.pad(self._decided, ((0, 0), (0, missing), *[(0, 0)] * action.ndim))
+        self._decided[row] = action
+
+    def _set_task(self, row: int, name: str) -> None:
+        """Begin an episode of a task."""
+        judge = task.judge_of(name)
+        self._judges.pop(row, None)
+        if judge is not None:
+            self._judges[row] = judge
 
     def _exchange(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Keep what is decided now, and take what was decided when each vehicle's delay began."""
@@ -155,8 +207,7 @@ class Vehicles:
         if not self._decided.shape[1]:  # none has ever been delayed
             return actions
         late = np.flatnonzero(active & (rows["delay"] > 0))
-        steps = rows["forward"][late] + rows["left"][late] + rows["right"][late]
-        turn, taken = steps % rows["delay"][late], actions.copy()
+        turn, taken = rows["steps"][late] % rows["delay"][late], actions.copy()
         taken[late] = self._decided[late, turn]
         self._decided[late, turn] = actions[late]
         return taken
@@ -185,7 +236,8 @@ class Vehicles:
             end = float(vehicle["x_m"]), float(vehicle["y_m"])
             share, ends = float(vehicle["share"]), (bool(vehicle["success"]), bool(vehicle["collision"]))
             outcome = Outcome(end, share, float(vehicle["reward"]), *ends)
-            sensor.step((float(vehicle["start_x_m"]), float(vehicle["start_y_m"])), outcome, t_us)
+            start = float(vehicle["start_x_m"]), float(vehicle["start_y_m"])
+            sensor.step(start, outcome, t_us, self._bodies.way(row) if vehicle["parts"] else None)
         except ValueError as error:
             vehicle["over"] = True
             raise StepError(row, str(error)) from error

@@ -38,8 +38,9 @@ def key_of(section: str, path: Sequence[int | str]) -> str:
 
 
 LAYOUT = "env.layout."  # begins the key of a layout's field, such as env.layout.ground_texture.pattern
+OPEN_FIELDS = {LAYOUT: "layout", "env.body.": "body"}  # the latter of a vehicle's, such as env.body.tau_s
 ADDED_FAULT = "faults.added."  # begins the key of a plug-in's fault
-OPEN_KEYS = (LAYOUT, ADDED_FAULT)
+OPEN_KEYS = (*OPEN_FIELDS, ADDED_FAULT)
 
 
 def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
@@ -51,9 +52,11 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
     fields: dict[str, typing.Any] = {}
     groups: dict[str, dict[str, object]] = {}
     for key, value in changes.items():
-        if key.startswith(LAYOUT):
-            layout = typing.cast(dict[str, object], fields.get("layout", env.layout))
-            fields["layout"] = _with_part(layout, key.removeprefix(LAYOUT).split("."), value)
+        start = next((one for one in OPEN_FIELDS if key.startswith(one)), None)
+        if start is not None:
+            field = OPEN_FIELDS[start]
+            values = typing.cast(dict[str, object], fields.get(field, getattr(env, field)))
+            fields[field] = _with_part(values, key.removeprefix(start).split("."), value)
             continue
         if key.startswith(ADDED_FAULT):
             added = groups.setdefault("faults", {}).setdefault("added", dict(env.faults.added))

@@ -1,8 +1,9 @@
 """Plug-ins: Python files outside this repository that add scenes, faults and kinds of policy.
 
 A plug-in is a file, the folder of a package, or an installed module. Importing it adds rows to `LAYOUTS`,
-`ADDED_FAULTS` and `KINDS`, in which every job looks names up. The key `plugins` names them; Ray ships their
-code to each worker, which imports them before it does anything else (docs/extend.md).
+`SHAPES`, `ADDED_FAULTS`, `VEHICLES`, `TASKS` and `KINDS`, in which every job looks names up. The key
+`plugins` names them; Ray ships their code to each worker, which imports them before it does anything else
+(docs/extend.md).
 """
 
 import hashlib
@@ -18,14 +19,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from envs.config import ADDED_FAULTS
+from core.places import resolve
+from envs.config import ADDED_FAULTS, TASKS, VEHICLES
 from envs.scene.layouts import LAYOUTS
+from envs.scene.shapes import SHAPES
 from jobs.config.errors import ConfigError
-from models.kinds import KINDS, resolve
+from models.kinds import KINDS
 
 GROUP = "evade.plugins"  # of the entry points of installed packages
 VARIABLE = "EVADE_PLUGINS"  # of a Ray worker: the names of its plug-ins
-ROWS: dict[str, dict[str, Any]] = {"scene": LAYOUTS, "fault": ADDED_FAULTS, "kind of policy": KINDS}
+ROWS: dict[str, dict[str, Any]] = {
+    **{"scene": LAYOUTS, "shape": SHAPES, "fault": ADDED_FAULTS, "kind of policy": KINDS},
+    **{"vehicle": VEHICLES, "task": TASKS},
+}
 
 _loaded: dict[str, ModuleType] = {}
 
@@ -136,6 +142,8 @@ def _check(what: str, name: str, row: Any) -> None:
         make_scene(name, np.random.default_rng(0))
     elif what == "fault" and not callable(row):
         raise ValueError(f"must be a function, got {row!r}")
+    elif what in ("vehicle", "task"):
+        resolve(row)
     elif what == "kind of policy":
         resolve(row.feature)
         resolve(row.network)

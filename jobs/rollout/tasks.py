@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.config import EnvConfig, FaultsConfig, seen_settings, settings_hash
+from envs.config import EnvConfig, FaultsConfig, hashed_settings, seen_settings, settings_hash
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.policies import EvaluatedPolicy
 
@@ -47,7 +47,7 @@ class EvaluationTask:
     @functools.cached_property
     def simulation(self) -> str:
         """Hash of what decides how exact its events are: the simulation without its faults."""
-        return settings_hash(dataclasses.asdict(dataclasses.replace(self.env, faults=FaultsConfig())))
+        return settings_hash(hashed_settings(dataclasses.replace(self.env, faults=FaultsConfig())))
 
     @property
     def part_id(self) -> tuple[str, int]:
@@ -66,7 +66,7 @@ def make_task(
     """The task of the first `trials` corridors, see `EvaluationTask`, with its key."""
     seen = seen_settings(env, policy.observation)
     facts: dict[str, object] = {
-        "env": dataclasses.asdict(seen),
+        "env": hashed_settings(seen),
         "agent": policy.identity,
         "action": action,
         "kept": list(EPISODE.names or ()),  # another version of EPISODE, another file

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from core.pictures import GREY_OFF, GREY_ON, grey_picture
+from core.places import resolve
 from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows, event_rows, thin
 from models.encoder.event_images import draw_last
 from models.encoder.finetuned import EVENTS as ENCODED_EVENTS
 from models.encoder.frozen import Encoder
-from models.kinds import PolicySpec, resolve
+from models.kinds import PolicySpec
 from models.policy.event_set import EVENTS, TIMES
 
 Windows = np.ndarray | Sequence[np.ndarray]  # packed ones, of one length or of several

@@ -16,11 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from core.places import resolve
 from models.encoder.event_images import nature_layers
 from models.encoder.finetuned import FinetunedEncoder
 from models.encoder.products import Linear, orthogonal_
 from models.encoder.table import dense
-from models.kinds import PolicySpec, resolve
+from models.kinds import PolicySpec
 from models.policy.dense_update import tanh
 from models.policy.event_set import OUTPUTS, EventSet, EventTables
 from models.policy.features import feature_of

@@ -29,9 +29,10 @@ from torch import Tensor, nn
 
 from core.neighbour_filter import NEVER
 from core.pictures import GAMMA, GREY_OFF, GREY_ON
+from core.places import resolve
 from models.encoder.event_batch import ROW_OFF, ROW_ON
 from models.encoder.event_images import OFF_SHARE, PictureEncoder
-from models.kinds import KINDS, resolve
+from models.kinds import KINDS
 from models.policy.event_filter import EventFilter, filter_of
 from models.policy.event_set import EVENTS, TIMES, EventSet
 from models.policy.policy import Policy

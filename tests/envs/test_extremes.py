@@ -12,6 +12,7 @@ from envs.kinematics import Outcome, clock_us
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene
 from envs.sensor import Sensor
 from envs.vehicles.step import step_all
+from tests.support.sensing import step_sensor
 
 TINY = CameraConfig(width=8, height=8)
 FREE = {"num_obstacles": 0}
@@ -112,7 +113,8 @@ def test_events_keep_their_microsecond_after_ten_hours_and_after_ten_million_sec
     later = Sensor(env.config)
     later.reset(env.scene, (env.camera_pose()[0], 0.0), np.random.default_rng(0), start_us)
     place = env.camera_pose()
-    later.step((place[0], 0.0), Outcome((place[0], place[1]), 1.0, 0.0, False, False), start_us + 5000)
+    outcome = Outcome((place[0], place[1]), 1.0, 0.0, False, False)
+    step_sensor(env.config, later, (place[0], 0.0), outcome, start_us + 5000)
     assert len(early) > 10
     np.testing.assert_array_equal(later.events["t"] - start_us, early["t"])
     np.testing.assert_array_equal(later.events[["x", "y", "p"]], early[["x", "y", "p"]])

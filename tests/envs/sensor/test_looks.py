@@ -13,18 +13,20 @@ from envs.raycast import RaycastRenderer
 from envs.raycast.columns import aim, paint_columns
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture, make_scene
 from envs.sensor import Sensor
+from tests.support.sensing import step_sensor
 
 STEP_M, STEP_US = 0.1, 5000
 
 
 def flight(scene, steps, **fields):
     """Events of a straight flight, renders a step, and the last picture."""
-    sensor = Sensor(EnvConfig(**fields))
+    config = EnvConfig(**fields)
+    sensor = Sensor(config)
     sensor.reset(scene, (0.2, 10.0), np.random.default_rng(0))
     events, renders = [], 0.0
     for k in range(steps):
         start, end = (0.2, 10.0 + k * STEP_M), (0.2, 10.0 + (k + 1) * STEP_M)
-        sensor.step(start, Outcome(end, 1.0, STEP_M, False, False), (k + 1) * STEP_US)
+        step_sensor(config, sensor, start, Outcome(end, 1.0, STEP_M, False, False), (k + 1) * STEP_US)
         events.append(sensor.events)
         renders += sensor.renders
     return events, renders / steps, sensor.luminance
@@ -108,7 +110,7 @@ def test_the_tolerance_is_kept_where_flights_seldom_lead(name, hz):
     for k in range(steps):
         end = place + step_m * np.array(heading)
         begin_us, end_us = clock_us(k, hz), clock_us(k + 1, hz)
-        sensor.step(tuple(place), Outcome(tuple(end), 1.0, 0.0, False, False), end_us)
+        step_sensor(config, sensor, tuple(place), Outcome(tuple(end), 1.0, 0.0, False, False), end_us)
         seen.append(sensor.events)
         for part in np.arange(1, renders + 1) / renders:
             t_us = begin_us + int(part * (end_us - begin_us))
@@ -124,11 +126,12 @@ def test_the_tolerance_is_kept_where_flights_seldom_lead(name, hz):
 
 def test_a_vehicle_that_stopped_within_a_step_sees_later_events_within_later_steps():
     scene = make_scene("poles", np.random.default_rng(5))
-    sensor, y = Sensor(EnvConfig()), 10.0
+    config, y = EnvConfig(), 10.0
+    sensor = Sensor(config)
     sensor.reset(scene, (0.2, y), np.random.default_rng(0))
     for k, share in enumerate((1.0, 0.3, 1.0, 0.0, 1.0)):
         end = (0.2, y + share * STEP_M)
-        sensor.step((0.2, y), Outcome(end, share, 0.0, False, False), (k + 1) * STEP_US)
+        step_sensor(config, sensor, (0.2, y), Outcome(end, share, 0.0, False, False), (k + 1) * STEP_US)
         y = end[1]
         assert (sensor.events.size > 0) == (share > 0.0)
         assert ((sensor.events["t"] > k * STEP_US) & (sensor.events["t"] <= (k + 1) * STEP_US)).all()
@@ -172,23 +175,26 @@ def test_the_picture_at_the_end_is_the_render_from_there():
 
 def test_a_still_world_makes_no_event_however_it_is_looked_at():
     scene = make_scene("poles", np.random.default_rng(9))
-    sensor = Sensor(EnvConfig(camera=CameraConfig(contrast_threshold=1e-3)))
+    config = EnvConfig(camera=CameraConfig(contrast_threshold=1e-3))
+    sensor = Sensor(config)
     sensor.reset(scene, (0.2, 10.0), np.random.default_rng(0))
     for k in range(3):
-        sensor.step((0.2, 10.0), Outcome((0.2, 10.0), 1.0, 0.0, False, False), (k + 1) * STEP_US)
+        step_sensor(
+            config, sensor, (0.2, 10.0), Outcome((0.2, 10.0), 1.0, 0.0, False, False), (k + 1) * STEP_US
+        )
         assert sensor.events.size == 0
 
 
 @pytest.mark.parametrize("step_us", [1, 2, 7])
 def test_steps_of_a_few_microseconds(step_us):
     scene = make_scene("poles_dense", np.random.default_rng(10))
-    sensor = Sensor(
-        EnvConfig(control_hz=1e6 / step_us, speed_mps=1e5, camera=CameraConfig(contrast_threshold=0.05))
-    )
+    camera = CameraConfig(contrast_threshold=0.05)
+    config = EnvConfig(control_hz=1e6 / step_us, speed_mps=1e5, camera=camera)
+    sensor = Sensor(config)
     sensor.reset(scene, (0.2, 10.0), np.random.default_rng(0))
     for k in range(5):
         start, end = (0.2, 10.0 + k), (0.2, 11.0 + k)
-        sensor.step(start, Outcome(end, 1.0, 1.0, False, False), (k + 1) * step_us)
+        step_sensor(config, sensor, start, Outcome(end, 1.0, 1.0, False, False), (k + 1) * step_us)
         assert sensor.events.size > 0
         assert k * step_us < sensor.events["t"].min() <= sensor.events["t"].max() <= (k + 1) * step_us
 

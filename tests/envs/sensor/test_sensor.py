@@ -11,6 +11,7 @@ from envs.raycast import RaycastRenderer
 from envs.scene import make_scene
 from envs.sensor import Sensor
 from envs.sensor import sensor as sensing
+from tests.support.sensing import step_sensor
 
 SMALL = CameraConfig(width=16, height=12, contrast_threshold=0.002)
 BY_FRAMES = CameraConfig(width=16, height=12, contrast_threshold=0.002, refractory_us=1)
@@ -62,11 +63,11 @@ def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, share):
 
 def test_events_lost_to_the_cap_are_counted_over_all_renders_of_a_step():
     capped = CameraConfig(width=16, height=12, contrast_threshold=0.002, max_events_per_pixel=1)
-    _, _, free = look(camera=CameraConfig(width=16, height=12, contrast_threshold=0.002))
+    config, _, free = look(camera=CameraConfig(width=16, height=12, contrast_threshold=0.002))
     _, _, sensor = look(camera=capped)
     outcome = Outcome((1.0, 5.1), 1.0, 0.1, False, False)
     for one in (free, sensor):
-        one.step((1.0, 5.0), outcome, 5000)
+        step_sensor(config, one, (1.0, 5.0), outcome, 5000)
     assert free.dropped == 0
     assert sensor.dropped + sensor.events.size == free.events.size
     assert sensor.dropped > 0
@@ -80,9 +81,9 @@ def test_a_camera_that_forgets_gets_one_frame_per_control_step():
 
 
 def test_a_vehicle_that_cannot_move_sees_nothing_and_renders_nothing():
-    _, _, sensor = look()
+    config, _, sensor = look()
     before = sensor.luminance
-    sensor.step((1.0, 5.0), Outcome((1.0, 5.0), 0.0, -100.0, False, True), 5000)
+    step_sensor(config, sensor, (1.0, 5.0), Outcome((1.0, 5.0), 0.0, -100.0, False, True), 5000)
     assert sensor.events.size == sensor.renders == 0
     assert sensor.luminance is before
     assert sensor.events.dtype == EVENT
@@ -136,16 +137,16 @@ def test_rendering_in_parts_keeps_the_events_alike_when_the_control_rate_falls()
 
 
 def test_faults_work_on_the_events_of_the_whole_step():
-    _, _, clean = look()
+    config, _, clean = look()
     _, _, noisy = look(faults=FaultsConfig(event_dropout=1.0))
     for one in (clean, noisy):
-        one.step((1.0, 5.0), Outcome((1.0, 5.1), 1.0, 0.1, False, False), 5000)
+        step_sensor(config, one, (1.0, 5.0), Outcome((1.0, 5.1), 1.0, 0.1, False, False), 5000)
     assert clean.events.size > 40
     assert noisy.events.size == 0
 
 
 def test_the_fidelity_that_is_set_is_the_fidelity_that_is_flown():
-    _, _, sensor = look(fidelity=FidelityConfig(max_step_m=0.02, samples=3, cull_m=30.0))
-    sensor.step((1.0, 5.0), Outcome((1.0, 5.1), 1.0, 0.1, False, False), 5000)
+    config, _, sensor = look(fidelity=FidelityConfig(max_step_m=0.02, samples=3, cull_m=30.0))
+    step_sensor(config, sensor, (1.0, 5.0), Outcome((1.0, 5.1), 1.0, 0.1, False, False), 5000)
     assert sensor.renders == 5
     assert (sensor.plan.samples, sensor.plan.cull_m) == (3, 30.0)

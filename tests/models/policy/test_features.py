@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies
 
+from core.places import resolve
 from envs.config import CameraConfig, EnvConfig, Observation
 from envs.corridor import CorridorEnv
 from envs.events import EVENT, event_image, pack_window
-from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec, resolve
+from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec
 from models.policy import Policy
 from models.policy.features import Feature, Step, feature_of, grey_picture, push_features
 from models.policy.networks import build_networks

@@ -1,0 +1,99 @@
+"""Bodies: the states of those vehicles of a batch that have dynamics of their own."""
+
+from typing import Any
+
+import numpy as np
+
+from envs.config import EnvConfig
+from envs.kinematics import Point
+from envs.vehicles.dynamics import Dynamics, loop_over, parts_of_step
+
+
+class Bodies:
+    """States, parameters and the last ways of vehicles; rows of kinematic vehicles stay unused.
+
+    Attributes:
+        ways: float64 (B, parts + 1, 2), places at the ends of the parts of the last step [m].
+    """
+
+    def __init__(self, count: int) -> None:
+        """Make room for `count` vehicles, all of them kinematic so far."""
+        self._dynamics: dict[int, Dynamics] = {}
+        self._state, self._parameters = np.zeros((count, 4)), np.zeros((count, 0))
+        self._tables, self._wind = np.zeros((count, 0, 0)), np.zeros((count, 2))
+        self._dt_s, self._parts = np.zeros(count), np.zeros(count, np.int64)
+        self.ways = np.zeros((count, 1, 2))
+
+    def start(self, row: int, config: EnvConfig, dynamics: Dynamics, place: Point) -> int:
+        """Start an episode of one vehicle at `place`; return the parts of its steps, 0 if it is kinematic."""
+        self._dynamics.pop(row, None)
+        if dynamics.move is None:
+            return 0
+        self._dynamics[row] = dynamics
+        parts = self._parts[row] = parts_of_step(config)
+        self._dt_s[row] = 1.0 / (config.control_hz * parts)
+        self._state = _with_room(self._state, dynamics.state.shape)
+        self._parameters = _with_room(self._parameters, dynamics.parameters.shape)
+        self.ways = _with_room(self.ways, (parts + 1, 2))
+        self._state[row, : dynamics.state.size] = dynamics.state
+        self._state[row, :2] = place
+        self._parameters[row, : dynamics.parameters.size] = dynamics.parameters
+        self._wind[row] = dynamics.wind
+        if dynamics.commands is not None:
+            self._tables = _with_room(self._tables, dynamics.commands.shape)
+            self._tables[row, : len(dynamics.commands), : dynamics.commands.shape[1]] = dynamics.commands
+        return int(parts)
+
+    def __bool__(self) -> bool:
+        """Whether any vehicle has a body."""
+        return bool(self._dynamics)
+
+    def move(self, actions: np.ndarray, active: np.ndarray) -> None:
+        """Move the active vehicles through one control step, as if nothing stood in the way.
+
+        Args:
+            actions: (B,) integers or (B, C) float64, those that are taken now.
+            active: bool (B,).
+        """
+        for move, rows in self._kinds().items():
+            own = np.zeros(len(active), bool)
+            own[rows] = active[rows]
+            arrays = self._wind, self._parameters, self._dt_s, self._parts, self.ways
+            loop_over(move)(self._state, self._commands(actions), *arrays, own)
+
+    def note_velocities(self, rows: np.ndarray, active: np.ndarray) -> None:
+        """Write the velocities of the active vehicles to their VEHICLE records."""
+        own = [row for row in self._dynamics if active[row]]
+        rows["vx_mps"][own], rows["vy_mps"][own] = self._state[own, 2], self._state[own, 3]
+
+    def way(self, row: int) -> np.ndarray:
+        """Return the planned places of a vehicle in its last step, (parts + 1, 2) [m]."""
+        return self.ways[row, : self._parts[row] + 1]
+
+    def state_after(self, row: int, actions: np.ndarray) -> np.ndarray:
+        """Return the state of a vehicle once these actions have been taken, float64 (S,)."""
+        dynamics, state = self._dynamics[row], self._state[row].copy()
+        for action in actions:
+            command = np.asarray(action if dynamics.commands is None else dynamics.commands[action], float)
+            for _ in range(int(self._parts[row])):
+                dynamics.move(state, command, self._wind[row], self._parameters[row], self._dt_s[row])  # type: ignore[misc]  # a body moves
+        return state
+
+    def _kinds(self) -> dict[Any, list[int]]:
+        """Return the rows that each `move` moves."""
+        kinds: dict[Any, list[int]] = {}
+        for row, dynamics in self._dynamics.items():
+            kinds.setdefault(dynamics.move, []).append(row)
+        return kinds
+
+    def _commands(self, actions: np.ndarray) -> np.ndarray:
+        """Return the command of each row, float64 (B, C)."""
+        if actions.ndim > 1:
+            return actions
+        return self._tables[np.arange(len(actions)), actions]
+
+
+def _with_room(array: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
+    """Return `array` (B, ...) with at least these `sides` behind B, padded with zeros."""
+    missing = [(0, max(0, side - here)) for side, here in zip(sides, array.shape[1:], strict=True)]
+    return np.pad(array, [(0, 0), *missing]) if any(more for _, more in missing) else array

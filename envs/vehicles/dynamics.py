@@ -1,0 +1,122 @@
+"""Dynamics: what turns a command into motion.
+
+`env.vehicle` names a row of `envs.config.VEHICLES`: the place, "module:function", of what makes a `Dynamics`
+from the settings of an episode. "kinematic", the paper's vehicle of three headings, is the default; it counts
+its moves, so that no error adds up, within the compiled step. Every other vehicle integrates a state by a
+compiled function:
+
+    @numba.njit
+    def move(state, command, wind, parameters, dt_s): ...
+
+It changes `state`, float64 (S,) that begins with x, y [m], vx, vy [m/s], over `dt_s` seconds. A plug-in adds
+a row, `VEHICLES["glider"] = "my_module:make_glider"`. The camera looks along +y whatever the state.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from gymnasium import spaces
+
+from core.places import resolve
+from envs.config import VEHICLES, EnvConfig
+from envs.kinematics import NUM_ACTIONS
+
+WAY_S = 0.01  # at most; the way of a control step is cut into straight parts of equal time
+
+
+class Dynamics(NamedTuple):
+    """A vehicle, with the settings of one episode.
+
+    Attributes:
+        action_space: Discrete(K), or a Box of shape (C,).
+        straight: The action that flies straight ahead; it is followed until the first delayed one is due.
+        top_speed_mps: No faster than this [m/s], so that the renders of a step can be planned.
+        move: Compiled, as above. None: the vehicle is the kinematic one.
+        state: float64 (S,) at the start; x and y are the spawn's, whatever stands here.
+        parameters: float64 (P,), handed to `move`.
+        wind: float64 (2,) [m/s], handed to `move`.
+        commands: float64 (K, C), the command of each action of a Discrete; None: an action is a command.
+    """
+
+    action_space: spaces.Space
+    straight: Any
+    top_speed_mps: float
+    move: Callable[..., None] | None = None
+    state: np.ndarray = np.zeros(4)
+    parameters: np.ndarray = np.zeros(0)
+    wind: np.ndarray = np.zeros(2)
+    commands: np.ndarray | None = None
+
+
+def make_dynamics(config: EnvConfig) -> Dynamics:
+    """Return the vehicle of an episode.
+
+    Raises:
+        ValueError: `config.body` has a key or a value that the vehicle does not accept.
+    """
+    made: Dynamics = resolve(VEHICLES[config.vehicle])(config)
+    return made
+
+
+def make_kinematic(config: EnvConfig) -> Dynamics:
+    """Return the paper's vehicle: constant speed, ahead or 45 degrees to a side (appendix D.1)."""
+    if config.body:
+        raise ValueError(f"body must be empty for vehicle 'kinematic'; got {config.body!r}")
+    return Dynamics(spaces.Discrete(NUM_ACTIONS), np.int64(0), config.speed_mps)
+
+
+def planned_config(config: EnvConfig, dynamics: Dynamics) -> EnvConfig:
+    """Return the settings whose speed and rate bound each part of a step's way, to plan its renders by."""
+    if dynamics.move is None:
+        return config
+    rate_hz = config.control_hz * parts_of_step(config)
+    return replace(config, speed_mps=dynamics.top_speed_mps, control_hz=rate_hz)
+
+
+def number_type(space: spaces.Space) -> type:
+    """Return the type in which actions of a space are queued and taken."""
+    return np.int64 if isinstance(space, spaces.Discrete) else np.float64
+
+
+def wrong_actions(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
+    """Return which of some actions are not in a Discrete(K) or a Box, bool (B,)."""
+    discrete = isinstance(space, spaces.Discrete)
+    if actions.dtype.kind not in ("iu" if discrete else "iuf"):
+        return np.ones(len(actions), bool)
+    if isinstance(space, spaces.Discrete):
+        return (actions < 0) | (actions >= space.n)
+    inside = (actions >= space.low) & (actions <= space.high)
+    return ~inside.all(axis=tuple(range(1, actions.ndim)))
+
+
+def parts_of_step(config: EnvConfig) -> int:
+    """Return into how many straight parts the way of a control step is cut, each at most `WAY_S` long."""
+    return max(1, math.ceil((1.0 - 1e-9) / (config.control_hz * WAY_S)))
+
+
+@lru_cache(maxsize=16)
+def loop_over(move: Callable[..., None]) -> Callable[..., None]:
+    """Return the compiled loop that moves all active vehicles of one kind by `move`.
+
+    It takes states (B, S), commands (B, C), winds (B, 2), parameters (B, P), the seconds of a part (B,), the
+    number of parts (B,), the places at the ends of the parts (B, parts + 1, 2), which it fills, and whether
+    each vehicle is active, bool (B,).
+    """
+
+    @numba.njit(error_model="numpy")
+    def move_all(
+        states: Any, commands: Any, winds: Any, parameters: Any, dt_s: Any, parts: Any, ways: Any, active: Any
+    ) -> None:
+        for row in range(len(states)):
+            if active[row]:
+                ways[row, 0] = states[row, :2]
+                for part in range(parts[row]):
+                    move(states[row], commands[row], winds[row], parameters[row], dt_s[row])
+                    ways[row, part + 1] = states[row, :2]
+
+    return move_all
