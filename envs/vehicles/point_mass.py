@@ -171,6 +171,11 @@ def _follow_velocity(state, command, wind, constants, piece):
         ax, ay = ax * limit / wish, ay * limit / wish
         if drag == 0.0:
             piece = min(piece, max(SHORT_S, (wish - limit) / (rate * limit)))  # until the limit stops to bind
+        else:  # the direction of the middle of the piece
+            bx = command[0] - state[2] - 0.5 * piece * (ax + drag * (wind[0] - state[2]))
+            by = command[1] - state[3] - 0.5 * piece * (ay + drag * (wind[1] - state[3]))
+            wish = max(limit, rate * math.hypot(bx, by))
+            ax, ay = rate * bx * limit / wish, rate * by * limit / wish
         _relax(state, ax + drag * wind[0], ay + drag * wind[1], drag, piece)
     else:
         ax, ay = rate * command[0] + drag * wind[0], rate * command[1] + drag * wind[1]

@@ -198,8 +198,9 @@ def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_k
         "env", "camera", "faults", "renderer", "fidelity",
     ]  # fmt: skip
     assert set(stored["env"]) == {
-        "scene", "layout", "control_hz", "speed_mps", "vehicle", "body", "task", "action_delay_ms", "vehicle_radius_m",
-        "camera_height_m", "time_limit_s", "window_capacity", "filter_support", "filter_tau_us",
+        "scene", "layout", "control_hz", "speed_mps", "vehicle", "body", "task", "action_delay_ms",
+        "vehicle_radius_m", "camera_height_m", "time_limit_s", "window_capacity",
+        "filter_support", "filter_tau_us",
     }  # fmt: skip
 
 
