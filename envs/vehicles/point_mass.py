@@ -38,7 +38,8 @@ class PointMass:
         command: What an action asks for: "velocity" or "acceleration". An action is a Box of two numbers in
             [-1, 1], right and ahead, times max_speed_mps or max_acceleration_mps2.
         primitives: If at least 2, an action is one of so many instead, Discrete: sideways velocities from
-            left to right at `speed_mps` ahead, or sideways accelerations. 0: a Box.
+            left to right at `speed_mps` ahead, or sideways accelerations. Three are ordered as the kinematic
+            vehicle's: ahead, left, right. 0: a Box.
         tau_s: Time constant of the lag [s].
         max_acceleration_mps2: Of the nominal mass, by the rotors [m/s^2].
         max_speed_mps: Largest commanded speed [m/s].
@@ -139,8 +140,10 @@ def _commands(body: PointMass, speed_mps: float) -> tuple[np.ndarray | None, Any
     if not body.primitives:
         return None, np.array([0.0, ahead])
     side = min(1.0, body.side_speed_mps / body.max_speed_mps) if body.command == "velocity" else 1.0
-    sideways = side * np.linspace(-1.0, 1.0, int(body.primitives))
-    return np.stack([sideways, np.full_like(sideways, ahead)], axis=1), np.int64(body.primitives // 2)
+    sideways, straight = side * np.linspace(-1.0, 1.0, int(body.primitives)), int(body.primitives) // 2
+    if body.primitives == 3:
+        sideways, straight = sideways[[1, 0, 2]], 0
+    return np.stack([sideways, np.full_like(sideways, ahead)], axis=1), np.int64(straight)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -113,6 +113,7 @@ def parse(values: Mapping[str, object]) -> Config:
             *condition_errors("train.conditions", config.train.conditions, config.env),
             *condition_errors("collect.conditions", config.collect.conditions, config.env),
             *_size_errors(config),
+            *_vehicle_errors(config.env),
             *scene_errors(list(_named_scenes(config)), config.env),
         ]
     if config is None or errors:
@@ -183,6 +184,22 @@ def _section(section: Callable[..., Part], values: object, name: str, errors: li
         errors.append(f"{name}: must be a group of settings, got {values!r}")
         return None
     return _build(section, values, name, errors)
+
+
+def _vehicle_errors(env: EnvConfig) -> list[str]:
+    """Return one line if the vehicle cannot be made, or has other actions than policies choose among."""
+    if env.vehicle == "kinematic" and not env.body:
+        return []
+    from envs.vehicles.dynamics import make_dynamics  # loads numba, which takes long
+
+    try:
+        space = make_dynamics(env).action_space
+    except ValueError as error:
+        return [f"env.{error}"]
+    if str(space) == "Discrete(3)":
+        return []
+    rule = "must have three actions, among which policies choose, such as env.body.primitives=3"
+    return [f"env.vehicle: {rule}; the actions of {env.vehicle!r} are {space}. Fly it through Gymnasium"]
 
 
 def _build(

@@ -114,6 +114,9 @@ def test_primitives_are_sideways_commands_and_their_middle_flies_straight():
     assert dynamics.action_space == spaces.Discrete(11)
     assert dynamics.commands[:, 0] * 30.0 == pytest.approx(np.linspace(-5, 5, 11))
     assert dynamics.commands[:, 1] * 30.0 == pytest.approx(10.0)
+    three = make_dynamics(EnvConfig(vehicle="point_mass", speed_mps=10.0, body={"primitives": 3.0}))
+    assert three.commands[:, 0] * 30.0 == pytest.approx([0.0, -5.0, 5.0])  # as the kinematic vehicle's
+    assert three.straight == 0
     env = CorridorEnv(EnvConfig(**BLIND, speed_mps=10.0, body={"primitives": 11.0}))
     env.reset(seed=1)
     x_m = env.camera_pose()[0]

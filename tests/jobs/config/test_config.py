@@ -98,6 +98,25 @@ def test_every_job_has_a_module_whose_settings_are_those_of_its_file():
         assert job.summary
 
 
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (
+            ["env.vehicle=point_mass"],
+            r"env.vehicle: must have three actions, .*the actions of 'point_mass' are",
+        ),
+        (["env.vehicle=boat"], r"env.vehicle: must be one of kinematic, point_mass, .*got 'boat'"),
+        (["env.vehicle=point_mass", "+env.body.tau=1"], r"env.body has no 'tau'; it has command, "),
+        (["+env.body.tau_s=1"], r"env.body must be empty for vehicle 'kinematic'"),
+        (["env.task=race"], r"env.task: must be one of corridor, got 'race'"),
+    ],
+)
+def test_a_vehicle_that_jobs_cannot_fly_is_refused(words, rule):
+    assert parse(compose("+exp=event_columns", "env.vehicle=point_mass", "+env.body.primitives=3"))
+    with pytest.raises(ConfigError, match=rule):
+        parse(compose("+exp=event_columns", *words))
+
+
 @pytest.mark.parametrize("budget", ["smoke", "short"])
 @pytest.mark.parametrize("name", [name for name, job in JOBS_THERE.items() if job.own_keys()])
 def test_a_configuration_is_the_core_and_the_section_of_its_job(name, budget):
