@@ -7,7 +7,7 @@ LIMIT_S = 1e9
 
 
 def check_image(width: int, height: int, fov_deg: float, samples: int, cull_m: float = math.inf) -> None:
-    """ValueError unless sizes and samples are at least 1, fov_deg is in [1, 170] and cull_m positive."""
+    """Raise ValueError unless sizes and samples are >= 1, fov_deg is in [1, 170] and cull_m positive."""
     if not (min(width, height, samples) >= 1 and 1.0 <= fov_deg <= 170.0):
         raise ValueError(
             "width, height and samples must be >= 1 and fov_deg in [1, 170], "
@@ -18,7 +18,7 @@ def check_image(width: int, height: int, fov_deg: float, samples: int, cull_m: f
 
 
 def check_pose(pose: tuple[float, float, float, float], t_s: float = 0.0) -> None:
-    """ValueError unless `pose` (x, y, z [m], yaw [rad]) is finite, above ground and within 1000 km."""
+    """Raise ValueError unless `pose` (x, y, z [m], yaw [rad]) is finite, above ground and within 1000 km."""
     x, y, z, yaw = pose
     # Each on its own: max() of Python may pass a NaN over.
     near = all(abs(value) <= LIMIT_M for value in (x, y, z))

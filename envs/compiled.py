@@ -1,4 +1,4 @@
-"""How kernels that allocate nothing are compiled."""
+"""Decorators for kernels that allocate nothing."""
 
 import numba
 

@@ -22,7 +22,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 def _layout_value(value: Any) -> Any:
-    """One rule and one message, where a union of types would give several."""
+    """Return a layout value in plain form: one rule and one message instead of those of a union of types."""
     if isinstance(value, bool | str):
         return value
     if isinstance(value, Mapping):
@@ -153,7 +153,7 @@ class CameraConfig:
 
 
 def with_floor(camera: CameraConfig, floor: float = LUMINANCE_FLOOR) -> CameraConfig:
-    """The camera with this luminance floor, unless it has one."""
+    """Return the camera with this luminance floor, unless it has one already."""
     if camera.luminance_floor is not None:
         return camera
     return dataclasses.replace(camera, luminance_floor=floor)
@@ -201,7 +201,7 @@ class FaultsConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class FidelityConfig:
-    """How exact the events have to be; `envs.fidelity.plan_renders` chooses the cheapest rendering.
+    """Required accuracy of the events; `envs.fidelity.plan_renders` chooses the cheapest rendering for it.
 
     Attributes:
         tolerance: Accepted share of events that differ from the converged ones in pixel,
@@ -280,14 +280,14 @@ class EnvConfig:
 
     @property
     def delay_steps(self) -> int:
-        """Control steps from an observation to its action."""
+        """Number of control steps from an observation to its action."""
         steps = 1e-3 * self.action_delay_ms * self.control_hz
         return math.ceil(steps * (1 - 1e-12))  # 3 * 1e-3 * 1000 is above 3
 
     @field_validator("camera", "faults", "fidelity", mode="before")
     @classmethod
     def _by_name(cls, value: Any, info: ValidationInfo) -> Any:
-        """A section by its fields' names, as a policy's manifest holds them."""
+        """Make a section from a mapping of its fields, the form in which a policy's manifest stores it."""
         return SECTIONS[str(info.field_name)](**value) if isinstance(value, Mapping) else value
 
     @field_validator("camera")
@@ -306,7 +306,7 @@ def hashed_settings(config: EnvConfig) -> dict[str, Any]:
 
 
 def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
-    """The settings that an observation depends on; all others are set to their defaults.
+    """Return the settings that an observation depends on; all others are set to their defaults.
 
     Two simulations with equal ones give the same episodes, step by step, to an agent that observes
     "luminance" (whatever the event camera is) or "none" (whatever any camera is); to other agents
@@ -331,7 +331,7 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
 
 
 def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
-    """The settings that give an event its meaning: data, encoder and policy must share them.
+    """Return the settings that give an event its meaning: data, encoder and policy must share them.
 
     Those of the neighbour filter are among them where there is one, and `LATER_SETTINGS` where they are
     not the defaults: what was made before they existed has its hash still.
@@ -347,13 +347,13 @@ def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
 
 
 def sensor_differences(theirs: Mapping[str, object], config: EnvConfig) -> dict[str, tuple[object, object]]:
-    """Setting -> (their value, this simulation's value), for the sensor settings that differ."""
+    """Return setting -> (their value, this simulation's value) for the sensor settings that differ."""
     ours = sensor_settings(config)
     pairs = {key: (theirs.get(key), ours.get(key)) for key in {**theirs, **ours}}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
 def settings_hash(settings: Mapping[str, object]) -> str:
-    """First 12 hexadecimal digits of the SHA-256 of `settings` as canonical JSON."""
+    """Return the first 12 hexadecimal digits of the SHA-256 of `settings` as canonical JSON."""
     text = json.dumps(settings, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -34,7 +34,7 @@ Draw = Callable[[EnvConfig, np.random.Generator], EnvConfig]  # the settings of 
 
 
 class Info(TypedDict):
-    """What `CorridorEnv` tells beside the observation.
+    """The `info` that `CorridorEnv` returns with each observation.
 
     Gymnasium and stable-baselines3 add keys of their own, such as "episode", which none here may have.
 
@@ -109,7 +109,7 @@ class CorridorEnv(gymnasium.Env):
         self._vehicles, self._row = Vehicles(1), 0
 
     def join(self, vehicles: Vehicles, row: int) -> None:
-        """Fly beside others, as one row of `vehicles`, from the next reset on."""
+        """Share `vehicles` with other environments; this one is row `row` from the next reset."""
         self._vehicles, self._row = vehicles, row
 
     def reset(
@@ -129,7 +129,7 @@ class CorridorEnv(gymnasium.Env):
         return self._observation(), self.info()
 
     def begin(self, seed: int | None, options: Mapping[str, object] | None) -> None:
-        """As `reset`, without a look at what is observed."""
+        """Start an episode like `reset`, but do not compute the observation."""
         super().reset(seed=seed)
         number, split = self.series[1], self._nominal.split
         if seed is None and self.series[0] is None:
@@ -149,7 +149,7 @@ class CorridorEnv(gymnasium.Env):
         self._vehicles.start(self._row, config, self.scene, self._sensor, spawn, self._dynamics)
 
     def _set_config(self, config: EnvConfig) -> None:
-        """Take other settings, before an episode begins."""
+        """Switch to the settings drawn for the next episode."""
         if config != self.config:
             self._sensor.close()
             self.config, self._dynamics = config, make_dynamics(config)
@@ -182,7 +182,7 @@ class CorridorEnv(gymnasium.Env):
         return self._observation(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
 
     def render(self) -> Any:
-        """Luminance beside the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
+        """Draw luminance beside the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
         return None if self.render_mode is None else picture(self.events, self.luminance)
 
     def close(self) -> None:
@@ -199,12 +199,12 @@ class CorridorEnv(gymnasium.Env):
 
     @property
     def seen_events(self) -> np.ndarray:
-        """As `events`, of those that the neighbour filter leaves (`EnvConfig.filter_support`)."""
+        """The events that pass the neighbour filter (`EnvConfig.filter_support`)."""
         return self._vehicles.seen_of(self._row)
 
     @property
     def true_events(self) -> np.ndarray:
-        """As `events`, before the faults of the sensor."""
+        """The events before the faults of the sensor."""
         return self._vehicles.true_of(self._row)
 
     @property
@@ -213,12 +213,12 @@ class CorridorEnv(gymnasium.Env):
         return self._sensor.luminance
 
     def camera_pose(self) -> tuple[float, float, float, float]:
-        """Where the camera is: x, y, z [m] and yaw [rad]."""
+        """Return the pose of the camera: x, y, z [m] and yaw [rad]."""
         vehicle = self._vehicles.rows[self._row]
         return float(vehicle["x_m"]), float(vehicle["y_m"]), self.config.camera_height_m, 0.0
 
     def place_of_action(self) -> tuple[float, float]:
-        """Where the next decision takes effect, if nothing is in the way: x, y [m].
+        """Return where the next decision takes effect if nothing is in the way: x, y [m].
 
         That is where the vehicle is, but for `action_delay_ms`: what was decided before moves it until then.
         """
@@ -235,12 +235,12 @@ class CorridorEnv(gymnasium.Env):
         return kinematics.planned_position(vehicle["spawn_x_m"], moves, way)
 
     def name_step(self) -> str:
-        """Episode, step and seed, for an error."""
+        """Return episode, step and seed as text for an error."""
         vehicle, (seed, number) = self._vehicles.rows[self._row], self.series
         return f"episode {number}, step {vehicle['steps']}, seed {seed}"
 
     def _observation(self) -> np.ndarray:
-        """What is observed of the last step."""
+        """Return the observation of the last step."""
         if self.config.observation != "window":
             return observe(self.config, self.seen_events, self.luminance)
         row, events = self._vehicles.rows[self._row : self._row + 1], self.seen_events
@@ -248,13 +248,13 @@ class CorridorEnv(gymnasium.Env):
         return pack_windows(events, ends, row["start_us"], row["window_us"], self.config.window_capacity)[0]
 
     def info(self) -> Info:
-        """Where the episode stands, as the last step or reset told."""
+        """Return the `Info` of the last step or reset."""
         infos = _infos_of([self], self._vehicles, np.array([self._row]))
         return cast(Info, {name: values.tolist()[0] for name, values in infos.items()})
 
 
 class CorridorVectorEnv(VectorEnv):
-    """Several episodes at once, each with the bytes that `CorridorEnv` gives for the same seed.
+    """Several episodes at once; each has the bytes of a `CorridorEnv` with the same seed.
 
     An episode that is over is reset by the next step (AutoresetMode.NEXT_STEP), whose
     action is ignored and whose reward is 0. All returned arrays are fresh.
@@ -347,7 +347,7 @@ class CorridorVectorEnv(VectorEnv):
     def step_some(
         self, actions: np.ndarray, some: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Step some environments and leave the others as they are; as `step`, but nothing is reset.
+        """Step some environments and leave the others as they are; unlike `step`, reset nothing.
 
         Args:
             actions: (n,) integers, or (n, C) of a Box.
@@ -368,13 +368,13 @@ class CorridorVectorEnv(VectorEnv):
     def _results(
         self, some: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """What `step` returns, of some environments."""
+        """Return the results of `step` for some environments."""
         rows = self._vehicles.rows[some]
         terminated, truncated = rows["success"] | rows["collision"], rows["truncated"]
         return self._observations(some), rows["reward"], terminated, truncated, self._infos(some)
 
     def _step_active(self, taken: np.ndarray, active: np.ndarray) -> None:
-        """One control step of the active environments."""
+        """Simulate one control step of the active environments."""
         rows, space = self._vehicles.rows, self.single_action_space
         if taken.shape != (self.num_envs, *(space.shape or ())):
             raise ValueError(f"actions must number {self.num_envs} of {space}; got shape {taken.shape}.")
@@ -389,7 +389,7 @@ class CorridorVectorEnv(VectorEnv):
             raise ValueError(f"{self.envs[error.row].name_step()}: {error}") from error
 
     def infos(self) -> dict[str, np.ndarray]:
-        """Infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
+        """Return the infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
         return self._infos(np.arange(self.num_envs))
 
     def _infos(self, some: np.ndarray) -> dict[str, np.ndarray]:
@@ -399,7 +399,7 @@ class CorridorVectorEnv(VectorEnv):
     def replay(
         self, episodes: Sequence[tuple[int, int, Sequence[Any]]]
     ) -> tuple[Any, np.ndarray, dict[str, np.ndarray]]:
-        """Lead each environment to where its actions led before; what follows has the same bytes too.
+        """Repeat recorded actions in each environment; later steps then have the same bytes too.
 
         Args:
             episodes: Of each environment the seed, the number of its episode and the actions since its start.
@@ -423,7 +423,7 @@ class CorridorVectorEnv(VectorEnv):
         return self._batch(observations), self._over.copy(), self.infos()
 
     def render(self) -> Any:
-        """One picture per environment, as `CorridorEnv.render`."""
+        """Return one picture per environment, see `CorridorEnv.render`."""
         return tuple(env.render() for env in self.envs)
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -432,7 +432,7 @@ class CorridorVectorEnv(VectorEnv):
             env.close()
 
     def _observations(self, some: np.ndarray) -> Any:
-        """What some observe of the last step, in which the others had no events."""
+        """Return the observations of some environments in the last step; the others had no events in it."""
         config, vehicles = self.envs[0].config, self._vehicles
         if config.observation != "window":
             envs = [self.envs[row] for row in some]
@@ -442,14 +442,14 @@ class CorridorVectorEnv(VectorEnv):
         return pack_windows(vehicles.seen, ends, *clocks, config.window_capacity)
 
     def _batch(self, observations: Any) -> Any:
-        """Observations as one fresh array; those that differ in length stay a tuple."""
+        """Return observations as one fresh array; observations of different lengths stay a tuple."""
         if isinstance(self.single_observation_space, spaces.Sequence):
             return tuple(observations)
         return np.stack(observations)
 
 
 def _infos_of(envs: Sequence[CorridorEnv], vehicles: Vehicles, some: np.ndarray) -> dict[str, np.ndarray]:
-    """`Info` of several environments, each value an array; `some` are the rows of their vehicles."""
+    """Return the `Info` of several environments as arrays; `some` are the rows of their vehicles."""
     config, rows = envs[0].config, vehicles.rows[some]
     lost = rows["dropped"].copy()
     if config.observation == "window" and config.window_capacity is not None:

@@ -55,7 +55,7 @@ class Accuracy(NamedTuple):
 
 
 def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0) -> Accuracy:
-    """Event error of a simulation on short flights, against the converged simulation of the same flights.
+    """Measure the event error of a simulation on short flights, against the converged simulation of them.
 
     Converged are: the renderer (the ray caster wherever it can draw the scene), its
     anti-aliasing, the number of renders, no culling, a camera that remembers and gets linear
@@ -91,7 +91,7 @@ def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, se
 
 
 def error_between(config: EnvConfig, other: EnvConfig, flights: int = 6, steps: int = 12) -> float:
-    """Event error between two sensors on the same short flights, such as one with faults and one without.
+    """Measure the event error between two sensors on the same short flights, such as with and without faults.
 
     The flights are those of `measure_event_error`, the partners those of `event_error`, at most a twentieth
     of a control step apart.
@@ -119,7 +119,7 @@ def error_between(config: EnvConfig, other: EnvConfig, flights: int = 6, steps: 
 
 
 def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
-    """The settings of the same simulation without any error of rendering, see `measure_event_error`."""
+    """Return the settings of the same simulation without rendering error, see `measure_event_error`."""
     renderer: Literal["raycast", "pyrender"] = "raycast" if scene.mesh is None else "pyrender"
     asked = dataclasses.replace(config, faults=FaultsConfig(), renderer=renderer)
     camera = dataclasses.replace(config.camera, memory="reference", encoding="linear32")
@@ -181,7 +181,7 @@ def _events_of(config: EnvConfig, scene: Scene, flight: Flight) -> tuple[np.ndar
 
 
 def event_error(events: np.ndarray, reference: np.ndarray, tolerance_us: float) -> float:
-    """Share of events without a partner: same pixel, same polarity, at most `tolerance_us` apart.
+    """Return the share of events without a partner: same pixel and polarity, at most `tolerance_us` apart.
 
     Partners are one to one, as many as possible. The share is taken of both streams together,
     1 - 2 pairs / (events + reference): 0 if all pair up (or both are empty), 1 if none does,
@@ -204,7 +204,7 @@ def event_error(events: np.ndarray, reference: np.ndarray, tolerance_us: float) 
 
 
 def _by_pixel(events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Keys of pixel and polarity, and times, sorted by key and then by time."""
+    """Return keys of pixel and polarity, and times, sorted by key and then by time."""
     keys = (events["y"].astype(np.int64) << 17) | (events["x"].astype(np.int64) << 1) | (events["p"] > 0)
     order = np.lexsort((events["t"], keys))
     return keys[order], events["t"][order]
@@ -212,7 +212,7 @@ def _by_pixel(events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(cache=True, error_model="numpy")
 def _pairs(keys, times, other_keys, other_times, tolerance):
-    """Pairs found by walking both streams at once; on a line, taking the earliest partner is optimal."""
+    """Count pairs in one pass over both streams; on a line, taking the earliest partner is optimal."""
     i, j, pairs = 0, 0, 0
     while i < keys.size and j < other_keys.size:
         if keys[i] != other_keys[j]:

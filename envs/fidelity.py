@@ -1,4 +1,4 @@
-"""From one tolerance to the renderer, renders per control step and anti-aliasing that a scene needs.
+"""Choose renderer, renders per control step and anti-aliasing of a scene from one tolerance.
 
 The tolerance is the accepted event error of `envs.event_error`. The rules below are fitted to
 that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
@@ -39,7 +39,7 @@ PYRENDER_SAMPLES = ((0.3, 1), (0.15, 2), (0.0, 4))  # from which tolerance on ho
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """How one scene is rendered.
+    """Rendering settings of one scene.
 
     Attributes:
         renderer: "raycast" or "pyrender".
@@ -60,7 +60,7 @@ class RenderPlan:
 
 
 def plan_renders(config: EnvConfig, scene: Scene) -> RenderPlan:
-    """The cheapest way to render `scene` within `config.fidelity.tolerance`; what is set there is kept.
+    """Return the cheapest plan within `config.fidelity.tolerance`; settings given in `config.fidelity` stay.
 
     The paper's two-frame cameras (memory "frame" and "legacy") see one frame a control step:
     more of them would change what they report, not make it more exact.
@@ -84,7 +84,7 @@ def plan_renders(config: EnvConfig, scene: Scene) -> RenderPlan:
 
 
 def choose_renderer(name: str, scene: Scene) -> str:
-    """The renderer called `name`; "auto" is the cheapest that can draw `scene`.
+    """Return the renderer called `name`; "auto" is the cheapest that can draw `scene`.
 
     Raises:
         ValueError: The name is not known, or the ray caster is asked for a scene with a mesh.
@@ -99,7 +99,7 @@ def choose_renderer(name: str, scene: Scene) -> str:
 
 
 def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov_deg: float) -> Any:
-    """The renderer of a plan. Raises RuntimeError if it is pyrender, and that or OpenGL is missing."""
+    """Make the renderer of a plan; RuntimeError if it is pyrender, and pyrender or OpenGL is missing."""
     make: Any = RaycastRenderer
     if chosen.renderer == "pyrender":  # imported only where it is needed: it loads OpenGL
         if importlib.util.find_spec("pyrender") is None:
@@ -109,7 +109,7 @@ def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov
 
 
 def sub_renders(step_m: float, max_step_m: float) -> int:
-    """How many equal parts, one render each, keep a way of `step_m` within `max_step_m`.
+    """Return how many equal parts, one render each, keep a way of `step_m` within `max_step_m`.
 
     At least 1, also for a step of 0 m. A step that exceeds a multiple of `max_step_m` by
     rounding alone (relative 1e-9) is not divided further.
@@ -125,12 +125,12 @@ def sub_renders(step_m: float, max_step_m: float) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def parts_of(step_m: float, max_step_m: float) -> int:
-    """As `sub_renders`, of valid numbers."""
+    """`sub_renders` without checks."""
     return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
 
 
 def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
-    """Longest way between two renders [m], from a fit of the renders per control step.
+    """Return the longest way between two renders [m], from a fit of the renders per control step.
 
     Between looks the light of a pixel is taken as linear in time, so an event is late or early
     within an interval; it may be so by 5 % of a control step. What a pixel sees changes faster the
@@ -146,7 +146,7 @@ def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
 
 
 def _max_shifts_px(config: EnvConfig, scene: Scene) -> Shifts:
-    """How far outlines may move between two looks at their columns, from a fit of the event error.
+    """Return how far outlines may move between two looks at their columns, from a fit of the event error.
 
     An event may be late by 5 % of a control step, so outlines may move less in a shorter one. The
     rest as in `_max_step_m`.
@@ -161,7 +161,7 @@ def _max_shifts_px(config: EnvConfig, scene: Scene) -> Shifts:
 
 
 def _renders_factor(config: EnvConfig) -> float:
-    """Renders of a control step in multiples of those at tolerance 0.05, threshold 0.2 and `FOCAL_PIXELS`."""
+    """Return the factor of renders against tolerance 0.05, threshold 0.2 and `FOCAL_PIXELS`."""
     tolerance, threshold = config.fidelity.tolerance, config.camera.contrast_threshold
     focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     factor = max(1.0, focal / FOCAL_PIXELS) ** 0.5 * max(1.0, threshold / 0.2) ** 0.4
@@ -169,12 +169,12 @@ def _renders_factor(config: EnvConfig) -> float:
 
 
 def _renders_alone(step_m: float, scene: Scene) -> float:
-    """Renders of a control step at tolerance 0.05, if whole images are all that is looked at."""
+    """Return the renders of a control step at tolerance 0.05 for a camera that renders whole images only."""
     return (3.19 + 1.8 * (step_m / 0.1)) * (1.0 if _plain(scene) else RENDERS_TEXTURED)
 
 
 def _renders_by_looks(config: EnvConfig, scene: Scene) -> float:
-    """The same, beside looks at columns: those follow all edges but the ground's, and no noise."""
+    """Return the renders beyond looks at columns, which follow all edges but the ground's, and no noise."""
     ground, renders = scene.ground_texture, 0.75
     for texture in (ground, scene.wall_texture):
         share = (config.speed_mps + math.hypot(*texture.velocity_mps)) / config.control_hz / 0.1
@@ -186,7 +186,7 @@ def _renders_by_looks(config: EnvConfig, scene: Scene) -> float:
 
 
 def _cull_m(tolerance: float, scene: Scene) -> float:
-    """From how far on obstacles add at most a twentieth of the tolerance; infinite: the scene ends before.
+    """Return the distance [m] beyond which obstacles add at most 5 % of the tolerance; inf if none is there.
 
     Leaving out what is farther than d adds an error of up to 0.05 (32 m / d)^2 in a long lane
     of poles, be they 0.5 or 2 m wide and the image 16 or 200 pixels: what is far moves slowly.
@@ -197,7 +197,7 @@ def _cull_m(tolerance: float, scene: Scene) -> float:
 
 
 def _samples(config: EnvConfig, scene: Scene, renderer: str) -> int:
-    """Anti-aliasing whose own error is a small part of the tolerance; shorter steps show smaller errors."""
+    """Return the anti-aliasing whose error is a small part of the tolerance; short steps need more."""
     tolerance = config.fidelity.tolerance
     if renderer == "pyrender":
         return next(samples for least, samples in PYRENDER_SAMPLES if tolerance >= least)

@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
 
 
 def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Generator, ...]:
-    """Random generators of an episode: of its scene, its spawn, its faults and its condition.
+    """Return the random generators of an episode's scene, spawn, faults and condition.
 
     The split comes first in their entropy, so no seed makes a corridor of another split. The
     seed comes last: it may be longer than a word, and what followed it would run into its end.
@@ -61,7 +61,7 @@ def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Gener
 
 
 def choose_episode(following: int, options: Mapping[str, object]) -> int:
-    """The episode that reset `options` ask for, or the `following` one.
+    """Return the episode that reset `options` ask for, or the `following` one.
 
     Raises:
         ValueError: An unknown option, or an episode that is no integer >= 0.
@@ -73,7 +73,7 @@ def choose_episode(following: int, options: Mapping[str, object]) -> int:
 
 
 def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
-    """One seed for each of `count` environments.
+    """Return one seed for each of `count` environments.
 
     One number makes seed + i * 2**32 for environment i: workers with neighbouring seeds
     then never get the same corridors, as they would with seed + i.
@@ -92,13 +92,13 @@ def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[in
 
 @numba.njit(cache=True, error_model="numpy")
 def clock_us(step: int, control_hz: float) -> int:
-    """Simulated time at the end of a control step [us], from the count: it does not drift."""
+    """Return the simulated time at the end of a control step [us]; from the count, so it does not drift."""
     return round(step * 1e6 / control_hz)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def planned_position(spawn_x_m: float, moves: tuple[int, int, int], step_m: tuple[float, float]) -> Point:
-    """Where all moves so far lead, x and y [m].
+    """Return the place to which all moves so far lead, x and y [m].
 
     One product of whole counts, so that no error adds up: 1000 steps of 0.1 m are 100 m.
 

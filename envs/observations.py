@@ -1,4 +1,4 @@
-"""What a policy observes of a control step, and a picture of it for people."""
+"""The observation of a control step, and a picture of it for people."""
 
 import numpy as np
 from gymnasium import spaces
@@ -12,7 +12,7 @@ ON_RGB, OFF_RGB = (96, 165, 250), (249, 115, 22)  # events in every picture for 
 
 
 def observation_space(config: EnvConfig) -> spaces.Space:
-    """The space of what `config.observation` names.
+    """Return the space of the observation that `config.observation` names.
 
     Returns:
         "window": int32 (capacity + 1, 4), see `envs.events.pack_window`, or (N + 1, 4) of all N
@@ -36,7 +36,7 @@ def observation_space(config: EnvConfig) -> spaces.Space:
 
 
 def observe(config: EnvConfig, events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
-    """The observation of one control step, unless it is a window, as a fresh array.
+    """Return the observation of one control step as a fresh array; windows are packed elsewhere.
 
     Args:
         config: Says which.
@@ -53,7 +53,7 @@ def observe(config: EnvConfig, events: np.ndarray, luminance: np.ndarray) -> np.
 
 
 def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
-    """Luminance (gamma 2.2) beside the events, ON blue and OFF orange, four times enlarged.
+    """Draw luminance (gamma 2.2) and events side by side, ON blue and OFF orange, four times enlarged.
 
     Args:
         events: EVENT in time order.

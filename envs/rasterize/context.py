@@ -1,4 +1,4 @@
-"""The OpenGL context of the rasteriser, and what is drawn in it: headless, linear, in float32.
+"""The OpenGL context of the rasteriser and its drawing: headless, linear, in float32.
 
 pyrender holds only the context: it opens EGL, uploads vertices, links shader programs and keeps
 the camera. What it would draw with is replaced here by subclasses: its shaders, framebuffers,
@@ -65,7 +65,7 @@ class Platform(egl.EGLPlatform):
             EGL.eglMakeCurrent(self._egl_display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
 
     def delete_context(self) -> None:
-        """As pyrender's, without eglTerminate: the display is shared, every other renderer would die."""
+        """Delete the context without eglTerminate, which would end all other renderers of the display."""
         if self._egl_context is not None:
             self.make_uncurrent()
             EGL.eglDestroyContext(self._egl_display, self._egl_context)
@@ -217,7 +217,7 @@ class LuminanceRenderer(Renderer):
 
 
 def _framebuffer(size: tuple[int, int], multisamples: int) -> tuple[int, int, int]:
-    """Framebuffer, float colour buffer and depth buffer of `size` (width, height)."""
+    """Make a framebuffer with a float colour buffer and a depth buffer of `size` (width, height)."""
     color, depth = GL.glGenRenderbuffers(2)
     frame = GL.glGenFramebuffers(1)
     GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, frame)
@@ -234,7 +234,7 @@ def _framebuffer(size: tuple[int, int], multisamples: int) -> tuple[int, int, in
 
 
 def _float_texture(texels: np.ndarray) -> int:
-    """A texture of one float channel that repeats, bilinear between its texels."""
+    """Make a texture of one float channel that repeats, bilinear between its texels."""
     texture = GL.glGenTextures(1)
     GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
     GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MIN_FILTER, GL.GL_LINEAR)

@@ -66,7 +66,7 @@ class Drawing(NamedTuple):
 
 
 def draw(scene: "Scene") -> Drawing:
-    """The triangles of `scene`."""
+    """Return the triangles of `scene`."""
     bodies = scene.obstacles
     pieces: list[Piece] = []
     standing = bodies["z"] <= bodies["rz"]  # their undersides cannot be seen
@@ -85,7 +85,7 @@ def draw(scene: "Scene") -> Drawing:
 
 
 def _join(pieces: list[Piece]) -> Drawing:
-    """The pieces, which are in the order of their surfaces, as one drawing."""
+    """Join pieces, sorted by surface, to one drawing."""
     offsets = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
     first = np.cumsum([0] + [len(piece.faces) for piece in pieces])
     surfaces = np.array([piece.surface for piece in pieces])
@@ -99,7 +99,7 @@ def _join(pieces: list[Piece]) -> Drawing:
 
 
 def repeat_m(texture: Texture) -> float:
-    """After how many metres along either axis `texture` repeats."""
+    """Return after how many metres `texture` repeats along either axis."""
     return texture.period_m * (TILE_PERIODS if texture.pattern == "noise" else 1)
 
 
@@ -110,7 +110,7 @@ def _flat(surface: int, part: Part, body: int = -1) -> Piece:
 
 
 def _round(scene: "Scene", kind: int, found: np.ndarray, underside: bool) -> list[Piece]:
-    """The surfaces of the obstacles `found` (B,), which are all of one `kind`."""
+    """Return the surfaces of the obstacles `found` (B,), all of one `kind`."""
     pieces = []
     for surface, corners, faces in _templates(kind, underside):
         vertices = _vertices(scene, kind, scene.obstacles[found], corners)
@@ -122,7 +122,7 @@ def _round(scene: "Scene", kind: int, found: np.ndarray, underside: bool) -> lis
 
 
 def _vertices(scene: "Scene", kind: int, bodies: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(B, V) VERTEX the `corners` (V, 3) of each of `bodies`."""
+    """Return (B, V) VERTEX, the `corners` (V, 3) of each of `bodies`."""
     radius, half = bodies["rx"], bodies["rz"]
     zero, texture = np.zeros(len(bodies)), scene.obstacle_texture
     vertices = np.zeros((len(bodies), len(corners)), VERTEX)
@@ -167,7 +167,7 @@ def _ring(corner: np.ndarray, radius: float, height: float) -> np.ndarray:
 
 
 def _polygon(corners: int, up: bool) -> np.ndarray:
-    """Triangles of a convex polygon whose corners are numbered counter-clockwise from above.
+    """Return the triangles of a convex polygon whose corners are numbered counter-clockwise from above.
 
     Every second corner is cut off, then every second one of what is left: few thin triangles,
     which cost most.

@@ -108,7 +108,7 @@ class PyrenderRenderer:
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
     ) -> np.ndarray:
-        """The image seen from a pose, as a fresh array.
+        """Render the image seen from a pose, as a fresh array.
 
         Args:
             x_m: Position of the camera to the right [m].
@@ -158,7 +158,7 @@ class PyrenderRenderer:
             self._renderer.draws[i] = self._renderer.draws[i]._replace(runs=_runs(batch, near))
 
     def render_way(self, poses: np.ndarray) -> np.ndarray:
-        """(K, height, width) images along a way, as `RaycastRenderer.render_way`."""
+        """Render images along a way, (K, height, width), like `RaycastRenderer.render_way`."""
         return np.stack([self.render(*pose) for pose in poses.tolist()])
 
     def close(self) -> None:
@@ -177,7 +177,7 @@ class PyrenderRenderer:
 
 
 def _start(width: int, height: int, antialias: bool) -> tuple[Any, Any]:
-    """The EGL platform and the renderer, with a float framebuffer, or RuntimeError in one line."""
+    """Start the EGL platform and a renderer with a float framebuffer, or raise RuntimeError in one line."""
     os.environ["PYOPENGL_PLATFORM"] = "egl"
     os.environ.setdefault("PYGLET_HEADLESS", "1")
     # llvmpipe's own threads hang a forked child.
@@ -197,7 +197,7 @@ def _start(width: int, height: int, antialias: bool) -> tuple[Any, Any]:
 
 
 def _distances(bodies: np.ndarray, eye_m: np.ndarray) -> np.ndarray:
-    """(N,) from `eye_m` to the nearest point of each obstacle's upright cylinder or box [m]."""
+    """Return the distance from `eye_m` to each obstacle's upright cylinder or box, (N,) [m]."""
     aside = np.stack([bodies["x"], bodies["y"], bodies["z"]], axis=1) - eye_m
     x, y, z = (np.abs(aside) - np.stack([bodies["rx"], bodies["ry"], bodies["rz"]], axis=1)).T
     square = np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0))
@@ -206,7 +206,7 @@ def _distances(bodies: np.ndarray, eye_m: np.ndarray) -> np.ndarray:
 
 
 def _primitive(drawing: Drawing) -> Any:
-    """All of a scene as one primitive of pyrender, whose attributes are those of `shaders.VERTEX`."""
+    """Return a scene as one primitive of pyrender with the attributes of `shaders.VERTEX`."""
     from pyrender import MetallicRoughnessMaterial, Primitive
 
     vertices = drawing.vertices
@@ -223,7 +223,7 @@ def _primitive(drawing: Drawing) -> Any:
 
 
 def _draw(batch: Batch, textures: tuple[Texture, ...]) -> Any:
-    """How to draw all of `batch`."""
+    """Return the draw call of `batch`."""
     from envs.rasterize.context import Draw
 
     place = TEXTURE_OF[batch.surface]
@@ -233,13 +233,13 @@ def _draw(batch: Batch, textures: tuple[Texture, ...]) -> Any:
 
 
 def _runs(batch: Batch, near: np.ndarray) -> np.ndarray:
-    """(R, 2) first and last + 1 of the faces of the bodies that are `near`; neighbours in one run."""
+    """Return (R, 2) first and last + 1 face of the bodies that are `near`; neighbours share a run."""
     drawn = np.concatenate([[False], near[batch.bodies], [False]])
     return batch.first[np.flatnonzero(drawn[1:] != drawn[:-1]).reshape(-1, 2)]
 
 
 def _mean_of_blocks(fine: np.ndarray, size: int) -> np.ndarray:
-    """(H, W) float32 mean over squares of `size` pixels of (H size, W size)."""
+    """Return the (H, W) float32 mean over squares of `size` pixels of (H size, W size)."""
     if size == 1:
         return fine
     rows = fine[::size].copy()
@@ -253,6 +253,6 @@ def _mean_of_blocks(fine: np.ndarray, size: int) -> np.ndarray:
 
 
 def _camera_pose(x_m: float, y_m: float, z_m: float, yaw_rad: float) -> np.ndarray:
-    """(4, 4) camera to world: its columns are right, up and back, as OpenGL has them."""
+    """Return the camera-to-world matrix (4, 4): columns right, up and back, as in OpenGL."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[cos, 0.0, sin, x_m], [sin, 0.0, -cos, y_m], [0.0, 1.0, 0.0, z_m], [0.0, 0.0, 0.0, 1.0]])

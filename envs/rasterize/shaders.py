@@ -197,7 +197,7 @@ void main() {
 
 
 def source(stage: str, surface: int, pattern: int) -> str:
-    """The whole text of one stage, VERTEX or FRAGMENT, for a kind of surface with a pattern."""
+    """Return the source of one stage, VERTEX or FRAGMENT, for a kind of surface with a pattern."""
     names: dict[str, int | None] = {name.upper(): i for i, name in _NAMES}
     names |= {"SURFACE": surface, "PATTERN": pattern, "TEXTURE": TEXTURE_OF[surface]}
     return _HEAD + "".join(f"#define {name} {value}\n" for name, value in names.items()) + _FRAME + stage

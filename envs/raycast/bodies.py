@@ -1,4 +1,4 @@
-"""Kernels of one body in one image column: is it in view, between which depths, in which rows.
+"""Kernels for one body in one image column: whether it is in view, its depths and its rows.
 
 The camera only yaws, so a column is an upright plane through the eye, in which every body is
 convex: a rectangle, an ellipse, or the piece of a hyperbola above a cone's base. Along slope
@@ -101,7 +101,7 @@ def drop_hidden(seen: np.ndarray, count: int, frame: Record) -> int:
 
 @kernel
 def _mark_hidden(seen: np.ndarray, one: Record, frame: Record) -> None:
-    """Give bodies that one hides a right silhouette at minus infinity."""
+    """Mark the bodies that `one` hides by a right silhouette at minus infinity."""
     for i in range(len(seen)):
         other = seen[i]
         if one.low < other.low < other.high < one.high and _hides(one, other, frame):
@@ -110,7 +110,7 @@ def _mark_hidden(seen: np.ndarray, one: Record, frame: Record) -> None:
 
 @kernel
 def _hides(one: Record, other: Record, frame: Record) -> bool:
-    """Whether a body hides another, whose silhouettes are within its own."""
+    """Whether a body hides another body whose silhouettes lie within its own."""
     near = other.forward - math.hypot(other.rx, other.ry)
     if near <= MIN_DEPTH or not is_before(one, other, frame, 0.5 * (other.low + other.high)):
         return False
@@ -126,7 +126,7 @@ def _hides(one: Record, other: Record, frame: Record) -> bool:
 
 @kernel
 def silhouette_of(body: Record, frame: Record) -> tuple[float, float]:
-    """Slopes of the left and right silhouette of one body, seen or not; +-inf as for a circle.
+    """Return the slopes of the left and right silhouette of a body, in view or not; +-inf as for a circle.
 
     Notes in the body where it is as seen from the eye.
     """
@@ -167,7 +167,7 @@ def _is_outside(body: Record, eye_z: float, cull: float) -> bool:
 
 @kernel
 def _round_silhouette(body: Record) -> tuple[float, float]:
-    """Slopes of both tangents to a circle; +-inf where one points backwards or the eye is inside."""
+    """Return the slopes of both tangents to a circle; +-inf if one points backwards or the eye is inside."""
     right, forward, radius = body.right, body.forward, body.rx
     distance = math.sqrt(right * right + forward * forward)
     power = (distance - radius) * (distance + radius)
@@ -187,7 +187,7 @@ def _round_silhouette(body: Record) -> tuple[float, float]:
 
 @kernel
 def corner(body: Record, frame: Record, k: int) -> tuple[float, float]:
-    """Right and forward of the k-th corner of a box's footprint, in order around it [m]."""
+    """Return right and forward of the k-th corner of a box's footprint, in order around it [m]."""
     dx = body.dx + (body.rx if k == 1 or k == 2 else -body.rx)
     dy = body.dy + (body.ry if k == 2 or k == 3 else -body.ry)
     return dx * frame.cos + dy * frame.sin, dy * frame.cos - dx * frame.sin
@@ -195,7 +195,7 @@ def corner(body: Record, frame: Record, k: int) -> tuple[float, float]:
 
 @kernel
 def _box_silhouette(body: Record, frame: Record) -> tuple[float, float]:
-    """Slopes of the left and right silhouette of a rectangle; +-inf as for a circle."""
+    """Return the slopes of the left and right silhouette of a rectangle; +-inf as for a circle."""
     if abs(body.dx) <= body.rx and abs(body.dy) <= body.ry:
         return -math.inf, math.inf
     low, high = math.inf, -math.inf
@@ -214,7 +214,7 @@ def _box_silhouette(body: Record, frame: Record) -> tuple[float, float]:
 
 @kernel
 def box_slab(body: Record, along_x: float, along_y: float) -> tuple[float, float, float]:
-    """Depths where a ray enters a box's footprint along x and along y, and where it leaves."""
+    """Return the depths where a ray enters a box's footprint along x and along y, and where it leaves."""
     one_x = 1.0 / (along_x if along_x != 0.0 else 1e-300)
     one_y = 1.0 / (along_y if along_y != 0.0 else 1e-300)
     near_x, far_x = (body.dx - body.rx) * one_x, (body.dx + body.rx) * one_x
@@ -224,7 +224,7 @@ def box_slab(body: Record, along_x: float, along_y: float) -> tuple[float, float
 
 @kernel
 def depths(body: Record, frame: Record, u: float) -> tuple[float, float]:
-    """Where slope `u` enters and leaves the footprint [m]; the entry is <= 0 from within."""
+    """Return the depths where slope `u` enters (<= 0 from within) and leaves the footprint [m]."""
     if body.kind == BOX:
         along_x, along_y = u * frame.cos - frame.sin, u * frame.sin + frame.cos
         near_x, near_y, far = box_slab(body, along_x, along_y)
@@ -236,14 +236,14 @@ def depths(body: Record, frame: Record, u: float) -> tuple[float, float]:
 
 @inlined
 def root(body: Record, u: float) -> float:
-    """Half of the chord that slope `u` cuts from a circle, in radii, times sqrt(1 + u^2)."""
+    """Return half of the chord that slope `u` cuts from a circle, in radii, times sqrt(1 + u^2)."""
     beside = (body.right - body.forward * u) / body.rx
     return math.sqrt(max(0.0, 1.0 + u * u - beside * beside))
 
 
 @kernel
 def mean_root(body: Record, left: float, right: float, one: float, other: float) -> float:
-    """Mean of `root` over the slopes left .. right, at whose ends it is `one` and `other`.
+    """Return the mean of `root` over the slopes left .. right, at whose ends it is `one` and `other`.
 
     Over u, the root is the arc of an ellipse, root^2 = crest - bend * (u - its middle)^2: its
     area is that below the chord and the segment above, which the chord's length in the
@@ -279,7 +279,7 @@ def is_before(one: Record, other: Record, frame: Record, u: float) -> bool:
 
 @kernel
 def _look_along(body: Record, frame: Record, u: float) -> None:
-    """Note in the body its rows and its root along slope `u`, and the cosine of a pole towards the sun."""
+    """Store in the body its rows and its root along slope `u`, and a pole's cosine towards the sun."""
     arc = 0.0 if body.kind == BOX else root(body, u)
     body.cap, body.side, body.under, body.end = section(body, frame, u, arc)
     body.at, body.root = u, arc
@@ -289,7 +289,7 @@ def _look_along(body: Record, frame: Record, u: float) -> None:
 
 @inlined
 def cosine(body: Record, frame: Record, u: float, arc: float) -> float:
-    """Cosine between the sun and a pole's side where slope `u`, whose root is `arc`, meets it."""
+    """Return the cosine between the sun and a pole's side where slope `u`, whose root is `arc`, meets it."""
     entry = (body.right * u + body.forward - body.rx * arc) / (1.0 + u * u)
     right, forward = entry * u - body.right, entry - body.forward
     return (right * frame.sun_right + forward * frame.sun_forward) / body.rx
@@ -297,7 +297,7 @@ def cosine(body: Record, frame: Record, u: float, arc: float) -> float:
 
 @inlined
 def outline(body: Record, frame: Record, strip: Record) -> float:
-    """Note in the strip the rows of a body at both ends; the mean of its root.
+    """Store the body's rows at both ends of the strip; return the mean of its root.
 
     Edges are taken as straight. Where they are arcs, they are shifted to the mean of the arc:
     rows depend on the root linearly.
@@ -342,7 +342,7 @@ def _keep_below(edge: Record, limit: Record) -> None:
 
 @kernel
 def section(body: Record, frame: Record, u: float, arc: float) -> Section:
-    """Rows of the body along slope `u`, of which `arc` is the root; numbers of moderate size."""
+    """Return the rows of the body along slope `u`, whose root is `arc`; numbers of moderate size."""
     if body.kind == ELLIPSOID:
         return _ellipsoid_section(body, frame, u, arc)
     if body.kind == BOX:
@@ -373,7 +373,7 @@ def _moderate(row: float) -> float:
 
 @kernel
 def _cone_top(body: Record, frame: Record, u: float, far: float) -> float:
-    """Fall per depth where a cone begins: its tangent, else the far edge of its base, else inf (unseen)."""
+    """Return the fall per depth where a cone begins: its tangent, its base's far edge, or inf (unseen)."""
     steep = body.rx / (body.top - body.bottom)
     rise = body.top - frame.eye_z
     over_bottom = frame.eye_z - body.bottom
@@ -390,7 +390,7 @@ def _cone_top(body: Record, frame: Record, u: float, far: float) -> float:
 
 @kernel
 def _ellipsoid_section(body: Record, frame: Record, u: float, arc: float) -> Section:
-    """Both tangents to an ellipse; only one where the eye is over or under it.
+    """Return the rows of both tangents to an ellipse; of one tangent if the eye is over or under it.
 
     In units of the half-axes: the fall per depth m touches where
     away * m^2 - 2 * middle * over * m + rest = 0.
@@ -426,7 +426,7 @@ def _ellipsoid_section(body: Record, frame: Record, u: float, arc: float) -> Sec
 def _above_ground(
     body: Record, frame: Record, u: float, buried: bool, upper: float, lower: float
 ) -> tuple[float, float]:
-    """The rows of an ellipsoid above the ground; `buried`: its upper tangent touches below."""
+    """Return the rows of an ellipsoid above the ground; `buried`: its upper tangent touches below."""
     half = 0.5 * (body.top - body.bottom)
     level = 1.0 + body.bottom / half  # of the middle above the ground, in half-heights
     square = 1.0 / (1.0 + u * u)

@@ -71,7 +71,7 @@ class Workspace(NamedTuple):
 
 
 def make_workspace(num_bodies: int, height: int) -> Workspace:
-    """Room for painting images of `height` rows of a scene of `num_bodies` bodies."""
+    """Allocate room for painting images of `height` rows of a scene of `num_bodies` bodies."""
     return Workspace(
         seen=np.empty(num_bodies, BODY),
         order=np.empty(num_bodies, np.int64),
@@ -218,7 +218,7 @@ def aim(frame: Record, x: float, y: float, z: float, yaw: float, time: float) ->
 
 @inlined
 def _add_cut(cuts: np.ndarray, size: int, part: Part, position: float, shown: bool) -> int:
-    """Note where a column is cut, if it is `shown` and in the part; the new number of cuts."""
+    """Store a cut of a column if it is `shown` and in the part; return the new number of cuts."""
     cuts[size].position, cuts[size].body = position, -1
     return size + (shown and part.left < position < part.right)
 

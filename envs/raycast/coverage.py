@@ -37,7 +37,7 @@ LAYERS = Layer.LEFT_WALL + 3
 
 @kernel
 def _step(layer: np.ndarray, row: float, change: float) -> None:
-    """From `row` downwards all is greater by `change`; exact for a row cut by it."""
+    """Add `change` to everything below `row`; exact for the row that it cuts."""
     r = int(row)
     below = change * (row - r)
     layer[r] += change - below
@@ -46,7 +46,7 @@ def _step(layer: np.ndarray, row: float, change: float) -> None:
 
 @kernel
 def _ramp(layer: np.ndarray, left: float, right: float, change: float) -> None:
-    """Below an edge from row `left` to row `right` all is greater by `change`; exact for the rows it cuts."""
+    """Add `change` to everything below an edge from row `left` to row `right`; exact for the rows it cuts."""
     low, high = min(left, right), max(left, right)
     first, last = int(low), int(high)
     if first == last or high - low < MIN_RISE:
@@ -65,7 +65,7 @@ def _ramp(layer: np.ndarray, left: float, right: float, change: float) -> None:
 
 @kernel
 def share_below(row: float, edge: Ends) -> float:
-    """Share of a row that lies below an edge."""
+    """Return the share of a row that lies below an edge."""
     low, high = min(edge.left, edge.right), max(edge.left, edge.right)
     spread = high - low
     if spread < MIN_RISE:
@@ -97,7 +97,7 @@ def _paint_below(frame: Record, steps: np.ndarray, edge: Ends, luminance: float,
 def fill(
     frame: Record, accumulators: np.ndarray, top: Ends, bottom: Ends, luminance: float, weight: float
 ) -> None:
-    """Paint what lies between two edges, which must lie in the image, with one luminance."""
+    """Paint the area between two edges, which must lie in the image, with one luminance."""
     steps = accumulators[Layer.STEPS]
     _paint_below(frame, steps, top, luminance, weight)
     _paint_below(frame, steps, bottom, luminance, -weight)
@@ -137,7 +137,7 @@ def _sum_block(sky: float, painted: np.ndarray, image: np.ndarray, first: int, c
 
 @kernel
 def cover(shown: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float) -> None:
-    """Note that a surface shows between two edges; `envs.raycast.patterns` adds its pattern.
+    """Store that a surface shows between two edges; `envs.raycast.patterns` adds its pattern.
 
     Args:
         shown: The surface's three layers: the share of each row that shows it, and where in the
@@ -162,7 +162,7 @@ def cover(shown: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float) -
 def cover_ground(
     frame: Record, accumulators: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float
 ) -> None:
-    """As `cover`, for the ground between two edges, of which nothing shows above the horizon."""
+    """`cover` the ground between two edges; nothing of it shows above the horizon."""
     top = Ends(max(top.left, frame.horizon), max(top.right, frame.horizon))
     bottom = Ends(max(bottom.left, frame.horizon), max(bottom.right, frame.horizon))
     if is_open(top, bottom):
@@ -171,7 +171,7 @@ def cover_ground(
 
 @inlined
 def ends(record: Record) -> Ends:
-    """The value of an ENDS record."""
+    """Return the value of an ENDS record."""
     return Ends(record.left, record.right)
 
 
@@ -183,7 +183,7 @@ def put(record: Record, value: Ends) -> None:
 
 @inlined
 def beyond(edge: Ends, limit: Ends) -> Ends:
-    """An edge, moved below a limit where it is above.
+    """Return an edge, moved below a limit where it is above.
 
     Where they cross, what lies between them is a triangle that ends there: it is drawn as one
     of the same area that reaches through the strip.
@@ -206,7 +206,7 @@ def is_open(top: Ends, bottom: Ends) -> bool:
 
 @inlined
 def _cut_ends(left: Record, right: Record, part: float) -> None:
-    """Cut what `left` and, as a copy, `right` say, so that each says its own part of it."""
+    """Cut `left` and its copy `right`, so that each holds its own part."""
     left.right = right.left = left.left + part * (left.right - left.left)
 
 

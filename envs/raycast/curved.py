@@ -45,7 +45,7 @@ class Quadric(NamedTuple):
 
 
 class Light(NamedTuple):
-    """Where the sun stands, and what a body's light is made of.
+    """Direction of the sun and the terms of a body's light.
 
     Attributes:
         right: Of the direction to the sun, which has length 1.
@@ -63,7 +63,7 @@ class Light(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """What shows of a body in a gap.
+    """Part of a body that shows in a gap.
 
     Attributes:
         left: Slope of its left end.
@@ -95,7 +95,7 @@ class Place(NamedTuple):
 
 
 def make_bends(height: int) -> Bends:
-    """Room for images of `height` rows."""
+    """Allocate room for images of `height` rows."""
     rows = height + 4  # one cut at either end, and as many as a vector holds
     return Bends(*np.zeros((5, POINTS * rows)))
 
@@ -112,7 +112,7 @@ def _quadric(body: Record, frame: Record) -> Quadric:
 
 @inlined
 def _footprint(shape: Quadric, u: float) -> tuple[float, float]:
-    """Depths between which slope `u` is over the footprint [m]."""
+    """Return the depths between which slope `u` is over the footprint [m]."""
     square, beside = 1.0 + u * u, (shape.right - shape.forward * u) / shape.radius
     half = shape.radius * math.sqrt(max(0.0, square - beside * beside))
     middle, per_square = shape.right * u + shape.forward, 1.0 / square
@@ -121,7 +121,7 @@ def _footprint(shape: Quadric, u: float) -> tuple[float, float]:
 
 @inlined
 def _meet(shape: Quadric, u: float, fall: float, nearest: float, farthest: float) -> Place:
-    """Where the ray of slope `u` and of `fall` per depth meets a quadric, between two depths.
+    """Return where the ray of slope `u` and of `fall` per depth meets a quadric, between two depths.
 
     The depth is a root of a * depth^2 - 2 * b * depth + rest.
     """
@@ -182,7 +182,7 @@ def _texture_rows(canvas: Canvas, body: Record, shape: Quadric, patch: Patch) ->
 
 @inlined
 def _back(turn: float) -> float:
-    """A difference of two angles, by the shorter way [rad]."""
+    """Return a difference of two angles by the shorter way [rad]."""
     return turn - 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
 
 
@@ -195,7 +195,7 @@ def _find_turns(points: int, turns: np.ndarray, aheads: np.ndarray) -> None:
 
 @inlined
 def _angle(sine: float, cosine: float) -> float:
-    """As `math.atan2`, to 1e-6, without branches."""
+    """`math.atan2` to 1e-6, without branches."""
     length = math.sqrt(max(LEAST, sine * sine + cosine * cosine))
     half = sine / (length + abs(cosine))  # tangent of the half of the angle, and of its quarter
     x = half / (1.0 + math.sqrt(1.0 + half * half))
@@ -253,13 +253,13 @@ def _light_points(shape: Quadric, light: Light, patch: Patch, bends: Bends) -> N
 
 @inlined
 def _inverse(rise: float) -> float:
-    """1 / rise; of a level edge 0."""
+    """Return 1 / rise; 0 for a level edge."""
     return 1.0 / rise if abs(rise) >= MIN_RISE else 0.0
 
 
 @inlined
 def _below(row: float, edge: Ends, per_rise: float) -> float:
-    """As `coverage.share_below`, without branches."""
+    """`coverage.share_below` without branches."""
     low, spread = min(edge.left, edge.right), abs(edge.right - edge.left)
     above, below = min(max(row - low, 0.0), spread), min(max(row + 1.0 - low, 0.0), spread)
     cut = 0.5 * (below - above) * (below + above) * abs(per_rise)

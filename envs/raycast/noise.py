@@ -1,4 +1,4 @@
-"""Noise is a sum of waves, each of which has a known mean over a parallelogram.
+"""Noise: a sum of waves, each of which has a known mean over a parallelogram.
 
 The waves are those of `envs.scene.textures.noise_waves`. From a given height a pixel always shows the
 same piece of the ground as seen from the camera; so the mean of each wave over each pixel of the
@@ -39,12 +39,12 @@ class Footprint(NamedTuple):
 
 
 def make_mixing(height: int) -> Mixing:
-    """Room for images of `height` rows."""
+    """Allocate room for images of `height` rows."""
     return Mixing(np.zeros(WAVES, REAL), np.zeros(2 * WAVES, REAL), np.zeros(height, REAL))
 
 
 def waves_of(seed: int) -> np.ndarray:
-    """(4, WAVES) float32 the waves of a seed, as `Noise` has them."""
+    """Return the waves of a seed, float32 (4, WAVES), see `Noise`."""
     cycles, amplitudes = noise_waves(seed)
     turn = np.angle(amplitudes) / (2.0 * math.pi)
     return np.stack([cycles[:, 0], cycles[:, 1], turn, np.abs(amplitudes)]).astype(REAL)
@@ -55,20 +55,20 @@ NO_NOISE = Noise(np.zeros((1, 4, WAVES), REAL), np.zeros((0, 0, 0), REAL), 0.0)
 
 @inlined
 def _sine(x: np.float32) -> np.float32:
-    """The sine of pi * x, for |x| <= 1/2."""
+    """Return the sine of pi * x for |x| <= 1/2."""
     y = x * x
     return x * (SINE[0] + y * (SINE[1] + y * (SINE[2] + y * (SINE[3] + y * (SINE[4] + y * SINE[5])))))
 
 
 @inlined
 def _cosine_of_turn(turn: np.float32) -> np.float32:
-    """The cosine of 2 pi * turn."""
+    """Return the cosine of 2 pi * turn."""
     return _sine(HALF - TWO * abs(turn - np.rint(turn)))
 
 
 @inlined
 def _mean_over(cycles: np.float32) -> np.float32:
-    """By how much the mean over so many cycles weakens a wave: sin(pi x) / (pi x)."""
+    """Return the factor by which the mean over so many cycles weakens a wave: sin(pi x) / (pi x)."""
     turn = cycles - TWO * np.rint(HALF * cycles)
     size = abs(turn)
     sine = np.copysign(_sine(min(size, ONE - size)), turn)
@@ -77,13 +77,13 @@ def _mean_over(cycles: np.float32) -> np.float32:
 
 @inlined
 def _bounded(side: float) -> np.float32:
-    """A side [tiles] that float32 can hold; over a longer one nothing is left of a wave."""
+    """Return a side [tiles] that float32 can hold; over a longer one nothing is left of a wave."""
     return REAL(min(max(side, -LONGEST), LONGEST))
 
 
 @kernel
 def mean_noise(waves: np.ndarray, terms: np.ndarray, s: float, q: float, sides: Footprint) -> float:
-    """Mean of noise over the parallelogram around (s, q) [tiles]; `waves` are (4, WAVES)."""
+    """Return the mean of noise over the parallelogram around (s, q) [tiles]; `waves` are (4, WAVES)."""
     left, down = REAL(s - np.floor(s)), REAL(q - np.floor(q))
     one_s, one_q = _bounded(sides.one_s), _bounded(sides.one_q)
     other_s, other_q = _bounded(sides.other_s), _bounded(sides.other_q)
@@ -105,7 +105,7 @@ def mean_noise(waves: np.ndarray, terms: np.ndarray, s: float, q: float, sides: 
 
 @inlined
 def is_tabulated(noise: Noise, frame: Record) -> bool:
-    """Whether the ground looks from here as it does in the table."""
+    """Whether the table of the ground holds for the current pose."""
     ahead = frame.cos == 1.0 and frame.sin == 0.0
     return ahead and noise.ground.size > 0 and noise.height == frame.eye_z
 
@@ -141,7 +141,7 @@ def mix_ground(noise: Noise, mixing: Mixing, column: int) -> None:
 
 @lru_cache(maxsize=8)
 def tabulate_ground(width: int, height: int, focal: float, eye_m: float, period_m: float) -> np.ndarray:
-    """What `Noise.ground` has for a camera that looks along q from `eye_m` above the ground.
+    """Return `Noise.ground` for a camera that looks along q from `eye_m` above the ground.
 
     Empty where it would have more than `MAX_TABLE` numbers, or the eye is on the ground.
     """

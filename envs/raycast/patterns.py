@@ -1,4 +1,4 @@
-"""Kernels that average patterns over what a row of a strip shows of a surface.
+"""Kernels that average patterns over the part of a surface that a row of a strip shows.
 
 What a row shows is taken as a parallelogram of the surface, of level faces as several. Over it noise,
 stripes and rings are averaged exactly, a checker where its sides lie along s and q. Input is
@@ -26,14 +26,14 @@ MIN_SHOWN = 1e-9  # [pixels] weight below which a surface is not textured
 
 
 class Rows(NamedTuple):
-    """From where to where a pattern is averaged, in rows of the image."""
+    """Range over which a pattern is averaged, in rows of the image."""
 
     first: float
     last: float
 
 
 class Upright(NamedTuple):
-    """What a strip shows of an upright surface [m].
+    """Part of an upright surface that a strip shows [m].
 
     Attributes:
         s: Surface coordinate of its middle.
@@ -54,7 +54,7 @@ class Upright(NamedTuple):
 
 @kernel
 def _wave(middle: float, wide: float) -> float:
-    """Mean of a square wave of period 1, +1 first, over an interval [periods]; exact."""
+    """Return the mean of a square wave of period 1, +1 first, over an interval [periods]; exact."""
     if wide < MIN_WIDTH:
         return 1.0 if middle - np.floor(middle) < 0.5 else -1.0
     start, end = middle - 0.5 * wide, middle + 0.5 * wide
@@ -64,7 +64,7 @@ def _wave(middle: float, wide: float) -> float:
 
 @inlined
 def _bow(x: float) -> float:
-    """A second integral of the square wave, of period 1."""
+    """Return a second integral of the square wave, of period 1."""
     half = 2.0 * x - np.floor(2.0 * x)
     sign = 1.0 if np.floor(2.0 * x) % 2.0 == 0.0 else -1.0
     return 0.125 * sign * half * (half - 1.0)
@@ -83,13 +83,13 @@ def _wave_between(middle: float, one: float, other: float) -> float:
 
 @inlined
 def _scaled(sides: Footprint, scale: float) -> Footprint:
-    """A footprint in another unit."""
+    """Return a footprint in another unit."""
     return Footprint(sides.one_s * scale, sides.one_q * scale, sides.other_s * scale, sides.other_q * scale)
 
 
 @kernel
 def mean_pattern(canvas: Canvas, look: Record, s: float, q: float, sides: Footprint) -> float:
-    """Contrast times the mean of a texture over the parallelogram around (s, q) [m].
+    """Return contrast times the mean of a texture over the parallelogram around (s, q) [m].
 
     Exact for noise, stripes and rings. A checker's coordinates are averaged each on its own, which is exact
     if the footprint is a rectangle along s and q, or shows no edge of one of them.
@@ -113,7 +113,7 @@ def mean_pattern(canvas: Canvas, look: Record, s: float, q: float, sides: Footpr
 
 @kernel
 def _level_row(canvas: Canvas, look: Record, rows: Rows, height: float, u: float, wide: float) -> float:
-    """Contrast times the mean of a texture of a level face at `height` [m] over some rows.
+    """Return contrast times the mean of a texture of a level face at `height` [m] over some rows.
 
     `u` and `wide` are the slope of the strip's middle and its width in slopes. Rows are cut where q is at an
     edge of the pattern, as far as there are few.
@@ -165,7 +165,7 @@ def _level_part(
 
 @inlined
 def _rows_between(row: int, top: Ends, bottom: Ends) -> Rows:
-    """First and last row of the part of a pixel that lies between the middles of two edges."""
+    """Return first and last row of the part of a pixel that lies between the middles of two edges."""
     high, low = 0.5 * (top.left + top.right), 0.5 * (bottom.left + bottom.right)
     return Rows(min(max(high, row), low), max(min(low, row + 1.0), high))
 
@@ -205,7 +205,7 @@ def texture_side(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
 
 @kernel
 def _upright_row(canvas: Canvas, look: Record, side: Upright, rows: Rows) -> float:
-    """Contrast times the mean of a texture of an upright surface over some rows."""
+    """Return contrast times the mean of a texture of an upright surface over some rows."""
     frame, scale = canvas.frame, look.frequency
     below = 0.5 * (rows.first + rows.last) - frame.horizon
     tall = (rows.last - rows.first) * side.depth / frame.focal
@@ -251,7 +251,7 @@ def _add_upright_rows(
 
 @inlined
 def _swing(frame: Record, look: Record, s: float, along: float) -> float:
-    """Mean of the square wave along s over a length around it [m]."""
+    """Return the mean of the square wave along s over a length around it [m]."""
     return _wave((s - look.speed_s * frame.time) * look.frequency, abs(along) * look.frequency)
 
 
@@ -365,7 +365,7 @@ def _part(
 
 @inlined
 def _wall(frame: Record, side: float, u: float, wide: float) -> Upright:
-    """What slopes `wide` around `u` show of the wall at x = side * half width."""
+    """Return the part of the wall at x = side * half width that slopes `wide` around `u` show."""
     away = side * frame.wall_half - frame.eye_x
     left, right = u - 0.5 * wide, u + 0.5 * wide
     one = away / (left * frame.cos - frame.sin)
@@ -402,7 +402,7 @@ def _along_face(frame: Record, body: Record, strip: Record) -> Upright:
 
 @kernel
 def _around_pole(frame: Record, body: Record, strip: Record) -> Upright:
-    """The side of a pole that the gap shows."""
+    """Return the side of a pole that the gap shows."""
     left, right = strip.gap_slopes.left, strip.gap_slopes.right
     near, _ = depths(body, frame, left)
     middle, _ = depths(body, frame, strip.slope)

@@ -97,7 +97,7 @@ CUT = _record([("position", "f8"), ("body", "i8"), ("begins", "i8")])
 
 
 class Noise(NamedTuple):
-    """What a scene has of noise.
+    """Noise of a scene.
 
     Attributes:
         waves: float32 (T, 4, K), of each texture: cycles a tile along s and q, turn [cycles], amplitude.
@@ -144,7 +144,7 @@ class Bends(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """All that painting a strip needs beside the body that is painted.
+    """Everything that painting a strip needs except the body itself.
 
     Attributes:
         frame: A FRAME record.

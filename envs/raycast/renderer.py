@@ -25,13 +25,13 @@ from envs.scene.textures import PATTERNS, around
 
 
 def _check_scene(scene: Scene) -> None:
-    """ValueError if the scene has a mesh, which only pyrender draws."""
+    """Raise ValueError if the scene has a mesh, which only pyrender draws."""
     if scene.mesh is not None:
         raise ValueError("raycast draws no meshes, and the scene has one; use pyrender")
 
 
 def _make_bodies(scene: Scene) -> np.ndarray:
-    """(M,) BODY the obstacles as far as they stand above the ground."""
+    """Return the obstacles, (M,) BODY, as far as they stand above the ground."""
     o = scene.obstacles[scene.obstacles["z"] + scene.obstacles["rz"] > 0.0]
     bottom, top = o["z"] - o["rz"], o["z"] + o["rz"]
     sunk = (bottom < 0.0) & (o["kind"] != ELLIPSOID)
@@ -47,7 +47,7 @@ def _make_bodies(scene: Scene) -> np.ndarray:
 
 
 def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """(1,) FRAME without what a pose determines, and the waves of the scene's noise."""
+    """Return a FRAME (1,) without the fields of a pose, and the waves of the scene's noise."""
     frame = np.zeros(1, FRAME)
     faces = np.array([(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)], np.float64)
     lit = scene.shade(np.ones(6), faces).tolist()
@@ -70,13 +70,13 @@ def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[
 
 
 def _texture_record(texture: Texture, noise: int) -> tuple[float, ...]:
-    """A TEXTURE record, of which `noise` tells where its waves are, if it is noise."""
+    """Return a TEXTURE record; `noise` is the place of its waves, if it is noise."""
     kind = PATTERNS.index(texture.pattern)
     return (kind, 1.0 / texture.period_m, texture.depth, *texture.velocity_mps, noise)
 
 
 def focal_length(width: int, fov_deg: float) -> float:
-    """Focal length [pixels] of `width` square pixels that `fov_deg` spans."""
+    """Return the focal length [pixels] of `width` square pixels that span `fov_deg`."""
     return 0.5 * width / math.tan(0.5 * math.radians(fov_deg))
 
 
@@ -99,7 +99,7 @@ class RaycastRenderer:
         samples: int = 1,
         cull_m: float = math.inf,
     ) -> None:
-        """Renderer of `width` x `height` square pixels with a horizontal field of view of `fov_deg`.
+        """Make a renderer of `width` x `height` square pixels with a horizontal field of view of `fov_deg`.
 
         Args:
             scene: What to draw.
@@ -149,7 +149,7 @@ class RaycastRenderer:
     def render(
         self, x_m: float, y_m: float, z_m: float, yaw_rad: float = 0.0, t_s: float = 0.0
     ) -> np.ndarray:
-        """The image seen from a pose, as a fresh array.
+        """Render the image seen from a pose, as a fresh array.
 
         Args:
             x_m: Position of the camera to the right [m].
@@ -168,7 +168,7 @@ class RaycastRenderer:
         return self.render_way(np.array([[x_m, y_m, z_m, yaw_rad, t_s]], np.float64))[0]
 
     def render_way(self, poses: np.ndarray) -> np.ndarray:
-        """The images seen one after the other along a way, in one call.
+        """Render the images along a way in one call.
 
         Args:
             poses: float64 (K, 5), of each image what `render` takes: x, y, z [m], yaw [rad]

@@ -1,4 +1,4 @@
-"""When the silhouettes of bodies cross the borders between columns of pixels, on a straight way.
+"""Times at which silhouettes cross the borders between columns of pixels on a straight way.
 
 While a silhouette moves within one column, the light of the column's pixels changes almost
 linearly; when it passes into the next, one column stops changing and the other begins. So these
@@ -61,7 +61,7 @@ class Stretch(NamedTuple):
 
 
 class Looks(NamedTuple):
-    """At which times which columns are looked at.
+    """Times and columns of the looks of a stretch.
 
     Attributes:
         t_us: Times, int64 [us].
@@ -79,7 +79,7 @@ class Looks(NamedTuple):
 
 
 def make_looks(width: int) -> Looks:
-    """Room for the looks at images of `width` columns."""
+    """Allocate room for the looks at images of `width` columns."""
     size = LOOKS_PER_COLUMN * width
     times, first, last = np.empty((3, size + width), np.int64)
     return Looks(times, first, last, np.empty(width, np.bool_), np.empty(width, np.int64))
@@ -87,7 +87,7 @@ def make_looks(width: int) -> Looks:
 
 @kernel
 def aim_along(frame: Record, way: Way, t_us: float) -> None:
-    """Aim from where the camera is on its way at a time."""
+    """Aim the frame from the camera's place on its way at a time."""
     part = (t_us - way.start_us) / way.moving_us
     x = way.start_x + (way.end_x - way.start_x) * part
     y = way.start_y + (way.end_y - way.start_y) * part
@@ -98,7 +98,7 @@ def aim_along(frame: Record, way: Way, t_us: float) -> None:
 def follow_bodies(
     bodies: np.ndarray, way: Way, focal: float, width: int, cull: float, numbers: np.ndarray
 ) -> int:
-    """Find the bodies that may be in view where a way begins or where it ends.
+    """Find the bodies that may be in view at the start or the end of a way.
 
     Args:
         bodies: (N,) BODY.
@@ -130,7 +130,7 @@ def follow_bodies(
 def find_silhouettes(
     bodies: np.ndarray, followed: np.ndarray, width: int, room: Workspace, places: np.ndarray
 ) -> None:
-    """Where the silhouettes of bodies stand, seen as `room.frames[0]` says.
+    """Find the silhouettes of bodies as seen by `room.frames[0]`.
 
     Args:
         bodies: (N,) BODY.
@@ -152,13 +152,13 @@ def find_silhouettes(
 
 @inlined
 def near(place: float, size: float) -> float:
-    """A place, moved next to an image of `size` pixels if it is farther outside."""
+    """Return a place, moved next to an image of `size` pixels if it is farther outside."""
     return min(max(place, -BESIDE), size + BESIDE)
 
 
 @kernel
 def find_looks(bodies: np.ndarray, focal: float, way: Way, stretch: Stretch, looks: Looks) -> int:
-    """The looks that a stretch of a way takes, sorted by time; those at its end by column.
+    """Find the looks of a stretch of a way, sorted by time; looks at its end by column.
 
     Args:
         bodies: (N,) BODY.
@@ -189,7 +189,7 @@ def find_looks(bodies: np.ndarray, focal: float, way: Way, stretch: Stretch, loo
 
 @inlined
 def _look_at_end(stretch: Stretch, looks: Looks, size: int) -> int:
-    """Append the looks at the columns that are due at the end of a stretch; the new number."""
+    """Append the looks at the columns that are due at the end of a stretch; return the new number."""
     due, width = False, len(looks.every)
     for column in range(width):
         before, due = due, stretch.number % looks.every[column] == 0
@@ -203,7 +203,7 @@ def _look_at_end(stretch: Stretch, looks: Looks, size: int) -> int:
 
 @inlined
 def _look_at_moving(stretch: Stretch, looks: Looks, t_us: int) -> int:
-    """Begin with looks at the columns in which a silhouette moves far; how many there are."""
+    """Start with looks at the columns in which a silhouette moves far; return their number."""
     before, after, moving, width = stretch.before, stretch.after, looks.moving, len(looks.moving)
     moving[:] = False
     for i in range(len(before)):
@@ -225,7 +225,7 @@ def _look_at_moving(stretch: Stretch, looks: Looks, t_us: int) -> int:
 
 @inlined
 def _crossing(body: Record, side: int, u: float, way: Way) -> float:
-    """When the left or the right silhouette of a body is at slope `u` [us]; not finite if it never is.
+    """Return when the left or right silhouette of a body is at slope `u` [us]; not finite if it never is.
 
     There the ray touches the body: its distance from the axis, which is linear in time, is the body's reach.
     """
@@ -237,7 +237,7 @@ def _crossing(body: Record, side: int, u: float, way: Way) -> float:
 
 @inlined
 def _add_look(looks: Looks, size: int, t_us: int, first: int, last: int) -> int:
-    """Add a look, sorted by time; the new number."""
+    """Add a look, sorted by time; return the new number."""
     j = size
     while j > 0 and looks.t_us[j - 1] > t_us:
         looks.t_us[j], looks.first[j], looks.last[j] = (

@@ -1,4 +1,4 @@
-"""Into how many stretches of time a way is cut, so that what is seen in a column moves little in each.
+"""Cut a way into so many stretches of time that a column's contents move little in each.
 
 Silhouettes have looks of their own (`envs.raycast.silhouettes`). This file counts for what crosses rows:
 the tops and feet of bodies and of walls, slanted outlines, and the patterns on them.
@@ -24,7 +24,7 @@ PATTERN = 4.0  # times as far as a level outline may a pattern on a body move
 
 
 class Shifts(NamedTuple):
-    """How far the outline of a body may move between two looks at its columns, by its edges [pixels].
+    """Largest motion of a body's outline between two looks at its columns, by kind of edge [pixels].
 
     Attributes:
         upright: Of a pole, or a box on the ground.
@@ -38,7 +38,7 @@ class Shifts(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """Where the bodies that are followed on a way are seen, at two of its places.
+    """Image positions of the followed bodies at two places of a way.
 
     Attributes:
         followed: (N,) int64, the numbers of the bodies; the first K elements are in use, as below.
@@ -54,7 +54,7 @@ class Outlines(NamedTuple):
 
 
 def make_outlines(num_bodies: int) -> Outlines:
-    """Room for the outlines of `num_bodies` bodies."""
+    """Allocate room for the outlines of `num_bodies` bodies."""
     places, rows = np.empty((2, num_bodies, 2)), np.empty((2, num_bodies, len(SIGHTS) * ROWS))
     return Outlines(np.empty(num_bodies, np.int64), *places, *rows)
 
@@ -69,7 +69,7 @@ def find_rows(
     room: Workspace,
     rows: np.ndarray,
 ) -> None:
-    """In which rows bodies show, seen as `room.frames[0]` says, where they are in view and near.
+    """Find the rows in which near bodies show, as seen by `room.frames[0]`.
 
     Args:
         bodies: (N,) BODY.
@@ -126,7 +126,7 @@ def divide_time(
     limit: int,
     looks: Looks,
 ) -> int:
-    """Cut a time into stretches, so many that outlines move little in each; say which columns need them all.
+    """Cut a time into so many stretches that outlines move little in each; mark columns that need them all.
 
     Args:
         bodies: (N,) BODY.
@@ -165,7 +165,7 @@ def divide_time(
 
 @inlined
 def _stretches(moved: float, limit: int) -> int:
-    """The least power of two not below a motion, in multiples of what a stretch may have; at most `limit`."""
+    """Return the least power of two >= `moved`, a motion in multiples of the allowed one; at most `limit`."""
     stretches = 1
     while moved > stretches and 2 * stretches <= limit:
         stretches *= 2
@@ -174,7 +174,7 @@ def _stretches(moved: float, limit: int) -> int:
 
 @inlined
 def _moved(body: Record, k: int, outlines: Outlines, way: Way, frame: Record, shifts: Shifts) -> float:
-    """How far the outline of a body moves, in multiples of what it may in a stretch."""
+    """Return the motion of a body's outline in multiples of the motion allowed in a stretch."""
     shift = _shift_of(body, shifts)
     level, moved = min(shift, shifts.level), 0.0
     for side in range(2):
@@ -191,7 +191,7 @@ def _moved(body: Record, k: int, outlines: Outlines, way: Way, frame: Record, sh
 
 @inlined
 def _pattern_moved(before: np.ndarray, after: np.ndarray, way: Way, frame: Record) -> float:
-    """How far the pattern on a body moves in the rows of the image that the body covers [pixels]."""
+    """Return how far the pattern on a body moves in the image rows that the body covers [pixels]."""
     reach = max(abs(before[0] - frame.horizon), abs(before[ROWS - 2] - frame.horizon))
     texture = frame.body_texture
     alone_m = math.hypot(texture.speed_s, texture.speed_q) * way.moving_us * 1e-6
@@ -208,7 +208,7 @@ def _shift_of(body: Record, shifts: Shifts) -> float:
 
 @inlined
 def _wall_moved(u: float, way: Way, frame: Record) -> float:
-    """How far the upper and the lower line of the wall that is seen along slope `u` move [pixels]."""
+    """Return how far the upper and lower line of the wall seen along slope `u` move [pixels]."""
     wall = math.copysign(frame.wall_half, u)
     before, after = (wall - way.start_x) * u, (wall - way.end_x) * u
     if before <= 0.0 or after <= 0.0:  # straight ahead, or from beyond a wall

@@ -21,7 +21,7 @@ MAX_SHARE = 0.1  # [widths of a body] a strip wider than this is lit by two poin
 
 @kernel
 def wall_depth(frame: Record, side: float, u: float) -> float:
-    """Depth at which slope `u` meets the wall at x = side * half width [m]; inf: never."""
+    """Return the depth at which slope `u` meets the wall at x = side * half width [m]; inf: never."""
     depth = (side * frame.wall_half - frame.eye_x) / (u * frame.cos - frame.sin)
     y = frame.eye_y + depth * (u * frame.sin + frame.cos)
     return depth if depth > MIN_DEPTH and frame.wall_near <= y <= frame.wall_far else math.inf
@@ -29,14 +29,14 @@ def wall_depth(frame: Record, side: float, u: float) -> float:
 
 @inlined
 def _in_gap(gap: Record, edge: Record) -> Ends:
-    """An edge of what is shown, at both ends of a gap."""
+    """Return an edge of the surface at both ends of a gap."""
     left, right = edge.left, edge.right
     return Ends(left + gap.reach.left * (right - left), right + (1.0 - gap.reach.right) * (left - right))
 
 
 @inlined
 def _clip(gap: Record, edge: Record) -> Ends:
-    """An edge of what is shown, moved into a gap."""
+    """Return an edge of the surface, moved into a gap."""
     left, right = beyond(_in_gap(gap, edge), ends(gap.top))
     left, right = beyond(Ends(-left, -right), Ends(-gap.bottom.left, -gap.bottom.right))
     return Ends(-left, -right)
@@ -44,7 +44,7 @@ def _clip(gap: Record, edge: Record) -> Ends:
 
 @inlined
 def _cut_gaps(gaps: np.ndarray, strip: Record, count: int) -> int:
-    """Cut the gaps where an edge of what is shown crosses one of theirs; their new number."""
+    """Cut the gaps where an edge of the surface crosses one of theirs; return their new number."""
     count = _cut_by(gaps, strip.cap, count)
     count = _cut_by(gaps, strip.end, count)
     if strip.side.left > strip.cap.left or strip.side.right > strip.cap.right:
@@ -78,7 +78,7 @@ def _cut_at(gaps: np.ndarray, k: int, edge: Record, limit: Record, count: int) -
 
 @inlined
 def enter_gap(frame: Record, strip: Record, gap: Record) -> None:
-    """Note in the strip where a gap is, and its weight."""
+    """Store the place and the weight of a gap in the strip."""
     first, wide = strip.slopes.left, strip.slopes.right - strip.slopes.left
     left, right = first + gap.reach.left * wide, first + gap.reach.right * wide
     put(strip.gap_slopes, Ends(left, right))
@@ -93,7 +93,7 @@ def _is_same(one: Record, other: Record) -> bool:
 
 @kernel
 def _carve(canvas: Canvas, count: int, k: int, first: Ends, last: Ends, standing: bool) -> int:
-    """Take what is shown, from edge `first` to `last`, out of gap `k`.
+    """Remove the surface, from edge `first` to `last`, from gap `k`.
 
     Below what stands on the ground only the ground is left.
     """
@@ -120,7 +120,7 @@ def _carve(canvas: Canvas, count: int, k: int, first: Ends, last: Ends, standing
 
 @inlined
 def _outline_wall(frame: Record, strip: Record) -> None:
-    """Note in the strip the rows of the wall that comes next."""
+    """Store the rows of the next wall in the strip."""
     away = frame.focal / (strip.wall_side * frame.wall_half - frame.eye_x)
     left = max(0.0, away * (strip.slopes.left * frame.cos - frame.sin))
     right = max(0.0, away * (strip.slopes.right * frame.cos - frame.sin))
@@ -135,7 +135,7 @@ def _outline_wall(frame: Record, strip: Record) -> None:
 
 @kernel
 def show_walls(canvas: Canvas, count: int, limit: float) -> int:
-    """Paint the walls nearer than `limit` [m] that are still to come into the gaps; their new number."""
+    """Paint the remaining walls nearer than `limit` [m] into the gaps; return the new number of gaps."""
     frame, strip, gaps, accumulators = canvas.frame, canvas.strip, canvas.gaps, canvas.accumulators
     while strip.wall_depth < limit:
         side = strip.wall_side
@@ -157,7 +157,7 @@ def show_walls(canvas: Canvas, count: int, limit: float) -> int:
 
 @kernel
 def _lit_part(frame: Record, body: Record, strip: Record) -> float:
-    """Mean cosine over a strip of which the sun lights one side, up to where its rays graze the pole."""
+    """Return the mean cosine over a strip that the sun lights up to where its rays graze the pole."""
     length = math.sqrt(frame.sun_right * frame.sun_right + frame.sun_forward * frame.sun_forward)
     right, forward = -frame.sun_forward / length, frame.sun_right / length
     away = right * body.right + forward * body.forward
@@ -172,7 +172,7 @@ def _lit_part(frame: Record, body: Record, strip: Record) -> float:
 
 @inlined
 def _side_light(frame: Record, body: Record, strip: Record) -> float:
-    """Mean luminance of a pole's or box's side over the strip."""
+    """Return the mean luminance of a pole's or box's side over the strip."""
     middle = 0.5 * (strip.slopes.left + strip.slopes.right)
     if body.kind == POLE:
         one, other = strip.cosine.left, strip.cosine.right
@@ -210,7 +210,7 @@ def _cut_for_body(canvas: Canvas, body: Record, count: int) -> int:
 
 @inlined
 def _paint_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: Ends, bottom: Ends) -> None:
-    """Paint what lies between four edges: a body's level top, its side, its underside."""
+    """Paint the areas between four edges: a body's level top, its side, its underside."""
     frame, strip, accumulators = canvas.frame, canvas.strip, canvas.accumulators
     if is_open(first, last):
         coverage.fill(frame, accumulators, first, last, strip.light, strip.weight)
@@ -226,7 +226,7 @@ def _paint_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: End
 
 @inlined
 def _light_gap(frame: Record, body: Record, strip: Record, mean: float) -> None:
-    """Note in the strip the light of a pole in the gap, and its tilt; `mean` is that of the whole strip."""
+    """Store the light and tilt of a pole in the gap; `mean` is the light of the whole strip."""
     first, last = strip.slopes.left, strip.slopes.right
     left = body.albedo * (frame.ambient + frame.diffuse * max(0.0, strip.cosine.left))
     right = body.albedo * (frame.ambient + frame.diffuse * max(0.0, strip.cosine.right))
@@ -238,7 +238,7 @@ def _light_gap(frame: Record, body: Record, strip: Record, mean: float) -> None:
 
 @inlined
 def show_body(canvas: Canvas, body: Record, count: int) -> int:
-    """Paint what the strip knows of a body into the gaps; their new number."""
+    """Paint a body, whose rows the strip holds, into the gaps; return their new number."""
     frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
     strip.light = 0.0 if _is_curved(body) else _side_light(frame, body, strip)
     strip.level_light = body.albedo * (frame.lit_up if frame.eye_z > body.top else frame.lit_down)

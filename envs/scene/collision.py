@@ -15,7 +15,7 @@ MARGIN = 1.0 + 1e-9  # times a size: rounding cannot make it too small
 
 @numba.njit(cache=True, error_model="numpy")
 def first_contact(segment: tuple, radius: float, half_width: float, sections: np.ndarray) -> float:
-    """Smallest fraction of `segment` (ax, ay, bx, by) in contact with a wall or a section, or inf.
+    """Return the smallest fraction of `segment` (ax, ay, bx, by) in contact with a wall or section, or inf.
 
     Args:
         segment: Way of the centre of a disc [m].
@@ -53,7 +53,7 @@ def _wall_contact(ax: float, bx: float, half: float) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _disc_contact(a: tuple, b: tuple, reach: float) -> float:
-    """First contact of the segment a-b with the disc of radius `reach` around the origin."""
+    """Return the first contact of the segment a-b with the disc of radius `reach` around the origin."""
     start = math.hypot(a[0], a[1])
     if start <= reach:
         return 0.0
@@ -75,7 +75,7 @@ def _disc_contact(a: tuple, b: tuple, reach: float) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _box_contact(a: tuple, b: tuple, half: tuple, reach: float) -> float:
-    """First contact of a-b with all points within `reach` of the rectangle of half-sizes `half`.
+    """Return the first contact of a-b with all points within `reach` of the rectangle of half-sizes `half`.
 
     These are two rectangles, one longer and one wider by `reach`, and a disc at each corner.
     """
@@ -92,13 +92,13 @@ def _box_contact(a: tuple, b: tuple, half: tuple, reach: float) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _distance(point: tuple, hx: float, hy: float) -> float:
-    """Distance of a point from a rectangle around the origin; 0 inside."""
+    """Return the distance of a point from a rectangle around the origin; 0 inside."""
     return math.hypot(max(abs(point[0]) - hx, 0.0), max(abs(point[1]) - hy, 0.0))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _entry(a: tuple, b: tuple, hx: float, hy: float) -> float:
-    """Where the segment a-b enters a rectangle around the origin, as a fraction, or inf."""
+    """Return where the segment a-b enters a rectangle around the origin, as a fraction, or inf."""
     enters, leaves = 0.0, 1.0
     for start, end, half in ((a[0], b[0], hx), (a[1], b[1], hy)):
         way = end - start
@@ -116,7 +116,7 @@ def _entry(a: tuple, b: tuple, hx: float, hy: float) -> float:
 def ways_to_goal(
     sections: np.ndarray, radius: float, half_width: float, length: float, columns: int
 ) -> np.ndarray:
-    """From where a vehicle that flies ahead or 45 degrees to a side reaches the goal line.
+    """Find the places from which a vehicle that flies ahead or 45 degrees to a side reaches the goal line.
 
     A place of the lattice is open if it keeps one cell more than `radius` from everything,
     and leads to the goal if it is open and so does a place one cell ahead: straight, left or
@@ -174,7 +174,7 @@ def _close(places: np.ndarray, section: np.ndarray, reach: float, middle: int) -
 
 @numba.njit(cache=True, error_model="numpy")
 def keep_apart(tries: np.ndarray, min_gap_m: float, count: int) -> np.ndarray:
-    """The first `count` points of `tries` that are `min_gap_m` from all points kept before."""
+    """Return the first `count` points of `tries` that are `min_gap_m` from all points chosen before."""
     kept = np.empty((count, 2))
     size = 0
     for i in range(len(tries)):

@@ -175,7 +175,7 @@ LAYOUTS: dict[str, Layout | MeshLayout] = {
 
 
 def with_overrides(layout: AnyLayout, overrides: Mapping[str, object]) -> AnyLayout:
-    """The layout with some of its fields replaced.
+    """Return the layout with some of its fields replaced.
 
     Raises:
         ValueError: A key is no field of the layout, or its value is refused.
@@ -191,7 +191,7 @@ def with_overrides(layout: AnyLayout, overrides: Mapping[str, object]) -> AnyLay
 
 
 def _with_texture(key: str, texture: object, changes: Mapping[str, Any]) -> Texture:
-    """A texture with some of its fields replaced; whole numbers and pairs may come as floats and lists."""
+    """Return a texture with some fields replaced; whole numbers and pairs may come as floats and lists."""
     known = [field.name for field in dataclasses.fields(Texture)]
     wrong = [name for name in changes if name not in known]
     if not isinstance(texture, Texture) or wrong:
@@ -203,7 +203,7 @@ def _with_texture(key: str, texture: object, changes: Mapping[str, Any]) -> Text
 
 
 def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
-    """Obstacles inside the lane with axes `min_gap_m` apart, by rejection with a bounded number of tries.
+    """Draw obstacles in the lane, axes `min_gap_m` apart, by rejection with a bounded number of tries.
 
     Returns:
         (M,) OBSTACLE, place by place; a gate is four of them.
@@ -238,7 +238,7 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
 
 
 def _share_covered(layout: Layout, half: float) -> float:
-    """Share of the area that discs of diameter `min_gap_m` around all axes would cover."""
+    """Return the share of the area that discs of diameter `min_gap_m` around all axes would cover."""
     gap = layout.min_gap_m
     width, length = 2 * half + gap, layout.last_y_m - layout.first_y_m + gap
     return layout.num_obstacles * 0.25 * math.pi * gap * gap / (width * length)

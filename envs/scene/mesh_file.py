@@ -21,7 +21,7 @@ def is_mesh_path(name: str) -> bool:
 
 
 def read_mesh(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Read what `trimesh` can: glTF, OBJ, OFF, PLY, STL and more.
+    """Read a mesh file in any format of `trimesh`: glTF, OBJ, OFF, PLY, STL and more.
 
     glTF is y-up by its standard, so (x, y, z) becomes (x, -z, y): what faced -z, away from
     the viewer, then lies ahead. Other formats are taken as they are: metres, z up.
@@ -67,7 +67,7 @@ def read_mesh(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _load(path: str) -> "list[trimesh.Trimesh] | None":
-    """The meshes of a file at their places; None if they have too many triangles."""
+    """Load the meshes of a file at their places; None if they have too many triangles."""
     import trimesh
 
     scene = trimesh.load_scene(path, process=False)
@@ -79,7 +79,7 @@ def _load(path: str) -> "list[trimesh.Trimesh] | None":
 
 
 def _usable(path: str, corners: np.ndarray, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles that have an area, with their normals."""
+    """Return the triangles that have an area, with their normals."""
     if not (np.isfinite(corners).all() and np.abs(corners).max() <= 1e6):
         raise ValueError(f"scene {path!r} must have finite vertices within 1e6 m")
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -91,7 +91,7 @@ def _usable(path: str, corners: np.ndarray, albedo: np.ndarray) -> tuple[np.ndar
 
 
 def _albedo(part: "trimesh.Trimesh", linear: bool) -> np.ndarray:
-    """Albedo of each corner of each face, (F, 3)."""
+    """Return the albedo of each corner of each face, (F, 3)."""
     shape, kind = (len(part.faces), 3), part.visual.kind
     if kind == "texture":
         return np.broadcast_to(_material_albedo(part, linear), shape)
@@ -103,7 +103,7 @@ def _albedo(part: "trimesh.Trimesh", linear: bool) -> np.ndarray:
 
 
 def _material_albedo(part: "trimesh.Trimesh", linear: bool) -> np.ndarray:
-    """Albedo of the material: its colour times its texture; (F, 3), or one value."""
+    """Return the albedo of the material, its colour times its texture; (F, 3), or one value."""
     from trimesh.visual.color import uv_to_color
     from trimesh.visual.material import PBRMaterial
 
@@ -122,6 +122,6 @@ def _luma(colours: Any, linear: bool) -> np.ndarray:
 
 
 def _linear(colours: Any, linear: bool) -> np.ndarray:
-    """Red, green and blue in [0, 1] of colours uint8 (..., 3 or 4), from sRGB unless `linear`."""
+    """Convert colours uint8 (..., 3 or 4) to red, green and blue in [0, 1], from sRGB unless `linear`."""
     rgb = np.asarray(colours)[..., :3] / 255.0
     return rgb if linear else np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)

@@ -30,7 +30,7 @@ ROUNDING = 1e-6  # by which a product of an albedo, which is float32, may exceed
 
 
 def checked_obstacles(obstacles: np.ndarray, contrast: float) -> np.ndarray:
-    """A read-only copy of obstacles whose texture raises the albedo by `contrast` at most.
+    """Check obstacles whose texture raises the albedo by `contrast` at most; return a read-only copy.
 
     Raises:
         ValueError: They are not OBSTACLE records, or one breaks a rule; both are named.
@@ -57,7 +57,7 @@ def checked_obstacles(obstacles: np.ndarray, contrast: float) -> np.ndarray:
 
 
 def checked_mesh(vertices: np.ndarray, faces: np.ndarray, luminance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Read-only vertices (V, 3) [m], faces (F, 3) and luminance (V,) of a mesh.
+    """Check a mesh; return read-only vertices (V, 3) [m], faces (F, 3) and luminance (V,).
 
     Raises:
         ValueError: A shape or a value is wrong.
@@ -77,7 +77,7 @@ def checked_mesh(vertices: np.ndarray, faces: np.ndarray, luminance: np.ndarray)
 
 
 def body_sections(obstacles: np.ndarray, height_m: float) -> np.ndarray:
-    """What the plane z = `height_m` cuts from bodies; top and bottom belong to a body.
+    """Return the sections of bodies at the plane z = `height_m`; top and bottom belong to a body.
 
     Args:
         obstacles: (N,) OBSTACLE.
@@ -105,7 +105,7 @@ def body_sections(obstacles: np.ndarray, height_m: float) -> np.ndarray:
 
 
 def mesh_sections(vertices: np.ndarray, faces: np.ndarray, height_m: float) -> np.ndarray:
-    """What the plane z = `height_m` cuts from the surfaces of a mesh: straight edges.
+    """Return the straight edges in which the plane z = `height_m` cuts the surfaces of a mesh.
 
     A face that touches the plane along an edge or at a corner counts, and one that lies in
     it gives its three edges. Faces that share an edge give the same point on it, bit for bit.
@@ -142,7 +142,7 @@ def mesh_sections(vertices: np.ndarray, faces: np.ndarray, height_m: float) -> n
 
 
 def edge_sections(a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-    """Straight edges from `a_m` to `b_m`, both (N, 2) [m], as (N, 7) sections."""
+    """Return straight edges from `a_m` to `b_m`, both (N, 2) [m], as (N, 7) sections."""
     along = b_m - a_m
     length = np.hypot(along[:, 0], along[:, 1])
     sections = np.zeros((len(a_m), 7))

@@ -23,7 +23,7 @@ SIDE_PRICE = 0.01  # of a lattice step to the side: of two free paths, the strai
 
 @dataclass(frozen=True)
 class CostToGo:
-    """What the cheapest way to the goal line costs, from each place of the lattice.
+    """Cost of the cheapest way to the goal line from each place of the lattice.
 
     Attributes:
         costs: (rows in y, columns in x), float64; row 0 is y = 0.
@@ -36,7 +36,7 @@ class CostToGo:
     first_x_m: float
 
     def of_actions(self, x_m: float, y_m: float, sight_m: float = math.inf) -> np.ndarray:
-        """What each action costs from anywhere: ahead, left, right; float64 (3,).
+        """Return the cost of each action from anywhere: ahead, left, right; float64 (3,).
 
         A lattice step in the action's direction, and from there the cheapest way, interpolated between
         the four nearest places; outside the lattice, as at its edge.
@@ -67,7 +67,7 @@ def cost_to_go(scene: Scene, radius_m: float, height_m: float = 2.0, through_x_m
 def lattice_prices(
     scene: Scene, through_x_m: float, radius_m: float, height_m: float
 ) -> tuple[np.ndarray, float]:
-    """What it costs to be at each place of the lattice, (rows in y, columns in x), and column 0's x [m].
+    """Return the price of each place of the lattice, (rows in y, columns in x), and column 0's x [m].
 
     A place in contact costs `BLOCKED`; others less, the farther they are from contact. The outermost
     columns are in contact with the walls, or farther away than the vehicle can come.
@@ -106,7 +106,7 @@ def _approach(
 
 @numba.njit(cache=True, error_model="numpy")
 def _costs(prices: np.ndarray) -> np.ndarray:
-    """The cheapest sum of prices to the last row, `SIDE_PRICE` added for each step to a side."""
+    """Return the least sum of prices to the last row; each step to a side adds `SIDE_PRICE`."""
     costs = prices.copy()
     rows, columns = prices.shape
     for j in range(rows - 2, -1, -1):
@@ -122,7 +122,7 @@ def _costs(prices: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _of_actions(costs: np.ndarray, column: float, row: float) -> np.ndarray:
-    """`CostToGo.of_actions` of a place in lattice steps."""
+    """Return `CostToGo.of_actions` of a place in lattice steps."""
     last_row, last_column = costs.shape[0] - 1, costs.shape[1] - 1
     y = min(max(row + 1.0, 0.0), float(last_row))
     j = min(int(y), last_row - 1)
@@ -138,7 +138,7 @@ def _of_actions(costs: np.ndarray, column: float, row: float) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _of_actions_in_sight(prices: np.ndarray, column: float, row: float, rows_ahead: int) -> np.ndarray:
-    """As `_of_actions`, of ways that end `rows_ahead` rows after the next.
+    """`_of_actions` of ways that end `rows_ahead` rows after the next.
 
     Only the places that such a way can come to are priced, and as many at each side that what lies beyond
     cannot be felt.

@@ -1,4 +1,4 @@
-"""Range scan: how near the first obstacle is in each direction, the truth that probes compare with.
+"""Range scan: proximity of the first obstacle in each direction, the ground truth of probes.
 
 A ray is the way of a point, and ends where that point first touches a section
 (`envs.scene.collision`): exact for every kind of body and for meshes.
@@ -17,7 +17,7 @@ NEAR_M = 10.0  # proximity falls by e with each such distance: half a second of 
 
 
 def proximity(scene: Scene, pose: tuple[float, float, float, float], bearings_rad: np.ndarray) -> np.ndarray:
-    """How near the first obstacle in each bearing is: exp(-distance / NEAR_M), 0 if there is none.
+    """Return the proximity of the first obstacle in each bearing: exp(-distance / NEAR_M), 0 if none.
 
     The exponential keeps the measure in [0, 1] and lets what is too far to matter weigh
     nothing: at 30 m it is 0.05, where 1 / (1 + distance / 5 m) is still 0.14.
@@ -41,7 +41,7 @@ def proximity(scene: Scene, pose: tuple[float, float, float, float], bearings_ra
 
 
 def sector_bearings(fov_deg: float, sectors: int, rays: int = 1) -> np.ndarray:
-    """Bearings of rays spread evenly over sectors of the field of view, from left to right.
+    """Return the bearings of rays spread evenly over sectors of the field of view, from left to right.
 
     Args:
         fov_deg: Horizontal field of view [degrees].

@@ -80,7 +80,7 @@ class Scene:
     mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def __post_init__(self) -> None:
-        """Keep read-only copies of the arrays; ValueError names the wrong value and the rule."""
+        """Store read-only copies of the arrays; ValueError names the wrong value and the rule."""
         _check_numbers(self)
         obstacles = bodies.checked_obstacles(self.obstacles, self.obstacle_texture.depth)
         object.__setattr__(self, "obstacles", obstacles)
@@ -97,7 +97,7 @@ class Scene:
         return {}
 
     def sections(self, height_m: float = 2.0) -> np.ndarray:
-        """What a vehicle at `height_m` [m] can hit, walls aside; cached for a few heights.
+        """Return the sections that a vehicle at `height_m` [m] can hit, without walls; cached.
 
         Returns:
             (M, 7) float64, read-only; see `envs.scene.obstacles`.
@@ -115,12 +115,12 @@ class Scene:
         return sections
 
     def shade(self, albedo: Any, normals: Any) -> np.ndarray:
-        """Lambertian luminance of surfaces of `albedo` (...,) with unit `normals` (..., 3); float64."""
+        """Return the Lambertian luminance of surfaces of `albedo` (...,) with `normals` (..., 3); float64."""
         towards_sun = np.maximum(0.0, np.asarray(normals, np.float64) @ np.asarray(self.sun))
         return np.asarray(albedo, np.float64) * (self.ambient + self.diffuse * towards_sun)
 
     def first_contact(self, a_m: Any, b_m: Any, radius_m: float, height_m: float = 2.0) -> float:
-        """Where a level disc of `radius_m` moving from `a_m` to `b_m` (x, y) [m] first touches something.
+        """Return where a level disc of `radius_m` moving from `a_m` to `b_m` (x, y) [m] first has contact.
 
         Touching counts as contact; a start in contact gives 0. Exact for any length. A body
         is solid; a mesh is its surfaces, so inside one there is no contact until one is reached.
@@ -150,7 +150,7 @@ class Scene:
         return self.first_contact(a_m, b_m, radius_m, height_m) <= 1.0
 
     def ways_to_goal(self, radius_m: float, height_m: float = 2.0) -> np.ndarray:
-        """From where the vehicle can reach the goal line, on a lattice of cells of `collision.CELL_M`.
+        """Find the cells of `collision.CELL_M` from which the vehicle can reach the goal line.
 
         True is a proof for a vehicle whose steps are short against a cell; see
         `envs.scene.collision.ways_to_goal`.
@@ -247,7 +247,7 @@ def _mesh_corridor(name: str, layout: MeshLayout) -> Scene:
 
 @functools.lru_cache(maxsize=2)
 def _read_mesh_corridor(name: str, stamp: tuple[int, int], layout: MeshLayout) -> Scene:
-    """The scene of a mesh file, read once for all episodes; `stamp` differs once the file has changed."""
+    """Return the scene of a mesh file, read once for all episodes; `stamp` changes with the file."""
     corners, normals, albedo = read_mesh(layout.file)
     nothing = np.empty(0, bodies.OBSTACLE)
     bare = Scene(name, nothing, width_m=layout.width_m, wall_height_m=layout.wall_height_m)

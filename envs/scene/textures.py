@@ -58,7 +58,7 @@ class Texture:
 
     @property
     def depth(self) -> float:
-        """By which share of its mean the albedo changes at most."""
+        """Largest change of the albedo, as a share of its mean."""
         return 0.0 if self.pattern == "plain" else self.contrast
 
     @property
@@ -73,7 +73,7 @@ class Texture:
 
 
 def around(texture: Texture, radius_m: float) -> float:
-    """Metres of surface coordinate per radian around a round body, so that the pattern closes.
+    """Return the metres of surface coordinate per radian around a round body, so that the pattern closes.
 
     Args:
         texture: What goes around.
@@ -85,7 +85,7 @@ def around(texture: Texture, radius_m: float) -> float:
 
 @functools.cache
 def noise_waves(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The waves whose sum is the noise: cycles per tile along (s, q), (M, 2), and complex amplitudes (M,).
+    """Return the waves of the noise: cycles per tile along (s, q), (M, 2), and complex amplitudes (M,).
 
     P(s, q) = Re sum of amplitude * exp(2 pi i (a s + b q)), s and q in tiles. All waves of a
     half-plane between TILE_PERIODS / 2 and TILE_PERIODS cycles long, equally strong, with
@@ -101,7 +101,7 @@ def noise_waves(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndarray:
-    """(size, size) float64 the sum of the waves at the texels, q along rows and s along columns."""
+    """Return the sum of the waves at the texels, (size, size) float64, q along rows and s along columns."""
     turns = 2j * math.pi / size * np.arange(size)
     along_s, along_q = np.exp(np.outer(turns, cycles[:, 0])), np.exp(np.outer(turns, cycles[:, 1]))
     return ((along_q * amplitudes) @ along_s.T).real
@@ -109,14 +109,14 @@ def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndar
 
 @functools.cache
 def noise_tile(seed: int) -> np.ndarray:
-    """One period of the noise, (TILE, TILE) float32, read-only: tile[j, i] is P at texel s = i, q = j."""
+    """Return one period of the noise, (TILE, TILE) float32, read-only: tile[j, i] is P at s = i, q = j."""
     tile = _sum_waves(*noise_waves(seed), TILE).astype(np.float32)
     tile.flags.writeable = False
     return tile
 
 
 def pattern_points(texture: Texture, s_m: np.ndarray, q_m: np.ndarray, t_s: float = 0.0) -> np.ndarray:
-    """The pattern P at points of a surface, not filtered.
+    """Return the pattern P at points of a surface, not filtered.
 
     Args:
         texture: What pattern, how long and how fast.
@@ -139,7 +139,7 @@ def pattern_points(texture: Texture, s_m: np.ndarray, q_m: np.ndarray, t_s: floa
 
 
 def _bilinear(tile: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Periodic bilinear interpolation of `tile` at `column`, `row` [texels]."""
+    """Interpolate `tile` at `column`, `row` [texels], bilinear and periodic."""
     left, top = np.floor(column), np.floor(row)
     across, down = column - left, row - top
     i, j = (left % TILE).astype(np.int64), (top % TILE).astype(np.int64)

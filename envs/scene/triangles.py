@@ -38,7 +38,7 @@ def to_trimesh(scene: Scene, sections: int = 32) -> "trimesh.Scene":
 
 
 def scene_mesh(scene: Scene, sections: int = 32) -> Part:
-    """All of `scene` as one mesh: obstacles, ground, both sides of the walls, its own mesh.
+    """Return `scene` as one mesh: obstacles, ground, both sides of the walls, its own mesh.
 
     Args:
         scene: What to triangulate.
@@ -57,7 +57,7 @@ def scene_mesh(scene: Scene, sections: int = 32) -> Part:
 
 
 def join(parts: list[Part]) -> Part:
-    """Several meshes as one; none give an empty one."""
+    """Join meshes; no mesh gives an empty one."""
     parts = [(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0)), *parts]
     offsets = np.cumsum([0] + [len(part[0]) for part in parts[:-1]])
     return (
@@ -68,7 +68,7 @@ def join(parts: list[Part]) -> Part:
 
 
 def body_mesh(scene: Scene, body: np.void, sections: int) -> Part:
-    """One obstacle, closed from all sides; see `envs.scene.obstacles` for the kinds."""
+    """Return one obstacle, closed from all sides; see `envs.scene.obstacles` for the kinds."""
     if body["kind"] == BOX:
         return box_mesh(scene, body)
     height = float(body["rz"])
@@ -87,7 +87,7 @@ def body_mesh(scene: Scene, body: np.void, sections: int) -> Part:
 
 
 def box_mesh(scene: Scene, box: np.void) -> Part:
-    """The six faces of a box, each with its own four corners, in the order x-, x+, y-, y+, z-, z+."""
+    """Return the six faces of a box, each with its own four corners, in the order x-, x+, y-, y+, z-, z+."""
     centre = np.array([box["x"], box["y"], box["z"]])
     half = np.array([box["rx"], box["ry"], box["rz"]])
     parts = []
@@ -103,7 +103,7 @@ def box_mesh(scene: Scene, box: np.void) -> Part:
 
 
 def ground_mesh(scene: Scene) -> Part:
-    """The ground, z = 0, as two squares around the origin.
+    """Return the ground, z = 0, as two squares around the origin.
 
     One triangle to the horizon would interpolate its depth in float32 so coarsely that the
     ground hides the feet of the obstacles.
@@ -116,7 +116,7 @@ def ground_mesh(scene: Scene) -> Part:
 
 
 def wall_meshes(scene: Scene) -> list[Part]:
-    """Both walls, each once for each side, so that back faces can be culled."""
+    """Return both walls, once for each side, so that back faces can be culled."""
     near, far = scene.walls_y_m
     height, half = scene.wall_height_m, 0.5 * scene.width_m
     meshes = []
@@ -129,12 +129,12 @@ def wall_meshes(scene: Scene) -> list[Part]:
 
 
 def mean_radius(corners: int) -> float:
-    """How much wider than its circle a regular polygon must be for their mean radii to agree."""
+    """Return how much wider than its circle a regular polygon must be for their mean radii to agree."""
     return (math.pi / corners) / math.sin(math.pi / corners)
 
 
 def _lathe(scene: Scene, body: np.void, radii: np.ndarray, heights: np.ndarray, sections: int) -> Part:
-    """The round side of `body` through rings (M,) of `radii` at `heights`, from -1 at the bottom to 1."""
+    """Return the round side of `body` through rings (M,) of `radii` at `heights`, -1 (bottom) to 1."""
     n, m = sections, len(radii)
     centre = np.array([body["x"], body["y"], body["z"]])
     half = np.array([body["rx"], body["rx"], body["rz"]])
@@ -162,7 +162,7 @@ def _lathe(scene: Scene, body: np.void, radii: np.ndarray, heights: np.ndarray, 
 
 
 def _disc(scene: Scene, body: np.void, height_m: float, sections: int) -> Part:
-    """The level face of `body` at `height_m` above its centre: seen from below if that is negative."""
+    """Return the level face of `body` at `height_m` above its centre: seen from below if that is negative."""
     n = sections
     angle = np.arange(n) * (2.0 * math.pi / n)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1) * body["rx"] * mean_radius(n)

@@ -58,7 +58,7 @@ class Scratch(NamedTuple):
 
 
 class View(NamedTuple):
-    """What one camera sees, and what it remembers of it; arrays that a step changes in place.
+    """The scene of one camera and the camera's memory; a step changes the arrays in place.
 
     Attributes:
         bodies: (N,) BODY, the obstacles.
@@ -86,13 +86,13 @@ class View(NamedTuple):
 
 
 def scratch_for(width: int, height: int, num_bodies: int) -> Scratch:
-    """Scratch for images of `width` x `height` pixels of a scene of `num_bodies` bodies."""
+    """Return scratch for images of `width` x `height` pixels of a scene of `num_bodies` bodies."""
     return _scratch(width, height, 1 << (num_bodies - 1).bit_length())
 
 
 @lru_cache(maxsize=4)
 def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
-    """One of each size: few scenes then work in the same memory, which stays in the cache."""
+    """Allocate one scratch per size: scenes share it, so it stays in the processor's cache."""
     size, words = width * height, (width * height + 7) // 8
     return Scratch(
         room=make_workspace(num_bodies, height),
@@ -107,7 +107,7 @@ def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
 
 @numba.njit(cache=True, error_model="numpy")
 def sense_way(view, way, parts):
-    """Events of a way.
+    """Simulate the camera along a way.
 
     Args:
         view: `View`, whose last image becomes that at the end.
@@ -151,7 +151,7 @@ def sense_way(view, way, parts):
 
 @kernel
 def _divide(view, way, parts):
-    """Into how many stretches each part of a way is cut.
+    """Choose into how many stretches each part of a way is cut.
 
     Returns:
         The number of bodies in view, of which the scratch's outlines are those of both ends of the way; and
@@ -173,7 +173,7 @@ def _divide(view, way, parts):
 
 @kernel
 def _look_along(view, way, stretch, ends, watch, kept):
-    """Look at the columns that a stretch of a way asks for; where it `ends` a part of the way, at all.
+    """Look at the columns that a stretch of a way asks for; at all columns if it `ends` a part of the way.
 
     Returns:
         First invalid pixel or -1, ramps in use, events lost, columns looked at.
@@ -197,13 +197,13 @@ def _look_along(view, way, stretch, ends, watch, kept):
 
 @inlined
 def _of_part(shifts, parts):
-    """The `Shifts` of the whole way, of which each of its parts gets its own."""
+    """Scale the shifts allowed in each part to the whole way."""
     return Shifts(shifts.upright * parts, shifts.level * parts, shifts.bent * parts)
 
 
 @kernel
 def _is_seen(seen_us, first, last, t_us):
-    """Whether one of some columns was looked at as late as that, or later."""
+    """Whether any of these columns was rendered at or after `t_us`."""
     latest = seen_us[first]
     for column in range(first + 1, last):
         latest = max(latest, seen_us[column])
@@ -219,7 +219,7 @@ def _is_near(way):
 
 @numba.njit(cache=True, error_model="numpy")
 def joined(events, more):
-    """Two EVENT arrays as one."""
+    """Concatenate two EVENT arrays."""
     joined = np.empty(events.size + more.size, EVENT)
     joined[: events.size] = events
     joined[events.size :] = more

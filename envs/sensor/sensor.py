@@ -120,7 +120,7 @@ class Sensor:
 
     @property
     def sees_by_looks(self) -> bool:
-        """Whether `view` is all that a step of this sensor needs."""
+        """Whether the compiled step simulates this sensor (adaptive looks at columns)."""
         return self._config.observation not in WITHOUT_EVENTS and self.plan.by_looks
 
     @property
@@ -134,7 +134,7 @@ class Sensor:
         return self._real.lost
 
     def view(self) -> View:
-        """What a compiled step needs of this sensor; without a scene where it does not see by looks."""
+        """Return the arrays with which the compiled step simulates this sensor; no scene if it does not."""
         scene = np.empty(0, BODY), NO_NOISE, np.zeros(1, FRAME), 0.0
         bandwidth, shifts = UNLIMITED, Shifts(1.0, 1.0, 1.0)
         if self.sees_by_looks:
@@ -147,20 +147,20 @@ class Sensor:
         return View(*scene, model, memory, self._seen_us, bandwidth, shifts, scratch)
 
     def pixel_noise(self) -> PixelState:
-        """What a compiled step needs to fire the noise of this sensor's pixels."""
+        """Return the state from which the compiled step fires the noise of this sensor's pixels."""
         return self._real.pixel_noise if self.sees_by_looks else NO_PIXEL_NOISE
 
     def with_faults(
         self, events: np.ndarray, start_us: int, end_us: int, fired: np.ndarray | None = None
     ) -> np.ndarray:
-        """The events of a step after the faults of this sensor; `fired` as `RealSensor.events` takes it."""
+        """Apply this sensor's faults to the events of a step; `fired` is passed to `RealSensor.events`."""
         self.true_events = events
         if not self.has_faults:
             return events
         return self._real.events(events, start_us, end_us, fired)
 
     def _render_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
-        """Events of a way from whole images."""
+        """Return the events of a way from whole images."""
         start_us = self.t_us
         batches, self.dropped = [], 0
         for first in range(0, self.renders, self._together):
@@ -172,7 +172,7 @@ class Sensor:
         return batches[0] if len(batches) == 1 else np.concatenate((np.empty(0, EVENT), *batches))
 
     def _picture(self, place: Point, t_us: int) -> np.ndarray:
-        """Luminance rendered from a place (x, y) [m] at a time, float32 (H, W)."""
+        """Render luminance from a place (x, y) [m] at a time, float32 (H, W)."""
         poses = self._poses(place, place, np.ones(1), np.array([t_us]))
         picture = self._renderer.render_way(poses)[0]
         if not (picture.min() >= 0.0 and picture.max() < np.inf):
@@ -187,7 +187,7 @@ class Sensor:
         self._renderer = None
 
     def _poses(self, start: Point, end: Point, part: np.ndarray, t_us: np.ndarray) -> np.ndarray:
-        """(K, 5) x, y, z [m], yaw [rad] and time [s] after each part of the way."""
+        """Return x, y, z [m], yaw [rad] and time [s] after each part of the way, (K, 5)."""
         poses = np.zeros((part.size, 5))
         if self._way is None:
             poses[:, 0] = start[0] + (end[0] - start[0]) * part
@@ -201,7 +201,7 @@ class Sensor:
         return poses
 
     def _set_renderer(self, scene: Scene) -> None:
-        """Keep the renderer from episode to episode while its settings stay the same."""
+        """Choose the renderer of a scene; reuse the last one while its settings stay the same."""
         chosen, camera = plan_renders(self._planned, scene), self._config.camera
         same = self._renderer is not None
         same = same and (chosen.renderer, chosen.samples) == (self.plan.renderer, self.plan.samples)
@@ -220,7 +220,7 @@ class Sensor:
 
 
 def check_sensed(bad: int, way: Way, columns: np.ndarray) -> None:
-    """Raise ValueError for what `sense_way` found to be wrong, if anything; `columns` is what it painted."""
+    """Raise ValueError if `sense_way` reported a problem; `columns` are the columns that it painted."""
     if bad == BAD_POSE:
         check_pose((way.end_x, way.end_y, way.height, 0.0), (way.start_us + way.moving_us) * 1e-6)
     if bad >= 0:

@@ -1,4 +1,4 @@
-"""Vehicles on their way through corridors, many of them in one compiled call."""
+"""Vehicles that fly through corridors, many in one compiled call."""
 
 from envs.vehicles.vehicles import StepError, Vehicles
 

@@ -48,7 +48,7 @@ VEHICLE = np.dtype(
 
 @numba.njit(cache=True, error_model="numpy")
 def corridor_list(corridor, count):
-    """A list with `count` times the same corridor: level sections of what stands there, and a `View`.
+    """Return a list of `count` times the same corridor: level sections of its obstacles, and a `View`.
 
     Or with the same `PixelState`.
     """
@@ -60,13 +60,13 @@ def corridor_list(corridor, count):
 
 @numba.njit(cache=True, error_model="numpy")
 def set_corridor(corridors, row, corridor):
-    """Exchange one corridor of a list."""
+    """Replace one corridor of a list."""
     corridors[row] = corridor
 
 
 @numba.njit(cache=True, error_model="numpy")
 def step_all(rows, corridors, noisy, actions, ways, active):
-    """One control step of all active vehicles.
+    """Simulate one control step of all active vehicles.
 
     Args:
         rows: (B,) VEHICLE, changed in place.
@@ -158,7 +158,7 @@ def way_of_part(vehicle, way, part):
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _look(vehicle, view, way):
-    """Events of the last step of a vehicle, sorted."""
+    """Return the events of the last step of a vehicle, sorted."""
     events = _look_along(vehicle, view, way, 0)
     for part in range(1, vehicle.parts):
         if vehicle.problem == GOOD:
@@ -168,7 +168,7 @@ def _look(vehicle, view, way):
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _look_along(vehicle, view, places, part):
-    """Events of a part of the last step; a vehicle that has stopped stands still and sees nothing."""
+    """Return the events of a part of the last step; none once the vehicle has stopped."""
     if vehicle.parts == 0:
         way, way_m = way_of(vehicle), vehicle.share * vehicle.speed_mps / vehicle.control_hz
     else:

@@ -1,4 +1,4 @@
-"""Vehicles side by side: where each is, and what its last step brought."""
+"""Vehicles side by side: their records, and the events of their last steps."""
 
 from typing import Any
 
@@ -21,10 +21,10 @@ NOTHING.flags.writeable = False  # as the sections of a scene, so that numba see
 
 
 class StepError(ValueError):
-    """A step that went wrong, and the row of the vehicle."""
+    """Error of a step, with the row of the vehicle."""
 
     def __init__(self, row: int, reason: str) -> None:
-        """Remember both."""
+        """Store the row and the reason."""
         super().__init__(reason)
         self.row = row
 
@@ -42,7 +42,7 @@ class Vehicles:
     """
 
     def __init__(self, count: int) -> None:
-        """Room for `count` vehicles, none of which has started."""
+        """Make room for `count` vehicles, none of which has started."""
         self.rows = np.zeros(count, VEHICLE)
         self.rows["over"] = True
         self._sensors: list[Sensor | None] = [None] * count
@@ -108,7 +108,7 @@ class Vehicles:
         set_corridor(self._corridors, row, (NOTHING, sensor.view()))
 
     def step(self, actions: np.ndarray, active: np.ndarray) -> None:
-        """One control step of the active vehicles; `rows`, `events` and `ends` tell what it brought.
+        """Simulate one control step of the active vehicles; results are in `rows`, `events` and `ends`.
 
         Args:
             actions: int64 (B,) or float64 (B, C), valid; decided now, and taken when the delay of each
@@ -150,19 +150,19 @@ class Vehicles:
             self.num_seen[active] = np.diff(self.seen_ends)[active]
 
     def events_of(self, row: int) -> np.ndarray:
-        """EVENT array of a vehicle in the last step of any; empty if it did not take part."""
+        """Return the EVENT array of a vehicle in the last step; empty if the vehicle was not active."""
         if not self.rows["t_us"][row]:
             return np.empty(0, EVENT)
         return self.events[self.ends[row] : self.ends[row + 1]]
 
     def seen_of(self, row: int) -> np.ndarray:
-        """As `events_of`, of those that the neighbour filter leaves."""
+        """Return the events of a vehicle that pass its neighbour filter."""
         if not self.rows["t_us"][row]:
             return np.empty(0, EVENT)
         return self.seen[self.seen_ends[row] : self.seen_ends[row + 1]]
 
     def true_of(self, row: int) -> np.ndarray:
-        """As `events_of`, before the faults of the sensor."""
+        """Return the events of a vehicle before the faults of its sensor."""
         sensor = self._sensors[row]
         if row not in self._in_python or sensor is None or not self.rows["t_us"][row]:
             return self.events_of(row)
@@ -179,7 +179,7 @@ class Vehicles:
         return self._bodies.state_after(row, self.decided(row))
 
     def forget_events(self) -> None:
-        """Begin anew with a step that had no events."""
+        """Forget the events of the last step."""
         self.events, self.ends = np.empty(0, EVENT), np.zeros(len(self.rows) + 1, np.int64)
         self.seen, self.seen_ends = self.events, self.ends
 
@@ -202,7 +202,7 @@ class Vehicles:
             self._judges[row] = judge
 
     def _exchange(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """Keep what is decided now, and take what was decided when each vehicle's delay began."""
+        """Queue the new decisions; return the decisions that each vehicle's delay makes due."""
         rows = self.rows
         if not self._decided.shape[1]:  # none has ever been delayed
             return actions
@@ -224,7 +224,7 @@ class Vehicles:
             self._last_us[row] = NEVER
 
     def _sense(self, row: int, events: np.ndarray, fired: np.ndarray) -> np.ndarray:
-        """Events of a step that the compiled call has not simulated to the end, as far as it has."""
+        """Complete the events of a step that the compiled call does not simulate to the end."""
         vehicle, sensor = self.rows[row], self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
         start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
@@ -245,7 +245,7 @@ class Vehicles:
         return sensor.events
 
     def _refuse(self, row: int) -> None:
-        """Raise the error of a step that the compiled call has found."""
+        """Raise the error that the compiled call found."""
         vehicle, sensor = self.rows[row].copy(), self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
         if vehicle["problem"] == BAD_REWARD:
