@@ -22,10 +22,11 @@ ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / "docs" / "data"
 MODULES = {
     "The world and its events": (
-        "envs.corridor", "envs.config", "envs.scene", "envs.scene.layouts", "envs.scene.obstacles",
-        "envs.scene.textures", "envs.scene.range_scan", "envs.scene.planning", "envs.raycast",
-        "envs.rasterize", "envs.events", "envs.events.faults", "envs.observations", "envs.kinematics",
-        "envs.fidelity", "envs.event_error", "envs.recordings", "envs.recordings.video",
+        "envs.corridor", "envs.config", "envs.scene", "envs.scene.layouts", "envs.scene.shapes",
+        "envs.scene.obstacles", "envs.scene.textures", "envs.scene.range_scan", "envs.scene.planning",
+        "envs.raycast", "envs.rasterize", "envs.events", "envs.events.faults", "envs.observations",
+        "envs.kinematics", "envs.vehicles.dynamics", "envs.vehicles.task", "envs.fidelity",
+        "envs.event_error", "envs.recordings", "envs.recordings.video",
     ),
     "From events to actions": (
         "models.kinds", "models.encoder.embedding", "models.encoder.context", "models.encoder.evae",
