@@ -13,7 +13,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import optuna
 from matplotlib.figure import Figure
@@ -30,8 +30,8 @@ from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import Searched
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count
-from jobs.run.files import json_lines, read_json_lines, whole_lines
-from jobs.run.folder import Run, finish, locate_run, open_run
+from jobs.run.files import json_lines, read_json_lines, whole_lines, write_atomic
+from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage
 from jobs.run.tune_state import mend_state
@@ -39,6 +39,7 @@ from jobs.tools.search.space import (
     encoder_facts,
     extremes,
     read_settings,
+    sampled,
     search_space,
     space_errors,
     with_settings,
@@ -87,11 +88,12 @@ def run(config: Config) -> dict[str, float]:
     check_inputs(config)
     folder = open_run(config)
     config = folder.config
-    name = f"tune-{settings_hash(dataclasses.asdict(config.own))[:8]}"  # as when the job was called tune
+    name = place_name(config.own)
     with open_tracker(config, folder, key=name) as tracker:
         tracker.tags({"kind": "tune"})
         files = _inputs(config, folder, tracker)
-        rows = search(config, folder.path / name, files, tracker)
+        begun = earlier_trials(folder, config.own)
+        rows = search(config, folder.path / name, files, tracker, begun)
         best = report(folder, name, rows, tracker)
         console.print(tracker.dashboard(), markup=False)
     figures = {key: float(best[key]) for key in ("distance_m", "success_rate", "env_steps")}
@@ -111,11 +113,41 @@ def _inputs(config: Config, folder: Run, tracker: Tracker) -> Files:
     return {file.name: file.read_bytes() for file in files}
 
 
-def search(config: Config, place: Path, files: Files, tracker: Tracker) -> list[Row]:
-    """Run the trials that are missing; every measurement of all, in the order in which they came."""
+def place_name(own: Settings) -> str:
+    """Return the folder of a search in its run folder; the name is from when the job was called tune."""
+    return f"tune-{settings_hash(dataclasses.asdict(own))[:8]}"
+
+
+class Earlier(NamedTuple):
+    """A finished search for the same, of fewer trials, which this one continues."""
+
+    trials: int = 0
+    rows: Sequence[Row] = ()
+
+
+NOTHING_YET = Earlier()
+
+
+def earlier_trials(folder: Run, own: Settings) -> Earlier:
+    """Return the largest finished search of fewer trials that differs in nothing else."""
+    for trials in range(own.trials - 1, 0, -1):
+        name = place_name(dataclasses.replace(own, trials=trials))
+        file = folder.path / name / "results.jsonl"
+        if finished(folder, name) is not None and file.is_file():
+            return Earlier(trials, read_json_lines(file))
+    return NOTHING_YET
+
+
+def search(
+    config: Config, place: Path, files: Files, tracker: Tracker, begun: Earlier = NOTHING_YET
+) -> list[Row]:
+    """Run the missing trials; return every measurement of all trials, in the order of their arrival."""
     start_ray(config.cluster, place.parent)
     place.mkdir(exist_ok=True)
     file = place / "results.jsonl"
+    if begun.trials and not file.is_file():
+        console.print(f"Continues a finished search: {begun.trials} of {config.own.trials} trials are there.")
+        write_atomic(file, json_lines(begun.rows))
     if file.is_file():
         os.truncate(file, len(whole_lines(file)))  # a kill can leave half a line
     rows: list[Row] = read_json_lines(file) if file.is_file() else []
@@ -135,13 +167,13 @@ def search(config: Config, place: Path, files: Files, tracker: Tracker) -> list[
             advance(int(new), note=f"{row['trial']}: {row['distance_m']:.1f} m at {row['env_steps']:,} steps")
 
         with relayed_to(LISTENER, listen):
-            results = fit(_tuner(config, place, files))
+            results = fit(_tuner(config, place, files, begun))
     if not rows and results.errors:
         raise TrainingError(stopped(results.errors[0]))
     return rows
 
 
-def _tuner(config: Config, place: Path, files: Files) -> tune.Tuner:
+def _tuner(config: Config, place: Path, files: Files, begun: Earlier) -> tune.Tuner:
     """The search in its folder: continued if it is there, else new."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     path, most = storage(config.cluster, place), config.train.env_steps
@@ -163,8 +195,8 @@ def _tuner(config: Config, place: Path, files: Files) -> tune.Tuner:
         tune_config=tune.TuneConfig(
             metric=METRIC,
             mode="max",
-            num_samples=config.own.trials,
-            search_alg=OptunaSearch(seed=config.seed),
+            num_samples=config.own.trials - begun.trials,
+            search_alg=_optuna(config, begun),
             scheduler=scheduler,
         ),
         run_config=tune.RunConfig(
@@ -175,6 +207,18 @@ def _tuner(config: Config, place: Path, files: Files) -> tune.Tuner:
             failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
             checkpoint_config=tune.CheckpointConfig(checkpoint_frequency=1, num_to_keep=CHECKPOINTS_KEPT),
         ),
+    )
+
+
+def _optuna(config: Config, begun: Earlier) -> OptunaSearch:
+    """Return Optuna's search, which knows the last measurement of each earlier trial and proposes others."""
+    last = {row["trial"]: row for row in begun.rows}.values()
+    if not last:
+        return OptunaSearch(seed=config.seed)
+    return OptunaSearch(
+        seed=config.seed + begun.trials,  # with the same seed it would propose the same trials again
+        points_to_evaluate=[sampled(row["settings"], config.own.space) for row in last],
+        evaluated_rewards=[row[METRIC] for row in last],
     )
 
 

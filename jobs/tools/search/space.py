@@ -34,6 +34,13 @@ def _domain(values: Any) -> Any:
     return (tune.loguniform if values.get("log") else tune.uniform)(low, high)
 
 
+def sampled(settings: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a trial as Tune draws them; the inverse of `read_settings`."""
+    return {
+        key: json.dumps(value) if isinstance(space[key], list) else value for key, value in settings.items()
+    }
+
+
 def read_settings(sampled: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a trial, from what Tune has drawn."""
     return {key: json.loads(value) if isinstance(value, str) else value for key, value in sampled.items()}

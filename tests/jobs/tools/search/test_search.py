@@ -8,9 +8,12 @@ import ray
 import torch
 
 from jobs.rollout.episodes import roll_out
+from jobs.run.files import json_lines
+from jobs.run.folder import finish, open_run
 from jobs.run.ray_cluster import start_ray
 from jobs.run.torch_threads import torch_threads
 from jobs.tools.search import search, trial
+from jobs.tools.search.space import read_settings, search_space
 from jobs.tools.search.trial import SearchTrial
 from jobs.tracking.tracker import open_store
 from tests.support.configs import tune_config
@@ -52,6 +55,28 @@ def test_the_words_of_settings_can_be_given_to_the_launcher():
         search.words({"algo.lr": 0.000312345, "model.hidden": [64, 64]})
         == "algo.lr=0.0003123 'model.hidden=[64,64]'"
     )
+
+
+def test_a_finished_search_takes_more_trials(tmp_path):
+    config = dataclasses.replace(tune_config(*SMALL), runs_dir=str(tmp_path / "runs"))
+    folder, fewer = open_run(config), dataclasses.replace(config.own, trials=2)
+    assert search.earlier_trials(folder, config.own) == search.NOTHING_YET
+    tried = [{"algo.lr": 1e-3, "model.hidden": [8]}, {"algo.lr": 2e-3, "model.hidden": [16, 16]}]
+    rows = [
+        row(name, 64, far, **settings) for name, far, settings in zip("ab", (1.0, 2.0), tried, strict=True)
+    ]
+    file = folder.path / search.place_name(fewer) / "results.jsonl"
+    file.parent.mkdir()
+    file.write_text(json_lines(rows))
+    assert search.earlier_trials(folder, config.own) == search.NOTHING_YET  # not finished
+    finish(folder, file.parent.name, {})
+    begun = search.earlier_trials(folder, config.own)
+    assert (begun.trials, list(begun.rows)) == (2, rows)
+    assert search.earlier_trials(folder, fewer) == search.NOTHING_YET
+    optuna = search._optuna(config, begun)
+    optuna.set_search_properties("distance_m", "max", search_space(config.own.space))
+    assert [trial.value for trial in optuna._ot_study.trials] == [1.0, 2.0]
+    assert read_settings(optuna.suggest("c")) not in tried
 
 
 class Diverging:
