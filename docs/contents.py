@@ -7,7 +7,7 @@ CONTENTS = {
     "Start": ("start", "watch", "models", "limits"),
     "Learn": ("task", "events", "camera", "encoder", "statistics", "glossary"),
     "Do": (
-        "experiments", "train", "sweep", "use", "own_camera", "recordings", "calibrate", "extend", "search",
+        "experiments", "train", "sweep", "use", "own_camera", "recordings", "calibrate", "extend", "hyperparameters",
         "deploy", "dashboard", "troubleshooting",
     ),
     "Results": ("results", "claims", "studies", "data"),
