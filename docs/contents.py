@@ -7,8 +7,8 @@ CONTENTS = {
     "Start": ("start", "watch", "models", "limits"),
     "Learn": ("task", "events", "camera", "encoder", "statistics", "glossary"),
     "Do": (
-        "experiments", "train", "sweep", "use", "own_camera", "recordings", "calibrate", "extend", "hyperparameters",
-        "deploy", "dashboard", "troubleshooting",
+        "experiments", "train", "sweep", "use", "own_camera", "recordings", "calibrate", "extend",
+        "hyperparameters", "deploy", "dashboard", "troubleshooting",
     ),
     "Results": ("results", "claims", "studies", "data"),
     "Engineering": ("simulator", "encoder_accuracy", "trade", "numerics", "performance", "reliability"),
