@@ -14,13 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.throughput import composed
-from benchmarks.timing import interleaved
 from envs.config import EnvConfig
 from envs.corridor import CorridorVectorEnv
 from jobs.analysis.tables import show_table
 from jobs.config.conditions import axis_points
 from jobs.config.env_keys import env_with
 from jobs.evaluation.sweep_plan import value_text
+from jobs.measure.timing import interleaved
 
 CORRIDORS = 7  # of a training and condition of the sweep
 SIMULATED_S = 0.5  # of each round

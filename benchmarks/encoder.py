@@ -26,11 +26,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.timing import interleaved
 from core.neighbour_filter import filter_neighbours, quiet_sensor
 from envs.events import EVENT
 from envs.events.windows import pack_window
 from jobs.measure.encodings import encode_by_network
+from jobs.measure.timing import interleaved
 from jobs.training.pretrain import Window
 from models.encoder.embedding import CODINGS
 from models.encoder.evae import EventVAE

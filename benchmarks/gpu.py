@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 from benchmarks.throughput import composed
-from benchmarks.timing import interleaved
 from jobs.analysis.tables import show_table
+from jobs.measure.timing import interleaved
 from jobs.run.device import device_variables
 from jobs.run.progress import console
 from jobs.run.ray_cluster import start_ray

@@ -24,11 +24,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.throughput import composed
-from benchmarks.timing import interleaved
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.analysis.tables import show_table
 from jobs.config.config import Config
+from jobs.measure.timing import interleaved
 from jobs.run.ray_cluster import start_ray
 from jobs.training.ppo import build_ppo, policy_spec
 from jobs.training.ppo_learner import PlainPPOLearner

@@ -16,10 +16,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.timing import interleaved
 from envs.corridor import CorridorEnv
 from envs.recordings import WRITERS, downscale_events, read_events, write_events
 from jobs.analysis.tables import show_table
+from jobs.measure.timing import interleaved
 from jobs.run.provenance import REPOSITORY
 
 DATA = Path(os.environ.get("EVADE_DATA", REPOSITORY.parent / "shared" / "data"))

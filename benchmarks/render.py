@@ -17,12 +17,12 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.timing import interleaved
 from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture
 from envs.scene.obstacles import KINDS
 from jobs.analysis.tables import show_table
+from jobs.measure.timing import interleaved
 from tests.support.point_samples import sample_luminance
 
 ROUNDS = 9

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 import yaml
 
-from benchmarks.timing import interleaved
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv, CorridorVectorEnv
 from envs.events import EventCamera
@@ -26,6 +25,7 @@ from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
 from jobs.analysis.tables import show_table
 from jobs.config.config import Config, parse
+from jobs.measure.timing import interleaved
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.progress import console
 from jobs.training.pretrain import evae_settings

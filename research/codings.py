@@ -1,7 +1,7 @@
-"""Compare codings of time in the event encoder, and draw what its latent contains.
+"""Compare codings of time and sizes of the context in the event encoder, and draw what its latent contains.
 
 Run: python -m platform.launch +exp=codings
-Expect: about 20 minutes on one core beyond the encoder of the run, nearly all of it nine short trainings.
+Expect: about 20 minutes on one core beyond the encoder of the run, nearly all of it thirteen short trainings.
 Finished trainings stay in the run folder, so an interrupted command continues. A table and plots in the run
 folder under `trade/`, and in MLflow.
 """
@@ -21,12 +21,20 @@ from envs.config import STRICT
 from envs.recordings import Recording, read_recording
 from jobs.analysis.plots import COLOURS, EVENT_COLOURS, GRID, INK, MUTED, tidy
 from jobs.analysis.statistics import half_width
-from jobs.analysis.tables import publish_plot, publish_table
+from jobs.analysis.tables import publish_plot, publish_table, write_csv
 from jobs.config.config import Config
 from jobs.config.schema import Count
-from jobs.measure.encodings import explained
-from jobs.measure.trade_encoder import DENSE_EVENTS
-from jobs.measure.trials import MAX_EVENTS, draw, trained
+from jobs.measure.encoding_plots import plot_encoding_costs
+from jobs.measure.encodings import (
+    COST_FIELDS,
+    Encoding,
+    cost_values,
+    default_encodings,
+    encode_whole,
+    explained,
+    measure_encodings,
+)
+from jobs.measure.trade_encoder import DENSE_EVENTS, HEADINGS, MAX_EVENTS, control_steps, cost_cells, draw
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
@@ -35,8 +43,11 @@ from jobs.training.pretrain import encoder_file, held_out_windows, prepare_encod
 from models.encoder.embedding import CODINGS, temporal_embedding
 from models.encoder.evae import EventVAE, event_targets, pictures, reconstruct
 from models.encoder.event_batch import EventBatch, Grid, batch_windows
+from models.encoder.table import EncoderTable
 from models.encoder.weights import load_encoder
+from research.trials import trained
 
+CONTEXTS = (128, 256, 512, 1024)
 CODING_CONTEXT = 256  # nine trainings at 1024 would take an hour
 OTHER_SCENES = ("cones", "gates", "texture_change")
 PICTURES = 3  # per condition, scene or pair
@@ -54,6 +65,7 @@ class Settings:
     iterations: Count
     seeds: Count
     windows: Annotated[int, Field(ge=4)]
+    rounds: Count
 
 
 def run(config: Config) -> dict[str, float]:
@@ -64,8 +76,31 @@ def run(config: Config) -> dict[str, float]:
         prepare_encoder(config, folder, tracker)
         evae, _ = load_encoder(encoder_file(folder))
         metrics = trade_coding(config, folder, tracker) | show_latent(config, folder, tracker, evae)
+        trade_contexts(config, folder, tracker, evae)
         tracker.log(0, metrics)
     return finish(folder, "codings", metrics)
+
+
+def trade_contexts(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> None:
+    """Train each size of the context briefly, and measure all encodings together with those of the run."""
+    models = [trained(config, folder, {"context": size}, 0) for size in CONTEXTS]
+    validation = read_recording(data_file(folder, "validation"))
+    count = config.own.windows
+    usual = draw(config, validation, "mixed", MAX_EVENTS, count)
+    dense = draw(config, validation, "count", DENSE_EVENTS, count)
+    encodings = [*default_encodings(evae), *map(sized_encoding, models)]
+    with progress("Measure encodings", len(encodings), "encodings") as advance:
+        timed = control_steps(validation, count), dense
+        rows = measure_encodings(encodings, usual, timed, config.own.rounds, advance)
+    lines = [cost_cells(row, rows[1].cost_us) for row in rows]
+    publish_table(folder, tracker, "trade/contexts", "Encoding a window", HEADINGS, lines)
+    publish_plot(folder, tracker, "trade/contexts", plot_encoding_costs(rows))
+    write_csv(folder.path / "trade" / "contexts.csv", COST_FIELDS, [cost_values(row) for row in rows])
+
+
+def sized_encoding(evae: EventVAE) -> Encoding:
+    """The table of a model of another context size."""
+    return Encoding("context", str(evae.settings.context), encode_whole(EncoderTable.from_evae(evae)), evae)
 
 
 def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
@@ -159,6 +194,7 @@ def percent(spread_of: tuple[float, float]) -> str:
     return f"{100 * mean:.0f}" + ("" if np.isnan(half) else f" ± {100 * half:.0f}")
 
 
+@torch.no_grad()
 def side_by_side(models: Mapping[str, EventVAE], batch: EventBatch, count: int = 2) -> list[np.ndarray]:
     """Pictures of some windows, each followed by what each model decodes of it: (H, W) each."""
     places = np.argsort(-np.diff(batch.offsets), kind="stable")[: max(count, len(batch) // 2)]
@@ -170,6 +206,7 @@ def side_by_side(models: Mapping[str, EventVAE], batch: EventBatch, count: int =
     return [part[place].numpy() for place in chosen for part in parts]
 
 
+@torch.no_grad()
 def between(evae: EventVAE, batch: EventBatch) -> dict[str, list[np.ndarray]]:
     """For pairs of full windows whose latents lie far apart: pictures along the line between them."""
     mu, targets = evae(batch)[1], event_targets(batch, evae.target)

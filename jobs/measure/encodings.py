@@ -4,12 +4,15 @@ import copy
 import csv
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from jobs.measure.measured import Measured
+from jobs.measure.timing import interleaved
 from jobs.training.pretrain import Window
 from models.encoder.embedding import time_code
 from models.encoder.evae import EventVAE, event_targets, reconstruct
@@ -34,24 +37,13 @@ class Encoding(NamedTuple):
     evae: EventVAE
 
 
-class EncodingCost(NamedTuple):
-    """Cost and accuracy of one way to encode.
+COST_FIELDS = ("knob", "setting", "step_us", "dense_us", "error_max", "error_mean", "explained")
 
-    Attributes:
-        knob, setting: As in `Encoding`.
-        step_us, dense_us: Process time per window of one control step, and of 2,000 events [us].
-        error_max, error_mean: Distance of mu from float64 with exact time, as share of the
-            standard deviation of the posterior, over latents and windows.
-        explained: Of the held-out pictures, decoded from this mu; see `explained`.
-    """
 
-    knob: str
-    setting: str
-    step_us: float
-    dense_us: float
-    error_max: float
-    error_mean: float
-    explained: float
+def cost_values(row: Measured) -> tuple[str | float, ...]:
+    """Return the values of `COST_FIELDS`."""
+    of = row.outcome
+    return (row.knob, row.setting, of["step_us"], row.cost_us, of["error_max"], row.error, of["explained"])
 
 
 def default_encodings(evae: EventVAE) -> list[Encoding]:
@@ -67,11 +59,6 @@ def default_encodings(evae: EventVAE) -> list[Encoding]:
     forms += [("chunks", str(count), encode_in_chunks(table, count)) for count in CHUNKS]
     forms.append(("chunks", "per event", encode_in_chunks(table, None)))
     return [Encoding(*form, evae) for form in forms]
-
-
-def sized_encoding(evae: EventVAE) -> Encoding:
-    """The table of a model of another context size."""
-    return Encoding("context", str(evae.settings.context), encode_whole(EncoderTable.from_evae(evae)), evae)
 
 
 def encode_whole(table: EncoderTable) -> Encode:
@@ -154,8 +141,13 @@ def measure_encodings(
     timed: tuple[list[Window], list[Window]],
     rounds: int,
     advance: Callable[[int], None],
-) -> list[EncodingCost]:
+) -> list[Measured]:
     """Measure cost and accuracy of each encoding.
+
+    The cost is the process time per window of 2,000 events, the error the mean distance of mu from float64
+    with exact time, as share of the standard deviation of the posterior, over latents and windows. Outcomes
+    are the process time of one control step, the largest distance, and what the pictures decoded from this
+    mu explain, see `explained`.
 
     Args:
         encodings: What to measure.
@@ -165,7 +157,7 @@ def measure_encodings(
         advance: Called with 1 after each encoding.
     """
     costs = costs_us(encodings, timed, rounds)
-    rows: list[EncodingCost] = []
+    rows: list[Measured] = []
     reference: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for encoding, (step_us, dense_us) in zip(encodings, costs.tolist(), strict=True):
         if id(encoding.evae) not in reference:
@@ -174,43 +166,41 @@ def measure_encodings(
         own = np.stack([encoding.encode(window) for window in windows])
         error = np.abs(own - mu) / deviation
         share = explained(encoding.evae, batch_windows(windows, encoding.evae.grid), torch.from_numpy(own))
-        rows.append(
-            EncodingCost(
-                *encoding[:2], step_us, dense_us, float(error.max()), float(error.mean()), float(share)
-            )
-        )
+        outcome = {"step_us": step_us, "error_max": float(error.max()), "explained": float(share)}
+        rows.append(Measured(*encoding[:2], dense_us, float(error.mean()), outcome))
         advance(1)
     return rows
 
 
 def costs_us(encodings: Sequence[Encoding], timed: tuple[list[Window], ...], rounds: int) -> np.ndarray:
-    """Process time per window [us] (encodings, kinds of windows): medians of interleaved rounds."""
-    seconds = np.empty((rounds + 1, len(encodings), len(timed)))  # the first round compiles
-    for turn in range(rounds + 1):
-        for place, encoding in enumerate(encodings):
-            for kind, windows in enumerate(timed):
-                encoding.encode(windows[0])  # its table comes back into the cache, as in an episode
-                start = time.process_time()
-                for window in windows[:TIMED_WINDOWS]:
-                    encoding.encode(window)
-                seconds[turn, place, kind] = (time.process_time() - start) / len(windows[:TIMED_WINDOWS])
-    return 1e6 * np.median(seconds[1:], axis=0)
+    """Return the process time per window [us], (encodings, kinds of windows), in interleaved rounds."""
+    pairs = [(encoding.encode, windows[:TIMED_WINDOWS]) for encoding in encodings for windows in timed]
+    work = {place: partial(_encode_all, *pair) for place, pair in enumerate(pairs)}
+    # The table comes back into the processor's cache, as in an episode.
+    before = {place: partial(encode, windows[0]) for place, (encode, windows) in enumerate(pairs)}
+    seconds = interleaved(work, rounds, time.process_time, before)
+    costs = [1e6 * seconds[place] / len(windows) for place, (_, windows) in enumerate(pairs)]
+    return np.reshape(costs, (len(encodings), len(timed)))
 
 
-def repeats(rows: Sequence[EncodingCost]) -> list[EncodingCost]:
+def _encode_all(encode: Encode, windows: Sequence[Window]) -> None:
+    for window in windows:
+        encode(window)
+
+
+def repeats(rows: Sequence[Measured]) -> list[Measured]:
     """The default, and the rows that compute the same: their costs differ by the noise of timing alone."""
     (default,) = (row for row in rows if row.knob == "default")
-    return [
-        row for row in rows if (row.knob, row.setting) in UNCHANGED and row.error_mean == default.error_mean
-    ]
+    return [row for row in rows if (row.knob, row.setting) in UNCHANGED and row.error == default.error]
 
 
-def read_costs(file: Path) -> list[EncodingCost]:
-    """The rows of a CSV file with the fields of `EncodingCost`."""
+def read_costs(file: Path) -> list[Measured]:
+    """Read the rows of a CSV file with the columns `COST_FIELDS`."""
     with file.open(encoding="utf-8") as lines:
-        return [
-            EncodingCost(
-                one["knob"], one["setting"], *(float(one[name]) for name in EncodingCost._fields[2:])
-            )
-            for one in csv.DictReader(lines)
-        ]
+        rows = list(csv.DictReader(lines))
+    found = []
+    for row in rows:
+        values = {name: float(row[name]) for name in COST_FIELDS[2:]}
+        cost_us, error = values.pop("dense_us"), values.pop("error_mean")
+        found.append(Measured(row["knob"], row["setting"], cost_us, error, values))
+    return found

@@ -1,47 +1,17 @@
 """Plots of what accuracy costs: cost against error, events against control rate."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jobs.analysis.plots import COLOURS, INK, MUTED, tidy
+from jobs.measure.measured import Measured
 
 MIN_ERROR = 1e-3  # that is drawn on a logarithmic axis
 
 
-class CostedSetting(NamedTuple):
-    """A setting of the simulator with its cost [us] and its event error."""
-
-    knob: str
-    setting: str
-    cost_us: float
-    error: float
-
-
-def pareto(points: Sequence[tuple[float, float]], noise: float = 0.0) -> list[int]:
-    """Places of the points that no other beats in cost and error, by rising cost.
-
-    Args:
-        points: Cost and error of each.
-        noise: Share of a cost by which it differs when it is measured again: a point is beaten by one that is
-            as exact and cheaper by more than that, and by one that is more exact and no dearer beyond that.
-    """
-
-    def beats(ours: tuple[float, float], theirs: tuple[float, float]) -> bool:
-        cheaper = ours[0] < (1.0 - noise) * theirs[0]
-        return (ours[1] <= theirs[1] and cheaper) or (
-            ours[1] < theirs[1] and ours[0] <= (1.0 + noise) * theirs[0]
-        )
-
-    front = [place for place, one in enumerate(points) if not any(beats(other, one) for other in points)]
-    return sorted(front, key=lambda place: points[place])
-
-
-def plot_costs(
-    scene: str, settings: Sequence[CostedSetting], front: Sequence[int], tolerance: float
-) -> Figure:
+def plot_costs(scene: str, settings: Sequence[Measured], front: Sequence[int], tolerance: float) -> Figure:
     """Draw the cost of settings against their event error; those of the front are ringed."""
     figure = Figure(figsize=(9.6, 5.6), layout="constrained")
     panel = figure.subplots()

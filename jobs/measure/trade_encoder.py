@@ -1,48 +1,48 @@
 """Measure what accuracy of the event encoder costs.
 
 Run: python -m platform.launch +exp=trade_encoder
-Expect: some minutes on one core beyond the run's own encoder, nearly all of it one short training for each
-size of the context. Finished trainings stay in the run folder, so an interrupted job continues. A table and
-its plot, in the run folder under `trade/` and in MLflow.
+Expect: a minute on one core beyond the run's own encoder. A table and its plot, in the run folder under
+`trade/` and in MLflow.
 """
 
-from collections.abc import Sequence
-from typing import Annotated
+import dataclasses
+from typing import Annotated, Literal
 
-import torch
+import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT
-from envs.recordings import read_recording
+from envs.recordings import Recording, read_recording
 from jobs.analysis.tables import publish_plot, publish_table, short, write_csv
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count
 from jobs.measure.encoding_plots import plot_encoding_costs
 from jobs.measure.encodings import (
-    EncodingCost,
+    COST_FIELDS,
+    cost_values,
     default_encodings,
     measure_encodings,
-    sized_encoding,
 )
-from jobs.measure.trials import (
-    MAX_EVENTS,
-    control_steps,
-    draw,
-    trained,
-)
+from jobs.measure.measured import Measured, columns
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.collect import data_file
-from jobs.training.pretrain import check_sources, encoder_file, prepare_encoder
+from jobs.training.pretrain import (
+    Window,
+    check_sources,
+    cut_window,
+    encoder_file,
+    prepare_encoder,
+    sample_windows,
+)
 from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder
 from models.kinds import EncoderModel
 
 EVENT_ENCODERS = ("bytestream", "bytestream_xy")
-CONTEXTS = (128, 256, 512, 1024)
-DENSE_EVENTS = 2000
+MAX_EVENTS, DENSE_EVENTS = 4096, 2000
 HEADINGS = (
     "Knob", "Setting", "Control step [us]", "2,000 events [us]", "Times faster",
     "Error, mean [% of sd]", "Error, largest [% of sd]", "Explained [%]",
@@ -51,9 +51,8 @@ HEADINGS = (
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """How long the compared encoders are trained, and on how many windows they are measured."""
+    """How many held-out windows, and how many rounds of timing."""
 
-    iterations: Count
     windows: Annotated[int, Field(ge=4)]
     rounds: Count
 
@@ -85,40 +84,54 @@ def run(config: Config) -> dict[str, float]:
 def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
     """Measure cost against error of every way to encode; return the metrics of the default."""
     trade = config.own
-    models = [trained(config, folder, {"context": size}, 0) for size in CONTEXTS]
     validation = read_recording(data_file(folder, "validation"))
     usual = draw(config, validation, "mixed", MAX_EVENTS, trade.windows)
     dense = draw(config, validation, "count", DENSE_EVENTS, trade.windows)
-    encodings = [*default_encodings(evae), *map(sized_encoding, models)]
+    encodings = default_encodings(evae)
     with progress("Measure encodings", len(encodings), "encodings") as advance:
         timed = control_steps(validation, trade.windows), dense
         rows = measure_encodings(encodings, usual, timed, trade.rounds, advance)
-    lines = [cost_cells(row, rows[1].dense_us) for row in rows]
+    lines = [cost_cells(row, rows[1].cost_us) for row in rows]
     title = "Encoding a window, one setting changed at a time"
     publish_table(folder, tracker, "trade/inference", title, HEADINGS, lines)
-    tracker.table("trade/inference", cost_columns(rows))
+    tracker.table("trade/inference", columns(rows))
     publish_plot(folder, tracker, "trade/inference", plot_encoding_costs(rows))
-    write_csv(folder.path / "trade" / "inference.csv", EncodingCost._fields, rows)
+    write_csv(folder.path / "trade" / "inference.csv", COST_FIELDS, [cost_values(row) for row in rows])
     first, network = rows[:2]
     return {
-        "perf/encode_step_us": first.step_us,
-        "perf/encode_2000_events_us": first.dense_us,
-        "perf/encode_times_faster_than_network": network.dense_us / first.dense_us,
-        "evae/latent_error_max": first.error_max,
-        "evae/latent_error_mean": first.error_mean,
+        "perf/encode_step_us": first.outcome["step_us"],
+        "perf/encode_2000_events_us": first.cost_us,
+        "perf/encode_times_faster_than_network": network.cost_us / first.cost_us,
+        "evae/latent_error_max": first.outcome["error_max"],
+        "evae/latent_error_mean": first.error,
     }
 
 
-@torch.no_grad()
-@torch.no_grad()
-def cost_cells(row: EncodingCost, network_us: float) -> tuple[str, ...]:
+def draw(
+    config: Config, recording: Recording, windows: Literal["mixed", "count"], most_events: int, count: int
+) -> list[Window]:
+    """`count` fixed windows: "mixed" lengths, or "count", those of `most_events` events.
+
+    At the end of an episode a window by count holds fewer; of four times as many the fullest are kept.
+    """
+    settings = dataclasses.replace(config.pretrain, windows=windows, window_events=most_events)
+    rng = np.random.default_rng(1)
+    if windows == "mixed":
+        return sample_windows(recording, settings, count, rng)
+    drawn = sample_windows(recording, settings, 4 * count, rng)
+    return sorted(drawn, key=lambda window: -len(window[0]))[:count]
+
+
+def control_steps(recording: Recording, count: int) -> list[Window]:
+    """`count` fixed windows of one control step."""
+    start, end = recording.index["step_t_us"], recording.index["step_end_us"]
+    chosen = np.random.default_rng(1).choice(len(start), count)
+    spans = [(int(start[step]), int(end[step] - start[step])) for step in chosen]
+    return [cut_window(recording, first, span, MAX_EVENTS) for first, span in spans]
+
+
+def cost_cells(row: Measured, network_us: float) -> tuple[str, ...]:
     """A text for each of `HEADINGS`; "times faster" refers to the network's cost of 2,000 events."""
-    costs = f"{row.step_us:,.0f}", f"{row.dense_us:,.0f}", f"{network_us / row.dense_us:,.0f}"
-    errors = short(100 * row.error_mean), short(100 * row.error_max)
-    return (row.knob, row.setting, *costs, *errors, f"{100 * row.explained:.1f}")
-
-
-def cost_columns(rows: Sequence[EncodingCost]) -> dict[str, list[str | float]]:
-    """The columns of a tracker's table; the first is unique."""
-    named: dict[str, list[str | float]] = {"form": [f"{row.knob} {row.setting}".strip() for row in rows]}
-    return named | {name: [getattr(row, name) for row in rows] for name in EncodingCost._fields[2:]}
+    costs = f"{row.outcome['step_us']:,.0f}", f"{row.cost_us:,.0f}", f"{network_us / row.cost_us:,.0f}"
+    errors = short(100 * row.error), short(100 * row.outcome["error_max"])
+    return (row.knob, row.setting, *costs, *errors, f"{100 * row.outcome['explained']:.1f}")

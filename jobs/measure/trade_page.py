@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from jobs.analysis.statistics import Difference, Estimate, holm
 from jobs.analysis.tables import estimate_metrics, estimate_text, markdown_table, percent_text, short
+from jobs.measure.measured import name_of
 from jobs.measure.trade_plot import TradePoint, plot_trade
 from jobs.run.provenance import Provenance
 from jobs.run.templates import render
@@ -89,7 +90,7 @@ class TradedSetting(NamedTuple):
     @property
     def name(self) -> str:
         """Knob and setting in one, such as "precision int8"; the knob is not said twice."""
-        return self.setting if self.knob in self.setting else f"{self.knob} {self.setting}".strip()
+        return name_of(self.knob, self.setting)
 
     @property
     def steps_per_s(self) -> float:

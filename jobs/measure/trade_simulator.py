@@ -8,22 +8,25 @@ the same flights, see `envs.event_error`; a cost is process time of `CorridorEnv
 """
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Annotated, NamedTuple
+from functools import partial
+from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, EnvConfig, Positive
 from envs.corridor import CorridorEnv
-from envs.event_error import Accuracy, measure_event_error
+from envs.event_error import measure_event_error
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import env_with
 from jobs.config.config import Config
 from jobs.config.schema import Count, Name
-from jobs.measure.front_plots import CostedSetting, pareto, plot_costs, plot_memory_modes
+from jobs.measure.front_plots import plot_costs, plot_memory_modes
+from jobs.measure.measured import Measured, columns, pareto
+from jobs.measure.timing import interleaved
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.progress import console, progress
 from jobs.tracking.tracker import Tracker, open_tracker
@@ -61,22 +64,6 @@ class Settings:
     rounds: Count
 
 
-class MeasuredSetting(NamedTuple):
-    """One setting of the simulator in one scene.
-
-    Attributes:
-        knob: What is varied; "default" for the unchanged simulation.
-        setting: To what.
-        cost_us: Process time of an environment step [us].
-        accuracy: What it achieves.
-    """
-
-    knob: str
-    setting: str
-    cost_us: float
-    accuracy: Accuracy
-
-
 def run(config: Config) -> dict[str, float]:
     """Measure every setting; return the metrics of the default."""
     folder = open_run(config)
@@ -105,19 +92,18 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
             advance(1, note=knob)
     costs = step_costs_us([simulation for *_, simulation in named], trade.steps, trade.rounds)
     rows = [
-        MeasuredSetting(knob, setting, cost, accuracy)
-        for (knob, setting, _), cost, accuracy in zip(named, costs, accuracies, strict=True)
+        Measured(knob, setting, cost, found.error, {"events": found.events[0], "renders": found.renders})
+        for (knob, setting, _), cost, found in zip(named, costs, accuracies, strict=True)
     ]
-    front = pareto([(row.cost_us, row.accuracy.error) for row in rows], NOISE)
+    front = pareto([(row.cost_us, row.error) for row in rows], NOISE)
     title = f"Scene {scene}: one setting changed at a time; * no other is better"
     lines = [setting_cells(row, place in front) for place, row in enumerate(rows)]
     publish_table(folder, tracker, f"trade/{scene}", title, HEADINGS, lines, 2)
-    tracker.table(f"trade/{scene}", setting_columns(rows))
-    points = [CostedSetting(*row[:3], row.accuracy.error) for row in rows]
-    plot = plot_costs(scene, points, front, default.fidelity.tolerance)
+    tracker.table(f"trade/{scene}", columns(rows))
+    plot = plot_costs(scene, rows, front, default.fidelity.tolerance)
     publish_plot(folder, tracker, f"trade/{scene}", plot)
     return {
-        f"sim/event_error_{scene}": rows[0].accuracy.error,
+        f"sim/event_error_{scene}": rows[0].error,
         f"perf/env_step_us_{scene}": rows[0].cost_us,
     }
 
@@ -150,21 +136,21 @@ def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
 
 
 def step_costs_us(configs: Sequence[EnvConfig], steps: int, rounds: int) -> list[float]:
-    """Process time of an environment step [us] in each simulation: medians of interleaved rounds."""
-    envs = [CorridorEnv(config) for config in configs]
-    costs = np.empty((rounds + 1, len(envs)))  # the first round compiles
-    for turn in range(rounds + 1):
-        for place, env in enumerate(envs):
-            env.reset(seed=turn)
-            count = max(1, steps if turn else 2)
-            start = time.process_time()
-            for _ in range(count):
-                if any(env.step(0)[2:4]):
-                    env.reset()
-            costs[turn, place] = (time.process_time() - start) / count
-    for env in envs:
+    """Return the process time of an environment step [us] in each simulation, in interleaved rounds."""
+    envs = dict(enumerate(map(CorridorEnv, configs)))
+    turns = {place: itertools.count() for place in envs}
+    work = {place: partial(_take_steps, env, steps) for place, env in envs.items()}
+    before = {place: lambda place=place: envs[place].reset(seed=next(turns[place])) for place in envs}
+    seconds = interleaved(work, rounds, time.process_time, before)
+    for env in envs.values():
         env.close()
-    return (1e6 * np.median(costs[1:], axis=0)).tolist()
+    return [1e6 * seconds[place] / steps for place in envs]
+
+
+def _take_steps(env: CorridorEnv, steps: int) -> None:
+    for _ in range(steps):
+        if any(env.step(0)[2:4]):
+            env.reset()
 
 
 def changed(default: EnvConfig, setting: Setting) -> EnvConfig:
@@ -184,19 +170,8 @@ def setting_text(setting: Setting) -> str:
     return ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in setting.items())
 
 
-def setting_cells(row: MeasuredSetting, on_front: bool) -> tuple[str, ...]:
+def setting_cells(row: Measured, on_front: bool) -> tuple[str, ...]:
     """A text for each of `HEADINGS`."""
-    accuracy = row.accuracy
-    numbers = (f"{row.cost_us:,.0f}", f"{100 * accuracy.error:.1f}", f"{accuracy.events[0]:.0f}")
-    return (row.knob, row.setting, *numbers, f"{accuracy.renders:.1f}", "*" if on_front else "")
-
-
-def setting_columns(rows: Sequence[MeasuredSetting]) -> dict[str, list[str | float]]:
-    """The columns of a tracker's table; the first is unique."""
-    return {
-        "setting": [f"{row.knob} {row.setting}".strip() for row in rows],
-        "cost_us": [row.cost_us for row in rows],
-        "event_error": [row.accuracy.error for row in rows],
-        "events_per_step": [row.accuracy.events[0] for row in rows],
-        "renders_per_step": [row.accuracy.renders for row in rows],
-    }
+    events, renders = row.outcome["events"], row.outcome["renders"]
+    numbers = (f"{row.cost_us:,.0f}", f"{100 * row.error:.1f}", f"{events:.0f}", f"{renders:.1f}")
+    return (row.knob, row.setting, *numbers, "*" if on_front else "")

@@ -23,7 +23,6 @@ from jobs.analysis.plots import BROWN, COLOURS, CYAN, GREYS, INK, MUTED, VIOLET,
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count
-from jobs.measure.trials import kept, trial_settings
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import open_tracker
@@ -43,6 +42,7 @@ from research.probe.dataset import (
     stacked,
 )
 from research.probe.readout import Interval, Scores, probe, scores
+from research.trials import kept, trial_settings
 
 OWN = "run's encoder"
 # Colour and dashes [points] of each representation without a latent size; the targets have other colours.

@@ -33,6 +33,7 @@ def test_a_spread_is_students_interval_of_the_mean():
 @pytest.mark.system
 def test_it_leaves_a_table_and_pictures(tmp_path, monkeypatch):
     monkeypatch.setattr(codings, "CODING_CONTEXT", 16)
+    monkeypatch.setattr(codings, "CONTEXTS", (16, 32))
     config = small_config(tmp_path, job="codings")
     config = dataclasses.replace(
         config,
@@ -43,7 +44,14 @@ def test_it_leaves_a_table_and_pictures(tmp_path, monkeypatch):
     )
     metrics = codings.run(config)
     folder = locate_run(config).path / "trade"
-    pictures = {"coding", "coding_pictures", "embedding", "interpolation", "scenes"}
+    pictures = {"coding", "coding_pictures", "contexts", "embedding", "interpolation", "scenes"}
     assert {path.stem for path in folder.glob("*.png")} == pictures
     assert (folder / "coding.md").read_text().count("±") == 3 * 7
     assert {f"evae/explained_r2_{coding}_dense" for coding in codings.CODINGS} <= metrics.keys()
+    assert len(list((folder / "encoders").glob("*.safetensors"))) == 2 + 2 * 3 - 1
+
+    def refuse(*arguments):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr("research.trials.train_short", refuse)
+    assert codings.run(config) == metrics

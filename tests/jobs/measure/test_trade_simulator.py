@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envs.config import EnvConfig
-from envs.event_error import Accuracy, measure_event_error
+from envs.event_error import measure_event_error
 from jobs.measure import trade_simulator
-from jobs.measure.front_plots import pareto
-from jobs.measure.trade_simulator import MeasuredSetting, setting_columns, step_costs_us
+from jobs.measure.measured import pareto
+from jobs.measure.trade_simulator import step_costs_us
 from jobs.run.folder import locate_run
 from tests.support.configs import small_config
 
@@ -48,19 +48,6 @@ def test_more_renders_cost_more():
     )
     costs = step_costs_us([once, often], steps=10, rounds=3)
     assert costs[1] > 3 * costs[0] > 0
-
-
-def test_a_row_becomes_columns_under_their_names():
-    found = setting_columns(
-        [MeasuredSetting("renders", "renders 1", 90.0, Accuracy(0.25, (300.0, 320.0), 1.0))]
-    )
-    assert found == {
-        "setting": ["renders renders 1"],
-        "cost_us": [90.0],
-        "event_error": [0.25],
-        "events_per_step": [300.0],
-        "renders_per_step": [1.0],
-    }
 
 
 @pytest.mark.system  # for its length

@@ -72,7 +72,7 @@ def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, 
     def refuse(*arguments):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr("jobs.measure.trials.train_short", refuse)
+    monkeypatch.setattr("research.trials.train_short", refuse)
     assert probe.run(config) == metrics
     with pytest.raises(AssertionError, match="trained again"):
         probe.run(dataclasses.replace(config, own=dataclasses.replace(config.own, iterations=2)))

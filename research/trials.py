@@ -1,11 +1,9 @@
-"""Short trainings of event VAEs, and the held-out windows on which they are compared."""
+"""Short trainings of event VAEs on the recordings of a run."""
 
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
+from typing import Any
 
 from envs.config import sensor_settings
 from envs.recordings import Recording, read_recording
@@ -13,7 +11,7 @@ from jobs.config.config import Config
 from jobs.run.folder import Run
 from jobs.run.progress import progress
 from jobs.training.collect import data_file
-from jobs.training.pretrain import EvaeTraining, Window, cut_window, evae_settings, sample_windows
+from jobs.training.pretrain import EvaeTraining, evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder, save_encoder
 from models.kinds import EvaeSettings
@@ -61,26 +59,3 @@ def train_short(
         for iteration in range(iterations):
             advance(1, note=f"loss {training.step(iteration)['loss']:.4f}")
     return training.evae.freeze()
-
-
-def draw(
-    config: Config, recording: Recording, windows: Literal["mixed", "count"], most_events: int, count: int
-) -> list[Window]:
-    """`count` fixed windows: "mixed" lengths, or "count", those of `most_events` events.
-
-    At the end of an episode a window by count holds fewer; of four times as many the fullest are kept.
-    """
-    settings = dataclasses.replace(config.pretrain, windows=windows, window_events=most_events)
-    rng = np.random.default_rng(1)
-    if windows == "mixed":
-        return sample_windows(recording, settings, count, rng)
-    drawn = sample_windows(recording, settings, 4 * count, rng)
-    return sorted(drawn, key=lambda window: -len(window[0]))[:count]
-
-
-def control_steps(recording: Recording, count: int) -> list[Window]:
-    """`count` fixed windows of one control step."""
-    start, end = recording.index["step_t_us"], recording.index["step_end_us"]
-    chosen = np.random.default_rng(1).choice(len(start), count)
-    spans = [(int(start[step]), int(end[step] - start[step])) for step in chosen]
-    return [cut_window(recording, first, span, MAX_EVENTS) for first, span in spans]

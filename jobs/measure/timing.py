@@ -1,4 +1,4 @@
-"""Time of pieces of work that take turns, so that a slow minute of the machine hits all of them alike."""
+"""Time pieces of work in turns, so that a slow minute of the machine affects all of them alike."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping
@@ -13,17 +13,21 @@ def interleaved(
     work: Mapping[Name, Callable[[], object]],
     rounds: int = 5,
     clock: Callable[[], float] = time.perf_counter,
+    before: Mapping[Name, Callable[[], object]] | None = None,
 ) -> dict[Name, float]:
-    """Median seconds of each piece of work; a first round, which compiles, does not count.
+    """Return the median seconds of each piece of work. A first round, which compiles, does not count.
 
     Args:
-        work: Name -> what is timed.
+        work: Name -> the piece that is timed.
         rounds: How often each piece is timed.
-        clock: Tells seconds: wall time, or `time.thread_time` and the like.
+        clock: Returns seconds: wall time, or `time.process_time` and the like.
+        before: Name -> what runs before each timing of the piece, not timed itself.
     """
     taken: dict[Name, list[float]] = {name: [] for name in work}
     for _ in range(rounds + 1):
         for name, piece in work.items():
+            if before is not None:
+                before[name]()
             start = clock()
             piece()
             taken[name].append(clock() - start)
