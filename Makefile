@@ -15,7 +15,7 @@ COMPARED_STEPS := 500000
 TAUGHT := bytestream_hold bytestream_imitation
 
 COMMA := ,
-TRAINED = 'sweep.policies=[$(subst $() ,$(COMMA),$(strip $(POLICIES)) straight oracle)]'
+TRAINED = 'study.policies=[$(subst $() ,$(COMMA),$(strip $(POLICIES)) straight oracle)]'
 
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed

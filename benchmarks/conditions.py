@@ -19,8 +19,8 @@ from envs.corridor import CorridorVectorEnv
 from jobs.analysis.tables import show_table
 from jobs.config.conditions import axis_points
 from jobs.config.env_keys import env_with
-from jobs.evaluation.sweep_plan import value_text
 from jobs.measure.timing import interleaved
+from jobs.rollout.tasks import text_of
 
 CORRIDORS = 7  # of a training and condition of the sweep
 SIMULATED_S = 0.5  # of each round
@@ -42,15 +42,15 @@ def main() -> None:
 
 
 def conditions_of_sweep() -> dict[str, EnvConfig]:
-    """Name -> environment of each condition of conf/sweep/robustness.yaml that is a simulation of its own."""
+    """Name -> environment of each condition of conf/exp/robustness.yaml that is a simulation of its own."""
     config = composed("+exp=robustness")
-    nominal = replace(config.env, scene=config.sweep.scene, split="eval", window_capacity=None)
+    nominal = replace(config.env, scene=config.own.scene, split="eval", window_capacity=None)
     found = {"nothing changed": nominal}
-    for axis, settings in config.sweep.axes.items():
+    for axis, settings in config.own.axes.items():
         for point in axis_points(settings):
             env = env_with(nominal, point)
             if env not in found.values():
-                found[f"{axis} {value_text(next(iter(point.values())))}"] = env
+                found[f"{axis} {text_of(next(iter(point.values())))}"] = env
     return found
 
 

@@ -40,8 +40,8 @@ try "user is not root" 'test "$(id -u)" = 1000 && test ! -w /etc && test -w /run
 try "help" 'python -m platform.launch --help'
 try "health" 'python -c "import envs, jobs, models"'
 try "training" "$SMOKE +exp=event_columns job=train env.time_limit_s=1.0 train.env_steps=2048"
-try "sweep" "$SMOKE +exp=robustness sweep.policies=[newest,oracle] model=event_columns env.time_limit_s=0.5 \
-    ~sweep.axes '+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}'"
+try "sweep" "$SMOKE +exp=robustness study.policies=[newest,oracle] model=event_columns env.time_limit_s=0.5 \
+    ~study.axes '+study.axes.sparsity={faults.sparsity:[0.0,0.5]}'"
 try "OpenGL" 'python -c "from envs.corridor import CorridorEnv; CorridorEnv(renderer=\"pyrender\").reset(seed=0)"'
 # The server of the jobs above must answer by HTTP with the experiment that they wrote.
 try "dashboard" 'mlflow server --workers 1 --host 127.0.0.1 --port 5055 --backend-store-uri sqlite:////runs/mlflow.db &

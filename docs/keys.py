@@ -23,7 +23,7 @@ CONF = Path(__file__).resolve().parents[1] / "conf"
 FILES = {  # where the comments stand: the section that a file begins in
     "config.yaml": "", "budget/short.yaml": "", "env/corridor.yaml": "env", "camera/paper.yaml": "camera",
     "faults/none.yaml": "faults", "fidelity/tolerance.yaml": "fidelity", "model/bytestream.yaml": "model",
-    "algo/ppo.yaml": "algo", "algo/imitation.yaml": "algo", "sweep/robustness.yaml": "sweep",
+    "algo/ppo.yaml": "algo", "algo/imitation.yaml": "algo",
     "cluster/local.yaml": "cluster", "tracking/local.yaml": "tracking",
 }  # fmt: skip
 LINE = re.compile(r"^(\s*)(\w+):\s*(.*?)(?:(?:^|\s+)# (.*))?$")
@@ -122,7 +122,7 @@ def row(key: str, kind: object, fallback: str = "") -> Row:
     unit, source = (", ".join(rule.findall(said)) for rule in (UNIT, SOURCE))
     meaning = SOURCE.sub("", UNIT.sub("", said)).strip(" ;,") or fallback
     value = _defaults().get(key, "")
-    default = "conditions of D.3, F.1" if key == "sweep.axes" else _as_yaml(value)
+    default = "conditions of D.3, F.1" if key == "study.axes" else _as_yaml(value)
     return Row(f"`{key}`", f"`{default}`" if default else "", allowed(kind), unit, meaning, source)
 
 

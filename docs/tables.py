@@ -15,8 +15,8 @@ from pathlib import Path
 
 from docs.keys import tables as key_tables
 from jobs.analysis.tables import markdown_table
-from jobs.reporting.models import models_tables
 from jobs.run.files import write_atomic
+from jobs.study.models import models_tables
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / "docs" / "data"

@@ -31,7 +31,7 @@ ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same 
 OPEN_GROUPS = (
     "env.layout",
     "faults.added",
-    "sweep.axes",
+    "study.axes",
     "search.space",
 )  # take entries that conf/ does not have
 UNWRITABLE = {  # what the operating system says: what to do

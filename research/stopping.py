@@ -3,7 +3,7 @@
 Two groups are compared after each batch of corridors, and no further corridor is evaluated once they differ
 for certain. Printed are how often they are said to differ, and the share of episodes that this takes: by a
 plan that looks once, by one that takes each look for the only one, and by one that shares its 5 % among the
-looks (Bonferroni). The studies are simulated as in `jobs.analysis.coverage`.
+looks (Bonferroni). The studies are simulated as in `research.coverage`.
 """
 
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jobs.analysis.coverage import CORRIDORS, RATE, STUDIES
 from jobs.analysis.statistics import CONFIDENCE, crossed_difference
 from jobs.analysis.tables import show_table
+from research.coverage import CORRIDORS, RATE, STUDIES
 
 MEAN = 1.5  # logit of the better group: a rate of 80 % if its trainings agree
 LOOKS = (5, 10, 14)  # corridors

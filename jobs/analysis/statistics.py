@@ -2,7 +2,7 @@
 
 What is replicated is the training: every training is evaluated in the same corridors, a crossed design of
 two random factors. scipy computes what it can; it has no interval of a mean over two crossed factors, and
-none of a difference of paired rates. `python -m jobs.analysis.coverage` prints how often the intervals hold.
+none of a difference of paired rates. `python -m research.coverage` prints how often the intervals hold.
 """
 
 from collections.abc import Sequence
@@ -76,7 +76,7 @@ def rate_estimate(successes: np.ndarray) -> Estimate:
     The interval reaches as far as the farthest of three: Student's of the training means with what the
     corridors add (`crossed_mean`), the same of their arcsines (Anscombe 1948), which fits rates near 0 and 1,
     and Wilson's of all episodes, without which trainings that agree would leave no doubt. How often it holds
-    the true rate: `python -m jobs.analysis.coverage`.
+    the true rate: `python -m research.coverage`.
 
     Args:
         successes: Shape (trainings, corridors), 0 or 1.

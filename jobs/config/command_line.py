@@ -72,7 +72,7 @@ def once_per_value(words: Sequence[str]) -> str:
     )
     rule = "one command is one run"
     if several is None:
-        return f"{rule}; give it once per value, or name conditions of an evaluation in sweep.axes"
+        return f"{rule}; give it once per value, or name conditions of an evaluation in study.axes"
     key, _, values = several.partition("=")
     kept = shlex.join(word for word in plain if word is not several)
     loop = f'for value in {shlex.join(values.split(","))}; do evade {kept} {key}="$value"; done'

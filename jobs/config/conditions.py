@@ -1,6 +1,6 @@
 """Axes and conditions: settings of the simulation that change together.
 
-A sweep takes the points of an axis one by one. A training or a data set draws a condition for each episode:
+A study takes the points of an axis one by one. A training or a data set draws a condition for each episode:
 one of a list, by their `weight` (1 unless it is given), and in it each value: a number or a word as it
 stands, one of a list, or one of a range {low: 50, high: 500}, even in its logarithm with `log: true`; between
 whole numbers it is a whole number.
@@ -108,11 +108,11 @@ def axis_numbers(points: Mapping[str, Mapping[str, object]]) -> dict[str, float]
 
 
 def axis_errors(axes: Mapping[str, Mapping[str, Sequence[Setting]]], env: EnvConfig) -> list[str]:
-    """One line for each setting of a sweep that the simulation would otherwise reject hours later."""
+    """One line for each setting of a study that the simulation would otherwise reject hours later."""
     rule = "must have another name, this one is of the condition that changes nothing; rename the axis"
-    taken = [f"sweep.axes.{NOMINAL}: {rule}, got {dict(axes[NOMINAL])!r}"] if NOMINAL in axes else []
+    taken = [f"study.axes.{NOMINAL}: {rule}, got {dict(axes[NOMINAL])!r}"] if NOMINAL in axes else []
     return taken + [
-        f"sweep.axes.{name}: {reason}" for name, axis in axes.items() for reason in _axis_errors(axis, env)
+        f"study.axes.{name}: {reason}" for name, axis in axes.items() for reason in _axis_errors(axis, env)
     ]
 
 

@@ -22,14 +22,12 @@ from jobs.config.plugins import load_plugins
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
-    AblationConfig,
     AlgoConfig,
     ClusterConfig,
     CollectConfig,
     EvaluateConfig,
     Name,
     PretrainConfig,
-    SweepConfig,
     TrackingConfig,
     TrainConfig,
 )
@@ -71,8 +69,6 @@ class Config:
     pretrain: PretrainConfig
     train: TrainConfig
     evaluate: EvaluateConfig
-    sweep: SweepConfig
-    ablation: AblationConfig
     cluster: ClusterConfig
     tracking: TrackingConfig
     plugins: list[Name]
@@ -109,7 +105,7 @@ def parse(values: Mapping[str, object]) -> Config:
     if config is not None and not errors:
         errors += [
             *_image_errors(config),
-            *axis_errors(config.sweep.axes, config.env),
+            *axis_errors(getattr(config.own, "axes", {}), config.env),
             *condition_errors("train.conditions", config.train.conditions, config.env),
             *condition_errors("collect.conditions", config.collect.conditions, config.env),
             *_size_errors(config),
@@ -238,10 +234,11 @@ def unknown_key(key: str) -> str:
 def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
     """Each scene that the configuration names, behind the key that names it."""
     yield "env.scene", config.env.scene
-    yield "sweep.scene", config.sweep.scene
     yield "evaluate", HELD_OUT_SCENE
     yield from (("collect.scenes", name) for name in config.collect.scenes)
     yield from ((f"{config.job}.scenes", name) for name in getattr(config.own, "scenes", ()))
+    if hasattr(config.own, "scene"):
+        yield f"{config.job}.scene", config.own.scene
     for key, conditions in (
         ("train.conditions", config.train.conditions),
         ("collect.conditions", config.collect.conditions),
@@ -249,10 +246,10 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
         for condition in conditions:
             scenes = condition.get("env.scene", [])
             yield from ((key, scene) for scene in ([scenes] if isinstance(scenes, str) else scenes))
-    swept = itertools.chain(*(axis.get("env.scene", []) for axis in config.sweep.axes.values()))
+    swept = itertools.chain(*(axis.get("env.scene", []) for axis in getattr(config.own, "axes", {}).values()))
     for scene in dict.fromkeys(swept):
         if isinstance(scene, str):
-            yield "sweep.axes", scene
+            yield "study.axes", scene
 
 
 def _size_errors(config: Config) -> Iterator[str]:

@@ -7,14 +7,14 @@ of its module.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pydantic
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
-from jobs.config.conditions import Axis, AxisName, Conditions
+from jobs.config.conditions import Conditions
 from models.kinds import checked
 
 Count = Annotated[int, Field(ge=1)]
@@ -172,47 +172,6 @@ class EvaluateConfig:
     action: Literal["deterministic", "stochastic"]
     beside: list[Name]
     video: bool
-
-
-@dataclass(frozen=True, config=STRICT)
-class SweepConfig:
-    """Which policies are evaluated under which conditions, in `trials` corridors for each training.
-
-    Attributes:
-        scene: The layout, unless an axis changes it.
-        policies: Each a group or a name in models/pretrained, "pretrained" (all there), "newest", a baseline,
-            or a path.
-        axes: Name -> setting -> values. The first setting names the points of the axis; others
-            have as many values, or one that stays.
-        reference: The group that paired differences are taken against.
-        split: Whose corridors: "eval", by which results are told, or "validation", for choosing settings.
-    """
-
-    scene: Name
-    policies: Annotated[list[Name], Field(min_length=1)]
-    axes: dict[AxisName, Axis]
-    trials: Count
-    reference: Name
-    split: Literal["eval", "validation"] = "eval"
-
-
-@dataclass(frozen=True, config=STRICT)
-class AblationConfig:
-    """Which parts of an experiment are changed, one at a time.
-
-    Attributes:
-        seeds: Of the trainings of each variant.
-        variants: Name -> what it changes, key -> value, with the place in a list as a number. Each is
-            compared with the first. `train.init` names the first: its policy of the same seed is trained on.
-            `seeds` gives a variant fewer trainings: some of `seeds` above. `encoder_seed` names one of them:
-            all trainings of the variant see by the first variant's encoder of that seed.
-        trained: A folder of their policies, each named as in models/pretrained, of this experiment or of
-            another that trains the same, which are then only evaluated; None: they are trained.
-    """
-
-    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]
-    variants: dict[AxisName, dict[str, Any]]
-    trained: str | None = None
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -32,7 +32,7 @@ from jobs.analysis.video import Decode, open_film
 from jobs.config.config import HELD_OUT_SCENE, TRAINED_SCENE, Config, ConfigError, as_dict
 from jobs.rollout.agents import BASELINES, make_agent
 from jobs.rollout.diagnostics import report_event_error
-from jobs.rollout.episodes import Trajectory, TrajectoryRecorder, roll_out, write_episodes
+from jobs.rollout.episodes import Trajectory, TrajectoryRecorder, roll_out
 from jobs.rollout.executors import Executor
 from jobs.rollout.policies import (
     PRETRAINED,
@@ -44,6 +44,7 @@ from jobs.rollout.policies import (
 )
 from jobs.rollout.scheduler import default_executor, evaluate_tasks
 from jobs.rollout.store import EpisodeStore, TaskResult
+from jobs.rollout.table import write_episodes
 from jobs.rollout.tasks import EvaluationTask, make_task
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console

@@ -1,12 +1,9 @@
 """Episodes: one agent through one corridor each, several side by side, and what is recorded of them."""
 
-import csv
 import dataclasses
-import io
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,6 @@ from envs.config import EnvConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv, Info
 from envs.scene import Scene
 from jobs.rollout.agents import Agent
-from jobs.run.files import write_atomic
 
 EPISODE = np.dtype(
     [
@@ -31,6 +27,8 @@ EPISODE = np.dtype(
         ("dropped", "i8"),
     ]
 )
+# Columns that were added later -> what older episodes have in their place.
+ADDED: dict[str, object] = {}
 # Called after each step with the environment, the seed and the observation.
 Watch = Callable[[CorridorEnv, int, np.ndarray], None]
 
@@ -110,22 +108,6 @@ def _record(episode: np.void, totals: np.ndarray, truncated: bool, info: Info) -
     episode["truncated"] = truncated
     episode["return"], episode["steps"], events, episode["dropped"] = totals
     episode["events_per_step"] = events / episode["steps"]
-
-
-def write_episodes(path: Path, headings: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> None:
-    """Write every episode as one row of a CSV file, behind its label.
-
-    Args:
-        path: The file.
-        headings: One for each word of a label.
-        episodes: Label -> EPISODE (n,).
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*headings, *(EPISODE.names or ())])
-    for label, rows in episodes.items():
-        writer.writerows([*label, *row.item()] for row in rows)
-    write_atomic(path, text.getvalue())
 
 
 @dataclass(frozen=True)

@@ -157,18 +157,18 @@ def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedP
     return find_policies(key, name, config, run)[0]
 
 
-def find_sweep_policies(
+def find_study_policies(
     config: Config, run: Run, pretrained: Path = PRETRAINED
 ) -> tuple[EvaluatedPolicy, ...]:
-    """The policies that `sweep.policies` names, each once, groups together in the order of the names.
+    """The policies that `study.policies` names, each once, groups together in the order of the names.
 
     Raises:
         ConfigError: If there is no such policy, or two have the same group and training seed.
     """
     named = [
         policy
-        for name in config.sweep.policies
-        for policy in find_policies("sweep.policies", name, config, run, pretrained)
+        for name in config.own.policies
+        for policy in find_policies("study.policies", name, config, run, pretrained)
     ]
     policies = list({policy.identity: policy for policy in named}.values())
     first: dict[str, EvaluatedPolicy] = {}
@@ -176,7 +176,7 @@ def find_sweep_policies(
         other = first.setdefault(policy.name, policy)
         if other is not policy:
             raise ConfigError(
-                f"sweep.policies: two policies are {policy.group} with training seed {policy.training}, got "
+                f"study.policies: two policies are {policy.group} with training seed {policy.training}, got "
                 f"{other.agent!r} and {policy.agent!r}; leave one out, or train one with another seed"
             )
     order = list(dict.fromkeys(policy.group for policy in policies))
@@ -229,4 +229,4 @@ def check_sensor(sensor: Mapping[str, Any], env: EnvConfig) -> None:
     differ = sensor_differences(dict(sensor), env)
     if differ:
         got = "; ".join(f"{key} = {ours!r} instead of {theirs!r}" for key, (theirs, ours) in differ.items())
-        raise ValueError(f"the sensor must be the policy's, got {got}; the sweep job evaluates such changes")
+        raise ValueError(f"the sensor must be the policy's, got {got}; the study job evaluates such changes")

@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from jobs.rollout.episodes import EPISODE
-from jobs.rollout.tasks import EvaluationTask
+from jobs.rollout.table import episodes_of
+from jobs.rollout.tasks import KEYED_COLUMNS, EvaluationTask, text_of
 from jobs.run.files import RunError, read_json, write_json
 from jobs.run.progress import console
 
@@ -92,10 +93,11 @@ class EpisodeStore:
                 before.restarts + restarts,
             )
         values = {
-            "label": [*part.condition, *part.policy.name.split()],
+            "label": [*map(text_of, part.condition), *part.policy.name.split()],
             "commits": merged.commits,
             "encoder": merged.drift,
             "restarts": merged.restarts,
+            "columns": list(EPISODE.names or ()),
             "episodes": merged.episodes.tolist(),
         }
         write_json(self._file(part.key), values)
@@ -129,7 +131,7 @@ class EpisodeStore:
         """All that is stored under a key; None if there is nothing, or if it is damaged."""
 
         def parse(values: Mapping[str, Any]) -> TaskResult:
-            episodes = np.array([tuple(row) for row in values["episodes"]], EPISODE)
+            episodes = episodes_of(values["episodes"], values.get("columns", KEYED_COLUMNS))
             return TaskResult(episodes, values["encoder"], tuple(values["commits"]), values["restarts"])
 
         return self._undamaged(self._file(key), parse)

@@ -8,7 +8,7 @@ from tests.support.faults import ROOT, SWEEP
 from tests.support.machines import two_machines
 
 pytestmark = pytest.mark.cluster
-WORDS = (*SWEEP, "~sweep.axes", "+sweep.axes.sparsity={faults.sparsity:[0.0]}", "sweep.policies=[straight]")
+WORDS = (*SWEEP, "~study.axes", "+study.axes.sparsity={faults.sparsity:[0.0]}", "study.policies=[straight]")
 HASTY = {"RAY_NUM_REDIS_GET_RETRIES": "1"}  # Ray would try 20 s long
 
 

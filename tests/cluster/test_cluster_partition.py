@@ -37,7 +37,7 @@ def check_sweep(sweep, undisturbed):
     assert sweep.end() == 0, sweep.said
     assert sweep.kept() == undisturbed.kept()
     for name in ("episodes.csv", "table.md"):
-        assert (sweep.run / "sweep" / name).read_bytes() == (undisturbed.run / "sweep" / name).read_bytes()
+        assert (sweep.run / "study" / name).read_bytes() == (undisturbed.run / "study" / name).read_bytes()
 
 
 def test_a_network_that_is_down_for_seconds_ends_nothing(tmp_path, undisturbed):

@@ -10,8 +10,8 @@ from tests.support.faults import SWEEP, launch
 
 pytestmark = pytest.mark.cluster
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extend.md"
-AXES = "+sweep.axes={spot: {faults.added.blind_spot: [0.0, 0.5]}, world: {env.scene: [forest]}}"
-WORDS = (*SWEEP, "~sweep.axes", AXES, "sweep.policies=[bytestream-s0,straight]")
+AXES = "+study.axes={spot: {faults.added.blind_spot: [0.0, 0.5]}, world: {env.scene: [forest]}}"
+WORDS = (*SWEEP, "~study.axes", AXES, "study.policies=[bytestream-s0,straight]")
 
 
 def test_a_plug_in_is_shipped_to_every_machine_of_a_cluster(tmp_path, cluster):

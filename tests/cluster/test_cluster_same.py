@@ -6,8 +6,8 @@ from tests.support.clusters import SMALL, on
 from tests.support.faults import SWEEP, launch
 
 pytestmark = pytest.mark.cluster
-AXIS = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}"
-WORDS = (*SWEEP, "~sweep.axes", AXIS, "sweep.policies=[straight,random]")
+AXIS = "+study.axes.sparsity={faults.sparsity:[0.0,0.5]}"
+WORDS = (*SWEEP, "~study.axes", AXIS, "study.policies=[straight,random]")
 
 
 def test_a_sweep_on_a_cluster_gives_the_bytes_of_a_sweep_on_one_machine(tmp_path, cluster):
@@ -20,4 +20,4 @@ def test_a_sweep_on_a_cluster_gives_the_bytes_of_a_sweep_on_one_machine(tmp_path
     assert near.run.name == far.run.name
     assert near.kept() == far.kept()
     for name in ("episodes.csv", "table.md"):
-        assert (near.run / "sweep" / name).read_bytes() == (far.run / "sweep" / name).read_bytes()
+        assert (near.run / "study" / name).read_bytes() == (far.run / "study" / name).read_bytes()

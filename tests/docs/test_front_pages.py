@@ -11,10 +11,10 @@ import pytest
 from docs.tables import DATA, ROOT, stale
 from envs.recordings import write_events
 from jobs.config.config import parse
-from jobs.evaluation.sweep_plan import plan_sweep
-from jobs.reporting.models import MANIFEST, shipped_groups, success_rates
-from jobs.rollout.policies import BASELINES, PRETRAINED, find_sweep_policies
+from jobs.rollout.policies import BASELINES, PRETRAINED, find_study_policies
 from jobs.run.folder import locate_run
+from jobs.study.models import MANIFEST, shipped_groups, success_rates
+from jobs.study.plan import plan_study
 from models.kinds import KINDS
 from tests.support.configs import compose
 
@@ -63,7 +63,7 @@ def mean(values):
 def planned(*words):
     """Return the groups of a command's sweep, its corridors, and its episodes; shared ones count once."""
     config = parse(compose(*words))
-    sweep = plan_sweep(config, find_sweep_policies(config, locate_run(config)))
+    sweep = plan_study(config, find_study_policies(config, locate_run(config)))
     episodes = {(task.key, seed) for task in sweep.tasks for seed in task.seeds}
     return sweep.groups, len(sweep.tasks[0].seeds), len(episodes)
 

@@ -17,7 +17,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jobs.evaluation.evaluate
-import jobs.evaluation.sweep
+import jobs.study.study
 import jobs.training.pretrain  # noqa: F401  so that forks have it
 from envs.recordings import WRITERS, Recording, read_recording, write_events, write_recording
 from jobs.analysis.tables import save_plot
@@ -54,11 +54,11 @@ EVALUATE = (
 SWEEP = (
     "+exp=robustness",
     *SHORT,
-    "~sweep.axes",
-    "+sweep.axes.sparsity={faults.sparsity:[0.0,0.5]}",
-    "sweep.policies=[newest,straight]",
-    "sweep.reference=straight",
-    "sweep.trials=1",
+    "~study.axes",
+    "+study.axes.sparsity={faults.sparsity:[0.0,0.5]}",
+    "study.policies=[newest,straight]",
+    "study.reference=straight",
+    "study.trials=1",
     "model=event_columns",
 )
 WORDS = {"evaluate": EVALUATE, "sweep": SWEEP}

@@ -41,5 +41,5 @@ def test_a_sweep_that_loses_a_machine_evaluates_every_task_once(tmp_path, cluste
     job.wait(lambda: len(job.kept()) >= 1)
     cluster.remove_node(nodes[0], allow_graceful=False)
     check_once(job, tmp_path, again_at_most=2)
-    assert (job.run / "stages" / "sweep.json").is_file()
+    assert (job.run / "stages" / "study.json").is_file()
     outcome("node lost, sweep", "its task is evaluated again elsewhere", "episodes under way")

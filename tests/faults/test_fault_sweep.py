@@ -49,7 +49,7 @@ def test_ctrl_c_stops_a_sweep_that_the_same_command_continues(tmp_path):
     job.process.send_signal(signal.SIGINT)
     assert job.end() == 130, job.said
     assert "interrupted; the same command continues where it stopped" in job.said
-    assert not (job.run / "stages" / "sweep.json").exists()
+    assert not (job.run / "stages" / "study.json").exists()
     again = start(tmp_path, job.printed_command(), after=noting(tmp_path))
     check_once(again, tmp_path, again_at_most=2 * 2)
     outcome("Ctrl+C, sweep", "status 130; the same command continues", "0 kept episodes")
@@ -75,16 +75,16 @@ def roll_out(agent, config, seeds, *given, **named):
 def test_a_task_that_raises_hangs_returns_nan_outgrows_or_has_no_opengl_stops_no_other(
     tmp_path, small_memory
 ):
-    sparsity = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75,0.9]}"
-    renderer = "+sweep.axes.renderer={renderer:[raycast,pyrender]}"
-    words = (*SWEEP, "~sweep.axes", sparsity, renderer, "sweep.policies=[event_set-s0]")
+    sparsity = "+study.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75,0.9]}"
+    renderer = "+study.axes.renderer={renderer:[raycast,pyrender]}"
+    words = (*SWEEP, "~study.axes", sparsity, renderer, "study.policies=[event_set-s0]")
     code = {
         "jobs.rollout.tune_executor": "MAX_START_S, MAX_STEP_S, MAX_FAILURES = 40.0, 0.0, 1",
         "jobs.rollout.executors": OUTGROW.format(group=str(small_memory)) + BROKEN,
     }
     job = launch(tmp_path, *words, after=code, EGL_DEVICE_ID="999")
     assert job.end() == 0, job.said
-    table = (job.run / "sweep" / "table.md").read_text()
+    table = (job.run / "study" / "table.md").read_text()
     reasons = {
         "sparsity | 0.25 | event_set | 0 | ZeroDivisionError: no |": "a trial that raises",
         "sparsity | 0.5 | event_set | 0 | its process ended (it may take 40 s) 2 times": "a trial that hangs",

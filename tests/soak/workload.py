@@ -62,9 +62,9 @@ def training(size: Size) -> list[str]:
 
 def sweep(size: Size) -> list[str]:
     """The words of a sweep over shipped policies."""
-    axis = "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}"
-    policies = "sweep.policies=[event_columns,straight]"
-    return ["+exp=robustness", "~sweep.axes", axis, policies, f"sweep.trials={size.trials}"]
+    axis = "+study.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}"
+    policies = "study.policies=[event_columns,straight]"
+    return ["+exp=robustness", "~study.axes", axis, policies, f"study.trials={size.trials}"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,9 +94,9 @@ def training_tables(run: Path) -> Tables:
 
 def sweep_tables(run: Path) -> Tables:
     """The table of a sweep, and its episodes in order."""
-    episodes = sorted((run / "sweep" / "episodes.csv").read_text().splitlines())
+    episodes = sorted((run / "study" / "episodes.csv").read_text().splitlines())
     return Tables(
-        {"table.md": (run / "sweep" / "table.md").read_text(), "episodes.csv": "\n".join(episodes)}, {}
+        {"table.md": (run / "study" / "table.md").read_text(), "episodes.csv": "\n".join(episodes)}, {}
     )
 
 

@@ -9,8 +9,8 @@ from tests.support.faults import HOOK, SWEEP
 TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
 SMALL = {"object_store_memory": 100 * 2**20, "include_dashboard": False}
 # Twelve parts, of two episodes each.
-AXIS = "+sweep.axes.rate={env.control_hz:[40,50,80,100,160,200]}"
-RATES = (*SWEEP, "~sweep.axes", AXIS, "sweep.policies=[straight,oracle]")
+AXIS = "+study.axes.rate={env.control_hz:[40,50,80,100,160,200]}"
+RATES = (*SWEEP, "~study.axes", AXIS, "study.policies=[straight,oracle]")
 SLOW = """
 import time
 whole = roll_out

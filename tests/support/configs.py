@@ -58,6 +58,7 @@ def tune_config(*overrides: str) -> Config:
 
 def sweep_config(tmp_path, trials=2, policies=("straight",), axes=AXES, **changes):
     """A sweep of short episodes."""
-    config = small_config(tmp_path, job="sweep", exp="robustness")
-    settings = dataclasses.replace(config.sweep, axes=axes, trials=trials, policies=list(policies), **changes)
-    return dataclasses.replace(config, sweep=settings, env=dataclasses.replace(config.env, time_limit_s=0.2))
+    own = {**compose("+exp=robustness")["study"], "families": {}, "figures": {}, "headline": {}}
+    config = small_config(tmp_path, job="study", exp="robustness", study=own)
+    settings = dataclasses.replace(config.own, axes=axes, trials=trials, policies=list(policies), **changes)
+    return dataclasses.replace(config, own=settings, env=dataclasses.replace(config.env, time_limit_s=0.2))

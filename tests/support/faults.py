@@ -23,12 +23,12 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from jobs.config.config import parse
-from jobs.evaluation.sweep_plan import plan_sweep
 from jobs.rollout.executors import run_serially
-from jobs.rollout.policies import find_sweep_policies
+from jobs.rollout.policies import find_study_policies
 from jobs.rollout.scheduler import evaluate_tasks
 from jobs.rollout.store import EpisodeStore
 from jobs.run.folder import locate_run
+from jobs.study.plan import plan_study
 from tests.support.configs import compose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,14 +47,20 @@ TRAIN = (
     "algo.num_epochs=1",
     "env.time_limit_s=0.035",
 )
-SWEEP = ("+exp=robustness", "budget=smoke", "env.time_limit_s=0.2", "sweep.reference=straight")
+SWEEP = (
+    "+exp=robustness",
+    "budget=smoke",
+    "env.time_limit_s=0.2",
+    "study.reference=straight",
+    "study.trials=2",
+)
 # Both policies see events, so that each sparsity is a task of its own for each; with two episodes a
 # task they are more than a job evaluates without Ray.
 SEEING = (
     *SWEEP,
-    "~sweep.axes",
-    "+sweep.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}",
-    "sweep.policies=[bytestream-s0,event_set-s0]",
+    "~study.axes",
+    "+study.axes.sparsity={faults.sparsity:[0.0,0.25,0.5,0.75]}",
+    "study.policies=[bytestream-s0,event_set-s0]",
 )
 TASKS = 4 * 2  # the nominal condition is that of sparsity 0
 
@@ -286,10 +292,10 @@ def expected_episodes() -> dict[str, list]:
     """What a sweep of `SEEING` keeps: evaluated in this process, one task after the other."""
     with tempfile.TemporaryDirectory() as folder:
         config = parse({**compose(*SEEING), "runs_dir": folder})
-        store = EpisodeStore(Path(folder) / "sweep")
-        tasks = plan_sweep(config, find_sweep_policies(config, locate_run(config))).tasks
+        store = EpisodeStore(Path(folder) / "study")
+        tasks = plan_study(config, find_study_policies(config, locate_run(config))).tasks
         evaluate_tasks(tasks, store, run_serially, measure_accuracy=False)
-        files = (Path(folder) / "sweep" / "episodes").iterdir()
+        files = (Path(folder) / "study" / "episodes").iterdir()
         return {path.stem: json.loads(path.read_text())["episodes"] for path in files}
 
 
@@ -302,7 +308,7 @@ def check_once(job: Job, notes: Path, again_at_most: int) -> None:
         again_at_most: How many episodes may have been evaluated again: those under way at the fault.
     """
     assert job.end() == 0, job.said
-    with (job.run / "sweep" / "episodes.csv").open() as file:
+    with (job.run / "study" / "episodes.csv").open() as file:
         rows = [tuple(row.values()) for row in csv.DictReader(file)]
     assert len(rows) == len(set(rows))
     assert len(expected_episodes()) == TASKS

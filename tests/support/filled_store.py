@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 from jobs import pipeline
-from jobs.evaluation.sweep import run as run_sweep
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.store import PartResult, SimulationAccuracy
 from jobs.run.folder import Run, finish, open_run
+from jobs.study.study import run as run_study
 from tests.support.configs import sweep_config
 from tests.support.fake_executor import FakeExecutor
 from tests.support.policies import save_training
@@ -40,6 +40,6 @@ def fill(place):
     axes = {"control_hz": {"env.control_hz": [100, 200]}, "sparsity": {"faults.sparsity": [0.0, 0.5]}}
     config = sweep_config(place, policies=["straight"], reference="straight", axes=axes)
     folder = evaluated_training(config)
-    settings = dataclasses.replace(config.sweep, policies=[str(folder.policy), "straight"])
-    run_sweep(dataclasses.replace(config, sweep=settings), FakeExecutor(crashed))
+    settings = dataclasses.replace(config.own, policies=[str(folder.policy), "straight"])
+    run_study(dataclasses.replace(config, own=settings), FakeExecutor(crashed))
     return config, folder

@@ -6,8 +6,8 @@ import torch
 from ray.train._internal.storage import StorageContext
 
 from envs.config import sensor_settings, settings_hash
-from jobs.evaluation.sweep_plan import plan_sweep
 from jobs.rollout.policies import read_policy
+from jobs.study.plan import plan_study
 from jobs.tracking.tracker import open_store
 from jobs.training.ppo import policy_about, policy_spec
 from jobs.training.pretrain import evae_settings
@@ -19,7 +19,7 @@ from models.policy.policy import NETWORKS
 
 
 def planned(config, *agents):
-    return plan_sweep(config, [read_policy(agent) for agent in agents])
+    return plan_study(config, [read_policy(agent) for agent in agents])
 
 
 def in_store(config, tmp_path):

@@ -6,15 +6,14 @@ import json
 
 import numpy as np
 
-from envs.config import EnvConfig
 from jobs.analysis.plots import Curve
 from jobs.config.config import parse
-from jobs.config.env_keys import flat_env
-from jobs.evaluation.group_stats import LABELS
-from jobs.evaluation.sweep_plan import axes_of, baselines_of, same_simulations
-from jobs.rollout.episodes import EPISODE, write_episodes
+from jobs.rollout.episodes import EPISODE
+from jobs.rollout.table import LABELS, write_episodes
+from jobs.rollout.tasks import text_of
 from jobs.run.files import write_json
-from jobs.studies.ablation.ablation import seeds_of
+from jobs.study.plan import axes_of, baselines_of, same_simulations
+from jobs.study.trainings import seeds_of
 from jobs.tools.curves import as_csv
 from models.policy.policy import MANIFEST
 from tests.support.configs import compose
@@ -44,13 +43,6 @@ ABOUT = {
         for at in (["nominal", "poles_eval"], ["sparsity", "0.2"], ["sparsity", "0.5"])
     ],
     "met": [["sparsity", "0.5", "bytestream"]],
-}
-KINDS = {
-    "lost": "faults.event_dropout",
-    "displaced": "faults.displaced",
-    "flipped": "faults.flipped",
-    "invented": "faults.background_activity",
-    "jittered": "camera.latency_jitter_us",
 }
 
 
@@ -84,37 +76,6 @@ def write_shipped(folder, before=""):
     return folder
 
 
-def write_study(folder):
-    """Leave a dose response of two groups: one fails under invented events, one never; returns the folder.
-
-    Beside it are its plan, its simulation, and what is published of its groups, see `study_places`.
-    """
-    axes = {"nominal": {"poles_eval": {}}}
-    axes |= {kind: {str(one): {key: one} for one in (0.1, 0.2)} for kind, key in KINDS.items()}
-    places = [[axis, value] for axis, points in axes.items() for value in points]
-    nominal = places[0]
-    about = {
-        "run": "dose_response-short-s0-1", "exp": "dose_response", "identity": "abc", "command": "command",
-        "commit": "c0ffee", "evaluated_at": ["c0ffee"], "date": "2026-01-02", "scene": "poles_eval",
-        "trials": 14, "reference": "steady", "action": "stochastic", "axes": axes,
-        "groups": {"weak": list(range(6)), "steady": list(range(6))},
-        "compared": [{"condition": at, "baseline": nominal, "same_as": at} for at in places],
-        "met": [],
-    }  # fmt: skip
-    rows = {}
-    for axis, value in places:
-        for group, seed in ((group, seed) for group, seeds in about["groups"].items() for seed in seeds):
-            episodes = np.zeros(14, EPISODE)
-            episodes["seed"] = np.arange(14)
-            lost = 12 if (axis, group) == ("invented", "weak") else 1
-            episodes["success"] = (np.arange(14) + 3 * seed) % 14 >= lost
-            rows[axis, value, group, str(seed)] = episodes
-    write_episodes(folder / "episodes.csv", LABELS, rows)
-    (folder / "about.json").write_text(json.dumps(about))
-    write_plan(folder.parent, about)
-    return folder
-
-
 def write_claims(folder, lost=(), exp="taught_claims", trainings=3):
     """Leave a study of the paper's claims in `folder`, whose trainings lose none or one of 14; returns it.
 
@@ -132,6 +93,11 @@ def write_claims(folder, lost=(), exp="taught_claims", trainings=3):
     return write_ablation(folder, exp, failed, trainings)
 
 
+def named(at):
+    """A condition as files have it."""
+    return [at[0], text_of(at[1])]
+
+
 def write_ablation(folder, exp, failed, trainings=None):
     """Leave the study of an experiment in `folder`, 14 episodes of each training and condition; returns it.
 
@@ -142,13 +108,16 @@ def write_ablation(folder, exp, failed, trainings=None):
         trainings: Of each group; None: all.
     """
     config = parse(compose(f"+exp={exp}"))
-    axes, env = axes_of(config.sweep), dataclasses.replace(config.env, scene="poles_eval", split="eval")
-    groups = {name: seeds_of(config, name)[:trainings] for name in config.ablation.variants}
+    axes = axes_of("poles_eval", config.own.axes)
+    env = dataclasses.replace(config.env, scene="poles_eval", split="eval")
+    groups = {name: seeds_of(config, name)[:trainings] for name in config.own.variants}
     baselines, same = baselines_of(env, axes), same_simulations(env, axes)
     about = {
-        **ABOUT, "run": f"{exp}-short-s0-1", "exp": exp, "axes": axes, "groups": groups,
-        "trials": 14, "met": [], "exactness": [],
-        "compared": [{"condition": at, "baseline": baselines[at], "same_as": same[at]} for at in baselines],
+        **ABOUT, "run": f"{exp}-short-s0-1", "exp": exp, "groups": groups, "trials": 14, "met": [],
+        "axes": {axis: {text_of(at): own for at, own in points.items()} for axis, points in axes.items()},
+        "exactness": [],
+        "compared": [{"condition": named(at), "baseline": named(baselines[at]), "same_as": named(same[at])}
+                     for at in baselines],
     }  # fmt: skip
     rows = {}
     for (axis, value), (group, seeds) in itertools.product(baselines, groups.items()):
@@ -157,25 +126,8 @@ def write_ablation(folder, exp, failed, trainings=None):
             episodes["seed"] = np.arange(14)
             episodes["success"] = (np.arange(14) + 3 * seed) % 14 >= failed(group, axis, value, seed)
             episodes["distance_m"] = np.where(episodes["success"], 100.0, 40.0)
-            rows[axis, value, group, str(seed)] = episodes
+            rows[axis, text_of(value), group, str(seed)] = episodes
     folder.mkdir(parents=True, exist_ok=True)
     write_episodes(folder / "episodes.csv", LABELS, rows)
     (folder / "about.json").write_text(json.dumps(about))
     return folder
-
-
-def write_plan(run, about):
-    """Leave the plan of a dose response, its published policies and its simulation in a run folder."""
-    axes = {kind: {key: [0.1, 0.2]} for kind, key in KINDS.items()}
-    plan = {name: about[name] for name in ("scene", "trials", "reference")}
-    plan |= {"policies": list(about["groups"]), "axes": axes}
-    (run / "plan.yaml").write_text(json.dumps(plan))  # JSON is YAML
-    write_json(run / "config.json", flat_env(EnvConfig()))
-    for group, seeds in about["groups"].items():
-        for seed in seeds:
-            write_json(run / "published" / f"{group}-s{seed}" / MANIFEST, {})
-
-
-def study_places(study):
-    """Arguments of `write_dose_response` that name what lies beside a study."""
-    return {"pretrained": study.parent / "published", "plan": study.parent / "plan.yaml"}

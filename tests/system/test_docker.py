@@ -242,7 +242,7 @@ def test_the_jobs_that_try_the_image_are_configurations_of_one_store(compose_con
     (smoke,) = re.findall(r'^SMOKE="(.+)"$', script, re.MULTILINE)
     tried = dict(re.findall(r'^try "(.+?)" "\$SMOKE (.+)"$', script, re.MULTILINE))
     configs = {what: compose_configuration(shlex.split(f"{smoke} {tried[what]}")[3:]) for what in tried}
-    assert [config.job for config in configs.values()] == ["train", "sweep"]
+    assert [config.job for config in configs.values()] == ["train", "study"]
     assert {config.runs_dir for config in configs.values()} == {"/runs/smoke"}
     (store,) = {config.tracking.uri for config in configs.values()}
     assert f"--backend-store-uri {store} " in script

@@ -108,7 +108,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["faults.sparsity=1.5"], "faults.sparsity: Input should be less than or equal to 1, got 1.5"),
         (["env.scene=moon"], "env.scene: must be one of cones, dynamic, gates, poles, "),
         (["collect.scenes=[moon]"], "collect.scenes: must be one of cones, dynamic, gates, poles, "),
-        (["sweep.scene=moon"], "sweep.scene: must be one of cones, dynamic, gates, poles, "),
+        (["study.scene=moon"], "study.scene: must be one of cones, dynamic, gates, poles, "),
         (
             ["+env.layout.num_obstacles=100000"],
             "env.layout: layout num_obstacles=100000 cannot be placed 2.0 m apart",
@@ -138,7 +138,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["+hydra.callbacks.x._target_=os.system"], "Hydra's own settings are fixed"),
         (["+env.layout._target_=os.system"], "env.layout._target_: such keys make Hydra call code"),
         (["++algo={_target_:torch.load,f:x}"], "algo._target_: such keys make Hydra call code"),
-        (["+sweep.axes.x=[{_target_:os.remove}]"], "sweep.axes.x.0._target_: such keys make Hydra call code"),
+        (["+study.axes.x=[{_target_:os.remove}]"], "study.axes.x.0._target_: such keys make Hydra call code"),
         (["tracking.uri=${oc.env:HOME}"], "tracking.uri: must be the value itself, not a reference"),
         (["--experimental-rerun=config.pickle"], "Hydra's own settings are fixed"),
     ],

@@ -43,7 +43,7 @@ SMALLER = (
     "evaluate.episodes=2",
     "evaluate.pyrender_episodes=1",
 )
-SWEEP = ("+exp=robustness", "sweep.policies=[newest]", "sweep.trials=1", "env.time_limit_s=0.5")
+SWEEP = ("+exp=robustness", "study.policies=[newest]", "study.trials=1", "env.time_limit_s=0.5")
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +107,9 @@ def test_an_encoder_that_learns_on_goes_through_every_stage_and_the_sweep(tmp_pa
         if not name.startswith("decoder."):
             moved = not np.array_equal(learnt[f"trunk.{name}"], value)
             assert moved is not ("running" in name or "num_batches" in name), name
-    axes = "~sweep.axes.renderer", "+sweep.axes.sparsity={faults.sparsity: [0.5]}"
-    flown = "sweep=renderer", "sweep.policies=[newest]", "sweep.trials=1", *axes
-    assert re.search(r"sparsity\s+│ 0\.5", launch(tmp_path, "+exp=robustness", *flown))
+    axes = "~study.axes.renderer", "+study.axes.sparsity={faults.sparsity: [0.5]}"
+    flown = "study.policies=[newest]", "study.trials=1", *axes
+    assert re.search(r"sparsity\s+│ 0\.5", launch(tmp_path, "+exp=renderer", *flown))
 
 
 def stored_run(folder: Path):

@@ -23,9 +23,9 @@ TRAIN = (
     *("evaluate.episodes=2", "evaluate.renderers=[raycast]", "evaluate.video=false"),
 )
 SWEEP = (
-    *("+exp=robustness", "sweep.policies=[newest]", "model=event_columns", "model.name=halves"),
-    *("sweep.trials=1", "~sweep.axes", "env.time_limit_s=0.5"),
-    "+sweep.axes={spot: {faults.added.blind_spot: [0.0, 0.9]}, world: {env.scene: [poles_eval, forest]}}",
+    *("+exp=robustness", "study.policies=[newest]", "model=event_columns", "model.name=halves"),
+    *("study.trials=1", "~study.axes", "env.time_limit_s=0.5"),
+    "+study.axes={spot: {faults.added.blind_spot: [0.0, 0.9]}, world: {env.scene: [poles_eval, forest]}}",
 )
 
 

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, ttest_ind
 
-from jobs.analysis.coverage import coverage
 from jobs.analysis.statistics import (
     bootstrap_interval,
     crossed_difference,
@@ -14,6 +13,7 @@ from jobs.analysis.statistics import (
     trainings_needed,
     wilson_interval,
 )
+from research.coverage import coverage
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def test_settings_of_an_axis_go_together_and_a_single_value_stays():
     ],
 )
 def test_a_setting_that_is_not_valid_gives_one_line_that_names_key_and_value(axis, reason):
-    assert errors_of(axis) == [f"sweep.axes.here: {reason}"]
+    assert errors_of(axis) == [f"study.axes.here: {reason}"]
 
 
 def test_each_bad_value_has_its_line():

@@ -17,20 +17,20 @@ from models.kinds import KINDS, model_keys
 from tests.support.configs import CONF, compose
 
 JOBS = {
-    "robustness": "sweep",
-    "dose_response": "sweep",
-    "dose_response_taught": "ablation",
-    "calibrated_camera": "ablation",
-    "camera_rates": "ablation",
-    "encoder_seeds": "ablation",
-    "learning_rates": "ablation",
-    "training_lengths": "ablation",
-    "memory_seconds": "ablation",
-    "ppo_claims": "ablation",
-    "ppo_event_set": "ablation",
-    "ppo_paper": "ablation",
-    "taught_claims": "ablation",
-    "taught": "ablation",
+    "robustness": "study",
+    "dose_response": "study",
+    "dose_response_taught": "study",
+    "calibrated_camera": "study",
+    "camera_rates": "study",
+    "encoder_seeds": "study",
+    "learning_rates": "study",
+    "training_lengths": "study",
+    "memory_seconds": "study",
+    "ppo_claims": "study",
+    "ppo_event_set": "study",
+    "ppo_paper": "study",
+    "taught_claims": "study",
+    "taught": "study",
 }
 POLICIES = {
     "bytestream": "bytestream",
@@ -169,7 +169,7 @@ def test_every_file_of_every_group_is_accepted(choice):
 
 def test_the_sweep_is_by_day_and_by_night_what_the_lights_are(values):
     """Of a light that a sweep changes nothing is left out, and nothing added."""
-    nominal, axis = parse(values), parse(compose("+exp=robustness")).sweep.axes["sensor_noise"]
+    nominal, axis = parse(values), parse(compose("+exp=robustness")).own.axes["sensor_noise"]
     for light, point in zip(("none", "day", "night"), axis_points(axis), strict=True):
         assert parse(compose("+exp=bytestream", f"light={light}")).env == env_with(nominal.env, point)
 
@@ -371,29 +371,29 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("exp", "../up", "got '../up'"),
         ("evaluate.renderers", [], "at least 1 item"),
         (
-            "sweep.axes",
+            "study.axes",
             {"rate": {"env.control_hz": [100.0, 0.0]}},
             "rate: env.control_hz=0.0: Input should be",
         ),
-        ("sweep.axes", {"rate": {}}, "sweep.axes.rate: Dictionary should have at least 1 item"),
-        ("sweep.axes", {"rate": {"env.control_hz": []}}, "rate.env.control_hz: List should have at least 1"),
+        ("study.axes", {"rate": {}}, "study.axes.rate: Dictionary should have at least 1 item"),
+        ("study.axes", {"rate": {"env.control_hz": []}}, "rate.env.control_hz: List should have at least 1"),
         (
-            "sweep.axes",
+            "study.axes",
             {"rate": {"env.control_hz": [float("nan")]}},
             "must be a finite number, a word or null",
         ),
-        ("sweep.axes", {"a/b": {"env.control_hz": [1]}}, "String should match pattern"),
+        ("study.axes", {"a/b": {"env.control_hz": [1]}}, "String should match pattern"),
         (
-            "sweep.axes",
+            "study.axes",
             {"nominal": {"faults.sparsity": [0.5]}},
-            "sweep.axes.nominal: must have another name, this one is of the condition that changes nothing",
+            "study.axes.nominal: must have another name, this one is of the condition that changes nothing",
         ),
         (
-            "sweep.axes",
+            "study.axes",
             {"where": {"env.scene": ["moon"]}},
-            "sweep.axes: must be one of cones, dynamic, gates",
+            "study.axes: must be one of cones, dynamic, gates",
         ),
-        ("sweep.policies", [], "at least 1 item"),
+        ("study.policies", [], "at least 1 item"),
         ("env.camera", {"width": 64}, "env.camera: "),
         ("camera", 64, "must be a group of settings, got 64"),
         ("env", None, "must be a group of settings, got None"),
@@ -402,7 +402,7 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("env.split", "eval", "env.split: no such key, got 'eval'; every job chooses it itself"),
         ("env.observation", "luminance", "no such key, got 'luminance'; every job chooses it itself"),
         ("env.scene", "moon", "env.scene: must be one of cones, dynamic, gates, "),
-        ("sweep.scene", "moon", "sweep.scene: must be one of cones, dynamic, gates, "),
+        ("study.scene", "moon", "study.scene: must be one of cones, dynamic, gates, "),
         (
             "collect.scenes",
             ["poles", "moon"],

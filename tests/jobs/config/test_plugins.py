@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from jobs.evaluation.met import met
 
 from envs.config import EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
@@ -13,7 +14,6 @@ from jobs.config import plugins
 from jobs.config.conditions import axis_errors, condition_errors
 from jobs.config.config import ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
-from jobs.evaluation.met import met
 from jobs.run.folder import run_name
 from models.kinds import DenseModel, Kind
 from tests.support.configs import compose, small_config

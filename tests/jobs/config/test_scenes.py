@@ -15,7 +15,7 @@ def test_a_layout_that_is_not_drawn_again_can_be_drawn(name):
 def test_only_what_differs_from_the_layouts_is_drawn(monkeypatch):
     drawn = []
     monkeypatch.setattr("envs.scene.make_scene", lambda name, *given, **layout: drawn.append(name))
-    named = [("env.scene", "poles"), ("sweep.scene", "gates")]
+    named = [("env.scene", "poles"), ("study.scene", "gates")]
     assert scene_errors(named, EnvConfig()) == []
     assert drawn == []
     for changed in (EnvConfig(layout={"num_obstacles": 9}), EnvConfig(vehicle_radius_m=0.5)):
@@ -26,12 +26,12 @@ def test_only_what_differs_from_the_layouts_is_drawn(monkeypatch):
 
 def test_a_vehicle_that_cannot_pass_is_named_by_the_layout_of_each_scene():
     env = EnvConfig(vehicle_radius_m=8.0)
-    (line,) = scene_errors([("env.scene", "poles"), ("sweep.scene", "poles")], env)
+    (line,) = scene_errors([("env.scene", "poles"), ("study.scene", "poles")], env)
     assert line.startswith("env.layout: layout of scene 'poles'")
     assert "8.0 m" in line
 
 
 def test_an_unknown_scene_is_named_by_its_key():
-    (line,) = scene_errors([("env.scene", "poles"), ("sweep.scene", "moon")], EnvConfig())
-    assert line.startswith("sweep.scene: must be one of ")
+    (line,) = scene_errors([("env.scene", "poles"), ("study.scene", "moon")], EnvConfig())
+    assert line.startswith("study.scene: must be one of ")
     assert "'moon'" in line

@@ -9,12 +9,12 @@ from jobs.run.provenance import command
     ("word", "shown"),
     [
         (
-            "ablation.trained=docs/data/taught_claims_policies",
-            "ablation.trained=docs/data/taught_claims_policies",
+            "study.train=false",
+            "study.train=false",
         ),
         ("ablation.trained=/elsewhere/work/policies", "ablation.trained=policies"),
         ("ablation.trained=../someone/work/policies", "ablation.trained=policies"),
-        ("sweep.policies=[/elsewhere/a,models/b/c]", "'sweep.policies=[a,models/b/c]'"),
+        ("study.policies=[/elsewhere/a,models/b/c]", "'study.policies=[a,models/b/c]'"),
     ],
 )
 def test_the_command_keeps_paths_of_the_repository_and_tells_no_local_ones(word, shown, monkeypatch):

@@ -29,7 +29,7 @@ def composed(conf, *words):
 
 
 # These axes change what a pixel remembers, which a refractory period forbids.
-WITHOUT_MEMORY = ("~sweep.axes.memory", "~sweep.axes.memory_400hz")
+WITHOUT_MEMORY = ("~study.axes.memory", "~study.axes.memory_400hz")
 
 
 # Of which a calibration takes how light becomes a response, and nothing else.

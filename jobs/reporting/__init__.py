@@ -1,1 +1,0 @@
-"""Pages of results: the report, the claims of the paper, learning curves, and published policies."""

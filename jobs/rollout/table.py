@@ -1,0 +1,71 @@
+"""The table of episodes: one row each, behind the labels that say whose it is and under which condition.
+
+A column that was added after a file was written gets its default, so that older files stay readable.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from jobs.rollout.episodes import ADDED, EPISODE
+from jobs.run.files import RunError, write_atomic
+
+COLUMNS: tuple[str, ...] = EPISODE.names or ()
+LABELS = ("Axis", "Value", "Group", "Training")  # of the episodes of a study
+WORDS: dict[str, Any] = {"Axis": str, "Value": str, "Group": str, "Training": "Int64"}
+
+
+def as_table(labels: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> pd.DataFrame:
+    """Return all episodes as one table.
+
+    Args:
+        labels: Headings of the labels.
+        episodes: Label -> EPISODE (n,).
+    """
+    parts = [
+        pd.DataFrame({**dict(zip(labels, label, strict=True)), **{name: rows[name] for name in COLUMNS}})
+        for label, rows in episodes.items()
+    ]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=[*labels, *COLUMNS])
+
+
+def write_episodes(path: Path, labels: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> None:
+    """Write all episodes as one table into a CSV file; arguments as in `as_table`."""
+    text = io.StringIO()
+    as_table(labels, episodes).to_csv(text, index=False, lineterminator="\n")
+    write_atomic(path, text.getvalue())
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read a table of a study's episodes, plain or packed (.gz); missing later columns get their defaults.
+
+    Raises:
+        RunError: The file lacks a column that has no default.
+    """
+    table = pd.read_csv(path, dtype=WORDS, keep_default_na=False, na_values={"Training": [""]})
+    return table.assign(**_missing(path, list(table.columns)))
+
+
+def _missing(path: Path, columns: Sequence[str]) -> dict[str, object]:
+    """Return the defaults of the columns that a file lacks."""
+    lacking = [name for name in COLUMNS if name not in columns]
+    without = [name for name in lacking if name not in ADDED]
+    if without:
+        raise RunError(f"{path}: must have the columns {without}; evaluate again")
+    return {name: ADDED[name] for name in lacking}
+
+
+def episodes_of(rows: Sequence[Sequence[object]], columns: Sequence[str]) -> np.ndarray:
+    """Return rows of values under these columns as EPISODE (n,); missing later columns get their defaults."""
+    found = np.zeros(len(rows), EPISODE)
+    for name in COLUMNS:
+        if name in columns:
+            place = list(columns).index(name)
+            found[name] = [row[place] for row in rows]
+        else:
+            found[name] = ADDED[name]
+    return found

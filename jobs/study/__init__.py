@@ -1,0 +1,1 @@
+"""Studies: which policies are trained and compared under which conditions, declared in one file each."""

@@ -1,0 +1,73 @@
+"""Success and distance of all groups along one axis of a study."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.analysis.plots import MUTED, style_of, tidy
+from jobs.config.conditions import axis_numbers, moving_settings
+from jobs.rollout.tasks import text_of
+from jobs.study.results import Value
+from jobs.study.summaries import Summary
+from jobs.study.words import TITLES
+
+WIDTH = 0.7  # of all groups at one value, where values are a step of 1 apart
+
+
+def axis_figure(axis: str, points: Mapping[Value, Mapping[str, object]], found: Sequence[Summary]) -> Figure:
+    """Draw a marker with its interval for each group and value, joined by lines over numbers.
+
+    Args:
+        axis: Its name.
+        points: Value -> settings that it changes; the first one names it.
+        found: Of this axis.
+    """
+    by_text = {text_of(value): changes for value, changes in points.items()}
+    moving, numbers = moving_settings(by_text), axis_numbers(by_text) is not None
+    places, groups = (
+        {value: place for place, value in enumerate(points)},
+        list(dict.fromkeys(one.group for one in found)),
+    )
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2)
+    for rank, group in enumerate(groups):
+        own = [one for one in found if one.group == group]
+        x = np.array([places[one.condition[1]] for one in own]) + WIDTH * ((rank + 0.5) / len(groups) - 0.5)
+        colour, marker = style_of(group)
+        ends = [
+            (100 * one.success.value, *(100 * end for end in one.success.interval or (0.0, 1.0)))
+            for one in own
+        ]
+        metres = [
+            (one.distance_m.value, *(one.distance_m.interval or (one.distance_m.value,) * 2)) for one in own
+        ]
+        for panel, rows in zip(panels, (ends, metres), strict=True):
+            value, low, high = np.array(rows).T
+            panel.vlines(x, low, high, color=colour, alpha=0.5, lw=1.2)
+            panel.plot(x, value, color=colour, marker=marker, ms=6, lw=1.4 if numbers else 0, label=group)
+    for panel in panels:
+        panel.set_xticks(range(len(points)), [_tick(point, moving) for point in points.values()], fontsize=8)
+        title = TITLES.get(axis, next(iter(next(iter(points.values())))))
+        panel.set_xlabel(title if len(moving) < 2 else f"{title}, and what changes with it")
+        tidy(panel, "y")
+    panels[0].set(ylim=(-2, 103), ylabel="Episodes that reached the goal [%]")
+    panels[1].set(ylim=(-2, 103), ylabel="Mean distance without collision [m]")
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 5), frameon=False)
+    figure.supxlabel(_footnote(axis, points, moving), x=0.995, ha="right", fontsize=7, color=MUTED)
+    return figure
+
+
+def _tick(point: Mapping[str, object], moving: Sequence[str]) -> str:
+    """Return what a point is; where several settings change, each on a line of its own with its name."""
+    if len(moving) < 2:
+        return text_of(next(iter(point.values()))).replace("_", "\n")
+    return "\n".join(f"{key.rpartition('.')[2]} {text_of(point[key])}" for key in moving)
+
+
+def _footnote(axis: str, points: Mapping[Value, Mapping[str, object]], moving: Sequence[str]) -> str:
+    """Return what stays the same along the axis."""
+    point = next(iter(points.values()))
+    held = [f"{key.rpartition('.')[2]} {value}" for key, value in point.items() if key not in moving]
+    return "; ".join([axis, *held, "95 % intervals over trainings"])

@@ -1,0 +1,217 @@
+"""Tests of a family: the difference of each, its p value after the correction, and the verdict.
+
+One rule for all families. A verdict is certain if p is below 0.05 after the correction. Otherwise the
+interval of the single test decides: within the smallest difference that matters on both sides, or below it.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import false_discovery_control
+
+from envs.scene import Scene
+from jobs.analysis.statistics import (
+    CONFIDENCE,
+    Difference,
+    Estimate,
+    Interval,
+    crossed_difference,
+    crossed_mean,
+    holm,
+    rate_estimate,
+    trainings_needed,
+)
+from jobs.study.results import RATE, Condition, Results, values_of
+from jobs.study.spec import LEARNED, Contrast, Family, Side
+
+UNDECIDED, NOT_TESTED = "undecided", "not tested"
+Learned = Mapping[str, Mapping[str, Sequence[float]]]  # measure -> group -> its trainings, 0..1
+
+
+class Finding(NamedTuple):
+    """What was found of a test.
+
+    Attributes:
+        contrast: The test.
+        difference: Its value, interval and p alone; None: there is nothing to compare.
+        adjusted_p: After the correction of its family; None: there is no test.
+        verdict: A word of the family, `UNDECIDED` or `NOT_TESTED`.
+        needed: Trainings of each side that would show a difference that matters, if it is undecided; None:
+            no number would in these corridors, or it was not asked.
+    """
+
+    contrast: Contrast
+    difference: Difference | None
+    adjusted_p: float | None
+    verdict: str
+    needed: int | None = None
+
+
+def judge(family: Family, results: Results, learned: Learned | None = None) -> list[Finding]:
+    """Test a family.
+
+    Args:
+        family: Its tests.
+        results: What was evaluated.
+        learned: How well each training did while it learned, for tests about that.
+    """
+    sides = [compared_values(one, results, learned or {}) for one in family.contrasts]
+    found = [_difference(one, *pair) for one, pair in zip(family.contrasts, sides, strict=True)]
+    places = [place for place, one in enumerate(found) if one is not None and one.p is not None]
+    adjusted = dict(zip(places, adjust(family.adjust, [found[place].p for place in places]), strict=True))  # type: ignore[union-attr, misc]
+    findings = []
+    for place, (one, difference) in enumerate(zip(family.contrasts, found, strict=True)):
+        p, margin, needed = (
+            adjusted.get(place),
+            family.margin.get(one.measure, family.margin["success"]),
+            None,
+        )
+        verdict = verdict_of(difference, p, margin, family.words)
+        ours, theirs = sides[place]
+        if (
+            family.power
+            and verdict == UNDECIDED
+            and p is not None
+            and ours is not None
+            and theirs is not None
+        ):
+            needed = trainings_needed(ours, theirs, margin, len(places), bounds_of(one, ours, theirs))
+        findings.append(Finding(one, difference, p, verdict, needed))
+    return findings
+
+
+def adjust(correction: str, p_values: Sequence[float]) -> list[float]:
+    """Return p values corrected for being a family ("holm", "bh"), or as they are ("none")."""
+    if correction == "holm":
+        return holm(p_values)
+    if correction == "bh" and len(p_values):
+        return [float(p) for p in false_discovery_control(np.array(p_values))]
+    return list(p_values)
+
+
+def verdict_of(
+    difference: Difference | None, adjusted_p: float | None, margin: float, words: Mapping[str, str]
+) -> str:
+    """Return the verdict of a test in the words of its family, see the top of this file."""
+    if difference is None:
+        return NOT_TESTED
+    if difference.interval is None or adjusted_p is None:
+        return UNDECIDED
+    low, high = difference.interval
+    if adjusted_p < 1 - CONFIDENCE:
+        return words.get("above" if difference.value > 0 else "below", UNDECIDED)
+    if -margin < low and high < margin and "within" in words:
+        return words["within"]
+    return words["no_gain"] if high < margin and "no_gain" in words else UNDECIDED
+
+
+def compared_values(
+    contrast: Contrast, results: Results, learned: Learned
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return what a test compares of both sides, (trainings, corridors) each; None: nothing was evaluated."""
+    ours, theirs = contrast.ours, contrast.theirs
+    if contrast.measure in LEARNED:
+        rates = learned.get(contrast.measure, {})
+        sides = [np.array(rates.get(side.group, ()))[:, None] if side else None for side in (ours, theirs)]
+        return (sides[0], sides[1]) if all(one is None or one.size for one in sides) else (None, None)
+    ours, theirs = _evaluated(ours, theirs, results)
+    seeds = [_seeds(side, results) if side else [] for side in (ours, theirs)]
+    if contrast.paired and theirs:
+        seeds = [[seed for seed in seeds[0] if seed in seeds[1]]] * 2
+    if not seeds[0] or (theirs and not seeds[1]):
+        return None, None
+    first = side_values(ours, contrast.measure, results, seeds[0])
+    return first, side_values(theirs, contrast.measure, results, seeds[1]) if theirs else None
+
+
+def side_values(side: Side, measure: str, results: Results, seeds: Sequence[int | None]) -> np.ndarray:
+    """Return the mean of a side over its conditions, float64 (trainings, corridors)."""
+    at, less = (
+        [values_of({seed: results.cells[one, side.group][seed] for seed in seeds}, measure) for one in places]
+        for places in (side.at, side.less)
+    )
+    if len(at) == len(less):
+        mean: np.ndarray = np.mean([one - other for one, other in zip(at, less, strict=True)], axis=0)
+        return mean
+    mean = np.mean(at, axis=0)
+    return mean - np.mean(less, axis=0) if less else mean
+
+
+def _evaluated(ours: Side, theirs: Side | None, results: Results) -> tuple[Side, Side | None]:
+    """Leave out the conditions under which a side was not evaluated, if both have the same out of both."""
+
+    def there(side: Side) -> list[bool]:
+        found = [bool(results.trainings(at, side.group)) for at in side.at]
+        if len(side.less) != len(side.at):
+            return found
+        return [one and bool(results.trainings(at, side.group))
+                for one, at in zip(found, side.less, strict=True)]  # fmt: skip
+
+    def only(side: Side, kept: Sequence[bool]) -> Side:
+        at = tuple(one for one, keep in zip(side.at, kept, strict=True) if keep)
+        if len(side.less) != len(side.at):
+            return side._replace(at=at)
+        return side._replace(at=at, less=tuple(one for one, k in zip(side.less, kept, strict=True) if k))
+
+    if theirs is None:
+        return only(ours, there(ours)), None
+    kept = there(ours), there(theirs)
+    if ours.at == theirs.at:
+        kept = ([one and other for one, other in zip(*kept, strict=True)],) * 2
+    return only(ours, kept[0]), only(theirs, kept[1])
+
+
+def _seeds(side: Side, results: Results) -> list[int | None]:
+    """Return the trainings that were evaluated under all conditions of a side."""
+    every = [set(results.trainings(at, side.group)) for at in (*side.at, *side.less)]
+    return sorted(set.intersection(*every) if side.at else (), key=lambda seed: (seed is None, seed or 0))
+
+
+def _difference(contrast: Contrast, ours: np.ndarray | None, theirs: np.ndarray | None) -> Difference | None:
+    """Return ours minus theirs, or ours alone; of one training nothing follows for others."""
+    if ours is None:
+        return None
+    if theirs is None:
+        return crossed_mean(ours, bounds_of(contrast, ours))
+    bounds = bounds_of(contrast, ours, theirs)
+    if contrast.paired:
+        low, high = bounds or RATE
+        return crossed_mean(ours - theirs, (-max(high, -low), max(high, -low)))
+    found = crossed_difference(ours, theirs, bounds)
+    return found if min(len(ours), len(theirs)) > 1 else Difference(found.value, None, None)
+
+
+def bounds_of(contrast: Contrast, *values: np.ndarray) -> Interval | None:
+    """Return the least and the greatest value that a side can have; None: a side has no corridors."""
+    if contrast.measure in LEARNED:
+        return None
+    low, high = RATE if contrast.measure == "success" else reach(*values)
+    return (-high, high) if contrast.ours.less else (low, high)
+
+
+def reach(*distances_m: np.ndarray) -> Interval:
+    """Return the least and the greatest distance of an episode [m]: at most the goal line's."""
+    return 0.0, max(Scene.length_m, *(float(own.max()) for own in distances_m))
+
+
+class Row(NamedTuple):
+    """Success of both sides of a test under one of its conditions, and the difference."""
+
+    condition: Condition
+    ours: Estimate
+    theirs: Estimate
+    difference: Difference
+
+
+def by_condition(contrast: Contrast, results: Results) -> list[Row]:
+    """Return a test of two groups under each of its conditions alone."""
+    rows, other = [], contrast.theirs
+    for at in contrast.ours.at if other is not None else ():
+        theirs_at = None if other is None else other._replace(at=(at,))
+        one = contrast._replace(ours=contrast.ours._replace(at=(at,)), theirs=theirs_at)
+        ours, theirs = compared_values(one, results, {})
+        difference = _difference(one, ours, theirs)
+        if ours is not None and theirs is not None and difference is not None:
+            rows.append(Row(at, rate_estimate(ours), rate_estimate(theirs), difference))
+    return rows

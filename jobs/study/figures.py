@@ -1,0 +1,435 @@
+"""The figures of a study's page, one function for each `kind` that its file can name."""
+
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from envs.scene import make_scene
+from jobs.analysis.plots import AMBER, BLUE, GREEN, GREYS, INK, MUTED, RED, panel_grid, style_of, tidy
+from jobs.analysis.statistics import Difference
+from jobs.config.conditions import NOMINAL, axis_numbers
+from jobs.rollout.agents import BASELINES
+from jobs.study.changes import Change, content
+from jobs.study.contact_map import contact_map
+from jobs.study.contrasts import Finding
+from jobs.study.dose_figure import dose_figure
+from jobs.study.doses import Dose
+from jobs.study.results import Condition, Results, text_of
+from jobs.study.spec import Family, tags_of
+from jobs.study.spread import crossed_tables, factors
+from jobs.study.summaries import Summary
+from jobs.study.tables import scale_of
+from jobs.study.words import TITLES, condition_text
+
+COLOURS = {"above": GREEN, "below": RED, "within": BLUE, "no_gain": AMBER}  # of verdicts
+STACKED = 0.16  # rows between the dots of two trainings in a map
+
+
+class Drawn(NamedTuple):
+    """All that a figure may show.
+
+    Attributes:
+        study: Section `study` of the study's file.
+        results: What was evaluated.
+        changes: Of its conditions.
+        summaries: Of its groups.
+        families: Name -> a family and its findings.
+        doses: Event errors of its conditions, if they were measured.
+    """
+
+    study: Mapping[str, Any]
+    results: Results
+    changes: Sequence[Change]
+    summaries: Sequence[Summary]
+    families: Mapping[str, tuple[Family, Sequence[Finding]]]
+    doses: Sequence[Dose]
+
+
+def change_map(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw a map of conditions x groups: success [%], coloured by its change, a dot for each training."""
+    changes = drawn.changes
+    found = {(change.condition, change.group): change for change in changes}
+    columns = [group for group in drawn.results.groups if any(change.group == group for change in changes)]
+    rows = [at for at in drawn.results.conditions if any(change.condition == at for change in changes)]
+    figure = Figure(figsize=(3.2 + 1.15 * len(columns), 1.8 + 0.3 * len(rows)), layout="constrained")
+    panel = figure.subplots()
+    table = np.full((len(rows), len(columns)), np.nan)
+    for change in changes:
+        table[rows.index(change.condition), columns.index(change.group)] = 100 * change.difference.value
+    picture = panel.imshow(table, cmap="RdBu", vmin=-100, vmax=100, aspect="auto")
+    for row, column in np.argwhere(np.isfinite(table)):
+        _draw_cell(panel, found[rows[row], columns[column]], row, column)
+    alone = {change.group for change in changes if len(change.success) == 1}
+    names = [f"{group} (1 training)" if group in alone else group for group in columns]
+    panel.set_xticks(range(len(columns)), names, rotation=35, ha="left", fontsize=8)
+    panel.xaxis.tick_top()
+    panel.set_yticks(range(len(rows)), [condition_text(at) for at in rows], fontsize=8)
+    panel.spines[:].set_visible(False)
+    panel.tick_params(length=0)
+    bar = figure.colorbar(picture, ax=panel, shrink=0.5, pad=0.01)
+    bar.set_label("Change against the baseline [points]", fontsize=8)
+    return figure
+
+
+def _draw_cell(panel: Axes, change: Change, row: int, column: int) -> None:
+    """Draw success and, from 0 (middle) to 100 % (right), a dot for each training."""
+    colour = "white" if abs(change.difference.value) > 0.6 else INK
+    weight = "bold" if change.certain else "normal"
+    panel.text(column - 0.22, row, f"{100 * change.success.mean():.0f}", ha="center", va="center",
+               color=colour, fontsize=9, weight=weight)  # fmt: skip
+    places, count = column + 0.05 + 0.4 * change.success, len(change.success)
+    panel.plot(places, row + STACKED * (np.arange(count) - (count - 1) / 2), "o", color=colour, ms=2)
+
+
+def forest(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw each test of a family with its interval, a panel for each unit, coloured by the verdict."""
+    family, findings = drawn.families[said["family"]]
+    tested = [one for one in findings if one.difference and one.difference.interval]
+    units = list(dict.fromkeys(scale_of(one.contrast) for one in tested))
+    sizes = [sum(scale_of(one.contrast) == unit for one in tested) for unit in units]
+    figure = Figure(figsize=(9.6, 1.2 + 0.42 * sum(sizes)), layout="constrained")
+    panels = figure.subplots(len(units), 1, squeeze=False, height_ratios=sizes)[:, 0]
+    colours = {word: COLOURS[name] for name, word in family.words.items()}
+    for panel, unit in zip(panels, units, strict=True):
+        scale, own = unit[0], [one for one in tested if scale_of(one.contrast) == unit]
+        margin = scale * family.margin[own[0].contrast.measure if unit[2] == "m" else "success"]
+        panel.axvspan(-margin, margin, color=MUTED, alpha=0.12, lw=0)
+        panel.axvline(0, color=MUTED, lw=0.8)
+        for row, one in enumerate(own):
+            colour, difference = colours.get(one.verdict, MUTED), cast(Difference, one.difference)
+            panel.plot([scale * end for end in difference.interval or ()], [row, row], color=colour, lw=1.6)
+            panel.plot(scale * difference.value, row, "o", color=colour, ms=5)
+            panel.text(1.01, row, one.verdict, color=colour, va="center", fontsize=8,
+                       transform=panel.get_yaxis_transform())  # fmt: skip
+        panel.set_yticks(range(len(own)), [_label(one) for one in own])
+        panel.tick_params(axis="y", labelsize=7.5)
+        panel.set_ylim(len(own) - 0.5, -0.5)
+        panel.set_xlabel(f"Difference [{unit[2]}]; grey: too small to matter", fontsize=8)
+        tidy(panel, "x")
+    return figure
+
+
+def _label(one: Finding) -> str:
+    ours, theirs = one.contrast.ours.group, one.contrast.theirs
+    against = f" against {theirs.group}" if theirs else ""
+    return "\n".join((f"{ours}{against}:", *textwrap.wrap(one.contrast.name, 52)))
+
+
+def still_going(episodes: np.ndarray, length_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share of episodes that have not ended before a distance, as the corners of a step function.
+
+    Args:
+        episodes: EPISODE (n,), at least one.
+        length_m: Where the goal line is; episodes that reach it go on to there [m].
+
+    Returns:
+        Distances from 0 to the goal line, rising [m], and the share that gets beyond each [-].
+    """
+    ends = np.sort(np.minimum(episodes["distance_m"][~episodes["success"]], length_m))
+    beyond = 1.0 - np.arange(1, ends.size + 1) / episodes.size
+    last = beyond[-1] if ends.size else 1.0
+    return np.concatenate([[0.0], ends, [length_m]]), np.concatenate([[1.0], beyond, [last]])
+
+
+def worst_conditions(results: Results, changes: Sequence[Change]) -> dict[str, Condition]:
+    """Return group -> the condition in which it succeeds least, of groups that were evaluated unchanged."""
+    found = {}
+    for group in dict.fromkeys(change.group for change in changes):
+        if (results.nominal, group) in results.cells:
+            own = (change for change in changes if change.group == group)
+            found[group] = min(own, key=lambda one: one.success.mean()).condition
+    return found
+
+
+def survival(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw the share of episodes still going over distance, unchanged and in the worst condition."""
+    results, worst = drawn.results, worst_conditions(drawn.results, drawn.changes)
+    length_m = _scene(results).length_m
+    figure, panels = panel_grid(max(len(worst), 1), 4, (2.9, 2.2), (0.4, 0.5), sharex=True, sharey=True)
+    for panel, (group, at) in zip(panels, worst.items(), strict=bool(worst)):
+        for place, colour in ((results.nominal, BLUE), (at, RED)):
+            trainings = list(results.cells[place, group].values())
+            for one in trainings if len(trainings) > 1 else ():
+                x, share = still_going(one, length_m)
+                panel.step(x, 100 * share, where="post", color=colour, lw=0.7, alpha=0.45)
+            x, share = still_going(np.concatenate(trainings), length_m)
+            panel.step(x, 100 * share, where="post", color=colour, lw=2.0)
+        panel.set_title(group, loc="left", fontsize=9, color=INK, pad=15)
+        panel.text(0.0, 1.04, condition_text(at), transform=panel.transAxes, fontsize=7, color=RED)
+        panel.set(xlim=(0, length_m), ylim=(0, 103))
+        panel.tick_params(labelsize=8, labelbottom=True)
+        tidy(panel)
+    figure.supxlabel("Distance travelled [m]", fontsize=9)
+    figure.supylabel("Episodes still going [%]", fontsize=9)
+    return figure
+
+
+def _scene(results: Results) -> Any:
+    return make_scene(results.facts["scene"], np.random.default_rng(0))
+
+
+def numeric_axes(results: Results) -> list[str]:
+    """Return the axes along which one number alone changes."""
+    return [
+        axis
+        for axis, points in results.axes.items()
+        if axis != NOMINAL and len(points) > 1 and axis_numbers({str(at): own for at, own in points.items()})
+    ]
+
+
+def axes_map(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw success along the axes of numbers: a row for each group, in front of all others in grey."""
+    axes = {axis: [one for one in drawn.summaries if one.condition[0] == axis]
+            for axis in numeric_axes(drawn.results)}  # fmt: skip
+    there = {one.group for own in axes.values() for one in own}
+    rows = [group for group in drawn.results.groups if group in there and group not in BASELINES]
+    size = 1.75 * len(axes) + 1.5, 1.15 * len(rows) + 0.9
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(rows), len(axes), squeeze=False, sharey=True, sharex="col")
+    for column, (axis, found) in enumerate(axes.items()):
+        values = list(dict.fromkeys(one.condition[1] for one in found))
+        for row, group in enumerate(rows):
+            panel = panels[row, column]
+            for other in rows:
+                _draw_group(panel, [one for one in found if one.group == other], values, other == group)
+            panel.set_xticks(range(len(values)), [text_of(value) for value in values])
+            panel.set(ylim=(-4, 104))
+            panel.tick_params(labelsize=6.5)
+            tidy(panel, "y")
+        panels[0, column].set_title(TITLES.get(axis, axis), fontsize=7.5, color=INK)
+    for row, group in enumerate(rows):
+        panels[row, 0].set_ylabel(group.replace("_", "\n"), fontsize=7.5, color=style_of(group)[0])
+    figure.supylabel("Success [%]", fontsize=8)
+    return figure
+
+
+def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object], own: bool) -> None:
+    """Draw a group's success over the places of the values: in its colour with its interval, or in grey."""
+    x = [values.index(one.condition[1]) for one in found]
+    y = [100 * one.success.value for one in found]
+    if not own:
+        panel.plot(x, y, color=GREYS[0], lw=0.6, alpha=0.6, zorder=1)
+        return
+    colour, marker = style_of(found[0].group) if found else (INK, "o")
+    ends = np.array([100 * np.array(one.success.interval or (0.0, 1.0)) for one in found]).reshape(-1, 2)
+    panel.fill_between(x, ends[:, 0], ends[:, 1], color=colour, alpha=0.15, lw=0, zorder=2)
+    panel.plot(x, y, color=colour, marker=marker, ms=3.5, lw=1.6, zorder=3)
+
+
+def contacts(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw where episodes end in contact, seen from above."""
+    scene = _scene(drawn.results)
+    return contact_map(contact_ends(drawn.results), scene.length_m, scene.width_m / 2)
+
+
+def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return group -> EPISODE unchanged, and under all changes in the same scene, no simulation twice.
+
+    What is the same simulation depends on the group: a policy that sees no events is not changed by faults.
+    """
+    usual = results.facts["scene"]
+    here = [at for at in results.conditions if results.axes[at[0]][at[1]].get("env.scene", usual) == usual]
+    here.sort(key=lambda at: at[0] != NOMINAL)
+    found = {}
+    for group in results.groups:
+        first: dict[bytes, Condition] = {}
+        for at in here:
+            first.setdefault(content(results.trainings(at, group)), at)
+        parts: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+        for at in first.values():
+            parts[at[0] != NOMINAL].extend(results.trainings(at, group).values())
+        empty = next(iter(results.cells.values()))
+        none = next(iter(empty.values()))[:0]
+        found[group] = np.concatenate([none, *parts[0]]), np.concatenate([none, *parts[1]])
+    return found
+
+
+def doses(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw the change of success against event error; axes that end with `dashed` as dashed lines."""
+    errors = {one.condition: one.measured for one in drawn.doses}
+    met = {(one.condition, group) for one in drawn.doses for group in one.met_by}
+    ending = said.get("dashed", "")
+    behind = [
+        one._replace(condition=(one.condition[0].removesuffix(ending), one.condition[1]))
+        for one in drawn.changes
+        if ending and one.condition[0].endswith(ending)
+    ]
+    return dose_figure([one for one in drawn.changes if one.condition in errors], errors, met, behind)
+
+
+def lines(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw success along axes: a panel for each value of a tag, a line for each value of another and axis."""
+    results, tags = drawn.results, tags_of(drawn.study, drawn.results)
+    panels_of = sorted({tags[group][said["panels"]] for group in results.trained})
+    figure = Figure(figsize=(3.4 * len(panels_of), 3.4), layout="constrained")
+    panels = figure.subplots(1, len(panels_of), sharey=True, squeeze=False)[0]
+    for panel, value in zip(panels, panels_of, strict=True):
+        groups = [group for group in results.trained if tags[group][said["panels"]] == value]
+        shown = [(axis, group) for axis in said["axes"] for group in groups]
+        for place, (axis, group) in enumerate(shown):
+            points = {at[1]: results.values(at, group).mean(axis=1) for at in results.conditions
+                      if at[0] == axis and (at, group) in results.cells}  # fmt: skip
+            name = str(tags[group][said["lines"]])
+            label = name if axis == said["axes"][0] else f"{name}, by {axis}"
+            colour, marker = ((BLUE, "o"), (RED, "s"), (MUTED, "D"), (GREEN, "^"))[place % 4]
+            x = np.array([float(at) for at in sorted(points)]) * (0.96 + 0.04 * place)
+            y = 100 * np.array([points[at] for at in sorted(points)])
+            panel.plot(x, y.mean(axis=1), color=colour, lw=1.4, label=label)
+            panel.plot(x, y, marker, color=colour, ms=3.5, alpha=0.7)
+        _label_rates(panel, results, said["axes"][0], value)
+    panels[0].set(ylabel="Success [%]", ylim=(-3, 103))
+    panels[-1].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _label_rates(panel: Axes, results: Results, axis: str, trained_at: float) -> None:
+    ticks = [float(value) for value in results.axes[axis]]
+    panel.axvline(trained_at, color=MUTED, lw=0.8, ls=":")
+    panel.set_xscale("log")
+    panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    panel.xaxis.set_minor_locator(NullLocator())
+    panel.set_xlabel(TITLES.get(axis, axis))
+    panel.set_title(f"Trained at {trained_at:g}", loc="left", fontsize=10)
+    tidy(panel)
+
+
+def dots(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw both groups of a test under each condition, a small marker for each training."""
+    results, (one, *_) = drawn.results, drawn.families[said["family"]][1]
+    at, groups = one.contrast.ours.at, [one.contrast.theirs.group, one.contrast.ours.group]  # type: ignore[union-attr]
+    names = ["mean of these", *map(condition_text, at)]
+    figure = Figure(figsize=(6.4, 1.0 + 0.34 * len(names)), layout="constrained")
+    panel = figure.subplots()
+    for group, aside in zip(groups, (-0.15, 0.15), strict=True):
+        rates = np.array([100 * results.values(place, group).mean(axis=1) for place in at])
+        colour, marker = style_of(group)
+        for row, each in enumerate((rates.mean(axis=0), *rates)):
+            panel.plot(each, np.full(len(each), row + aside), marker, color=colour, ms=3.5, alpha=0.4, mew=0)
+            (mean,) = panel.plot(each.mean(), row + aside, "|", color=colour, ms=11, mew=2)
+            if not row:
+                mean.set_label(f"{group}: mean of {len(each)} trainings")
+    panel.axhline(0.5, color=MUTED, lw=0.8)
+    panel.set_yticks(range(len(names)), names)
+    panel.set(xlabel="Success [%]", xlim=(-3, 103), ylim=(len(names) - 0.4, -0.6))
+    figure.legend(frameon=False, fontsize=9, ncols=2, loc="outside upper center")
+    tidy(panel, "x")
+    return figure
+
+
+def spread(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw the mean success of every training as a map, and by what it differs under each condition."""
+    tables, names = crossed_tables(drawn.study, drawn.results), drawn.study["spread"]
+    mean = 100 * np.mean(list(tables.values()), axis=0)
+    figure = Figure(figsize=(9.6, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
+    _draw_numbers(left, mean)
+    left.set_xticks(range(len(mean)))
+    left.set_yticks(range(len(mean)))
+    left.set(xlabel=names["columns"].capitalize(), ylabel=names["rows"].capitalize())
+    left.set_title("Success [%], mean of the conditions", loc="left", fontsize=10)
+    overall, each = factors(tables)
+    rows = {"mean of these": overall, **{condition_text(at): one for at, one in each.items()}}
+    shown = {names["rows"]: (BLUE, "o"), names["columns"]: (RED, "s"), "neither": (MUTED, "D")}
+    for place, (label, (colour, marker)) in enumerate(shown.items()):
+        values = [one.spread[place] for one in rows.values()]
+        right.plot(values, np.arange(len(rows)) + 0.18 * (place - 1), marker, color=colour, ms=6, label=label)
+    right.set_yticks(range(len(rows)), list(rows))
+    right.set_ylim(len(rows) - 0.5, -0.5)
+    right.set_xlim(left=-0.5)
+    right.set_title("Standard deviation of success [points] by", loc="left", fontsize=10)
+    right.legend(frameon=False, fontsize=8)
+    tidy(right)
+    return figure
+
+
+def _draw_numbers(panel: Axes, values: np.ndarray) -> None:
+    """Draw a map of numbers from 0 to 100."""
+    panel.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+    for row, column in np.ndindex(values.shape):
+        colour = "black" if values[row, column] > 55 else "white"
+        panel.text(
+            column, row, f"{values[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=9
+        )
+
+
+def variants(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+    """Draw success by variant and condition as a map, and the tests of a family with a dot for each pair."""
+    results, (_, findings) = drawn.results, drawn.families[said["family"]]
+    groups, found = results.trained, {one.contrast.ours.group: one for one in findings}
+    values = np.array(
+        [[100 * results.values(at, group).mean() for at in results.conditions] for group in groups]
+    )
+    figure = Figure(figsize=(4.6 + 0.72 * values.shape[1], 1.6 + 0.42 * len(groups)), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
+    _draw_numbers(left, values)
+    left.set_xticks(range(values.shape[1]), map(condition_text, results.conditions), rotation=35, ha="right")
+    left.set_yticks(range(len(groups)), groups)
+    left.set_title("Success [%]", loc="left", fontsize=10)
+    right.axvline(0, color=MUTED, lw=0.8)
+    for row, group in enumerate(groups):
+        one = found.get(group)
+        if one is not None and one.difference is not None and one.difference.interval is not None:
+            right.plot([100 * end for end in one.difference.interval], [row, row], color=INK, lw=1.2)
+            right.plot(100 * one.difference.value, row, "|", color=INK, ms=12)
+            pairs = 100 * pair_differences(results, one)
+            right.plot(pairs, [row] * len(pairs), "o", color=BLUE, ms=4, alpha=0.8)
+    right.set_title("Difference of the mean [points]", loc="left", fontsize=10)
+    tidy(right, "x")
+    return figure
+
+
+def pair_differences(results: Results, one: Finding) -> np.ndarray:
+    """Return the difference of each pair of trainings of one seed, (n,)."""
+    ours, theirs = one.contrast.ours.group, one.contrast.theirs.group  # type: ignore[union-attr]
+    seeds = [seed for seed in results.groups[ours] if seed in results.groups[theirs]]
+    rates = [np.mean([[results.cells[at, group][seed]["success"].mean() for seed in seeds]
+                      for at in one.contrast.ours.at], axis=0) for group in (ours, theirs)]  # fmt: skip
+    difference: np.ndarray = rates[0] - rates[1]
+    return difference
+
+
+KINDS: dict[str, Callable[[Drawn, Mapping[str, Any]], Figure]] = {
+    "map": change_map,
+    "forest": forest,
+    "survival": survival,
+    "axes": axes_map,
+    "contacts": contacts,
+    "doses": doses,
+    "lines": lines,
+    "dots": dots,
+    "spread": spread,
+    "variants": variants,
+}
+CAPTIONS = {
+    "map": "Success [%] of each group under each condition. Colour: the change against the baseline "
+    "of the condition, by the same trainings in the same corridors. Bold: certain for other "
+    "trainings. Dots: each training, from 0 (middle of the cell) to 100 % (right). Empty: the"
+    " change cannot affect that policy.",
+    "forest": "Difference of each test. A line is a test: the dot is the difference, the line its 95 % "
+    "interval, of this test alone. Within the grey band a difference is too small to matter.",
+    "survival": "Share of episodes that have not ended before a distance [%]; a thin line for each "
+    "training, a thick one for all. Blue: nothing changed. Red: the condition in which the "
+    "group succeeds least, named above.",
+    "axes": "Success along every axis of numbers. Coloured: the mean of the row's own group with its "
+    "95 % interval; grey: the other trained groups. Values stand at equal distances.",
+    "contacts": "Where episodes end in contact, all corridors laid over each other: large dots with "
+    "nothing changed, small ones under all changes in the same scene.",
+    "doses": "Change of success against the measured event error, with 95 % intervals that are not "
+    "adjusted. Kinds stand a little aside of their errors. Hollow: a training of the group "
+    "met as much of that kind.",
+    "lines": "Success against control rate. A marker is one training, set a little aside of its value;"
+    " a line is the mean. Dotted: the value at which they were trained.",
+    "dots": "Success of every training under each condition. A small marker is one training, a stroke"
+    " the mean of its group.",
+    "spread": "Mean success of every training, and by what success differs. Left: a cell is one "
+    "training, its mean success under all conditions. Right: the standard deviations of the "
+    "table.",
+    "variants": "Success of each variant, and the difference of the means. Left: success [%], mean of the"
+    " trainings. Right: difference of the mean over the conditions; a dot for each pair of "
+    "trainings of one seed, a tick for their mean, a bar for its 95 % interval.",
+}

@@ -1,0 +1,48 @@
+"""How well the trainings of a study did while they learned, from the learning curves beside its policies."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from jobs.run.provenance import REPOSITORY
+from jobs.study.contrasts import Learned
+from jobs.tools.curves import published_trainings
+
+VARIANT = "VARIANT"  # stands for a group in the place of its published policies
+
+
+def published_place(study: Mapping[str, Any], group: str) -> Path | None:
+    """Return where the published policies of a group are, but for "-s0" and so on; None: nowhere.
+
+    Args:
+        study: Section `study` of its file.
+        group: One of its groups.
+    """
+    own = (study.get("variants") or {}).get(group) or {}
+    named = own.get("published", study.get("published"))
+    if named is None:
+        return None
+    place = Path(str(named).replace(VARIANT, group))
+    return place if place.parent.is_dir() else REPOSITORY / place
+
+
+def learned(study: Mapping[str, Any], groups: Iterable[str]) -> Learned:
+    """Return measure -> group -> mean success of each published training over the compared steps.
+
+    Args:
+        study: Section `study` of its file.
+        groups: Of its results.
+    """
+    places = {group: published_place(study, group) for group in groups}
+    curves = {
+        folder: published_trainings(folder)
+        for folder in {place.parent for place in places.values() if place is not None}
+    }
+    found: dict[str, dict[str, list[float]]] = {"learned": {}, "learned_uncharged": {}}
+    for group, place in places.items():
+        for one in curves[place.parent] if place is not None else ():
+            for measure, value in (("learned", one.mean_success_with_encoder),
+                                   ("learned_uncharged", one.mean_success)):  # fmt: skip
+                if one.group == place.name and value is not None:  # type: ignore[union-attr]
+                    found[measure].setdefault(group, []).append(value)
+    return found

@@ -1,0 +1,306 @@
+"""What stands on the pages of a study: parts between marks, filled from its data alone.
+
+A page is written by hand but for its marks. `<!-- study NAME PART -->` begins a part, `<!-- end of study -->`
+ends it; what is between them is replaced. `results` is the usual choice of all parts, `provenance` says what
+made them. NAME:DATA takes the file of one study and the data of another.
+"""
+
+import functools
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.analysis.tables import markdown_table
+from jobs.config.conditions import NOMINAL
+from jobs.study import tables
+from jobs.study.changes import Change, changes_of, content, replicated
+from jobs.study.contrasts import Finding, by_condition, judge
+from jobs.study.doses import Dose, read_doses
+from jobs.study.figures import CAPTIONS, KINDS, Drawn
+from jobs.study.learned import learned
+from jobs.study.results import Condition, Results, place, read_published, value_of
+from jobs.study.spec import Family, families_of, read_study
+from jobs.study.spread import crossed_tables, factors
+from jobs.study.summaries import MET, Summary, success_lines, summaries_of
+from jobs.study.words import condition_text
+
+MARK = re.compile(r"(<!-- study ([\w:]+) ([\w:]+) -->\n).*?(<!-- end of study -->\n)", re.DOTALL)
+NEW_PAGE = "# {name}\n\n{results}\n{provenance}"
+EMPTY = "<!-- study {name} {part} -->\n<!-- end of study -->\n"
+FOUND_MET = f"{MET} The condition lies within what the group was trained on."
+
+
+class Study(NamedTuple):
+    """A study and all that is computed of its results.
+
+    Attributes:
+        name: Of its data.
+        said: Section `study` of its file.
+        results: What was evaluated.
+        changes: Of its conditions.
+        summaries: Of its groups.
+        families: Name -> a family and its findings.
+        doses: Event errors of its conditions, if they were measured.
+        beside: Study -> `tables.key_of` a test -> its verdict there.
+    """
+
+    name: str
+    said: Mapping[str, Any]
+    results: Results
+    changes: list[Change]
+    summaries: list[Summary]
+    families: Mapping[str, tuple[Family, list[Finding]]]
+    doses: list[Dose]
+    beside: Mapping[str, Mapping[tuple[str, ...], str]]
+
+
+def judge_all(said: Mapping[str, Any], results: Results) -> dict[str, tuple[Family, list[Finding]]]:
+    """Return name -> each family of a study and its findings."""
+    rates = learned(said, results.groups)
+    found = {family.name: (family, judge(family, results, rates)) for family in families_of(said, results)}
+    return {name: (family, [one for one in own if one.difference is not None])
+            for name, (family, own) in found.items()}  # fmt: skip
+
+
+def compute(
+    name: str, said: Mapping[str, Any], results: Results, doses: list[Dose], data: Path | None
+) -> Study:
+    """Compute all that the pages of a study show.
+
+    Args:
+        name: Of its data.
+        said: Section `study` of its file.
+        results: What was evaluated.
+        doses: Event errors of its conditions, if they were measured.
+        data: Where other published studies are; None: none is shown beside.
+    """
+    families = judge_all(said, results)
+    named = {other for family, _ in families.values() for other in family.beside.values()}
+    there = [other for other in named if data and (data / f"{other}_about.json").is_file()]
+    beside = {other: _verdicts(data, other) for other in there if data}
+    every = bool(said.get("doses"))  # a plan that was written before names all of its conditions
+    return Study(
+        name, said, results, changes_of(results, every), summaries_of(results), families, doses, beside
+    )
+
+
+@functools.cache
+def published(data: Path, name: str, spec: str) -> Study:
+    """Compute a published study by the file of `spec`."""
+    said = read_study(spec)
+    return compute(name, said, read_published(data, name), read_doses(data / f"{name}_doses.csv"), data)
+
+
+@functools.cache
+def _verdicts(data: Path, name: str) -> dict[tuple[str, ...], str]:
+    found = judge_all(read_study(name), read_published(data, name))
+    return {tables.key_of(family, one.contrast): one.verdict for family, own in found.values() for one in own}
+
+
+def figures(study: Study) -> dict[str, Figure]:
+    """Return name -> each figure of a study; of other data than the file's own the name is the data's."""
+    drawn = Drawn(study.said, study.results, study.changes, study.summaries, study.families, study.doses)
+    return {name: KINDS[said["kind"]](drawn, said) for name, said in _figures(study).items()}
+
+
+def _figures(study: Study) -> dict[str, Mapping[str, Any]]:
+    return dict(study.said.get("figures") or {})
+
+
+def part(study: Study, name: str) -> str:
+    """Return a part of a study's pages as Markdown.
+
+    Raises:
+        KeyError: There is no such part.
+    """
+    kind, _, own = name.partition(":")
+    return PARTS[kind](study, own).strip("\n")
+
+
+def fill(text: str, find: Callable[[str, str], str]) -> str:
+    """Return the text of a page with its parts filled.
+
+    Args:
+        text: Of the page.
+        find: Name of a study, as the mark has it, and part -> Markdown.
+    """
+    return MARK.sub(lambda found: f"{found[1]}\n{find(found[2], found[3])}\n\n{found[4]}", text)
+
+
+def marked(texts: Iterable[str]) -> list[str]:
+    """Return the names of the studies that pages have marks of."""
+    return list(dict.fromkeys(found[2] for text in texts for found in MARK.finditer(text)))
+
+
+def new_page(name: str) -> str:
+    """Return a page with marks for all of a study."""
+    parts = {part: EMPTY.format(name=name, part=part) for part in ("results", "provenance")}
+    return NEW_PAGE.format(name=name, **parts)
+
+
+def _results(study: Study, _: str) -> str:
+    blocks = [_summary(study, ""), *(_figure(study, name) for name in _figures(study))]
+    blocks += [_family(study, name, heading=True) for name in study.families]
+    if "spread" in study.said:
+        blocks.append(f"### By {study.said['spread']['rows']} and by {study.said['spread']['columns']}\n\n"
+                      f"{_spread(study, '')}")  # fmt: skip
+    if study.doses:
+        blocks += [f"### Every change\n\n{_changes(study, '')}",
+                   f"### Which trainings lose\n\n{tables.broken_table(study.changes)}"]  # fmt: skip
+    blocks.append(f"### Success under each condition\n\n{_success(study, '')}")
+    return "\n\n".join(block.strip("\n") for block in blocks if block)
+
+
+def _summary(study: Study, _: str) -> str:
+    results = study.results
+    said = [tables.lead_sentence(results, own) if name == "lead" else tables.family_sentence(family, own)
+            for name, (family, own) in study.families.items()]  # fmt: skip
+    if "spread" in study.said:
+        overall, _each, names, mean = _crossed(study)
+        said.append(tables.spread_sentence(overall, names, mean))
+    if not study.said.get("variants"):
+        said.append(tables.worst_sentence(results, study.changes))
+    return "\n".join(f"- {one}" for one in said if one)
+
+
+def _figure(study: Study, name: str) -> str:
+    caption = CAPTIONS[_figures(study)[name]["kind"]]
+    return f"![{caption.split('.')[0]}](images/{name}.png)\n\n{caption}"
+
+
+def _family(study: Study, name: str, heading: bool = False) -> str:
+    family, findings = study.families[name]
+    beside = {head: study.beside.get(other, {}) for head, other in family.beside.items()}
+    blocks = [f"### {family.title}"] if heading else []
+    if len(findings) == 1 and findings[0].contrast.theirs is not None:
+        (one,) = findings
+        rows = by_condition(one.contrast, study.results)
+        blocks.append(tables.condition_table(rows, one.contrast, one, study.results))
+        blocks.append(
+            "Means with 95 % intervals over trainings and corridors, each alone. The first line is the test."
+        )
+    elif name != "lead":
+        blocks += [tables.family_note(family, findings), tables.family_table(family, findings, beside)]
+    else:
+        blocks.append(tables.family_table(family, findings, {}))
+    return "\n\n".join(block.strip("\n") for block in blocks)
+
+
+def _crossed(study: Study) -> tuple[Any, Any, tuple[str, str], np.ndarray]:
+    crossed, names = crossed_tables(study.said, study.results), study.said["spread"]
+    overall, each = factors(crossed)
+    return overall, each, (names["rows"], names["columns"]), np.mean(list(crossed.values()), axis=0)
+
+
+def _spread(study: Study, _: str) -> str:
+    overall, each, names, _mean = _crossed(study)
+    note = "The tests of the mean are one family, the tests of the single conditions another."
+    return f"{note}\n\n{tables.spread_table(overall, each, names)}"
+
+
+def _success(study: Study, _: str) -> str:
+    results = study.results
+    shown = [at for at in results.conditions if not _is_repeated(results, at)]
+    head, lines = success_lines(study.summaries, results, shown)
+    met = f" {FOUND_MET}" if results.met else ""
+    note = f"Success [%] with 95 % intervals over trainings; of a single training over corridors.{met}"
+    return f"{note}\n\n{markdown_table(head, lines, 2)}"
+
+
+def _is_repeated(results: Results, at: Condition) -> bool:
+    """Whether a condition has the episodes of an earlier one that is the same simulation."""
+    first = results.same_as[at]
+    groups = results.groups
+    return first != at and all(
+        content(results.trainings(at, group)) == content(results.trainings(first, group)) for group in groups
+    )
+
+
+def _changes(study: Study, _: str) -> str:
+    tests = len(replicated(study.changes))
+    note = (
+        "Change of success [points] against no error, with 95 % intervals. Bold: certain among all "
+        f"{tests} changes (Benjamini and Hochberg). {MET} A training of the group met as much of that kind."
+    )
+    return f"{note}\n\n{tables.change_table(study.changes, study.doses)}"
+
+
+def _losses(study: Study, _: str) -> str:
+    tests = len(replicated(study.changes))
+    note = (
+        f'"2 of 3": so many of these trainings certainly lose, by McNemar\'s exact test over the corridors; '
+        f"all such tests are one family (Benjamini and Hochberg). The interval is over trainings; **bold**: "
+        f"certain for other trainings, among all {tests} such tests."
+    )
+    return f"{note}\n\n{tables.losses_table(study.results, study.changes)}"
+
+
+def _headline(study: Study, _: str) -> str:
+    """Return success [%] of each group under the conditions that the file names, best mean first."""
+    results, asked = study.results, study.said["headline"]
+    shown: list[Condition] = [
+        (axis, value_of(str(value))) for axis, values in asked.items() for value in values
+    ]
+    lines: list[tuple[float, tuple[str, ...]]] = []
+    for group, seeds in results.groups.items():
+        rates = {at: float(results.values(at, group).mean()) for at in shown if (at, group) in results.cells}
+        cells = [f"{100 * rates[at]:.0f}{MET if (at, group) in results.met else ''}" if at in rates else "-"
+                 for at in shown]  # fmt: skip
+        count = "" if None in seeds else f" ({len(seeds)})"
+        lines.append((float(np.mean(list(rates.values()) or [0.0])), (f"`{group}`{count}", *cells)))
+    lines.sort(key=lambda line: -line[0])
+    head = ("policy (trainings)", *map(condition_text, shown))
+    return markdown_table(head, [cells for _, cells in lines], 1)
+
+
+def _provenance(study: Study, _: str) -> str:
+    """Return what made the results; a simulation that several conditions share is counted once."""
+    facts, results, name = study.results.facts, study.results, study.name
+    groups = ", ".join(f"`{group}` ({len(seeds)})" for group, seeds in results.groups.items())
+    different = {(group, content(trainings)): trainings for (_, group), trainings in results.cells.items()}
+    count = sum(len(own) for trainings in different.values() for own in trainings.values())
+    files = ", ".join(
+        f"[`_{one}`](data/{name}_{one})" for one in ("trainings.csv", "estimates.csv", "changes.csv")
+    )
+    return " ".join(filter(None, (
+        f"Made on {facts['date']} by `{facts['command']}`, then `python -m platform.launch +exp=report`; run "
+        f"`{facts['run']}`, evaluated at commit {', '.join(commit[:7] for commit in facts['evaluated_at'])}.",
+        f"Groups (trainings): {groups}; {facts['trials']} corridors, {count:,} episodes, "
+        f"actions {facts['action']}.",
+        _coarse(results),
+        f"Data: [`data/{name}_episodes.csv.gz`](data/{name}_episodes.csv.gz), {files}.",
+    )))  # fmt: skip
+
+
+def _coarse(results: Results) -> str:
+    """Return which conditions were simulated more coarsely than the rest; "" if none was."""
+    found = results.facts.get("exactness", ())
+    finest = min((one["asked"] for one in found), default=0.0)
+    errors = [f"{condition_text(place(one['condition']))} {100 * one['event_error']:.1f} %"
+              for one in found if one["asked"] > finest]  # fmt: skip
+    usual = [one["event_error"] for one in found if one["condition"][0] == NOMINAL]
+    beside = f"; with nothing changed {100 * usual[0]:.1f} %" if usual else ""
+    return (
+        f"Event error of conditions that were simulated more coarsely: {', '.join(errors)}{beside}."
+        if errors
+        else ""
+    )
+
+
+PARTS: dict[str, Callable[[Study, str], str]] = {
+    "results": _results,
+    "summary": _summary,
+    "figure": _figure,
+    "family": _family,
+    "spread": _spread,
+    "success": _success,
+    "changes": _changes,
+    "losses": _losses,
+    "headline": _headline,
+    "errors": lambda study, _: tables.errors_table(study.results),
+    "provenance": _provenance,
+}

@@ -1,0 +1,184 @@
+"""Plan a study: every policy under every condition, each pair as one task."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pydantic
+
+from envs.config import EnvConfig, settings_hash
+from jobs.config.conditions import NOMINAL, axis_points, moving_settings
+from jobs.config.config import Config, ConfigError
+from jobs.config.env_keys import env_with
+from jobs.rollout.policies import Differences, EvaluatedPolicy, own_sensor_differences, with_sensor
+from jobs.rollout.tasks import EvaluationTask, make_task, text_of
+from jobs.study.met import met
+from jobs.study.results import Condition, Value
+
+Axes = Mapping[str, Mapping[Value, Mapping[str, Any]]]  # axis -> value -> settings that it changes
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that a study evaluates.
+
+    Attributes:
+        policies: Groups together, in the order in which they were named.
+        differences: Agent -> where its own sensor, with which it is evaluated, is not the configured one.
+        axes: The first axis is `NOMINAL`.
+        tasks: One for each policy and condition; two may share a key.
+        met: Condition and group of those that lie within what a training of the group drew.
+        baselines: Condition -> the condition it is compared with, see `baselines_of`.
+        own_baselines: Group -> the same for its own sensor and control rate, where they differ.
+        same_as: Condition -> the first one that is the same simulation for every policy.
+    """
+
+    policies: tuple[EvaluatedPolicy, ...]
+    differences: dict[str, Differences]
+    axes: Axes
+    tasks: tuple[EvaluationTask, ...]
+    met: frozenset[tuple[Condition, str]] = frozenset()
+    baselines: Mapping[Condition, Condition] = field(default_factory=dict)
+    own_baselines: Mapping[str, Mapping[Condition, Condition]] = field(default_factory=dict)
+    same_as: Mapping[Condition, Condition] = field(default_factory=dict)
+
+    @property
+    def identity(self) -> str:
+        """Return the hash of all that decides its metrics; frozen, so that earlier studies continue."""
+        facts = [[*map(text_of, task.condition), task.key, *task.seeds] for task in self.tasks]
+        return settings_hash({"cells": facts})
+
+    @property
+    def groups(self) -> dict[str, list[int | None]]:
+        """Return group -> its training seeds."""
+        found: dict[str, list[int | None]] = {}
+        for policy in self.policies:
+            found.setdefault(policy.group, []).append(policy.training)
+        return found
+
+    @property
+    def conditions(self) -> list[Condition]:
+        """Return axis and value of each condition."""
+        return conditions_of(self.axes)
+
+
+def plan_study(config: Config, policies: Sequence[EvaluatedPolicy]) -> Plan:
+    """Plan the tasks of a study: a policy keeps its own sensor, and each condition changes settings of that.
+
+    Raises:
+        ConfigError: A policy's own sensor and a changed setting exclude each other.
+    """
+    study = config.own
+    configured = dataclasses.replace(config.env, scene=study.scene, split=study.split)
+    axes = axes_of(study.scene, study.axes)
+    tasks = [
+        make_task(
+            (axis, value),
+            policy,
+            config.evaluate.action,
+            _changed_env(policy, with_sensor(configured, policy.sensor), axis, changes),
+            study.trials,
+        )
+        for policy in policies
+        for axis, points in axes.items()
+        for value, changes in points.items()
+    ]
+    differences = {policy.agent: own_sensor_differences(policy, configured) for policy in policies}
+    usual = baselines_of(configured, axes)
+    # Of each group that of its first training.
+    envs = {policy.group: with_sensor(configured, policy.sensor) for policy in reversed(policies)}
+    baselines = {group: baselines_of(env, axes) for group, env in envs.items()}
+    return Plan(
+        tuple(policies),
+        {agent: found for agent, found in differences.items() if found},
+        axes,
+        tuple(tasks),
+        _met(tasks),
+        baselines=usual,
+        own_baselines={group: found for group, found in baselines.items() if found != usual},
+        same_as=same_for_all([same_simulations(env, axes) for env in (configured, *envs.values())]),
+    )
+
+
+def axes_of(scene: str, axes: Mapping[str, Mapping[str, Sequence[Any]]]) -> dict[str, dict[Value, Any]]:
+    """Return the axes of a study; the first is `NOMINAL`, in the scene of the study."""
+    found: dict[str, dict[Value, Any]] = {NOMINAL: {scene: {}}}
+    for name, axis in axes.items():
+        points = axis_points(axis)
+        found[name] = {_value(next(iter(point.values()))): point for point in points}
+    return found
+
+
+def _value(value: object) -> Value:
+    return value if isinstance(value, int | float) else text_of(value)
+
+
+def conditions_of(axes: Axes) -> list[Condition]:
+    """Return axis and value of each condition."""
+    return [(axis, value) for axis, points in axes.items() for value in points]
+
+
+def _envs(configured: EnvConfig, axes: Axes) -> dict[Condition, EnvConfig]:
+    """Return condition -> its simulation."""
+    return {
+        (axis, value): env_with(configured, dict(axes[axis][value])) for axis, value in conditions_of(axes)
+    }
+
+
+def same_simulations(configured: EnvConfig, axes: Axes) -> dict[Condition, Condition]:
+    """Return condition -> the first condition that is the same simulation, often itself."""
+    envs = _envs(configured, axes)
+    return {at: next(first for first, other in envs.items() if other == env) for at, env in envs.items()}
+
+
+def same_for_all(found: Sequence[Mapping[Condition, Condition]]) -> dict[Condition, Condition]:
+    """Return condition -> the first one that is the same simulation in each of several `same_simulations`."""
+    first: dict[tuple[Condition, ...], Condition] = {}
+    return {at: first.setdefault(tuple(same[at] for same in found), at) for at in found[0]}
+
+
+def baselines_of(configured: EnvConfig, axes: Axes) -> dict[Condition, Condition]:
+    """Return condition -> the condition it is compared with, to see what the axis itself changes.
+
+    The baseline changes only those settings that stay the same along the axis: for rates in a dense scene,
+    the same scene at the usual rate. If the study has no such condition, the baseline changes nothing.
+    """
+    envs = _envs(configured, axes)
+    nominal = next(iter(envs))
+    found = {}
+    for axis, points in axes.items():
+        by_text = {text_of(value): changes for value, changes in points.items()}
+        moving = moving_settings(by_text) if len(points) > 1 else list(next(iter(points.values())))
+        for value, changes in points.items():
+            kept = {key: setting for key, setting in changes.items() if key not in moving}
+            env = env_with(configured, kept)
+            found[axis, value] = next((at for at, other in envs.items() if other == env), nominal)
+    return found
+
+
+def _met(tasks: Sequence[EvaluationTask]) -> frozenset[tuple[Condition, str]]:
+    nominal = {task.policy.name: task.env for task in tasks if task.condition[0] == NOMINAL}
+    return frozenset(
+        (task.condition, task.policy.group)
+        for task in tasks
+        if was_met(task.policy, nominal[task.policy.name], task.env)
+    )
+
+
+def was_met(policy: EvaluatedPolicy, nominal: EnvConfig, env: EnvConfig) -> bool:
+    """Whether a condition lies within what a policy's training drew; always False for baselines."""
+    if not policy.conditions:
+        return False
+    trained = with_sensor(EnvConfig(**policy.world), policy.sensor)
+    return met(policy.conditions, trained, nominal, env)
+
+
+def _changed_env(policy: EvaluatedPolicy, own: EnvConfig, axis: str, changes: Mapping[str, Any]) -> EnvConfig:
+    try:
+        return env_with(own, dict(changes))
+    except pydantic.ValidationError as error:
+        reason = error.errors()[0]["msg"]
+        raise ConfigError(
+            f"study.axes.{axis}: {dict(changes)} with the sensor of {policy.agent!r}: {reason}"
+        ) from None

@@ -1,0 +1,196 @@
+"""Copy finished studies, trades and replay pages into docs/ of this folder.
+
+Run: python -m platform.launch +exp=report
+Expect: seconds. Of the newest run of each study that a page in docs has marks of, or of the run folder
+`resume`: its data into docs/data, its figures into docs/images, and the parts between its marks on all pages;
+a study without a page gets docs/NAME.md. Of the newest trade docs/trade.md with its plot, of the newest
+replay page docs/replay.html.
+"""
+
+import dataclasses
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from PIL import Image
+
+from core.files import replaced
+from jobs.analysis.tables import save_plot
+from jobs.config.config import Config, ConfigError
+from jobs.run.files import RunError, read_json, write_atomic
+from jobs.run.progress import console
+from jobs.study.doses import measure_doses, read_doses, write_doses
+from jobs.study.page import Study, compute, figures, fill, marked, new_page, part, published
+from jobs.study.results import FOLDERS, check_whole, publish, read_results
+from jobs.study.spec import read_study
+from jobs.study.tables import write_changes, write_estimates
+from jobs.tools.replay_page import PAGE
+
+DOCS = Path("docs")
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Write the newest studies, trade and replay page, or those in the run folder `resume`, into docs/.
+
+    Raises:
+        ConfigError: There is none, or a study is not complete.
+    """
+    written = [*_copied(config)]
+    pages = marked(path.read_text() for path in sorted(DOCS.glob("*.md")))
+    named = {name.partition(":")[2] or name for name in pages}
+    for name, folder in newest_studies(config).items():
+        if config.resume is not None or name in named:
+            written.append(write_study(name, folder, config, DOCS))
+    if not written:
+        where = config.resume or config.runs_dir
+        commands = " or ".join(f"python -m platform.launch +exp={exp}" for exp in ("robustness", "trade"))
+        raise ConfigError(f"resume: no finished study or trade in {where!r}: run {commands}")
+    for page in written:
+        console.print(f"Written: {page}", markup=False)
+    return {}
+
+
+def _runs(config: Config) -> list[Path]:
+    return list(Path(config.runs_dir).glob("*")) if config.resume is None else [Path(config.resume)]
+
+
+def _newest(found: Collection[Path]) -> Path | None:
+    return max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
+
+
+def newest_studies(config: Config) -> dict[str, Path]:
+    """Return name -> the folder of its newest finished run; of `resume` what it holds."""
+    found: dict[str, list[Path]] = {}
+    for run_ in _runs(config):
+        for file in (run_ / folder / "about.json" for folder in FOLDERS):
+            if file.is_file():
+                found.setdefault(str(read_json(file).get("exp", "robustness")), []).append(file)
+    newest = {name: _newest(files) for name, files in found.items()}
+    return {name: file.parent for name, file in newest.items() if file is not None}
+
+
+def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
+    """Publish a study: its data, its figures and the parts of all pages.
+
+    Args:
+        name: Of the study, whose file is conf/exp/NAME.yaml.
+        folder: What it has left in its run folder.
+        config: The experiment; event errors are measured in its simulation.
+        docs: Where pages are, data and figures below.
+
+    Returns:
+        The first page that shows it.
+
+    Raises:
+        ConfigError: It is not complete, or of an earlier version.
+        RunError: A file of it is damaged.
+    """
+    said, results = read_study(name), read_results(folder)
+    check_whole(results)
+    data, doses = docs / "data", []
+    if said.get("doses"):
+        env = dataclasses.replace(config.env, scene=results.facts["scene"], split="eval")
+        doses = measure_doses(said, results, env)
+    study = compute(name, said, results, doses, data)
+    drawn = figures(study)  # before anything is replaced: data, figures and pages must stay in step
+    publish(folder, data, name, results)
+    if doses:
+        write_doses(data / f"{name}_doses.csv", doses)
+        study = study._replace(doses=read_doses(data / f"{name}_doses.csv"))
+    write_values(data, study)
+    write_figures(docs / "images", drawn)
+    pages = {page: page.read_text() for page in sorted(docs.glob("*.md"))}
+    shown = [page for page, text in pages.items() if name in marked([text])]
+    if not shown:
+        shown = [docs / f"{name}.md"]
+        pages[shown[0]] = new_page(name)
+    for page in shown:
+        write_atomic(page, fill(pages[page], lambda at, what: _part(study, at, what, data)))
+    return shown[0]
+
+
+def _part(study: Study, mark: str, what: str, data: Path) -> str:
+    """Return a part of a page: of this study, or of another that is published."""
+    if mark == study.name:
+        return part(study, what)
+    spec, _, own = mark.partition(":")
+    return part(published(data, own or spec, spec), what)
+
+
+def filled_pages(docs: Path) -> dict[str, str]:
+    """Return name -> each page that shows a published study, filled from the data alone."""
+    texts = {page: page.read_text() for page in sorted(docs.glob("*.md"))}
+    return {
+        page.name: fill(text, lambda mark, what: part(study_of(docs / "data", mark), what))
+        for page, text in texts.items()
+        if marked([text])
+    }
+
+
+def study_of(data: Path, mark: str) -> Study:
+    """Return the published study of a mark, NAME or NAME:DATA."""
+    spec, _, own = mark.partition(":")
+    return published(data, own or spec, spec)
+
+
+def write_values(folder: Path, study: Study) -> None:
+    """Write every estimate and every change of a study as CSV."""
+    write_estimates(folder / f"{study.name}_estimates.csv", study.summaries)
+    write_changes(folder / f"{study.name}_changes.csv", study.changes)
+
+
+def write_figures(images: Path, drawn: Mapping[str, Figure]) -> None:
+    """Save figures by their names, packed."""
+    images.mkdir(parents=True, exist_ok=True)
+    for name, figure in drawn.items():
+        picture = images / f"{name}.png"
+        save_plot(picture, figure)
+        copy_plot(picture, picture)
+
+
+def copy_plot(picture: Path, target: Path) -> None:
+    """Copy a plot, packed as small as it can be without changing a colour.
+
+    Raises:
+        RunError: The plot is damaged.
+    """
+    try:
+        with Image.open(picture) as whole:
+            colours = whole.convert("RGB")
+    except (OSError, SyntaxError, ValueError) as error:
+        raise RunError(f"{picture}: damaged ({error}); run the command that drew it again") from None
+    with replaced(target) as part_:
+        colours.save(part_, "png", optimize=True)
+
+
+def _copied(config: Config) -> Iterable[Path]:
+    """Copy the newest trade and the newest replay page; yield what was written."""
+    trade = _newest([file for one in _runs(config) if (file := one / "trade" / "about.json").is_file()])
+    if trade is not None:
+        yield write_trade(trade.parent, DOCS)
+    replay = _newest([file for one in _runs(config) if (file := one / "replay" / "about.json").is_file()])
+    if replay is not None:
+        yield write_replay(replay.parent, DOCS)
+
+
+def write_trade(trade: Path, docs: Path) -> Path:
+    """Copy the page of a trade, its plot and its settings; return the page.
+
+    Args:
+        trade: The folder that the job has left in its run folder.
+        docs: Where trade.md goes, its plot into `images`, its settings into `data`.
+    """
+    (docs / "images").mkdir(parents=True, exist_ok=True)
+    copy_plot(trade / "images" / "trade.png", docs / "images" / "trade.png")
+    if (trade / "settings.csv").is_file():  # trades of earlier versions have none
+        (docs / "data").mkdir(exist_ok=True)
+        write_atomic(docs / "data" / "trade_settings.csv", (trade / "settings.csv").read_text())
+    write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
+    return docs / "trade.md"
+
+
+def write_replay(replay: Path, docs: Path) -> Path:
+    """Copy a replay page from the folder that the job has left in its run folder; return the file."""
+    write_atomic(docs / PAGE, (replay / PAGE).read_bytes())
+    return docs / PAGE

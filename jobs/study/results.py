@@ -1,0 +1,211 @@
+"""Results of a study: what made it, and its episodes by condition, group and training."""
+
+import gzip
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jobs.analysis.tables import write_csv
+from jobs.config.conditions import NOMINAL
+from jobs.config.errors import ConfigError
+from jobs.rollout.episodes import EPISODE
+from jobs.rollout.table import LABELS, read_table
+from jobs.rollout.tasks import text_of
+from jobs.run.checkpoints import sha256
+from jobs.run.files import RunError, read_json, write_atomic, write_json
+
+Value = float | str
+Condition = tuple[str, Value]  # an axis, and its value as a number or a word
+Trainings = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the same corridors
+Cells = Mapping[tuple[Condition, str], Trainings]  # by condition and group
+FOLDERS = ("study", "sweep", "ablation")  # in a run folder; the last two are of earlier versions
+RATE = (0.0, 1.0)  # bounds of a rate
+
+
+@dataclass(frozen=True)
+class Results:
+    """All that was found.
+
+    Attributes:
+        facts: What made it, as its about.json says (`jobs.study.record.facts`).
+        cells: The episodes.
+    """
+
+    facts: Mapping[str, Any]
+    cells: Cells
+
+    @cached_property
+    def axes(self) -> dict[str, dict[Value, Mapping[str, Any]]]:
+        """Return axis -> value -> the settings that it changes; the first axis changes nothing."""
+        return {
+            axis: {value_of(text): changes for text, changes in points.items()}
+            for axis, points in self.facts["axes"].items()
+        }
+
+    @cached_property
+    def conditions(self) -> list[Condition]:
+        """Return all conditions, in their order."""
+        return [(axis, value) for axis, points in self.axes.items() for value in points]
+
+    @property
+    def nominal(self) -> Condition:
+        """Return the condition that changes nothing."""
+        return next(at for at in self.conditions if at[0] == NOMINAL)
+
+    @property
+    def groups(self) -> dict[str, list[int | None]]:
+        """Return group -> its training seeds."""
+        return dict(self.facts["groups"])
+
+    @property
+    def trained(self) -> list[str]:
+        """Return the groups that are no baselines."""
+        return [group for group, seeds in self.groups.items() if None not in seeds]
+
+    @cached_property
+    def same_as(self) -> dict[Condition, Condition]:
+        """Return condition -> the first one that is the same simulation for every group."""
+        return {place(one["condition"]): place(one["same_as"]) for one in self._compared}
+
+    def baselines(self, group: str | None = None) -> dict[Condition, Condition]:
+        """Return condition -> what a group is compared with there; None: what most are."""
+        return {
+            place(one["condition"]): place(one.get("own_baseline", {}).get(group or "", one["baseline"]))
+            for one in self._compared
+        }
+
+    @property
+    def met(self) -> set[tuple[Condition, str]]:
+        """Return the conditions that lie within what a group was trained on, with the group."""
+        return {(place((axis, value)), group) for axis, value, group in self.facts.get("met", ())}
+
+    def trainings(self, at: Condition, group: str) -> Trainings:
+        """Return training seed -> its episodes; empty where nothing was evaluated."""
+        return self.cells.get((at, group), {})
+
+    def values(self, at: Condition, group: str, measure: str = "success") -> np.ndarray:
+        """Return a measure of all trainings of a group under a condition, float64 (trainings, corridors)."""
+        return values_of(self.cells[at, group], measure)
+
+    @property
+    def _compared(self) -> Sequence[Mapping[str, Any]]:
+        usual = [NOMINAL, text_of(self.nominal[1])]
+        own = [[axis, text] for axis, points in self.facts["axes"].items() for text in points]
+        alone = [{"condition": at, "baseline": usual, "same_as": at} for at in own]
+        return list(self.facts.get("compared", alone))
+
+
+def place(names: Sequence[str]) -> Condition:
+    """Return a condition of which a file has axis and value as text."""
+    axis, text = names
+    return axis, value_of(text)
+
+
+def value_of(text: str) -> Value:
+    """Return the value that a text stands for: a finite number, or else the word."""
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    return number if math.isfinite(number) else text
+
+
+def values_of(trainings: Trainings, measure: str) -> np.ndarray:
+    """Return a column of EPISODE as float64 (trainings, corridors).
+
+    Raises:
+        ValueError: Two trainings were evaluated in different corridors.
+    """
+    every = list(trainings.values())
+    if any(not np.array_equal(episodes["seed"], every[0]["seed"]) for episodes in every):
+        raise ValueError(
+            f"trainings {list(trainings)} must have the same corridors; evaluate what is missing"
+        )
+    return np.stack([episodes[measure].astype(np.float64) for episodes in every])
+
+
+def read_cells(file: Path) -> dict[tuple[Condition, str], dict[int | None, np.ndarray]]:
+    """Read the episodes of a study, plain or packed (.gz)."""
+    table, found = read_table(file), dict[tuple[Condition, str], dict[int | None, np.ndarray]]()
+    for (axis, text, group, seed), rows in table.groupby(list(LABELS), sort=False, dropna=False):
+        own = np.zeros(len(rows), EPISODE)
+        for name in EPISODE.names or ():
+            own[name] = rows[name].to_numpy()
+        training = int(seed) if isinstance(seed, int | np.integer) else None
+        found.setdefault(((axis, value_of(text)), group), {})[training] = own
+    return found
+
+
+def read_results(folder: Path) -> Results:
+    """Read what a study has left in its run folder, of earlier versions too.
+
+    Raises:
+        ConfigError: A version wrote it that did not say what is compared.
+        RunError: A file is damaged.
+    """
+    facts = read_json(folder / "about.json")
+    if "met" not in facts:
+        raise ConfigError(f"resume: {folder} is of an earlier version; run its command again")
+    file = folder / "episodes.csv"
+    if facts.get("episodes_sha256") not in (None, sha256(file)):
+        raise RunError(f"{file}: damaged; run the command of the study again")
+    return Results(facts, read_cells(file))
+
+
+def read_published(data: Path, name: str) -> Results:
+    """Read a published study; without `NAME_about.json` groups and conditions are those of its episodes."""
+    cells, about = read_cells(data / f"{name}_episodes.csv.gz"), data / f"{name}_about.json"
+    if about.is_file():
+        return Results(read_json(about), cells)
+    axes: dict[str, dict[str, dict[str, object]]] = {}
+    groups: dict[str, list[int | None]] = {}
+    for ((axis, value), group), trainings in cells.items():
+        axes.setdefault(axis, {})[text_of(value)] = {}
+        groups.setdefault(group, list(trainings))
+    return Results({"axes": axes, "groups": groups}, cells)
+
+
+def publish(study: Path, data: Path, name: str, results: Results) -> None:
+    """Copy a study from its run folder into the published data.
+
+    Args:
+        study: The folder in its run folder.
+        data: Where `NAME_episodes.csv.gz`, `NAME_about.json` and `NAME_trainings.csv` go.
+        name: Of the study.
+        results: What the folder holds.
+    """
+    data.mkdir(parents=True, exist_ok=True)
+    packed = gzip.compress((study / "episodes.csv").read_bytes(), mtime=0)
+    write_atomic(data / f"{name}_episodes.csv.gz", packed)
+    facts = read_json(study / "about.json")
+    facts.pop("host", None)  # means nothing to others
+    write_json(data / f"{name}_about.json", facts)
+    rows = [
+        (axis, text_of(value), group, "" if seed is None else seed, len(own),
+         f"{own['success'].mean():.4f}", f"{own['distance_m'].mean():.2f}")
+        for ((axis, value), group), trainings in results.cells.items()
+        for seed, own in trainings.items()
+    ]  # fmt: skip
+    write_csv(data / f"{name}_trainings.csv", (*LABELS, "episodes", "success_rate", "distance_m"), rows)
+
+
+def check_whole(results: Results) -> None:
+    """Check that every training has all of its episodes under every condition.
+
+    Raises:
+        ConfigError: One has not; the message names it.
+    """
+    trials = results.facts["trials"]
+    for at in results.conditions:
+        for group, seeds in results.groups.items():
+            for seed in seeds:
+                count = len(results.trainings(at, group).get(seed, ()))
+                if count != trials:
+                    what = f"{at[0]} {text_of(at[1])} of {group} s{seed}"
+                    rule = f"resume: {what} must have {trials} episodes, got {count}"
+                    raise ConfigError(f"{rule}; run the command of the study again")

@@ -1,0 +1,396 @@
+"""The tables and sentences of a study's page, each by one rule for all studies."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jobs.analysis.statistics import crossed_mean
+from jobs.analysis.tables import estimate_text, markdown_table, percent_text, write_csv
+from jobs.study.changes import Change, replicated
+from jobs.study.contrasts import UNDECIDED, Finding, Row
+from jobs.study.doses import Dose
+from jobs.study.results import RATE, Condition, Results, place, text_of
+from jobs.study.spec import LEARNED, Contrast, Family, changed_conditions
+from jobs.study.spread import Factors
+from jobs.study.summaries import MET, Summary
+from jobs.study.words import condition_text
+
+CORRECTIONS = {"holm": "Holm", "bh": "Benjamini and Hochberg"}
+ESTIMATES = (
+    *("Axis", "Value", "Group", "trainings", "episodes"),
+    *("success_rate", "success_low", "success_high"),
+    *("distance_m", "distance_low_m", "distance_high_m"),
+    *("events_per_step", "dropped"),
+)
+CHANGES = (
+    *("Axis", "Value", "Group", "baseline_axis", "baseline_value", "trainings"),
+    *("success_rate", "baseline_success_rate", "difference", "difference_low", "difference_high"),
+    *("p", "certain", "broken"),
+)
+WORST = 3  # conditions that break most are named, and what ties with them
+
+
+def scale_of(contrast: Contrast) -> tuple[float, str, str]:
+    """Return factor, format and unit in which a test's value is shown."""
+    if contrast.measure not in ("success", *LEARNED):
+        return 1, "+.1f", "m"
+    return (100, "+.0f", "points") if contrast.theirs or contrast.ours.less else (100, ".0f", "%")
+
+
+def value_text(finding: Finding) -> str:
+    """Return the value of a test with its interval and unit."""
+    scale, form, unit = scale_of(finding.contrast)
+    return f"{estimate_text(finding.difference, scale, form)} {unit}"
+
+
+def family_table(
+    family: Family, findings: Sequence[Finding], beside: Mapping[str, Mapping[tuple[str, ...], str]]
+) -> str:
+    """Return the tests of a family as a Markdown table: a line each, or a line for each group.
+
+    Args:
+        family: The family.
+        findings: Of its tests.
+        beside: Heading -> `key_of` a test -> its verdict in another study.
+    """
+    names = list(dict.fromkeys(one.contrast.name for one in findings))
+    groups = list(dict.fromkeys(one.contrast.ours.group for one in findings))
+    if len(names) > 1 and not beside and all(_alone(one.contrast) for one in findings):
+        cells = {(one.contrast.ours.group, one.contrast.name): _cell(family, one) for one in findings}
+        lines = [(f"`{group}`", *(cells.get((group, name), "-") for name in names)) for group in groups]
+        return markdown_table(("Group", *names), lines, len(names) + 1)
+    columns = _columns(family, findings)
+    head = (*columns, *beside)
+    lines = [
+        (*cells, *(own.get(key_of(family, one.contrast), "-") for own in beside.values()))
+        for one, *cells in zip(findings, *columns.values(), strict=True)
+    ]
+    return markdown_table(head, lines, 4)
+
+
+def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]]:
+    """Return heading -> a text for each test; headings of which a family has nothing are left out."""
+    tested = family.adjust != "none"
+    found = {
+        "Group": [f"`{one.contrast.ours.group}`" for one in findings],
+        "Test": [one.contrast.name for one in findings],
+        "Source": [one.contrast.source for one in findings],
+        "Against": ["" if _alone(one.contrast) else f"`{one.contrast.theirs.group}`" for one in findings],  # type: ignore[union-attr]
+        "Finding": [one.verdict for one in findings] if tested else [],
+        "Difference": [value_text(one) for one in findings],
+        f"p ({CORRECTIONS.get(family.adjust)})": [_p_text(one) for one in findings] if tested else [],
+        "Trainings needed": [_needed_text(one) for one in findings] if family.power else [],
+    }
+    return {name: texts for name, texts in found.items() if any(texts)}
+
+
+def _alone(contrast: Contrast) -> bool:
+    """Whether a test is about one group."""
+    return contrast.theirs is None or contrast.theirs.group == contrast.ours.group
+
+
+def _cell(family: Family, one: Finding) -> str:
+    if family.adjust == "none":
+        return value_text(one)
+    verdict = one.verdict if one.verdict == UNDECIDED else f"**{one.verdict}**"
+    return f"{verdict}: {value_text(one)}, p = {_p_text(one)}"
+
+
+def _p_text(one: Finding) -> str:
+    return "-" if one.adjusted_p is None else f"{one.adjusted_p:.2g}"
+
+
+def _needed_text(one: Finding) -> str:
+    if one.verdict != UNDECIDED or one.adjusted_p is None:
+        return "-"
+    return "corridors" if one.needed is None else str(one.needed)
+
+
+def key_of(family: Family, contrast: Contrast) -> tuple[str, ...]:
+    """Return what a test asks, by the names that a shared family has for its groups."""
+    sides = (contrast.ours.group, "" if contrast.theirs is None else contrast.theirs.group)
+    return contrast.name, *(family.alias.get(group, group) for group in sides)
+
+
+def counted(findings: Sequence[Finding]) -> str:
+    """Return how many findings have each verdict, the most frequent first."""
+    verdicts = Counter(one.verdict for one in findings)
+    plural = {"does not hold": "do not hold"}
+    return ", ".join(
+        f"{count} {plural.get(verdict, verdict) if count > 1 else verdict}"
+        for verdict, count in verdicts.most_common()
+    )
+
+
+def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
+    """Return what a family of tests found: its one test, or the counts and the tests that are certain."""
+    if family.adjust == "none" or not findings:
+        return ""
+    if len(findings) == 1:
+        (one,) = findings
+        return f"{family.title}: {value_text(one)}, p = {_p_text(one)}, {one.verdict}."
+    certain = [family.words[name] for name in ("above", "below") if name in family.words]
+    named = [
+        f"{one.verdict}: {_test_text(one.contrast)}, {value_text(one)}"
+        for one in findings
+        if one.verdict in certain
+    ]
+    listed = f" Certain: {'; '.join(named)}." if 0 < len(named) <= 6 else "" if named else " None is certain."
+    return f"{family.title}, {len(findings)} tests: {counted(findings)}.{listed}"
+
+
+def _test_text(contrast: Contrast) -> str:
+    against = "" if _alone(contrast) else f" (against `{contrast.theirs.group}`)"  # type: ignore[union-attr]
+    return f"`{contrast.ours.group}` {contrast.name}{against}"
+
+
+def family_note(family: Family, findings: Sequence[Finding]) -> str:
+    """Return how the verdicts of a family are to be read."""
+    if family.adjust == "none":
+        return family.note or "Means with 95 % intervals over trainings and corridors, each alone."
+    words = family.words
+    sure = " and ".join(dict.fromkeys(f"*{words[name]}*" for name in ("above", "below") if name in words))
+    measures = {one.contrast.measure for one in findings}
+    margins = [f"{100 * family.margin['success']:g} points"] if measures & {"success", *LEARNED} else []
+    margins += [f"{family.margin['distance_m']:g} m"] if "distance_m" in measures else []
+    limit = " or ".join(margins)
+    said = [
+        family.note,
+        f"{sure}: certain among these {len(findings)} tests (p < 0.05 after {CORRECTIONS[family.adjust]}).",
+        f"*{words['within']}*: the interval of this test alone lies within {limit} on both sides."
+        if "within" in words
+        else "",
+        f"*{words['no_gain']}*: the interval of this test alone excludes a gain of {limit}."
+        if "no_gain" in words
+        else "",
+        "*Trainings needed*: of each group, to show such a difference in four of five studies; *corridors*: "
+        "no number would, more corridors are needed."
+        if family.power
+        else "",
+    ]
+    return " ".join(filter(None, said))
+
+
+def lead_sentence(results: Results, findings: Sequence[Finding]) -> str:
+    """Return which group succeeds most over all conditions, its worst one, and how sure its lead is."""
+    at = [
+        one for one in changed_conditions(results) if all((one, g) in results.cells for g in results.trained)
+    ]
+    if not at:
+        return ""
+    rates = {group: np.stack([results.values(one, group) for one in at]) for group in results.trained}
+    best = max(rates, key=lambda group: float(rates[group].mean()))
+    each, usual = rates[best].mean(axis=(1, 2)), results.values(results.nominal, best).mean()
+    behind = [
+        f"`{({one.contrast.ours.group, one.contrast.theirs.group} - {best}).pop()}`"  # type: ignore[union-attr]
+        for one in findings
+        if one.verdict == "certain" and best in (one.contrast.ours.group, one.contrast.theirs.group)  # type: ignore[union-attr]
+    ]
+    lead = f"certain over {', '.join(behind)}" if behind else "certain over none"
+    return (
+        f"`{best}` succeeds most: {100 * usual:.0f} % with nothing changed, {100 * each.mean():.0f} % as the "
+        f"mean of {len(at)} changed conditions, {100 * each.min():.0f} % in its worst, "
+        f"{condition_text(at[int(each.argmin())])}. Its lead is {lead} (Holm over {len(findings)} pairs)."
+    )
+
+
+def worst_sentence(results: Results, changes: Sequence[Change]) -> str:
+    """Return under which conditions most trainings lose half of their success or more."""
+    if not changes:
+        return ""
+    every = sum(len(results.groups[group]) for group in {change.group for change in changes})
+    halved, broken = Counter[tuple[Condition, Condition]](), Counter[tuple[Condition, Condition]]()
+    for change in changes:
+        pair = change.condition, change.baseline
+        halved[pair] += int((change.success <= change.before / 2)[change.before > 0].sum())
+        broken[pair] += int(change.broken.sum())
+    most = halved.most_common()
+    least = max(most[min(WORST, len(most)) - 1][1], 1)
+    worst = [f"{count} with {_against(*pair)} ({broken[pair]})" for pair, count in most if count >= least]
+    several = replicated(changes)
+    certain = sum(one.certain and one.loses for one in several)
+    return (
+        f"Of {every} trainings lose half of their success or more (in brackets, how many certainly lose): "
+        f"{'; '.join(worst) or 'none'}. Of {len(several)} changes of groups {certain} are losses that are "
+        f"certain for other trainings."
+    )
+
+
+def _against(at: Condition, baseline: Condition) -> str:
+    usual = condition_text(baseline)
+    return condition_text(at) + ("" if usual == "nothing changed" else f" against {usual}")
+
+
+def losses_table(results: Results, changes: Sequence[Change]) -> str:
+    """Return what certainly takes success from trainings, for each group its worst condition first."""
+    lines = []
+    for group in results.trained:
+        own = [change for change in changes if change.group == group]
+        lost = [change for change in own if change.broken.any() or (change.certain and change.loses)]
+        lost.sort(key=lambda change: (-change.broken.mean(), change.difference.value))
+        if own:
+            worst = min(own, key=lambda change: change.difference.value)
+            before = (f"{100 * results.values(results.nominal, group).mean():.0f}"
+                      if (results.nominal, group) in results.cells else "-")  # fmt: skip
+            texts = [_loss_text(change) for change in lost]
+            lines.append((f"`{group}` ({len(results.groups[group])})", before,
+                          _drop_text(worst) if worst.loses else "-", "; ".join(texts) or "none"))  # fmt: skip
+    head = ("Group (trainings)", "Nothing changed [%]", "Largest drop of the mean", "Certain losses")
+    return markdown_table(head, lines, len(head))
+
+
+def _drop_text(change: Change) -> str:
+    before, success = 100 * change.before.mean(), 100 * change.success.mean()
+    return f"{condition_text(change.condition)}: {before:.0f} to {success:.0f} %"
+
+
+def _loss_text(change: Change) -> str:
+    difference = estimate_text(change.difference, 100, "+.0f")
+    said = f"{condition_text(change.condition)}: {difference}, {change.broken.sum()} of {len(change.broken)}"
+    return f"**{said}**" if change.certain else said
+
+
+def broken_table(changes: Sequence[Change]) -> str:
+    """Return how many of a group's trainings certainly lose, over all points of an axis."""
+    groups, axes = (list(dict.fromkeys(names)) for names in
+                    zip(*((one.group, one.condition[0]) for one in changes), strict=True))  # fmt: skip
+
+    def cell(group: str, axis: str) -> str:
+        own = [one.broken for one in changes if (one.group, one.condition[0]) == (group, axis)]
+        return f"{sum(int(broken.sum()) for broken in own)} of {sum(map(len, own))}"
+
+    return markdown_table(
+        ("Group", *axes), [(f"`{group}`", *(cell(group, at) for at in axes)) for group in groups]
+    )
+
+
+def change_table(changes: Sequence[Change], doses: Sequence[Dose]) -> str:
+    """Return the change of success [points] at every dose of wrong events, a column for each group."""
+    found = {(one.condition, one.group): one for one in changes}
+    groups = list(dict.fromkeys(one.group for one in changes))
+
+    def cell(dose: Dose, group: str) -> str:
+        one = found.get((dose.condition, group))
+        if one is None:
+            return "-"
+        text = estimate_text(one.difference, 100, "+.0f")
+        return (f"**{text}**" if one.certain else text) + (MET if group in dose.met_by else "")
+
+    lines = [
+        (
+            dose.condition[0],
+            "-" if dose.asked is None else f"{100 * dose.asked:.0f}",
+            f"{100 * dose.measured:.1f}",
+            *(cell(dose, group) for group in groups),
+        )
+        for dose in doses
+    ]
+    return markdown_table(("Kind", "asked [%]", "Event error [%]", *(f"`{one}`" for one in groups)), lines)
+
+
+def condition_table(rows: Sequence[Row], contrast: Contrast, mean: Finding, results: Results) -> str:
+    """Return both sides of a test under each of its conditions, the mean of all first."""
+    ours, theirs = contrast.ours.group, contrast.theirs.group if contrast.theirs else ""
+    at = contrast.ours.at
+    every = [np.mean([results.values(one, group) for one in at], axis=0) for group in (theirs, ours)]
+    means = [estimate_text(crossed_mean(one, RATE), 100, ".0f") for one in every]
+    lines = [
+        (condition_text(one.condition), percent_text(one.theirs), percent_text(one.ours),
+         estimate_text(one.difference, 100, "+.0f"))
+        for one in rows
+    ]  # fmt: skip
+    first = ("mean of these", *means, estimate_text(mean.difference, 100, "+.0f"))
+    return markdown_table(
+        ("Condition", f"`{theirs}` [%]", f"`{ours}` [%]", "Difference [points]"), [first, *lines]
+    )
+
+
+def spread_table(overall: Factors, each: Mapping[Condition, Factors], names: tuple[str, str]) -> str:
+    """Return the standard deviations of two crossed factors, of the mean of all conditions and of each."""
+    lines = []
+    for name, one in [("mean of these", overall), *((condition_text(at), one) for at, one in each.items())]:
+        p_values = ["-" if p is None else f"{p:.2g}" for p in (one.rows_p, one.columns_p)]
+        spread = one.spread
+        lines.append((name, f"{one.mean:.0f}", f"{spread.rows:.0f}", p_values[0], f"{spread.columns:.0f}",
+                      p_values[1], f"{spread.rest:.0f}"))  # fmt: skip
+    head = (
+        "Success [%]",
+        "Mean",
+        f"SD by {names[0]}",
+        "p (Holm)",
+        f"SD by {names[1]}",
+        "p (Holm)",
+        "SD of the rest",
+    )
+    return markdown_table(head, lines)
+
+
+def spread_sentence(overall: Factors, names: tuple[str, str], mean: np.ndarray) -> str:
+    """Return by which factor trainings certainly differ; `mean` is the success 0..1 (rows, columns)."""
+    certain = overall.certain(names)
+    said = (
+        f"differ by their {' and '.join(certain)}"
+        if certain
+        else f"certainly differ neither by {' nor by '.join(names)}"
+    )
+    span = [
+        f"{100 * own.min():.0f} to {100 * own.max():.0f} %"
+        for own in (mean, mean.mean(axis=1), mean.mean(axis=0))
+    ]
+    return (
+        f"Trainings {said}. The {mean.size} succeed in {span[0]} of their episodes; the means by {names[0]} "
+        f"are {span[1]}, the means by {names[1]} {span[2]}. Neither explains {overall.spread.rest:.0f} "
+        f"points of standard deviation."
+    )
+
+
+def errors_table(results: Results) -> str:
+    """Return how exact the events of each condition were; "" if that was not measured."""
+    lines = [
+        (condition_text(place(one["condition"])), f"{100 * one['asked']:g}",
+         f"{100 * one['event_error']:.1f}", f"{one['renders_per_step']:.1f}")
+        for one in results.facts.get("exactness", ())
+    ]  # fmt: skip
+    head = ("Condition", "Event error asked [%]", "achieved [%]", "Renders a step")
+    return markdown_table(head, lines) if lines else ""
+
+
+def write_estimates(file: Path, found: Sequence[Summary]) -> None:
+    """Write every estimate with its interval as CSV."""
+    rows = [
+        (
+            *(one.condition[0], text_of(one.condition[1]), one.group, len(one.trainings), one.episodes),
+            *_numbers(one.success.value, one.success.interval, ".4f"),
+            *_numbers(one.distance_m.value, one.distance_m.interval, ".2f"),
+            *(f"{one.events_per_step:.1f}", one.dropped),
+        )
+        for one in found
+    ]
+    write_csv(file, ESTIMATES, rows)
+
+
+def write_changes(file: Path, changes: Sequence[Change]) -> None:
+    """Write every change against its baseline as CSV."""
+    rows = [
+        (
+            *(one.condition[0], text_of(one.condition[1]), one.group),
+            *(one.baseline[0], text_of(one.baseline[1]), len(one.success)),
+            *(f"{one.success.mean():.4f}", f"{one.before.mean():.4f}"),
+            *_numbers(one.difference.value, one.difference.interval, ".4f"),
+            *(
+                "" if one.difference.p is None else f"{one.difference.p:.3g}",
+                int(one.certain),
+                int(one.broken.sum()),
+            ),
+        )
+        for one in changes
+    ]
+    write_csv(file, CHANGES, rows)
+
+
+def _numbers(value: float, interval: tuple[float, float] | None, form: str) -> tuple[str, str, str]:
+    """Return a value and the ends of its interval as text."""
+    low, high = ("", "") if interval is None else (format(end, form) for end in interval)
+    return format(value, form), low, high

@@ -1,0 +1,211 @@
+"""The trainings of a study: each variant with each seed, trained in a run folder of its own or published."""
+
+import dataclasses
+import itertools
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+from envs.config import sensor_settings
+from jobs.config.config import Config, ConfigError, as_dict, parse
+from jobs.config.errors import differences
+from jobs.run.files import read_json_lines
+from jobs.run.folder import Run, finished, locate_run, open_run
+from jobs.run.progress import console
+from jobs.study.learned import published_place
+from jobs.training import train
+from models.kinds import model_keys
+from models.policy.policy import MANIFEST, read_policy_manifest
+
+ENCODER_FILES = (
+    "encoder/encoder.safetensors",
+    "encoder/encoder.json",
+    "stages/collect.json",
+    "stages/pretrain.json",
+)
+# Settings that change nothing an encoder learns from: such a variant uses the encoder of the first.
+SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden")
+INIT = "train.init"
+STATED = ("algo", "train", "collect", "pretrain")  # sections that a manifest states, beside the model's
+# Keys of a variant that are no settings of its experiment.
+SEEDS, ENCODER_SEED = "seeds", "encoder_seed"
+APART = (SEEDS, ENCODER_SEED, "tags", "published")
+Training = tuple[str, int]  # variant and seed
+
+
+def check_variants(config: Config) -> None:
+    """Check every variant before anything is trained.
+
+    Raises:
+        ConfigError: One has a wrong key or value.
+    """
+    for name in config.own.variants:
+        seed = seeds_of(config, name)[0]
+        variant_config(config, name, seed)
+        encoder_seed_of(config, name, seed)
+
+
+def published_policies(config: Config) -> dict[Training, Path]:
+    """Return the published policy folder of every training of a study.
+
+    Raises:
+        ConfigError: A training is missing, or its manifest says that it was trained otherwise.
+    """
+    said, found, wrong = {**dataclasses.asdict(config.own)}, {}, []
+    for name, seed in trainings_of(config):
+        place = published_place(said, name)
+        if place is None:
+            raise ConfigError("study.published: must name published policies where train is false, got null")
+        folder = place.with_name(f"{place.name}-s{seed}")
+        found[name, seed] = folder
+        differ = _stated_otherwise(folder, variant_config(config, name, seed))
+        wrong += [f"{folder.name} {differ}"] if differ else []
+    if wrong:
+        rule = f"must hold every training as +exp={config.exp} makes it"
+        raise ConfigError(f"study.published: {rule}, got {config.own.published!r}: {'; '.join(wrong)}")
+    return found
+
+
+def _stated_otherwise(folder: Path, training: Config) -> str:
+    """Return how a published policy was trained otherwise than a configuration says; "" if it was not."""
+    if not (folder / MANIFEST).is_file():
+        return "is not there"
+    manifest = read_policy_manifest(folder / MANIFEST)
+    there, here = stated(manifest), stated(as_dict(training))
+    both = there.keys() & here.keys()  # older policies lack what was added since
+    sensor = sensor_settings(training.env)
+    seen = {key: value for key, value in manifest["sensor"].items() if key in sensor}
+    differ = differences({key: there[key] for key in both}, {key: here[key] for key in both})
+    differ = differ or differences(seen, {key: sensor[key] for key in seen})
+    return f"has {differ}" if differ else ""
+
+
+def stated(settings: Mapping[str, object]) -> dict[str, object]:
+    """Return what a manifest states of its policy's training, or the same of a configuration."""
+    sections = {name: cast(dict[str, object], settings.get(name, {})) for name in (*STATED, "model")}
+    model = sections.pop("model") or {name: settings[name] for name in model_keys() if name in settings}
+    parts = {f"{name}.{key}": value for name, own in sections.items() for key, value in own.items()}
+    parts.pop("algo.num_env_runners", None)  # as many as there were cores
+    return {**model, **parts}
+
+
+def trainings_of(config: Config) -> list[Training]:
+    """Return every variant with each of its seeds."""
+    return [(name, seed) for name in config.own.variants for seed in seeds_of(config, name)]
+
+
+def train_variants(config: Config) -> dict[Training, Run]:
+    """Train every variant with every seed unless that is done; return the runs."""
+    trained = dict[Training, Run]()
+    for name, seed in trainings_of(config):
+        first = trained.get((_first(config), encoder_seed_of(config, name, seed)))
+        trained[name, seed] = train_variant(config, name, seed, first)
+    return trained
+
+
+def _first(config: Config) -> str:
+    return next(iter(config.own.variants))
+
+
+def seeds_of(config: Config, name: str) -> list[int]:
+    """Return the seeds of a variant, in the order of `study.seeds`: all of these unless it names fewer.
+
+    Raises:
+        ConfigError: They are fewer than two, or others, or it is the first variant, which has all.
+    """
+    every, named = config.own.seeds, config.own.variants[name].get(SEEDS)
+    if named is None:
+        return every
+    first = _first(config)
+    several = isinstance(named, list) and len(named) > 1
+    if name == first or not several or any(one not in every or named.count(one) > 1 for one in named):
+        raise ConfigError(
+            f"study.variants.{name}.{SEEDS}: must be two or more of study.seeds, {every}, and not of "
+            f"{first}, with which the others are compared; got {named!r}"
+        )
+    return [seed for seed in every if seed in named]
+
+
+def encoder_seed_of(config: Config, name: str, seed: int) -> int:
+    """Return the seed of the training of the first variant whose encoder a training uses, if not its own.
+
+    Raises:
+        ConfigError: The variant names another seed, needs an encoder of its own, or is the first.
+    """
+    named = config.own.variants[name].get(ENCODER_SEED)
+    if named is None:
+        return seed
+    first = _first(config)
+    if name == first or named not in config.own.seeds or not shares_encoder(config, name):
+        raise ConfigError(
+            f"study.variants.{name}.{ENCODER_SEED}: must be one of study.seeds, {config.own.seeds}, of a "
+            f"variant after the first, {first}, that changes nothing its encoder learns from; got {named!r}"
+        )
+    return int(named)
+
+
+def shares_encoder(config: Config, name: str) -> bool:
+    """Whether a variant uses an encoder of the first: there is one, and it learns from nothing changed."""
+    changes = changes_of(config, name)
+    same = changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
+    return config.model.has_encoder and same
+
+
+def changes_of(config: Config, name: str) -> dict[str, Any]:
+    """Return the settings that a variant changes."""
+    return {key: value for key, value in config.own.variants[name].items() if key not in APART}
+
+
+def variant_config(config: Config, name: str, seed: int) -> Config:
+    """Return the experiment of one training.
+
+    Raises:
+        ConfigError: It has a wrong key or value.
+    """
+    changes, first = changes_of(config, name), _first(config)
+    values = as_dict(config) | {"job": "train", "exp": f"{config.exp}_{name}", "seed": seed}
+    del values[config.job]  # the settings of the study
+    try:
+        for key, value in changes.items():
+            _set(values, key, value)
+        if changes.get(INIT) is not None:
+            if changes[INIT] != first or name == first:
+                raise ConfigError(f"{INIT}: must be {first}, the first variant, got {changes[INIT]!r}")
+            _set(values, INIT, str(locate_run(variant_config(config, first, seed)).path))
+        parsed = parse(values)
+    except ConfigError as error:
+        raise ConfigError(f"study.variants.{name}: {error}") from None
+    return dataclasses.replace(parsed, tracking=config.tracking)  # with its password
+
+
+def _set(values: Any, key: str, value: Any) -> None:
+    """Replace one value in nested containers; `parse` checks that its key is one."""
+    *path, last = [int(word) if word.isdigit() else word for word in key.split(".")]
+    try:
+        for name in path:
+            values = values[name]
+        values[last] = value
+    except (KeyError, IndexError, TypeError):
+        raise ConfigError(f"{key}: no such key, got {value!r}") from None
+
+
+def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Run:
+    """Train a variant unless that is done, on the encoder of a run of the first where it may."""
+    own = open_run(variant_config(config, name, seed))
+    if finished(own, "train") is None:
+        console.print(f"Train {name}, seed {seed}", markup=False)
+        if first is not None and shares_encoder(config, name) and finished(own, "pretrain") is None:
+            for file in ENCODER_FILES:  # the marks of the finished stages last
+                (own.path / file).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(first.path / file, own.path / file)
+        train.run(own.config)
+    return own
+
+
+def minutes(training: Run) -> float:
+    """Return how long a policy was trained, without its encoder [min]."""
+    rows = read_json_lines(training.train / "results.jsonl")
+    ends = [0, *(row["env_steps"] for row in rows)]
+    steps = [end - begin for begin, end in itertools.pairwise(ends)]
+    return sum(step / row["perf/env_steps_per_second"] for step, row in zip(steps, rows, strict=True)) / 60

@@ -1,0 +1,163 @@
+import numpy as np
+import pytest
+
+from jobs.analysis.statistics import Difference, trainings_needed
+from jobs.study.contrasts import adjust, judge, verdict_of
+from jobs.study.results import Results, values_of
+from jobs.study.spec import Contrast, Family, Side
+from tests.support.episodes import flights
+
+NOMINAL, A, B = ("nominal", "poles"), ("world", "a"), ("world", "b")
+WORDS = {"above": "holds", "below": "reversed", "within": "equivalent", "no_gain": "does not hold"}
+GAIN = {"success": 0.1, "distance_m": 10.0}
+
+
+def family(*contrasts, words=WORDS, **changes):
+    one = Family("claims", "Claims", contrasts, "holm", GAIN, words, False, {}, "", {})
+    return one._replace(**changes)
+
+
+def better(at=(A, B), change=False, measure="success", paired=False, ours="ours", theirs="theirs"):
+    less = (NOMINAL,) * len(at) if change else ()
+    return Contrast("better", "", Side(ours, at, less), Side(theirs, at, less), measure, paired)
+
+
+def results(table):
+    return Results({"groups": {group: list(own) for (_, group), own in table.items()}, "axes": {}}, table)
+
+
+def found(*pairs, before=(20, 20)):
+    """Two trainings of ours and theirs in each condition, by their successes."""
+    return {(at, group): {0: flights(won), 1: flights(won)}
+            for at, pair in zip((NOMINAL, A, B), (before, *pairs), strict=False)
+            for group, won in zip(("ours", "theirs"), pair, strict=True)}  # fmt: skip
+
+
+def judged(contrast, table, **changes):
+    (one,) = judge(family(contrast, **changes), results(table))
+    return one
+
+
+@pytest.mark.parametrize(
+    ("value", "interval", "p", "verdict"),
+    [
+        (0.3, (0.2, 0.4), 0.001, "holds"),
+        (-0.3, (-0.4, -0.2), 0.001, "reversed"),
+        (0.3, (0.01, 0.6), 0.2, "undecided"),  # certain alone, not within its family
+        (0.01, (-0.05, 0.08), 0.7, "equivalent"),
+        (0.01, (-0.05, 0.1), 0.7, "undecided"),  # at the margin nothing is excluded
+        (-0.2, (-0.45, 0.05), 0.1, "does not hold"),
+        (0.0, (-0.3, 0.3), 1.0, "undecided"),
+        (0.2, None, None, "undecided"),
+    ],
+)
+def test_certainty_comes_before_the_interval_of_the_single_test(value, interval, p, verdict):
+    assert verdict_of(Difference(value, interval, p), p, 0.1, WORDS) == verdict
+    assert verdict_of(None, None, 0.1, WORDS) == "not tested"
+    only = {"above": "certain", "below": "certain"}
+    assert verdict_of(Difference(value, interval, p), p, 0.1, only) in ("certain", "undecided")
+
+
+def test_a_side_is_the_mean_of_its_conditions():
+    assert judged(better(), found((18, 4), (10, 6))).difference.value == pytest.approx((14 + 4) / 40)
+
+
+def test_a_change_is_against_the_same_trainings_at_their_baseline_and_not_who_is_better():
+    table = found((16, 8), (16, 8), before=(20, 12))
+    assert judged(better(), table).difference.value == pytest.approx(0.4)
+    assert judged(better(change=True), table).difference.value == pytest.approx(0.0)
+    one = judged(better(at=(A,), change=True), found((10, 12), before=(20, 12)))
+    assert one.difference.value == pytest.approx(-0.5)
+    assert one.difference.p < 0.05
+
+
+def test_a_group_alone_is_compared_with_nothing():
+    alone = Contrast("errors", "", Side("ours", (A, B), (NOMINAL, NOMINAL)), None, "success", True)
+    assert judged(alone, found((16, 0), (12, 0))).difference.value == pytest.approx(-0.3)
+
+
+def test_means_are_subtracted_where_conditions_are_not_as_many():
+    loss = Contrast("loss", "", Side("ours", (A,), (A, B)), None, "success", True)
+    assert judged(loss, found((20, 0), (10, 0))).difference.value == pytest.approx(1.0 - 0.75)
+
+
+def test_what_was_not_evaluated_is_not_tested():
+    assert judged(better(), found()).verdict == "not tested"
+    assert judged(better(), found((18, 4))).difference.value == pytest.approx(0.7)
+
+
+def test_of_one_training_nothing_follows_for_others():
+    table = {(A, "ours"): {0: flights(18)}, (A, "theirs"): {0: flights(3), 1: flights(4)}}
+    one = judged(better(), table)
+    assert (one.difference.p, one.verdict) == (None, "undecided")
+    assert one.difference.value > 0.5
+
+
+def test_only_trainings_that_have_all_conditions_are_compared():
+    table = {(A, "ours"): {0: flights(18), 1: flights(16), 2: flights(2)},
+             (B, "ours"): {2: flights(4), 1: flights(14)},
+             (A, "theirs"): {0: flights(3)}, (B, "theirs"): {0: flights(3)}}  # fmt: skip
+    assert judged(better(), table).difference.value == pytest.approx((16 + 2 + 14 + 4) / 80 - 3 / 20)
+    table[B, "ours"] = {5: flights(20)}  # no training has both
+    assert judged(better(), table).difference is None
+
+
+def test_pairs_are_trainings_of_one_seed_whatever_their_order():
+    won = {0: 20, 1: 4, 2: 12}
+    table = {(A, "ours"): {seed: flights(won[seed]) for seed in (2, 0, 1)},
+             (A, "theirs"): {seed: flights(won[seed]) for seed in (0, 1, 2)}}  # fmt: skip
+    table[A, "theirs"] = {**table[A, "theirs"], 7: flights(1)}  # without a partner
+    one = judged(better(at=(A,), paired=True), table)
+    assert one.difference.value == 0.0
+    apart = judged(better(at=(A,)), table)
+    assert np.ptp(one.difference.interval) < np.ptp(apart.difference.interval)
+
+
+def test_distances_that_agree_at_the_goal_are_equivalent_only_after_enough_episodes():
+    def verdict(trainings):
+        table = {(at, group): {seed: flights(20) for seed in range(trainings)}
+                 for at in (A, B) for group in ("ours", "theirs")}  # fmt: skip
+        return judged(better(measure="distance_m"), table).verdict
+
+    assert verdict(2) == "undecided"
+    assert verdict(10) == "equivalent"
+
+
+def learnt(*groups):
+    return Contrast("learns faster", "", Side(groups[0], ()), Side(groups[1], ()), "learned", False)
+
+
+def test_all_tests_are_one_family_and_what_is_not_tested_is_in_none():
+    rates = {"learned": {"a": (0.7, 0.72, 0.71), "b": (0.5, 0.4, 0.6), "c": (0.4, 0.42, 0.38)}}
+    three = family(learnt("a", "c"), learnt("b", "c"), learnt("d", "c"))
+    one, other, absent = judge(three, results({}), rates)
+    assert one.adjusted_p == pytest.approx(2 * one.difference.p)
+    assert one.difference.value == pytest.approx(0.71 - 0.4)
+    assert (one.verdict, absent.verdict) == ("holds", "not tested")
+    alone = judge(three._replace(adjust="none"), results({}), rates)
+    assert [found.adjusted_p for found in alone[:2]] == [one.difference.p, other.difference.p]
+
+
+def test_corrections_are_those_of_their_names():
+    assert adjust("holm", [0.01, 0.04]) == pytest.approx([0.02, 0.04])
+    assert adjust("bh", [0.01, 0.04, 0.05]) == pytest.approx([0.03, 0.05, 0.05])
+    assert adjust("none", [0.01, 0.04]) == [0.01, 0.04]
+    assert adjust("bh", []) == []
+
+
+def test_what_an_undecided_test_needs_is_counted_by_its_own_episodes_and_for_all_tests():
+    table = {(A, "ours"): {seed: flights(won) for seed, won in enumerate((9, 14, 11))},
+             (A, "theirs"): {seed: flights(won) for seed, won in enumerate((12, 8, 13))}}  # fmt: skip
+    one, rates = better(at=(A,)), {"learned": {"a": (0.7, 0.2, 0.4), "b": (0.6, 0.1, 0.9)}}
+    sides = [values_of(table[A, group], "success") for group in ("ours", "theirs")]
+    (alone,) = judge(family(one, power=True), results(table))
+    both = judge(family(one, learnt("a", "b"), power=True), results(table), rates)
+    assert alone.needed == trainings_needed(*sides, 0.1, 1, (0.0, 1.0))
+    assert both[0].needed == trainings_needed(*sides, 0.1, 2, (0.0, 1.0)) > alone.needed
+
+
+def test_other_corridors_for_one_training_are_refused():
+    table = {(A, "ours"): {0: flights(18), 1: flights(16)}, (A, "theirs"): {0: flights(3), 1: flights(3)}}
+    table[A, "ours"][1]["seed"] += 1
+    with pytest.raises(ValueError, match="same corridors"):
+        judged(better(at=(A,)), table)

@@ -1,0 +1,62 @@
+"""The page about the published data knows each of their columns, and which figures they cannot draw."""
+
+import csv
+import gzip
+import re
+
+import pytest
+
+from docs.from_data import other_figures, studies, study_figures
+from jobs.rollout.policies import PRETRAINED
+from jobs.run.provenance import REPOSITORY
+
+DOCS = REPOSITORY / "docs"
+PAGE = (DOCS / "data.md").read_text()
+OF_STUDIES = (  # NAME_... on the page
+    *("episodes.csv.gz", "trainings.csv", "about.json", "estimates.csv", "changes.csv", "doses.csv"),
+)
+OTHERS = r"learning|scene_\w+|concept_\w+"  # that the page tells of in a sentence
+
+
+def first_cells(heading):
+    """The names in the first cells of the table below a heading."""
+    section = PAGE.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    cells = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    return [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
+
+
+def columns(file):
+    with gzip.open(file, "rt") if file.suffix == ".gz" else file.open() as stream:
+        return next(csv.reader(stream))
+
+
+def test_every_column_of_every_table_has_its_row_and_every_row_its_column():
+    files = [*(DOCS / "data").rglob("*.csv"), *(DOCS / "data").rglob("*.csv.gz"), PRETRAINED / "curves.csv"]
+    assert len(files) > 15
+    known = first_cells("Columns")
+    unknown = {str(file.relative_to(REPOSITORY)): set(columns(file)) - set(known) for file in files}
+    assert {name: missing for name, missing in unknown.items() if missing} == {}
+    assert sorted(known) == sorted({name for file in files for name in columns(file)})
+
+
+def test_every_file_is_told_of():
+    table = PAGE.split("| file | a row is |")[1].split("\n\n")[0]
+    names = {f"{path.name}/" if path.is_dir() else path.name for path in (DOCS / "data").iterdir()}
+    told = set(re.findall(r"`(?:models/pretrained/)?([\w.]+/?)`", table))
+    studies = {name.removesuffix("_about.json") for name in names if name.endswith("_about.json")}
+    told |= {f"{study}_{part}" for study in studies for part in OF_STUDIES}
+    assert names - told == set()
+
+
+@pytest.mark.slow
+def test_a_figure_is_drawn_from_the_data_or_named_as_one_that_cannot_be():
+    linked = {
+        name for page in DOCS.glob("*.md") for name in re.findall(r"images/(\w+)\.png", page.read_text())
+    }
+    named, drawn = (
+        set(first_cells("Figures without data")),
+        {*study_figures(studies(DOCS)), *other_figures(DOCS / "data")},
+    )
+    assert named & drawn == set()
+    assert {name for name in linked - named - drawn if not re.fullmatch(OTHERS, name)} == set()
+    assert named <= linked

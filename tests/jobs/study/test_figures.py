@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+
+from jobs.analysis.statistics import Difference
+from jobs.run.provenance import REPOSITORY
+from jobs.study.changes import Change, changes_of
+from jobs.study.figures import (
+    KINDS,
+    Drawn,
+    change_map,
+    contact_ends,
+    numeric_axes,
+    still_going,
+    worst_conditions,
+)
+from jobs.study.page import published
+from jobs.study.results import Results, read_cells
+from tests.support.episodes import flights
+from tests.support.sweep_folders import ABOUT, write_sweep
+
+DATA = REPOSITORY / "docs" / "data"
+NOMINAL, FEW, MANY = ("nominal", "poles_eval"), ("sparsity", 0.2), ("sparsity", 0.5)
+
+
+@pytest.fixture
+def swept(tmp_path):
+    return read_cells(write_sweep(tmp_path / "sweep") / "episodes.csv")
+
+
+def test_episodes_continue_until_they_end():
+    episodes = flights(5, trials=20)
+    x, share = still_going(episodes, 100.0)
+    assert (x[0], x[-1], share[0], share[-1]) == (0.0, 100.0, 1.0, 5 / 20)
+    assert (np.diff(x) >= 0).all()
+    assert (np.diff(share) <= 1e-12).all()
+    for at in (10.0, 47.5, 52.5, 99.0):
+        beyond = np.mean(episodes["success"] | (episodes["distance_m"] > at))
+        assert share[x <= at][-1] == pytest.approx(beyond)
+    alone = still_going(flights(20), 100.0)
+    assert [list(part) for part in alone] == [[0.0, 100.0], [1.0, 1.0]]
+
+
+def test_the_worst_condition_of_a_group_is_the_one_it_succeeds_least_in(swept):
+    for one in swept[FEW, "bytestream"].values():
+        one["success"][:] = False
+    results = Results(ABOUT, swept)
+    assert worst_conditions(results, changes_of(results))["bytestream"] == FEW
+    del swept[NOMINAL, "event_image"]  # of which nothing was evaluated unchanged
+    assert set(worst_conditions(results, changes_of(results))) == {"bytestream"}
+
+
+def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(swept):
+    found = contact_ends(Results(ABOUT, swept))
+    assert [len(part) for part in found["bytestream"]] == [3 * 20, 2 * 3 * 20]
+    assert [len(part) for part in found["oracle"]] == [20, 0]  # sees no events: dead pixels change nothing
+    swept[FEW, "bytestream"] = swept[NOMINAL, "bytestream"]
+    dense = {"0.2": {"faults.sparsity": 0.2}, "0.5": {"env.scene": "poles_dense"}}
+    axes = {"sparsity": dense, "nominal": {"poles_eval": {}}}  # the unchanged condition stands last
+    assert [len(part) for part in contact_ends(Results({**ABOUT, "axes": axes}, swept))["bytestream"]] == [
+        60,
+        0,
+    ]
+
+
+def test_trainings_that_do_alike_have_a_dot_each_in_the_map(swept):
+    success = np.array([1.0, 1.0, 0.5, 1.0, 1.0])
+    change = Change(
+        MANY, NOMINAL, "bytestream", success, success, Difference(0.0, None, None), False, success < 0
+    )
+    panel = change_map(Drawn({}, Results(ABOUT, swept), [change], [], {}, []), {}).axes[0]
+    (dots,) = [line for line in panel.lines if line.get_marker() == "o"]
+    assert len({tuple(point) for point in dots.get_xydata()}) == len(success)
+    assert abs(dots.get_ydata()).max() < 0.5  # within the row
+
+
+def test_axes_of_numbers_are_those_along_which_one_number_changes(swept):
+    assert numeric_axes(Results(ABOUT, swept)) == ["sparsity"]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("ppo_claims", "forest"),
+        ("camera_rates", "lines"),
+        ("encoder_seeds", "spread"),
+        ("ppo_event_set", "dots"),
+    ],
+)
+def test_published_figures_are_drawn_from_their_data(name, kind):
+    study = published(DATA, name, name)
+    drawn = Drawn(study.said, study.results, study.changes, study.summaries, study.families, study.doses)
+    (said,) = [one for one in study.said["figures"].values() if one["kind"] == kind]
+    figure = KINDS[kind](drawn, said)
+    marks = sum(len(panel.lines) + len(panel.texts) for panel in figure.axes)
+    assert marks >= len(study.results.trained)

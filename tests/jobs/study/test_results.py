@@ -1,0 +1,118 @@
+"""The one table of episodes: what is read back is what was written, whatever version wrote it."""
+
+import gzip
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jobs.config.config import parse
+from jobs.config.errors import ConfigError
+from jobs.rollout import episodes, table, tasks
+from jobs.rollout.episodes import EPISODE
+from jobs.rollout.store import EpisodeStore
+from jobs.rollout.table import LABELS, read_table
+from jobs.run.files import RunError, write_json
+from jobs.run.folder import run_name
+from jobs.run.provenance import REPOSITORY
+from jobs.study.results import check_whole, read_cells, read_published, read_results, value_of
+from tests.support.configs import compose, sweep_config
+from tests.support.episodes import flights
+from tests.support.runs import planned
+from tests.support.sweep_folders import ABOUT, write_sweep
+
+DATA = REPOSITORY / "docs" / "data"
+
+
+@pytest.fixture
+def study(tmp_path):
+    return write_sweep(tmp_path / "runs" / "robustness-short-s0-1" / "study")
+
+
+def test_every_published_table_is_written_again_byte_for_byte(tmp_path):
+    for name in ("encoder_seeds", "hold"):
+        packed = gzip.decompress((DATA / f"{name}_episodes.csv.gz").read_bytes())
+        (tmp_path / "episodes.csv").write_bytes(packed)
+        cells = read_cells(tmp_path / "episodes.csv")
+        rows = {(at[0], tasks.text_of(at[1]), group, "" if seed is None else seed): own
+                for (at, group), trainings in cells.items() for seed, own in trainings.items()}  # fmt: skip
+        table.write_episodes(tmp_path / "again.csv", LABELS, rows)
+        assert sorted((tmp_path / "again.csv").read_bytes().splitlines()) == sorted(packed.splitlines())
+
+
+def test_flights_survive_their_file_and_values_are_numbers(study):
+    results = read_results(study)
+    assert set(results.trainings(("sparsity", 0.2), "bytestream")) == {0, 1, 2}
+    np.testing.assert_array_equal(results.cells[results.nominal, "bytestream"][2], flights(16))
+    assert results.trainings(results.nominal, "oracle").keys() == {None}
+    assert results.trained == ["bytestream", "event_image"]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("45", 45.0), ("0.05", 0.05), ("texture_change", "texture_change"), ("nan", "nan")]
+)
+def test_a_value_is_a_number_where_its_text_is_one(text, value):
+    assert value_of(text) == value
+    assert tasks.text_of(value_of(text)) == text
+
+
+def test_a_column_that_an_older_file_lacks_has_its_default_and_a_first_column_is_missed(study, monkeypatch):
+    later = np.dtype([*EPISODE.descr, ("near_misses", "i8")])
+    monkeypatch.setattr(table, "COLUMNS", later.names)
+    monkeypatch.setattr(table, "ADDED", {"near_misses": 7})
+    assert set(read_table(study / "episodes.csv")["near_misses"]) == {7}
+    monkeypatch.setattr(table, "EPISODE", later)
+    assert table.episodes_of([(3, *[0] * 9)], EPISODE.names)["near_misses"].tolist() == [7]
+    lines = (study / "episodes.csv").read_text().splitlines()
+    lines[0] = lines[0].replace("success", "won")
+    (study / "episodes.csv").write_text("\n".join(lines))
+    with pytest.raises(RunError, match=r"must have the columns \['success'\]; evaluate again"):
+        read_table(study / "episodes.csv")
+
+
+def test_a_new_column_renames_no_task_and_older_stores_are_read(tmp_path, monkeypatch):
+    """The key of this task has been the same since the first sweeps; `KEYED_COLUMNS` is never extended."""
+    assert EPISODE.names[: len(tasks.KEYED_COLUMNS)] == tasks.KEYED_COLUMNS
+    assert set(EPISODE.names[len(tasks.KEYED_COLUMNS) :]) == set(episodes.ADDED)
+    plan = planned(sweep_config(tmp_path), "straight")
+    before = plan.tasks[0].key
+    monkeypatch.setattr(episodes, "EPISODE", np.dtype([*EPISODE.descr, ("near_misses", "i8")]))
+    assert planned(sweep_config(tmp_path), "straight").tasks[0].key == before
+    store, rows = EpisodeStore(tmp_path / "store"), flights(1, trials=2)
+    old = {"label": ["nominal", "poles_eval", "straight"], "commits": ["c0ffee"], "encoder": {}}
+    old |= {"restarts": 0, "episodes": rows.tolist()}
+    write_json(tmp_path / "store" / "episodes" / f"{before}.json", old)
+    np.testing.assert_array_equal(store.result(plan.tasks[0]).episodes, rows)
+    assert store.missing(plan.tasks[0]).seeds == ()
+
+
+@pytest.mark.parametrize(
+    "name", ["ppo_claims", "camera_rates", "encoder_seeds", "taught_claims", "ppo_paper"]
+)
+def test_a_run_of_an_earlier_version_is_found_in_its_folder(name):
+    told = json.loads((DATA / f"{name}_about.json").read_text())["run"]
+    assert run_name(parse(compose(f"+exp={name}"))) == told
+
+
+def test_a_study_that_lacks_episodes_or_is_of_the_first_versions_is_refused(study):
+    check_whole(read_results(study))
+    lines = (study / "episodes.csv").read_text().splitlines(keepends=True)
+    own = [line for line in lines if line.startswith("sparsity,0.5,bytestream,1,")]
+    (study / "episodes.csv").write_text("".join(line for line in lines if line not in own[9:]))
+    said = r"sparsity 0\.5 of bytestream s1 must have 20 episodes, got 9; run the command of the study again"
+    with pytest.raises(ConfigError, match=said):
+        check_whole(read_results(study))
+    write_json(study / "about.json", {**ABOUT, "episodes_sha256": "0" * 64})
+    with pytest.raises(RunError, match="damaged"):
+        read_results(study)
+    write_json(study / "about.json", {name: value for name, value in ABOUT.items() if name != "met"})
+    with pytest.raises(ConfigError, match="earlier version"):
+        read_results(study)
+
+
+def test_a_study_without_what_made_it_has_the_groups_of_its_episodes():
+    results = read_published(DATA, "taught")
+    assert len(results.trained) == 7
+    assert results.baselines()["control_hz", 45.0] == results.nominal
+    assert isinstance(read_table(DATA / "taught_episodes.csv.gz"), pd.DataFrame)

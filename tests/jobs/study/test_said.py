@@ -1,0 +1,43 @@
+"""What hand-written pages say in numbers of the published sweep is what its data say."""
+
+import pytest
+
+from jobs.run.provenance import REPOSITORY
+from jobs.study.results import read_published
+
+
+@pytest.fixture(scope="module")
+def sweep():
+    return read_published(REPOSITORY / "docs" / "data", "robustness")
+
+
+def success(sweep, at, group):
+    return float(sweep.values(at, group).mean())
+
+
+def test_what_is_left_to_the_policy_that_holds_is_what_the_data_say(sweep):
+    rates = {at: success(sweep, at, "bytestream_hold") for at in sweep.conditions}
+    dense = {("control_hz_dense", rate) for rate in (25.0, 45.0, 800.0)}
+    late = {("action_delay", 50.0), ("action_delay", 100.0)}
+    assert {at for at, rate in rates.items() if round(100 * rate) < 96} == dense | late
+    shown = {rate: round(100 * rates["control_hz_dense", rate]) for rate in (25.0, 45.0, 200.0, 800.0)}
+    assert shown == {25.0: 90, 45.0: 87, 200.0: 97, 800.0: 94}
+    assert [round(100 * rates["action_delay", late]) for late in (50.0, 100.0)] == [94, 66]
+
+
+def test_late_actions_change_what_the_page_says(sweep):
+    groups = [group for group in sweep.trained if len(sweep.groups[group]) > 1 and group != "rgb"]
+    assert len(groups) == 8
+    usual = {group: success(sweep, ("action_delay", 0.0), group) for group in groups}
+    ends = []
+    for delays in ((25.0, 50.0), (100.0,)):
+        found = [
+            success(sweep, ("action_delay", ms), group) - usual[group] for ms in delays for group in groups
+        ]
+        ends.append((round(100 * min(found)), round(100 * max(found))))
+    assert ends == [(-7, 17), (-34, -5)]
+
+
+def test_a_page_about_trainings_that_have_been_replaced_says_so():
+    text = (REPOSITORY / "docs" / "dose_response.md").read_text()
+    assert "stands for trainings shipped at commit 2991870" in text

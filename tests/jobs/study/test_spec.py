@@ -1,0 +1,135 @@
+import json
+
+import pytest
+import yaml
+
+from jobs.config.errors import ConfigError
+from jobs.run.provenance import REPOSITORY
+from jobs.study.results import Results, text_of
+from jobs.study.spec import CONF, families_of, read_study
+from tests.support.configs import compose, sweep_config
+from tests.support.runs import planned
+
+FACTS = {
+    "axes": {"nominal": {"poles": {}}, "hz": {"45": {"env.control_hz": 45}, "400": {"env.control_hz": 400}},
+             "late": {"50": {"env.action_delay_ms": 50}}},
+    "groups": {"a_45": [0, 1], "a_400": [0, 1], "b_45": [0, 1], "oracle": [None]},
+}  # fmt: skip
+TAGS = {"a_45": {"kind": "a", "at": 45}, "a_400": {"kind": "a", "at": 400}, "b_45": {"kind": "b", "at": 45}}
+
+
+def families(said):
+    study = {"variants": {name: {"tags": tags} for name, tags in TAGS.items()}, "families": {"one": said}}
+    return families_of(study, Results(json.loads(json.dumps(FACTS)), {}))
+
+
+def contrasts(said):
+    (family,) = families({"contrasts": said} if isinstance(said, list) else said)
+    return family.contrasts
+
+
+def test_groups_are_chosen_by_their_tags_and_conditions_are_numbers():
+    block = {"for": {"hz": [45]}, "contrasts": [{"name": "at <hz> Hz", "ours": {"kind": "a", "at": "<hz>"}}]}
+    with pytest.raises(
+        ConfigError, match=r"must select one group, {'kind': 'a'} selects \['a_45', 'a_400'\]"
+    ):
+        contrasts([block])
+    tags = {name: {"kind": own["kind"], "rate": own["at"]} for name, own in TAGS.items()}
+    study = {"variants": {name: {"tags": own} for name, own in tags.items()}}
+    said = {"contrasts": [{"name": "at <hz> Hz", "for": {"hz": [45, 400]}, "at": {"hz": ["<hz>"]},
+                           "ours": {"kind": "a", "rate": "<hz>"}}]}  # fmt: skip
+    (family,) = families_of({**study, "families": {"one": said}}, Results(FACTS, {}))
+    assert [(one.name, one.ours.group, one.ours.at) for one in family.contrasts] == [
+        ("at 45 Hz", "a_45", (("hz", 45.0),)), ("at 400 Hz", "a_400", (("hz", 400.0),))
+    ]  # fmt: skip
+
+
+def test_loops_go_round_in_their_order_inside_each_other():
+    inner = {"for": {"kind": ["x", "y"]}, "contrasts": [{"name": "<group> <kind>", "ours": "<group>"}]}
+    found = contrasts({"for": {"group": "groups"}, "contrasts": [inner]})
+    assert [one.name for one in found] == [f"{group} {kind}" for group in list(TAGS) for kind in "xy"]
+    others = contrasts(
+        [{"name": "<group>", "for": {"group": "others"}, "ours": "<group>", "theirs": "<first>"}]
+    )
+    assert [(one.name, one.theirs.group) for one in others] == [("a_400", "a_45"), ("b_45", "a_45")]
+
+
+def test_a_test_of_a_group_or_a_condition_that_the_study_lacks_is_left_out():
+    assert contrasts([{"ours": "a_45", "theirs": "rgb"}]) == ()
+    (one,) = contrasts([{"ours": "a_45", "at": {"hz": [45, 100], "moon": "all"}}])
+    assert one.ours.at == (("hz", 45.0),)
+
+
+def test_baselines_are_those_of_each_condition():
+    (one,) = contrasts([{"ours": "a_45", "at": {"hz": "all", "late": "all"}, "less": "baseline"}])
+    assert one.ours.less == (("nominal", "poles"),) * 3
+    (mean,) = contrasts([{"ours": "a_45", "at": {"hz": [45]}, "less": {"hz": "all"}}])
+    assert mean.ours.less == (("hz", 45.0), ("hz", 400.0))
+
+
+def test_a_shared_family_keeps_its_names_for_groups_that_are_called_otherwise():
+    said = {"as": {"b_45": "a_400"}, "contrasts": [{"ours": "b_45", "theirs": "a_45"}]}
+    (family,) = families(said)
+    (one,) = family.contrasts
+    assert (one.ours.group, one.theirs.group) == ("a_400", "a_45")
+    assert family.alias == {"a_400": "b_45"}
+
+
+REFUSED = {
+    "no such key": ({"contrast": []}, "has the keys"),
+    "a wrong correction": (
+        {"adjust": "bonferroni", "contrasts": []},
+        "adjust holm, bh or none, got 'bonferroni'",
+    ),
+    "a wrong word": ({"words": {"better": "yes"}, "contrasts": []}, r"got \['words.better'\]"),
+    "a wrong file": ("moon", "must name a file of conf/claims, got 'moon'"),
+    "no family": (3, "must be a family or a file of conf/claims, got 3"),
+    "no side": ({"contrasts": [{"theirs": "a_45"}]}, "a test has `ours`"),
+    "wrong conditions": ({"contrasts": [{"ours": "a_45", "at": "some"}]}, "must be all, changed, nominal"),
+    "a wrong loop": ({"for": {"group": "every"}, "contrasts": [{"ours": "a_45"}]}, "must name a list"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_wrong_family_is_refused_with_the_rule(name):
+    said, rule = REFUSED[name]
+    with pytest.raises(ConfigError, match=rule):
+        families(said)
+
+
+def test_the_papers_claims_are_about_conditions_of_the_default_study_and_their_baselines(tmp_path):
+    config = sweep_config(tmp_path, axes=compose("+exp=robustness")["study"]["axes"])
+    plan, nominal = planned(config, "straight"), ("nominal", "poles_eval")
+    claims = yaml.safe_load((CONF / "claims" / "paper.yaml").read_text())
+    asked = {(axis, value) for at in _places(claims) for axis, values in at.items() for value in values}
+    assert asked <= set(plan.conditions)
+    dense = {at: base for at, base in plan.baselines.items() if at[0] == "control_hz_dense"}
+    assert set(dense.values()) == {("control_hz_dense", 200)}
+    assert plan.baselines["memory_400hz", "frame"] == ("control_hz", 400)
+    assert {base for at, base in plan.baselines.items() if at[0] in ("world", "sensor_noise")} == {nominal}
+    assert plan.same_as["world", "poles_dense"] == ("control_hz_dense", 200)
+    assert plan.same_as["sparsity", 0.0] == nominal
+    assert plan.same_as["sparsity", 0.5] == ("sparsity", 0.5)
+
+
+def _places(block):
+    """Yield the conditions of all tests of a block."""
+    for one in block.get("contrasts", ()):
+        yield from _places(one)
+    if isinstance(block.get("at"), dict):
+        yield block["at"]
+
+
+@pytest.mark.parametrize(
+    "name", ["ppo_claims", "taught_claims", "camera_rates", "encoder_seeds", "ppo_paper"]
+)
+def test_every_published_group_and_condition_is_still_in_the_file_of_its_study(name):
+    facts = json.loads((REPOSITORY / "docs" / "data" / f"{name}_about.json").read_text())
+    study = compose(f"+exp={name}")["study"]
+    assert list(study["variants"]) == list(facts["groups"])
+    assert study["trials"] == facts["trials"]
+    assert list(study["axes"]) == [axis for axis in facts["axes"] if axis != "nominal"]
+    for axis, settings in study["axes"].items():
+        first = next(iter(settings.values()))
+        assert [text_of(value) for value in first] == list(facts["axes"][axis])
+    assert read_study(name)["seeds"] == facts["seeds"]

@@ -1,0 +1,103 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jobs.analysis.tables import markdown_table
+from jobs.study.results import Results
+from jobs.study.summaries import axis_curves, columns_of, details_table, metrics_of, success_lines, summarise
+from jobs.tracking.store import check_metrics
+from tests.support.episodes import flights
+
+AT = ("sparsity", 0.2)
+
+
+def test_a_group_pools_its_trainings():
+    row = summarise(AT, "a", {0: flights(10), 1: flights(14)})
+    assert (row.trainings, row.episodes, row.success.value) == ((0, 1), 40, 0.6)
+    low, high = row.success.interval
+    assert low < 0.446 < 0.737 < high  # wider than Wilson's of 40 episodes
+    assert row.distance_m.value == pytest.approx(
+        np.mean([flights(10)["distance_m"], flights(14)["distance_m"]])
+    )
+
+
+def test_a_difference_is_taken_corridor_by_corridor():
+    ours = {seed: flights(10, offset_m=3.0) for seed in (0, 1)}
+    row = summarise(AT, "a", ours, {5: flights(10), 6: flights(10)})
+    assert row.success_difference.value == 0.0
+    assert row.success_difference.interval[0] < 0.0 < row.success_difference.interval[1]
+    assert row.distance_difference_m.value == pytest.approx(3.0)
+    low, high = row.distance_difference_m.interval
+    assert low < 3.0 < high  # of trainings that agree, too, there are few
+    worse = summarise(AT, "a", {0: flights(4)}, {0: flights(16)})
+    assert worse.success_difference.value == pytest.approx(-0.6)
+    assert worse.success_difference.interval[1] < 0
+
+
+def test_trainings_of_different_corridors_are_refused():
+    other = flights(3)
+    other["seed"] += 1
+    with pytest.raises(ValueError, match=r"trainings \[0, 1\] .*same corridors"):
+        summarise(AT, "a", {0: flights(3), 1: other})
+
+
+def test_the_table_has_a_column_for_each_group_and_says_what_failed():
+    rows = [summarise(AT, "a", {0: flights(10)})]
+    results = Results({"groups": {"a": [0], "b": [0]}}, {})
+    head, lines = success_lines(rows, results, [AT, ("sparsity", 0.5)], {(AT, "b"): "failed"})
+    assert markdown_table(head, lines, 2).splitlines() == [
+        "| Axis | Value | a | b |",
+        "| --- | --- | ---: | ---: |",
+        "| sparsity | 0.2 | 50 [30, 70] | failed |",
+        "| sparsity | 0.5 | - | - |",
+    ]
+
+
+def test_every_estimate_stands_beside_its_interval():
+    row = summarise(AT, "a", {0: flights(10)}, {0: flights(10, offset_m=1.0)})
+    text = details_table([row], "b")
+    low, high = row.distance_m.interval
+    assert f"| {row.distance_m.value:.1f} [{low:.1f}, {high:.1f}] |" in text
+    low, high = row.distance_difference_m.interval
+    assert f"| -1.0 [{low:.1f}, {high:+.1f}] | 300 | 0 |" in text
+
+
+def test_a_tracked_row_says_its_place_on_the_axis_where_that_is_a_number():
+    row = summarise(AT, "a", {0: flights(10)}, {0: flights(8)})
+    figures = check_metrics(metrics_of(row))
+    assert figures["sweep/value"] == 0.2
+    assert figures["eval/success_rate_low"] == row.success.interval[0]
+    assert figures["sweep/success_difference"] == pytest.approx(0.1)
+    word = dataclasses.replace(row, condition=("world", "poles"), success_difference=None)
+    assert not {"sweep/value", "sweep/success_difference"} & set(metrics_of(word))
+    single = summarise(AT, "a", {0: flights(1, trials=1)})
+    assert "eval/distance_m_low" not in metrics_of(single)
+
+
+def test_the_first_column_of_a_tracked_table_is_unique():
+    rows = [summarise(AT, group, {0: flights(10)}) for group in ("a", "b")]
+    first, *others = columns_of(rows).values()
+    assert len(set(first)) == 2
+    assert {len(values) for values in others} == {2}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "steps", "unit"),
+    [
+        ([25.0, 800.0], [25, 800], ""),
+        ([0.05, 0.4], [5, 40], "_percent"),
+        ([0.0, 0.125], [0, 125], "_permille"),
+    ],
+)
+def test_a_curve_has_the_axis_as_whole_steps_and_says_their_unit(numbers, steps, unit):
+    rows = [
+        summarise(("a", value), "g", {0: flights(won)}) for won, value in zip((5, 20), numbers, strict=True)
+    ]
+    curves = axis_curves("a", numbers, rows)
+    assert set(curves) == {f"sweep/a{unit}_success", f"sweep/a{unit}_distance_m"}
+    assert curves[f"sweep/a{unit}_success"] == dict(zip(steps, [0.25, 1.0], strict=True))
+
+
+def test_an_axis_too_fine_for_whole_steps_has_no_curve():
+    assert axis_curves("a", [1e-5], []) == {}

@@ -1,0 +1,45 @@
+import re
+from pathlib import Path
+
+from jobs.analysis import coverage
+from research.coverage import SPREADS, change_coverage, true_rate
+from research.stopping import EFFECTS, MEAN
+
+PAGE = (Path(__file__).parents[3] / "docs" / "statistics.md").read_text()
+
+
+def percent(mean, spread):
+    """A true rate as the page says it."""
+    return f"{100 * true_rate(mean, spread):.0f}"
+
+
+def test_the_page_says_the_true_rates_at_each_spread():
+    *first, last = (percent(1.5, spread) for spread in SPREADS)
+    assert f"the true rates are {', '.join(first)} and {last} %" in PAGE
+    assert f"a true rate of {percent(3, 0)} % where trainings agree, of {percent(3, 3)} % at a spread" in PAGE
+    ours, theirs = ([percent(MEAN - effect, spread) for spread in (0, 2)] for effect in EFFECTS)
+    said = f"true rates of {ours[0]} and {theirs[0]} % where trainings agree, of {ours[1]} and {theirs[1]} %"
+    assert said in PAGE
+
+
+def test_the_page_says_what_looking_early_costs_as_its_rows_do():
+    rows = re.findall(r"^\| \d+ \| \d+ \| \d \| (\d+) % \| (\d+) % \|", PAGE, re.MULTILINE)
+    losses = [1 - int(shared) / int(once) for once, shared in rows]
+    assert len(losses) == 4
+    assert 0.32 < min(losses) < max(losses) < 0.45
+    assert "costs a third to four in ten of the decisions" in PAGE
+
+
+def test_intervals_of_a_change_hold_zero_where_nothing_changes(monkeypatch):
+    """Of eight trainings and seven corridors; halved intervals hold it in less than nine of ten."""
+    monkeypatch.setattr(coverage, "STUDIES", 200)
+    assert 0.95 <= change_coverage(8, 7, 1.5, 1.0) <= 1.0
+    whole = coverage.crossed_mean
+
+    def halved(values, limits):
+        found = whole(values, limits)
+        low, high = found.interval or (0.0, 0.0)
+        return type("Halved", (), {"interval": ((3 * low + high) / 4, (low + 3 * high) / 4)})
+
+    monkeypatch.setattr(coverage, "crossed_mean", halved)
+    assert change_coverage(8, 7, 1.5, 1.0) < 0.9
