@@ -19,6 +19,7 @@ from envs.config import ADDED_FAULTS, CameraConfig, FaultsConfig
 from envs.events.camera import MAX_EVENTS_PER_FRAME
 from envs.events.disturbances import disturb
 from envs.events.emission import EVENT
+from envs.events.noise_labels import NoiseLabels
 from envs.events.pixel_noise import PixelNoise, PixelState, no_noise
 from envs.events.readout import Readout
 
@@ -97,11 +98,14 @@ class RealSensor:
         self._labels, self.is_noise = labels, np.empty(0, bool)
         shape = camera.height, camera.width
         self._pixels = draw_pixel_faults(shape, faults, rng)
-        self._noise = self._readout = None
+        self._noise = self._readout = self._noise_labels = None
         if faults.shot_noise_hz > 0.0 or faults.leak_hz > 0.0:
             own, numbers = state
+            rest = own[1][1]["first_level"].copy()  # before the noise moves the levels
             alive = np.where(self._pixels.dead.flat[numbers], -1, numbers)
             self._noise = PixelNoise(camera, faults, own, alive, t_us, rng)
+            if labels:
+                self._noise_labels = NoiseLabels(own, numbers, rest)
         if has_readout(camera):
             self._readout = Readout(camera, t_us, rng, LABELLED if labels else EVENT)
         amounts = sorted(faults.added.items())
@@ -122,10 +126,16 @@ class RealSensor:
         The camera has seen the light of t1_us. `fired` is what `pixel_noise.fire` found of `pixel_noise` for
         this interval, if that was called. As `apply_faults`, which also says what is raised.
         """
-        noise = None
+        noise, labels = None, None
+        kept = self._noise.kept() if self._noise_labels is not None and self._noise is not None else None
         if self._noise is not None:
             noise = self._noise.events(t0_us, t1_us) if fired is None else self._noise.of_image(fired)
-        events, is_noise = _with_faults(events, (t0_us, t1_us), self._faults, self._pixels, self._rng, noise)
+        if self._noise_labels is not None and noise is not None and kept is not None:
+            pixels = events["y"].astype(np.int64) * self._pixels.dead.shape[1] + events["x"]
+            of_light, labels = self._noise_labels.of((pixels, events["p"]), noise[1:], t1_us, kept)
+            events = labelled(events, of_light)
+        drawn = self._pixels, self._rng
+        events, is_noise = _with_faults(events, (t0_us, t1_us), self._faults, *drawn, noise, labels)
         for name, apply in self._added.items():
             before, events = events, apply(events, t0_us, t1_us)
             _check_added(name, events, (t0_us, t1_us), self._pixels.dead.shape)
@@ -135,8 +145,7 @@ class RealSensor:
             return events if self._readout is None else self._sent(events, t1_us)
         self.is_noise = is_noise
         if self._readout is not None:
-            sent = self._sent(labelled(events, is_noise), t1_us)
-            events, self.is_noise = sent[list(EVENT.names or ())].astype(EVENT), sent["is_noise"]
+            events, self.is_noise = unlabelled(self._sent(labelled(events, is_noise), t1_us))
         return events
 
     def _sent(self, events: np.ndarray, t1_us: int) -> np.ndarray:
@@ -153,6 +162,13 @@ def labelled(events: np.ndarray, is_noise: np.ndarray) -> np.ndarray:
         rows[name] = events[name]
     rows["is_noise"] = is_noise
     return rows
+
+
+def unlabelled(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """EVENT (N,) and bool (N,) of `LABELLED` (N,); events without labels are no noise."""
+    if rows.dtype != LABELLED:
+        return rows, np.zeros(rows.size, bool)
+    return rows[list(EVENT.names or ())].astype(EVENT), rows["is_noise"].copy()
 
 
 def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, ...]) -> None:
@@ -218,8 +234,13 @@ def _with_faults(
     pixels: PixelFaults,
     rng: np.random.Generator,
     noise: Noise | None,
+    labels: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`apply_faults`, and which of the events are false, bool (N,)."""
+    """`apply_faults`, and which of the events are noise, bool (N,).
+
+    All that is added is noise, except where `labels` (bool, one for each event of `noise`) says otherwise; so
+    are those events that come as LABELLED with that label.
+    """
     t0_us, t1_us = span_us
     if t1_us <= t0_us:
         raise ValueError(f"faults need t1_us > t0_us; got {t0_us} and {t1_us}.")
@@ -237,12 +258,14 @@ def _with_faults(
         )
     drawn = [where[rng.integers(0, where.size, int(rng.poisson(mean)))] for where, mean in kinds]
     false = [_at_any_time(where, (t0_us, t1_us), rng) for where in drawn] + ([noise] if noise else [])
-    if not false:
-        return events, np.zeros(events.size, bool)
+    events, is_noise = unlabelled(events)
+    if not sum(part[0].size for part in false):
+        return events, is_noise
     times, places, polarities = (np.concatenate(parts) for parts in zip(*false, strict=True))
-    if times.size == 0:
-        return events, np.zeros(events.size, bool)
-    return _merged(events, times, places, polarities, t0_us, pixels.dead.shape)
+    are_noise = np.ones(times.size, bool)
+    if labels is not None:
+        are_noise[times.size - labels.size :] = labels
+    return _merged((events, is_noise), (times, places, polarities, are_noise), t0_us, pixels.dead.shape)
 
 
 def _expected(
@@ -267,34 +290,38 @@ def _at_any_time(where: np.ndarray, span_us: tuple[int, int], rng: np.random.Gen
 
 @numba.njit(cache=True, error_model="numpy")
 def _merged(
-    events: np.ndarray,
-    times: np.ndarray,
-    places: np.ndarray,
-    polarities: np.ndarray,
+    light: tuple[np.ndarray, np.ndarray],
+    false: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     t0_us: int,
     shape: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """EVENT sorted by (t, y, x) of events, which are, and noise; of equal ones the true events come first.
+    """Merge events with false ones and sort them by (t, y, x); of equal ones the true events come first.
 
-    And which of them are the noise, bool (N,).
+    Args:
+        light: EVENT (N,), sorted, and their labels, bool (N,).
+        false: Times [us], flat pixels, polarities and labels of M events.
+        t0_us: A time before all of them [us].
+        shape: (H, W).
+
+    Returns:
+        EVENT (N + M,), and their labels.
     """
-    width = shape[1]
+    (events, labels), (times, places, polarities, false_labels), width = light, false, shape[1]
     order = np.argsort((times - t0_us) * (shape[0] * width) + places, kind="mergesort")
-    times, places, polarities = times[order], places[order], polarities[order]
     both = np.empty(events.size + times.size, events.dtype)
-    is_noise = np.zeros(both.size, np.bool_)
-    true = false = 0
+    is_noise = np.empty(both.size, np.bool_)
+    true = added = 0
     for k in range(both.size):
-        first = false == times.size
+        first, j = added == times.size, order[min(added, times.size - 1)]
         if not first and true < events.size:
             t, place = events[true]["t"], events[true]["y"] * np.int64(width) + events[true]["x"]
-            first = t < times[false] or (t == times[false] and place <= places[false])
+            first = t < times[j] or (t == times[j] and place <= places[j])
         if first:
-            both[k] = events[true]
+            both[k], is_noise[k] = events[true], labels[true]
             true += 1
         else:
-            is_noise[k] = True
-            both[k]["t"], both[k]["p"] = times[false], polarities[false]
-            both[k]["y"], both[k]["x"] = places[false] // width, places[false] % width
-            false += 1
+            is_noise[k] = false_labels[j]
+            both[k]["t"], both[k]["p"] = times[j], polarities[j]
+            both[k]["y"], both[k]["x"] = places[j] // width, places[j] % width
+            added += 1
     return both, is_noise

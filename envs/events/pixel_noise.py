@@ -273,6 +273,11 @@ class PixelNoise:
         """
         return self.of_image(fire(t0_us, t1_us, self._model, self._memory, self.state))
 
+    def kept(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return copies of `Noise.kept` and `Noise.kept_us`."""
+        rows, _, _, kept_us = self.state.rows
+        return rows[:, 8].copy(), kept_us.copy()
+
     def of_image(self, fired: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `events`, of what `fire` returns."""
         return fired[0], self._numbers[fired[1]], fired[2]

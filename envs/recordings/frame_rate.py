@@ -10,6 +10,7 @@ from envs.events import EventCamera
 MOST_PIXELS = 1 << 14  # that are looked at; they lie on an even grid
 FEWEST_INTERVALS = 4
 FEWEST_EVENTS = 100
+REPEATED = 0.02  # of the largest change from frame to frame, up to which a frame repeats another
 
 
 class FrameLoss:
@@ -18,6 +19,7 @@ class FrameLoss:
     Halving the frame rate loses a share s of the events. If what is lost is in proportion to the time between
     frames, the frames as they are miss the share s / (1 + s) of all events. That is about the truth for edges
     that move, and more than the truth for light that changes smoothly. Noise of the frames counts as motion.
+    A frame that repeats the one before it shows nothing new, so it is left out.
     """
 
     def __init__(self, camera: CameraConfig) -> None:
@@ -35,10 +37,14 @@ class FrameLoss:
         self._every, self._other = EventCamera(ideal), EventCamera(ideal)
         self._frames, self._since = 0, 0
         self._of_every, self._of_other = 0, 0
+        self._last: np.ndarray | None = None
+        self._largest_change = 0.0
 
     def see(self, luminance: np.ndarray, t_us: int) -> None:
         """Take the next frame, float32 (H, W), linear."""
         sample = np.ascontiguousarray(luminance[:: self._stride, :: self._stride])
+        if self._repeats(sample):
+            return
         if self._frames == 0:
             self._every.reset(sample, t_us)
             self._other.reset(sample, t_us)
@@ -48,6 +54,16 @@ class FrameLoss:
                 self._of_every, self._since = self._of_every + self._since, 0
                 self._of_other += self._other.step(sample, t_us).size
         self._frames += 1
+
+    def _repeats(self, sample: np.ndarray) -> bool:
+        """Whether a frame is the last one again, as coded; if not, remember it."""
+        if self._last is not None:
+            change = float(np.abs(sample - self._last).mean(dtype=np.float64))
+            if change <= REPEATED * self._largest_change:
+                return True
+            self._largest_change = max(self._largest_change, change)
+        self._last = sample.copy()
+        return False
 
     @property
     def at_half_rate(self) -> float | None:

@@ -222,6 +222,14 @@ def test_averaging_keeps_the_mean_and_a_flat_picture_flat(old, new):
     assert average(picture).max() <= picture.max() + 1e-6
 
 
+def test_averaging_sums_in_one_order_whatever_the_processor_and_its_threads():
+    picture = np.random.default_rng(0).random((90, 160)).astype(np.float32)
+    rows = picture.astype(float).reshape(9, 10, 160) * 0.1
+    lines = np.add.accumulate(rows, axis=1)[:, -1]
+    blocks = np.add.accumulate(lines.reshape(9, 16, 10) * 0.1, axis=2)[..., -1].astype(np.float32)
+    assert area_average((90, 160), (9, 16))(picture).tobytes() == blocks.tobytes()
+
+
 def test_averaging_by_whole_numbers_is_the_mean_of_blocks():
     picture = np.random.default_rng(0).random((12, 16)).astype(np.float32)
     blocks = picture.reshape(3, 4, 4, 4).mean(axis=(1, 3))
