@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -21,16 +23,17 @@ def test_the_embedding_keeps_the_shape_of_the_times_in_front():
     assert temporal_embedding(np.zeros((2, 3)), 16).shape == (2, 3, 16)
 
 
-@pytest.mark.parametrize("context", [0, 1, 7])
-def test_a_context_without_pairs_is_refused(context):
-    with pytest.raises(ValueError, match="context must be even"):
-        temporal_embedding(0.5, context)
+REFUSED = [
+    *((partial(temporal_embedding, 0.5, context), "context must be even") for context in (0, 1, 7)),
+    *((partial(temporal_embedding, [0.5, t], 8), "must lie in") for t in (-1e-9, 1.001, np.nan, np.inf)),
+    (partial(time_code, 0.5, 8, "sum"), "coding must be one of additive, eventnet, none, got 'sum'"),
+]
 
 
-@pytest.mark.parametrize("t", [-1e-9, 1.001, np.nan, np.inf])
-def test_a_time_outside_of_the_window_is_refused(t):
-    with pytest.raises(ValueError, match="must lie in"):
-        temporal_embedding([0.5, t], 8)
+@pytest.mark.parametrize(("call", "rule"), REFUSED)
+def test_what_has_no_code_is_refused_with_the_rule(call, rule):
+    with pytest.raises(ValueError, match=rule):
+        call()
 
 
 def test_the_table_holds_the_bin_centres_and_cannot_be_written():
@@ -59,11 +62,6 @@ def test_eventnet_turns_once_backwards_over_the_window():
     assert np.allclose(phase[0] + 1j * phase[1], np.exp(-2j * np.pi * age), atol=1e-15)
     with pytest.raises(ValueError, match="read-only"):
         phase[0, 0] = 1
-
-
-def test_an_unknown_coding_is_refused():
-    with pytest.raises(ValueError, match="coding must be one of additive, eventnet, none, got 'sum'"):
-        time_code(0.5, 8, "sum")
 
 
 def test_bins_are_the_floor_of_time_times_bins_with_the_window_end_in_the_last():

@@ -96,22 +96,20 @@ def test_an_event_off_the_sensor_or_without_polarity_is_refused_by_its_index(row
         batch_windows([(events((1, 0, 0, 1), row), 0, 10)], GRID)
 
 
-def test_negative_coordinates_of_a_packed_window_are_refused():
-    with pytest.raises(ValueError, match="x=-1"):
-        batch_packed(packed(4, 10, [(1, -1, 0, 1)])[None], GRID)
+FLOATS = np.array([(np.nan, 0, 0, 1)] * 2, np.dtype([("t", "f8"), ("x", "u2"), ("y", "u2"), ("p", "i1")]))
+REFUSED = [
+    (lambda: batch_packed(packed(4, 10, [(1, -1, 0, 1)])[None], GRID), "x=-1"),
+    (lambda: batch_windows([(FLOATS, 0, 10)], GRID), "field t must hold integers"),
+    (lambda: batch_windows([(events((1, 0, 0, 1)), 0, 0)], GRID), "window_us must be"),
+    (lambda: batch_windows([(events((1, 0, 0, 1)), 0, -5)], GRID), "window_us must be"),
+    (lambda: batch_windows([(events((1, 0, 0, 1)), 0, 2**60)], GRID), "window_us must be"),
+]
 
 
-def test_a_time_that_is_not_a_number_is_refused():
-    floats = np.zeros(2, np.dtype([("t", "f8"), ("x", "u2"), ("y", "u2"), ("p", "i1")]))
-    floats["t"], floats["p"] = np.nan, 1
-    with pytest.raises(ValueError, match="field t must hold integers"):
-        batch_windows([(floats, 0, 10)], GRID)
-
-
-@pytest.mark.parametrize("window_us", [0, -5, 2**60])
-def test_a_window_without_a_usable_length_is_refused(window_us):
-    with pytest.raises(ValueError, match="window_us must be"):
-        batch_windows([(events((1, 0, 0, 1)), 0, window_us)], GRID)
+@pytest.mark.parametrize(("call", "rule"), REFUSED)
+def test_windows_that_cannot_be_are_refused_with_the_rule(call, rule):
+    with pytest.raises(ValueError, match=rule):
+        call()
 
 
 @pytest.mark.parametrize(
