@@ -306,6 +306,8 @@ class CorridorVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._over = np.zeros(num_envs, bool)
+        self._number = number_type(self.single_action_space)
+        self._actions_shape = (num_envs, *(self.single_action_space.shape or ()))
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Mapping[str, object] | None = None
@@ -376,7 +378,7 @@ class CorridorVectorEnv(VectorEnv):
     def _step_active(self, taken: np.ndarray, active: np.ndarray) -> None:
         """Simulate one control step of the active environments."""
         rows, space = self._vehicles.rows, self.single_action_space
-        if taken.shape != (self.num_envs, *(space.shape or ())):
+        if taken.shape != self._actions_shape:
             raise ValueError(f"actions must number {self.num_envs} of {space}; got shape {taken.shape}.")
         if (rows["over"] & active).any():
             raise ResetNeeded("An episode is over or has not begun; call reset() before step().")
@@ -384,7 +386,7 @@ class CorridorVectorEnv(VectorEnv):
         if wrong.any():
             raise ValueError(_bad_action(space, taken[wrong.argmax()]))
         try:
-            self._vehicles.step(taken.astype(number_type(space)), active)
+            self._vehicles.step(taken.astype(self._number), active)
         except StepError as error:
             raise ValueError(f"{self.envs[error.row].name_step()}: {error}") from error
 

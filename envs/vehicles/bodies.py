@@ -1,5 +1,6 @@
 """Bodies: the states of those vehicles of a batch that have dynamics of their own."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,23 +14,28 @@ class Bodies:
     """States, parameters and the last ways of vehicles; rows of kinematic vehicles stay unused.
 
     Attributes:
+        dynamics: Row -> `Dynamics`, of those that have a body.
         ways: float64 (B, parts + 1, 2), places at the ends of the parts of the last step [m].
     """
 
     def __init__(self, count: int) -> None:
         """Make room for `count` vehicles, all of them kinematic so far."""
-        self._dynamics: dict[int, Dynamics] = {}
+        self.dynamics: dict[int, Dynamics] = {}
         self._state, self._parameters = np.zeros((count, 4)), np.zeros((count, 0))
         self._tables, self._wind = np.zeros((count, 0, 0)), np.zeros((count, 2))
         self._dt_s, self._parts = np.zeros(count), np.zeros(count, np.int64)
+        self._rows = np.arange(count)
+        self._kinds: list[tuple[Callable[..., None], np.ndarray]] | None = None
         self.ways = np.zeros((count, 1, 2))
 
     def start(self, row: int, config: EnvConfig, dynamics: Dynamics, place: Point) -> int:
         """Start an episode of one vehicle at `place`; return the parts of its steps, 0 if it is kinematic."""
-        self._dynamics.pop(row, None)
+        if self.dynamics.pop(row, None) is not None:
+            self._state[row], self._kinds = 0.0, None
         if dynamics.move is None:
             return 0
-        self._dynamics[row] = dynamics
+        self._kinds = None
+        self.dynamics[row] = dynamics
         parts = self._parts[row] = parts_of_step(config)
         self._dt_s[row] = 1.0 / (config.control_hz * parts)
         self._state = _with_room(self._state, dynamics.state.shape)
@@ -44,9 +50,10 @@ class Bodies:
             self._tables[row, : len(dynamics.commands), : dynamics.commands.shape[1]] = dynamics.commands
         return int(parts)
 
-    def __bool__(self) -> bool:
-        """Whether any vehicle has a body."""
-        return bool(self._dynamics)
+    @property
+    def velocities(self) -> np.ndarray:
+        """The velocities of all vehicles, (2, B) [m/s]; 0 of kinematic ones."""
+        return self._state[:, 2:4].T
 
     def move(self, actions: np.ndarray, active: np.ndarray) -> None:
         """Move the active vehicles through one control step, as if nothing stood in the way.
@@ -55,16 +62,12 @@ class Bodies:
             actions: (B,) integers or (B, C) float64, those that are taken now.
             active: bool (B,).
         """
-        for move, rows in self._kinds().items():
-            own = np.zeros(len(active), bool)
-            own[rows] = active[rows]
+        if self._kinds is None:
+            self._kinds = self._find_kinds(len(active))
+        commands = actions if actions.ndim > 1 else self._tables[self._rows, actions]
+        for move_all, own in self._kinds:
             arrays = self._wind, self._parameters, self._dt_s, self._parts, self.ways
-            loop_over(move)(self._state, self._commands(actions), *arrays, own)
-
-    def note_velocities(self, rows: np.ndarray, active: np.ndarray) -> None:
-        """Write the velocities of the active vehicles to their VEHICLE records."""
-        own = [row for row in self._dynamics if active[row]]
-        rows["vx_mps"][own], rows["vy_mps"][own] = self._state[own, 2], self._state[own, 3]
+            move_all(self._state, commands, *arrays, own & active)
 
     def way(self, row: int) -> np.ndarray:
         """Return the planned places of a vehicle in its last step, (parts + 1, 2) [m]."""
@@ -72,25 +75,19 @@ class Bodies:
 
     def state_after(self, row: int, actions: np.ndarray) -> np.ndarray:
         """Return the state of a vehicle once these actions have been taken, float64 (S,)."""
-        dynamics, state = self._dynamics[row], self._state[row].copy()
+        dynamics, state = self.dynamics[row], self._state[row].copy()
         for action in actions:
             command = np.asarray(action if dynamics.commands is None else dynamics.commands[action], float)
             for _ in range(int(self._parts[row])):
                 dynamics.move(state, command, self._wind[row], self._parameters[row], self._dt_s[row])  # type: ignore[misc]  # a body moves
         return state
 
-    def _kinds(self) -> dict[Any, list[int]]:
-        """Return the rows that each `move` moves."""
-        kinds: dict[Any, list[int]] = {}
-        for row, dynamics in self._dynamics.items():
-            kinds.setdefault(dynamics.move, []).append(row)
-        return kinds
-
-    def _commands(self, actions: np.ndarray) -> np.ndarray:
-        """Return the command of each row, float64 (B, C)."""
-        if actions.ndim > 1:
-            return actions
-        return self._tables[np.arange(len(actions)), actions]
+    def _find_kinds(self, count: int) -> list[tuple[Callable[..., None], np.ndarray]]:
+        """Return each loop over vehicles, and the vehicles that it moves, bool (B,)."""
+        own: dict[Any, np.ndarray] = {}
+        for row, dynamics in self.dynamics.items():
+            own.setdefault(dynamics.move, np.zeros(count, bool))[row] = True
+        return [(loop_over(move), rows) for move, rows in own.items()]
 
 
 def _with_room(array: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:

@@ -85,11 +85,10 @@ def number_type(space: spaces.Space) -> type:
 
 def wrong_actions(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
     """Return which of some actions are not in a Discrete(K) or a Box, bool (B,)."""
-    discrete = isinstance(space, spaces.Discrete)
-    if actions.dtype.kind not in ("iu" if discrete else "iuf"):
-        return np.ones(len(actions), bool)
     if isinstance(space, spaces.Discrete):
-        return (actions < 0) | (actions >= space.n)
+        return (actions < 0) | (actions >= space.n) | (actions.dtype.kind not in "iu")
+    if actions.dtype.kind not in "iuf":
+        return np.ones(len(actions), bool)
     inside = (actions >= space.low) & (actions <= space.high)
     return ~inside.all(axis=tuple(range(1, actions.ndim)))
 

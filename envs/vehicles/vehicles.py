@@ -51,6 +51,7 @@ class Vehicles:
         self._noise: Any = None  # of pixels
         self._noise_of: list[PixelState | None] = [None] * count
         self._bodies = Bodies(count)
+        self._straight = np.zeros(count, np.int64)  # actions of kinematic vehicles where there is none
         self._judges: dict[int, task.Judge] = {}  # of the rows whose task is not the corridor's
         self._decided = np.zeros((count, 0), np.int64)  # actions not yet taken, the delay's steps in turn
         self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
@@ -120,17 +121,16 @@ class Vehicles:
         """
         rows = self.rows
         taken = self._exchange(actions, active)
-        headings, ways = taken, self._bodies.ways
-        if self._bodies:
+        headings = taken
+        if self._bodies.dynamics:
             self._bodies.move(taken, active)
-            headings = np.zeros(len(rows), np.int64)
-            self._bodies.note_velocities(rows, active)
+            rows["vx_mps"], rows["vy_mps"] = self._bodies.velocities
+            headings = taken if taken.ndim == 1 else self._straight
         self.events, self.ends, noise, noise_ends = step_all(
-            rows, self._corridors, self._noise, headings, ways, active
+            rows, self._corridors, self._noise, headings, self._bodies.ways, active
         )
-        for judge in set(self._judges.values()):
-            own = [self._judges.get(row) is judge for row in range(len(rows))]
-            task.loop_over(judge)(rows, active & own)
+        if self._judges:
+            self._judge(active)
         wrong = active & (rows["problem"] != GOOD)
         if wrong.any():
             self._refuse(int(wrong.argmax()))
@@ -200,6 +200,12 @@ class Vehicles:
         self._judges.pop(row, None)
         if judge is not None:
             self._judges[row] = judge
+
+    def _judge(self, active: np.ndarray) -> None:
+        """Judge the last step of the active vehicles whose task is not the corridor's."""
+        for judge in set(self._judges.values()):
+            own = [self._judges.get(row) is judge for row in range(len(self.rows))]
+            task.loop_over(judge)(self.rows, active & own)
 
     def _exchange(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Queue the new decisions; return the decisions that each vehicle's delay makes due."""

@@ -80,6 +80,20 @@ def test_headings_through_the_seam_fly_and_see_as_the_kinematic_vehicle():
     assert (others[["x", "y", "p"]] == events[["x", "y", "p"]]).mean() > 0.99
 
 
+def test_kinematic_vehicles_and_others_fly_side_by_side_as_each_alone():
+    configs = [EnvConfig(vehicle=name) for name in ("kinematic", "headings", "kinematic")]
+    vector, singles = CorridorVectorEnv(3, configs), [CorridorEnv(config) for config in configs]
+    vector.reset(seed=[1, 2, 3])
+    for seed, env in enumerate(singles, 1):
+        env.reset(seed=seed)
+    for actions in np.random.default_rng(0).integers(0, 3, (20, 3)):
+        vector.step(actions)
+        for one, env, action in zip(vector.envs, singles, actions, strict=True):
+            env.step(action)
+            assert one.camera_pose() == env.camera_pose()
+            assert one.events.tobytes() == env.events.tobytes()
+
+
 def test_delayed_headings_fly_as_the_delayed_kinematic_vehicle():
     actions = np.random.default_rng(2).integers(0, 3, 30)
     both = [flown(actions, action_delay_ms=12.0, **vehicle)[1] for vehicle in ({}, {"vehicle": "headings"})]
