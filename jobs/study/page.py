@@ -151,7 +151,8 @@ def _results(study: Study, _: str) -> str:
     if study.doses:
         blocks += [f"### Every change\n\n{_changes(study, '')}",
                    f"### Which trainings lose\n\n{tables.broken_table(study.changes)}"]  # fmt: skip
-    blocks.append(f"### Success under each condition\n\n{_success(study, '')}")
+    file = f"{study.name}_trainings.csv"
+    blocks.append(f"Success of every run under each condition: [`{file}`](data/{file}).")
     return "\n\n".join(block.strip("\n") for block in blocks if block)
 
 

@@ -182,3 +182,14 @@ def test_what_the_gallery_says_of_other_textures_is_what_the_data_say():
         "docs/watch.md",
     )
     assert found == [len(failed), len(first), len(early), len(rows) // len(first), round(half)]
+
+
+def test_the_page_of_claims_says_what_the_results_say():
+    def rows(page, columns):
+        lines = [line for line in (ROOT / "docs" / page).read_text().splitlines() if line.startswith("| `")]
+        cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+        return [tuple(row[at] for at in columns) for row in cells if len(row) > max(columns)]
+
+    shown = [(*row[0].split(": ", 1), *row[1:]) for row in rows("claims.md", range(5))]
+    assert sorted(shown) == sorted(rows("results.md", (0, 1, 3, 4, 8, 9)))
+    assert len(shown) == 20

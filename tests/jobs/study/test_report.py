@@ -85,7 +85,7 @@ def test_every_episode_and_training_is_there_to_be_analysed_again(sweep, tmp_pat
 def test_every_kind_of_study_is_published_from_the_folder_of_an_earlier_version(exp, tmp_path):
     folder = write_ablation(tmp_path / "ablation", exp, lambda group, axis, value, seed: seed % 3)
     text = write_study(exp, folder, config_of(tmp_path), tmp_path / "docs").read_text()
-    assert "### Success under each condition" in text
+    assert f"(data/{exp}_trainings.csv)" in text
     assert list((tmp_path / "docs" / "images").glob(f"{exp}.png"))
 
 
