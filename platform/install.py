@@ -30,7 +30,7 @@ WITHOUT_EFFECT = {
 
 
 def main(locks: list[str]) -> int:
-    """Install, and return the exit status of the installer."""
+    """Install the packages, and return the exit status of the installer."""
     files = [word for lock in locks for word in ("--requirement", lock)]
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     settings = uv_settings(pip_settings())
@@ -43,7 +43,7 @@ def main(locks: list[str]) -> int:
 
 
 def pip_settings() -> dict[str, str]:
-    """Return what files and variables set for pip, the strongest last."""
+    """Return pip's settings from files and variables, the strongest last."""
     command = [sys.executable, "-m", "pip", "config", "list", "--disable-pip-version-check"]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     pairs = [line.partition(".")[2].partition("=") for line in lines]

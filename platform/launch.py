@@ -74,14 +74,14 @@ def main() -> int:
 
 
 def command(words: list[str]) -> str:
-    """The same command line for a shell in this folder; only `evade` works outside the repository's root."""
+    """Return this command line for a shell in this folder; outside the clone only `evade` works."""
     started = Path(sys.argv[0])
     evade = started.name == "evade" and started.is_file()
     return shlex.join([*([sys.argv[0]] if evade else [sys.executable, "-m", "platform.launch"]), *words])
 
 
 def compose(words: list[str]) -> dict[str, object] | None:
-    """The composed configuration as plain containers; None if Hydra only answered a question.
+    """Compose the configuration as plain containers; return None if Hydra only answered a question.
 
     Args:
         words: The command line.
@@ -131,7 +131,7 @@ def with_jobs(answer: str) -> str:
 
 
 def word_errors(words: list[str]) -> list[str]:
-    """One line for each word that Hydra would accept and this launcher does not support."""
+    """Return one line for each word that Hydra accepts and this launcher does not support."""
     if not (CONF / "config.yaml").is_file():
         return [f"conf/config.yaml: not found in {str(ROOT)!r}; install from a clone with `pip install -e .`"]
     errors = []
@@ -144,7 +144,7 @@ def word_errors(words: list[str]) -> list[str]:
 
 
 def explain(error: Exception, words: list[str]) -> str:
-    """Hydra's error about a command line, in one line with the nearest key or the choices."""
+    """Return Hydra's error about a command line in one line, with the nearest key or the choices."""
     from jobs.config.config import keys_of_jobs, unknown_key
 
     text = str(error)
@@ -193,7 +193,7 @@ def run(values: dict[str, object]) -> None:
 
 
 def value_errors(values: object, key: str = "") -> Iterator[str]:
-    """One line for each value of a configuration that is missing, or is not plain data."""
+    """Yield one line for each value of a configuration that is missing, or is not plain data."""
     if isinstance(values, dict | list):
         for name, value in values.items() if isinstance(values, dict) else enumerate(values):
             inner = f"{key}.{name}" if key else str(name)
@@ -232,7 +232,7 @@ def report(error: Exception) -> int:
 
 
 def full_disk(error: Exception) -> str | None:
-    """Return what to say of a file system's error that its user can mend; None for another error."""
+    """Return the message for a file system's error that a user can mend; None for another error."""
     if not isinstance(error, OSError) or error.errno not in UNWRITABLE:
         return None
     where = error.filename2 or error.filename  # the second is what was copied to

@@ -1,4 +1,4 @@
-"""How a user's words become the words that Hydra composes: experiments, jobs, and names that changed."""
+"""Translate a user's words into the words that Hydra composes: experiments, jobs, and names that changed."""
 
 import re
 import shlex
@@ -25,7 +25,7 @@ def hydra_words(words: Sequence[str], jobs: Mapping[str, object] = JOBS) -> list
 
 
 def given_keys(words: Sequence[str]) -> set[str]:
-    """Return the keys whose values the words for Hydra give: of a group's file, the keys that it holds."""
+    """Return the keys that the words for Hydra set, including every key of a group's file."""
     keys: set[str] = set()
     for word in words:
         match = re.match(r"[+~]*([\w./]+)(?:@[\w.]*)?(?:=(.*))?$", word, re.DOTALL)
@@ -86,7 +86,7 @@ def experiments() -> list[str]:
 
 
 def _job(word: str, jobs: Mapping[str, object]) -> str:
-    """Return `job=NAME` for the experiment that a job is, under its present name; other words as they are."""
+    """Return `job=NAME` if the word names a job, under its present name; otherwise return the word."""
     named = EXPERIMENT.fullmatch(word) or re.fullmatch(r"job=(\w+)", word)
     if not named:
         return word

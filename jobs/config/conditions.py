@@ -32,7 +32,7 @@ WEIGHT = "weight"
 
 
 def _number_or_word(value: object) -> float | str | None:
-    """One rule and one message, where a union of types would give several."""
+    """Return a number, a word or null. A union of types would give several messages instead of one."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -41,7 +41,7 @@ def _number_or_word(value: object) -> float | str | None:
 
 
 def _settings(value: object) -> Any:
-    """A setting, a list of which one is drawn, or a range."""
+    """Return a setting, a list from which one is drawn, or a range."""
     if isinstance(value, Mapping):
         low, high, log = value.get("low"), value.get("high"), value.get("log", False)
         known = value.keys() <= {"low", "high", "log"} and isinstance(log, bool)
@@ -58,7 +58,7 @@ def _settings(value: object) -> Any:
 
 
 def _searched(value: object) -> Any:
-    """A list of any values, or a range."""
+    """Return a list of values, or a range."""
     if isinstance(value, list) and value:
         return value
     if not isinstance(value, Mapping):
@@ -78,7 +78,7 @@ Conditions = Annotated[list[dict[str, Drawn]], Field(min_length=1)]
 
 
 def axis_points(axis: Mapping[str, Sequence[Setting]]) -> list[Condition]:
-    """The points of an axis, each as setting -> value: settings have equally many values, or one for all.
+    """Return the points of an axis, each as setting -> value: one value of a setting is for all points.
 
     Raises:
         ValueError: If the lengths differ, or two points have the same first value.
@@ -95,20 +95,20 @@ def axis_points(axis: Mapping[str, Sequence[Setting]]) -> list[Condition]:
 
 
 def moving_settings(points: Mapping[str, Mapping[str, object]]) -> list[str]:
-    """The settings that change along an axis; `points` maps each point's value as text to its settings."""
+    """Return the settings that change along an axis; `points` maps a point's value to its settings."""
     every = list(points.values())
     return [key for key in every[0] if len({str(point[key]) for point in every}) > 1]
 
 
 def axis_numbers(points: Mapping[str, Mapping[str, object]]) -> dict[str, float] | None:
-    """The number that each point of an axis stands for; None for words, or if several settings change."""
+    """Return the number of each point of an axis; None for words, or if several settings change."""
     firsts = {value: next(iter(point.values()), None) for value, point in points.items()}
     numbers = {value: float(first) for value, first in firsts.items() if isinstance(first, int | float)}
     return numbers if len(numbers) == len(firsts) and len(moving_settings(points)) <= 1 else None
 
 
 def axis_errors(axes: Mapping[str, Mapping[str, Sequence[Setting]]], env: EnvConfig) -> list[str]:
-    """One line for each setting of a study that the simulation would otherwise reject hours later."""
+    """Return one line for each setting of a study that the simulation would otherwise reject hours later."""
     rule = "must have another name, this one is of the condition that changes nothing; rename the axis"
     taken = [f"study.axes.{NOMINAL}: {rule}, got {dict(axes[NOMINAL])!r}"] if NOMINAL in axes else []
     return taken + [
@@ -117,7 +117,7 @@ def axis_errors(axes: Mapping[str, Mapping[str, Sequence[Setting]]], env: EnvCon
 
 
 def condition_errors(name: str, conditions: Sequence[Mapping[str, Any]], env: EnvConfig) -> list[str]:
-    """One line for each setting that the simulation would reject in the conditions of the key `name`."""
+    """Return one line for each setting in the conditions of the key `name` that the simulation rejects."""
     errors = []
     for place, condition in enumerate(conditions):
         weight, settings = condition.get(WEIGHT, 1), _without_weight(condition)
@@ -138,7 +138,7 @@ def condition_errors(name: str, conditions: Sequence[Mapping[str, Any]], env: En
 def episode_draw(
     conditions: Sequence[Mapping[str, Any]],
 ) -> Callable[[EnvConfig, np.random.Generator], EnvConfig] | None:
-    """What draws the settings of an episode, for `CorridorEnv`; None where nothing is to be drawn."""
+    """Return the function that draws an episode's settings, for `CorridorEnv`; None without conditions."""
     return None if list(conditions) == [{}] else partial(_drawn_env, conditions)
 
 
@@ -151,7 +151,7 @@ def _drawn_env(
 
 
 def _drawn(value: Any, rng: np.random.Generator) -> Any:
-    """One value of a setting, a list or a range."""
+    """Draw one value of a setting, a list or a range."""
     if isinstance(value, list):
         return value[int(rng.integers(len(value)))]
     if not isinstance(value, Mapping):
@@ -165,7 +165,7 @@ def _drawn(value: Any, rng: np.random.Generator) -> Any:
 
 
 def _extremes(settings: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Conditions in which every value that may be drawn occurs; of a range its ends."""
+    """Yield conditions that together contain every value of each list and both ends of each range."""
     ends = {
         key: [value["low"], value["high"]] if isinstance(value, Mapping) else value
         for key, value in settings.items()
@@ -191,7 +191,7 @@ def _axis_errors(axis: Mapping[str, Sequence[Setting]], env: EnvConfig) -> list[
 
 
 def _key_errors(settings: Mapping[str, object]) -> list[str]:
-    """One line for each key that is no setting of the simulation."""
+    """Return one line for each key that is no setting of the simulation."""
     unknown = {
         key: value
         for key, value in settings.items()
@@ -203,7 +203,7 @@ def _key_errors(settings: Mapping[str, object]) -> list[str]:
 
 
 def _value_errors(point: Condition, env: EnvConfig) -> list[str]:
-    """One line for each value that is not valid among settings that are replaced together."""
+    """Return one line for each value that is not valid among settings that are replaced together."""
     try:
         changed = env_with(env, point)
     except pydantic.ValidationError as error:

@@ -1,4 +1,4 @@
-"""Every setting of an experiment, checked; the values are in conf/, their ranges in `jobs.config.schema`.
+"""Check every setting of an experiment; the values are in conf/, their ranges in `jobs.config.schema`.
 
 `parse` turns the composed configuration into one frozen `Config`, or raises one `ConfigError`
 with a line for each wrong key. Nothing has been started or written by then.
@@ -118,7 +118,7 @@ def parse(values: Mapping[str, object]) -> Config:
 
 
 def as_dict(config: Config) -> dict[str, object]:
-    """The configuration as plain containers in the groups of conf/, without the tracker's password."""
+    """Return the configuration as plain containers in the groups of conf/, without the tracker's password."""
     tracking = dataclasses.replace(config.tracking, uri=redacted(config.tracking.uri))
     values: dict[str, object] = {}
     for name, value in dataclasses.asdict(dataclasses.replace(config, tracking=tracking)).items():
@@ -160,7 +160,7 @@ def _own(job: str, values: Mapping[str, object], errors: list[str]) -> object:
 
 
 def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:
-    """The simulation, made of `env` and of the groups that stand beside it."""
+    """Build the simulation from `env` and the groups camera, faults, fidelity and renderer."""
     env = values.get("env")
     if not isinstance(env, Mapping):
         return _section(EnvConfig, env, "env", errors)
@@ -175,7 +175,7 @@ def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:
 
 
 def _section(section: Callable[..., Part], values: object, name: str, errors: list[str]) -> Part | None:
-    """The section made of its values; None if they are wrong, with the reasons added to `errors`."""
+    """Build a section from its values; return None if they are wrong, and add the reasons to `errors`."""
     if not isinstance(values, Mapping):
         errors.append(f"{name}: must be a group of settings, got {values!r}")
         return None
@@ -205,7 +205,7 @@ def _build(
     errors: list[str],
     skip: Collection[str] = (),
 ) -> Part | None:
-    """As `_section`, of a mapping; says nothing about the fields in `skip`."""
+    """Build a section from a mapping, like `_section`; report no error about the fields in `skip`."""
     try:
         return section(**{str(key): value for key, value in values.items()})
     except pydantic.ValidationError as error:
@@ -215,7 +215,7 @@ def _build(
 
 
 def _line(problem: ErrorDetails, key: str) -> str:
-    """What pydantic found, as key, rule and value."""
+    """Return an error of pydantic as key, rule and value."""
     if problem["type"] == "unexpected_keyword_argument":
         hint = "; this kind of model has none" if key in known_keys() else unknown_key(key)
         return f"{key}: no such key, got {problem['input']!r}{hint}"
@@ -232,7 +232,7 @@ def unknown_key(key: str) -> str:
 
 
 def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
-    """Each scene that the configuration names, behind the key that names it."""
+    """Yield each scene that the configuration names, behind its key."""
     yield "env.scene", config.env.scene
     yield "evaluate", HELD_OUT_SCENE
     yield from (("collect.scenes", name) for name in config.collect.scenes)
@@ -253,13 +253,13 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def _size_errors(config: Config) -> Iterator[str]:
-    """Lists that are too long, or empty where something is needed."""
+    """Yield one line for each list that is empty where something is needed."""
     if not config.collect.scenes and not config.collect.recordings:
         yield "collect.scenes: must name a scene where collect.recordings is empty, got []"
 
 
 def _image_errors(config: Config) -> Iterator[str]:
-    """Sides of the sensor's image that are too small for the policy's network."""
+    """Yield one line for each side of the sensor's image that is too small for the policy's network."""
     smallest = KINDS[config.model.name].min_side
     for name in ("width", "height"):
         side = getattr(config.env.camera, name)

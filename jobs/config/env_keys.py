@@ -1,7 +1,7 @@
-"""How a user spells the settings of `EnvConfig`: env.*, camera.*, faults.*, fidelity.* and renderer.
+"""Translate between `EnvConfig` and the keys of a user: env.*, camera.*, faults.*, fidelity.*, renderer.
 
 `EnvConfig` holds camera, faults, fidelity and renderer as fields of its own. On the command line,
-in conf/ and in the files of a run they stand beside `env`. Only this file knows both shapes.
+in conf/ and in the files of a run they are groups of their own. Only this file knows both shapes.
 """
 
 import dataclasses
@@ -14,11 +14,16 @@ from jobs.config.errors import SET_BY_JOBS
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-BESIDE_ENV = ("camera", "faults", "renderer", "fidelity")  # fields of EnvConfig that stand beside `env`
+BESIDE_ENV = (
+    "camera",
+    "faults",
+    "renderer",
+    "fidelity",
+)  # users write these fields without `env.`
 
 
 def fields_of(section: "type[DataclassInstance]") -> dict[str, type]:
-    """The fields of a dataclass of settings: name -> type."""
+    """Return the fields of a dataclass of settings: name -> type."""
     return {part.name: typing.cast(type, part.type) for part in dataclasses.fields(section)}
 
 
@@ -32,7 +37,7 @@ ENV_KEYS = {  # key -> the fields of EnvConfig that lead to its value
 
 
 def key_of(section: str, path: Sequence[int | str]) -> str:
-    """The key of a field of a section, as users write it: env.scene, camera.width, renderer."""
+    """Return the key of a field of a section, as users write it: env.scene, camera.width, renderer."""
     beside = section == "env" and path[:1] and path[0] in BESIDE_ENV
     return ".".join([*([section] if section and not beside else []), *map(str, path)])
 
@@ -44,7 +49,7 @@ OPEN_KEYS = (*OPEN_FIELDS, ADDED_FAULT)
 
 
 def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
-    """The simulation with settings replaced together, such as {"camera.memory": "frame"}.
+    """Return the simulation with settings replaced together, such as {"camera.memory": "frame"}.
 
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is not valid.
@@ -72,7 +77,7 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
 
 
 def _with_part(values: Mapping[str, object], path: Sequence[str], value: object) -> dict[str, object]:
-    """Nested mappings with one value replaced."""
+    """Return nested mappings with one value replaced."""
     name, *rest = path
     if not rest:
         return {**values, name: value}
@@ -81,7 +86,7 @@ def _with_part(values: Mapping[str, object], path: Sequence[str], value: object)
 
 
 def flat_env(env: EnvConfig) -> dict[str, object]:
-    """The settings as plain containers in the groups of conf/: `env` and those that stand beside it."""
+    """Return the settings as plain containers: env, camera, faults, fidelity and renderer, as in conf/."""
     values = dataclasses.asdict(env)
     beside = {name: values[name] for name in BESIDE_ENV}
     return {"env": {name: values[name] for name in ENV_FIELDS}, **beside}

@@ -1,4 +1,4 @@
-"""What a configuration error says: the nearest key to an unknown one, and no password."""
+"""Write configuration errors: the nearest key to an unknown one, and no password."""
 
 import difflib
 import re
@@ -18,18 +18,18 @@ class ConfigError(ValueError):
 
 
 def differences(there: Mapping[str, object], here: Mapping[str, object]) -> str:
-    """Where two settings differ, such as "stack: 3 there, 2 here"; empty if nowhere."""
+    """Return the differences of two settings, such as "stack: 3 there, 2 here"; empty if there are none."""
     names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
     return ", ".join(f"{name}: {there.get(name)!r} there, {here.get(name)!r} here" for name in names)
 
 
 def redacted(text: str) -> str:
-    """The text with `***` for the user, password and secret parameters of each address in it."""
+    """Return the text with `***` for the user, password and secret parameters of each address in it."""
     return SECRET_PARAMETER.sub(rf"\1{HIDDEN}", USER_AND_PASSWORD.sub(f"{HIDDEN}@", text))
 
 
 def nearest(key: str, keys: Sequence[str]) -> str:
-    """What to do instead of an unknown key, after a semicolon: the nearest key, or where to look."""
+    """Return the remedy for an unknown key, after a semicolon: the nearest key, or where to look."""
     if key.removeprefix("env.") in SET_BY_JOBS:
         return "; every job chooses it itself"
     by_last_word = {known.rpartition(".")[2]: known for known in reversed(keys)}

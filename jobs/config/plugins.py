@@ -62,7 +62,7 @@ def load_plugins(names: object) -> None:
 
 
 def _load(name: str, before: Mapping[str, Mapping[str, Any]]) -> None:
-    """Import one, unless it is there, and check what is new since `before`."""
+    """Import a plug-in, unless it is loaded already, and check the rows that are new since `before`."""
     path = Path(name).resolve() if name.endswith(".py") or os.sep in name else None
     stem = path.stem if path else _module_of(name)
     if stem in _loaded and (path is None or path in _files(_loaded[stem])):
@@ -84,7 +84,7 @@ def _load(name: str, before: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _module_of(name: str) -> str:
-    """The module that an installed package's entry point of this name leads to, else the name itself.
+    """Return the module of the installed entry point of this name, or else the name itself.
 
     Raises:
         ValueError: It leads to no one module, or there is neither an entry point nor a module of the name.
@@ -100,7 +100,7 @@ def _module_of(name: str) -> str:
 
 
 def _import_module(name: str) -> None:
-    """Import what Python finds; an empty module stands for it meanwhile, so that errors name its line.
+    """Import a module that Python finds. Register it before it runs, so that errors name its line.
 
     Raises:
         ValueError: It has no file, as a folder without __init__.py: nothing could be shipped or digested.
@@ -150,7 +150,7 @@ def _check(what: str, name: str, row: Any) -> None:
 
 
 def with_plugins(runtime_env: Mapping[str, Any]) -> dict[str, Any]:
-    """Ray's runtime environment with the plug-ins in it; as it was where there is none."""
+    """Return Ray's runtime environment with the plug-ins added, if there are any."""
     if not _loaded:
         return dict(runtime_env)
     tops = {sys.modules[name.partition(".")[0]] for name in _loaded}
@@ -163,7 +163,7 @@ def with_plugins(runtime_env: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def load_in_worker() -> None:
-    """Import the plug-ins of a Ray worker; what cannot be imported is told when its content is asked for."""
+    """Import the plug-ins of a Ray worker; `plugin_digests` reports those that cannot be imported."""
     for name in filter(None, os.environ.get(VARIABLE, "").split(",")):
         try:
             _loaded[name] = importlib.import_module(name)
@@ -172,7 +172,7 @@ def load_in_worker() -> None:
 
 
 def plugin_digests() -> dict[str, str]:
-    """Name and content, a SHA-256, of each plug-in.
+    """Return the name and the content, a SHA-256, of each plug-in.
 
     Raises:
         ConfigError: In a Ray worker, if one could not be imported.
@@ -187,13 +187,13 @@ def plugin_digests() -> dict[str, str]:
 
 
 def one_line(error: BaseException) -> str:
-    """Type and text of an error, and the plug-in whose code raised it, if one did."""
+    """Return type and text of an error, and the plug-in whose code raised it, if one did."""
     said = " ".join(f"{type(error).__name__}: {error}".split())
     return with_culprit(said, "".join(traceback.format_exception(error)))
 
 
 def with_culprit(said: str, trace: str) -> str:
-    """What is said of an error, and the plug-in that its traceback passes through, here or in a worker."""
+    """Return the text of an error with the plug-in that its traceback passes through, here or in a worker."""
     for name, module in _loaded.items():
         place = _place(module)
         shipped = rf"[^\"]*/py_modules_files/[^\"/]+/{re.escape(place.name)}"
@@ -204,13 +204,13 @@ def with_culprit(said: str, trace: str) -> str:
 
 
 def _place(module: ModuleType) -> Path:
-    """The file of a module, or the folder of a package."""
+    """Return the file of a module, or the folder of a package."""
     file = Path(str(module.__file__)).resolve()
     return file.parent if file.name == "__init__.py" else file
 
 
 def _files(module: ModuleType) -> list[Path]:
-    """The Python files of a module or a package; for a package its folder too."""
+    """Return the Python files of a module or a package; for a package also its folder."""
     place = _place(module)
     return [place, *sorted(place.rglob("*.py"))] if place.is_dir() else [place]
 

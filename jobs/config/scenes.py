@@ -1,4 +1,4 @@
-"""Whether the scenes that a configuration names can be made."""
+"""Check that the scenes of a configuration can be made."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from envs.scene.layouts import LAYOUTS
 
 
 def scene_errors(named: Sequence[tuple[str, str]], env: EnvConfig) -> list[str]:
-    """One line for each scene that cannot be made: for its name, its file or the values of env.layout.
+    """Return one line for each scene that cannot be made: its name, its file or the values of env.layout.
 
     A layout of `envs.scene.LAYOUTS` as it stands is known to be passable for the default vehicle
     (tests/jobs/config/test_scenes.py), so only changed ones and mesh files are drawn.

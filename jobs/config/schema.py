@@ -43,13 +43,13 @@ class ImitationConfig:
 
 
 def _imitation(values: object) -> object:
-    """The settings of a mapping, which pydantic would not take for a dataclass where it is strict."""
+    """Build the settings from a mapping, which strict pydantic does not accept for a dataclass."""
     return checked(ImitationConfig, dict(values)) if isinstance(values, Mapping) else values
 
 
 @dataclass(frozen=True, config=STRICT)
 class AlgoConfig:
-    """PPO, each word as RLlib spells it (appendix D.1.2).
+    """Settings of PPO, each word as RLlib spells it (appendix D.1.2).
 
     Attributes:
         critic: What the value network sees: what the policy does, or also what the cheapest way to the goal
@@ -99,12 +99,12 @@ class AlgoConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class CollectConfig:
-    """What the data set of the event VAE is made of; scenes and recordings get equal shares of the steps.
+    """The data set of the event VAE; scenes and recordings get equal shares of the steps.
 
     Attributes:
         scenes: Layouts in which episodes are recorded.
         recordings: Event files of real cameras; a short one contributes all that it has.
-        policy: Run or policy folder of a policy to record beside random actions.
+        policy: Run or policy folder of a policy to record in addition to random actions.
         policy_share: Share of the control steps that the policy takes.
         conditions: As those of `TrainConfig`, of the episodes that are recorded.
     """
@@ -120,7 +120,7 @@ class CollectConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class PretrainConfig:
-    """How the event VAE is trained (appendix B.2).
+    """Training of the event VAE (appendix B.2).
 
     Attributes:
         denoise: Whether it decodes the events as they were before the faults of the sensor.
@@ -142,7 +142,7 @@ class PretrainConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TrainConfig:
-    """How long the policy is trained, how often it is saved, from what, and under which conditions.
+    """Training of the policy: length, checkpoints, initial policy and conditions.
 
     Attributes:
         init: Run or policy folder whose policy is trained on; None: random weights.
@@ -160,10 +160,10 @@ class TrainConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class EvaluateConfig:
-    """In how many held-out corridors a policy is evaluated, and with which renderers.
+    """Evaluation of a policy: held-out corridors and renderers.
 
     Attributes:
-        beside: Published policies that are evaluated beside it, each a name in models/pretrained.
+        beside: Published policies to evaluate in the same corridors, each a name in models/pretrained.
     """
 
     episodes: Count
@@ -197,7 +197,7 @@ class ClusterConfig:
     def _has_a_gpu_here(self) -> "ClusterConfig":
         if self.device == "cuda" and self.name != "local":
             raise ValueError(
-                "device must be cpu on a cluster, of which no machine is asked for a GPU; got 'cuda'"
+                "device must be cpu on a cluster, whose machines are not asked for GPUs; got 'cuda'"
             )
         return self
 

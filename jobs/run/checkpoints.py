@@ -20,7 +20,7 @@ UNFINISHED = ".checkpoint-"  # begins the names of folders that checkpoints are 
 
 @contextlib.contextmanager
 def unfinished(place: Path | None) -> Iterator[str]:
-    """A folder to make a checkpoint in, beside the finished ones; it goes, whatever ends the block.
+    """Yield a folder for a new checkpoint, next to the finished ones; remove it when the block ends.
 
     Not in the system's temporary folder, which may be memory, or have less room.
 
@@ -35,18 +35,18 @@ def unfinished(place: Path | None) -> Iterator[str]:
 
 
 def drop_unfinished(place: Path | None) -> None:
-    """Remove what a process that was killed has left of checkpoints that it was making in a folder."""
+    """Remove the unfinished checkpoints that a killed process left in a folder."""
     for left in place.glob(f"{UNFINISHED}*") if place is not None else ():
         shutil.rmtree(left, ignore_errors=True)
 
 
 def seal(checkpoint: Path) -> None:
-    """Write the SHA-256 of each file of a checkpoint beside them."""
+    """Write the SHA-256 of each file of a checkpoint into its folder."""
     write_json(checkpoint / SEAL, _digests(checkpoint))
 
 
 def damage(checkpoint: Path) -> str | None:
-    """What is wrong with a checkpoint, in a few words; None if it is what was written.
+    """Return what is wrong with a checkpoint, in a few words; None if it is as it was written.
 
     A checkpoint has no seal if the process was killed before it wrote one: it may be whole or not.
     """
@@ -64,7 +64,7 @@ def damage(checkpoint: Path) -> str | None:
 
 
 def mend(checkpoint: Path) -> str | None:
-    """Replace a damaged checkpoint by the newest whole one beside it; return what was done, None if nothing.
+    """Replace a damaged checkpoint by the newest whole one; return what was done, None if nothing.
 
     One without a seal, which may be whole, is taken only if none has a seal.
 
@@ -86,7 +86,7 @@ def mend(checkpoint: Path) -> str | None:
         return None
     if good is None:
         experiment = checkpoint.parent.parent
-        remedy = f"delete {experiment}, and the same command trains anew"
+        remedy = f"delete {experiment}, and the same command trains again from the start"
         raise RunError(f"{checkpoint}: damaged ({reason}), and no other is whole; {remedy}")
     shutil.rmtree(checkpoint, ignore_errors=True)
     part = checkpoint.with_name(f".{checkpoint.name}.part")
@@ -97,12 +97,12 @@ def mend(checkpoint: Path) -> str | None:
 
 
 def sha256(file: Path) -> str:
-    """The SHA-256 of a file, in hexadecimal digits."""
+    """Return the SHA-256 of a file, in hexadecimal digits."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _digests(checkpoint: Path) -> dict[str, str]:
-    """File -> SHA-256 of all but the seal."""
+    """Return file -> SHA-256, without the seal."""
     files = (path for path in sorted(checkpoint.rglob("*")) if path.is_file())
     return {str(path.relative_to(checkpoint)): sha256(path) for path in files if path != checkpoint / SEAL}

@@ -40,7 +40,7 @@ ARCHIVES = 8  # of compiled kernels, 10 MB each, that stay in the user's cache
 
 
 def compile_kernels() -> None:
-    """Compile, in a process of its own, before several processes start that would each do it.
+    """Compile in a separate process, before several processes start that would each compile.
 
     Nothing is done where the folder of the source cannot be written: numba then compiles elsewhere.
     """
@@ -71,14 +71,14 @@ def main(which: str = "first") -> None:
 
 
 def _is_current(which: str) -> bool:
-    """Whether nothing has changed since these kernels, or all, were compiled."""
+    """Whether these kernels, or all, are compiled from the present sources."""
     now = _digest()
     files = (CACHE / f"compiled_{name}" for name in {which, "all"})
     return any(file.is_file() and file.read_text() == now for file in files)
 
 
 def _digest() -> str:
-    """A hash of the kernels' sources, of what is compiled of them, and of compiler, target and place."""
+    """Return a hash of the kernels' sources, the compiler, the target and the cache folder."""
     files = sorted(path for room in ROOMS for path in (REPOSITORY / room).rglob("*.py"))
     whole = hashlib.sha256(b"".join(path.read_bytes() for path in (Path(__file__), *files)))
     compiler = [version("numba"), version("llvmlite"), sys.version_info[:2], sysconfig.get_platform()]
@@ -88,13 +88,13 @@ def _digest() -> str:
 
 
 def _archive(name: str) -> Path:
-    """Where the kernels of one digest are kept for other clones of this user."""
+    """Return the archive in which this user's other clones find the kernels of a digest."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache, "evade", "kernels", f"{name}.zip")
 
 
 def pack(archive: Path) -> None:
-    """Keep what is compiled for other clones; without room or right to write, nothing is kept."""
+    """Archive the compiled kernels for other clones; do nothing if the archive cannot be written."""
     part = archive.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):
         archive.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def pack(archive: Path) -> None:
 
 
 def unpack(archive: Path) -> bool:
-    """Take what another clone has compiled; return whether there was something."""
+    """Take the kernels of another clone; return whether there were any."""
     for room in ROOMS:  # later it would take what is unpacked for stale
         forget_stale_kernels(REPOSITORY / room)
     try:

@@ -10,10 +10,10 @@ LEARNER_DEVICE = "EVADE_LEARNER_DEVICE"
 
 
 def device_variables(device: str) -> dict[str, str]:
-    """The environment variables that tell the processes of a job of its device."""
+    """Return the environment variables that name the device to the processes of a job."""
     return {LEARNER_DEVICE: device}
 
 
 def learner_device() -> str:
-    """What this process was told, as torch names it."""
+    """Return this process's device, as torch names it."""
     return os.environ.get(LEARNER_DEVICE, "cpu")

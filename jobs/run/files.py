@@ -29,7 +29,7 @@ def write_json(path: Path, values: object) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read what `write_json` wrote.
+    """Read a file of `write_json`.
 
     Raises:
         RunError: The file is damaged.
@@ -37,19 +37,19 @@ def read_json(path: Path) -> Any:
     try:
         return without_checksum(json.loads(path.read_bytes()))
     except ValueError as error:
-        remedy = "delete it, and the same command makes it anew"
+        remedy = "delete it, and the same command makes it again"
         raise RunError(f"{path}: must be JSON, got a damaged file ({error}); {remedy}") from None
 
 
 def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a JSON object as JSON holds them, and their checksum."""
+    """Return the values of a JSON object as JSON holds them, with their checksum."""
     text = json.dumps({name: value for name, value in values.items() if name != CHECKSUM}, allow_nan=False)
     own = json.loads(text)
     return {**own, CHECKSUM: settings_hash(own)}
 
 
 def without_checksum(values: Any) -> Any:
-    """The values of a JSON object without their checksum; what has none is returned as it is.
+    """Return the values of a JSON object without their checksum; values without one are returned unchanged.
 
     Raises:
         ValueError: They are not those that the checksum was made of.
@@ -62,12 +62,12 @@ def without_checksum(values: Any) -> Any:
 
 
 def json_lines(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows as lines of JSON, each with its checksum; NaN and infinity are refused."""
+    """Return rows as lines of JSON, each with its checksum; NaN and infinity are refused."""
     return "".join(json.dumps(with_checksum(row), allow_nan=False) + "\n" for row in rows)
 
 
 def read_json_lines(path: Path) -> list[Any]:
-    """The rows of a file of `json_lines`; none without a file. Half a line that a kill left is dropped.
+    """Read the rows of a file of `json_lines`; none without a file. Half a line that a kill left is dropped.
 
     Raises:
         RunError: A line is damaged.
@@ -84,6 +84,6 @@ def read_json_lines(path: Path) -> list[Any]:
 
 
 def whole_lines(path: Path) -> bytes:
-    """A file's content up to its last line end; nothing without a file."""
+    """Return a file's content up to its last line end; nothing without a file."""
     content = path.read_bytes() if path.is_file() else b""
     return content[: content.rfind(b"\n") + 1]

@@ -1,4 +1,4 @@
-"""Run folders: where one experiment keeps everything it made, and how it is found again.
+"""Run folders: all files of one experiment, found again by its configuration.
 
 A folder is named after the configuration that fills it, so that the same command finds
 the same folder and continues there. Each finished stage leaves a marker with its results.
@@ -71,7 +71,7 @@ class Run:
 
 
 def open_run(config: Config) -> Run:
-    """The run folder of a configuration, with the configuration written to it if it is new.
+    """Return the run folder of a configuration; write the configuration to it if the folder is new.
 
     Raises:
         ConfigError: If `resume` names no run folder, or one that this version cannot continue.
@@ -86,7 +86,7 @@ def open_run(config: Config) -> Run:
 
 
 def locate_run(config: Config) -> Run:
-    """As `open_run`, but nothing is written: for jobs that check more before they start."""
+    """Return the run folder of a configuration, like `open_run`, without writing anything."""
     if config.resume is not None:
         return reopen(Path(config.resume), config)
     path = Path(config.runs_dir).resolve() / run_name(config)
@@ -128,7 +128,7 @@ def _remove_new(path: Path) -> None:
 
 
 def reopen(path: Path, config: Config) -> Run:
-    """An existing run folder: `TRAINED_BY` is taken from its stored configuration, the rest from `config`.
+    """Return an existing run folder: `TRAINED_BY` from its stored configuration, the rest from `config`.
 
     Raises:
         ConfigError: If `path` is no run folder, or was made with a model that has another name now.
@@ -144,7 +144,7 @@ def reopen(path: Path, config: Config) -> Run:
     if model in RENAMED:
         raise ConfigError(
             f"resume: {str(path)!r} was made with model {model}{renamed(model)}, and cannot be continued; "
-            "train it anew, or check out the commit that its stages/ name"
+            "train it again, or check out the commit that its stages/ name"
         )
     # Older versions wrote null for the settings that a kind of model does not have.
     values["model"] = {name: value for name, value in values["model"].items() if value is not None}
@@ -158,7 +158,7 @@ def run_name(config: Config) -> str:
 
 
 def group_name(settings: Mapping[str, Any]) -> str:
-    """The group that a training of these settings belongs to.
+    """Return the group that a training of these settings belongs to.
 
     Its experiment, and behind it its length, unless that is `COMPARED_STEPS` or a planner taught it.
     """
@@ -167,7 +167,7 @@ def group_name(settings: Mapping[str, Any]) -> str:
 
 
 def finished(run: Run, stage: str) -> dict[str, Any] | None:
-    """The results of a finished stage, or None while it is not finished."""
+    """Return the results of a finished stage; None while it is not finished."""
     marker = run.path / "stages" / f"{stage}.json"
     return read_json(marker)["figures"] if marker.is_file() else None
 
@@ -184,7 +184,7 @@ def finish(run: Run, stage: str, results: Results) -> Results:
 
 
 def latest_policies(runs_dir: str | Path) -> dict[str, Path]:
-    """The policy folder of each kind that was finished last: name of the model -> folder."""
+    """Return the policy folder of each kind that was finished last: name of the model -> folder."""
     manifests = Path(runs_dir).resolve().glob("*/policy/policy.json")
     ordered = sorted(manifests, key=lambda path: path.stat().st_mtime_ns)
     found = {}
@@ -197,6 +197,6 @@ def latest_policies(runs_dir: str | Path) -> dict[str, Path]:
 
 
 def named_policy(name: str) -> Path | None:
-    """The policy folder at a path, or in the run folder at that path; None if there is none."""
+    """Return the policy folder at a path, or in the run folder at that path; None if there is none."""
     found = (path for path in (Path(name), Path(name) / "policy") if (path / "policy.json").is_file())
     return next((path.resolve() for path in found), None)

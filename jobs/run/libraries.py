@@ -7,7 +7,7 @@ anything that reads them. A value that the user has set stays.
 import os
 from pathlib import Path
 
-# Two threads beside other busy processes ran ten times slower than one. Parts that take more set their number
+# On a busy machine two threads ran ten times slower than one. Parts that take more set their number
 # (pretraining, a learner of a large network); those that wait must sleep: spinning beside one busy program
 # made a gradient three times slower.
 ONE_THREAD = {

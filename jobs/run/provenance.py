@@ -1,4 +1,4 @@
-"""What made a number: the commit, the machine, the command and the date."""
+"""The provenance of a number: the commit, the machine, the command and the date."""
 
 import os
 import re
@@ -14,7 +14,7 @@ PLACES = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say wher
 
 
 class Provenance(TypedDict):
-    """What to name beside a number so that it can be trusted: the commit and the machine."""
+    """Where a number comes from: the commit and the machine."""
 
     commit: str
     host: str

@@ -29,7 +29,7 @@ QUIET = {
     "RAY_DEDUP_LOGS": "1",
     # Ray's own 15 leaves a worker a thirtieth of a core that any other program wants.
     "RAY_worker_niceness": "0",
-    # A busy machine starts a worker in minutes; after a minute, Ray would start another beside it.
+    # A busy machine starts a worker in minutes; after a minute, Ray would start a second one.
     "RAY_worker_register_timeout_seconds": "600",
     "RAY_AIR_NEW_OUTPUT": "0",
     # Write down at once which checkpoint is the newest: a kill must not leave the name of one
@@ -80,7 +80,7 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     compile_kernels()
     for name in ("ray", "ray.rllib", "ray.tune"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    # It logs the traceback of a trial's error, which it also writes beside the trial and jobs report.
+    # Ray logs the traceback of a trial's error, which it also writes to the trial's folder and jobs report.
     logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
         "runtime_env": with_plugins({"env_vars": of_workers() | device_variables(cluster.device)}),

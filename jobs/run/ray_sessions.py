@@ -1,4 +1,4 @@
-"""The folders of local Rays that have ended: the newest are kept for their logs, older ones are deleted."""
+"""Folders of local Rays that have ended: the newest stay for their logs, older ones are deleted."""
 
 import shutil
 import socket

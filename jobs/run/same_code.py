@@ -1,4 +1,4 @@
-"""Whether every machine of a cluster has the code and the packages that the driver has."""
+"""Check that every machine of a cluster has the code and the packages of the driver."""
 
 import hashlib
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ ANSWER_S = 600.0  # a busy machine starts a worker in minutes
 
 
 def fingerprint() -> dict[str, str]:
-    """What decides the results of this process: the code, as a SHA-256, and the versions of packages."""
+    """Return what decides this process's results: the code, as a SHA-256, and the packages' versions."""
     digest = hashlib.sha256()
     for room in ROOMS:
         for file in sorted((REPOSITORY / room).rglob("*.py")):
@@ -25,7 +25,7 @@ def fingerprint() -> dict[str, str]:
 
 
 def check_machines() -> None:
-    """Refuse a cluster, already joined, if a machine of it that computes has other code than this one.
+    """Check that each machine of the joined cluster that computes has the same code as this machine.
 
     A machine that joins later is not asked, and one that is lost meanwhile is left out.
 
@@ -39,7 +39,7 @@ def check_machines() -> None:
 
 
 def ask_machines() -> dict[str, dict[str, str] | str]:
-    """The address of each machine, and its fingerprint, or why it has none."""
+    """Return the address of each machine, and its fingerprint or the reason why it has none."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -56,7 +56,7 @@ def ask_machines() -> dict[str, dict[str, str] | str]:
 
 
 def _answer(reference: Any) -> dict[str, str] | str | None:
-    """What a machine answers, why it cannot, or None if it is lost."""
+    """Return a machine's answer, or the reason why it cannot answer; None if the machine is lost."""
     import ray
 
     try:
@@ -71,7 +71,7 @@ def _answer(reference: Any) -> dict[str, str] | str | None:
 
 
 def differences(here: Mapping[str, str], answers: Mapping[str, Mapping[str, str] | str]) -> list[str]:
-    """One line for each machine that is not as this one, with the remedy."""
+    """Return one line for each machine that differs from this one, with the remedy."""
     errors = []
     for address, answer in answers.items():
         if isinstance(answer, str):

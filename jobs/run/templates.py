@@ -1,4 +1,4 @@
-"""Text from jinja2 templates, which lie beside the modules that fill them."""
+"""Text from jinja2 templates, which lie in the folders of the modules that fill them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Let torch take some threads for a while, and give them back."""
+"""Set torch's number of threads for a block."""
 
 import contextlib
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ import torch
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch take `count` threads inside; afterwards as many as before.
+    """Set torch's number of threads to `count` for a block, and restore it afterwards.
 
     Sums are added in another order by other numbers of threads: what one part of a job took must not
     change the digits of the next.

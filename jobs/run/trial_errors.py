@@ -1,4 +1,4 @@
-"""What Tune writes about a trial whose process ended, and what to tell a person of it."""
+"""Errors that Tune writes about a trial whose process ended."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ LOW_MEMORY = re.compile(r"low on memory\. Memory on the node .*? was (\S+) used 
 
 
 def newest_error(file: str | None) -> str:
-    """The newest of the errors that Tune has written about a trial, as text; empty if there is none.
+    """Return the newest error that Tune has written about a trial, as text; empty if there is none.
 
     Tune keeps the error itself too, pickled, but where another user of the machine may write.
     """
@@ -18,7 +18,7 @@ def newest_error(file: str | None) -> str:
 
 
 def low_memory(error: str) -> str | None:
-    """Who ended a process and why, if an error says that Ray's memory monitor did it; else None.
+    """Return who ended a process and why, if an error says that Ray's memory monitor did; else None.
 
     The monitor ends processes before the kernel would: when more of the machine's memory is in use
     than RAY_memory_usage_threshold says, 95 % by default.

@@ -1,4 +1,4 @@
-"""What Tune knows of a training, kept whole: Tune overwrites its own file, and a full disk cuts it short."""
+"""Copies of Tune's state of a training: Tune overwrites its own file, and a full disk cuts it short."""
 
 import json
 from pathlib import Path
@@ -10,16 +10,16 @@ KEPT = "kept_state.json"  # does not match, so that Tune does not read it
 
 
 def keep_state(experiment: Path) -> None:
-    """Copy the newest state of an experiment, if it is whole, to where it is never half-written."""
+    """Copy the newest state of an experiment, if it is whole, into a file that is written atomically."""
     states = sorted(experiment.glob(STATES))
     if states and _is_whole(states[-1]):
         write_atomic(experiment / KEPT, states[-1].read_bytes())
 
 
 def mend_state(experiment: Path) -> str | None:
-    """Replace states that are cut short by the one that was kept; what was done, None if nothing.
+    """Replace truncated states by the copy; return what was done, None if nothing.
 
-    Without one, the training begins anew, with the same results.
+    Without a copy, the training starts again, with the same results.
     """
     damaged = [path for path in sorted(experiment.glob(STATES)) if not _is_whole(path)]
     if not damaged:
@@ -30,7 +30,7 @@ def mend_state(experiment: Path) -> str | None:
         done = "the one before takes its place"
     else:
         damaged[-1].unlink()
-        done = "the training goes on from an older state, or begins anew"
+        done = "the training continues from an older state, or starts again"
     for path in damaged[:-1]:
         path.unlink()
     return f"State of the training damaged, {done}: {damaged[-1]}"

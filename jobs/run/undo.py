@@ -1,4 +1,4 @@
-"""What a command has made before it is refused: it goes again, so that a refusal leaves nothing behind."""
+"""Remove what a command has made before it is refused, so that a refusal leaves nothing behind."""
 
 import contextlib
 from collections.abc import Callable

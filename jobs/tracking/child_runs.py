@@ -52,7 +52,7 @@ def write_child_runs(parent: Tracker, kind: str, children: Sequence[ChildRun]) -
 
 
 def _points(child: ChildRun) -> list[tuple[str, int, float]]:
-    """Name, step and value of every metric of a child run; those that are not curves are at step 0."""
+    """Return name, step and value of every metric of a child run; single values are at step 0."""
     curves = {name: {0: value} for name, value in child.metrics.items()} | dict(child.curves)
     check_metrics({name: sum(points.values()) for name, points in curves.items()})
     return [(name, step, value) for name, points in curves.items() for step, value in points.items()]

@@ -9,5 +9,5 @@ _START_MS = (time.time() - time.monotonic()) * 1000
 
 
 def now_ms() -> int:
-    """Milliseconds since 1970."""
+    """Return the milliseconds since 1970."""
     return int(_START_MS + time.monotonic() * 1000)

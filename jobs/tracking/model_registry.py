@@ -31,7 +31,7 @@ Policies of `{group}`, a version for each training; its tags name seed, length, 
     model = mlflow.pyfunc.load_model("models:/{name}/1")
     actions = model.predict(observations_of_an_episode)["action"]
 
-Loading runs the code that lies beside the weights, as of any MLflow model; the weights alone are in
+Loading a policy runs the code in its folder, as for any MLflow model; the weights alone are in
 the artifacts of the model, `artifacts/policy`, for `models.policy.load_policy`.
 """
 INTERFACE = (
@@ -127,7 +127,7 @@ def _add_version(tracker: Tracker, policy: Path, name: str, manifest: Mapping[st
 
 
 def signature(manifest: Mapping[str, Any]) -> "ModelSignature":
-    """What `ServedPolicy.predict` takes and gives, for the policy of a manifest."""
+    """Return the signature of `ServedPolicy.predict` for the policy of a manifest."""
     import numpy as np
     from mlflow.models import ModelSignature
     from mlflow.types import ColSpec, ParamSchema, ParamSpec, Schema, TensorSpec

@@ -20,7 +20,7 @@ WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow 
 # MLflow's own names: of the text on a page, of a run's colour in charts, of stored views.
 NOTE, COLOUR, VIEW_TAG = "mlflow.note.content", "mlflow.runColor", "mlflow.sharedViewState"
 MAX_CHARACTERS = 8000  # of a run's page; MLflow cuts what is longer, and does not say so
-PAGE_WIDTH = 860  # pixels of a picture beside MLflow's side panels on a screen of 1600
+PAGE_WIDTH = 860  # pixels of a picture between MLflow's side panels on a screen of 1600
 PREVIEWS = "page"
 
 METRICS = {  # metric: what it is, how it is written
@@ -65,19 +65,19 @@ what was asked.
 
 
 def run_address(experiment_id: str, run_id: str, file: str = "") -> str:
-    """Address of a run's page, or of one of its artifacts, from the dashboard's own."""
+    """Return the address of a run's page, or of one of its artifacts, relative to the dashboard."""
     path = f"/artifacts/{file}" if file else ""
     return f"#/experiments/{experiment_id}/runs/{run_id}{path}?{WORKFLOW}"
 
 
 def view_address(experiment_id: str, key: str) -> str:
-    """Address of a stored view of the experiment's runs; one of charts opens as such."""
+    """Return the address of a stored view of the experiment's runs, as a table or as charts."""
     mode = "&compareRunsMode=CHART" if key.startswith("charts") else ""
     return f"#/experiments/{experiment_id}/runs?{WORKFLOW}&viewStateShareKey={key}{mode}"
 
 
 def table_view(search: str, columns: Sequence[str]) -> dict[str, object]:
-    """The state of a table of runs.
+    """Return the state of a table of runs.
 
     Args:
         search: Filter, such as "tags.kind = 'condition'".
@@ -88,7 +88,7 @@ def table_view(search: str, columns: Sequence[str]) -> dict[str, object]:
 
 
 def chart_view(search: str, metrics: Sequence[str]) -> dict[str, object]:
-    """The state of a page of line charts, one for each metric; x is the metric's step."""
+    """Return the state of a page of line charts, one for each metric; x is the metric's step."""
     section = {"uuid": "charts", "name": "Charts", "display": True, "isReordered": True}
     cards = [
         {
@@ -108,20 +108,20 @@ def chart_view(search: str, metrics: Sequence[str]) -> dict[str, object]:
 
 
 def usual_views() -> Iterator[tuple[str, str, dict[str, object]]]:
-    """Key, name and state of the views that every store has."""
+    """Return key, name and state of the views that every store has."""
     for key, (name, search, columns) in COLUMNS.items():
         yield key, name, table_view(search, columns)
     yield "charts-learning", "Learning curves", chart_view(f"tags.kind = 'run' and {NOT_ENDED_EARLY}", CURVES)
 
 
 def packed_view(name: str, state: Mapping[str, object], now_ms: int) -> str:
-    """A view as MLflow stores it in a tag of the experiment."""
+    """Return a view as MLflow stores it in a tag of the experiment."""
     packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
     return json.dumps({"name": name, "createdAt": now_ms, "updatedAt": now_ms, "state": packed})
 
 
 def stored_views(tags: Mapping[str, str]) -> dict[str, str]:
-    """Key -> name of the views in an experiment's tags, the newest first."""
+    """Return key -> name of the views in an experiment's tags, the newest first."""
     views = {
         tag.removeprefix(f"{VIEW_TAG}."): json.loads(value)
         for tag, value in tags.items()
@@ -132,7 +132,7 @@ def stored_views(tags: Mapping[str, str]) -> dict[str, str]:
 
 
 def experiment_note(experiment_id: str, tags: Mapping[str, str]) -> str:
-    """The text above the table of runs; its first line, all that MLflow shows folded, leads to the views."""
+    """Return the text above the table of runs. Its first line, always shown, links to the views."""
     views = stored_views(tags)
     usual = [key for key, *_ in usual_views() if key in views]
     newest = [key for key in views if key not in usual][:2]  # of the newest sweep
@@ -144,7 +144,7 @@ def experiment_note(experiment_id: str, tags: Mapping[str, str]) -> str:
 
 @dataclass(frozen=True)
 class Page:
-    """What the page of a run is made of.
+    """The content of a run's page.
 
     Attributes:
         experiment_id: Of MLflow.
@@ -168,7 +168,7 @@ class Page:
 
 
 def run_note(page: Page) -> str:
-    """The text at the top of a run's page: what it is, its metrics, pictures and tables."""
+    """Return the text at the top of a run's page: what it is, its metrics, pictures and tables."""
     parts = [headline(page), links(page), *pictures(page), made(page)]
     used = sum(len(part) + 2 for part in parts)
     for path, text in page.tables.items():
@@ -181,7 +181,7 @@ def run_note(page: Page) -> str:
 
 
 def headline(page: Page) -> str:
-    """What the run is, and its main metrics."""
+    """Return what the run is, and its main metrics."""
     job = JOBS.get(page.tags.get("job", ""))
     what = job.summary if job else "A run"
     named = ", ".join(page.params[name] for name in ("exp", "budget") if name in page.params)
@@ -191,7 +191,7 @@ def headline(page: Page) -> str:
 
 
 def _metric_text(page: Page, name: str) -> str:
-    """A metric as text, with its interval if there is one."""
+    """Return a metric as text, with its interval if there is one."""
     text, form = METRICS[name]
     ends = [page.metrics.get(f"{name}_{side}") for side in ("low", "high")]
     known = [form.format(end) for end in ends if end is not None]
@@ -200,7 +200,7 @@ def _metric_text(page: Page, name: str) -> str:
 
 
 def links(page: Page) -> str:
-    """Where to go from here: the views of this run, and its films."""
+    """Return links to the views of this run and to its films."""
     found = [f"[{name}]({view_address(page.experiment_id, key)})" for key, name in page.views.items()]
     films = [path for path in page.files if path.endswith(".mp4")]
     found += [f"[Film: {path}]({run_address(page.experiment_id, page.run_id, path)})" for path in films]
@@ -208,7 +208,7 @@ def links(page: Page) -> str:
 
 
 def pictures(page: Page) -> list[str]:
-    """The small pictures, those first that say most, each with the way to the large one."""
+    """Return the small pictures, the most telling first, each with a link to the large one."""
     names = [path.removeprefix(f"{PREVIEWS}/") for path in page.files if path.startswith(f"{PREVIEWS}/")]
     return [
         f"![{name}](get-artifact?path={PREVIEWS}/{name}&run_uuid={page.run_id})\n"
@@ -223,7 +223,7 @@ def _place(name: str) -> tuple[int, str]:
 
 
 def made(page: Page) -> str:
-    """Commit, machine, and the fidelity asked and achieved."""
+    """Return commit, machine, and the fidelity asked and achieved."""
     tags = {name: page.tags.get(name, "-") for name in ("commit", "host", "cpus", "python")}
     asked = page.params.get("fidelity.tolerance", "-")
     text = "Commit `{commit}`, host `{host}` ({cpus} CPUs), Python {python}. ".format(**tags)
@@ -233,7 +233,7 @@ def made(page: Page) -> str:
 
 
 def preview(picture: bytes) -> Image.Image:
-    """A picture no wider than a run's page."""
+    """Return a picture no wider than a run's page."""
     image = Image.open(io.BytesIO(picture)).convert("RGB")
     image.thumbnail((PAGE_WIDTH, 10 * PAGE_WIDTH))
     return image

@@ -56,11 +56,11 @@ class RetryQueue:
 
     @property
     def record(self) -> Path:
-        """The file of all steps, delivered or not, as lines of JSON."""
+        """Return the file of all steps, delivered or not, as lines of JSON."""
         return self.file.with_name(f"metrics-{self.file.name.removeprefix('undelivered-')}")
 
     def recorded(self) -> list[LoggedStep]:
-        """Read all steps, delivered or not; of the same metrics of a step only the last."""
+        """Read all steps, delivered or not; if a step was logged twice, only its last metrics."""
         rows: list[LoggedStep] = read_json_lines(self.record)
         return list({(row["step"], *sorted(row["metrics"])): row for row in rows}.values())
 

@@ -29,7 +29,7 @@ class ServedPolicy(PythonModel):
     def predict(
         self, context: Any, model_input: pd.DataFrame, params: dict[str, int] | None = None
     ) -> pd.DataFrame:
-        """The likeliest action of each control step of one episode, with the logits of all actions.
+        """Return the likeliest action of each control step of one episode, with the logits of all actions.
 
         Args:
             context: Of MLflow; unused.
@@ -56,7 +56,7 @@ class ServedPolicy(PythonModel):
 
 
 def control_steps(events: pd.DataFrame, window_us: int) -> Iterator[tuple[dict[str, np.ndarray], int, int]]:
-    """The inputs of an episode's decisions: nothing at its start, then the events of each control step.
+    """Yield the inputs of an episode's decisions: nothing at its start, then the events of each control step.
 
     Yields:
         Fields by name, start and length [us] of each step, up to that of the newest event; it has

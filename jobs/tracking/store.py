@@ -20,7 +20,7 @@ LOCAL_PAGE = "http://127.0.0.1:5000"
 
 
 def store_uri(config: Config) -> str:
-    """The store's address; a relative SQLite file lies in the folder that holds `runs_dir`.
+    """Return the store's address; a relative SQLite file lies in the folder that holds `runs_dir`.
 
     Raises:
         ConfigError: If the address is of a kind that MLflow does not keep runs in, or one that
@@ -42,7 +42,7 @@ def store_uri(config: Config) -> str:
 
 
 def quoted(path: str) -> str:
-    """Return a path as an address holds it: a `%` or `?` in it would begin something else there."""
+    """Return a path for use in an address, where `%` and `?` have a meaning of their own."""
     return path.replace("%", "%25").replace("?", "%3F")
 
 
@@ -80,17 +80,17 @@ def of_environment(values: dict[str, Any], words: Sequence[str], variables: Mapp
 
 
 def page(uri: str) -> str:
-    """The address of a tracking store in a browser, which will ask for the password."""
+    """Return the address of a tracking store in a browser, which will ask for the password."""
     return redacted(uri).replace(f"{HIDDEN}@", "").rstrip("/") if uri.startswith("http") else LOCAL_PAGE
 
 
 def dashboard_command(uri: str) -> str:
-    """The command that serves a store to browsers of this machine only."""
+    """Return the command that serves a store to browsers of this machine only."""
     return "make mlflow" if uri == f"sqlite:///{quoted(str(REPOSITORY))}/mlflow.db" else server_command(uri)
 
 
 def server_command(uri: str) -> str:
-    """The server's command for any store: variables and words."""
+    """Return the server's command for any store: variables and words."""
     lean = (
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true "
         "MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false"
@@ -100,7 +100,7 @@ def server_command(uri: str) -> str:
 
 
 def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
-    """The metrics as floats; `jobs.tracking.tracker.Tracker.log` says what is refused."""
+    """Return the metrics as floats; `jobs.tracking.tracker.Tracker.log` says what is refused."""
     values = {name: float(value) for name, value in metrics.items()}
     infinite = [f"{name} = {value}" for name, value in values.items() if math.isinf(value)]
     if infinite:
@@ -114,7 +114,7 @@ def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
 
 
 def flatten(values: Mapping[str, object], prefix: str = "") -> dict[str, str]:
-    """Nested settings as `outer.inner` -> text; a text that MLflow would cut is refused."""
+    """Return nested settings as `outer.inner` -> text; a text that MLflow would cut is refused."""
     flat: dict[str, str] = {}
     for key, value in values.items():
         name = f"{prefix}{key}"

@@ -199,7 +199,7 @@ class Tracker:
         self.client.log_artifact(self.run_id, str(path), folder)
 
     def of(self, path: Path) -> "Tracker":
-        """The MLflow run of another run folder in the same store; this one, if that has none."""
+        """Return the MLflow run of another run folder in the same store; this one, if there is none."""
         run_id = _known_runs(path).get(_slot(self, "run"), self.run_id)
         return dataclasses.replace(self, run_id=run_id)
 
@@ -246,12 +246,12 @@ class Tracker:
         self.tags({NOTE: run_note(shown)})
 
     def files(self, folder: str | None = None) -> list[str]:
-        """Paths of all artifacts of the run."""
+        """Return the paths of all artifacts of the run."""
         found = self.client.list_artifacts(self.run_id, folder)
         return [path for file in found for path in (self.files(file.path) if file.is_dir else [file.path])]
 
     def dashboard(self) -> str:
-        """The command that opens the dashboard, and the addresses to open in it."""
+        """Return the command that opens the dashboard, and the addresses to open in it."""
         lines = [] if self.uri.startswith("http") else [f"Dashboard: {dashboard_command(self.uri)}"]
         own = run_address(self.experiment_id, self.run_id), view_address(self.experiment_id, "results")
         this, every = (f"{page(self.uri)}/{address}" for address in own)
@@ -323,7 +323,7 @@ def _refusal(error: "MlflowException", uri: str, folder: Run) -> "TrackingError 
 
 
 def _reason(error: Exception) -> str:
-    """The cause, as the last words of what MLflow says, or as SQLite says it."""
+    """Return the cause of an error: the last words of MLflow's message, or SQLite's own."""
     lines = str(error).strip().splitlines()
     cause = next((line for line in lines if line.startswith("(sqlite3.")), lines[0])
     return cause.rpartition("Caused by ")[2][:200]
@@ -349,13 +349,13 @@ def _ended(tracker: Tracker) -> Iterator[None]:
 
 
 def _terminate(tracker: Tracker, status: str) -> None:
-    """Set a run's status and end; a run that is continued after the clock was set back ends when it began."""
+    """Set a run's status and end time, which is never before its start, even if the clock was set back."""
     start_ms = tracker.client.get_run(tracker.run_id).info.start_time
     tracker.client.set_terminated(tracker.run_id, status, max(start_ms, now_ms()))
 
 
 def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
-    """The MLflow run that the folder remembers under `key`, or a new one that it will remember."""
+    """Return the MLflow run that the folder remembers under `key`, or create one that it will remember."""
     from mlflow.exceptions import MlflowException
 
     known, slot = _known_runs(folder.path), _slot(near, key)
@@ -379,20 +379,20 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
 
 
 def _known_runs(path: Path) -> dict[str, str]:
-    """The MLflow runs that a run folder remembers: id by slot."""
+    """Return the MLflow runs that a run folder remembers: slot -> id."""
     file = path / KNOWN_RUNS
     return read_json(file) if file.is_file() else {}
 
 
 def _slot(near: Tracker, key: str) -> str:
-    """The name of one MLflow run of a folder: it has others in other stores."""
+    """Return the key of a run folder's MLflow run in this tracking store."""
     return f"{near.uri} {near.experiment_id} {key}"
 
 
 def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["MlflowClient", str]:
-    """A client of the store and the id of the experiment; both are created if they are not there.
+    """Return a client of the store and the experiment's id; create the store and the experiment if missing.
 
-    `storage` keeps a new experiment's artifacts; None: beside an SQLite file, or the server's own.
+    `storage` keeps a new experiment's artifacts; None: next to an SQLite file, or the server's own.
     """
     os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
     os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
@@ -438,7 +438,7 @@ def _remove_stray(uri: str, file: Path) -> None:
 
 
 def _create_or_check(file: Path) -> None:
-    """Make an SQLite store, whole or not at all: MLflow cannot go on with half of its tables.
+    """Create an SQLite store, whole or not at all: MLflow cannot use one with half of its tables.
 
     Raises:
         TrackingError: There is one, and it is damaged.

@@ -95,7 +95,7 @@ def test_without_a_whole_checkpoint_the_remedy_is_said(tmp_path):
     for path in paths:
         cut(path)
     with pytest.raises(
-        RunError, match=rf"no other is whole; delete {tmp_path}, and the same command trains anew"
+        RunError, match=rf"no other is whole; delete {tmp_path}, and the same command trains again"
     ):
         mend(paths[1])
 

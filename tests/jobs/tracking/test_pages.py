@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from docs.browser import CHROMIUM, Browser, served
+from jobs.config.registry import JOBS
 from jobs.run.provenance import REPOSITORY
 from jobs.tracking.pages import (
     MAX_CHARACTERS,
@@ -27,7 +28,7 @@ PAGE = Page(
     experiment_id="1",
     run_id="abc",
     params={"exp": "robustness", "budget": "short", "seed": "0", "fidelity.tolerance": "0.05"},
-    tags={"job": "sweep", "commit": "c0ffee", "host": "box", "cpus": "2", "python": "3.11"},
+    tags={"job": "evaluate", "commit": "c0ffee", "host": "box", "cpus": "2", "python": "3.11"},
     metrics={"eval/success_rate": 0.9, "eval/success_rate_low": 0.8, "eval/success_rate_high": 0.95},
     files=["sweep/crashes/a.mp4", "page/sweep/world.png", "page/sweep/control_hz.png"],
     tables={"sweep/table.md": "| a |"},
@@ -38,7 +39,7 @@ PAGE = Page(
 def test_a_runs_page_begins_with_what_it_is_and_shows_figures_before_tables():
     note = run_note(PAGE)
     order = (
-        "**Policies at other rates", "90% [80%, 95%]", "charts-abc", "sweep/crashes/a.mp4",
+        f"**{JOBS['evaluate'].summary}", "90% [80%, 95%]", "charts-abc", "sweep/crashes/a.mp4",
         "page/sweep/control_hz.png&run_uuid=abc", "page/sweep/world.png", "`c0ffee`", "0.05", "| a |",
     )  # fmt: skip
     assert sorted(map(note.index, order)) == list(map(note.index, order))
