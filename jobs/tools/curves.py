@@ -85,21 +85,6 @@ def _published(folder: Path, curve: Curve) -> PublishedTraining:
     )  # fmt: skip
 
 
-def read_trainings(file: Path) -> list[PublishedTraining]:
-    """The published table of the trainings, as `published_trainings` found them."""
-    with file.open() as stream:
-        rows = list(csv.DictReader(stream))
-    whole = ("seed", "env_steps", "encoder_env_steps", "encoder_iterations")
-    return [
-        PublishedTraining(
-            row["group"],
-            *(int(row[name]) for name in whole),
-            *(float(row[name]) if row[name] else None for name in PublishedTraining._fields[-2:]),
-        )
-        for row in rows
-    ]
-
-
 def mean_success(curve: Curve, env_steps: int, before: int = 0) -> float:
     """Success rate, 0..1, averaged over a training's first steps: high if it learns early and well.
 

@@ -109,4 +109,5 @@ def test_a_model_holds_the_policys_own_files_and_the_code_that_reads_them_and_no
     own = {path.name for path in folders["bytestream"].iterdir()}
     assert own == {Path(path).name for path in kept if path.startswith("artifacts/")}
     assert {"served_policy.py", "code/models/policy/policy.py", "MLmodel", "requirements.txt"} <= kept
+    assert "code/core/__init__.py" in kept
     assert {Path(path).suffix for path in kept} <= {".py", ".json", ".safetensors", ".yaml", ".txt", ""}
