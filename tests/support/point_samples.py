@@ -17,7 +17,7 @@ import envs
 from core import forget_stale_kernels
 from envs.raycast.renderer import focal_length
 from envs.scene import CONE, ELLIPSOID, POLE, Scene
-from envs.scene.textures import around, pattern_points
+from envs.scene.textures import TILE, TILE_PERIODS, Texture, around, noise_tile
 
 forget_stale_kernels(Path(__file__).parent, Path(envs.__file__).parent)
 SKY, GROUND, WALL, BODY = range(4)  # what a ray hits
@@ -305,3 +305,37 @@ def sample_luminance(
     focal = focal_length(width * samples, fov_deg)
     points = shade_hits(scene, trace_scene(scene, pose, width * samples, height * samples, focal), t_s)
     return points.reshape(height, samples, width, samples).mean(axis=(1, 3)).astype(np.float32)
+
+
+def pattern_points(texture: Texture, s_m: np.ndarray, q_m: np.ndarray, t_s: float = 0.0) -> np.ndarray:
+    """Return the pattern P at points of a surface, not filtered.
+
+    Args:
+        texture: What pattern, how long and how fast.
+        s_m: Surface coordinates [m], any shape.
+        q_m: The other surface coordinates [m], of the same shape.
+        t_s: Time [s].
+
+    Returns:
+        float64 in [-1, 1], of the same shape. A checker is +1 in the cell of the origin; the
+        noise is bilinear between the texels of `noise_tile`.
+    """
+    s = (np.asarray(s_m, np.float64) - texture.velocity_mps[0] * t_s) / texture.period_m
+    q = (np.asarray(q_m, np.float64) - texture.velocity_mps[1] * t_s) / texture.period_m
+    if texture.pattern == "noise":
+        return _bilinear(noise_tile(texture.seed), s * (TILE / TILE_PERIODS), q * (TILE / TILE_PERIODS))
+    along_s = 1.0 - 2.0 * (np.floor(2.0 * s) % 2.0)
+    along_q = 1.0 - 2.0 * (np.floor(2.0 * q) % 2.0)
+    signs = {"checker": along_s * along_q, "stripes": along_s, "rings": along_q}
+    return signs.get(texture.pattern, np.zeros(np.broadcast(s, q).shape))
+
+
+def _bilinear(tile: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Interpolate `tile` at `column`, `row` [texels], bilinear and periodic."""
+    left, top = np.floor(column), np.floor(row)
+    across, down = column - left, row - top
+    i, j = (left % TILE).astype(np.int64), (top % TILE).astype(np.int64)
+    right, below = (i + 1) % TILE, (j + 1) % TILE
+    upper = tile[j, i] * (1.0 - across) + tile[j, right] * across
+    lower = tile[below, i] * (1.0 - across) + tile[below, right] * across
+    return upper * (1.0 - down) + lower * down

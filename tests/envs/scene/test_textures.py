@@ -11,8 +11,8 @@ from envs.scene.textures import (
     around,
     noise_tile,
     noise_waves,
-    pattern_points,
 )
+from tests.support.point_samples import pattern_points
 
 
 def places(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
