@@ -1,4 +1,4 @@
-"""Events of a sensor with fewer, larger pixels, from the events of a finer one."""
+"""Make pixels larger: turn the events of a fine sensor into those of one with fewer pixels."""
 
 from typing import Literal
 
@@ -15,7 +15,7 @@ def downscale_events(
     to_shape: tuple[int, int],
     rule: Literal["integrate", "funnel"] = "integrate",
 ) -> np.ndarray:
-    """Events as a sensor with larger pixels would have sent them.
+    """Return events as a sensor with larger pixels would have sent them.
 
     Pixel (x, y) belongs to the larger pixel (x * new_width // width, y * new_height // height);
     where the sizes do not divide, blocks differ by one row or column.
@@ -45,28 +45,52 @@ def downscale_events(
         ValueError: A shape that is larger than the old one or not positive, an unknown rule, or
             events that are not valid for `from_shape`.
     """
-    if not all(0 < new <= old for old, new in zip(from_shape, to_shape, strict=True)):
-        raise ValueError(f"to_shape must lie between (1, 1) and from_shape={from_shape}, got {to_shape}")
-    if rule not in ("integrate", "funnel"):
-        raise ValueError(f"rule must be 'integrate' or 'funnel', got {rule!r}")
     check_events(events, from_shape[1], from_shape[0])
-    row_of, column_of = (np.arange(old) * new // old for old, new in zip(from_shape, to_shape, strict=True))
-    if rule == "funnel":
-        moved = events.copy()
-        moved["x"], moved["y"] = column_of[events["x"]], row_of[events["y"]]
-        return moved
-    sizes = np.outer(np.bincount(row_of), np.bincount(column_of))
-    moved = np.empty(len(events), EVENT)
-    count = _integrate(events, row_of, column_of, sizes, moved)
-    return moved[:count].copy()
+    return Downscaler(from_shape, to_shape, rule)(events)
+
+
+class Downscaler:
+    """Makes pixels larger as `downscale_events` does, part by part: what is left in a block is carried on."""
+
+    def __init__(
+        self,
+        from_shape: tuple[int, int],
+        to_shape: tuple[int, int],
+        rule: Literal["integrate", "funnel"] = "integrate",
+    ) -> None:
+        """Begin with blocks at zero; raises as `downscale_events`."""
+        if not all(0 < new <= old for old, new in zip(from_shape, to_shape, strict=True)):
+            raise ValueError(f"to_shape must lie between (1, 1) and from_shape={from_shape}, got {to_shape}")
+        if rule not in ("integrate", "funnel"):
+            raise ValueError(f"rule must be 'integrate' or 'funnel', got {rule!r}")
+        self._row_of, self._column_of = (
+            np.arange(old) * new // old for old, new in zip(from_shape, to_shape, strict=True)
+        )
+        self._rule = rule
+        self._sizes = np.outer(np.bincount(self._row_of), np.bincount(self._column_of))
+        self._sums = np.zeros(self._sizes.shape, np.int64)
+
+    def __call__(self, events: np.ndarray) -> np.ndarray:
+        """Return the events of the larger pixels for the next part of a valid recording."""
+        if self._rule == "funnel":
+            moved = events.copy()
+            moved["x"], moved["y"] = self._column_of[events["x"]], self._row_of[events["y"]]
+            return moved
+        moved = np.empty(len(events), EVENT)
+        count = _integrate(events, self._row_of, self._column_of, self._sizes, self._sums, moved)
+        return moved[:count].copy()
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _integrate(
-    events: np.ndarray, row_of: np.ndarray, column_of: np.ndarray, sizes: np.ndarray, moved: np.ndarray
+    events: np.ndarray,
+    row_of: np.ndarray,
+    column_of: np.ndarray,
+    sizes: np.ndarray,
+    sums: np.ndarray,
+    moved: np.ndarray,
 ) -> int:
-    """Fill `moved` and say how many there are; `sizes` holds the pixels of each block."""
-    sums = np.zeros(sizes.shape, np.int64)
+    """Fill `moved` and return how many there are; `sizes` are pixels of blocks, `sums` their polarities."""
     count = 0
     for i in range(events.size):
         event = events[i]

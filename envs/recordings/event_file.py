@@ -1,27 +1,78 @@
-"""The result of every event file reader, and the rules that hold for every format.
+"""Define what readers of event files take and return, and check the columns that they read.
 
-A reader checks sizes before it allocates, and passes its raw columns to `finish`, which applies
-the same rules to every format. What breaks a rule raises one ValueError that names the file, the
-rule and the remedy.
+A reader gets a `Request` and returns an `Opened` file: the sensor's size, and parts of events in the
+order of the file. `envs.recordings.order` puts the parts in the order of time, by one set of rules.
+What the file contains beside good events is counted in a `Tally`. An error is one ValueError that
+names the file, the rule and the remedy.
 """
 
 import dataclasses
 import stat
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from envs.events import EVENT
 from envs.events.camera import T_LIMIT_US
 
-MAX_EVENTS = 100_000_000  # 1.3 GB in the end, and up to 8 GB on the way
-SMALL_EVENTS = 10_000_000  # what any file may hold
+MAX_EVENTS = 100_000_000  # 1.3 GB in the end
+SMALL_EVENTS = 10_000_000  # any file may contain as many
 EVENTS_PER_BYTE = 2  # of dense recordings, five times as many as a camera's EVT 3.0 has
-MAX_BYTES = 8 << 30
-MAX_DISORDER_US = 1_000_000
+MAX_BYTES = 1 << 38  # 275 GB; files are read in parts
 MAX_PACKED = 1000  # times a file's size that it may unpack to; events pack to a tenth
-SMALL_BYTES = 1 << 26  # what any file may unpack to
+SMALL_BYTES = 1 << 26  # any file may unpack to as many
+PART_EVENTS = 1 << 22  # 55 MB
+
+TRIGGER = np.dtype([("t", "<i8"), ("channel", "<i2"), ("p", "i1")])  # us; +1 rising, -1 falling, 0 pulse
+
+# Damage: why something is left out. Each is a count of `EventFile.damage`.
+OUTSIDE = "events outside the sensor"
+RESERVED = "words of types that the encoding does not have"
+CUT = "bytes of an entry that was cut off"
+CUT_PACKETS = "packets that are damaged or were cut off"
+OLD_CLOCK = "events of an older clock at the start"
+TORN = "events whose second was not carried"
+STRAY_TIMES = "events with a time far from all others"
+RESETS = "resets of the clock; later times were moved to follow"
+TOO_LATE = "events too late for their part"
+ROWS = "rows that are no event"
+CUT_LINE = "lines that were cut off"
+
+
+@dataclasses.dataclass
+class Tally:
+    """Counts of what a reader found beside the events; it grows while parts are read.
+
+    Attributes:
+        skipped, late, strays, damage, gaps: As in `EventFile`.
+        codes: Codes of OFF that were seen, 0 or -1; one file has one.
+        notes: What the reader chose where the file left a choice, such as one of two streams.
+    """
+
+    skipped: int = 0
+    late: int = 0
+    strays: int = 0
+    damage: Counter[str] = dataclasses.field(default_factory=Counter)
+    gaps: list[tuple[int, int]] = dataclasses.field(default_factory=list)
+    codes: set[int] = dataclasses.field(default_factory=set)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+
+class Part(NamedTuple):
+    """Some events of a file.
+
+    Attributes:
+        events: EVENT array (N,).
+        is_noise: bool (N,), labels of the events; None: the file has none.
+        triggers: TRIGGER array (K,).
+    """
+
+    events: np.ndarray
+    is_noise: np.ndarray | None = None
+    triggers: np.ndarray = np.empty(0, TRIGGER)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,14 +84,18 @@ class EventFile:
         width, height: Pixels of the sensor; None where neither the file nor the caller says.
         format: Name of the format that was read, such as "evt3".
         late: Events that were older than one before them in the file, and were sorted in.
-        skipped: Entries left out: no brightness change (triggers, frames, inertial samples of an
-            AEDAT 2 file), or before the first time or row of an EVT stream.
+        skipped: Entries that are no brightness change (triggers, frames, inertial samples, padding),
+            or come before the first time or row of an EVT stream.
         dropped: Events that the simulated sensor lost to its limit (videos only).
         strays: Times of an EVT stream that damage moved by more than a second, left out; the
-            events after one keep the time before it, until the next.
+            events after one have the time before it, until the next.
         is_noise: bool (N,), which events no change of the light fired; None: nobody knows.
         missed: About which share of a scene's events its frames miss (videos and images only); None: too
             few frames or events to tell.
+        triggers: TRIGGER array, external triggers: time [us], channel, edge.
+        damage: What was left out or moved because the file is damaged, and how often.
+        gaps: Pauses of more than a second: time of the last event before and of the first after [us].
+        notes: What the reader chose where the file left a choice.
     """
 
     events: np.ndarray
@@ -53,6 +108,10 @@ class EventFile:
     strays: int = 0
     is_noise: np.ndarray | None = None
     missed: float | None = None
+    triggers: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, TRIGGER))
+    damage: dict[str, int] = dataclasses.field(default_factory=dict)
+    gaps: tuple[tuple[int, int], ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,11 +119,17 @@ class Request:
     """One file to read, as the caller describes it.
 
     Attributes:
-        path: A regular file.
+        path: A regular file, or the folder of a bag.
         width, height: Pixels of the sensor [px], or None: as the file says.
-        columns: Names of the columns of a text file, in place of those that it gives.
+        columns: Names of columns, as in `read_events`.
         time_unit: "s", "ms", "us" or "ns", where the file does not say.
+        topic: Topic of a bag.
+        group: Group or data set of an HDF5 file, array of an npz file.
+        stream: Number of a stream of events in an AEDAT file.
+        start_us, end_us: First time, and the time before which reading ends; None: all.
         max_events: Most events that are read.
+        part_events: Most events of a part, about.
+        strict: Whether damage is refused.
     """
 
     path: Path
@@ -72,27 +137,47 @@ class Request:
     height: int | None = None
     columns: tuple[str, ...] | None = None
     time_unit: str | None = None
+    topic: str | None = None
+    group: str | None = None
+    stream: int | None = None
+    start_us: int | None = None
+    end_us: int | None = None
     max_events: int = MAX_EVENTS
+    part_events: int = PART_EVENTS
+    strict: bool = False
 
     def refusal(self, rule: str) -> ValueError:
-        """The error for a file that breaks a rule."""
+        """Return the error for a file that breaks a rule."""
         return ValueError(f"{self.path}: {rule}")
 
     def check_count(self, count: int) -> int:
-        """The number of events, if it may be read.
+        """Return the number of events, if it may be read.
 
         Raises:
             ValueError: It is more than `max_events`.
         """
         if count > self.max_events:
             raise self.refusal(
-                f"holds {count} events and at most max_events={self.max_events} are read; "
-                "raise max_events or cut the file"
+                f"contains {count} events or more and at most max_events={self.max_events} are read; raise "
+                "max_events, or read a part by start_us and end_us"
             )
         return count
 
+    def check_declared(self, count: int) -> int:
+        """Return the number of events that a file declares, if all of them may be read.
+
+        Raises:
+            ValueError: It is more than `max_events`, and the caller asked for no range of times.
+        """
+        return count if self.is_range else self.check_count(count)
+
+    @property
+    def is_range(self) -> bool:
+        """Whether the caller asks for a range of times."""
+        return self.start_us is not None or self.end_us is not None
+
     def sized(self, width: int | None, height: int | None) -> "Request":
-        """The same request with the sensor's size from the file filled in.
+        """Return the same request with the sensor's size from the file filled in.
 
         Raises:
             ValueError: The file and the caller name different sizes.
@@ -107,8 +192,28 @@ class Request:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class Opened:
+    """A file that is ready to be read.
+
+    Attributes:
+        format: Name of the format.
+        request: The request, with the sensor's size from the file filled in.
+        tally: Counts that grow while parts are read.
+        parts: The events in the order of the file, once.
+    """
+
+    format: str
+    request: Request
+    tally: Tally
+    parts: Iterator[Part]
+
+
+Reader = Callable[[Request], Opened]
+
+
 def check_file(path: Path, max_bytes: int) -> int:
-    """The size of a regular file [bytes]; nothing is opened, so a FIFO cannot block.
+    """Return the size of a regular file [bytes]; nothing is opened, so a FIFO cannot block.
 
     Raises:
         ValueError: There is no such file, it is a directory, device or pipe, it is empty,
@@ -124,165 +229,122 @@ def check_file(path: Path, max_bytes: int) -> int:
         raise ValueError(f"{path}: is empty; record or copy it again")
     if info.st_size > max_bytes:
         raise ValueError(
-            f"{path}: is {info.st_size} bytes and at most max_bytes={max_bytes} are read; "
-            "raise max_bytes or cut the file"
+            f"{path}: is {info.st_size} bytes and at most max_bytes={max_bytes} are read; raise max_bytes"
         )
     return info.st_size
 
 
 def usual_events(size: int) -> int:
-    """Most events that a file of a size [bytes] may hold unless the caller allows more."""
+    """Return the most events that a file of a size [bytes] may contain unless the caller allows more."""
     return min(MAX_EVENTS, max(SMALL_EVENTS, EVENTS_PER_BYTE * size))
 
 
 def check_declared(path: Path, name: str, declared_bytes: int) -> None:
-    """Refuse what a file says it holds if it is far too small for that, before memory is taken.
+    """Refuse contents that are far too large for the file, before memory is taken.
 
     Raises:
         ValueError: `declared_bytes` are more than `MAX_PACKED` times the file's size.
     """
     size = path.stat().st_size
     if declared_bytes > max(SMALL_BYTES, MAX_PACKED * size):
-        raise ValueError(f"{name} declares {declared_bytes} bytes in a file of {size}; write it again")
+        raise ValueError(
+            f"{name} declares {declared_bytes} bytes in a file of {size}; copy or record it again"
+        )
 
 
-def polarity(request: Request, values: np.ndarray) -> np.ndarray:
-    """Polarities in {-1, +1}, int8, from either of the two codes in use.
+def check_options(path: Path, format: str, given: dict[str, object], known: tuple[str, ...]) -> None:
+    """Refuse an option that has no effect on a format.
+
+    Raises:
+        ValueError: An option that is not None is not among `known`.
+    """
+    for name, value in given.items():
+        if value is not None and name not in known:
+            raise ValueError(f"{path}: {name}={value!r} has no effect on {format} files; leave {name} out")
+
+
+def whole_entries(request: Request, tally: Tally, size: int, entry: int) -> int:
+    """Return how many entries of `entry` bytes are whole in `size` bytes; count the bytes after them."""
+    if size % entry:
+        tally.damage[CUT] += size % entry
+    return size // entry
+
+
+def polarity(request: Request, values: np.ndarray, codes: set[int]) -> np.ndarray:
+    """Return polarities in {-1, +1}, int8, from either of the two codes in use.
+
+    Args:
+        request: The file.
+        values: Numbers or booleans.
+        codes: Codes of OFF that were seen before; those of `values` are added.
 
     Raises:
         ValueError: The values are neither all in {0, 1} nor all in {-1, +1}.
     """
-    if values.size and not np.isin(values, (-1, 0, 1)).all():
-        worst = values[~np.isin(values, (-1, 0, 1))][0]
+    if values.dtype.kind == "u" and values.dtype.itemsize >= 4:  # -1 as some writers store it
+        values = np.where(values == np.iinfo(values.dtype).max, np.int64(-1), values.astype(np.int64))
+    good = (values == 1) | (values == 0) | (values == -1)
+    if not good.all():
+        worst = values[~good][0]
         raise request.refusal(f"polarity must be coded as 0 and 1 or as -1 and 1, got {worst}; recode it")
     is_off = values <= 0
-    if is_off.any() and len(np.unique(values[is_off])) > 1:
-        raise request.refusal("polarity is coded as -1, 0 and 1 at once; keep 0 and 1 or -1 and 1")
+    codes |= {int(code) for code in np.unique(values[is_off])}
+    if len(codes) > 1:
+        raise request.refusal("polarity is coded as -1, 0 and 1 at once; recode it as 0 and 1")
     return np.where(is_off, np.int8(-1), np.int8(1))
 
 
-def assemble(request: Request, t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """An EVENT array from four columns of numbers of any type; t is already in microseconds.
+def assemble(
+    request: Request, tally: Tally, t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return an EVENT array from four columns of numbers of any type; t is already in microseconds.
 
-    Raises:
-        ValueError: A coordinate is negative, fractional or above 65535, a time is not finite or
-            outside [0, 2**52), or a polarity is not coded in one of the two ways.
-    """
-    events = np.empty(len(t_us), EVENT)
-    for name, stored, limit in (("t", t_us, T_LIMIT_US), ("x", x, 65536), ("y", y, 65536)):
-        values = stored.astype(np.float64) if stored.dtype.kind == "f" else stored  # half floats end at 65504
-        good = (values >= 0) & (values < limit)  # NaN and infinity are not good either
-        if not good.all():
-            first = int(np.argmin(good))
-            remedy = "shift the times" if name == "t" else "coordinates count from 0"
-            raise request.refusal(
-                f"{name} must lie in [0, {limit}), event {first} has {values[first]}; {remedy}"
-            )
-        if values.dtype.kind == "f" and name != "t" and np.any(values % 1):
-            raise request.refusal(
-                f"{name} must be whole pixels, event {int(np.argmax(values % 1 > 0))} is not"
-            )
-        events[name] = np.rint(values) if values.dtype.kind == "f" else values
-    events["p"] = polarity(request, p)
-    return events
-
-
-def finish(
-    request: Request,
-    format: str,
-    events: np.ndarray,
-    skipped: int = 0,
-    strays: int = 0,
-    is_noise: np.ndarray | None = None,
-) -> EventFile:
-    """Check the rules that hold for every format, and put the events in time order.
-
-    Times that go back by at most one second are sorted in (stable: ties keep the order of
-    the file) and counted in `late`; real files hold a little such disorder. A longer way back
-    is a clock that was reset or a damaged file, and is refused.
-
-    Args:
-        request: Its width and height, where known, bound the coordinates.
-        format: Name of the format.
-        events: EVENT array in the order of the file.
-        skipped: Entries that were left out.
-        strays: Times that were left out.
-        is_noise: Labels of the events, 0 or 1 of any type, or None.
-
-    Raises:
-        ValueError: A coordinate is outside the sensor, a time is outside [0, 2**52), the
-            times go back by more than a second, or labels are others or not one for each event.
-    """
-    labels = None if is_noise is None else _checked_labels(request, is_noise, len(events))
-    x_max, y_max, t_min, t_max, late, back_us = _extremes(events)
-    for name, size, largest in (("x", request.width, x_max), ("y", request.height, y_max)):
-        if size is not None and largest >= size:
-            first = int(np.argmax(events[name] >= size))
-            raise request.refusal(
-                f"event {first} has {name}={events[name][first]} outside the sensor of "
-                f"{request.width}x{request.height}; give the right width and height or repair the file"
-            )
-    if t_min < 0 or t_max >= T_LIMIT_US:
-        raise request.refusal("times must lie in [0, 2**52) us; shift them")
-    if back_us > MAX_DISORDER_US:
-        steps_us = np.maximum.accumulate(events["t"]) - events["t"]
-        first = int(np.argmax(steps_us > MAX_DISORDER_US))
-        raise request.refusal(
-            f"event {first} is {steps_us[first]} us older than one before it; up to {MAX_DISORDER_US} us "
-            "are sorted, more is a reset clock or damage: cut the file there"
-        )
-    if late:
-        order = np.argsort(events["t"], kind="stable")
-        events, labels = events[order], labels if labels is None else labels[order]
-    return EventFile(
-        events, request.width, request.height, format, late, skipped, strays=strays, is_noise=labels
-    )
-
-
-def _checked_labels(request: Request, is_noise: np.ndarray, count: int) -> np.ndarray:
-    """The labels as bool (count,)."""
-    if len(is_noise) != count or not np.isin(is_noise, (0, 1)).all():
-        raise request.refusal("must have one is_noise of 0 or 1 for each event; repair or remove it")
-    return is_noise.astype(bool)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _extremes(events: np.ndarray) -> tuple[int, int, int, int, int, int]:
-    """Largest x and y, least and largest t, number of late events, and how late the latest is [us].
-
-    One pass, because events take more memory than a processor's caches have.
-    """
-    x, y, oldest, newest, late, back_us = -1, -1, 0, 0, 0, 0
-    for i in range(events.size):
-        event = events[i]
-        t = event.t
-        x, y = max(x, event.x), max(y, event.y)
-        oldest, newest = min(oldest, t), max(newest, t)
-        late += t < newest
-        back_us = max(back_us, newest - t)
-    return x, y, oldest, newest, late, back_us
-
-
-def unwrap(counter: np.ndarray, bits: int) -> np.ndarray:
-    """Times [us] from a counter of a few bits that starts again at zero.
-
-    A step of at least half the counter's range backwards is read as a wrap, and so is one that would lead
-    before 0; a smaller one is disorder. So after a wrap, gaps of half the range or more cannot be told.
-
-    Args:
-        counter: Shape (N,), unsigned integers below 2**bits.
-        bits: Width of the counter.
+    A row that is no event (a time that is not finite or outside [0, 2**52), a coordinate outside
+    [0, 65536)) is left out and counted, unless more than a tenth of the rows are none.
 
     Returns:
-        int64 (N,), beginning with the first value of the counter.
+        EVENT array, and bool (N,), which rows it has.
+
+    Raises:
+        ValueError: Too many rows are no event, a coordinate is fractional, or a polarity is not coded
+            in one of the two ways.
     """
-    half = 1 << (bits - 1)
-    t_us = counter.astype(np.int64)
-    if len(t_us):
-        t_us[1:] = (np.diff(t_us) + half) % (2 * half) - half
-        np.cumsum(t_us, out=t_us)
-        t_us -= np.minimum.accumulate(t_us) // (2 * half) * (2 * half)
-    return t_us
+    columns, good = {"t": t_us, "x": x, "y": y}, np.ones(len(t_us), bool)
+    for name, limit in (("t", T_LIMIT_US), ("x", 65536), ("y", 65536)):
+        values = columns[name]
+        if values.dtype.kind == "f":
+            values = values.astype(np.float64)  # half floats end at 65504
+        fits = (values >= 0) & (values < limit)  # NaN and infinity do not
+        bad = len(values) - np.count_nonzero(fits)
+        if bad > max(1, len(values) // 10) or bad == len(values):
+            _refuse_column(request, name, values, fits, limit)
+        good &= fits
+        columns[name] = values
+    if not good.all():
+        tally.damage[ROWS] += int(np.count_nonzero(~good))
+        columns = {name: values[good] for name, values in columns.items()}
+    events = np.empty(np.count_nonzero(good), EVENT)
+    for name, values in columns.items():
+        if values.dtype.kind == "f" and name != "t" and np.any(values % 1):
+            raise request.refusal(
+                f"{name} must be whole pixels, event {int(np.argmax(values % 1 > 0))} is not; round them"
+            )
+        events[name] = np.rint(values) if values.dtype.kind == "f" else values
+    events["p"] = polarity(request, p if good.all() else p[good], tally.codes)
+    return events, good
+
+
+def _refuse_column(request: Request, name: str, values: np.ndarray, fits: np.ndarray, limit: int) -> None:
+    """Raise the error for a column with too many values that are none, if there are any."""
+    if fits.all():
+        return
+    first = int(np.argmin(fits))
+    remedy = "coordinates count from 0"
+    if name == "t":
+        remedy = "shift the times"
+        if values[first] >= limit:
+            remedy = "give time_unit='ns' if they are nanoseconds, else shift them"
+    raise request.refusal(f"{name} must lie in [0, {limit}), event {first} has {values[first]}; {remedy}")
 
 
 def check_events(events: np.ndarray, width: int, height: int) -> None:
@@ -305,7 +367,7 @@ def check_events(events: np.ndarray, width: int, height: int) -> None:
         raise ValueError(
             f"times must lie in [0, 2**52) us, got {events['t'][0]} to {events['t'][-1]}; shift them"
         )
-    if not np.isin(events["p"], (-1, 1)).all():
+    if not ((events["p"] == 1) | (events["p"] == -1)).all():
         raise ValueError("polarities must be -1 or +1; recode them")
     x, y = int(events["x"].max()), int(events["y"].max())
     if x >= width or y >= height:

@@ -1,9 +1,7 @@
-"""Kernels that decode the words of Prophesee's DAT and of its encodings EVT 2.0, EVT 2.1 and EVT 3.0.
+"""Decode the words of Prophesee's DAT and of its encodings EVT 2.0, EVT 2.1 and EVT 3.0, in kernels.
 
-Call a decoder of EVT once with empty `events` to count, and once with room for all of them. It returns
-the number of events, the number of events skipped because their time or row was not yet known, the number
-of stray high parts of the time (EVT 3.0: of the second call), and the index of the first word of a
-reserved type or beyond the last column, or -1.
+A decoder of EVT is called once for each part: it goes on where its state says, and fills arrays of events
+and triggers until one of them is full or the words end.
 
 A high part of the time is stray if it lies more than a second from the time before it and one of the next
 few is near that time again: a flipped bit, not a gap. It is passed over; taken for the time, it would move
@@ -16,7 +14,7 @@ import numba
 import numpy as np
 
 FIRST_VENDOR_TYPE = 14  # words of this type and above are the vendor's own, in all encodings
-COLUMNS = 1 << 11  # that an address of 11 bits tells apart; a vector may not reach beyond them
+COLUMNS = 1 << 11  # an address of 11 bits tells them apart
 FAR_US = 1_000_000  # as far as events may be out of order
 LOOK_AHEAD = 16  # high parts
 
@@ -44,13 +42,36 @@ class Evt3(IntEnum):
     TRIGGER = 10
 
 
+class State(IntEnum):
+    """Places of a decoder's state, int64: where it is, what it knows, and what it counted."""
+
+    WORD = 0  # index of the next word
+    BASE = 1  # high part of the time [us]; -1: not known yet
+    LOW = 2  # low part of the time [us]
+    X = 3
+    Y = 4  # -1: not known yet
+    P = 5  # 0: not known yet
+    SKIPPED = 6  # events before the first time, row or polarity; triggers; padding
+    STRAYS = 7  # stray high parts of the time
+    RESERVED = 8  # words of types that the encoding does not have
+    BEYOND = 9  # events beyond the last column
+
+
+PADDING = 9  # type of the words with which a camera fills its packets (data sheet of the IMX636)
 # One bit for each type that EVT 3.0 does not have.
-RESERVED_EVT3 = sum(1 << kind for kind in range(FIRST_VENDOR_TYPE) if kind not in set(Evt3))
+RESERVED_EVT3 = sum(1 << kind for kind in range(FIRST_VENDOR_TYPE) if kind not in {*Evt3, PADDING})
+
+
+def new_state() -> np.ndarray:
+    """Return the state of a decoder that has seen nothing."""
+    state = np.zeros(len(State), np.int64)
+    state[State.BASE] = state[State.Y] = -1
+    return state
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _bits(mask: int) -> int:
-    """How many of the lowest 32 bits are set."""
+    """Return how many of the lowest 32 bits are set."""
     mask -= mask >> 1 & 0x55555555
     mask = (mask & 0x33333333) + (mask >> 2 & 0x33333333)
     return ((mask + (mask >> 4) & 0x0F0F0F0F) * 0x01010101 & 0xFFFFFFFF) >> 24
@@ -58,9 +79,7 @@ def _bits(mask: int) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def _emit(events: np.ndarray, n: int, mask: int, t: int, x: int, y: int, p: int) -> int:
-    """One event for each bit of the mask, at x + bit; the number of events after it."""
-    if n >= events.size:
-        return n + _bits(mask)
+    """Write one event for each bit of the mask, at x + bit; return the number of events after it."""
     while mask:
         event = events[n]
         event.t, event.x, event.y, event.p = t, x + _bits((mask & -mask) - 1), y, p
@@ -70,8 +89,24 @@ def _emit(events: np.ndarray, n: int, mask: int, t: int, x: int, y: int, p: int)
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _inside(mask: int, x: int) -> int:
+    """Return the bits of a mask whose columns exist."""
+    if x > COLUMNS - 32:
+        mask &= (1 << max(COLUMNS - x, 0)) - 1
+    return mask
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _trigger(triggers: np.ndarray, k: int, t: int, channel: int, is_rising: int) -> int:
+    """Write one trigger; return the number of triggers after it."""
+    trigger = triggers[k]
+    trigger.t, trigger.channel, trigger.p = t, channel, 2 * is_rising - 1
+    return k + 1
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _time_base(value: int, base: int, low_bits: int, high_bits: int) -> int:
-    """The time of a new high part [us]; the clock began again if that fell by more than half its range."""
+    """Return the time of a new high part [us]; a fall by more than half its range is a turn of the clock."""
     bits = low_bits + high_bits
     if base < 0:
         return value << low_bits
@@ -110,7 +145,7 @@ def _is_stray(words: np.ndarray, place: int, base: int, low_bits: int, high_bits
 
 @numba.njit(cache=True, error_model="numpy")
 def _next_base(words: np.ndarray, place: int, base: int, low_bits: int, high_bits: int) -> int:
-    """The time of the high part in a word [us], or -1 if it is stray."""
+    """Return the time of the high part in a word [us], or -1 if it is stray."""
     later = _time_base(np.int64(words[place]) & (1 << high_bits) - 1, base, low_bits, high_bits)
     if abs(later - base) > FAR_US and _is_stray(words, place, base, low_bits, high_bits):
         return -1
@@ -118,155 +153,131 @@ def _next_base(words: np.ndarray, place: int, base: int, low_bits: int, high_bit
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _first_beyond(words: np.ndarray, masks: np.ndarray) -> int:
-    """Index of the first word of EVT 2.1 that reaches beyond the last column, or -1."""
-    for i in range(masks.size):
-        kind, x = np.int64(words[i]) >> 28, np.int64(words[i]) >> 11 & 2047
-        is_event = kind == Evt2.OFF or kind == Evt2.ON
-        if is_event and x > COLUMNS - 32 and np.int64(masks[i]) >> (COLUMNS - x):
-            return i
-    return -1
-
-
-@numba.njit(cache=True, error_model="numpy")
-def decode_evt2(words: np.ndarray, masks: np.ndarray, events: np.ndarray) -> tuple[int, int, int, int]:
+def decode_evt2(
+    words: np.ndarray, masks: np.ndarray, state: np.ndarray, events: np.ndarray, triggers: np.ndarray
+) -> tuple[int, int]:
     """Decode EVT 2.0, or EVT 2.1 from the upper halves of its words and their masks.
 
     Args:
         words: uint32 (N,): type 4 bits, low time 6 bits, x 11 bits, y 11 bits.
         masks: uint32 (N,): which of the 32 pixels from x on have an event; empty for EVT 2.0.
-        events: EVENT array to fill.
+        state: Of `new_state`; it is moved on.
+        events: EVENT array of at least 32 events to fill.
+        triggers: TRIGGER array to fill.
+
+    Returns:
+        Numbers of events and of triggers.
     """
-    beyond = _first_beyond(words, masks)
-    if beyond >= 0:
-        return 0, 0, 0, beyond
-    n, skipped, strays, base = 0, 0, 0, np.int64(-1)
-    for i in range(words.size):
+    n, k, i, base = 0, 0, state[State.WORD], state[State.BASE]
+    while i < words.size and n <= events.size - 32 and k < triggers.size:
         word = np.int64(words[i])
         kind = word >> 28
         if kind == Evt2.OFF or kind == Evt2.ON:
-            mask = np.int64(masks[i]) if masks.size else np.int64(1)
+            mask, x = np.int64(masks[i]) if masks.size else np.int64(1), word >> 11 & 2047
             if base < 0:
-                skipped += _bits(mask)
+                state[State.SKIPPED] += _bits(mask)
             else:
-                t = base | (word >> 22 & 63)
-                n = _emit(events, n, mask, t, word >> 11 & 2047, word & 2047, 2 * kind - 1)
+                inside = _inside(mask, x)
+                state[State.BEYOND] += _bits(mask) - _bits(inside)
+                n = _emit(events, n, inside, base | (word >> 22 & 63), x, word & 2047, 2 * kind - 1)
         elif kind == Evt2.TIME_HIGH:
             later = _next_base(words, i, base, 6, 28)
-            strays += later < 0
+            state[State.STRAYS] += later < 0
             base = base if later < 0 else later
-        elif kind != Evt2.TRIGGER and kind < FIRST_VENDOR_TYPE:
-            return n, skipped, strays, i
-    return n, skipped, strays, -1
+        elif kind == Evt2.TRIGGER:
+            state[State.SKIPPED] += 1
+            if base >= 0:
+                k = _trigger(triggers, k, base | (word >> 22 & 63), word >> 8 & 31, word & 1)
+        elif kind < FIRST_VENDOR_TYPE:
+            state[State.RESERVED] += 1
+        i += 1
+    state[State.WORD], state[State.BASE] = i, base
+    return n, k
 
 
 @numba.njit(cache=True, error_model="numpy")
-def decode_evt3(words: np.ndarray, events: np.ndarray) -> tuple[int, int, int, int]:
+def decode_evt3(  # noqa: C901  a branch for each type of word
+    words: np.ndarray, state: np.ndarray, events: np.ndarray, triggers: np.ndarray
+) -> tuple[int, int]:
     """Decode EVT 3.0.
 
     The low part of the time counts as zero from a changed high part until the next low part.
 
     Args:
         words: uint16 (N,): type 4 bits, value 12 bits.
-        events: EVENT array to fill, empty or of exactly the counted size.
+        state: Of `new_state`; it is moved on.
+        events: EVENT array of at least 12 events to fill.
+        triggers: TRIGGER array to fill.
+
+    Returns:
+        Numbers of events and of triggers.
     """
-    start = _first_known(words)
-    if events.size:
-        strays, beyond = _fill_evt3(words, start, events)
-        return events.size, 0, strays, beyond
-    skipped, bad_before = _count_evt3(words[:start])
-    n, bad_after = _count_evt3(words[start:])
-    return n, skipped, 0, _first_reserved(words) if bad_before or bad_after else -1
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _first_known(words: np.ndarray) -> int:
-    """Index of the word from which on time, row and polarity are known; N if they never are."""
-    time, row, polarity = False, False, False
-    for i in range(words.size):
-        kind = np.int64(words[i]) >> 12
-        time |= kind == Evt3.TIME_HIGH and not _is_stray(words, i, -1, 12, 12)
-        row |= kind == Evt3.ROW
-        polarity |= kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE
-        if time and row and polarity:
-            return i
-    return words.size
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _first_reserved(words: np.ndarray) -> int:
-    """Index of the first word of a type that EVT 3.0 does not have, or -1."""
-    for i in range(words.size):
-        if RESERVED_EVT3 >> (np.int64(words[i]) >> 12) & 1:
-            return i
-    return -1
+    n, k, i, base, low = 0, 0, state[State.WORD], state[State.BASE], state[State.LOW]
+    x, y, p = state[State.X], state[State.Y], state[State.P]
+    while i < words.size and n <= events.size - 12 and k < triggers.size:
+        kind, value = np.int64(words[i]) >> 12, np.int64(words[i]) & 0xFFF
+        i += 1
+        if kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE:
+            x, p = value & 2047, 2 * (value >> 11) - 1
+            if kind == Evt3.VECTOR_BASE:
+                continue
+        elif kind == Evt3.ROW:
+            y = value & 2047
+        elif kind == Evt3.TIME_LOW:
+            low = value
+        elif kind == Evt3.TIME_HIGH:
+            later = _next_base(words, i - 1, base, 12, 12)
+            state[State.STRAYS] += later < 0
+            low = low if later < 0 or later == base else np.int64(0)
+            base = base if later < 0 else later
+        elif kind == Evt3.TRIGGER:
+            state[State.SKIPPED] += 1
+            if base >= 0:
+                k = _trigger(triggers, k, base | low, value >> 8, value & 1)
+        elif kind == PADDING:
+            state[State.SKIPPED] += 1
+        elif RESERVED_EVT3 >> kind & 1:
+            state[State.RESERVED] += 1
+        mask = _mask(kind, value)
+        if mask:
+            if base < 0 or y < 0 or p == 0:
+                state[State.SKIPPED] += _bits(mask)
+            else:
+                inside = _inside(mask, x)
+                state[State.BEYOND] += _bits(mask) - _bits(inside)
+                n = _emit(events, n, inside, base | low, x, y, p)
+        if kind == Evt3.VECTOR_12 or kind == Evt3.VECTOR_8:
+            x += 12 if kind == Evt3.VECTOR_12 else 8
+    state[State.WORD], state[State.BASE], state[State.LOW] = i, base, low
+    state[State.X], state[State.Y], state[State.P] = x, y, p
+    return n, k
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _mask(kind: int, value: int) -> int:
-    """Which of the pixels from x on have an event by an EVT 3.0 word."""
+    """Return which of the pixels from x on have an event by an EVT 3.0 word."""
     if kind == Evt3.VECTOR_12:
         return value
     return value & 255 if kind == Evt3.VECTOR_8 else int(kind == Evt3.EVENT)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _count_evt3(words: np.ndarray) -> tuple[int, bool]:
-    """Number of events, and whether a type is reserved; no branches, so several words go at once."""
-    n, reserved = 0, np.int64(0)
-    for i in range(words.size):
-        word = np.int64(words[i])
-        n += _bits(_mask(word >> 12, word & 0xFFF))
-        reserved |= RESERVED_EVT3 >> (word >> 12)
-    return n, reserved & 1 == 1
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _fill_evt3(words: np.ndarray, start: int, events: np.ndarray) -> tuple[int, int]:
-    """Write the events of the words from `start` on; the words before it only say where and when.
-
-    Returns:
-        Number of stray high parts of the time, and the index of a vector beyond the last column or -1.
-    """
-    n, i, strays, beyond, base = 0, 0, 0, -1, np.int64(-1)
-    x = y = p = low = np.int64(0)
-    while n < events.size and beyond < 0:
-        kind, value = np.int64(words[i]) >> 12, np.int64(words[i]) & 0xFFF
-        if kind == Evt3.EVENT or kind == Evt3.VECTOR_BASE:
-            x, p = value & 2047, 2 * (value >> 11) - 1
-            if kind == Evt3.EVENT:
-                n = _emit(events, n, 1, base | low, x, y, p) if i >= start else n
-        elif kind == Evt3.ROW:
-            y = value & 2047
-        elif kind == Evt3.VECTOR_12 or kind == Evt3.VECTOR_8:
-            mask = _mask(kind, value)
-            beyond = i if x > COLUMNS - 12 and mask >> max(COLUMNS - x, 0) else -1
-            n = _emit(events, n, mask, base | low, x, y, p) if i >= start else n
-            x += 12 if kind == Evt3.VECTOR_12 else 8
-        elif kind == Evt3.TIME_LOW:
-            low = value
-        elif kind == Evt3.TIME_HIGH:
-            later = _next_base(words, i, base, 12, 12)
-            strays += later < 0
-            low = low if later < 0 or later == base else np.int64(0)
-            base = base if later < 0 else later
-        i += 1
-    return strays, beyond
-
-
-@numba.njit(cache=True, error_model="numpy")
-def decode_dat(words: np.ndarray, events: np.ndarray) -> None:
-    """Decode DAT, whose clock of 32 bits is unwrapped as by `unwrap`.
+def decode_dat(words: np.ndarray, last_us: int, events: np.ndarray) -> None:
+    """Decode DAT, whose clock of 32 bits is unwrapped as by `clocks.unwrap`.
 
     Args:
         words: Shape (N,), fields t and data, uint32: x 14 bits, y 14 bits, polarity 1 bit.
+        last_us: The time before the first [us]; -1: none.
         events: EVENT array (N,) to fill.
     """
-    t, half = np.int64(0), 1 << 31
+    t, full, half = np.int64(last_us), np.int64(1) << 32, np.int64(1) << 31
     for i in range(events.size):
-        step = np.int64(words[i].t) - t
-        t += (step + half & 2 * half - 1) - half if i else step
-        t += 2 * half if t < 0 else 0
+        value = np.int64(words[i].t)
+        if t < 0:
+            t = value
+        else:
+            t += ((value - t + half) & (full - 1)) - half
+            t += full if t < 0 else 0
         data, event = words[i].data, events[i]
         event.t, event.x, event.y = t, data & 0x3FFF, data >> 14 & 0x3FFF
         event.p = 2 * np.int8(data >> 28 & 1) - 1

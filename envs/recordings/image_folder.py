@@ -1,24 +1,52 @@
-"""Folders of images with their times: the Event Camera Dataset's `images.txt`, or a frame rate."""
+"""Find the images of a folder and their times: by a list, as data sets have it, or a frame rate."""
 
 import math
 import re
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 from envs.recordings.event_file import check_file
 
 LIST_NAME = "images.txt"
 KINDS = (".bmp", ".exr", ".hdr", ".jpeg", ".jpg", ".pfm", ".pgm", ".png", ".ppm", ".tif", ".tiff")
+SUBFOLDERS = ("imgs", "images", "frames", "rgb")  # where images may be, if the folder has none
 MAX_IMAGES = 1_000_000
 MAX_LIST_BYTES = 1 << 28
 
 
-def find_images(folder: Path, fps: float | None, max_bytes: int) -> tuple[list[Path], list[int]]:
-    """The images of a folder in the order of their times, and their times [us].
+class List(NamedTuple):
+    """A text file with a line for each image.
 
-    With an `images.txt`, a line for each image, its time [s] and its path in the folder, they are those of
-    the list; else all images of the folder, by their names, numbers in them by their value.
+    Attributes:
+        name: Of the file.
+        users: Who writes it.
+        columns: In a line, "time" and "name"; without names the images are in the order of their numbers.
+        unit_us: The unit of the times [us].
+    """
+
+    name: str
+    users: str
+    columns: tuple[str, ...]
+    unit_us: Decimal
+
+
+LISTS = (
+    List(LIST_NAME, "Event Camera Dataset", ("time", "name"), Decimal(1_000_000)),
+    List("images.csv", "ESIM", ("time", "name"), Decimal("0.001")),
+    List("timestamps.txt", "vid2e", ("time",), Decimal(1_000_000)),
+    List("info.txt", "DVS-Voltmeter", ("name", "time"), Decimal(1)),
+    List("rgb.txt", "TUM RGB-D", ("time", "name"), Decimal(1_000_000)),
+)
+NUMBER = re.compile(r"\d+(\.\d*)?([eE][+-]?\d+)?")
+
+
+def find_images(folder: Path, fps: float | None, max_bytes: int) -> tuple[list[Path], list[int]]:
+    """Return the images of a folder in the order of their times, and their times [us].
+
+    With a list of `LISTS` they are those of the list; else all images of the folder, or of a subfolder, by
+    their names, numbers in them by their value.
 
     Args:
         folder: The folder.
@@ -26,21 +54,31 @@ def find_images(folder: Path, fps: float | None, max_bytes: int) -> tuple[list[P
         max_bytes: Most bytes of all images together.
 
     Raises:
-        ValueError: There are no images, or no times; a line is not as above; an image is no regular file, or
-            outside the folder.
+        ValueError: There are no images, or no times; a line of a list is not as it should be; an image is no
+            regular file, or outside the folder.
     """
-    listed = folder / LIST_NAME
-    if listed.exists():
-        names, times = _read_list(listed)
-        _check_inside(folder, names)
-        paths = [folder / name for name in names]
+    known = next((one for one in LISTS if (folder / one.name).exists()), None)
+    names, times = _read_list(folder / known.name, known) if known else ([], [])
+    if names:
+        paths = [_inside(folder, folder / (known.name if known else ""), name) for name in names]
     else:
-        kinds = (path for path in folder.iterdir() if path.suffix.lower() in KINDS)
-        paths, times = sorted(kinds, key=_by_number), []
-        if fps is None:
-            raise ValueError(f"{folder}: has no {LIST_NAME} with lines 'time name'; write it, or give fps")
+        paths = _images(folder)
+    if fps is None and not times:
+        listed = ", ".join(f"{one.name} ({one.users})" for one in LISTS)
+        raise ValueError(
+            f"{folder}: has no list of times ({listed}); write {LIST_NAME} with lines 'time name', or give "
+            "fps"
+        )
     if not 2 <= len(paths) <= MAX_IMAGES:
-        raise ValueError(f"{folder}: has {len(paths)} images; give 2 to {MAX_IMAGES} of {', '.join(KINDS)}")
+        found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
+        raise ValueError(
+            f"{folder}: has {len(paths)} images, and contains {found}; give 2 to {MAX_IMAGES} of "
+            f"{', '.join(KINDS)}"
+        )
+    if fps is None and len(times) != len(paths):
+        raise ValueError(
+            f"{folder}: has {len(paths)} images and {len(times)} times; write one line an image, or give fps"
+        )
     left = max_bytes
     for path in paths:
         if path.suffix.lower() not in KINDS:
@@ -49,8 +87,18 @@ def find_images(folder: Path, fps: float | None, max_bytes: int) -> tuple[list[P
     return paths, times if fps is None else [even_time_us(number, fps) for number in range(len(paths))]
 
 
+def _images(folder: Path) -> list[Path]:
+    """Return the images of a folder, or of the first subfolder that has some."""
+    for place in (folder, *(folder / name for name in SUBFOLDERS)):
+        if place.is_dir():
+            found = [path for path in place.iterdir() if path.suffix.lower() in KINDS]
+            if found:
+                return sorted(found, key=_by_number)
+    return []
+
+
 def even_time_us(number: int, fps: float) -> int:
-    """The time [us] of a frame by its number at a rate; frame 0 has 0."""
+    """Return the time [us] of a frame by its number at a rate; frame 0 has 0."""
     return round(1_000_000 * number / Fraction(fps))
 
 
@@ -60,8 +108,8 @@ def check_fps(fps: float | None) -> None:
         raise ValueError(f"fps must lie in (0, 1e6], got {fps}")
 
 
-def _read_list(path: Path) -> tuple[list[str], list[int]]:
-    """Names and times [us] of an `images.txt`."""
+def _read_list(path: Path, known: List) -> tuple[list[str], list[int]]:
+    """Return names and times [us] of a list."""
     check_file(path, MAX_LIST_BYTES)
     names, times = [], []
     try:
@@ -69,30 +117,50 @@ def _read_list(path: Path) -> tuple[list[str], list[int]]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is not UTF-8 text at byte {error.start}; write it again") from None
     for number, line in enumerate(lines, 1):
-        words = line.split(maxsplit=1)
-        if not words or line.startswith("#"):
+        text = line.strip()
+        if not text or text.startswith("#"):
             continue
-        try:
-            time_s = Decimal(words[0])
-            if len(words) < 2 or not 0 <= time_s < 1 << 32:
-                raise InvalidOperation
-        except InvalidOperation:
+        name, time_us = _row(text, known)
+        if time_us is None or (name is None and len(known.columns) > 1):
             raise ValueError(
-                f"{path}: line {number} must be a time from 0 to 2**32 s and a name, got {line[:80]!r}"
-            ) from None
-        times.append(round(time_s * 1_000_000))
-        names.append(words[1].strip())
+                f"{path}: line {number} must be {' and '.join(known.columns)}, the time from 0 to 2**32 s, "
+                f"got {line[:80]!r}; repair it, or give fps"
+            )
+        times.append(time_us)
+        names += [] if name is None else [name]
     return names, times
 
 
-def _check_inside(folder: Path, names: list[str]) -> None:
-    """Refuse images outside the folder: a list may come from elsewhere."""
-    for name in names:
-        if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise ValueError(f"{folder / LIST_NAME}: names {name!r}, which is not inside its folder; copy it")
+def _row(text: str, known: List) -> tuple[str | None, int | None]:
+    """Return name and time [us] of a line."""
+    mark = "," if known.name.endswith(".csv") else None
+    words = text.rsplit(mark, 1) if known.columns[0] == "name" else text.split(mark, len(known.columns) - 1)
+    words = [word.strip() for word in words]
+    if len(words) != len(known.columns):
+        return None, None
+    facts = dict(zip(known.columns, words, strict=True))
+    try:
+        time_us = Decimal(facts["time"]) * known.unit_us if NUMBER.fullmatch(facts["time"]) else Decimal(-1)
+    except ArithmeticError:
+        time_us = Decimal(-1)
+    return facts.get("name"), round(time_us) if 0 <= time_us < 1_000_000 << 32 else None
+
+
+def _inside(folder: Path, listed: Path, name: str) -> Path:
+    """Return the path of an image of a list.
+
+    Raises:
+        ValueError: It is outside the folder; a list may come from elsewhere.
+    """
+    path = Path(name)
+    if path.is_absolute() and path.parent.name == folder.resolve().name:
+        path = Path(path.name)  # as DVS-Voltmeter writes them; the folder may have moved
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"{listed}: names {name!r}, which is not inside its folder; copy it there")
+    return folder / path
 
 
 def _by_number(path: Path) -> list[tuple[int, int, str]]:
-    """A key that sorts names as people count: frame_2 before frame_10."""
+    """Return a key that sorts names as people count: frame_2 before frame_10."""
     parts = re.findall(r"(\d+)|(\D+)", path.name)
     return [(0, int(digits), digits) if digits else (1, 0, text) for digits, text in parts]

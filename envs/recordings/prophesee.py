@@ -1,64 +1,78 @@
-"""Files of Prophesee cameras: DAT, and RAW with the encodings EVT 2.0, EVT 2.1 and EVT 3.0.
+"""Read files of Prophesee cameras: DAT, and RAW with the encodings EVT 2.0, EVT 2.1 and EVT 3.0.
 
-Both begin with lines `% name value`, and what these name tells them apart. From the published
-descriptions (docs.prophesee.ai: "DAT File Format", "EVT 2.0 Format", "EVT 2.1 Format", "EVT 3.0
-Format"). Every decoder runs twice: once to count, so that the number of events is known and checked
-before memory is taken for them, once to fill.
+Both begin with lines `% name value`, and the names tell them apart. From the published descriptions
+(docs.prophesee.ai: "DAT File Format", "EVT 2.0 Format", "EVT 2.1 Format", "EVT 3.0 Format").
 """
 
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from core.files import replaced
 from envs.events import EVENT
-from envs.recordings.event_file import EventFile, Request, finish
-from envs.recordings.evt_decoders import COLUMNS, decode_dat, decode_evt2, decode_evt3
+from envs.recordings.event_file import (
+    OUTSIDE,
+    RESERVED,
+    TRIGGER,
+    Opened,
+    Part,
+    Request,
+    Tally,
+    whole_entries,
+)
+from envs.recordings.evt_decoders import State, decode_dat, decode_evt2, decode_evt3, new_state
+from envs.recordings.mapped import Mapped, mapped_parts
 
 MAX_HEADER_BYTES = 1 << 16
-MAX_WORDS = 1 << 30
 DAT_WORD = np.dtype([("t", "<u4"), ("data", "<u4")])
 DAT_CD_TYPES = (0x00, 0x0C)  # Event2d, EventCD
+FEW_RESERVED = 16  # words of types that do not exist; more than an eighth of all words is another encoding
+MAX_TRIGGERS = 1 << 16  # of a part
+NAMES = {"EVT2": "evt2", "2.0": "evt2", "EVT21": "evt21", "2.1": "evt21", "EVT3": "evt3", "3.0": "evt3"}
 
 # Sensors by the name of the camera plug-in, for files that state no geometry.
 SENSORS = (("genx320", 320, 320), ("imx636", 1280, 720), ("gen4", 1280, 720), ("gen3", 640, 480))
 
-# Clock bits and coordinate bits of what is written, and so the first time that does not fit.
-LIMITS = {"dat": (32, 14), "evt2": (34, 11), "evt3": (24, 11)}
 
-
-def read_dat(request: Request) -> EventFile:
-    """Events of a DAT file, version 2. The 32-bit clock of 71.6 minutes is unwrapped.
+def read_dat(request: Request) -> Opened:
+    """Open a DAT file, version 2. The 32-bit clock of 71.6 minutes is unwrapped.
 
     Raises:
-        ValueError: Another version or event type, a truncated body, or a rule of `finish`.
+        ValueError: Another version or event type.
     """
     fields, start = _header(request)
     if fields.get("Version") != "2":
-        raise request.refusal(f"is DAT version {fields.get('Version')}; only version 2 is read: convert it")
+        raise request.refusal(f"is DAT version {fields.get('Version')}; version 2 is read: write it again")
     kind, size = [*np.fromfile(request.path, np.uint8, 2, offset=start).tolist(), 0, 0][:2]
     if kind not in DAT_CD_TYPES or size != DAT_WORD.itemsize:
         raise request.refusal(
-            f"holds entries of type {kind} and {size} bytes, no brightness changes of 8 bytes"
+            f"contains entries of type {kind} and {size} bytes, no brightness changes of 8 bytes; "
+            "give the DAT file of brightness changes (CD)"
         )
-    words = _words(request, start + 2, DAT_WORD)
-    request.check_count(len(words))
     request = request.sized(_number(fields.get("Width")), _number(fields.get("Height")))
-    events = np.empty(len(words), EVENT)
-    decode_dat(words, events)
-    return finish(request, "dat", events)
+    tally = Tally()
+    count = whole_entries(request, tally, request.path.stat().st_size - start - 2, DAT_WORD.itemsize)
+    request.check_declared(count)
+    return Opened("dat", request, tally, _dat_parts(request, start + 2, count))
 
 
-def read_evt(request: Request, format: str | None = None) -> EventFile:
-    """Events of a RAW file, in the encoding that its header names or that `format` says.
+def _dat_parts(request: Request, start: int, count: int) -> Iterator[Part]:
+    """Yield the events of a DAT file."""
+    last_us = -1
+    for words in mapped_parts(request, start, DAT_WORD, count):
+        events = np.empty(len(words), EVENT)
+        decode_dat(words, last_us, events)
+        last_us = int(events["t"][-1])
+        yield Part(events)
 
-    External triggers and vendor words are passed over. Words of reserved types are refused. A header
-    with a version and without an encoding is that of a DAT file, in whatever order its lines are.
+
+def read_evt(request: Request, format: str | None = None) -> Opened:
+    """Open a RAW file of EVT 2.0, 2.1 or 3.0, as its header says, else as the caller says.
+
+    Triggers are read; padding is passed over and counted. A header with a version and without an
+    encoding is that of a DAT file, in whatever order its lines are.
 
     Raises:
-        ValueError: No known encoding, a truncated body, words that the encoding does not have,
-            or a rule of `finish`.
+        ValueError: No known encoding, or words that the encoding does not have.
     """
     fields, start = _header(request)
     if format is None and "Version" in fields and not fields.keys() & {"evt", "format"}:
@@ -66,103 +80,98 @@ def read_evt(request: Request, format: str | None = None) -> EventFile:
     options = dict(part.partition("=")[::2] for part in fields.get("format", "").split(";")[1:])
     encoding = _encoding(request, fields, format)
     request = request.sized(*_geometry(fields, options))
-    if options.get("endianness", "little") not in ("little", "legacy"):
-        raise request.refusal(f"has {options['endianness']}-endian words; only little-endian ones are read")
+    endianness = options.get("endianness", "little")
+    if endianness not in ("little", "legacy"):
+        raise request.refusal(f"has {endianness}-endian words; little-endian ones are read: write it again")
+    tally, word = Tally(), np.dtype({"evt3": "<u2", "evt2": "<u4", "evt21": "<u8"}[encoding])
+    count = whole_entries(request, tally, request.path.stat().st_size - start, word.itemsize)
+    mapped = Mapped(request, start, word, count)
+    parts = evt_parts(request, tally, encoding, mapped.values, endianness, mapped.forget)
+    return Opened(encoding, request, tally, parts)
+
+
+def evt_parts(
+    request: Request,
+    tally: Tally,
+    encoding: str,
+    words: np.ndarray,
+    endianness: str = "little",
+    forget: Callable[[int], None] = lambda stop: None,
+    states: dict[str, np.ndarray] | None = None,
+) -> Iterator[Part]:
+    """Yield the events of words of an EVT encoding.
+
+    Args:
+        request: The file.
+        tally: Counts that grow.
+        encoding: "evt2", "evt21" or "evt3".
+        words: uint16, uint32 or uint64.
+        endianness: "legacy": the lower half of a word of EVT 2.1 comes second.
+        forget: Called with the number of words that have been decoded.
+        states: State by encoding, of the words before these; it is moved on. None: nothing was before.
+    """
+    states = {} if states is None else states
+    state = states.setdefault(encoding, new_state())
+    state[State.WORD], before = 0, state.copy()
+    most = len(words) * {"evt2": 1, "evt21": 32, "evt3": 12}[encoding]
+    while state[State.WORD] < len(words):
+        events = np.empty(min(request.part_events, most) + 32, EVENT)
+        triggers = np.empty(min(MAX_TRIGGERS, len(words)), TRIGGER)
+        n, k = decode(encoding, words, state, events, triggers, endianness)
+        _count(request, tally, state, before)
+        yield Part(events[:n] if n > len(events) // 2 else events[:n].copy(), None, triggers[:k].copy())
+        forget(int(state[State.WORD]))
+
+
+def decode(
+    encoding: str,
+    words: np.ndarray,
+    state: np.ndarray,
+    events: np.ndarray,
+    triggers: np.ndarray,
+    endianness: str = "little",
+) -> tuple[int, int]:
+    """Fill events and triggers from words of an encoding; return how many there are of each."""
     if encoding == "evt3":
-        decoded = _decoded(request, decode_evt3, _words(request, start, np.dtype("<u2")))
-    elif encoding == "evt2":
-        words = _words(request, start, np.dtype("<u4"))
-        decoded = _decoded(request, decode_evt2, words, np.empty(0, "<u4"))
-    else:
-        pairs = _words(request, start, np.dtype("<u8")).view("<u4").reshape(-1, 2)
-        upper = 0 if options.get("endianness") == "legacy" else 1  # IMX636 sends the upper half first
-        columns = np.ascontiguousarray(pairs.T)
-        decoded = _decoded(request, decode_evt2, columns[upper], columns[1 - upper])
-    return finish(request, encoding, *decoded)
+        return decode_evt3(words, state, events, triggers)
+    if encoding == "evt2":
+        return decode_evt2(words, np.empty(0, "<u4"), state, events, triggers)
+    pairs = words.view("<u4").reshape(-1, 2)
+    upper = 0 if endianness == "legacy" else 1  # IMX636 sends the upper half first
+    return decode_evt2(pairs[:, upper], pairs[:, 1 - upper], state, events, triggers)
 
 
-def write_prophesee(path: Path, events: np.ndarray, width: int, height: int, format: str) -> None:
-    """Write checked events as "dat", "evt2" or "evt3"; reading gives the same events.
+def _count(request: Request, tally: Tally, state: np.ndarray, before: np.ndarray) -> None:
+    """Add to the tally what a decoder counted since `before`, and refuse words of another encoding.
 
     Raises:
-        ValueError: The format's clock or address cannot hold them.
+        ValueError: More than an eighth of the words are of types that the encoding does not have.
     """
-    clock_bits, address_bits = LIMITS[format]
-    if max(width, height) > 1 << address_bits:
-        raise ValueError(f"{format} addresses at most {1 << address_bits} pixels, got {width}x{height}")
-    limit_us = 1 << clock_bits
-    clocked = events["t"][:1] if format == "evt3" else events["t"][-1:]
-    if len(clocked) and clocked[0] >= limit_us:
-        which = "first" if format == "evt3" else "last"
-        raise ValueError(
-            f"{format} has a clock of {clock_bits} bits: the {which} event must be before {limit_us} us, got "
-            f"{clocked[0]}; subtract the time of the first event, or choose another format"
+    new = state - before
+    tally.skipped += int(new[State.SKIPPED])
+    tally.strays += int(new[State.STRAYS])
+    for place, name in ((State.RESERVED, RESERVED), (State.BEYOND, OUTSIDE)):
+        if new[place]:
+            tally.damage[name] += int(new[place])
+    before[:] = state
+    if state[State.RESERVED] > FEW_RESERVED + state[State.WORD] // 8:
+        raise request.refusal(
+            f"has {state[State.RESERVED]} of {state[State.WORD]} words of types that this encoding does not "
+            "have; the file is damaged or of another encoding: give format as evt2, evt21 or evt3"
         )
-    with replaced(path) as part, part.open("wb") as file:
-        if format == "dat":
-            lines = f"% Data file containing CD events\n% Version 2\n% Width {width}\n% Height {height}\n"
-            file.write(lines.encode() + bytes((0x0C, 8)))
-            file.write(_dat_words(events).tobytes())
-        else:
-            version = format[3:] + ".0"
-            lines = f"% evt {version}\n% format {format.upper()};height={height};width={width}\n"
-            file.write(f"{lines}% geometry {width}x{height}\n% end\n".encode())
-            words = _evt2_words(events) if format == "evt2" else _evt3_words(path, events)
-            file.write(words.tobytes())
-
-
-def _dat_words(events: np.ndarray) -> np.ndarray:
-    """Entries of DAT."""
-    words = np.empty(len(events), DAT_WORD)
-    words["t"] = events["t"]
-    words["data"] = (
-        events["x"] | events["y"].astype(np.uint32) << 14 | (events["p"] > 0).astype(np.uint32) << 28
-    )
-    return words
-
-
-def _evt2_words(events: np.ndarray) -> np.ndarray:
-    """Words of EVT 2.0: a high part of the time wherever it changes, then the event."""
-    t = events["t"]
-    words = (events["p"] > 0).astype(np.uint32) << 28 | (t & 63).astype(np.uint32) << 22
-    words |= events["x"].astype(np.uint32) << 11 | events["y"]
-    changes = np.flatnonzero(np.diff(t >> 6, prepend=-1))
-    return np.insert(words, changes, np.uint32(8 << 28) | (t[changes] >> 6).astype(np.uint32)).astype("<u4")
-
-
-def _evt3_words(path: Path, events: np.ndarray) -> np.ndarray:
-    """Words of EVT 3.0 without vectors, with every high part of the time, as a camera sends them."""
-    if not len(events):
-        return np.empty(0, "<u2")
-    high, low, y = events["t"] >> 12, events["t"] & 0xFFF, events["y"].astype(np.int64)
-    steps = np.diff(high, prepend=high[0] - 1)
-    new_low = (steps > 0) | (np.diff(low, prepend=-1) != 0)
-    new_y = np.diff(y, prepend=-1) != 0
-    last = np.cumsum(steps + new_low + new_y + 1) - 1  # where the word with x of each event goes
-    if last[-1] >= MAX_WORDS:
-        raise ValueError(f"{path}: evt3 needs {last[-1] + 1} words for gaps this long; choose npz or hdf5")
-    words = np.empty(last[-1] + 1, "<u2")
-    is_high = np.ones(len(words), bool)
-    for places, values in (
-        (last, 0x2000 | (events["p"] > 0).astype(np.int64) << 11 | events["x"]),
-        ((last - 1)[new_y], y[new_y]),
-        ((last - 1 - new_y)[new_low], 0x6000 | low[new_low]),
-    ):
-        words[places] = values
-        is_high[places] = False
-    words[is_high] = 0x8000 | np.arange(high[0], high[-1] + 1) & 0xFFF
-    return words
 
 
 def _header(request: Request) -> tuple[dict[str, str], int]:
-    """The fields of the text lines at the beginning, and where the words begin."""
+    """Return the fields of the text lines at the beginning, and the place of the first word."""
     head = np.fromfile(request.path, np.uint8, MAX_HEADER_BYTES).tobytes()
     fields: dict[str, str] = {}
     start = 0
     while head.startswith(b"% ", start):
         end = head.find(b"\n", start)
         if end < 0:
-            raise request.refusal("has a header without end; it is no file of a Prophesee camera, or damaged")
+            raise request.refusal(
+                "has a header without end; it is no file of a Prophesee camera, or damaged: give its format"
+            )
         line = head[start + 2 : end].decode("latin-1").strip()
         start = end + 1
         if line == "end":
@@ -173,12 +182,13 @@ def _header(request: Request) -> tuple[dict[str, str], int]:
 
 
 def _encoding(request: Request, fields: dict[str, str], format: str | None) -> str:
-    """The encoding by the header, else by the caller."""
-    names = {"EVT2": "evt2", "2.0": "evt2", "EVT21": "evt21", "2.1": "evt21", "EVT3": "evt3", "3.0": "evt3"}
+    """Return the encoding by the header, else by the caller."""
     said = fields.get("format", fields.get("evt", "")).partition(";")[0]
-    encoding = names.get(said)
+    encoding = NAMES.get(said)
     if said and encoding is None:
-        raise request.refusal(f"is encoded as {said!r}; EVT2, EVT21 and EVT3 are read: convert it")
+        raise request.refusal(
+            f"is encoded as {said!r}; EVT2, EVT21 and EVT3 are read: write it again with one"
+        )
     if encoding and format and format != encoding:
         raise request.refusal(f"says {encoding} and the caller says {format}; leave format out")
     if not (encoding or format):
@@ -187,7 +197,7 @@ def _encoding(request: Request, fields: dict[str, str], format: str | None) -> s
 
 
 def _geometry(fields: dict[str, str], options: dict[str, str]) -> tuple[int | None, int | None]:
-    """Width and height of the sensor as far as the header knows them."""
+    """Return width and height of the sensor as far as the header knows them."""
     if "width" in options and "height" in options:
         return _number(options["width"]), _number(options["height"])
     width, _, height = fields.get("geometry", "").partition("x")
@@ -201,32 +211,5 @@ def _geometry(fields: dict[str, str], options: dict[str, str]) -> tuple[int | No
 
 
 def _number(text: str | None) -> int | None:
-    """A size of a sensor in decimal digits, or None."""
+    """Return a size of a sensor in decimal digits, or None."""
     return int(text) if text and text.isascii() and text.isdigit() and 0 < len(text) < 6 else None
-
-
-def _words(request: Request, start: int, word: np.dtype) -> np.ndarray:
-    """The body as an array of words."""
-    size = request.path.stat().st_size - start
-    if size % word.itemsize:
-        raise request.refusal(
-            f"is truncated: {size} bytes after the header are no whole number of {word.itemsize}-byte words; "
-            f"copy it again, or cut its last {size % word.itemsize} bytes"
-        )
-    return np.fromfile(request.path, word, offset=start)
-
-
-def _decoded(
-    request: Request, decode: Callable[..., tuple[int, int, int, int]], *words: np.ndarray
-) -> tuple[np.ndarray, int, int]:
-    """Events, the number of entries skipped and the number of stray times."""
-    count, skipped, strays, bad = decode(*words, np.empty(0, EVENT))
-    events = np.empty(request.check_count(count), EVENT)
-    if bad < 0:
-        _, _, strays, bad = decode(*words, events)
-    if bad >= 0:
-        raise request.refusal(
-            f"word {bad} is of no type that this encoding has, or lies beyond its {COLUMNS} columns; "
-            "the file is damaged or of another encoding"
-        )
-    return events, skipped, strays

@@ -17,9 +17,9 @@ from envs.config import LUMINANCE_FLOOR, CameraConfig, FaultsConfig, with_floor
 from envs.events import EVENT, EventCamera, RealSensor
 from envs.events.faults import has_readout
 from envs.recordings.decoder import decoded_images, decoded_video
-from envs.recordings.event_file import MAX_BYTES, MAX_EVENTS, EventFile, Request, check_file
+from envs.recordings.event_file import MAX_BYTES, MAX_EVENTS, EventFile, check_file
 from envs.recordings.frame_rate import FrameLoss
-from envs.recordings.image_folder import LIST_NAME, check_fps, even_time_us, find_images
+from envs.recordings.image_folder import LISTS, check_fps, even_time_us, find_images
 from envs.recordings.in_between import frames_between, open_cv
 from envs.recordings.light import (
     TRANSFERS,
@@ -89,14 +89,18 @@ def video_to_events(  # noqa: PLR0913 - each is a choice of its own
     Raises:
         ValueError: As `video_steps`, or there are more than `max_events` events.
     """
-    request = Request(Path(path), max_events=max_events)
     parts, noise = [np.empty(0, EVENT)], [np.empty(0, bool)]
     count, dropped = 0, 0
     options: dict[str, Any] = {"transfer": transfer, "fps": fps, "interpolate": interpolate, "rng": rng}
     for step in video_steps(path, camera, faults, max_bytes=max_bytes, **options):
         parts.append(step.events)
         noise.append(step.is_noise)
-        count = request.check_count(count + len(step.events))
+        count += len(step.events)
+        if count > max_events:
+            raise ValueError(
+                f"{path}: gives more than max_events={max_events} events; raise max_events, or take them "
+                "frame by frame from video_steps and write them with event_writer"
+            )
         dropped += step.dropped
     events = np.concatenate(parts)
     return EventFile(
@@ -258,7 +262,7 @@ def _frames(path: Path, fps: float | None, max_bytes: int) -> Iterator[tuple[int
         for t_us, picture in zip(times_us, decoded_images(paths), strict=True):
             yield t_us, picture.values
         return
-    if path.name == LIST_NAME:
+    if path.name in {one.name for one in LISTS}:
         raise ValueError(f"{path}: lists images; give its folder")
     check_file(path, max_bytes)
     for number, picture in enumerate(decoded_video(path)):

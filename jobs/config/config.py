@@ -28,6 +28,7 @@ from jobs.config.schema import (
     EvaluateConfig,
     Name,
     PretrainConfig,
+    RecordingConfig,
     TrackingConfig,
     TrainConfig,
 )
@@ -65,6 +66,7 @@ class Config:
     env: EnvConfig
     model: Model
     algo: AlgoConfig
+    recording: RecordingConfig
     collect: CollectConfig
     pretrain: PretrainConfig
     train: TrainConfig

@@ -20,6 +20,7 @@ from models.kinds import checked
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
 Name = Annotated[str, Field(min_length=1)]
+Pixels = Annotated[int, Field(ge=1, le=65536)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -95,6 +96,37 @@ class AlgoConfig:
             rule = "must be null without a teacher (algo=imitation, algo.critic=teacher, algo.shaping)"
             raise ValueError(f"teacher_sight_m {rule}, got {self.teacher_sight_m}")
         return self
+
+
+@dataclass(frozen=True, config=STRICT)
+class RecordingConfig:
+    """How a command reads event files: what the file itself does not say (docs/recordings.md).
+
+    Attributes:
+        format: One of `envs.recordings.FORMATS`; None: by the file.
+        columns: Text: names of its columns in their order; npz and HDF5: names of t, x, y and p.
+        time_unit: Of the times; None: as the file says.
+        width, height: Pixels of the sensor; None: as the file says.
+        topic: Topic of a ROS bag.
+        group: Group or data set of an HDF5 file, array of an npz file.
+        stream: Number of a stream of an AEDAT file.
+        start_us, end_us: First time, and the time before which reading ends [us]; None: all.
+        max_events: Most events that are read at once; None: as `envs.recordings.read_events`.
+        strict: Whether a damaged file is refused; else what is damaged is left out and told.
+    """
+
+    format: Name | None = None
+    columns: list[Name] | None = None
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    width: Pixels | None = None
+    height: Pixels | None = None
+    topic: Name | None = None
+    group: Name | None = None
+    stream: Annotated[int, Field(ge=0)] | None = None
+    start_us: Annotated[int, Field(ge=0)] | None = None
+    end_us: Annotated[int, Field(ge=1)] | None = None
+    max_events: Count | None = None
+    strict: bool = False
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -222,15 +222,21 @@ def simulate() -> None:
 def record() -> None:
     """Write and read recordings."""
     from envs.recordings import read_events, write_events
+    from envs.recordings.clocks import unwrap
     from envs.recordings.ecf import decode_ecf
+    from envs.recordings.event_packets import decode_libcaer_cmp
     from envs.recordings.event_stream import MAGIC_ES
 
     with tempfile.TemporaryDirectory() as folder:
         for name in ("dat", "evt2", "evt3"):
             write_events(Path(folder) / name, some_events(), 16, 16, name)
             read_events(Path(folder) / name)
-        (Path(folder) / "es").write_bytes(MAGIC_ES + bytes((2, 0, 0, 1, 16, 0, 16, 0)))
-        read_events(Path(folder) / "es")
+        (Path(folder) / "es").write_bytes(MAGIC_ES + bytes((2, 0, 0, 1, 16, 0, 16, 0)) + bytes(5))
+        (Path(folder) / "evt21").write_bytes(b"% evt 2.1\n" + bytes((0, 0, 0, 0, 0, 0, 0, 128)))
+        for name in ("es", "evt21"):
+            read_events(Path(folder) / name)
+    unwrap(np.zeros(1, np.uint32), 32, -1)
+    decode_libcaer_cmp(np.zeros(1, np.uint16), 0, np.empty((4, 8), np.int64))
     decode_ecf(np.frombuffer(bytes(12), np.uint8), some_events()[:0])
 
 

@@ -8,7 +8,7 @@ from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from jobs.config.config import Config, as_dict
 from jobs.config.env_keys import ENV_FIELDS
 from jobs.config.plugins import plugin_digests
-from jobs.config.schema import AlgoConfig, CollectConfig, PretrainConfig, TrainConfig
+from jobs.config.schema import AlgoConfig, CollectConfig, PretrainConfig, RecordingConfig, TrainConfig
 from models.kinds import ADDED_MODEL_SETTINGS
 
 # The settings that can change what is trained: not the job, nor where a run is computed and recorded.
@@ -76,6 +76,10 @@ def identity(config: Config) -> dict[str, Any]:
     for section, added in ADDED_SETTINGS.items():
         own = settings[section].items()
         settings[section] = {name: value for name, value in own if added.get(name, ...) != value}
+    usual_reading = dataclasses.asdict(RecordingConfig())
+    reading = dataclasses.asdict(config.recording)
+    given = {name: value for name, value in reading.items() if value != usual_reading[name]}
+    settings |= {"recording": given} if given else {}
     for job, (name, usual) in ALWAYS.items():
         settings[name] = _of_older_versions(usual, values.get(job))
     if config.plugins:

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, EnvConfig
+from envs.corridor import CorridorEnv
 from jobs.analysis.tables import show_table
 from jobs.analysis.video import coloured, frame, last_polarity, open_film
 from jobs.config.config import Config, ConfigError
@@ -22,13 +23,17 @@ from jobs.config.schema import Name
 from jobs.rollout.policies import find_one_policy
 from jobs.run.files import write_atomic
 from jobs.run.folder import locate_run, open_run
-from jobs.run.progress import console
+from jobs.run.progress import console, progress
+from jobs.run.recordings import refused
 from jobs.training.real_recordings import Recorded, read_whole
 from models.policy import Policy, load_policy
 
 ACTIONS = ("forward", "left", "right")
 HEADINGS = ("Recording", "Policy", "Steps", "Events/step", "Forward", "Left", "Right", "p50", "p95", "p99")
 FILM_FPS, SLOWEST_FPS = 50.0, 5.0
+FAR = 5.0  # times the event rate of the training, or less than its reciprocal: a warning
+RATE_EPISODES, RATE_STEPS = 3, 100  # of the simulation whose event rate is measured
+FORWARD = ACTIONS.index("forward")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -73,9 +78,15 @@ def run(config: Config) -> list[Choice]:
         raise ConfigError(f"replay.policy: must see events, got {config.own.policy!r}")
     env = EnvConfig(**policy.env_fields)
     try:
-        recorded = read_whole(config.own.recording, env)
+        recorded, fitted = read_whole(config.own.recording, env, config.recording)
     except (ValueError, OSError) as error:
-        raise ConfigError(f"replay.recording: {error}") from error
+        raise refused("replay.recording", config.own.recording, error) from error
+    if fitted.gaps:
+        console.print(
+            f"{fitted.gaps:,} gaps, {fitted.closed_us / 1e6:,.1f} s together, are closed in all times.",
+            markup=False,
+        )
+    _tell_rate(recorded, trained_rate(policy, config.seed))
     choices, name = choose(policy, recorded), f"{found.group}-s{found.training}"
     show_table("A policy looks at a recording", HEADINGS, [line(recorded.name, name, choices)], words=2)
     console.print(
@@ -91,23 +102,55 @@ def run(config: Config) -> list[Choice]:
 
 
 def choose(policy: Policy, recorded: Recorded) -> list[Choice]:
-    """What a policy makes of each control step of a recording, from its own memory of those before."""
+    """Return what a policy chooses at each control step of a recording; it remembers the steps before."""
     policy.reset()
-    policy.event_logits(recorded.events[:1], int(recorded.events["t"][0]) - 1, 1)  # compiles
+    first_us = int(recorded.events["t"][0]) if recorded.events.size else 1
+    policy.event_logits(recorded.events[:1], first_us - 1, 1)  # compiles
     policy.reset()
     starts_us = np.concatenate(([0], recorded.ends_us[:-1]))
     cuts = np.searchsorted(recorded.events["t"], np.append(starts_us, recorded.ends_us[-1]), side="right")
     choices = []
-    for step, (start_us, end_us) in enumerate(
-        zip(starts_us.tolist(), recorded.ends_us.tolist(), strict=True)
-    ):
-        events = recorded.events[cuts[step] : cuts[step + 1]]
-        begun = time.perf_counter()
-        logits = policy.event_logits(events, start_us, end_us - start_us).astype(np.float64)
-        seconds = time.perf_counter() - begun
-        odds = np.exp(logits - logits.max())
-        choices.append(Choice(start_us, end_us, events, odds / odds.sum(), seconds))
+    with progress("Replay", len(starts_us), "steps") as advance:
+        for step, (start_us, end_us) in enumerate(
+            zip(starts_us.tolist(), recorded.ends_us.tolist(), strict=True)
+        ):
+            events = recorded.events[cuts[step] : cuts[step + 1]]
+            begun = time.perf_counter()
+            logits = policy.event_logits(events, start_us, end_us - start_us).astype(np.float64)
+            seconds = time.perf_counter() - begun
+            odds = np.exp(logits - logits.max())
+            choices.append(Choice(start_us, end_us, events, odds / odds.sum(), seconds))
+            advance(1)
     return choices
+
+
+def trained_rate(policy: Policy, seed: int) -> float:
+    """Return the events of a control step, on average, in the simulation that a policy was trained in.
+
+    A vehicle that flies straight on, in corridors of the policy's camera; the policy's file does not say it.
+    """
+    env = CorridorEnv(**{**policy.env_fields, "observation": "events"})
+    counts: list[int] = []
+    for episode in range(RATE_EPISODES):
+        env.reset(seed=seed + episode)
+        ended = False
+        while not ended and len(counts) < RATE_STEPS * (episode + 1):
+            _, _, terminated, truncated, info = env.step(FORWARD)
+            counts.append(int(info["num_events"]))
+            ended = terminated or truncated
+    return float(np.mean(counts))
+
+
+def _tell_rate(recorded: Recorded, trained: float) -> None:
+    """Print a warning if a recording's event rate is far from what the policy knows."""
+    rate = recorded.events.size / len(recorded.ends_us)
+    if not trained / FAR <= rate <= trained * FAR:
+        console.print(
+            f"The recording has {rate:.1f} events a control step, and the policy was trained with about "
+            f"{trained:.0f}: it has not seen such input. Record with another contrast threshold or lens, or "
+            "train a policy whose encoder knows such recordings (docs/pretrain.md).",
+            markup=False,
+        )
 
 
 def line(recording: str, policy: str, choices: list[Choice]) -> tuple[str, ...]:

@@ -1,11 +1,13 @@
-"""The events that the configured camera would have seen of a video or a folder of images, as a file.
+"""Write the events that the configured camera would have seen of a video or a folder of images.
 
 Run: python -m platform.launch +exp=video_events video_events.path=ride.mp4 camera=davis346 light=night
 Expect: seconds to minutes. A line of numbers and the file, with labels of noise where its format holds them.
 """
 
 import dataclasses
+import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,10 +15,10 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from envs.config import STRICT, EnvConfig
-from envs.recordings import video_to_events, write_events
-from envs.recordings.event_file import EventFile
+from envs.config import STRICT
+from envs.recordings import event_writer
 from envs.recordings.formats import LABELLED, WRITERS, WRITTEN_SUFFIXES
+from envs.recordings.video import VideoStep, video_steps
 from jobs.analysis.tables import show_table
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Name
@@ -24,6 +26,7 @@ from jobs.run.folder import open_run
 from jobs.run.progress import console
 
 SECOND_US = 1_000_000
+TELL_EVERY_S = 10.0
 HEADINGS = (
     *("Video", "Pixels", "Seconds", "Events", "per pixel [Hz]"),
     *("ON [%]", "Noise [%]", "Lost", "Missed [%]"),
@@ -63,57 +66,114 @@ def run(config: Config) -> Path:
     if kind not in WRITERS:
         known = ", ".join(suffix for suffix, name in WRITTEN_SUFFIXES.items() if name in WRITERS)
         raise ConfigError(f"video_events.output: must end in one of {known}, got {output.name!r}")
-    file = seen(config.own, config.env, np.random.default_rng(config.seed))
-    labels = file.is_noise if kind in LABELLED else None
-    camera = config.env.camera
-    try:
-        write_events(output, file.events, camera.width, camera.height, is_noise=labels)
-    except (ValueError, OSError) as error:
-        raise ConfigError(f"video_events.output: {error}") from error
-    unlabelled = "" if kind in LABELLED else f" ({kind} holds no labels of noise; npz and hdf5 do)"
+    camera, chosen = config.env.camera, config.own
+    steps = video_steps(
+        chosen.path,
+        dataclasses.replace(camera, luminance_floor=chosen.luminance_floor),
+        config.env.faults,
+        transfer=chosen.transfer,
+        fps=chosen.fps,
+        interpolate=chosen.interpolate,
+        rng=np.random.default_rng(config.seed),
+    )
+    counts, said = write_steps(steps, output, kind, (camera.width, camera.height))
+    show_table("The events of a video", HEADINGS, [line(Path(chosen.path).name, counts)])
+    for warning in said:
+        console.print(warning, markup=False)
+    unlabelled = "" if kind in LABELLED else f" ({kind} stores no labels of noise; npz and hdf5 do)"
     console.print(f"Events: {output}{unlabelled}", markup=False)
     return output
 
 
-def seen(chosen: Settings, env: EnvConfig, rng: np.random.Generator) -> EventFile:
-    """The events of a video, after a line of numbers and what is to be warned of."""
+@dataclasses.dataclass
+class Counts:
+    """What the events of a video are, counted while they are written.
+
+    Attributes:
+        events, on, noise, dropped: Numbers of events: all, ON, noise, lost.
+        first_us, last_us: Times of the first and the last event [us].
+        width, height: Pixels of the camera.
+        missed: As in `envs.recordings.video.VideoStep`.
+    """
+
+    events: int = 0
+    on: int = 0
+    noise: int = 0
+    dropped: int = 0
+    first_us: int = 0
+    last_us: int = 0
+    width: int = 0
+    height: int = 0
+    missed: float | None = None
+
+    def add(self, step: VideoStep) -> None:
+        """Count the events of one frame."""
+        if step.events.size:
+            self.first_us = self.first_us if self.events else int(step.events["t"][0])
+            self.last_us = int(step.events["t"][-1])
+        self.events += step.events.size
+        self.on += int(np.count_nonzero(step.events["p"] > 0))
+        self.noise += int(np.count_nonzero(step.is_noise))
+        self.dropped += step.dropped
+        self.width, self.height, self.missed = step.width, step.height, step.missed
+
+
+def write_steps(
+    steps: Iterator[VideoStep], output: Path, kind: str, size: tuple[int, int]
+) -> tuple[Counts, list[str]]:
+    """Write the events of each frame as it comes, with a line now and then; return counts and warnings.
+
+    Raises:
+        ConfigError: The video is refused, or the format cannot store its events.
+    """
+    counts, is_labelled, told, frames = Counts(), kind in LABELLED, time.monotonic(), 0
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            with event_writer(output, *size, kind, is_labelled=is_labelled) as write:
+                for step in _refusing(steps):
+                    write(step.events, step.is_noise if is_labelled else None)
+                    counts.add(step)
+                    frames += 1
+                    if time.monotonic() - told > TELL_EVERY_S:
+                        told = time.monotonic()
+                        console.print(
+                            f"Frame {frames:,}, {step.t_us / SECOND_US:.2f} s: "
+                            f"{counts.events / 1e6:,.1f} million events",
+                            markup=False,
+                        )
+        except ConfigError:
+            raise
+        except (ValueError, OSError) as error:
+            raise ConfigError(f"video_events.output: {error}") from error
+    return counts, [str(warning.message) for warning in said]
+
+
+def _refusing(steps: Iterator[VideoStep]) -> Iterator[VideoStep]:
+    """Yield the steps of a video; raise ConfigError if it is refused."""
     try:
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", UserWarning)
-            file = video_to_events(
-                chosen.path,
-                dataclasses.replace(env.camera, luminance_floor=chosen.luminance_floor),
-                env.faults,
-                transfer=chosen.transfer,
-                fps=chosen.fps,
-                interpolate=chosen.interpolate,
-                rng=rng,
-            )
+        yield from steps
     except (ValueError, OSError, RuntimeError) as error:
         raise ConfigError(f"video_events.path: {error}") from error
-    show_table("The events of a video", HEADINGS, [line(Path(chosen.path).name, file)])
-    for warning in said:
-        console.print(str(warning.message), markup=False)
-    return file
 
 
-def line(name: str, file: EventFile) -> tuple[str, ...]:
-    """A row of the table."""
-    events, width, height = file.events, file.width or 0, file.height or 0
-    span_s = (int(events["t"][-1]) - int(events["t"][0])) / SECOND_US if events.size else 0.0
+def line(name: str, counts: Counts) -> tuple[str, ...]:
+    """Return a row of the table."""
+    span_s = (counts.last_us - counts.first_us) / SECOND_US
+    rate = counts.events / (counts.width * counts.height) / span_s if span_s else None
     return (
         name,
-        f"{width}x{height}",
+        f"{counts.width}x{counts.height}",
         f"{span_s:.2f}",
-        f"{events.size:,}",
-        f"{events.size / (width * height) / span_s:.2f}" if span_s else "-",
-        percent(events["p"] > 0),
-        percent(np.asarray(file.is_noise)),
-        f"{file.dropped:,}",
-        "-" if file.missed is None else f"{100 * file.missed:.0f}",
+        f"{counts.events:,}",
+        "-" if rate is None else f"{rate:.2f}",
+        percent(counts.on, counts.events),
+        percent(counts.noise, counts.events),
+        f"{counts.dropped:,}",
+        "-" if counts.missed is None else f"{100 * counts.missed:.0f}",
     )
 
 
-def percent(which: np.ndarray) -> str:
-    """The share of what is true."""
-    return f"{100 * np.mean(which):.1f}" if which.size else "-"
+def percent(some: int, all_of_them: int) -> str:
+    """Return a share in percent."""
+    return f"{100 * some / all_of_them:.1f}" if all_of_them else "-"

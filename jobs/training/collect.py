@@ -22,13 +22,14 @@ from envs.events import EVENT
 from envs.kinematics import NUM_ACTIONS
 from envs.recordings import Recording, write_recording
 from jobs.config.conditions import episode_draw
-from jobs.config.config import Config, ConfigError
+from jobs.config.config import Config
 from jobs.rollout.agents import Agent, make_agent
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.policies import load_trained
 from jobs.run.checkpoints import seal
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import progress
+from jobs.run.recordings import refused
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.real_recordings import GAP_US, Recorded, no_episodes, read_recorded, with_recorded
 
@@ -100,10 +101,13 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
         return None, []
     settings = config.collect
     share = settings.num_validation_steps / (settings.num_steps + settings.num_validation_steps)
+    read: list[dict[str, Recorded]] = []
     try:
-        return policy, [read_recorded(path, config.env, share) for path in settings.recordings]
-    except ValueError as error:
-        raise ConfigError(f"collect.recordings: {error}") from error
+        for path in settings.recordings:
+            read.append(read_recorded(path, config.env, share, config.recording))
+    except (ValueError, OSError) as error:
+        raise refused("collect.recordings", path, error) from error
+    return policy, read
 
 
 def check_policy(folder: Run) -> Path | None:

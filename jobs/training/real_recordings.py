@@ -1,4 +1,4 @@
-"""Real cameras' recordings as data of the event VAE: cropped, with the simulator's pixels, cut into steps."""
+"""Turn real cameras' recordings into data of the event VAE: cropped, on the simulator's pixels, in steps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,9 +9,13 @@ import numpy as np
 from envs.config import CameraConfig, EnvConfig, sensor_settings, settings_hash
 from envs.events import EVENT
 from envs.kinematics import clock_us
-from envs.recordings import Recording, downscale_events, read_events
+from envs.recordings import Recording
+from envs.recordings.downscale import Downscaler
+from jobs.config.schema import RecordingConfig
+from jobs.run.recordings import recording_parts
 
 GAP_US = 1_000_000  # between one recording and the next
+FROM_THE_FILE = RecordingConfig()  # a file that says everything
 
 
 class Recorded(NamedTuple):
@@ -28,17 +32,20 @@ class Recorded(NamedTuple):
     ends_us: np.ndarray
 
 
-def read_recorded(path: str | Path, env: EnvConfig, validation_share: float) -> dict[str, Recorded]:
-    """An event file as the simulator's camera would have seen its middle.
+def read_recorded(
+    path: str | Path, env: EnvConfig, validation_share: float, settings: RecordingConfig = FROM_THE_FILE
+) -> dict[str, Recorded]:
+    """Return an event file as the simulator's camera would have seen its middle.
 
     Of the picture the largest part of the camera's proportions stays, around the centre; pixels are
     made as large as the camera has them (`envs.recordings.downscale`). Contrast threshold, optics and motion
-    stay those of the recording, whatever the simulation's are.
+    stay those of the recording, whatever the simulation's are. Gaps of more than a second are closed.
 
     Args:
-        path: A file that `envs.recordings.read_events` reads, which says its sensor's size.
+        path: A file that `envs.recordings.read_events` reads.
         env: The simulation: camera and control rate.
         validation_share: Of the time, at the end, that is kept for validation, 0 < share < 1.
+        settings: What the file does not say.
 
     Returns:
         "train" and "validation".
@@ -47,41 +54,85 @@ def read_recorded(path: str | Path, env: EnvConfig, validation_share: float) -> 
         ValueError: The file is refused, does not say its size, has fewer pixels than the camera, or
             is too short for a control step of either part.
     """
-    events, begin_us, steps = _fitted(path, env)
-    kept = round(steps * (1.0 - validation_share))
-    if not 0 < kept < steps:
+    fitted = fit(path, env, settings)
+    kept = round(fitted.steps * (1.0 - validation_share))
+    if not 0 < kept < fitted.steps:
         least = 1 / env.control_hz / min(validation_share, 1.0 - validation_share)
-        raise ValueError(f"{path}: must last at least {least:.3g} s, got {steps / env.control_hz:.3g} s")
-    spans = {"train": (0, kept), "validation": (kept, steps)}
-    return {split: _part(Path(path).name, events, begin_us, span, env) for split, span in spans.items()}
-
-
-def read_whole(path: str | Path, env: EnvConfig) -> Recorded:
-    """As `read_recorded`, all of it; ValueError also if it is shorter than a control step."""
-    events, begin_us, steps = _fitted(path, env)
-    if steps == 0:
-        raise ValueError(f"{path}: must last at least a control step, {1 / env.control_hz:.3g} s")
-    return _part(Path(path).name, events, begin_us, (0, steps), env)
-
-
-def _fitted(path: str | Path, env: EnvConfig) -> tuple[np.ndarray, int, int]:
-    """The events of a file as the camera's, the time before the first [us], and their whole control steps."""
-    file = read_events(path)
-    if file.width is None or file.height is None:
         raise ValueError(
-            f"{path}: does not say its sensor's size; write it with envs.recordings.write_events"
+            f"{path}: must last at least {least:.3g} s, got {fitted.steps / env.control_hz:.3g} s; name "
+            "another file"
         )
-    events, shape = cropped(file.events, (file.height, file.width), env.camera)
-    events = downscale_events(events, shape, (env.camera.height, env.camera.width))
-    begin_us = int(file.events["t"][0]) - 1 if file.events.size else 0
-    duration_us = int(file.events["t"][-1]) - begin_us if file.events.size else 0
-    return events, begin_us, int(duration_us * env.control_hz / 1e6)
+    spans = {"train": (0, kept), "validation": (kept, fitted.steps)}
+    return {split: _part(Path(path).name, fitted.events, span, env) for split, span in spans.items()}
+
+
+def read_whole(
+    path: str | Path, env: EnvConfig, settings: RecordingConfig = FROM_THE_FILE
+) -> tuple[Recorded, "Fitted"]:
+    """Return all of a file as `read_recorded`, with what is known of it.
+
+    Raises:
+        ValueError: As `read_recorded`, or it is shorter than a control step.
+    """
+    fitted = fit(path, env, settings)
+    if fitted.steps == 0:
+        raise ValueError(
+            f"{path}: must last at least a control step, {1 / env.control_hz:.3g} s, and contains "
+            f"{fitted.num_events:,} events; name another file"
+        )
+    return _part(Path(path).name, fitted.events, (0, fitted.steps), env), fitted
+
+
+class Fitted(NamedTuple):
+    """A recording on the camera's pixels, and on a clock that begins at 0 and has no gaps.
+
+    Attributes:
+        events: EVENT (N,), t in us.
+        steps: Whole control steps.
+        num_events: Events of the file.
+        gaps: Gaps that were closed [-].
+        closed_us: Their length together [us].
+    """
+
+    events: np.ndarray
+    steps: int
+    num_events: int
+    gaps: int
+    closed_us: int
+
+
+def fit(path: str | Path, env: EnvConfig, settings: RecordingConfig) -> Fitted:
+    """Read a file part by part, and keep what the camera would have seen; raises as `read_recorded`."""
+    small, downscale, shape = [np.empty(0, EVENT)], None, (0, 0)
+    begin_us, last_us, count, gaps, closed_us = None, 0, 0, 0, 0
+    step_us = round(1e6 / env.control_hz)
+    for file in recording_parts(path, settings):
+        if file.width is None or file.height is None:
+            raise ValueError(f"{path}: does not say its sensor's size; give width and height")
+        events, shape = cropped(file.events, (file.height, file.width), env.camera)
+        downscale = downscale or Downscaler(shape, (env.camera.height, env.camera.width))
+        events = downscale(events)
+        if file.events.size:
+            begin_us = int(file.events["t"][0]) - 1 if begin_us is None else begin_us
+            last_us = int(file.events["t"][-1])
+        shift_us = np.full(events.size, closed_us, np.int64)
+        for before_us, after_us in file.gaps:
+            closed_us, gaps = closed_us + after_us - before_us - step_us, gaps + 1
+            shift_us[events["t"] >= after_us] = closed_us
+        events["t"] -= shift_us
+        count += file.events.size
+        small.append(events)
+    begin_us = 0 if begin_us is None else begin_us
+    together = np.concatenate(small)
+    together["t"] -= begin_us
+    duration_us = last_us - closed_us - begin_us if count else 0
+    return Fitted(together, int(duration_us * env.control_hz / 1e6), count, gaps, closed_us)
 
 
 def cropped(
     events: np.ndarray, shape: tuple[int, int], camera: CameraConfig
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """The events of the largest part in the middle that has a camera's proportions, and its shape (H, W).
+    """Return the events of the largest part in the middle with a camera's proportions, and its shape (H, W).
 
     Raises:
         ValueError: It has fewer pixels than the camera.
@@ -99,17 +150,17 @@ def cropped(
     return kept, (height, width)
 
 
-def _part(name: str, events: np.ndarray, begin_us: int, span: tuple[int, int], env: EnvConfig) -> Recorded:
-    """Some control steps of a recording, on a clock of their own."""
+def _part(name: str, events: np.ndarray, span: tuple[int, int], env: EnvConfig) -> Recorded:
+    """Return some control steps of a recording, on a clock of their own."""
     ends_us = np.array([clock_us(step, env.control_hz) for step in range(span[0], span[1] + 1)], np.int64)
-    first, last = np.searchsorted(events["t"], begin_us + ends_us[[0, -1]], side="right")
+    first, last = np.searchsorted(events["t"], ends_us[[0, -1]], side="right")
     part = events[first:last].copy()
-    part["t"] -= begin_us + ends_us[0]
+    part["t"] -= ends_us[0]
     return Recorded(name, part, ends_us[1:] - ends_us[0])
 
 
 def with_recorded(recording: Recording, parts: Sequence[tuple[Recorded, int]]) -> Recording:
-    """A recording of episodes with parts of others behind it, each of at most a number of control steps."""
+    """Return a recording of episodes with parts of others behind it, each of at most some control steps."""
     clock = int(recording.index["step_end_us"][-1]) + GAP_US if len(recording.index["step_end_us"]) else 0
     episode = int(recording.about["flights"])
     events, index, names = [recording.events], [np.stack(list(recording.index.values()))], []
@@ -130,7 +181,7 @@ def with_recorded(recording: Recording, parts: Sequence[tuple[Recorded, int]]) -
 
 
 def no_episodes(env: EnvConfig) -> Recording:
-    """The recording of nothing, for real recordings alone."""
+    """Return the recording of nothing, for real recordings alone."""
     settings = sensor_settings(env)
     none = np.empty(0, np.int64)
     about = {"sensor": settings, "sensor_hash": settings_hash(settings), "scenes": [], "flights": 0}

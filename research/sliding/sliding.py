@@ -24,13 +24,13 @@ from jobs.analysis.plots import AMBER, BLUE, INK, tidy
 from jobs.analysis.statistics import CONFIDENCE
 from jobs.analysis.tables import markdown_table, save_plot, show_table
 from jobs.config.config import Config, ConfigError
-from jobs.config.schema import Name
+from jobs.config.schema import Name, RecordingConfig
 from jobs.rollout.policies import find_one_policy
 from jobs.run.files import write_atomic
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console
 from jobs.tools.calibrate.estimate import Footage, simulate
-from jobs.tools.calibrate.sources import read_frames, read_greys, read_recording
+from jobs.tools.calibrate.sources import read_frames, read_greys, read_source
 from jobs.training.real_recordings import cropped
 from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder
@@ -160,7 +160,7 @@ def read_folder(folder: Path, events: str, delay_us: int) -> tuple[Truth, Footag
     if poses.shape[1:] != (8,) or np.abs(poses[:, 2:7] - poses[0, 2:7]).max() > 1e-3:
         raise ValueError(f"{folder / 'groundtruth.txt'}: must be of a camera that moves along x alone")
     footage = read_frames(folder / "images.txt", delay_us)
-    recorded = read_recording(folder / events, footage).events
+    recorded = read_source(folder / events, footage, RecordingConfig()).events
     if not recorded.size:
         raise ValueError(f"{folder / events}: must have events, got 0; name another file by `sliding.events`")
     inside = (footage.times_us >= recorded["t"][0]) & (footage.times_us <= recorded["t"][-1])

@@ -1,6 +1,7 @@
 """Reads damaged copies of event files in a process with little memory.
 
-Run: python -m tests.support.damaged_files ROUNDS SEED FILE... (0 rounds: reads the files as they are)
+Run: PYTHONPATH=. python tests/support/damaged_files.py ROUNDS SEED FILE...
+(0 rounds: reads the files as they are)
 Prints how many copies of each were read and refused. Anything but a ValueError that names the file
 once ends the process, and leaves the copy in place of the file.
 """

@@ -106,3 +106,16 @@ def aedat2(path: Path, entries: list[tuple[int, int]], chip: str = "") -> Path:
     lines = b"#!AER-DAT2.0\r\n" + (f"# AEChip: {chip}\r\n".encode() if chip else b"")
     path.write_bytes(lines + b"".join(struct.pack(">II", *entry) for entry in entries))
     return path
+
+
+def aedat3(
+    path: Path, packets: list[tuple[int, int, int, bytes]], sources: str = "#Source 1: DVS128\r\n"
+) -> Path:
+    """A file of packets: type, turns of the clock, size of an event, bytes."""
+    head = f"#!AER-DAT3.1\r\n#Format: RAW\r\n{sources}#!END-HEADER\r\n".encode()
+    body = b""
+    for kind, turns, size, raw in packets:
+        n = len(raw) // size
+        body += struct.pack("<hhiiiiii", kind, 1, size, 4, turns, n, n, n) + raw
+    path.write_bytes(head + body)
+    return path

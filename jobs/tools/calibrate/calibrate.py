@@ -20,12 +20,13 @@ from envs.config import LUMINANCE_FLOOR, STRICT, CameraConfig, FaultsConfig, wit
 from envs.recordings.event_file import EventFile
 from jobs.analysis.plots import AMBER, BLUE, GREEN, INK, tidy
 from jobs.analysis.tables import save_plot, show_table
-from jobs.config.config import Config, ConfigError
+from jobs.config.config import Config
 from jobs.config.schema import Name
 from jobs.run.files import write_atomic
 from jobs.run.folder import open_run
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
+from jobs.run.recordings import refused
 from jobs.tools.calibrate.camera_file import camera_text, unit
 from jobs.tools.calibrate.estimate import (
     Calibration,
@@ -37,7 +38,7 @@ from jobs.tools.calibrate.estimate import (
 )
 from jobs.tools.calibrate.found import Found
 from jobs.tools.calibrate.likeness import INTERVALS_MS, Likeness, likeness
-from jobs.tools.calibrate.sources import read_frames, read_recording
+from jobs.tools.calibrate.sources import frames_beside, read_frames, read_source
 
 HEADINGS = ("Setting", "Value", "95 % interval", "Not found, because")
 SIMULATED = (
@@ -74,14 +75,18 @@ def run(config: Config) -> Calibration:
     """
     chosen, camera = config.own, config.env.camera
     try:
-        frames = read_frames(chosen.frames, chosen.frame_delay_us) if chosen.frames else None
-        file = read_recording(chosen.recording, frames)
+        frames: Footage | None
+        if chosen.frames:
+            frames = read_frames(chosen.frames, chosen.frame_delay_us)
+        else:
+            frames = frames_beside(chosen.recording, chosen.frame_delay_us, config.recording)
+        file = read_source(chosen.recording, frames, config.recording)
         footage = frames or _still(file, chosen.luminance)
         footage = within(footage, file.events)
         taken = assumed(camera, footage.is_still)
         calibration = estimate(file.events, footage, taken, config.seed)
     except (ValueError, OSError) as error:
-        raise ConfigError(f"calibrate.recording: {chosen.recording}: {error}") from error
+        raise refused("calibrate.recording", chosen.recording, error) from error
     name = Path(chosen.recording).name
     show_table(
         f"The camera of {name}", HEADINGS, [line(*pair) for pair in calibration.found.items()], words=4

@@ -1,22 +1,24 @@
 """A recording and the frames beside it, as files have them."""
 
-import re
+import dataclasses
 import struct
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from envs.recordings import read_events
+from envs.recordings.beside import NoFramesError, has_frames
+from envs.recordings.beside import read_frames as event_file_frames
 from envs.recordings.event_file import EventFile
-from envs.recordings.light import light_of_grey
+from envs.recordings.light import light_of_grey, luminance
+from jobs.config.schema import RecordingConfig
+from jobs.run.recordings import read_recording
 from jobs.tools.calibrate.estimate import Footage
 
 MAX_PIXELS = 1 << 28  # of all frames together: 1 GiB
 EIGHT_BITS = ("L", "LA", "P", "RGB", "RGBA")  # of Pillow's modes
 # What Pillow raises of files that are damaged, or too large to be decoded.
 BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
-BARE_ROW = re.compile(rb"\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")  # of the data set of Mueggler et al. (IJRR 2017)
 
 
 def read_frames(path: str | Path, delay_us: int) -> Footage:
@@ -88,26 +90,58 @@ def _unfit(picture: Image.Image, left: int) -> str:
     return ""
 
 
-def read_recording(path: str | Path, frames: Footage | None) -> EventFile:
-    """The events of any format of `envs.recordings`; a text of bare rows is read as "seconds x y polarity".
+def read_source(path: str | Path, frames: Footage | None, settings: RecordingConfig) -> EventFile:
+    """Return the events of a file of any format; what it does not say, `recording.*` and the frames do.
 
     Raises:
         ValueError: The file is refused, does not say its sensor's size where there are no frames, or has
             another than these.
     """
-    with Path(path).open("rb") as file:
-        bare = BARE_ROW.match(file.read(100)) is not None
     size = dict(zip(("height", "width"), frames.luminance.shape[1:], strict=True)) if frames else {}
-    if bare:
-        return read_events(path, "txt", columns=("t", "x", "y", "p"), time_unit="s", **size)
-    found = read_events(path)
-    shape = (found.height, found.width) if None not in (found.height, found.width) else None
-    if frames is None and shape is None:
+    found = read_recording(path, settings)
+    if frames is not None and (found.height, found.width) == (None, None):
+        return read_recording(path, dataclasses.replace(settings, **size))  # refuses events outside
+    if frames is None and None in (found.height, found.width):
+        raise ValueError(f"{path}: does not say its sensor's size; give width and height")
+    if frames is not None and (found.height, found.width) != frames.luminance.shape[1:]:
+        shape = (found.height, found.width)
         raise ValueError(
-            f"{path}: does not say its sensor's size; write it with envs.recordings.write_events"
+            f"{path}: has {shape} pixels and its frames {frames.luminance.shape[1:]}; (H, W) must agree: "
+            "give the frames of the same sensor"
         )
-    if frames is not None and shape not in (None, frames.luminance.shape[1:]):
-        raise ValueError(
-            f"{path}: has {shape} pixels and its frames {frames.luminance.shape[1:]}; (H, W) must agree"
-        )
-    return found if shape else read_events(path, **size)  # which refuses events beside the frames
+    return found
+
+
+def frames_beside(path: str | Path, delay_us: int, settings: RecordingConfig) -> Footage | None:
+    """Return the frames in the event file itself, if it has some.
+
+    Args:
+        path: The event file, such as an AEDAT 4 file of a DAVIS.
+        delay_us: As in `read_frames`, for files that do not say the exposure.
+        settings: What the file does not say.
+
+    Raises:
+        ValueError: They are damaged, or too many.
+    """
+    if not has_frames(path):
+        return None
+    chosen = {"group": settings.group} if settings.group else {}
+    found, left = [], MAX_PIXELS
+    try:
+        for frame in event_file_frames(path, **chosen):
+            if not (settings.start_us or 0) <= frame.t_us < (settings.end_us or 1 << 62):
+                continue
+            left -= frame.values.shape[0] * frame.values.shape[1]
+            if left < 0:
+                raise ValueError(
+                    f"{path}: has frames of more than {MAX_PIXELS} pixels together; give start_us and end_us"
+                )
+            found.append(frame)
+    except NoFramesError:
+        return None
+    if len(found) < 2:
+        return None
+    light = np.stack([luminance(frame.values, "srgb") for frame in found])
+    times_us = np.array([frame.t_us + (0 if frame.exposure_us else delay_us) for frame in found], np.int64)
+    increases = np.concatenate(([True], np.diff(times_us) > 0))
+    return Footage(light[increases], times_us[increases])

@@ -15,7 +15,17 @@ import numpy as np
 import pytest
 
 from envs.recordings import FORMATS, WRITERS, read_events, write_events
-from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, ecf_chunk, es, metavision, some_events
+from tests.support.bags import davis, write_bag
+from tests.support.event_files import (
+    LZ4_FILE,
+    ZSTD_FILE,
+    aedat2,
+    aedat3,
+    ecf_chunk,
+    es,
+    metavision,
+    some_events,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 # Each runs in a process of its own: a crash or a hang of a library must fail the test, not end it.
@@ -24,8 +34,15 @@ ROOT = Path(__file__).resolve().parents[3]
 def run_child(paths: list[Path], rounds: int = 0, seed: int = 0) -> dict[str, dict[str, int]]:
     """How many reads of each file, or of damaged copies of it, were "read" and "refused"."""
     child = subprocess.run(
-        [sys.executable, "-m", "tests.support.damaged_files", str(rounds), str(seed), *map(str, paths)],
+        [
+            sys.executable,
+            str(ROOT / "tests" / "support" / "damaged_files.py"),
+            str(rounds),
+            str(seed),
+            *map(str, paths),
+        ],
         cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},  # by its path: other packages are called tests too
         capture_output=True,
         text=True,
     )
@@ -52,6 +69,12 @@ def one_of_each(folder: Path) -> list[Path]:
     paths.append(folder / "nmnist.bin")
     entries = [(x << 32 | y << 24 | t).to_bytes(5, "big") for x, y, t in zip(*columns, strict=True)]
     paths[-1].write_bytes(b"".join(entries))
+    paths.append(folder / "rows.npy")
+    np.save(paths[-1], events)
+    words = np.stack((events["x"].astype("<u4") << 17 | events["y"].astype("<u4") << 2 | 1, events["t"]), 1)
+    paths.append(aedat3(folder / "aedat3", [(1, 0, 8, words.astype("<u4").tobytes())]))
+    store, part = davis(events, "dvs_msgs", True)
+    paths.append(write_bag(folder / "ros", {"/dvs/events": part}, store, True))
     paths += [es(folder / "es", events, 34, 34), metavision(folder / "metavision.h5", [ecf_chunk(0)])]
     halves = np.zeros((4, 2), "<u4")
     halves[:, 1] = [8 << 28, 1 << 28, 1 << 28 | 5, 0]

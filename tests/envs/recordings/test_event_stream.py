@@ -38,12 +38,11 @@ def test_resets_are_nothing_and_exposures_of_an_atis_are_passed_over(tmp_path):
 @pytest.mark.parametrize(
     ("change", "rule"),
     [
-        (lambda raw: raw[:-1], "is truncated"),
         (lambda raw: raw[:19], "no header"),
         (lambda raw: raw[:12] + b"\3" + raw[13:], "version 3"),
         (lambda raw: raw[:15] + b"\4" + raw[16:], "type 4"),
-        (lambda raw: raw[:18] + b"\1\0" + raw[20:], "a row outside"),
-        (lambda raw: raw[:16] + b"\1\0" + raw[18:], "outside the sensor of 1x480"),
+        (lambda raw: raw[:18] + b"\1\0" + raw[20:], "1 of 1 outside the sensor of 640x1"),
+        (lambda raw: raw[:16] + b"\1\0" + raw[18:], "1 of 1 outside the sensor of 1x480"),
     ],
 )
 def test_a_file_that_breaks_a_rule_is_refused_by_name(change, rule, tmp_path):

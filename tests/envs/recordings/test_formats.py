@@ -102,7 +102,7 @@ def test_more_than_a_file_of_this_size_could_hold_is_refused_before_it_is_read(r
             for column in "txyp":  # nothing of it is stored
                 file.create_dataset(f"events/{column}", (10**8,), "i8", chunks=(1024,), **options)
         assert path.stat().st_size < 1 << 16
-        with pytest.raises(ValueError, match="at most 10000000 are read"):
+        with pytest.raises(ValueError, match="at most max_events=10000000 are read"):
             read_events(path)
         for read in (read_recording, partial(read_events, max_events=10**8)):
             with pytest.raises(ValueError, match="events/t declares 800000000 bytes in a file of"):
@@ -179,10 +179,9 @@ def test_an_offset_that_is_no_whole_microsecond_is_refused(offset, tmp_path):
     [
         ({"t": np.array([0.5, 1.0, 2.0])}, "no whole microseconds"),
         ({"t": np.array([2**63, 1, 2], np.uint64)}, "no whole microseconds"),
-        ({"t": [-20_000_000_000, 1, 2]}, "t must lie in"),
-        ({"t": [5_000_000, 1, 2]}, "reset clock"),
+        ({"t": [-20_000_000_000, -20_000_000_000, 2]}, "t must lie in"),
         ({"x": [1, 2]}, "differ in length"),
-        ({"x": [1, 2, 640]}, "x=640 outside the sensor"),
+        ({"x": [1, 641, 640]}, "x=641, y=6, 2 of 3 outside the sensor"),
         ({"p": [0, 1, 7]}, "polarity must be coded"),
         ({"p": np.array([b"0", b"1", b"1"])}, "not numbers"),
         ({"t": [[0, 1, 2]]}, "plain data set of 1 dimensions"),

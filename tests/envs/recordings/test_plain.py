@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.recordings import read_events, write_events
-from envs.recordings.plain import CHUNK_BYTES
+from envs.recordings.text import CHUNK_BYTES
 from tests.support.event_files import some_events
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
@@ -118,7 +118,7 @@ def test_labels_stay_with_events_that_are_sorted_in_and_bad_ones_are_refused(tmp
 
 @pytest.mark.parametrize("format", ["txt", "csv", "dat", "evt2", "evt3", "aedat4"])
 def test_a_format_without_labels_does_not_lose_them_in_silence(format, tmp_path):
-    with pytest.raises(ValueError, match="holds no labels of noise; choose hdf5 or npz"):
+    with pytest.raises(ValueError, match="stores no labels of noise; choose hdf5 or npz"):
         write_events(
             tmp_path / "a", some_events(0, 3, 346, 260, 9), 346, 260, format, is_noise=np.zeros(3, bool)
         )
@@ -132,7 +132,7 @@ def test_numpy_reads_what_is_written(tmp_path):
     stored = np.load(tmp_path / "a.npz")
     rows = np.loadtxt(tmp_path / "a.txt", dtype=np.int64)
     for place, name in enumerate(TXYP):
-        assert np.array_equal(stored[name], events[name])
+        assert np.array_equal(stored[name], events[name] > 0 if name == "p" else events[name])
         assert np.array_equal(rows[:, place], events[name])
     assert "# columns: t x y p\n" in (tmp_path / "a.txt").read_text()
 
@@ -212,8 +212,7 @@ def test_the_header_of_a_text_file_says_what_its_columns_are(text, tmp_path):
         ("t_us x y p\n1 2 3 0\n1 2 3 -1\n", "-1, 0 and 1 at once"),
         ("t_us x y p\n1 2 3\n", "no row of numbers"),
         ("t_us x y p\n1 two 3 1\n", "no row of numbers"),
-        ("t_us x y p\n5000000 2 3 1\n1 2 3 1\n", "reset clock"),
-        ("# width: 2\n# height: 9\nt_us x y p\n1 2 3 1\n", "x=2 outside the sensor of 2x9"),
+        ("# width: 2\n# height: 9\nt_us x y p\n1 2 3 1\n", "1 of 1 outside the sensor of 2x9"),
         ("# width: many\nt_us x y p\n1 2 3 1\n", "no row of numbers"),
         ("t_us x y p\n" + "1 " * 600 + "\n", "a line of more than 1000 bytes"),
         ("1" * 3_000_000, "a line of more than 1000 bytes"),
@@ -275,15 +274,15 @@ def test_both_codes_of_polarity_are_understood_in_every_type(p, tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "rule"),
     [
-        ({"t": [[1], [2]]}, "shape"),
+        ({"t": [[1], [2]]}, r"has no array 't'; it contains t int64 \(2, 1\)"),
         ({"t": [1]}, "different lengths"),
-        ({"t": np.array([1, 2**63], np.uint64)}, "t must lie in"),
-        ({"t": [1 + 2j, 2]}, "dtype complex128"),
-        ({"p": ["a", "b"]}, "dtype <U1"),
-        ({"x": [0, -1]}, "x must lie in"),
-        ({"width": 1, "height": 5}, "x=1 outside the sensor of 1x5"),
+        ({"t": np.array([2**62, 2**63], np.uint64)}, "t must lie in"),
+        ({"t": [1 + 2j, 2]}, "t complex128"),
+        ({"p": ["a", "b"]}, "p <U1"),
+        ({"x": [-2, -1]}, "x must lie in"),
+        ({"width": 1, "height": 5, "x": [1, 1]}, "x=1, y=1, 2 of 2 outside the sensor of 1x5"),
         ({"width": [1, 2]}, "array width"),
-        ({"width": "wide"}, "is no readable npz file"),
+        ({"width": "wide"}, "is no readable array file"),
         ({"time_unit": "weeks"}, "does not say the unit"),
     ],
 )
@@ -301,7 +300,7 @@ class Payload:
 def test_a_pickle_in_an_npz_file_is_not_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = save(tmp_path / "a.npz", p=np.array([Payload(), 1], object))
-    with pytest.raises(ValueError, match="dtype object"):
+    with pytest.raises(ValueError, match="p object"):
         read_events(path)
     assert not Path("pwned").exists()
 
@@ -322,13 +321,12 @@ def npy(header: dict, body: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("header", "body", "rule"),
     [
-        ({"descr": "<i8", "fortran_order": False, "shape": (10**13,)}, b"", "at most max_events"),
+        ({"descr": "<i8", "fortran_order": False, "shape": (10**13,)}, b"", "arrays of different lengths"),
         (
             {"descr": "<i8", "fortran_order": False, "shape": (2,)},
-            bytes(15),
-            "declares 16 bytes and holds 15",
+            bytes(10**8),
+            "array t contains more than it declares",
         ),
-        ({"descr": "<i8", "fortran_order": False, "shape": (2,)}, bytes(10**8), "holds 17 or more"),
         ({"descr": "<i8", "fortran_order": False, "shape": (-2,)}, bytes(10**8), "shape \\(-2,\\)"),
     ],
 )
@@ -347,7 +345,7 @@ def test_an_array_that_unpacks_to_more_than_it_declares_takes_no_memory(tmp_path
     path = zipped(tmp_path / "a.npz", members)
     members.clear()
     tracemalloc.start()
-    with pytest.raises(ValueError, match="holds 17 or more"):
+    with pytest.raises(ValueError, match="array t contains more than it declares"):
         read_events(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -373,6 +371,7 @@ def test_an_array_without_a_sound_header_and_a_missing_one_are_refused(tmp_path)
     members = {f"{name}.npy": b"junk" for name in TXYP}
     with pytest.raises(ValueError, match="array t has no sound header"):
         read_events(zipped(tmp_path / "a.npz", members))
-    del members["y.npy"]
+    body = npy({"descr": "<i8", "fortran_order": False, "shape": (2,)}, bytes(16))
+    members = {f"{name}.npy": body for name in "txp"}
     with pytest.raises(ValueError, match="has no array 'y'"):
         read_events(zipped(tmp_path / "a.npz", members))

@@ -8,16 +8,18 @@ from hypothesis import strategies as st
 
 from envs.events import EVENT
 from envs.recordings import read_events, write_events
-from envs.recordings.event_file import Request, finish, unwrap, usual_events
-from envs.recordings.evt_decoders import decode_dat, decode_evt3
+from envs.recordings.clocks import unwrap
+from envs.recordings.event_file import CUT, OUTSIDE, RESERVED, TRIGGER, Request, usual_events
+from envs.recordings.evt_decoders import State, decode_dat, decode_evt3, new_state
 from tests.support.event_files import some_events
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 EVT3_SAMPLE = DATA / "expelliarmus_evt" / "evt3_sample.raw"
 needs_sample = pytest.mark.skipif(not EVT3_SAMPLE.is_file(), reason=f"no {EVT3_SAMPLE}; set EVADE_DATA")
 
-OFF, ON, TIME_HIGH, TRIGGER, VENDOR = 0, 1, 8, 10, 14
-RESERVED = (1, 9, 11, 12, 13)  # types of words that EVT 3.0 does not have
+OFF, ON, TIME_HIGH, TRIGGER_KIND, VENDOR = 0, 1, 8, 10, 14
+NOT_THERE = (1, 11, 12, 13)  # types of words that EVT 3.0 does not have
+PADDING = 9
 
 
 def slow_clock(highs: list[int], step_us: int, count: int) -> list[int | None]:
@@ -107,7 +109,8 @@ def words3(*words: int) -> bytes:
 
 
 # The last of 32 pixels from x = 2017 on.
-EVT21_BEYOND = b"% format EVT21;\n" + np.array([0, 8 << 28, 1 << 31, 1 << 28 | 2017 << 11], "<u4").tobytes()
+EVT21_GOOD = b"% format EVT21;\n" + np.array([0, 8 << 28, 0xFFFFF, 1 << 28], "<u4").tobytes()
+EVT21_BEYOND = np.array([1 << 31, 1 << 28 | 2017 << 11], "<u4").tobytes()
 
 
 def tuples(events: np.ndarray) -> list[tuple[int, int, int, int]]:
@@ -157,26 +160,30 @@ def test_evt3_words_in_any_order_decode_as_by_the_published_table(seed, tmp_path
     assert len(expected) > 3000
 
 
-@given(seed=st.integers(0, 2**32 - 1), length=st.integers(0, 100), bad_words=st.integers(0, 1))
-def test_any_evt3_words_give_the_events_the_skipped_ones_and_the_bad_word_of_the_table(
-    seed, length, bad_words
-):
+@given(seed=st.integers(0, 2**32 - 1), length=st.integers(0, 100), part=st.integers(32, 60))
+def test_any_evt3_words_give_the_events_and_counts_of_the_table_in_parts_of_any_size(seed, length, part):
     rng = np.random.default_rng(seed)
-    kinds = rng.choice([0, 2, 3, 4, 5, 6, 7, 8, 8, 10, 14, *RESERVED[: 2 * bad_words]], length)
+    kinds = rng.choice([0, 2, 3, 4, 5, 6, 7, 8, 8, PADDING, 10, *NOT_THERE, 14], length)
     array = (kinds << 12 | rng.integers(0, 4096, length) & rng.choice([1, 4095], length)).astype("<u2")
-    words = array.tolist()
-    count, skipped, _, bad = decode_evt3(array, np.empty(0, EVENT))
-    assert bad == next((i for i, word in enumerate(words) if word >> 12 in RESERVED), -1)
-    if bad < 0:
-        events, expected = np.empty(count, EVENT), slow_evt3(words)
-        beyond = decode_evt3(array, events)[3]
-        assert beyond in (-1, first_beyond(words))
-        if beyond < 0:
-            assert tuples(events) == expected
-            assert all(x < 2048 for _, x, _, _ in expected)
-        masks = {0x2: lambda _: 1, 0x4: lambda value: value, 0x5: lambda value: value % 256}
-        entries = [masks[word >> 12](word % 4096) for word in words if word >> 12 in masks]
-        assert count + skipped == sum(mask.bit_count() for mask in entries)
+    words, state, found, edges = array.tolist(), new_state(), [], []
+    while state[State.WORD] < length:
+        events, triggers = np.empty(part, EVENT), np.empty(2, TRIGGER)
+        n, k = decode_evt3(array, state, events, triggers)
+        found += tuples(events[:n])
+        edges += triggers[:k].tolist()
+    expected = slow_evt3(words)
+    assert found == [event for event in expected if event[1] < 2048]
+    masks = {0x2: lambda _: 1, 0x4: lambda value: value, 0x5: lambda value: value % 256}
+    entries = [masks[word >> 12](word % 4096) for word in words if word >> 12 in masks]
+    total = sum(mask.bit_count() for mask in entries)
+    of_kind = {kind: sum(word >> 12 == kind for word in words) for kind in range(16)}
+    assert state[State.BEYOND] == len(expected) - len(found)
+    assert state[State.SKIPPED] == total - len(expected) + of_kind[PADDING] + of_kind[TRIGGER_KIND]
+    assert state[State.RESERVED] == sum(of_kind[kind] for kind in NOT_THERE)
+    shown = [word for word in words if word >> 12 == TRIGGER_KIND]
+    assert [(c, p) for _, c, p in edges] == [
+        (w >> 8 & 15, 2 * (w & 1) - 1) for w in shown[-len(edges) :] if edges
+    ]
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -187,18 +194,20 @@ def test_dat_entries_give_the_columns_of_the_published_table(seed):
     entries["t"] = np.cumsum(steps) % 2**32
     entries["data"] = rng.integers(0, 2**32, 100)
     events = np.empty(100, EVENT)
-    decode_dat(entries, events)
+    decode_dat(entries, -1, events)
     data = entries["data"].tolist()
     assert tuples(events) == [
         (t, d % 2**14, d // 2**14 % 2**14, 1 if d // 2**28 % 2 else -1)
-        for t, d in zip(unwrap(entries["t"], 32).tolist(), data, strict=True)
+        for t, d in zip(unwrap(entries["t"], 32, -1).tolist(), data, strict=True)
     ]
 
 
 @pytest.mark.parametrize("endianness", ["little", "legacy"])
 def test_evt21_vectors_decode_as_by_the_published_table_in_both_orders_of_halves(endianness, tmp_path):
     rng = np.random.default_rng(1)
-    uppers = (rng.choice([OFF, ON, TRIGGER, VENDOR], 500) << 28 | rng.integers(0, 2**28, 500)).astype("<u4")
+    uppers = (rng.choice([OFF, ON, TRIGGER_KIND, VENDOR], 500) << 28 | rng.integers(0, 2**28, 500)).astype(
+        "<u4"
+    )
     masks = rng.integers(0, 2**32, 500, dtype="<u4")
     uppers &= ~np.uint32(1 << 21)  # x below 1024: no vector reaches beyond the last column
     clock = np.arange(5, 500, 20)  # the first words have no time
@@ -210,12 +219,13 @@ def test_evt21_vectors_decode_as_by_the_published_table_in_both_orders_of_halves
     assert tuples(found.events) == sorted(expected, key=lambda event: event[0])
     assert expected[-1][0] > 2**34 > expected[0][0]
     first = (uppers[:5] >> 28 <= 1) * np.array([bin(mask).count("1") for mask in masks[:5].tolist()])
-    assert found.skipped == first.sum() > 0
+    assert found.skipped == first.sum() + len(found.triggers) + np.sum(uppers[:5] >> 28 == TRIGGER_KIND)
+    assert first.sum() > 0 < len(found.triggers)
 
 
 def test_evt2_words_decode_as_by_the_published_table(tmp_path):
     rng = np.random.default_rng(2)
-    words = (rng.choice([OFF, ON, TRIGGER, VENDOR, 15], 500) << 28 | rng.integers(0, 2**28, 500)).astype(
+    words = (rng.choice([OFF, ON, TRIGGER_KIND, VENDOR, 15], 500) << 28 | rng.integers(0, 2**28, 500)).astype(
         "<u4"
     )
     clock = np.arange(3, 500, 20)
@@ -228,7 +238,7 @@ def test_evt2_words_decode_as_by_the_published_table(tmp_path):
 @pytest.mark.parametrize("t_us", [[5, 2**31 + 6], [0, 2**32 - 1], [7, 2**32 - 7, 2**32 + 7]])
 def test_a_gap_of_more_than_half_the_clock_is_told_until_it_wraps(t_us, tmp_path):
     counter = np.array(t_us) % 2**32
-    np.testing.assert_array_equal(unwrap(counter.astype(np.uint32), 32), t_us)
+    np.testing.assert_array_equal(unwrap(counter.astype(np.uint32), 32, -1), t_us)
     events = np.zeros(len(t_us), EVENT)
     events["t"], events["p"] = t_us, 1
     if t_us[-1] < 2**32:
@@ -324,12 +334,6 @@ def test_the_size_of_the_sensor_is_what_the_header_says(header, size, tmp_path):
 @pytest.mark.parametrize(
     ("content", "format", "rule"),
     [
-        (b"% evt 3.0\n\x00", None, "is truncated"),
-        (words3(0x8000, 0, 0x3000 | 2037, 0x4800), None, "word 3 is of no type .* or lies beyond its 2048"),
-        (words3(0x8000, 0, 0x3000 | 2030, 0x4000, 0x5000, 0x5001), None, "word 5 is of no type"),
-        (EVT21_BEYOND, None, "word 1 is of no type"),
-        (b"% evt 3.0\n\x00\x10", None, "word 0 is of no type"),
-        (b"% evt 2.0\n\x00\x00\x00\x20", None, "word 0 is of no type"),
         (b"% evt 4.0\n", None, "encoded as '4.0'"),
         (b"% evt 3.0\n", "evt2", "says evt3 and the caller says evt2"),
         (b"% format EVT21;endianness=big\n", None, "big-endian"),
@@ -338,7 +342,7 @@ def test_the_size_of_the_sensor_is_what_the_header_says(header, size, tmp_path):
         (b"% Data file containing CD events\n% Version 1\n", None, "version 1"),
         (b"% Data file containing CD events\n% Version 2\n\x0e\x08", None, "type 14 and 8 bytes"),
         (b"% Data file containing CD events\n% Version 2\n", None, "type 0 and 0 bytes"),
-        (b"% Data file containing CD events\n% Version 2\n\x0c\x08abc", None, "is truncated"),
+        (words3(*[0x1000] * 17), None, "has 17 of 17 words of types that this encoding does not have"),
     ],
 )
 def test_a_file_that_breaks_a_rule_is_refused_by_name(content, format, rule, tmp_path):
@@ -348,16 +352,43 @@ def test_a_file_that_breaks_a_rule_is_refused_by_name(content, format, rule, tmp
     assert "a.raw" in str(caught.value)
 
 
-def test_a_pixel_outside_the_sensor_and_a_wrong_size_are_refused(tmp_path):
-    words = np.array([0x8000, 0x0001, 0x2000 | 64], "<u2")
+def test_words_and_pixels_that_do_not_exist_are_left_out_and_counted(tmp_path):
+    good = [0x8000, 1, *[0x2000 | x for x in range(20)]]
+    for content, damage in (
+        (b"% evt 3.0\n\x00", {CUT: 1}),
+        (words3(*good, 0x3000 | 2037, 0x4800), {OUTSIDE: 1}),
+        (words3(*good, 0x3000 | 2030, 0x4000, 0x5000, 0x5001), {}),
+        (words3(*good, 0x3000 | 2036, 0x4000, 0x5001), {OUTSIDE: 1}),
+        (words3(*good, 0x1000, 0xB000), {RESERVED: 2}),
+        (EVT21_GOOD + EVT21_BEYOND, {OUTSIDE: 1}),
+        (b"% evt 2.0\n\x00\x00\x00\x20", {RESERVED: 1}),
+        (b"% Data file containing CD events\n% Version 2\n\x0c\x08abc", {CUT: 3}),
+    ):
+        (tmp_path / "a.raw").write_bytes(content)
+        file = read_events(tmp_path / "a.raw")
+        assert file.damage == damage, content
+        assert len(file.events) in (0, 20, 21)
+        if damage:
+            with pytest.raises(ValueError, match=r"a\.raw: is damaged .*read it without strict"):
+                read_events(tmp_path / "a.raw", strict=True)
+
+
+def test_a_pixel_outside_the_sensor_is_left_out_and_a_wrong_size_is_refused(tmp_path):
+    words = np.array([0x8000, 0x0001, *[0x2000 | x for x in (1, 2, 64)]], "<u2")
     path = raw(tmp_path / "a.raw", words, "format EVT3;height=48;width=64")
-    with pytest.raises(ValueError, match="event 0 has x=64 outside the sensor of 64x48"):
-        read_events(path)
+    file = read_events(path)
+    assert (file.events["x"].tolist(), file.damage) == ([1, 2], {OUTSIDE: 1})
     with pytest.raises(ValueError, match="says width=64 and the caller says 65"):
         read_events(path, width=65)
+    path = raw(tmp_path / "b.raw", words, "evt 3.0")
+    with pytest.raises(
+        ValueError, match=r"x=64, y=1, 2 of 3 outside the sensor of 2x9; give the right width"
+    ):
+        read_events(path, width=2, height=9)
+    assert len(read_events(path, width=65, height=9).events) == 3
 
 
-def test_times_a_little_out_of_order_are_sorted_and_a_reset_clock_is_refused(tmp_path):
+def test_times_a_little_out_of_order_are_sorted(tmp_path):
     def words(*highs: int) -> np.ndarray:
         return np.array(
             [word for high in highs for word in (0x8000 | high, 0x0001, 0x2000 | high & 7)], "<u2"
@@ -365,19 +396,7 @@ def test_times_a_little_out_of_order_are_sorted_and_a_reset_clock_is_refused(tmp
 
     file = read_events(raw(tmp_path / "a.raw", words(1, 3, 2, 3), "evt 3.0"))
     assert tuples(file.events) == [(4096, 1, 1, -1), (8192, 2, 1, -1), (12288, 3, 1, -1), (12288, 3, 1, -1)]
-    assert file.late == 1
-    with pytest.raises(ValueError, match="reset clock or damage"):
-        read_events(raw(tmp_path / "b.raw", words(300, 301, 2, 3), "evt 3.0"))
-
-
-@given(steps_us=st.lists(st.integers(-400, 500), min_size=1, max_size=50))
-def test_late_events_are_counted_and_sorted_in_with_ties_in_the_order_of_the_file(steps_us):
-    t_us = 30_000 + np.cumsum(steps_us)
-    events = some_events(0, len(t_us), 640, 480, 1)
-    events["t"] = t_us
-    file = finish(Request(Path("a"), 640, 480), "evt3", events)
-    assert file.late == sum(t < max(t_us[: i + 1]) for i, t in enumerate(t_us))
-    assert tuples(file.events) == sorted(tuples(events), key=lambda event: event[0])
+    assert (file.late, file.damage) == (1, {})
 
 
 METAVISION_DAT = b"% Height 720\n% Version 2\n% Width 1280\n% date 2026-11-22 10:11:12\n% end\n"
@@ -464,7 +483,7 @@ def test_more_events_than_asked_for_are_refused_before_memory_is_taken(tmp_path)
     words = np.array([0x8000, 0x0001, 0x3000, *[0x4FFF] * 100], "<u2")
     path = raw(tmp_path / "a.raw", words, "evt 3.0")
     assert len(read_events(path, max_events=1200).events) == 1200
-    with pytest.raises(ValueError, match="holds 1200 events and at most max_events=1199"):
+    with pytest.raises(ValueError, match="contains 1200 events or more and at most max_events=1199"):
         read_events(path, max_events=1199)
 
 

@@ -1,16 +1,19 @@
-"""AEDAT 4.0 is written: a header, packets of events packed with LZ4, and a table of the packets.
+"""Write AEDAT 4.0: a header, packets of events packed with LZ4, and a table of the packets.
 
 By the schema of dv-processing (IOHeader, EventPacket, FileDataTable): each part is a flatbuffer
 after its size. All have one layout here, which is therefore written without a library.
 """
 
+import contextlib
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from core.files import replaced
-from envs.recordings.aedat import EVENT_PACKET, MAGIC_4, PACKED_EVENT, PACKET_TABLE
+from envs.recordings.aedat4 import EVENT_PACKET, MAGIC_4, PACKED_EVENT, PACKET_TABLE
+from envs.recordings.writing import Append
 
 MAX_PIXELS = 1 << 15  # a coordinate is a signed 16-bit integer
 PACKET_EVENTS = 1 << 14
@@ -46,8 +49,9 @@ PACKET = np.dtype(
 )
 
 
-def write_aedat4(path: Path, events: np.ndarray, width: int, height: int) -> None:
-    """Write checked events as one stream of packets; reading gives the same events.
+@contextlib.contextmanager
+def aedat4_writer(path: Path, width: int, height: int) -> Iterator[Append]:
+    """Yield a function that adds events to one stream of packets.
 
     Raises:
         ValueError: The sensor has more than 32768 columns or rows.
@@ -56,29 +60,36 @@ def write_aedat4(path: Path, events: np.ndarray, width: int, height: int) -> Non
 
     if max(width, height) > MAX_PIXELS:
         raise ValueError(f"aedat4 addresses at most {MAX_PIXELS} pixels, got {width}x{height}")
-    packed = np.zeros(len(events), PACKED_EVENT)
-    for name in ("t", "x", "y"):
-        packed[name] = events[name]
-    packed["on"] = events["p"] > 0
-    codec = pyarrow.Codec("lz4")
-    rows = np.zeros(-(-len(events) // PACKET_EVENTS), PACKET)
+    codec, rows = pyarrow.Codec("lz4"), []
     with replaced(path) as part, part.open("wb") as file:
         file.write(MAGIC_4 + _header(DESCRIPTION.format(width=width, height=height).encode()))
-        for row, first in zip(rows, range(0, len(events), PACKET_EVENTS), strict=True):
-            some = packed[first : first + PACKET_EVENTS]
-            body = codec.compress(_vector(EVENT_PACKET, len(some), some.tobytes()), asbytes=True)
-            file.write(struct.pack("<ii", 0, len(body)))
-            row["place"], row["size"], row["count"] = file.tell(), len(body), len(some)
-            row["first_us"], row["last_us"] = some["t"][[0, -1]]
-            file.write(body)
+
+        def append(events: np.ndarray, _: np.ndarray | None) -> None:
+            for first in range(0, len(events), PACKET_EVENTS):
+                some = _packed(events[first : first + PACKET_EVENTS])
+                body = codec.compress(_vector(EVENT_PACKET, len(some), some.tobytes()), asbytes=True)
+                file.write(struct.pack("<ii", 0, len(body)))
+                rows.append((0, 0, file.tell(), 0, len(body), len(some), *some["t"][[0, -1]].tolist()))
+                file.write(body)
+
+        yield append
         table = file.tell()
-        file.write(codec.compress(_table(rows), asbytes=True))
+        file.write(codec.compress(_table(np.array(rows, PACKET)), asbytes=True))
         file.seek(TABLE_PLACE)
         file.write(struct.pack("<q", table))
 
 
+def _packed(events: np.ndarray) -> np.ndarray:
+    """Return events as a packet has them."""
+    packed = np.zeros(len(events), PACKED_EVENT)
+    for name in ("t", "x", "y"):
+        packed[name] = events[name]
+    packed["on"] = events["p"] > 0
+    return packed
+
+
 def _header(description: bytes) -> bytes:
-    """IOHeader: the codec, where the table begins (still -1), and the description of the streams."""
+    """Return IOHeader: the codec, where the table begins (still -1), and the description of the streams."""
     fields = struct.pack("<HHHHH2x", 10, 20, 4, 8, 16)  # sizes of this list and of the table, then places
     table = struct.pack("<iiqI", 12, LZ4, -1, 4)
     return _sized(struct.pack("<I4s", 20, b"IOHE") + fields + table + _text(description))
@@ -89,13 +100,13 @@ def _text(text: bytes) -> bytes:
 
 
 def _vector(kind: bytes, count: int, elements: bytes) -> bytes:
-    """A flatbuffer whose root table has one field, a vector, that begins 32 bytes from its size."""
+    """Return a flatbuffer whose root table has one field, a vector, that begins 32 bytes from its size."""
     fields = struct.pack("<HHH2x", 6, 8, 4)
     return _sized(struct.pack("<I4s", 16, kind) + fields + struct.pack("<iII", 8, 4, count) + elements)
 
 
 def _table(rows: np.ndarray) -> bytes:
-    """FileDataTable: a vector of offsets to the rows, which share one list of fields."""
+    """Return FileDataTable: a vector of offsets to the rows, which share one list of fields."""
     fields = struct.pack("<HHHHHHH2x", 14, PACKET.itemsize, 8, 16, 24, 32, 40)
     list_place = 32 + 4 * len(rows)
     first = -(-(list_place + len(fields)) // 8) * 8
@@ -107,6 +118,6 @@ def _table(rows: np.ndarray) -> bytes:
 
 
 def _sized(buffer: bytes) -> bytes:
-    """A flatbuffer after its size, filled up to whole 8 bytes."""
+    """Return a flatbuffer after its size, filled up to whole 8 bytes."""
     buffer += bytes(-(4 + len(buffer)) % 8)
     return struct.pack("<I", len(buffer)) + buffer

@@ -1,0 +1,170 @@
+"""Read AEDAT 3.1 and 3.0, the files of cAER (DVS Gesture): packets of events after a header of text.
+
+From the format's description (inivation.github.io, "AEDAT file formats") and libcaer's headers.
+"""
+
+import struct
+from collections.abc import Iterator
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from envs.recordings.event_file import (
+    CUT,
+    CUT_PACKETS,
+    TRIGGER,
+    Opened,
+    Part,
+    Request,
+    Tally,
+    assemble,
+)
+
+MAGIC_3 = b"#!AER-DAT3"
+MAX_HEADER_BYTES = 1 << 20
+MAX_PACKET_BYTES = 1 << 28
+PACKET = struct.Struct("<hhiiiiii")  # type, source, size, place of t, turns of t, capacity, number, valid
+SPECIAL, POLARITY, FRAME, IMU6, IMU9 = range(5)  # types of packets
+WORD = np.dtype([("data", "<u4"), ("t", "<i4")])
+EDGES = {2: (0, 1), 3: (0, -1), 4: (0, 0), 10: (1, 1), 11: (1, -1)}  # special type: channel, edge
+# Sensors by how the header names the source; the first that fits.
+SIZES = (
+    ("DVS128", 128, 128), ("DAVIS128", 128, 128), ("DAVIS208", 208, 192), ("DAVIS240", 240, 180),
+    ("DAVIS346", 346, 260), ("DAVIS640", 640, 480), ("DAVISHET640", 640, 480), ("DAVISRGB", 640, 480),
+    ("DVS132S", 132, 104), ("DVXPLORERMINI", 320, 240), ("DVXPLORER", 640, 480),
+)  # fmt: skip
+
+
+class Header(NamedTuple):
+    """What the header says.
+
+    Attributes:
+        start: First byte of the packets.
+        sources: Names of the sources by number.
+        from_below: Whether rows count from below, as in version 3.0.
+    """
+
+    start: int
+    sources: dict[int, str]
+    from_below: bool
+
+
+def read_aedat3(request: Request) -> Opened:
+    """Open the events of one source of an AEDAT 3 file; of several, `stream` names one, else the first.
+
+    Raises:
+        ValueError: The header has no end, the format is not RAW, or there is no such source.
+    """
+    header, tally = read_header(request), Tally()
+    sources = sorted(header.sources)
+    if request.stream is not None and request.stream not in sources:
+        raise request.refusal(f"has no source {request.stream}; give stream as one of {header.sources}")
+    if len(sources) > 1 and request.stream is None:
+        tally.notes.append(f"source {sources[0]} is read of {header.sources}; stream= chooses")
+    source = request.stream if request.stream is not None else next(iter(sources), None)
+    name = header.sources.get(source, "").upper() if source is not None else ""
+    size = next(((w, h) for known, w, h in SIZES if name.startswith(known)), (None, None))
+    if None not in size:
+        request = request.sized(*size)
+    return Opened("aedat3", request, tally, _parts(request, tally, header, source))
+
+
+def read_header(request: Request) -> Header:
+    """Return what the lines of text say.
+
+    Raises:
+        ValueError: They have no end, or name another format than RAW.
+    """
+    with request.path.open("rb") as file:
+        head = file.read(MAX_HEADER_BYTES)
+    start, sources, is_ended = 0, {}, False
+    while head.startswith(b"#", start) and (end := head.find(b"\n", start)) >= 0:
+        line = head[start:end].decode("latin-1").strip()
+        start = end + 1
+        if line.startswith("#Source "):
+            number, _, name = line.removeprefix("#Source ").partition(":")
+            if number.strip().isdigit():
+                sources[int(number)] = name.strip()
+        if line.startswith("#Format:") and line.partition(":")[2].strip() != "RAW":
+            raise request.refusal(
+                f"has the format {line.partition(':')[2].strip()}; RAW is read: save it as RAW"
+            )
+        if line.startswith("#!END-HEADER"):
+            is_ended = True
+            break
+    from_below = head.startswith(b"#!AER-DAT3.0")
+    if not is_ended and not from_below:
+        raise request.refusal(
+            "has a header without its end; it is no AEDAT 3.1 file, or damaged: copy it again"
+        )
+    return Header(start, sources, from_below)
+
+
+def packets(request: Request, header: Header, tally: Tally) -> Iterator[tuple[int, int, int, bytes]]:
+    """Yield type, source, turns of the clock [2**31 us] and body of each packet."""
+    with request.path.open("rb") as file:
+        file.seek(header.start)
+        while head := file.read(PACKET.size):
+            if len(head) < PACKET.size:
+                tally.damage[CUT] += len(head)
+                return
+            kind, source, size, _, turns, _, number, _ = PACKET.unpack(head)
+            if min(size, number, turns, kind) < 0 or size * number > MAX_PACKET_BYTES:
+                raise request.refusal(
+                    f"is damaged: a packet at byte {file.tell() - PACKET.size} declares {number} events of "
+                    f"{size} bytes; copy or record it again"
+                )
+            yield from _body(file, tally, kind, source, turns, size, number)
+
+
+def _body(
+    file: IO[bytes], tally: Tally, kind: int, source: int, turns: int, size: int, number: int
+) -> Iterator[tuple[int, int, int, bytes]]:
+    """Yield a packet, or its whole events if it was cut off."""
+    body = file.read(size * number)
+    if len(body) < size * number:
+        tally.damage[CUT_PACKETS] += 1
+        body = body[: len(body) // size * size]
+    yield kind, source, turns, body
+
+
+def _parts(request: Request, tally: Tally, header: Header, source: int | None) -> Iterator[Part]:
+    """Yield the events and triggers of one source."""
+    some, triggers, count = [], [np.empty(0, TRIGGER)], 0
+    for kind, number, turns, body in packets(request, header, tally):
+        if source is not None and number != source:
+            continue
+        if kind not in (POLARITY, SPECIAL) or len(body) % WORD.itemsize:
+            tally.skipped += 1
+            continue
+        words = np.frombuffer(body, WORD)
+        words = words[words["data"] & 1 == 1]
+        t_us = words["t"].astype(np.int64) + (turns << 31)
+        if kind == SPECIAL:
+            triggers.append(_triggers(words["data"] >> 1 & 127, t_us))
+            tally.skipped += len(words)
+            continue
+        some.append(np.stack((words["data"].astype(np.int64), t_us)))
+        count += len(words)
+        if count >= request.part_events:
+            yield _part(request, tally, header, some, triggers)
+            some, triggers, count = [], [np.empty(0, TRIGGER)], 0
+    yield _part(request, tally, header, some, triggers)
+
+
+def _part(
+    request: Request, tally: Tally, header: Header, some: list[np.ndarray], triggers: list[np.ndarray]
+) -> Part:
+    """Return the words of some packets as one part."""
+    data, t_us = np.concatenate([np.empty((2, 0), np.int64), *some], axis=1)
+    y = data >> 2 & 0x7FFF
+    if header.from_below:
+        y = ((request.height or 1) - 1 - y) & 0xFFFF
+    events, _ = assemble(request, tally, t_us, data >> 17 & 0x7FFF, y, data >> 1 & 1)
+    return Part(events, None, np.concatenate(triggers))
+
+
+def _triggers(kinds: np.ndarray, t_us: np.ndarray) -> np.ndarray:
+    """Return the external triggers among special events."""
+    rows = [(t, *EDGES[kind]) for kind, t in zip(kinds.tolist(), t_us.tolist(), strict=True) if kind in EDGES]
+    return np.array(rows, TRIGGER)

@@ -1,0 +1,156 @@
+"""Look into HDF5 files that may be damaged or hostile, with every size checked before memory is taken.
+
+The library crashes on some damaged files, follows links to other files, and reads texts that lead in a
+circle for ever. What could do so is refused here before the library sees it.
+"""
+
+import contextlib
+import mmap
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin  # noqa: F401  registers the filters
+import numpy as np
+
+from envs.recordings.event_file import check_declared
+
+MAX_CHUNK_BYTES = 1 << 28
+# Filters that event files use: deflate, shuffle, fletcher32, lzf, blosc, blosc2. Others (nbit,
+# bitshuffle) crashed on damaged files, or (lz4, zstd) take the memory that the data declare.
+FILTERS = (1, 2, 3, 32000, 32001, 32026)
+BLOSC = (32001, 32026)
+FLETCHER32, CHECKSUM_BYTES = 3, 4
+SIMPLE = (h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeStringID)  # types of attributes
+HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
+ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)  # of the library
+MAX_NODES, MAX_DEPTH = 10_000, 5  # of a listing
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """Open a file whose heaps do not lead in a circle."""
+    check_heaps(path)
+    with h5py.File(path, "r") as file:
+        yield file
+
+
+def attribute(file: h5py.File, name: str) -> Any:
+    """Return one number or text; another type that damage declares, such as a list, can crash HDF5."""
+    stored = file.attrs.get_id(name)
+    if stored.shape != () or not isinstance(stored.get_type(), SIMPLE):
+        raise ValueError(f"the attribute {name} is no single number or text")
+    value = file.attrs[name]
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def numbers(file: h5py.File, name: str, most: int) -> list[int] | None:
+    """Return an attribute that is a short list of whole numbers, or None."""
+    stored = file.attrs.get_id(name)
+    if len(stored.shape) != 1 or stored.shape[0] > most or not isinstance(stored.get_type(), SIMPLE[:1]):
+        return None
+    return [int(value) for value in file.attrs[name]]
+
+
+def data_sets(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """Return the data sets of this very file by their paths, with few levels and no links."""
+    found: dict[str, h5py.Dataset] = {}
+    nodes = 0
+    waiting: list[tuple[str, h5py.Group, int]] = [("", file, 0)]
+    while waiting:
+        path, group, depth = waiting.pop(0)
+        for name in group:
+            nodes += 1
+            if nodes > MAX_NODES:
+                return found
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue
+            item = group[name]
+            if isinstance(item, h5py.Dataset):
+                found[f"{path}{name}"] = item
+            elif isinstance(item, h5py.Group) and depth < MAX_DEPTH:
+                waiting.append((f"{path}{name}/", item, depth + 1))
+    return found
+
+
+def listing(file: h5py.File, most: int = 12) -> str:
+    """Return what a file contains, in words."""
+    found = data_sets(file)
+    shown = [f"{name} {data.dtype} {data.shape}" for name, data in list(found.items())[:most]]
+    more = f" and {len(found) - most} more" if len(found) > most else ""
+    return f"it contains {', '.join(shown) or 'no data sets'}{more}"
+
+
+def declared_length(file: h5py.File, name: str, most: int) -> int:
+    """Return the length of a one-dimensional data set of this very file, checked before it is read."""
+    check_plain(file, name, 1)
+    length = len(file[name])
+    if length > most:
+        raise ValueError(f"{name} declares {length} entries; at most {most} are read")
+    check_declared(Path(file.filename), name, length * file[name].dtype.itemsize)
+    return length
+
+
+def check_plain(file: h5py.File, name: str, ndim: int) -> None:
+    """Refuse links, virtual and external data, other types than numbers, and huge chunks."""
+    parts = name.split("/")
+    for end in range(1, len(parts) + 1):
+        check_own(file, "/".join(parts[:end]))
+    data = file[name]
+    if not isinstance(data, h5py.Dataset) or data.ndim != ndim or data.external or data.is_virtual:
+        raise ValueError(f"{name} is not a plain data set of {ndim} dimensions")
+    fields = [data.dtype[field] for field in data.dtype.names] if data.dtype.names else [data.dtype]
+    if not all(field.kind in "iufb" for field in fields):
+        raise ValueError(f"{name} contains {data.dtype}, not numbers")
+    check_chunks(data, name)
+
+
+def check_own(file: h5py.File, name: str) -> None:
+    """Refuse a name that leads elsewhere, before it is followed: another file would be opened."""
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{name} is missing or a link")
+
+
+def check_chunks(data: h5py.Dataset, name: str) -> None:
+    """Refuse huge chunks, and filters that are unknown or declare another size of elements or chunks."""
+    if data.chunks and int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize > MAX_CHUNK_BYTES:
+        raise ValueError(f"{name} has chunks of more than {MAX_CHUNK_BYTES} bytes")
+    pipeline, codes = data.id.get_create_plist(), filters(data)
+    for number, code in enumerate(codes):
+        if code not in FILTERS:
+            raise ValueError(f"{name} is packed with the filter {code}; write it again with blosc or gzip")
+        size = int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize if data.chunks else 0
+        if code in BLOSC and pipeline.get_filter(number)[2][2:4] != (data.dtype.itemsize, size):
+            raise ValueError(f"{name} describes its packing wrongly")
+    if FLETCHER32 in codes[:-1]:  # what decompression leaves may be too short for it
+        raise ValueError(f"{name} has its checksum within its compression; write it again without fletcher32")
+    if FLETCHER32 in codes and data.id.chunk_iter(_too_short):
+        raise ValueError(f"{name} has a chunk without its checksum")
+
+
+def _too_short(chunk: Any) -> bool | None:
+    """Whether a stored chunk has no room for its checksum, in front of which HDF5 would look for it."""
+    return chunk.size < CHECKSUM_BYTES or None
+
+
+def filters(data: h5py.Dataset) -> list[int]:
+    """Return the numbers of the filters that packed a data set."""
+    pipeline = data.id.get_create_plist()
+    return [pipeline.get_filter(number)[0] for number in range(pipeline.get_nfilters())]
+
+
+def check_heaps(path: Path) -> None:
+    """Refuse a heap of texts with an object that is its own next one: HDF5 would read it for ever."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
+        heap = raw.find(HEAP)
+        while heap >= 0:
+            place, end = heap + 16, min(len(raw), heap + int.from_bytes(raw[heap + 8 : heap + 16], "little"))
+            while place + 16 <= end:
+                number, size = struct.unpack_from("<H6xQ", raw, place)
+                step = 16 + -(-size // 8) * 8 if number else size  # without a number it is free space
+                if step == 0 or step >= 1 << 63:
+                    raise ValueError(f"the heap at byte {heap} leads in a circle")
+                place += step
+            heap = raw.find(HEAP, heap + 1)

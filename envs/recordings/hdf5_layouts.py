@@ -1,0 +1,362 @@
+"""Read events from HDF5 files: a table of known layouts, and any other by `group` and `columns`."""
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from envs.recordings.event_file import Opened, Part, Request, Tally, assemble
+from envs.recordings.hdf5_checks import (
+    ERRORS,
+    attribute,
+    check_plain,
+    data_sets,
+    declared_length,
+    listing,
+    numbers,
+    opened,
+)
+from envs.recordings.metavision_hdf5 import metavision_parts
+from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
+from envs.recordings.npz import table_order
+
+NOISE = "events/is_noise"  # labels, where there are any
+FIRST_ROWS = 1 << 16
+
+
+class Layout(NamedTuple):
+    """Where a data set has its events.
+
+    Attributes:
+        users: Data sets and programs that write it.
+        group: Path of the group or of the one data set of rows.
+        columns: Data sets of t, x, y and p in the group, or the columns of the rows in their order.
+        time_unit: Of fractional times; whole ones are microseconds.
+        size: Width and height, if all files have one and do not say it.
+    """
+
+    users: str
+    group: str
+    columns: tuple[str, ...] = COLUMNS
+    time_unit: str | None = None
+    size: tuple[int, int] | None = None
+
+
+LAYOUTS = (
+    Layout("DSEC, TUM-VIE, VECtor, RVT, eTraM, vid2e, v2e", "events"),
+    Layout("event_utils, EVREAL, E2VID+", "events", ("ts", "xs", "ys", "ps"), "s"),
+    Layout("M3ED, EvTTC", "prophesee/left"),
+    Layout("M3ED, EvTTC", "prophesee/right"),
+    Layout("MVSEC", "davis/left/events", ("x", "y", "t", "p"), "s", (346, 260)),
+    Layout("MVSEC", "davis/right/events", ("x", "y", "t", "p"), "s", (346, 260)),
+    Layout("event-vision-library", "raw_events", COLUMNS, "s"),
+    Layout("EDS", ""),
+    Layout("RPEFlow", "", ("events_t", "events_x", "events_y", "events_p")),
+)
+# Sizes by the types of DSEC, whose files have an offset and an index of milliseconds.
+DSEC_TYPES, DSEC_SIZE = {"t": "u4", "x": "u2", "y": "u2", "p": "u1"}, (640, 480)
+
+
+class Found(NamedTuple):
+    """Where the events of a file are.
+
+    Attributes:
+        group: As in `Layout`.
+        paths: Data sets of t, x, y and p; or the one of rows, four times.
+        fields: Fields or columns of the rows, or None four times.
+        layout: Its row of the table, or None.
+    """
+
+    group: str
+    paths: tuple[str, ...]
+    fields: tuple[str | int | None, ...]
+    layout: Layout | None
+
+
+def read_hdf5(request: Request) -> Opened:
+    """Open an HDF5 file.
+
+    Raises:
+        ValueError: It has no layout that is known, is truncated, links to other files, or declares more
+            than `max_events`.
+    """
+    try:
+        with opened(request.path) as file:
+            if "CD" in file and request.group is None:
+                request = request.sized(*_said_size(file, "CD"))
+                return Opened("hdf5", request, (tally := Tally()), _metavision(request, tally))
+            found, others = find(request, file)
+            count = len(file[found.paths[0]])
+            request.check_declared(count)
+            for path in dict.fromkeys(found.paths):
+                if found.fields[0] is None and declared_length(file, path, max(count, 1 << 62)) != count:
+                    raise ValueError(f"{path} and {found.paths[0]} differ in length")
+            request = _sized(request, file, found)
+    except ERRORS as error:
+        raise _refused(request, error) from None
+    tally = Tally()
+    if others:
+        tally.notes.append(f"events of {found.group} are read; group= chooses another of {', '.join(others)}")
+    return Opened("hdf5", request, tally, _parts(request, tally, found, count))
+
+
+def _refused(request: Request, error: Exception) -> ValueError:
+    """Return the refusal for an error of the library."""
+    if str(error).startswith(str(request.path)):
+        return ValueError(str(error))
+    return request.refusal(f"is no readable HDF5 event file ({error}); copy or write it again")
+
+
+def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
+    """Return where the events are, and other groups that have events too.
+
+    Raises:
+        ValueError: No layout is known; the message lists what the file contains.
+    """
+    sets = data_sets(file)
+    if request.group is not None or request.columns is not None:
+        return _named(request, file, sets), []
+    found = [one for layout in LAYOUTS if (one := _matched(request, file, sets, layout))]
+    if not found:
+        groups = {path.rpartition("/")[0] for path in sets}
+        layouts = [Layout("", group) for group in sorted(groups)]
+        found = [one for layout in layouts if (one := _by_roles(request, sets, layout.group))]
+    if not found:
+        for name in ("events/t", "events"):  # says what is wrong with data sets that should be there
+            if name.split("/")[0] in file and not sets:
+                check_plain(file, name, 1)
+        known = "; ".join(f"{row.users}: {row.group or '/'}" for row in LAYOUTS)
+        raise request.refusal(
+            f"has no events in a layout that is known ({known}); {listing(file)}: give group= with the path "
+            "of the group or data set of the events, and columns= with the names of its t, x, y and p"
+        )
+    names = list(dict.fromkeys(one.group or "/" for one in found))
+    return found[0], names if len(names) > 1 else []
+
+
+def _matched(
+    request: Request, file: h5py.File, sets: dict[str, h5py.Dataset], layout: Layout
+) -> Found | None:
+    """Return where the events are if a file has a layout."""
+    if layout.group in sets:
+        data = sets[layout.group]
+        if data.dtype.names:
+            return _fields(request, layout.group, data, None, layout)
+        if data.ndim == 2 and data.shape[1] == len(COLUMNS):
+            return _table(layout.group, layout.columns, layout)
+        return None
+    paths = tuple(_join(layout.group, name) for name in layout.columns)
+    if all(_has(file, path) for path in paths) and len(set(paths)) == len(COLUMNS):
+        return Found(layout.group, paths, (None,) * 4, layout)
+    return None
+
+
+def _has(file: h5py.File, path: str) -> bool:
+    """Whether a path begins with a name of the file; what it leads to is checked later."""
+    parts = path.split("/")
+    group: Any = file
+    for part in parts[:-1]:
+        if not isinstance(group.get(part, getlink=True), h5py.HardLink):
+            return group.get(part, getlink=True) is not None
+        group = group[part]
+        if not isinstance(group, h5py.Group):
+            return False
+    return group.get(parts[-1], getlink=True) is not None
+
+
+def _named(request: Request, file: h5py.File, sets: dict[str, h5py.Dataset]) -> Found:
+    """Return the events that the caller names by `group` and `columns`."""
+    group = (request.group or "").strip("/")
+    if request.group is None and "events" in sets:
+        group = "events"
+    if group in sets:
+        data = sets[group]
+        if data.dtype.names:
+            found = _fields(request, group, data, request.columns, None)
+        else:
+            columns = request.columns or table_order(request, group, _first_rows(file, group))
+            found = _table(group, columns, None)
+    elif request.columns is not None:
+        paths = tuple(_join(group, name) for name in request.columns)
+        missing = [path for path in paths if path not in sets]
+        if missing and request.group is None:
+            paths = tuple(_join("events", name) for name in request.columns)
+            missing = missing if any(path not in sets for path in paths) else []
+        found = None if missing or len(paths) != len(COLUMNS) else Found(group, paths, (None,) * 4, None)
+    else:
+        found = _by_roles(request, sets, group)
+    if found is None:
+        raise request.refusal(
+            f"has no events at group={request.group!r}, columns={request.columns!r}; {listing(file)}: give "
+            "group= with the path of a group or data set, and columns= with the names of its t, x, y and p"
+        )
+    return found
+
+
+def _by_roles(request: Request, sets: dict[str, h5py.Dataset], group: str) -> Found | None:
+    """Return the events of a group by the names of its data sets, whatever their spelling."""
+    prefix = f"{group}/" if group else ""
+    names = [
+        path[len(prefix) :] for path in sets if path.startswith(prefix) and "/" not in path[len(prefix) :]
+    ]
+    one = [name for name in names if sets[prefix + name].ndim == 1]
+    places, _ = roles(request, [name.removeprefix("events_") for name in one])
+    if not set(COLUMNS) <= places.keys():
+        return None
+    return Found(group, tuple(prefix + one[places[name]] for name in COLUMNS), (None,) * 4, None)
+
+
+def _fields(
+    request: Request, path: str, data: h5py.Dataset, columns: tuple[str, ...] | None, layout: Layout | None
+) -> Found | None:
+    """Return the events of a data set of rows with named fields."""
+    names = data.dtype.names or ()
+    if columns is None:
+        places, _ = roles(request, names)
+        columns = tuple(names[places[name]] if name in places else "" for name in COLUMNS)
+    if not set(columns) <= set(names) or len(columns) != len(COLUMNS):
+        return None
+    return Found(path, (path,) * 4, columns, layout)
+
+
+def _table(path: str, columns: tuple[str, ...], layout: Layout | None) -> Found | None:
+    """Return the events of a data set of rows without names."""
+    if not set(COLUMNS) <= set(columns):
+        return None
+    return Found(path, (path,) * 4, tuple(columns.index(name) for name in COLUMNS), layout)
+
+
+def _join(group: str, name: str) -> str:
+    """Return the path of a name in a group."""
+    return f"{group}/{name}" if group else name
+
+
+def _first_rows(file: h5py.File, path: str) -> np.ndarray:
+    """Return the first rows of a table."""
+    check_plain(file, path, 2)
+    return np.asarray(file[path][:FIRST_ROWS])
+
+
+def _metavision(request: Request, tally: Tally) -> Iterator[Part]:
+    """Yield the events of a file in Metavision's layout."""
+    try:
+        with opened(request.path) as file:
+            yield from metavision_parts(request, tally, file)
+    except ERRORS as error:
+        raise _refused(request, error) from None
+
+
+def _parts(request: Request, tally: Tally, found: Found, count: int) -> Iterator[Part]:
+    """Yield the events where they were found."""
+    try:
+        with opened(request.path) as file:
+            for path in dict.fromkeys(found.paths):
+                check_plain(file, path, 2 if isinstance(found.fields[0], int) else 1)
+            offset = _offset(file, found)
+            has_labels = found.group == "events" and file.get(NOISE, getlink=True) is not None
+            if has_labels and declared_length(file, NOISE, max(count, 1 << 62)) != count:
+                raise ValueError("it must have one is_noise of 0 or 1 for each event")
+            for first in range(0, count, request.part_events):
+                rows = slice(first, min(count, first + request.part_events))
+                labels = _labels(file, rows) if has_labels else None
+                yield _part(request, tally, file, found, rows, offset, labels)
+    except ERRORS as error:
+        raise _refused(request, error) from None
+
+
+def _part(
+    request: Request,
+    tally: Tally,
+    file: h5py.File,
+    found: Found,
+    rows: slice,
+    offset: int,
+    labels: np.ndarray | None,
+) -> Part:
+    """Return some rows as events."""
+    if found.fields[0] is None:
+        t, x, y, p = (file[path][rows] for path in found.paths)
+    else:
+        block = file[found.paths[0]][rows]
+        t, x, y, p = (block[field] if isinstance(field, str) else block[:, field] for field in found.fields)
+    usual = usual_unit(t)
+    if t.dtype.kind == "f" and found.layout and found.layout.time_unit:
+        usual = found.layout.time_unit
+    if usual is None and request.time_unit is None:
+        raise ValueError(f"{found.paths[0]} are no whole microseconds; give time_unit")
+    t_us = microseconds(request, t, None, usual)
+    if t_us.dtype.kind in "iu" and len(t_us) and not 0 <= int(t_us.max()) + abs(offset) < 1 << 62:
+        raise ValueError(f"{found.paths[0]} are no whole microseconds of a recording; give time_unit")
+    t_us = t_us.astype(np.int64, copy=False) + offset if t_us.dtype.kind in "iu" else t_us + offset
+    events, good = assemble(request, tally, t_us, x, y, p)
+    return Part(events, None if labels is None else labels[good])
+
+
+def _labels(file: h5py.File, rows: slice) -> np.ndarray:
+    """Return labels of some events."""
+    labels = np.asarray(file[NOISE][rows])
+    if not np.isin(labels, (0, 1)).all():
+        raise ValueError("it must have one is_noise of 0 or 1 for each event")
+    return labels.astype(bool)
+
+
+def _offset(file: h5py.File, found: Found) -> int:
+    """Return the time of t = 0 [us], which files of the DSEC layout say."""
+    if found.group != "events" or file.get("t_offset", getlink=True) is None:
+        return 0
+    check_plain(file, "t_offset", 0)
+    offset = int(file["t_offset"][()])
+    if offset != file["t_offset"][()]:
+        raise ValueError("t_offset is no whole number of microseconds")
+    return offset
+
+
+def _sized(request: Request, file: h5py.File, found: Found) -> Request:
+    """Return the request with the size that the file says, or that its data set has."""
+    width, height = _said_size(file, found.group)
+    if (width, height) == (None, None) and (request.width, request.height) == (None, None):
+        usual = found.layout.size if found.layout else None
+        types = {name: file[path].dtype.str[1:] for name, path in zip(COLUMNS, found.paths, strict=True)}
+        if types == DSEC_TYPES and {"t_offset", "ms_to_idx"} <= set(file):
+            usual = DSEC_SIZE
+        return request.sized(*(usual or (None, None)))
+    return request.sized(width, height)
+
+
+def _said_size(file: h5py.File, group: str) -> tuple[int | None, int | None]:
+    """Return width and height by attributes, by data sets beside the events, or by a recording's settings."""
+    given = file.attrs
+    if "width" in given and "height" in given:
+        return int(attribute(file, "width")), int(attribute(file, "height"))
+    geometry = str(attribute(file, "geometry")) if "geometry" in given else ""
+    if found := re.fullmatch(r"(\d{1,5})x(\d{1,5})", geometry, re.ASCII):
+        return int(found[1]), int(found[2])
+    shape = numbers(file, "sensor_resolution", 2) if "sensor_resolution" in given else None  # event_utils
+    if shape and len(shape) == 2:
+        return shape[1], shape[0]
+    for name, ndim in ((_join(group, "width"), 0), (_join(group, "calib/resolution"), 1)):
+        size = _size_set(file, name, ndim)
+        if size:
+            return size
+    about = json.loads(attribute(file, "about")) if "about" in given else {}
+    sensor = about.get("sensor") if isinstance(about, dict) else None
+    if not isinstance(sensor, dict) or not all(type(sensor.get(name)) is int for name in ("width", "height")):
+        return None, None
+    return sensor["width"], sensor["height"]
+
+
+def _size_set(file: h5py.File, name: str, ndim: int) -> tuple[int, int] | None:
+    """Return width and height from data sets: RVT's two numbers, or M3ED's one pair."""
+    try:
+        check_plain(file, name, ndim)
+        if ndim:
+            values = file[name][:] if file[name].shape == (2,) else []
+            return (int(values[0]), int(values[1])) if len(values) == 2 else None
+        other = name.removesuffix("width") + "height"
+        check_plain(file, other, 0)
+        return int(file[name][()]), int(file[other][()])
+    except (KeyError, ValueError, TypeError):
+        return None

@@ -1,0 +1,136 @@
+"""Write events as HDF5 in the layout of DSEC, in parts, so that every reader of HDF5 opens them."""
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from core.files import replaced
+from envs.recordings.hdf5 import MAX_INDEX
+from envs.recordings.hdf5_layouts import NOISE
+from envs.recordings.writing import Append
+
+CHUNK = 1 << 16
+TYPES = {"events/t": "i8", "events/x": "u2", "events/y": "u2", "events/p": "u1"}
+# Filters that are part of HDF5 itself; other ones need a plug-in that C++ and MATLAB do not have.
+PACKING = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+FILL_MS = 1 << 20  # entries of the index that are made at once
+
+
+@contextlib.contextmanager
+def hdf5_writer(path: Path, width: int, height: int, is_labelled: bool) -> Iterator[Append]:
+    """Yield a function that adds events to an HDF5 file, with the sensor's size as attributes.
+
+    Raises:
+        ValueError: They last longer than an index of milliseconds can tell.
+    """
+    types = TYPES | ({NOISE: "u1"} if is_labelled else {})
+    with replaced(path) as part, part.open("w+b", buffering=0) as raw:
+        target = Forgiving(raw)
+        with h5py.File(target, "w") as file:
+            for name, kind in types.items():
+                file.create_dataset(name, (0,), kind, maxshape=(None,), chunks=(CHUNK,), **PACKING)
+            file.create_dataset("ms_to_idx", (0,), "u8", maxshape=(None,), chunks=(CHUNK,), **PACKING)
+            file.attrs["width"], file.attrs["height"] = width, height
+            file.attrs["timestamp_scale_ms"] = 1e-3
+            file["t_offset"] = np.int64(0)
+            yield Adding(path, file, target)
+        target.check()
+
+
+class Forgiving(io.RawIOBase):
+    """A file whose errors are told later: HDF5 crashes the process if a write fails, as on a full disk."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        """Wrap a file that is open for reading and writing."""
+        self._file, self._error = file, None  # type: tuple[io.FileIO, OSError | None]
+
+    def check(self) -> None:
+        """Raise the first error, if there was one."""
+        if self._error is not None:
+            raise self._error
+
+    def _tried(self, action: str, *arguments: object) -> object:
+        """Do something with the file, unless an error has happened."""
+        try:
+            return None if self._error else getattr(self._file, action)(*arguments)
+        except OSError as error:
+            self._error = error
+            return None
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Move to a byte."""
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """Return the byte that is next."""
+        return self._file.tell()
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read bytes that were written."""
+        return self._file.readinto(buffer)
+
+    def write(self, data: memoryview) -> int:  # type: ignore[override]
+        """Write all bytes."""
+        rest = memoryview(data).cast("B")
+        while len(rest) and self._error is None:
+            rest = rest[int(self._tried("write", rest) or len(rest)) :]  # type: ignore[call-overload]
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size of the file."""
+        self._tried("truncate", size)
+        return size or 0
+
+    def flush(self) -> None:
+        """Do nothing: the file has no buffer."""
+
+
+class Adding:
+    """Adds events to the data sets of a file, whole chunks at a time."""
+
+    def __init__(self, path: Path, file: h5py.File, target: Forgiving) -> None:
+        """Begin with empty data sets."""
+        self._path, self._file, self._target = path, file, target
+        self._offset_us: int | None = None
+        self._count, self._next_ms = 0, 0
+
+    def __call__(self, events: np.ndarray, is_noise: np.ndarray | None) -> None:
+        """Add events; raises ValueError if they last too long, OSError if the disk is full."""
+        if not len(events):
+            return
+        if self._offset_us is None:
+            self._offset_us = int(events["t"][0])
+            self._file["t_offset"][()] = self._offset_us
+        t_us = events["t"] - self._offset_us
+        if t_us[-1] >= 1000 * MAX_INDEX:
+            raise ValueError(
+                f"{self._path}: the hdf5 layout has an index entry for each millisecond and this is "
+                f"{t_us[-1]} us; write parts of at most {1000 * MAX_INDEX} us, or choose npz"
+            )
+        columns = {"t": t_us, "x": events["x"], "y": events["y"], "p": events["p"] > 0}
+        for name, values in columns.items():
+            self._extend(f"events/{name}", values)
+        if is_noise is not None:
+            self._extend(NOISE, is_noise)
+        self._index(t_us)
+        self._count += len(events)
+        self._target.check()
+
+    def _extend(self, name: str, values: np.ndarray) -> None:
+        """Add values to a data set."""
+        data = self._file[name]
+        first = len(data)
+        data.resize((first + len(values),))
+        data[first:] = values
+
+    def _index(self, t_us: np.ndarray) -> None:
+        """Add the first event at or after each millisecond that has come."""
+        stop = int(t_us[-1]) // 1000 + 1
+        for first in range(self._next_ms, stop, FILL_MS):
+            ms = np.arange(first, min(stop, first + FILL_MS), dtype=np.int64)
+            self._extend("ms_to_idx", self._count + np.searchsorted(t_us, ms * 1000).astype(np.uint64))
+        self._next_ms = max(self._next_ms, stop)

@@ -1,0 +1,71 @@
+"""Recognise the columns of events by the names that programs give them."""
+
+import re
+from collections.abc import Iterable
+
+import numpy as np
+
+from envs.recordings.event_file import Request
+
+COLUMNS = ("t", "x", "y", "p")
+US_PER = {"s": 1_000_000.0, "ms": 1000.0, "us": 1.0, "ns": 0.001}
+ALIASES = {
+    **dict.fromkeys(("ts", "time", "times", "timestamp", "timestamps"), "t"),
+    **dict.fromkeys(("xs", "col", "column"), "x"),
+    **dict.fromkeys(("ys", "row"), "y"),
+    **dict.fromkeys(("ps", "pol", "pols", "polarity", "polarities", "on", "sign"), "p"),
+    **dict.fromkeys(("sec", "secs", "seconds"), "sec"),
+    **dict.fromkeys(("nsec", "nsecs", "nanosec", "nanoseconds"), "nsec"),
+}
+NAME = re.compile(r"(.*?)(?:[_\[( ](s|ms|us|ns)[\])]?)?", re.DOTALL)
+
+
+def roles(request: Request, names: Iterable[str]) -> tuple[dict[str, int], str | None]:
+    """Return the place of each column that is known by its name, and the unit of t that its name tells.
+
+    Raises:
+        ValueError: Two columns have the same name.
+    """
+    places: dict[str, int] = {}
+    told = None
+    for place, word in enumerate(names):
+        match = NAME.fullmatch(word.strip().lower())
+        name, unit = match.groups() if match else (word, None)
+        name = ALIASES.get(name, name)
+        if name not in (*COLUMNS, "sec", "nsec"):
+            continue
+        if name in places:
+            raise request.refusal(f"names the column {name} twice; give columns= with one")
+        places[name] = place
+        told = unit if name == "t" else told
+    return places, told
+
+
+def microseconds(request: Request, t: np.ndarray, said: str | None, usual: str | None = None) -> np.ndarray:
+    """Return times in microseconds by the unit that the file says, else the caller, else the format.
+
+    Raises:
+        ValueError: The file and the caller name different units, or nobody names one.
+    """
+    given = request.time_unit
+    if said and given and said != given:
+        raise request.refusal(f"says time_unit={said} and the caller says {given}; leave time_unit out")
+    unit = said or given or usual
+    if unit not in US_PER:
+        raise request.refusal(
+            f"does not say the unit of its times; give time_unit as one of {', '.join(US_PER)}"
+        )
+    if unit == "us":
+        return t
+    if unit == "ns" and t.dtype.kind in "iu":
+        return (t + t.dtype.type(500)) // 1000  # to the nearest
+    if unit == "ms" and t.dtype.kind in "iu":
+        return t.astype(np.int64) * 1000
+    return t.astype(np.float64) * US_PER[unit]
+
+
+def usual_unit(t: np.ndarray) -> str | None:
+    """Return "us" for whole numbers, which all known writers mean as microseconds, else None."""
+    if t.dtype.kind in "iub":
+        return "us"
+    return "us" if len(t) and bool(np.all(t[np.isfinite(t)] % 1 == 0)) else None

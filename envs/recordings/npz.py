@@ -1,0 +1,384 @@
+"""Read npz and npy files of any names, and zip files of one text.
+
+Arrays are found by their names. Nothing is unpickled, and nothing is unpacked before its header is known
+to be sound. Columns are read side by side, in parts.
+"""
+
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from envs.recordings.event_file import CUT, Opened, Part, Request, Tally, assemble
+from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
+from envs.recordings.text import read_text
+
+MAX_HEADER_BYTES = 1 << 16
+NOISE = "is_noise"  # an array that labels each event, if there is one
+ROWS = 4  # columns of a table
+BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
+# Sizes of the data sets whose files do not say them, by the name of their array.
+SIZES = {"event_data": (640, 480)}  # N-ImageNet
+SECONDS = ("events_t",)  # names of times in seconds: EVIMO 2
+
+
+class Array(NamedTuple):
+    """An array of a file.
+
+    Attributes:
+        name: In the file.
+        open: Opens its bytes, from its header on.
+        shape, dtype: As its header declares.
+    """
+
+    name: str
+    open: Callable[[], IO[bytes]]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+class Column(NamedTuple):
+    """Where a column of the events is.
+
+    Attributes:
+        array: Name of the array.
+        field: Name of a field of a structured array, number of a column of a table, or None.
+    """
+
+    array: str
+    field: str | int | None
+
+
+def read_npz(request: Request) -> Opened:
+    """Open an npz file, or a zip file of one text as E2VID has it.
+
+    Arrays are t, x, y and p by these names or others in use; or one array of rows, structured or of four
+    columns; and, if known, width, height, time_unit. Whole times are microseconds unless the file or the
+    caller names another unit; fractional times need a unit.
+
+    Raises:
+        ValueError: There are no such arrays, or one is pickled, of another length, or contains
+            another number of bytes than it declares.
+    """
+    try:
+        archive = zipfile.ZipFile(request.path)
+        names = archive.namelist()
+    except BROKEN as error:
+        raise _broken(request, error) from None
+    texts = [name for name in names if name.lower().endswith((".txt", ".csv"))]
+    if not any(name.endswith(".npy") for name in names) and len(texts) == 1:
+        return read_text(request, lambda: archive.open(texts[0]))
+    try:
+        arrays = {
+            name.removesuffix(".npy"): _header(request, name.removesuffix(".npy"), _opener(archive, name))
+            for name in names
+            if name.endswith(".npy")
+        }
+        return _opened(request, "npz", arrays)
+    except BROKEN as error:
+        raise _broken(request, error) from None
+
+
+def read_npy(request: Request) -> Opened:
+    """Open an npy file of rows: a structured array, or a table of four columns.
+
+    Raises:
+        ValueError: As `read_npz`.
+    """
+    try:
+        array = _header(request, "rows", lambda: request.path.open("rb"))
+        return _opened(request, "npy", {"rows": array})
+    except BROKEN as error:
+        raise _broken(request, error) from None
+
+
+def _broken(request: Request, error: Exception) -> ValueError:
+    """Return the refusal for an error of a library."""
+    if str(error).startswith(str(request.path)):
+        return ValueError(str(error))
+    return request.refusal(f"is no readable array file ({error}); copy or save it again")
+
+
+def _opener(archive: zipfile.ZipFile, name: str) -> Callable[[], IO[bytes]]:
+    """Return a function that opens one member."""
+    return lambda: archive.open(name)
+
+
+def _header(request: Request, name: str, open_bytes: Callable[[], IO[bytes]]) -> Array:
+    """Return an array by the header that it declares."""
+    with open_bytes() as file:
+        shape, dtype = _shape(request, file, name)
+    return Array(name, open_bytes, shape, dtype)
+
+
+def _shape(request: Request, file: IO[bytes], name: str) -> tuple[tuple[int, ...], np.dtype]:
+    """Read shape and dtype of an array; the file is then at its first number."""
+    try:
+        version = np.lib.format.read_magic(file)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[
+            version
+        ]
+        shape, is_fortran, dtype = read(file, max_header_size=MAX_HEADER_BYTES)
+    except Exception as error:  # numpy's parser of headers promises no type
+        raise request.refusal(
+            f"array {name} has no sound header ({type(error).__name__}); save it again"
+        ) from None
+    if min(shape, default=0) < 0 or (is_fortran and len(shape) > 1):
+        raise request.refusal(f"array {name} has shape {shape} by columns; save np.ascontiguousarray of it")
+    return shape, dtype
+
+
+def _opened(request: Request, format: str, arrays: dict[str, Array]) -> Opened:
+    """Find the columns of the events and the facts beside them."""
+    columns = _columns(request, arrays)
+    used = [arrays[name] for name in dict.fromkeys(column.array for column in columns)]
+    noise = arrays.get(NOISE) if format == "npz" else None
+    lengths = {
+        array.name: array.shape[0] if array.shape else 0 for array in (*used, *([noise] if noise else ()))
+    }
+    if len(set(lengths.values())) > 1:
+        raise request.refusal(
+            f"has arrays of different lengths ({lengths}); save one entry per event in each"
+        )
+    count = request.check_declared(next(iter(lengths.values())))
+    request = _sized(request, arrays, used)
+    name = columns[0].field if isinstance(columns[0].field, str) else columns[0].array
+    unit = _text(request, arrays, "time_unit") or roles(request, [name])[1]
+    if "timestamp_scale_ms" in arrays:
+        unit = {1e3: "s", 1.0: "ms", 1e-3: "us", 1e-6: "ns"}.get(
+            float(_one(request, arrays, "timestamp_scale_ms"))
+        )
+    if columns[0].array in SECONDS and not request.time_unit:
+        unit = "s"
+    tally = Tally()
+    return Opened(format, request, tally, _parts(request, tally, used, columns, unit, noise, count))
+
+
+def _columns(request: Request, arrays: dict[str, Array]) -> list[Column]:
+    """Return where t, x, y and p are."""
+    found = {name: array for name, array in arrays.items() if array.shape and array.dtype.kind in "iufbV"}
+    if request.group is not None:
+        if request.group not in found:
+            raise request.refusal(f"has no array {request.group!r}; {_listing(arrays)}: give group as one")
+        found = {request.group: found[request.group]}
+    rows = [name for name, array in found.items() if _is_rows(array)]
+    by_name = {}
+    if request.columns and set(request.columns) <= found.keys() and len(request.columns) == ROWS:
+        by_name = dict(zip(COLUMNS, request.columns, strict=True))
+    elif request.columns is None:
+        one = {name.removeprefix("events_"): name for name in found if len(found[name].shape) == 1}
+        by_name = {name: list(one.values())[place] for name, place in roles(request, one)[0].items()}
+        if "events_xy" in found and {"t", "p"} <= by_name.keys():  # EVIMO 2
+            xy = [Column("events_xy", 0), Column("events_xy", 1)]
+            return [Column(by_name["t"], None), *xy, Column(by_name["p"], None)]
+    if set(COLUMNS) <= by_name.keys():
+        return [Column(by_name[name], None) for name in COLUMNS]
+    if len(rows) != 1:
+        missing = next((name for name in COLUMNS if name not in by_name), "t")
+        raise request.refusal(
+            f"has no array {missing!r}; {_listing(arrays)}: give columns= with the names of the arrays of "
+            "t, x, y and p, or group= with the name of one array of rows"
+        )
+    return _row_columns(request, found[rows[0]])
+
+
+def _is_rows(array: Array) -> bool:
+    """Whether an array has a row for each event."""
+    return bool(array.dtype.names) or (len(array.shape) == 2 and array.shape[1] >= ROWS)
+
+
+def _row_columns(request: Request, array: Array) -> list[Column]:
+    """Return where t, x, y and p are in an array of rows."""
+    if array.dtype.names:
+        names = list(array.dtype.names)
+        places, _ = roles(request, names)
+        if request.columns and set(request.columns) <= set(names):
+            return [Column(array.name, name) for name in request.columns]
+        if not set(COLUMNS) <= places.keys():
+            raise request.refusal(
+                f"array {array.name} has the fields {names}; give columns= with those of t, x, y, p"
+            )
+        return [Column(array.name, names[places[name]]) for name in COLUMNS]
+    words = request.columns or table_order(request, array.name, _first_rows(request, array))
+    places, _ = roles(request, words)
+    if not set(COLUMNS) <= places.keys() or len(words) > array.shape[1]:
+        raise request.refusal(
+            f"columns={tuple(words)} must name t, x, y and p among the columns of {array.name}"
+        )
+    return [Column(array.name, places[name]) for name in COLUMNS]
+
+
+def table_order(request: Request, name: str, rows: np.ndarray) -> tuple[str, ...]:
+    """Return the order of the columns of a table if its numbers leave no doubt.
+
+    The last column is the polarity; the time is the only other column that never falls, in the first or
+    the third place.
+
+    Args:
+        request: The file.
+        name: The table in the file.
+        rows: Its first rows, (N, 4).
+
+    Raises:
+        ValueError: The numbers fit none or two orders.
+    """
+    if rows.shape[1] != ROWS or not len(rows):
+        raise _no_order(request, name)
+    signs = rows[:, 3].astype(np.float64)
+    signs = np.where(signs > 1 << 31, -1.0, signs)
+    rises = [bool((np.diff(rows[:, place].astype(np.float64)) >= 0).all()) for place in (0, 2)]
+    spans = [float(np.ptp(rows[:, place].astype(np.float64))) for place in (0, 2)]
+    if rises == [True, True]:  # pixels may rise too, but no further than a sensor reaches
+        rises = [spans[0] >= spans[1], spans[1] > spans[0]]
+    if not np.isin(signs, (-1, 0, 1)).all() or rises == [False, False]:
+        raise _no_order(request, name)
+    return ("t", "x", "y", "p") if rises[0] else ("x", "y", "t", "p")
+
+
+def _no_order(request: Request, name: str) -> ValueError:
+    """Return the refusal for a table whose columns are not known."""
+    return request.refusal(
+        f"the table {name} does not name its columns; give columns= in their order, such as "
+        "('x', 'y', 't', 'p')"
+    )
+
+
+def _first_rows(request: Request, array: Array) -> np.ndarray:
+    """Return the first rows of a table."""
+    with array.open() as file:
+        _shape(request, file, array.name)
+        width, count = array.shape[1], min(1 << 16, array.shape[0])
+        raw = file.read(count * width * array.dtype.itemsize)
+    return np.frombuffer(raw, array.dtype, len(raw) // array.dtype.itemsize // width * width).reshape(
+        -1, width
+    )
+
+
+def _parts(
+    request: Request,
+    tally: Tally,
+    used: list[Array],
+    columns: list[Column],
+    unit: str | None,
+    noise: Array | None,
+    count: int,
+) -> Iterator[Part]:
+    """Yield the events; the arrays are read side by side."""
+    used = used if noise is None else [*used, noise]
+    files = [array.open() for array in used]
+    try:
+        for file, array in zip(files, used, strict=True):
+            _shape(request, file, array.name)
+        for first in range(0, count, request.part_events):
+            size = min(request.part_events, count - first)
+            some = _side_by_side(request, tally, files, used, size)
+            yield _part(request, tally, some, columns, unit, noise)
+        for file, array in zip(files, used, strict=True):
+            if file.read(1):
+                raise request.refusal(f"array {array.name} contains more than it declares; save it again")
+    except BROKEN as error:
+        raise _broken(request, error) from None
+    finally:
+        for file in files:
+            file.close()
+
+
+def _side_by_side(
+    request: Request, tally: Tally, files: list[IO[bytes]], used: list[Array], size: int
+) -> dict[str, np.ndarray]:
+    """Return the next rows of all arrays by their names; all end where the first ends."""
+    read = [_next(request, file, array, size) for file, array in zip(files, used, strict=True)]
+    whole = min(map(len, read))
+    if whole < size:
+        tally.damage[CUT] += sum((size - whole) * values.itemsize for values in read)
+    return {array.name: values[:whole] for array, values in zip(used, read, strict=True)}
+
+
+def _next(request: Request, file: IO[bytes], array: Array, size: int) -> np.ndarray:
+    """Read the next rows of an array; fewer if the file ends."""
+    row = int(np.prod(array.shape[1:], dtype=np.int64))
+    if array.dtype.hasobject or array.dtype.itemsize > 64 * 8 or row > 64:
+        raise request.refusal(
+            f"array {array.name} has dtype {array.dtype} and shape {array.shape}; save numbers"
+        )
+    raw = file.read(size * row * array.dtype.itemsize)
+    got = len(raw) // (row * array.dtype.itemsize)
+    values = np.frombuffer(raw, array.dtype, got * row)
+    return values.reshape(got, *array.shape[1:])
+
+
+def _part(
+    request: Request,
+    tally: Tally,
+    some: dict[str, np.ndarray],
+    columns: list[Column],
+    unit: str | None,
+    noise: Array | None,
+) -> Part:
+    """Return the events of some rows of the arrays."""
+    t, x, y, p = (
+        some[array]
+        if field is None
+        else some[array][field]
+        if isinstance(field, str)
+        else some[array][:, field]
+        for array, field in columns
+    )
+    t_us = microseconds(request, t, unit, usual_unit(t))
+    events, good = assemble(request, tally, t_us, x, y, p)
+    if noise is None:
+        return Part(events)
+    labels = some[noise.name]
+    if not np.isin(labels, (0, 1)).all():
+        raise request.refusal("must have one is_noise of 0 or 1 for each event; repair or remove it")
+    return Part(events, labels.astype(bool)[good])
+
+
+def _values(array: np.ndarray, field: str | int | None) -> np.ndarray:
+    """Return a column of an array."""
+    if field is None:
+        return array
+    return array[field] if isinstance(field, str) else array[:, field]
+
+
+def _sized(request: Request, arrays: dict[str, Array], used: list[Array]) -> Request:
+    """Return the request with the sensor's size that the file says, or that its data set has."""
+    size = [int(_one(request, arrays, name)) if name in arrays else None for name in ("width", "height")]
+    usual = SIZES.get(used[0].name)
+    if usual and size == [None, None] and (request.width, request.height) == (None, None):
+        return request.sized(*usual)
+    return request.sized(*size)
+
+
+def _one(request: Request, arrays: dict[str, Array], name: str) -> np.ndarray:
+    """Return the one number or text of an array."""
+    array = arrays[name]
+    if (
+        int(np.prod(array.shape, dtype=object)) != 1
+        or array.dtype.kind not in "iufU"
+        or array.dtype.itemsize > 64
+    ):
+        raise request.refusal(
+            f"array {name} has dtype {array.dtype} and shape {array.shape}, not one number; save it again"
+        )
+    with array.open() as file:
+        _shape(request, file, name)
+        raw = file.read(array.dtype.itemsize)
+    if len(raw) != array.dtype.itemsize:
+        raise request.refusal(
+            f"array {name} declares {array.dtype.itemsize} bytes and contains {len(raw)}; save it again"
+        )
+    return np.frombuffer(raw, array.dtype)[0]
+
+
+def _text(request: Request, arrays: dict[str, Array], name: str) -> str | None:
+    """Return the text of an array, or None."""
+    return str(_one(request, arrays, name)) if name in arrays else None
+
+
+def _listing(arrays: dict[str, Array]) -> str:
+    """Return the arrays of a file in words."""
+    shown = [f"{array.name} {array.dtype} {array.shape}" for array in list(arrays.values())[:12]]
+    return f"it contains {', '.join(shown) or 'no arrays'}"

@@ -1,0 +1,289 @@
+"""Put the events of a file in the order of time, by rules that are the same for every format.
+
+Real files contain a little disorder and some damage. Late events are sorted in. An event outside the
+sensor, of an older clock, or with a time far from all others is left out and counted. Gaps are told.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+
+import numba
+import numpy as np
+
+from envs.events import EVENT
+from envs.recordings.event_file import (
+    OLD_CLOCK,
+    OUTSIDE,
+    RESETS,
+    STRAY_TIMES,
+    TOO_LATE,
+    TORN,
+    Opened,
+    Part,
+    Request,
+    Tally,
+)
+
+FAR_US = 1_000_000  # a longer step is a gap, or a clock that was set
+TORN_US = 990_000  # an event as late as this has a second that was not carried (jAER drops them too)
+FEW_STRAYS = 100  # events in a row whose times may be damaged
+FEW_OLD = 10_000  # events that a camera may send with the clock of before a reset
+MOST_RESETS = 16
+
+GOOD, IS_OUTSIDE, IS_TORN, IS_LEFT_OUT = range(4)  # marks of events
+
+
+@dataclasses.dataclass
+class Clock:
+    """Follow the time from part to part.
+
+    Attributes:
+        newest_us: Newest time that was taken [us]; -1: none.
+        shift_us: Added to the times of the file after a reset [us].
+        taken: Number of events that were taken.
+        seen: Number of events of the file.
+        delivered_us: Newest time that was handed on [us]; -1: none.
+    """
+
+    newest_us: int = -1
+    shift_us: int = 0
+    taken: int = 0
+    seen: int = 0
+    delivered_us: int = -1
+
+
+def in_order(opened: Opened, hold: int | None) -> Iterator[Part]:
+    """Yield the events of a file in the order of time.
+
+    Args:
+        opened: The file.
+        hold: The newest second of events is held back until later events are known, but at most so many
+            events; None: the whole file is one part.
+
+    Raises:
+        ValueError: More than a tenth of the events are outside the sensor, the clock goes back often, or
+            the request is strict and the file is damaged.
+    """
+    request, tally, clock, held = opened.request, opened.tally, Clock(), Part(np.empty(0, EVENT))
+    for part in opened.parts if hold is not None else (joined(opened.parts, request),):
+        good, is_old = _taken(part, request, tally, clock)
+        merged = _merged(Part(held.events[:0]) if is_old else held, good, tally, clock)
+        check_strict(request, tally)
+        cut = len(merged.events)
+        if hold is not None and cut:
+            recent = int(np.searchsorted(merged.events["t"], merged.events["t"][-1] - FAR_US))
+            cut = max(recent, cut - hold)
+        held = _cut(merged, slice(cut, None))._replace(triggers=Part(held.events).triggers)
+        yield _delivered(_cut(merged, slice(0, cut)), clock)
+    check_strict(request, tally)
+    if len(held.events):
+        yield _delivered(held, clock)
+
+
+def joined(parts: Iterator[Part], request: Request) -> Part:
+    """Return all parts as one.
+
+    Raises:
+        ValueError: They have more than `max_events` events.
+    """
+    some, count = [Part(np.empty(0, EVENT))], 0
+    for part in parts:
+        some.append(part)
+        count = request.check_count(count + len(part.events))
+    labels = [part.is_noise for part in some if part.is_noise is not None]
+    return Part(
+        np.concatenate([part.events for part in some]) if len(some) != 2 else some[1].events,
+        np.concatenate(labels) if labels else None,
+        np.concatenate([part.triggers for part in some]),
+    )
+
+
+def check_strict(request: Request, tally: Tally) -> None:
+    """Refuse a damaged file if the request is strict.
+
+    Raises:
+        ValueError: The tally counts damage.
+    """
+    if request.strict and (tally.damage or tally.strays):
+        raise request.refusal(
+            f"is damaged ({'; '.join(damage_lines(tally))}); read it without strict, which leaves this out"
+        )
+
+
+def damage_lines(tally: Tally) -> list[str]:
+    """Return a line for each kind of damage with its count."""
+    lines = [f"{count:,} {name}" for name, count in tally.damage.items()]
+    return lines + ([f"{tally.strays:,} stray times of the stream"] if tally.strays else [])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def walk(
+    events: np.ndarray, width: int, height: int, newest: int, marks: np.ndarray, breaks: np.ndarray
+) -> tuple[int, int, int]:
+    """Mark events outside the sensor and torn ones, and find where time makes a long step.
+
+    Args:
+        events: EVENT array (N,) in the order of the file.
+        width: Columns of the sensor [px].
+        height: Its rows [px].
+        newest: The newest time before them [us]; -1: none.
+        marks: uint8 (N,), filled with marks.
+        breaks: int64 (N,), filled with the first event after each step of more than a second.
+
+    Returns:
+        Number of events outside, number of torn events, number of breaks.
+    """
+    outside, torn, count = 0, 0, 0
+    is_begun = newest >= 0
+    for i in range(events.size):
+        event = events[i]
+        if event.x >= width or event.y >= height:
+            marks[i] = IS_OUTSIDE
+            outside += 1
+            continue
+        marks[i] = GOOD
+        step = event.t - newest
+        if is_begun and (step > FAR_US or step < -FAR_US):
+            breaks[count] = i
+            count += 1
+            newest = event.t
+        elif is_begun and step < -TORN_US:
+            marks[i] = IS_TORN
+            torn += 1
+        elif step > 0 or not is_begun:
+            newest = event.t
+        is_begun = True
+    return outside, torn, count
+
+
+@numba.njit(cache=True, error_model="numpy")
+def count_late(events: np.ndarray, newest: int) -> tuple[int, int]:
+    """Return how many events are older than one before them, and the newest time [us]."""
+    late = 0
+    for i in range(events.size):
+        t = events[i].t
+        late += t < newest
+        newest = max(newest, t)
+    return late, newest
+
+
+def _taken(part: Part, request: Request, tally: Tally, clock: Clock) -> tuple[Part, bool]:
+    """Return the good events of a part, and whether all events before them are of an older clock."""
+    events = part.events
+    marks, breaks = np.empty(len(events), np.uint8), np.empty(len(events), np.int64)
+    size = request.width or 65536, request.height or 65536
+    newest = clock.newest_us - clock.shift_us if clock.newest_us >= 0 else -1
+    outside, torn, count = walk(events, *size, newest, marks, breaks)
+    clock.seen += len(events)
+    _count_outside(request, tally, clock, events, outside)
+    if torn:
+        tally.damage[TORN] += torn
+    is_old = False
+    if count:
+        events, is_old = _without_jumps(request, events, marks, breaks[:count].copy(), tally, clock)
+    elif clock.shift_us:
+        events = events.copy()
+        events["t"] += clock.shift_us
+    if marks.any():
+        good = marks == GOOD
+        labels = part.is_noise if part.is_noise is None else part.is_noise[good]
+        part = Part(events[good], labels, part.triggers)
+    else:
+        part = part._replace(events=events)
+    late, clock.newest_us = count_late(part.events, -1 if is_old else clock.newest_us)
+    tally.late += late
+    clock.taken += len(part.events)
+    return part, is_old
+
+
+def _count_outside(request: Request, tally: Tally, clock: Clock, events: np.ndarray, outside: int) -> None:
+    """Count events outside the sensor, and refuse the file if they are many."""
+    if not outside:
+        return
+    tally.damage[OUTSIDE] += outside
+    if tally.damage[OUTSIDE] > max(1, clock.seen // 10) or tally.damage[OUTSIDE] == clock.seen:
+        raise request.refusal(
+            f"has events up to x={events['x'].max()}, y={events['y'].max()}, {tally.damage[OUTSIDE]:,} of "
+            f"{clock.seen:,} outside the sensor of {request.width}x{request.height}; give the right width "
+            "and height"
+        )
+
+
+def _without_jumps(
+    request: Request, events: np.ndarray, marks: np.ndarray, breaks: np.ndarray, tally: Tally, clock: Clock
+) -> tuple[np.ndarray, bool]:
+    """Decide what each long step of the time is: a gap, stray times, an older clock or a reset.
+
+    Returns:
+        The events, on one clock, with marks where they are left out; and whether everything before
+        the part is of an older clock.
+    """
+    events, is_old = events.copy(), False
+    bounds = [0, *breaks.tolist(), len(events)]
+    runs = [(a, b) for a, b in itertools.pairwise(bounds) if (marks[a:b] == GOOD).any()]
+    firsts = [int(events["t"][a:b][marks[a:b] == GOOD][0]) for a, b in runs] + [-1]
+    now = clock.newest_us
+    for (a, b), first, later in zip(runs, firsts, firsts[1:], strict=False):
+        run, size = slice(a, b), int(np.count_nonzero(marks[a:b] == GOOD))
+        shown, follows = first + clock.shift_us, later + clock.shift_us >= now - FAR_US and later >= 0
+        is_back = now >= 0 and shown < now - FAR_US
+        is_gap = now >= 0 and shown > now + FAR_US
+        if size <= FEW_STRAYS and follows and (is_back or (is_gap and later < first)):
+            tally.damage[STRAY_TIMES] += size
+            marks[run][marks[run] == GOOD] = IS_LEFT_OUT
+            continue
+        if is_back and _is_old(marks[:a], clock, size):
+            tally.damage[OLD_CLOCK] += clock.taken + int(np.count_nonzero(marks[:a] == GOOD))
+            marks[:a] = np.where(marks[:a] == GOOD, IS_LEFT_OUT, marks[:a])
+            clock.taken, clock.shift_us, is_old = 0, 0, True
+            tally.gaps.clear()
+        elif is_back:
+            tally.damage[RESETS] += 1
+            clock.shift_us += now + 1 - shown
+            if tally.damage[RESETS] > MOST_RESETS:
+                raise request.refusal(
+                    f"goes back in time more than {MOST_RESETS} times by more than a second; check format, "
+                    "columns and time_unit, or sort its events"
+                )
+        elif is_gap:
+            tally.gaps.append((now, shown))
+        events["t"][run] += clock.shift_us
+        now = int(events["t"][run][marks[run] == GOOD].max())
+    return events, is_old
+
+
+def _is_old(marks: np.ndarray, clock: Clock, size: int) -> bool:
+    """Whether the few events before a run are left over from an older clock."""
+    before = clock.taken + int(np.count_nonzero(marks == GOOD))
+    return clock.delivered_us < 0 and before <= min(FEW_OLD, size // 10)
+
+
+def _merged(held: Part, part: Part, tally: Tally, clock: Clock) -> Part:
+    """Return the events that were held back and those of a part, sorted; ties keep their order."""
+    if len(held.events):
+        labels = None
+        if held.is_noise is not None and part.is_noise is not None:
+            labels = np.concatenate((held.is_noise, part.is_noise))
+        part = Part(np.concatenate((held.events, part.events)), labels, part.triggers)
+    t_us = part.events["t"]
+    if len(t_us) and (t_us[1:] < t_us[:-1]).any():
+        part = _cut(part, np.argsort(t_us, kind="stable"))
+    if len(t_us) and part.events["t"][0] < clock.delivered_us:
+        first = int(np.searchsorted(part.events["t"], clock.delivered_us))
+        tally.damage[TOO_LATE] += first
+        part = _cut(part, slice(first, None))
+    return part
+
+
+def _cut(part: Part, which: slice | np.ndarray) -> Part:
+    """Return some events of a part."""
+    labels = part.is_noise if part.is_noise is None else part.is_noise[which]
+    return part._replace(events=part.events[which], is_noise=labels)
+
+
+def _delivered(part: Part, clock: Clock) -> Part:
+    """Return a part that is handed on."""
+    if len(part.events):
+        clock.delivered_us = int(part.events["t"][-1])
+    return part

@@ -1,0 +1,252 @@
+"""Read events of any format: a whole file, a range of its times, or part by part."""
+
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs.events import EVENT
+from envs.recordings.event_file import (
+    MAX_BYTES,
+    PART_EVENTS,
+    EventFile,
+    Opened,
+    Part,
+    Request,
+    Tally,
+    check_file,
+    usual_events,
+)
+from envs.recordings.formats import FORMATS, TABLE, check_options, recognised
+from envs.recordings.names import US_PER
+from envs.recordings.order import damage_lines, in_order, joined
+from envs.recordings.ros_storage import is_bag_folder
+
+MOST_GAPS = 3  # that a warning names
+
+
+def read_events(  # noqa: PLR0913  each is something else that a file may not say
+    path: str | Path,
+    format: str | None = None,
+    *,
+    width: int | None = None,
+    height: int | None = None,
+    columns: Sequence[str] | None = None,
+    time_unit: str | None = None,
+    topic: str | None = None,
+    group: str | None = None,
+    stream: int | None = None,
+    start_us: int | None = None,
+    end_us: int | None = None,
+    strict: bool = False,
+    max_events: int | None = None,
+    max_bytes: int = MAX_BYTES,
+) -> EventFile:
+    """Read an event file of any known format.
+
+    Damage is left out and counted in `damage`; one warning tells of it, and of gaps.
+
+    Args:
+        path: A regular file, or the folder of a rosbag2.
+        format: One of `FORMATS`; None: by how the file begins, else by its suffix.
+        width: Columns of the sensor [px], where the file does not say.
+        height: Its rows [px].
+        columns: Text, and rows without names: all columns in their order, such as ("t", "x", "y", "p");
+            others than these four are passed over. npz and HDF5: names of the arrays of t, x, y and p.
+        time_unit: "s", "ms", "us" or "ns", for files that do not say.
+        topic: Topic of events in a ROS bag.
+        group: Group or data set of an HDF5 file, or array of an npz file, that has the events.
+        stream: Number of a stream or source of an AEDAT file.
+        start_us: First time that is read [us], on the clock of the file.
+        end_us: Time before which reading ends [us].
+        strict: Whether damage is refused.
+        max_events: Most events that are read; each takes 13 bytes in the end and up to 80 on the way
+            (a camera's own format: 50). None: two for each byte of the file, but ten million
+            of any file and at most a hundred million.
+        max_bytes: Largest file that is opened [bytes].
+
+    Returns:
+        The events sorted by t (ties keep the order of the file), p in {-1, +1}, with the sensor's size.
+
+    Raises:
+        ValueError: The file is no regular file, of no known format, too large, damaged beyond what is
+            tolerated, or breaks a rule of its format; the message names the file, the rule and the remedy.
+    """
+    opened, tally = _opened(locals())
+    request = opened.request
+    try:
+        if request.is_range:
+            ordered: Iterator[Part] = _within(in_order(opened, request.part_events), request)
+        else:
+            ordered = in_order(opened, None)
+        part = joined(ordered, request)
+    except MemoryError:
+        raise ValueError(
+            f"{path}: does not fit into memory; read a part by start_us and end_us, or lower max_events"
+        ) from None
+    file = _file(opened, part, tally)
+    tell(request.path, file)
+    return file
+
+
+def read_parts(  # noqa: PLR0913  as above
+    path: str | Path,
+    format: str | None = None,
+    *,
+    width: int | None = None,
+    height: int | None = None,
+    columns: Sequence[str] | None = None,
+    time_unit: str | None = None,
+    topic: str | None = None,
+    group: str | None = None,
+    stream: int | None = None,
+    start_us: int | None = None,
+    end_us: int | None = None,
+    strict: bool = False,
+    part_events: int = PART_EVENTS,
+    max_bytes: int = MAX_BYTES,
+) -> Iterator[EventFile]:
+    """Yield the events of a file in parts, in order, in memory that is bounded by the part.
+
+    Events that are late by less than a second are sorted in, if the second has no more events than a part;
+    events that are too late are counted in `damage`.
+
+    Args:
+        path: As in `read_events`, and so are the other arguments.
+        format: As there.
+        width: As there.
+        height: As there.
+        columns: As there.
+        time_unit: As there.
+        topic: As there.
+        group: As there.
+        stream: As there.
+        start_us: As there.
+        end_us: As there.
+        strict: As there.
+        part_events: Most events of a part, about.
+        max_bytes: As there.
+
+    Yields:
+        Parts, each with the counts of what was found since the part before it. A file without events gives
+        one part without events.
+
+    Raises:
+        ValueError: As `read_events`.
+    """
+    if part_events < 1:
+        raise ValueError(f"part_events must be at least 1, got {part_events}")
+    opened, tally = _opened(locals() | {"max_events": 1 << 62})
+    return _parts(opened, tally)
+
+
+def _parts(opened: Opened, tally: Tally) -> Iterator[EventFile]:
+    """Yield parts as files."""
+    is_first = True
+    ordered = in_order(opened, opened.request.part_events)
+    empty = None
+    for part in _within(ordered, opened.request) if opened.request.is_range else ordered:
+        file = _file(opened, part, tally)
+        tally = dataclasses.replace(
+            opened.tally,
+            damage=opened.tally.damage.copy(),
+            gaps=opened.tally.gaps.copy(),
+            notes=opened.tally.notes.copy(),
+        )
+        tell(opened.request.path, file)
+        if len(file.events) or len(file.triggers):
+            yield file
+            is_first = False
+        else:
+            empty = file
+    if is_first:
+        yield empty or _file(opened, Part(np.empty(0, EVENT)), tally)
+
+
+def _opened(arguments: dict[str, Any]) -> tuple[Opened, Tally]:
+    """Open the file that the arguments of `read_events` describe, with an empty tally beside it."""
+    path, format = Path(arguments["path"]), arguments["format"]
+    if is_bag_folder(path):
+        size, kind = sum(one.stat().st_size for one in path.iterdir() if one.is_file()), format or "ros"
+        if kind != "ros":
+            raise ValueError(f"{path}: is the folder of a ROS bag and no {kind} file; leave format out")
+    else:
+        size = check_file(path, arguments["max_bytes"])
+        kind = format or recognised(path)
+    if kind not in TABLE or TABLE[kind].read is None:
+        raise ValueError(f"{path}: format must be one of {', '.join(FORMATS)}, got {format!r}")
+    if arguments["time_unit"] is not None and arguments["time_unit"] not in US_PER:
+        raise ValueError(f"time_unit must be one of {', '.join(US_PER)}, got {arguments['time_unit']!r}")
+    check_options(path, kind, arguments)
+    columns, most = arguments["columns"], arguments["max_events"]
+    names = {field.name for field in dataclasses.fields(Request)} - {"path", "columns", "max_events"}
+    request = Request(
+        path,
+        columns=None if columns is None else tuple(columns),
+        max_events=usual_events(size) if most is None else most,
+        **{name: value for name, value in arguments.items() if name in names},
+    )
+    read = TABLE[kind].read
+    assert read is not None  # noqa: S101  for the type checker
+    return read(request), Tally()
+
+
+def _within(parts: Iterator[Part], request: Request) -> Iterator[Part]:
+    """Yield what lies in the range of times of a request, and stop after it."""
+    start, end = request.start_us, request.end_us
+    for part in parts:
+        t_us, triggers = part.events["t"], part.triggers
+        first = 0 if start is None else int(np.searchsorted(t_us, start))
+        last = len(t_us) if end is None else int(np.searchsorted(t_us, end))
+        inside = np.ones(len(triggers), bool)
+        inside &= triggers["t"] >= start if start is not None else True
+        inside &= triggers["t"] < end if end is not None else True
+        labels = part.is_noise if part.is_noise is None else part.is_noise[first:last]
+        yield Part(part.events[first:last].copy(), labels, triggers[inside])
+        if last < len(t_us):
+            return
+
+
+def _file(opened: Opened, part: Part, before: Tally) -> EventFile:
+    """Return a part with the counts since another tally."""
+    tally, request = opened.tally, opened.request
+    damage = {
+        name: count - before.damage[name]
+        for name, count in tally.damage.items()
+        if count > before.damage[name]
+    }
+    return EventFile(
+        part.events,
+        request.width,
+        request.height,
+        opened.format,
+        tally.late - before.late,
+        tally.skipped - before.skipped,
+        strays=tally.strays - before.strays,
+        is_noise=part.is_noise,
+        triggers=part.triggers,
+        damage=damage,
+        gaps=tuple(tally.gaps[len(before.gaps) :]),
+        notes=tuple(tally.notes[len(before.notes) :]),
+    )
+
+
+def tell(path: Path, file: EventFile) -> None:
+    """Warn once of what a reader left out, chose, or found missing."""
+    lines = list(file.notes)
+    lost = damage_lines(Tally(strays=file.strays, damage=file.damage))  # type: ignore[arg-type]
+    if lost:
+        lines.append(f"left out or moved: {'; '.join(lost)}. strict=True refuses such a file")
+    if file.gaps:
+        shown = ", ".join(
+            f"{(b - a) / 1e6:,.1f} s from {a / 1e6:,.3f} s on"
+            for a, b in itertools.islice(file.gaps, MOST_GAPS)
+        )
+        more = f" and {len(file.gaps) - MOST_GAPS:,} more" if len(file.gaps) > MOST_GAPS else ""
+        lines.append(f"no events for {shown}{more}")
+    if lines:
+        warnings.warn(f"{path}: {'. '.join(lines)}.", stacklevel=3)

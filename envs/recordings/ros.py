@@ -1,0 +1,124 @@
+"""Read events of ROS bags: dvs_msgs, prophesee_event_msgs and event_camera_msgs.
+
+Messages are decoded from their bytes: an object for each event would take a hundred times as long.
+"""
+
+import struct
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.recordings.event_file import (
+    CUT,
+    CUT_PACKETS,
+    TRIGGER,
+    Opened,
+    Part,
+    Request,
+    Tally,
+    assemble,
+)
+from envs.recordings.event_packets import PacketDecoder
+from envs.recordings.ros_messages import EventPacket, Values, event_array, event_packet
+from envs.recordings.ros_storage import Bag, Message, Topic, messages, open_bags
+
+# Types of messages with events, and with arrays of packed bytes.
+ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
+PACKETS = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
+MIN_BYTES = 2  # of an event, about
+
+
+class Size(NamedTuple):
+    """The sensor's size as the first message says it."""
+
+    width: int | None
+    height: int | None
+
+
+def read_ros(request: Request) -> Opened:
+    """Open a ROS 1 bag, or a rosbag2 as a folder or a .db3 or .mcap file.
+
+    Events come from the topic that `topic` names, else from the one topic of events with most messages.
+
+    Raises:
+        ValueError: The library rosbags is missing, or there is no such topic; the message lists them.
+    """
+    bags, tally = open_bags(request), Tally()
+    topics = list(dict.fromkeys(topic for bag in bags for topic in bag.topics))
+    for bag in bags:
+        if not bag.is_whole:
+            tally.damage[CUT_PACKETS] += 1
+    if not topics and not all(bag.is_whole for bag in bags):  # cut off before its first record
+        tally.damage[CUT] += sum(bag.path.stat().st_size for bag in bags)
+        return Opened("ros", request, tally, iter(()))
+    topic = _chosen(request, topics, tally)
+    size = _size(bags, topic.name)
+    return Opened("ros", request.sized(*size), tally, _parts(request, tally, bags, topic))
+
+
+def _chosen(request: Request, topics: list[Topic], tally: Tally) -> Topic:
+    """Return the topic that is read."""
+    found = [topic for topic in topics if topic.kind in (*ARRAYS, *PACKETS)]
+    if request.topic is not None:
+        found = [topic for topic in found if topic.name == request.topic]
+    if not found:
+        listing = ", ".join(f"{topic.name} ({topic.kind})" for topic in topics)
+        wanted = "" if request.topic is None else f" {request.topic!r}"
+        raise request.refusal(
+            f"has no topic{wanted} of events ({', '.join((*ARRAYS, *PACKETS))}); its topics are {listing}: "
+            "give topic as one of events, or another bag"
+        )
+    found = sorted(found, key=lambda topic: -topic.number)
+    if len(found) > 1:
+        names = ", ".join(topic.name for topic in found)
+        tally.notes.append(f"topic {found[0].name} is read of {names}; topic= chooses")
+    return found[0]
+
+
+def _size(bags: list[Bag], topic: str) -> Size:
+    """Return the sensor's size by the first message."""
+    for bag in bags:
+        for message in messages(bag, {topic}):
+            try:
+                values = Values(message.raw, bag.is_ros1)
+                decoded = event_array(values) if message.kind in ARRAYS else event_packet(values)
+            except (struct.error, ValueError):
+                continue
+            return Size(decoded.width or None, decoded.height or None)
+    return Size(None, None)
+
+
+def _parts(request: Request, tally: Tally, bags: list[Bag], topic: Topic) -> Iterator[Part]:
+    """Yield the events of a topic."""
+    packets, arrays, size = PacketDecoder(request, tally), [], 0
+    for bag in bags:
+        for message in messages(bag, {topic.name}):
+            decoded = _decoded(message, bag, tally)
+            if isinstance(decoded, EventPacket):
+                packets.add(decoded)
+            elif decoded is not None:
+                arrays.append(decoded)
+            size += len(message.raw) // MIN_BYTES
+            if size >= request.part_events:
+                yield _part(request, tally, packets, arrays)
+                arrays, size = [], 0
+    yield _part(request, tally, packets, arrays)
+
+
+def _decoded(message: Message, bag: Bag, tally: Tally) -> EventPacket | np.ndarray | None:
+    """Return the events of one message, or None if it is damaged."""
+    try:
+        values = Values(message.raw, bag.is_ros1)
+        return event_array(values).columns if message.kind in ARRAYS else event_packet(values)
+    except (struct.error, ValueError):
+        tally.damage[CUT_PACKETS] += 1
+        return None
+
+
+def _part(request: Request, tally: Tally, packets: PacketDecoder, arrays: list[np.ndarray]) -> Part:
+    """Return the events of some messages."""
+    if arrays:
+        t_us, x, y, p = np.concatenate(arrays, axis=1)
+        return Part(assemble(request, tally, t_us, x, y, p)[0], None, np.empty(0, TRIGGER))
+    return packets.taken()

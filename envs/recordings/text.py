@@ -1,0 +1,204 @@
+"""Read text and CSV files of events, one event a line."""
+
+import io
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from itertools import islice
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from envs.recordings.event_file import CUT_LINE, Opened, Part, Request, Tally, assemble
+from envs.recordings.names import COLUMNS, microseconds, roles
+
+E2VID = {"columns": "t x y p", "usual_unit": "s"}  # after a first line with the sensor's size
+MAX_LINE_BYTES = 1000
+MAX_HEADER_LINES = 1000
+CHUNK_BYTES = 1 << 20
+PART_LINES = 1 << 18
+WORD = re.compile(r"[A-Za-z_]")
+NUMBERS = re.compile(r"nan|[+-]?inf|true|false", re.IGNORECASE)
+TRUTH = {"true": "1", "false": "0"}
+
+
+class Table(NamedTuple):
+    """How a text file lays out its events.
+
+    Attributes:
+        facts: What comment lines say: columns, time_unit, width, height.
+        names: Names of the columns in the first line that is no comment, if there are any.
+        skip: Lines before the first event.
+        separator: Of columns; None: spaces.
+        has_words: Whether truth values are written as words.
+    """
+
+    facts: dict[str, str]
+    names: list[str]
+    skip: int
+    separator: str | None
+    has_words: bool
+
+
+def read_text(request: Request, open_bytes: Callable[[], IO[bytes]] | None = None) -> Opened:
+    """Open a text or CSV file.
+
+    Lines that begin with `#` or `%` may say `columns`, `time_unit`, `width` and `height`, or name the
+    columns; or the first line names them, the time with its unit, such as `t_us,x,y,p` or
+    `timestamp[s] x y polarity`. What the file does not say the caller must. Columns are separated by
+    commas, semicolons, tabs or spaces. Further columns are passed over. A first line of two numbers is
+    E2VID's: width and height, before `t x y p` in seconds.
+
+    Args:
+        request: The file.
+        open_bytes: Opens the text; None: the file itself is the text.
+
+    Raises:
+        ValueError: Columns or unit are unknown, a line is no row of numbers or longer than
+            1,000 bytes, or the text is not UTF-8.
+    """
+    open_bytes = open_bytes or (lambda: request.path.open("rb"))
+    _check_lines(request, open_bytes)
+    with _refusing(request), open_bytes() as raw:
+        table = _table(io.TextIOWrapper(raw, "utf-8-sig"))
+        size = [int(table.facts[name]) if name in table.facts else None for name in ("width", "height")]
+    words = list(request.columns or table.names or table.facts.get("columns", "").split())
+    places, told = roles(request, words)
+    if "t" not in places and {"sec", "nsec"} <= places.keys():
+        places["t"] = places["sec"]
+        told = "us"
+    missing = [name for name in COLUMNS if name not in places]
+    if missing:
+        raise request.refusal(
+            f"does not name the column {missing[0]!r} (it names {words or 'none'}); "
+            "give columns=('t', 'x', 'y', 'p') in the order of the file and time_unit"
+        )
+    unit = table.facts.get("time_unit", told)
+    request, tally = request.sized(*size), Tally()
+    microseconds(request, np.zeros(1), unit, table.facts.get("usual_unit"))  # refuses a missing unit now
+    return Opened("txt", request, tally, _parts(request, tally, open_bytes, table, places, unit))
+
+
+def _parts(
+    request: Request,
+    tally: Tally,
+    open_bytes: Callable[[], IO[bytes]],
+    table: Table,
+    places: dict[str, int],
+    unit: str | None,
+) -> Iterator[Part]:
+    """Yield the events of the lines."""
+    columns = [places[name] for name in COLUMNS]
+    if "nsec" in places and places["t"] == places.get("sec"):
+        columns.append(places["nsec"])
+    with _refusing(request), open_bytes() as raw:
+        lines = io.TextIOWrapper(raw, "utf-8-sig")
+        for _ in islice(lines, table.skip):
+            pass
+        while some := list(islice(lines, min(request.part_events, PART_LINES))):
+            if not some[-1].endswith("\n") and not _is_whole(some[-1], table, columns):
+                tally.damage[CUT_LINE] += 1
+                some = some[:-1]
+            t, x, y, p, *nanoseconds = _numbers(some, table, columns).T
+            if nanoseconds:
+                t_us = np.rint(t * 1e6 + nanoseconds[0] * 1e-3)
+            else:
+                t_us = microseconds(request, t, unit, table.facts.get("usual_unit"))
+            yield Part(assemble(request, tally, t_us, x, y, p)[0])
+
+
+def _numbers(lines: list[str], table: Table, columns: list[int]) -> np.ndarray:
+    """Return the numbers of some columns of lines, float64 (N, columns)."""
+    if table.has_words:
+        lines = [
+            re.sub("true|false", lambda word: TRUTH[word[0].lower()], line, flags=re.I) for line in lines
+        ]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+        return np.loadtxt(
+            lines, np.float64, "#", table.separator, usecols=columns, ndmin=2, quotechar='"'
+        ).reshape(-1, len(columns))
+
+
+def _is_whole(line: str, table: Table, columns: list[int]) -> bool:
+    """Whether the last line of a file, which has no end, is a row of numbers."""
+    try:
+        return line.lstrip().startswith(("#", "%")) or len(_numbers([line], table, columns)) == 1
+    except ValueError:
+        return not line.strip()
+
+
+class _refusing:
+    """Turn errors of numpy and of the decoder into a refusal of the file."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        """Raise the refusal."""
+        if isinstance(error, UnicodeDecodeError):
+            raise self._request.refusal(
+                f"is not UTF-8 text ({error.reason} at byte {error.start}); give the format"
+            ) from None
+        if isinstance(error, ValueError) and not str(error).startswith(str(self._request.path)):
+            raise self._request.refusal(
+                f"has a line that is no row of numbers ({error}); repair or remove it"
+            ) from None
+
+
+def _check_lines(request: Request, open_bytes: Callable[[], IO[bytes]]) -> None:
+    """Refuse too many lines or one that is too long, in memory that does not grow."""
+    lines, carried = 0, 0
+    with open_bytes() as file:
+        while chunk := file.read(CHUNK_BYTES):
+            ends = np.flatnonzero(np.frombuffer(chunk, np.uint8) == ord("\n"))
+            lines += len(ends)
+            lengths = np.diff(ends, prepend=-1 - carried, append=len(chunk))
+            if lengths.max() > MAX_LINE_BYTES:
+                raise request.refusal(
+                    f"has a line of more than {MAX_LINE_BYTES} bytes, so it is no text; give its format"
+                )
+            carried = int(lengths[-1]) - 1
+            request.check_declared(max(0, lines - MAX_HEADER_LINES))
+
+
+def _table(lines: IO[str]) -> Table:
+    """Return the layout that the first lines show."""
+    facts: dict[str, str] = {}
+    number = -1
+    for number, line in enumerate(lines):
+        text = line.strip()
+        if text.startswith(("#", "%")) or not text:
+            facts |= _facts(text)
+            continue
+        separator = next((mark for mark in ";,\t" if mark in text), None)
+        words = [word.strip().strip('"') for word in text.split(separator)]
+        if len(words) == 2 and all(word.isdecimal() for word in words) and "width" not in facts:
+            facts |= E2VID | dict(zip(("width", "height"), words, strict=True))
+            continue
+        is_header = any(WORD.match(word) and not NUMBERS.fullmatch(word) for word in words)
+        row = next(lines, "") if is_header else text
+        return Table(facts, words if is_header else [], number + is_header, separator, _has_words(row))
+    return Table(facts, [], number + 1, None, False)
+
+
+def _facts(text: str) -> dict[str, str]:
+    """Return what a comment line says: `name: value`, `%geometry:W,H` (Metavision), or names of columns."""
+    text = text.lstrip("#% ")
+    name, _, value = (part.strip() for part in text.partition(":"))
+    if name == "geometry" and (size := re.fullmatch(r"(\d{1,5})[,x ]+(\d{1,5})", value)):
+        return {"width": size[1], "height": size[2]}
+    words = [word.lower().partition("(")[0].partition("[")[0] for word in re.split(r"[\s,;]+", text)]
+    if {"x", "y"} <= set(words) and not value:
+        return {"columns": " ".join(re.split(r"[\s,;]+", text))}
+    if name.lower() in ("columns", "time_unit", "width", "height"):
+        return {name.lower(): value.replace(",", " ").strip()}
+    return {}
+
+
+def _has_words(line: str) -> bool:
+    """Whether truth values are written as words."""
+    return re.search("true|false", line, re.IGNORECASE) is not None

@@ -1,0 +1,102 @@
+"""Write events to a file of any format, at once or part by part."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from envs.events import EVENT
+from envs.recordings.event_file import check_events
+from envs.recordings.formats import LABELLED, TABLE, WRITERS, WRITTEN_SUFFIXES
+from envs.recordings.writing import Append
+
+Write = Callable[..., None]
+
+
+def write_events(
+    path: str | Path,
+    events: np.ndarray,
+    width: int,
+    height: int,
+    format: str | None = None,
+    *,
+    is_noise: np.ndarray | None = None,
+) -> None:
+    """Write events to a file, which appears whole or not at all; `read_events` gives the same events.
+
+    Formats: "npz" and "hdf5" (the layout of DSEC), which EventCV opens too, "txt" and "csv" (a header names
+    columns and unit), and what the cameras' own tools open: iniVation's "aedat4", Prophesee's "dat", "evt2"
+    and "evt3".
+
+    Args:
+        path: The file; its folder is made. A file of that name is replaced.
+        events: EVENT array (N,), sorted by t.
+        width: Columns of the sensor [px].
+        height: Its rows [px].
+        format: One of the above; None: by the suffix (`.raw` is "evt3").
+        is_noise: bool (N,), which events are noise, as `video_to_events` labels them; for "npz" and "hdf5".
+
+    Raises:
+        ValueError: The format is unknown, the events or labels are not valid, or the format cannot store
+            them: its clock ends before the last event (dat 2**32 us, evt2 2**34 us), or before
+            the first (evt3 2**24 us), or it has fewer pixels.
+    """
+    check_events(events, width, height)
+    with event_writer(path, width, height, format, is_labelled=is_noise is not None) as write:
+        write(events, is_noise)
+
+
+@contextlib.contextmanager
+def event_writer(
+    path: str | Path, width: int, height: int, format: str | None = None, *, is_labelled: bool = False
+) -> Iterator[Write]:
+    """Yield a function that adds events to a file, in memory that is bounded by the part.
+
+    The file appears when the block ends without an error. The function takes an EVENT array that begins no
+    earlier than the last one ended, and labels if the file has them.
+
+    Args:
+        path: As in `write_events`.
+        width: As there.
+        height: As there.
+        format: As there.
+        is_labelled: Whether each part comes with labels of noise.
+
+    Raises:
+        ValueError: As `write_events`.
+    """
+    path = Path(path)
+    kind = format or WRITTEN_SUFFIXES.get(path.suffix.lower(), "")
+    if kind not in WRITERS:
+        raise ValueError(f"{path}: format must be one of {', '.join(WRITERS)}, got {format or path.suffix!r}")
+    row, labels = TABLE[kind], (is_labelled,) if kind in LABELLED else ()
+    if is_labelled and not row.has_labels:
+        raise ValueError(f"{path}: {kind} stores no labels of noise; choose {' or '.join(LABELLED)}")
+    check_events(np.empty(0, EVENT), width, height)
+    assert row.write is not None  # noqa: S101  for the type checker
+    with row.write(path, width, height, *labels) as append:
+        yield _checked(path, width, height, append, is_labelled)
+
+
+def _checked(path: Path, width: int, height: int, append: Append, is_labelled: bool) -> Write:
+    """Return a function that checks events before it adds them."""
+    last_us = 0
+
+    def write(events: np.ndarray, is_noise: np.ndarray | None = None) -> None:
+        nonlocal last_us
+        check_events(events, width, height)
+        if len(events) and events["t"][0] < last_us:
+            raise ValueError(
+                f"{path}: a part begins at {events['t'][0]} us, before {last_us} us; sort the parts"
+            )
+        if (is_noise is not None) != is_labelled:
+            raise ValueError(f"{path}: is_noise must be given for every part or for none")
+        if is_noise is not None and (
+            getattr(is_noise, "dtype", None) != np.dtype(bool) or is_noise.shape != events.shape
+        ):
+            raise ValueError(f"{path}: is_noise must be bool {events.shape}, got {is_noise!r:.80}")
+        last_us = int(events["t"][-1]) if len(events) else last_us
+        append(events, is_noise)
+
+    return write

@@ -1,0 +1,89 @@
+"""Read event files as every command does: by the keys `recording.*`, and print what the reader tells."""
+
+import dataclasses
+import re
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from envs.recordings import read_events, read_parts
+from envs.recordings.event_file import EventFile
+from jobs.config.config import ConfigError
+from jobs.config.schema import RecordingConfig
+from jobs.run.progress import console
+
+BARE_ROW = re.compile(rb"\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")  # of the Event Camera Dataset (IJRR 2017)
+TELL_EVERY_S = 10.0
+KEYS = tuple(field.name for field in dataclasses.fields(RecordingConfig))
+EXAMPLES = {"columns": "[t,x,y,p]", "time_unit": "us", "strict": "true", "stream": "0", "start_us": "0"}
+
+
+def read_recording(path: str | Path, settings: RecordingConfig) -> EventFile:
+    """Return the events of a file, and print what was left out, chosen or missing.
+
+    Raises:
+        ValueError: As `envs.recordings.read_events`.
+    """
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        file = read_events(path, **options(path, settings))
+    _print(said)
+    return file
+
+
+def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[EventFile]:
+    """Yield the events of a file in parts, with a line now and then about how far it is.
+
+    Raises:
+        ValueError: As `envs.recordings.read_parts`.
+    """
+    count, told = 0, time.monotonic()
+    given = options(path, settings)
+    most = given.pop("max_events")
+    parts = read_parts(path, **given)
+    while True:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", UserWarning)
+            part = next(parts, None)
+        _print(said)
+        if part is None:
+            return
+        count += len(part.events)
+        if most is not None and count > most:
+            raise ValueError(
+                f"{path}: contains more than max_events={most} events; raise max_events, or give start_us "
+                "and end_us"
+            )
+        if time.monotonic() - told > TELL_EVERY_S:
+            told = time.monotonic()
+            console.print(f"{Path(path).name}: {count / 1e6:,.1f} million events read", markup=False)
+        yield part
+
+
+def options(path: str | Path, settings: RecordingConfig) -> dict[str, Any]:
+    """Return the arguments of `read_events`; bare rows of the Event Camera Dataset need none."""
+    given = {name: getattr(settings, name) for name in KEYS}
+    if given["columns"] is None and given["format"] in (None, "txt") and Path(path).is_file():
+        with Path(path).open("rb") as file:
+            if BARE_ROW.match(file.read(100)):
+                given |= {"format": "txt", "columns": ["t", "x", "y", "p"]}
+                given["time_unit"] = given["time_unit"] or "s"
+    return given
+
+
+def refused(key: str, path: str | Path, error: Exception) -> ConfigError:
+    """Return the error of a command for a file that is refused, with the keys that its remedy names."""
+    if not str(error).startswith(str(path)):
+        error = ValueError(f"{path}: {error}")
+    named = [name for name in KEYS if re.search(rf"\b{name}\b", str(error).partition(": ")[2])]
+    spelled = " ".join(f"recording.{name}={EXAMPLES.get(name, name.upper())}" for name in named)
+    return ConfigError(f"{key}: {error}{f' (as {spelled})' if spelled else ''}")
+
+
+def _print(said: list[warnings.WarningMessage]) -> None:
+    """Print warnings as plain lines, with the keys of commands."""
+    for warning in said:
+        text = re.sub(r"\b(topic|group|stream)= chooses", r"recording.\1 chooses", str(warning.message))
+        console.print(text.replace("strict=True", "recording.strict=true"), markup=False)
