@@ -378,7 +378,7 @@ def variants(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
             right.plot(100 * one.difference.value, row, "|", color=INK, ms=12)
             pairs = 100 * pair_differences(results, one)
             right.plot(pairs, [row] * len(pairs), "o", color=BLUE, ms=4, alpha=0.8)
-    right.set_title("Difference of the mean [points]", loc="left", fontsize=10)
+    right.set_title("Difference [points]", loc="left", fontsize=10)
     tidy(right, "x")
     return figure
 
