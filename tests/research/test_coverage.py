@@ -1,11 +1,11 @@
 import re
 from pathlib import Path
 
-from jobs.analysis import coverage
+from research import coverage
 from research.coverage import SPREADS, change_coverage, true_rate
 from research.stopping import EFFECTS, MEAN
 
-PAGE = (Path(__file__).parents[3] / "docs" / "statistics.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "statistics.md").read_text()
 
 
 def percent(mean, spread):

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from jobs.evaluation.met import met
 
 from envs.config import EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
@@ -15,6 +14,7 @@ from jobs.config.conditions import axis_errors, condition_errors
 from jobs.config.config import ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
 from jobs.run.folder import run_name
+from jobs.study.met import met
 from models.kinds import DenseModel, Kind
 from tests.support.configs import compose, small_config
 
