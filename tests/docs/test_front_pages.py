@@ -25,7 +25,7 @@ TIMED = {
     "make demo": ("README.md", "docs/index.md", "docs/start.md", "docs/experiments.md"),
     "make bytestream": (
         "README.md", "docs/index.md", "docs/start.md", "docs/experiments.md", "docs/train.md",
-        "docs/troubleshooting.md", "docs/differences.md", "Makefile", "conf/hydra/help/evade.yaml",
+        "docs/troubleshooting.md", "Makefile", "conf/hydra/help/evade.yaml",
     ),
     "make sweep-robustness": ("README.md", "docs/experiments.md", "docs/sweep.md"),
 }  # fmt: skip
