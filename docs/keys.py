@@ -122,7 +122,7 @@ def row(key: str, kind: object, fallback: str = "") -> Row:
     unit, source = (", ".join(rule.findall(said)) for rule in (UNIT, SOURCE))
     meaning = SOURCE.sub("", UNIT.sub("", said)).strip(" ;,") or fallback
     value = _defaults().get(key, "")
-    default = "conditions of D.3, F.1" if key == "study.axes" else _as_yaml(value)
+    default = _as_yaml(value)
     return Row(f"`{key}`", f"`{default}`" if default else "", allowed(kind), unit, meaning, source)
 
 

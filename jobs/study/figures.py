@@ -270,7 +270,9 @@ def lines(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     panels = figure.subplots(1, len(panels_of), sharey=True, squeeze=False)[0]
     for panel, value in zip(panels, panels_of, strict=True):
         groups = [group for group in results.trained if tags[group][said["panels"]] == value]
-        shown = [(axis, group) for axis in said["axes"] for group in groups]
+        first = said["axes"][0]
+        shown = [(axis, group) for axis in said["axes"] for group in groups
+                 if axis == first or not _same_episodes(results, first, axis, group)]  # fmt: skip
         for place, (axis, group) in enumerate(shown):
             points = {at[1]: results.values(at, group).mean(axis=1) for at in results.conditions
                       if at[0] == axis and (at, group) in results.cells}  # fmt: skip
@@ -285,6 +287,15 @@ def lines(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     panels[0].set(ylabel="Success [%]", ylim=(-3, 103))
     panels[-1].legend(frameon=False, fontsize=8)
     return figure
+
+
+def _same_episodes(results: Results, one: str, other: str, group: str) -> bool:
+    """Whether a group has the same episodes along two axes, as far as both have a value."""
+    shared = [value for value in results.axes[other] if value in results.axes[one]]
+    return all(
+        content(results.trainings((one, value), group)) == content(results.trainings((other, value), group))
+        for value in shared
+    )
 
 
 def _label_rates(panel: Axes, results: Results, axis: str, trained_at: float) -> None:

@@ -47,7 +47,7 @@ def test_a_study_is_published_with_its_data_figures_and_page_and_the_plan_stays(
     for fact in ("2026-01-02", "`python -m platform.launch +exp=robustness`", "commit c0ffee"):
         assert fact in text
     assert re.search(
-        r"\| `bytestream` \| tolerates dead pixels \| D.3 \| `event_image` \| undecided \| \S+ \[", text
+        r"\| `bytestream` \| tolerates dead pixels \| D.3 \| `event_image` \| undecided \| \S+ m", text
     )
     assert "| nominal | poles_eval | 80 [" in text
     assert "\n\n\n" not in text
