@@ -77,10 +77,10 @@ def report(folder, uri, seed):
     """A sweep whose episodes are made up, and everything else is not."""
     # Here, in a process of its own: Ray reads its token once, when it is imported, and another
     # test of this run names one later.
-    from jobs.evaluation import sweep
+    from jobs.study import study
     from tests.support.fake_executor import FakeExecutor
 
-    sweep.run(in_store(folder, uri, seed), FakeExecutor())
+    study.run(in_store(folder, uri, seed), FakeExecutor())
 
 
 def test_eight_sweeps_report_at_once_and_all_is_read_back(tmp_path, postgres):
