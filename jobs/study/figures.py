@@ -27,7 +27,6 @@ from jobs.study.tables import scale_of
 from jobs.study.words import TITLES, condition_text
 
 COLOURS = {"above": GREEN, "below": RED, "within": BLUE, "no_gain": AMBER}  # of verdicts
-STACKED = 0.16  # rows between the dots of two trainings in a map
 
 
 class Drawn(NamedTuple):
@@ -51,39 +50,44 @@ class Drawn(NamedTuple):
 
 
 def change_map(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
-    """Draw a map of conditions x groups: success [%], coloured by its change, a dot for each training."""
+    """Draw success [%] of conditions x groups, coloured by its change; the first row is the baseline."""
     changes = drawn.changes
-    found = {(change.condition, change.group): change for change in changes}
     columns = [group for group in drawn.results.groups if any(change.group == group for change in changes)]
     rows = [at for at in drawn.results.conditions if any(change.condition == at for change in changes)]
-    figure = Figure(figsize=(3.2 + 1.15 * len(columns), 1.8 + 0.3 * len(rows)), layout="constrained")
+    first = [change.baseline for change in changes if change.baseline[0] == NOMINAL][:1]
+    rows = [*first, *rows]
+    figure = Figure(figsize=(2.6 + 0.85 * len(columns), 1.6 + 0.27 * len(rows)), layout="constrained")
     panel = figure.subplots()
     table = np.full((len(rows), len(columns)), np.nan)
     for change in changes:
-        table[rows.index(change.condition), columns.index(change.group)] = 100 * change.difference.value
+        column = columns.index(change.group)
+        if change.baseline in first:
+            table[0, column] = 0.0
+            _write_cell(panel, change.before, 0.0, 0, column, "normal")
+        row, points = rows.index(change.condition), 100 * change.difference.value
+        table[row, column] = points
+        _write_cell(panel, change.success, points, row, column, "bold" if change.certain else "normal")
     picture = panel.imshow(table, cmap="RdBu", vmin=-100, vmax=100, aspect="auto")
-    for row, column in np.argwhere(np.isfinite(table)):
-        _draw_cell(panel, found[rows[row], columns[column]], row, column)
     alone = {change.group for change in changes if len(change.success) == 1}
-    names = [f"{group} (1 training)" if group in alone else group for group in columns]
-    panel.set_xticks(range(len(columns)), names, rotation=35, ha="left", fontsize=8)
+    names = [f"{group} (1 run)" if group in alone else group for group in columns]
+    panel.set_xticks(range(len(columns)), names, rotation=35, ha="left", fontsize=9)
     panel.xaxis.tick_top()
-    panel.set_yticks(range(len(rows)), [condition_text(at) for at in rows], fontsize=8)
+    panel.set_yticks(range(len(rows)), [condition_text(at) for at in rows], fontsize=9)
+    panel.axhline(0.5, color=INK, lw=1.2, visible=bool(first))
     panel.spines[:].set_visible(False)
     panel.tick_params(length=0)
     bar = figure.colorbar(picture, ax=panel, shrink=0.5, pad=0.01)
-    bar.set_label("Change against the baseline [points]", fontsize=8)
+    bar.set_label("Change against the baseline [points]", fontsize=9)
     return figure
 
 
-def _draw_cell(panel: Axes, change: Change, row: int, column: int) -> None:
-    """Draw success and, from 0 (middle) to 100 % (right), a dot for each training."""
-    colour = "white" if abs(change.difference.value) > 0.6 else INK
-    weight = "bold" if change.certain else "normal"
-    panel.text(column - 0.22, row, f"{100 * change.success.mean():.0f}", ha="center", va="center",
-               color=colour, fontsize=9, weight=weight)  # fmt: skip
-    places, count = column + 0.05 + 0.4 * change.success, len(change.success)
-    panel.plot(places, row + STACKED * (np.arange(count) - (count - 1) / 2), "o", color=colour, ms=2)
+def _write_cell(panel: Axes, success: np.ndarray, points: float, row: int, column: int, weight: str) -> None:
+    """Write the mean success [%] of a cell, once, in a colour that its ground lets read."""
+    text = f"{100 * success.mean():.0f}"
+    written = {(one.get_position(), one.get_text()) for one in panel.texts}
+    if ((column, row), text) not in written:
+        colour = "white" if abs(points) > 60 else INK
+        panel.text(column, row, text, ha="center", va="center", color=colour, fontsize=9, weight=weight)
 
 
 def forest(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
@@ -418,9 +422,8 @@ KINDS: dict[str, Callable[[Drawn, Mapping[str, Any]], Figure]] = {
 }
 CAPTIONS = {
     "map": "Success [%] of each group under each condition. Colour: the change against the baseline "
-    "of the condition, by the same trainings in the same corridors. Bold: certain for other "
-    "trainings. Dots: each training, from 0 (middle of the cell) to 100 % (right). Empty: the"
-    " change cannot affect that policy.",
+    "of the condition, by the same runs in the same corridors. First row: the baseline. Bold: "
+    "significant for other runs. Empty: the change cannot affect that policy.",
     "forest": "Difference of each test. A line is a test: the dot is the difference, the line its 95 % "
     "interval, of this test alone. Within the grey band a difference is too small to matter.",
     "survival": "Share of episodes that have not ended before a distance [%]; a thin line for each "

@@ -62,15 +62,17 @@ def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(swept):
     ]
 
 
-def test_trainings_that_do_alike_have_a_dot_each_in_the_map(swept):
-    success = np.array([1.0, 1.0, 0.5, 1.0, 1.0])
-    change = Change(
-        MANY, NOMINAL, "bytestream", success, success, Difference(0.0, None, None), False, success < 0
-    )
-    panel = change_map(Drawn({}, Results(ABOUT, swept), [change], [], {}, []), {}).axes[0]
-    (dots,) = [line for line in panel.lines if line.get_marker() == "o"]
-    assert len({tuple(point) for point in dots.get_xydata()}) == len(success)
-    assert abs(dots.get_ydata()).max() < 0.5  # within the row
+def test_the_map_says_each_success_once_below_the_baseline(swept):
+    before, success = np.array([1.0, 0.5]), np.array([0.5, 0.0])
+    changes = [
+        Change(at, NOMINAL, "bytestream", before, success, Difference(-0.5, None, None), False, success < 0)
+        for at in (FEW, MANY)
+    ]
+    panel = change_map(Drawn({}, Results(ABOUT, swept), changes, [], {}, []), {}).axes[0]
+    assert panel.get_yticklabels()[0].get_text() == "nothing changed"
+    assert [(text.get_position(), text.get_text()) for text in panel.texts] == [
+        ((0, 0), "75"), ((0, 1), "25"), ((0, 2), "25"),
+    ]  # fmt: skip
 
 
 def test_axes_of_numbers_are_those_along_which_one_number_changes(swept):
