@@ -19,6 +19,7 @@ INSTEAD = {"camera=mine": "camera=davis240_slider", "calibrate.camera=mine": ""}
 
 pytestmark = [
     pytest.mark.system,
+    pytest.mark.slow,
     pytest.mark.skipif(not SLIDER.is_dir(), reason=f"needs the recording in {SLIDER}"),
 ]
 
