@@ -65,7 +65,7 @@ def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(swept):
 def test_the_map_says_each_success_once_below_the_baseline(swept):
     before, success = np.array([1.0, 0.5]), np.array([0.5, 0.0])
     changes = [
-        Change(at, NOMINAL, "bytestream", before, success, Difference(-0.5, None, None), False, success < 0)
+        Change(at, NOMINAL, "bytestream", success, before, Difference(-0.5, None, None), False, success < 0)
         for at in (FEW, MANY)
     ]
     panel = change_map(Drawn({}, Results(ABOUT, swept), changes, [], {}, []), {}).axes[0]
