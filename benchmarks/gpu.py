@@ -20,7 +20,7 @@ from jobs.measure.timing import interleaved
 from jobs.run.device import device_variables
 from jobs.run.progress import console
 from jobs.run.ray_cluster import start_ray
-from jobs.training.ppo import build_ppo
+from jobs.training.algorithms import build_algorithm
 
 ROUNDS = 3
 STEPS = 2048  # of an iteration (appendix D.1.2)
@@ -54,7 +54,7 @@ def trainings(folder: Path) -> dict[tuple[str, str], Callable[[], object]]:
             # All four are there at once: on a machine of two cores Ray would let one wait forever.
             start_ray(replace(config.cluster, num_cpus=4), folder)
             os.environ.update(device_variables(device))  # read when the learner is built, in this process
-            work[algorithm, device] = build_ppo(config).build_algo().train
+            work[algorithm, device] = build_algorithm(config).build_algo().train
     return work
 
 

@@ -21,7 +21,7 @@ from benchmarks.throughput import composed
 from envs.config import EnvConfig
 from envs.events import EVENT
 from jobs.analysis.tables import show_table
-from jobs.training.ppo import policy_spec
+from jobs.training.policy import policy_spec
 from models.encoder.evae import EventVAE
 from models.encoder.frozen import encoder_of
 from models.kinds import KINDS

@@ -2,7 +2,7 @@
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.ppo
 Expect: two tables in about eight minutes. "RLlib's learner" is RLlib as it comes, "ours" is
-`jobs.training.ppo_learner`, "tensor by tensor" the same without `models.policy.dense_update`,
+`jobs.training.ppo.learner`, "tensor by tensor" the same without `models.policy.dense_update`,
 "stable-baselines3" its PPO with the same networks, encoder, corridors and settings. All take turns in
 one process; an iteration samples 2,048 steps in 16 corridors and learns 10 epochs. Seconds are wall
 time, medians over the rounds: `ppo_fast` samples in processes of its own, so the machine should be
@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -27,11 +27,13 @@ from benchmarks.throughput import composed
 from envs.config import EnvConfig, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv
 from jobs.analysis.tables import show_table
+from jobs.config.algorithms import AlgoConfig
 from jobs.config.config import Config
 from jobs.measure.timing import interleaved
 from jobs.run.ray_cluster import start_ray
-from jobs.training.ppo import build_ppo, policy_spec
-from jobs.training.ppo_learner import PlainPPOLearner
+from jobs.training.algorithms import build_algorithm
+from jobs.training.policy import policy_spec
+from jobs.training.ppo.learner import PlainPPOLearner
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
@@ -139,7 +141,7 @@ def against_others(folder: Path) -> dict[str, Callable[[], object]]:
     for size in MINIBATCHES:
         config = composed(f"algo.minibatch_size={size}", CONSTANT)
         start_ray(config.cluster, folder)
-        ppo = build_ppo(config, path)
+        ppo = build_algorithm(config, path)
         work[f"ours, {size}"] = ppo.build_algo().train
         for name, learner in (("tensor by tensor", TensorByTensor), ("RLlib's learner", PPOTorchLearner)):
             other = ppo.copy(copy_frozen=False).learners(learner_class=learner)
@@ -147,7 +149,7 @@ def against_others(folder: Path) -> dict[str, Callable[[], object]]:
         rival = stable_baselines(config, table)
         work[f"stable-baselines3, {size}"] = partial(rival.learn, STEPS, reset_num_timesteps=False)
     fast = composed("algo=ppo_fast", CONSTANT)
-    work["ours, algo=ppo_fast"] = build_ppo(fast, path).build_algo().train
+    work["ours, algo=ppo_fast"] = build_algorithm(fast, path).build_algo().train
     return work
 
 
@@ -161,7 +163,7 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
         needed = KINDS[config.model.name].encoder
         evae = EventVAE.of(evae_settings(config)).freeze() if needed else None
         path = encoder_file(evae, folder) if evae else None
-        work[name] = build_ppo(config, path).build_algo().train
+        work[name] = build_algorithm(config, path).build_algo().train
     return work
 
 
@@ -175,7 +177,10 @@ def encoder_file(evae: EventVAE, folder: Path) -> Path:
 
 def stable_baselines(config: Config, table: EncoderTable) -> PPO:
     """PPO of stable-baselines3 with an experiment's settings."""
-    algo, env = config.algo, dataclasses.replace(config.env, split="train", observation="window")
+    algo, env = (
+        cast(AlgoConfig, config.algo),
+        dataclasses.replace(config.env, split="train", observation="window"),
+    )
     corridors = EncodedCorridors(algo.num_envs_per_env_runner, env, table, config.model.stack)
     return PPO(
         "MlpPolicy",

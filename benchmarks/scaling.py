@@ -37,8 +37,8 @@ from jobs.run.files import write_json
 from jobs.run.libraries import of_workers
 from jobs.run.provenance import git_commit, today
 from jobs.run.ray_cluster import QUIET, on_loopback, ray_folder, use_token
-from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.ppo import build_ppo
+from jobs.training.algorithms import build_algorithm
+from jobs.training.sampling.env_runner import PlainEnvRunner
 
 ROUNDS = 3
 TRIALS = 1000
@@ -105,7 +105,7 @@ def show_model(costs: Costs) -> None:
 
 def bytes_sent(*words: str) -> tuple[float, float]:
     """Bytes of a step's sample and of the weights, as they travel between processes."""
-    here = build_ppo(composed(*words, "algo.num_env_runners=0"))
+    here = build_algorithm(composed(*words, "algo.num_env_runners=0"))
     runner = PlainEnvRunner(config=here, worker_index=0)
     episodes = runner.sample(num_timesteps=STEPS)
     weights = runner.get_state(components="rl_module", inference_only=True)
@@ -116,7 +116,7 @@ def bytes_sent(*words: str) -> tuple[float, float]:
 
 def training_rate(*words: str) -> tuple[float, float, float]:
     """Environment steps per second of an iteration, and its seconds sampling and learning per step."""
-    algorithm = build_ppo(composed(*words)).build_algo()
+    algorithm = build_algorithm(composed(*words)).build_algo()
     algorithm.train()  # compiles
     rates, shares = [], []
     for _ in range(ROUNDS):

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from envs.rasterize import PyrenderRenderer
 from envs.raycast import RaycastRenderer
 from envs.scene import Scene, make_scene
 from jobs.analysis.tables import show_table
+from jobs.config.algorithms import AlgoConfig
 from jobs.config.config import Config, parse
 from jobs.measure.timing import interleaved
 from jobs.rollout.policies import PRETRAINED
@@ -130,17 +131,18 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
 def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
     """Seconds per environment step of sampling, and of whole PPO iterations."""
     from jobs.run.ray_cluster import start_ray
-    from jobs.training.env_runner import PlainEnvRunner
-    from jobs.training.ppo import build_ppo
+    from jobs.training.algorithms import build_algorithm
+    from jobs.training.sampling.env_runner import PlainEnvRunner
 
     sensor = sensor_settings(CONFIG)
     path = folder / "encoder.safetensors"
     save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
     config = composed()
-    size = config.algo.train_batch_size_per_learner
+    algo = cast(AlgoConfig, config.algo)
+    size = algo.train_batch_size_per_learner
     start_ray(config.cluster, folder)
     ppo = {
-        minibatch: build_ppo(replace(config, algo=replace(config.algo, minibatch_size=minibatch)), path)
+        minibatch: build_algorithm(replace(config, algo=replace(algo, minibatch_size=minibatch)), path)
         for minibatch in (32, 256)
     }
     runner = PlainEnvRunner(config=ppo[32], worker_index=0)

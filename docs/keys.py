@@ -150,7 +150,7 @@ def kinds() -> dict[str, dict[str, tuple[object, str]]]:
             owner = typing.get_type_hints(owner, include_extras=True)[field]
         found[key.rpartition(".")[0]][key] = _field(owner, path[-1])
     for name, kind in hints.items():
-        owner = typing.get_args(kind)[0] if name == "model" else kind  # of a policy with an encoder
+        owner = typing.get_args(kind)[0] if name in ("model", "algo") else kind  # with an encoder; by PPO
         if name != "env" and dataclasses.is_dataclass(owner):
             found[name] = {f"{name}.{field}": _field(owner, field) for field in fields_of(owner)}  # type: ignore[arg-type]
         elif name != "env":

@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 
 from envs.config import STRICT, EnvConfig
+from jobs.config.algorithms import Algo, algo_keys, read_algo
 from jobs.config.conditions import axis_errors, condition_errors
 from jobs.config.env_keys import BESIDE_ENV, ENV_GROUPS, ENV_KEYS, fields_of, flat_env, key_of
 from jobs.config.errors import SET_BY_JOBS, ConfigError, nearest, redacted
@@ -22,7 +23,6 @@ from jobs.config.plugins import load_plugins
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
-    AlgoConfig,
     ClusterConfig,
     CollectConfig,
     EvaluateConfig,
@@ -65,7 +65,7 @@ class Config:
     runs_dir: Name
     env: EnvConfig
     model: Model
-    algo: AlgoConfig
+    algo: Algo
     recording: RecordingConfig
     collect: CollectConfig
     pretrain: PretrainConfig
@@ -98,6 +98,7 @@ def parse(values: Mapping[str, object]) -> Config:
     parts: dict[str, object] = {"env": _env(values, errors)}
     parts |= {name: _section(section, values.get(name), name, errors) for name, section in SECTIONS.items()}
     parts["model"] = _section(read_model, values.get("model"), "model", errors)
+    parts["algo"] = _section(read_algo, values.get("algo"), "algo", errors)
     job = str(values.get("job"))
     parts |= {"own": _own(job, values, errors)} if has_own(job) else {}
     top = {name: value for name, value in values.items() if name not in (*BESIDE_ENV, "name", job)}
@@ -135,7 +136,7 @@ def known_keys() -> list[str]:
     keys = [*core, "name", *ENV_GROUPS, *ENV_KEYS]
     for name, section in SECTIONS.items():
         keys += [f"{name}.{field}" for field in fields_of(section)]
-    return keys + [f"model.{name}" for name in model_keys()]
+    return [*keys, *(f"model.{name}" for name in model_keys()), *(f"algo.{name}" for name in algo_keys())]
 
 
 def has_own(job: str) -> bool:
@@ -214,12 +215,16 @@ def _build(
         problems = [problem for problem in error.errors() if not {*problem["loc"][:1]} & {*skip}]
         errors += [_line(problem, key_of(name, problem["loc"])) for problem in problems]
         return None
+    except ValueError as error:
+        errors.append(f"{name}.{error}")
+        return None
 
 
 def _line(problem: ErrorDetails, key: str) -> str:
     """Return an error of pydantic as key, rule and value."""
     if problem["type"] == "unexpected_keyword_argument":
-        hint = "; this kind of model has none" if key in known_keys() else unknown_key(key)
+        kind = f"; this kind of {key.partition('.')[0]} has none"
+        hint = kind if key in known_keys() else unknown_key(key)
         return f"{key}: no such key, got {problem['input']!r}{hint}"
     if problem["type"] in ("missing", "missing_argument", "value_error"):
         return f"{key}: {problem['msg'].removeprefix('Value error, ')}"

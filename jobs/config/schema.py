@@ -6,96 +6,19 @@ of its module.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import pydantic
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
 from jobs.config.conditions import Conditions
-from models.kinds import checked
 
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
 Name = Annotated[str, Field(min_length=1)]
 Pixels = Annotated[int, Field(ge=1, le=65536)]
-
-
-@dataclass(frozen=True, config=STRICT)
-class ImitationConfig:
-    """Imitation of a planner that knows the geometry (DAgger: Ross et al. 2011).
-
-    Attributes:
-        temperature: Labels are softmax(-cost / temperature); costs as in `envs.scene.planning`.
-        guided_batches: In the first batches the teacher acts too: in all steps of the first, then in half as
-            many in each; 0: never.
-        fit_steps: Gradient steps after each batch, on steps of all batches.
-        final_steps: Gradient steps after the last, from the first weights, with a step size that falls to 0.
-        keep_mb: Memory for the steps that are kept [MB]; beyond it, a random sample of all.
-    """
-
-    temperature: Positive
-    guided_batches: Annotated[int, Field(ge=0)]
-    fit_steps: Count
-    final_steps: Count
-    keep_mb: Positive
-
-
-def _imitation(values: object) -> object:
-    """Build the settings from a mapping, which strict pydantic does not accept for a dataclass."""
-    return checked(ImitationConfig, dict(values)) if isinstance(values, Mapping) else values
-
-
-@dataclass(frozen=True, config=STRICT)
-class AlgoConfig:
-    """Settings of PPO, each word as RLlib spells it (appendix D.1.2).
-
-    Attributes:
-        critic: What the value network sees: what the policy does, or also what the cheapest way to the goal
-            line costs, of a teacher that knows the geometry.
-        shaping: Of the potential -shaping * log(1 + that cost), by which rewards are shaped in training only;
-            0: they are not.
-        imitation: Learn from a teacher instead; of the others then only lr, sizes, grad_clip, mirrored and
-            teacher_sight_m count.
-        mirrored: Learn each step a second time, left and right exchanged (`models.policy.mirror`).
-        teacher_sight_m: How far ahead the teacher plans [m], in imitation, critic and shaping alike; None: to
-            the goal line.
-    """
-
-    lr: Positive
-    lr_schedule: Literal["constant", "linear"]
-    gamma: Fraction
-    lambda_: Fraction
-    clip_param: Positive
-    num_epochs: Count
-    minibatch_size: Count
-    train_batch_size_per_learner: Count
-    vf_loss_coeff: NonNegative
-    entropy_coeff: NonNegative
-    grad_clip: Positive
-    reward_scale: Positive
-    num_envs_per_env_runner: Count
-    num_env_runners: Annotated[int, Field(ge=0, le=10_000)]
-    critic: Literal["observation", "teacher"] = "observation"
-    shaping: NonNegative = 0.0
-    imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)] = None
-    mirrored: bool = False
-    teacher_sight_m: Positive | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _minibatch_fits(self) -> "AlgoConfig":
-        if self.minibatch_size > self.train_batch_size_per_learner:
-            raise ValueError("minibatch_size must not exceed train_batch_size_per_learner")
-        if self.mirrored and self.imitation is None:
-            rule = "must be false without algo.imitation, because PPO learns only from what it did"
-            raise ValueError(f"mirrored {rule}, got true")
-        taught = self.imitation is not None or self.critic == "teacher" or self.shaping > 0.0
-        if self.teacher_sight_m is not None and not taught:
-            rule = "must be null without a teacher (algo=imitation, algo.critic=teacher, algo.shaping)"
-            raise ValueError(f"teacher_sight_m {rule}, got {self.teacher_sight_m}")
-        return self
 
 
 @dataclass(frozen=True, config=STRICT)

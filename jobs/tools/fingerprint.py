@@ -13,7 +13,7 @@ import os
 import warnings
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -24,8 +24,8 @@ from envs.raycast import RaycastRenderer
 from envs.recordings import Recording
 from envs.scene import make_scene
 from jobs.analysis.tables import show_table
+from jobs.config.algorithms import AlgoConfig, ImitationConfig
 from jobs.config.config import Config
-from jobs.config.schema import ImitationConfig
 from jobs.rollout.agents import make_agent
 from jobs.rollout.episodes import roll_out
 from jobs.rollout.policies import PRETRAINED
@@ -34,8 +34,9 @@ from jobs.run.libraries import processor
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
 from jobs.run.torch_threads import torch_threads
+from jobs.training.algorithms import algorithm_of
 from jobs.training.collect import record
-from jobs.training.ppo import build_ppo, env_runner, policy_spec
+from jobs.training.policy import policy_spec
 from jobs.training.pretrain import THREADS, EvaeTraining
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
@@ -135,7 +136,7 @@ def stages(config: Config) -> Iterator[tuple[str, Arrays]]:
             yield f"table{name}", tabulated(training.evae)
     for name, model in POLICIES.items():
         yield f"PPO: {name}", learnt(dataclasses.replace(config, model=model))
-    algo = dataclasses.replace(config.algo, imitation=TAUGHT)
+    algo = dataclasses.replace(cast(AlgoConfig, config.algo), imitation=TAUGHT)
     yield "imitation", learnt(dataclasses.replace(config, algo=algo, model=POLICIES["dense"]))
     yield "episodes", [roll_out(make_agent(str(PRETRAINED / POLICY), "stochastic"), config.env, CORRIDORS)]
 
@@ -170,9 +171,9 @@ def learnt(config: Config) -> list[np.ndarray]:
     """The weights of a policy after two updates of the experiment's learner."""
     torch.manual_seed(0)
     logging.getLogger("ray").setLevel(logging.ERROR)  # it calls its own settings outdated
-    ppo = build_ppo(config)
+    ppo = algorithm_of(config).build(config, None, None)
     with warnings.catch_warnings(action="ignore"):  # the stage before has registered the same environment
-        runner = env_runner(config)(config=ppo, worker_index=0)
+        runner = ppo.env_runner_cls(config=ppo, worker_index=0)
     learner = ppo.build_learner(env=runner.env)
     for count in (1, 2):
         learner.update(

@@ -14,7 +14,7 @@ from jobs.rollout.policies import load_trained
 from jobs.run.files import read_json, write_atomic
 from jobs.run.folder import Run, finished, locate_run, named_policy
 from jobs.tracking.tracker import Tracker
-from jobs.training.ppo import policy_spec
+from jobs.training.policy import policy_spec
 from jobs.training.pretrain import check_sources, encoder_file, prepare_encoder
 from models.policy.policy import ENCODER, ENCODER_FILES, MANIFEST, NETWORKS, Policy
 

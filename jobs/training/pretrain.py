@@ -28,7 +28,7 @@ from jobs.run.progress import console, progress
 from jobs.run.torch_threads import torch_threads
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.collect import check_collect, collect, data_file
-from jobs.training.gpu_steps import exact
+from jobs.training.ppo.gpu_steps import exact
 from models.encoder.evae import (
     EventVAE,
     appendix_beta,

@@ -1,4 +1,4 @@
-"""Train the policy by PPO (appendix D.1), on the encoder if it has one.
+"""Train the policy (appendix D.1), on its encoder if it has one.
 
 Run: python -m platform.launch +exp=train
 Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pyarrow.fs
 import torch
@@ -33,14 +33,15 @@ from jobs.run.ray_cluster import fit, holds, start_ray, storage
 from jobs.run.trial_errors import low_memory, newest_error
 from jobs.run.tune_state import keep_state, mend_state
 from jobs.tracking.tracker import open_tracker
-from jobs.training.algorithm import NOTICE, PPO
-from jobs.training.env_runner import RolloutError
-from jobs.training.imitation import AGREEMENT_KEY
+from jobs.training.algorithms import Algorithm, algorithm_of
 from jobs.training.inputs import check_cpus, check_inputs, prepare_inputs
-from jobs.training.ppo import build_ppo, policy_about, policy_spec
+from jobs.training.policy import policy_about, policy_spec
+from jobs.training.ppo.algorithm import NOTICE
+from jobs.training.sampling.env_runner import RolloutError
 from models.encoder.weights import EncoderManifest, load_encoder
 from models.policy import save_policy
 from models.policy.policy import NETWORKS
+from models.policy.rllib_module import PolicyModule
 
 OnResult = Callable[[int, Mapping[str, float]], None]
 
@@ -51,21 +52,15 @@ METRICS = {
     "train/success_rate": ("env_runners", "success_rate"),
     "train/collision_rate": ("env_runners", "collision_rate"),
     "train/distance_m": ("env_runners", "distance_m"),
-    "train/policy_loss": ("learners", "default_policy", "policy_loss"),
-    "train/value_loss": ("learners", "default_policy", "vf_loss"),
-    "train/explained_variance": ("learners", "default_policy", "vf_explained_var"),
-    "train/entropy": ("learners", "default_policy", "entropy"),
-    "train/agreement": ("learners", "default_policy", AGREEMENT_KEY),
-    "train/gradient_norm": ("learners", "default_policy", "gradients_default_optimizer_global_norm"),
     "sim/events_per_step": ("env_runners", "events_per_step"),
     "sim/dropped_events": ("env_runners", "dropped_events"),
     **{f"evae/{name}": ("env_runners", name) for name in DRIFT_METRICS},
     "perf/env_runner_restarts": ("fault_tolerance", "num_remote_worker_restarts"),
     "perf/trial_restarts": ("trial_restarts",),
 }
-ALWAYS_FINITE = ("train/policy_loss", "train/value_loss", "train/entropy", "train/gradient_norm")
 ENV_STEPS = "num_env_steps_sampled_lifetime"
 SAMPLED = ("env_runners", "num_env_steps_sampled")
+LEARNER = ("learners", "default_policy")
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
@@ -133,7 +128,7 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
         config: The experiment.
         folder: The run folder.
         encoder_path: The pretrained encoder's file; None for a policy without one.
-        on_result: Called with (environment steps, metrics) after each PPO iteration, in this
+        on_result: Called with (environment steps, metrics) after each iteration, in this
             process; a metric that was not measured is NaN.
 
     Returns:
@@ -147,9 +142,9 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     check_cpus(config)
     start_ray(config.cluster, folder.path)
     init = folder.init / NETWORKS if config.train.init else None
-    algorithm = build_ppo(config, encoder_path, init)
+    built = algorithm_of(config).build(config, encoder_path, init)
     with _listening(config, folder, on_result) as last:
-        results = fit(_tuner(config, folder, algorithm))
+        results = fit(_tuner(config, folder, built))
     if results.errors:
         raise TrainingError(stopped(results.errors[0]))
     figures = {name: value for name, value in last.items() if math.isfinite(value)}
@@ -183,35 +178,36 @@ def export_policy(
     Raises:
         TrainingError: If the checkpoint's encoder is not the one in the file.
     """
-    module: Any = RLModule.from_checkpoint(checkpoint / MODULE)
-    spec = policy_spec(config)
+    spec, module = policy_spec(config), cast(Any, RLModule.from_checkpoint(checkpoint / MODULE))
     evae, of_encoder = None, EncoderManifest()
     if encoder_path is not None and spec.frozen:
         evae, of_encoder = load_encoder(encoder_path)
     frozen = {} if evae is None else evae.state_dict()
-    trained_on = {} if module.encoder is None else module.encoder.state_dict()
+    encoder = module.encoder if isinstance(module, PolicyModule) else None
+    trained_on = {} if encoder is None else encoder.state_dict()
     if not all(torch.equal(value, frozen[name]) for name, value in trained_on.items()):
         raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
     about = {**policy_about(config), "figures": figures}
-    save_policy(target, module.networks(), spec, about, evae, of_encoder.get("figures"))
+    networks = algorithm_of(config).networks(module, spec)
+    save_policy(target, networks, spec, about, evae, of_encoder.get("figures"))
 
 
-def _tuner(config: Config, folder: Run, algorithm: Any) -> tune.Tuner:
+def _tuner(config: Config, folder: Run, built: Any) -> tune.Tuner:
     """The experiment in the run folder: continued if it is there, else new."""
-    path = storage(config.cluster, folder.train)
+    path, trainable = storage(config.cluster, folder.train), algorithm_of(config).trainable(config)
     said = mend_state(folder.train)
     if said:
         console.print(said, markup=False)
     # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
     if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
-        stopped_at = restored(path, algorithm).get_results()[0].checkpoint
+        stopped_at = restored(path, trainable, built).get_results()[0].checkpoint
         said = mend(Path(stopped_at.path)) if stopped_at and on_disk(stopped_at) else None
         if said:
             console.print(said, markup=False)
-        return restored(path, algorithm)
+        return restored(path, trainable, built)
     return tune.Tuner(
-        PPO,
-        param_space=algorithm,
+        trainable,
+        param_space=built,
         run_config=tune.RunConfig(
             name=folder.train.name,
             storage_path=path.rpartition("/")[0],
@@ -233,9 +229,9 @@ def on_disk(checkpoint: tune.Checkpoint) -> bool:
     return isinstance(checkpoint.filesystem, pyarrow.fs.LocalFileSystem)
 
 
-def restored(path: str, algorithm: Any) -> tune.Tuner:
+def restored(path: str, trainable: type, built: Any) -> tune.Tuner:
     """The experiment of a folder, to go on."""
-    return tune.Tuner.restore(path, PPO, resume_errored=True, param_space=algorithm)
+    return tune.Tuner.restore(path, trainable, resume_errored=True, param_space=built)
 
 
 @contextlib.contextmanager
@@ -246,13 +242,13 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
     with file.open("ab") as content:
         content.truncate(len(whole_lines(file)))  # a kill can leave half a line
     reported, last = reported_so_far(file)
-    total, since_s = config.train.env_steps, time.monotonic()
+    algorithm, total, since_s = algorithm_of(config), config.train.env_steps, time.monotonic()
     with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
 
         def listen(result: Mapping[str, object]) -> None:
             nonlocal reported, since_s
             now_s, env_steps = time.monotonic(), int(_lookup(result, (ENV_STEPS,)))
-            last.update(read_metrics(result, now_s - since_s))
+            last.update(read_metrics(result, now_s - since_s, algorithm))
             since_s = now_s
             if env_steps <= reported:
                 return
@@ -291,19 +287,23 @@ def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
     return int(row.pop("env_steps")), {name: math.nan if x is None else x for name, x in row.items()}
 
 
-def read_metrics(result: Mapping[str, object], seconds: float) -> dict[str, float]:
-    """The metrics worth keeping of an RLlib result; NaN where nothing was measured.
+def read_metrics(result: Mapping[str, object], seconds: float, algorithm: Algorithm) -> dict[str, float]:
+    """Return the metrics worth recording of an RLlib result; NaN where nothing was measured.
 
-    `seconds` have passed since the one before it, on a clock that does not jump as RLlib's may.
+    Args:
+        result: One iteration's.
+        seconds: Time since the result before, on a clock that does not jump as RLlib's may.
+        algorithm: Its losses and figures are recorded.
 
     Raises:
         TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
     """
-    metrics = {name: _lookup(result, path) for name, path in METRICS.items()}
+    learnt = {name: (*LEARNER, key) for name, key in {**algorithm.losses, **algorithm.figures}.items()}
+    metrics = {name: _lookup(result, path) for name, path in {**METRICS, **learnt}.items()}
     steps = _lookup(result, SAMPLED)
     metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
-    learners: Any = result["learners"]
-    told = [name for name in ALWAYS_FINITE if METRICS[name][-1] in learners["default_policy"]]
+    updated: Any = result.get("learners", {})
+    told = [name for name, key in algorithm.losses.items() if key in updated.get(LEARNER[-1], {})]
     bad = [f"{name} = {metrics[name]}" for name in told if not math.isfinite(metrics[name])]
     if bad:
         where = f"at environment step {result[ENV_STEPS]}"

@@ -1,11 +1,10 @@
 """A policy inside RLlib: a module that owns the networks and the encoder.
 
-`features` computes the features of a step (`models.policy.features`); the networks read stacks of the
-last ones (`jobs.training.env_runner` keeps them). `models.policy.policy` is the same policy without Ray.
+`features` computes the features of a step (`models.policy.features`); the networks read stacks of the last
+ones, which the env runners keep. `models.policy.policy` is the same policy without Ray.
 """
 
 import math
-from collections import deque
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,6 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor, nn
 
-from models.encoder.event_batch import cut_packed
 from models.encoder.frozen import Encoder, read_encoder_part, tabulate
 from models.encoder.weights import EncoderManifest
 from models.kinds import EvaeSettings, PolicySpec
@@ -28,7 +26,6 @@ from models.policy.mirror import mirror
 from models.policy.networks import PARTS, build_networks, widened
 from models.policy.policy import load_networks
 
-MET_WINDOWS = 128  # that a module remembers
 PRIVILEGED = "privileged"  # of a batch: what the value network alone is told, float32 (B, numbers)
 VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
 
@@ -62,11 +59,6 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     checkpoint is complete in itself. A fine-tuned encoder is the networks' trunk instead.
     `model_config` holds what `module_spec` puts there. What is `PRIVILEGED` only widens the first layer of
     the value network, and a policy that is exported is without it.
-
-    Attributes:
-        met: With a frozen encoder, a sample of the newest windows that it was shown, one of each vector
-            step and of each episode in turn, as `models.encoder.event_batch.cut_packed` cuts them.
-        steps: Vector steps so far, which say whose turn it is.
     """
 
     def setup(self) -> None:
@@ -85,8 +77,6 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         self.encoder = part
         self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
         self._table: Encoder | None = None
-        self.met: deque[np.ndarray] = deque(maxlen=MET_WINDOWS)
-        self.steps = 0
 
     def get_non_inference_attributes(self) -> list[str]:
         """What an env runner does without."""
@@ -110,8 +100,6 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         """Features (B, ...) of B observations, as those of `models.policy.policy.Policy`."""
         if self.encoder is not None:
             self._table = self._table or tabulate(self.encoder, self.model_config["encoder_file"].settings)
-            self.met.append(cut_packed(observations[self.steps % len(observations)]))
-            self.steps += 1
         return self._features(observations)
 
     def _features(self, observations: Windows) -> np.ndarray:
@@ -139,7 +127,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
     def __getstate__(self) -> dict[str, object]:
         """Everything but the windows and the table, which is built from the encoder where it is needed."""
-        return {**self.__dict__, "_table": None, "met": deque(maxlen=MET_WINDOWS)}
+        return {**self.__dict__, "_table": None}
 
     def _forward(self, batch: dict[str, Tensor], **kwargs: object) -> dict[str, Tensor]:
         return {Columns.ACTION_DIST_INPUTS: self.pi(self.trunk(batch[Columns.OBS]))}

@@ -32,7 +32,7 @@ from jobs.run.files import RunError, json_lines, read_json_lines, write_atomic
 from jobs.run.folder import Run, finish, finished, open_run, reopen
 from jobs.tracking.tracker import TrackingError, open_store, open_tracker
 from jobs.training.collect import data_file
-from jobs.training.ppo import pretrained_encoder
+from jobs.training.policy import pretrained_encoder
 from jobs.training.pretrain import check_data
 from models.policy import load_policy
 from tests.support.configs import compose, small_config, sweep_config

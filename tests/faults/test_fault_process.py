@@ -118,7 +118,7 @@ def test_a_training_that_stood_still_gives_the_same_results(tmp_path):
     words = (*TRAIN, *FINE, "train.env_steps=2560")  # still at work when it stands still for the last time
     undisturbed = launch(tmp_path / "undisturbed", *words)
     check_complete(undisturbed)
-    code = {"jobs.training.env_runner": UNDER_A_LIMIT.format(mark=str(mark), begun=str(begun))}
+    code = {"jobs.training.sampling.env_runner": UNDER_A_LIMIT.format(mark=str(mark), begun=str(begun))}
     job = launch(tmp_path / "stopped", *words, after=code)
     job.wait(lambda: job.steps() >= 128)
     with standing_still(job.workers("ray::PlainEnvRunner")):

@@ -9,11 +9,12 @@ import tempfile
 
 import pytest
 
+from jobs.training.ppo.train import FIGURES, LOSSES
 from jobs.training.train import METRICS
 from tests.support.faults import FINE, TRAIN, check_complete, launch, outcome, start
 
 pytestmark = pytest.mark.faults
-SAME = ["env_steps", *(name for name in METRICS if not name.startswith("perf/"))]
+SAME = ["env_steps", *(name for name in [*METRICS, *LOSSES, *FIGURES] if not name.startswith("perf/"))]
 
 
 def checkpoints(job):
@@ -173,7 +174,9 @@ def test_an_env_runner_that_hangs_is_ended_and_started_again(tmp_path):
         "import time;", "open(MARK, 'w'); import time;"
     )
     code = f"MARK = {str(tmp_path / 'hung')!r}\n{once}"
-    job = launch(tmp_path, *TRAIN, *FINE, after={"jobs.training.env_runner": limit, "envs.corridor": code})
+    job = launch(
+        tmp_path, *TRAIN, *FINE, after={"jobs.training.sampling.env_runner": limit, "envs.corridor": code}
+    )
     check_complete(job)
     assert (tmp_path / "hung").exists()
     assert job.rows()[-1]["perf/env_runner_restarts"] >= 1

@@ -9,7 +9,7 @@ from envs.config import sensor_settings, settings_hash
 from jobs.rollout.policies import read_policy
 from jobs.study.plan import plan_study
 from jobs.tracking.tracker import open_store
-from jobs.training.ppo import policy_about, policy_spec
+from jobs.training.policy import policy_about, policy_spec
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.weights import save_encoder

@@ -16,10 +16,10 @@ from jobs.run.folder import Run
 from jobs.run.torch_threads import torch_threads
 from jobs.tools.search.space import encoder_facts, read_settings, with_settings
 from jobs.tracking.tracker import Tracker
-from jobs.training.algorithm import PPO, Trainable
-from jobs.training.ppo import build_ppo
+from jobs.training.algorithms import algorithm_of
 from jobs.training.pretrain import prepare_encoder
 from jobs.training.train import ENV_STEPS, TrainingError, export_policy, read_metrics
+from jobs.training.trainable import Trainable
 from models.policy.policy import ENCODER, NETWORKS
 
 PROGRESS = "trial.json"  # in a checkpoint
@@ -60,8 +60,9 @@ class SearchTrial(Trainable):
             own = Run(place / "run", self._experiment)
             self._encoder = prepare_encoder(self._experiment, own, cast(Tracker, Unrecorded()))
         init = place / "inputs" / NETWORKS if NETWORKS in files else None
-        ppo = build_ppo(self._experiment, self._encoder, init)
-        self._training = PPO(config=ppo)
+        self._algorithm = algorithm_of(self._experiment)
+        built = self._algorithm.build(self._experiment, self._encoder, init)
+        self._training = self._algorithm.trainable(self._experiment)(config=built)
 
     @torch_threads(1)
     def step(self) -> dict[str, Any]:
@@ -74,7 +75,8 @@ class SearchTrial(Trainable):
                 began_s = time.monotonic()
                 result = self._training.train()
                 self._steps = int(result[ENV_STEPS])
-                metrics = read_metrics({**result, "trial_restarts": 0}, time.monotonic() - began_s)
+                passed_s = time.monotonic() - began_s
+                metrics = read_metrics({**result, "trial_restarts": 0}, passed_s, self._algorithm)
             figures = self.measured()
         except (TrainingError, RuntimeError, ValueError) as error:
             if NOT_FINITE not in str(error):

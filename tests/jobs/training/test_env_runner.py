@@ -1,6 +1,6 @@
+import pickle
 import itertools
 import math
-import pickle
 import shutil
 from types import SimpleNamespace
 
@@ -12,8 +12,9 @@ from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 from jobs.rollout.diagnostics import DRIFT_METRICS, drift_metrics
-from jobs.training.env_runner import PlainEnvRunner, RolloutError
-from jobs.training.ppo import build_ppo
+from jobs.training.algorithms import build_algorithm
+from jobs.training.sampling.env_runner import PlainEnvRunner, RolloutError
+from jobs.training.sampling.window_sample import WindowSample
 from models.encoder.weights import load_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
@@ -50,7 +51,7 @@ def make_runners(name, folder, *overrides):
     """Ours, and RLlib's with the connector; both with larger logits, so that actions differ."""
     equal = "env.window_capacity=512"  # RLlib's own takes no observations of different length
     config = make_config(*SHORT, f"model={name}", "algo.num_envs_per_env_runner=3", equal, *overrides)
-    ppo = build_ppo(config, write_encoder(folder, config) if KINDS[name].encoder else None)
+    ppo = build_algorithm(config, write_encoder(folder, config) if KINDS[name].encoder else None)
     space = ppo.rl_module_spec.observation_space
     theirs = ppo.copy(copy_frozen=False).env_runners(
         env_runner_cls=SingleAgentEnvRunner,
@@ -95,7 +96,7 @@ def test_flights_are_rllibs_own_to_the_byte(name, tmp_path):
 @pytest.mark.parametrize("name", kinds(["bytestream", "event_columns", "event_set", "event_image", "rgb"]))
 def test_one_that_resumes_samples_as_the_one_that_went_on(name, tmp_path):
     config = make_config(*SHORT, f"model={name}", "algo.train_batch_size_per_learner=32")
-    ppo = build_ppo(config, write_encoder(tmp_path, config) if KINDS[name].encoder else None)
+    ppo = build_algorithm(config, write_encoder(tmp_path, config) if KINDS[name].encoder else None)
     first, second = (PlainEnvRunner(config=ppo, worker_index=0) for _ in range(2))
     samples_of(first, (40, 17))
     kept, number = first.snapshot(), first.module.steps
@@ -121,7 +122,7 @@ def test_one_that_resumes_samples_as_the_one_that_went_on(name, tmp_path):
 
 def test_one_that_resumes_before_its_first_round_begins_anew():
     words = "model=event_columns", "algo.train_batch_size_per_learner=32"
-    runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT, *words)), worker_index=0)
+    runner = PlainEnvRunner(config=build_algorithm(make_config(*SHORT, *words)), worker_index=0)
     kept = runner.snapshot()
     first = runner.take_part()
     assert runner.resume(kept) == ""
@@ -203,7 +204,7 @@ def test_any_other_error_ends_the_process_as_rllib_has_it():
 
 @pytest.fixture
 def encoded_runner(encoder):
-    runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), encoder), worker_index=0)
+    runner = PlainEnvRunner(config=build_algorithm(make_config(*SHORT), encoder), worker_index=0)
     yield runner
     runner.stop()
 
@@ -237,19 +238,29 @@ def test_returns_are_reported_unscaled(encoded_runner):
     assert metrics["events_per_step"] > 0.0
 
 
-def test_a_module_remembers_the_newest_windows_of_all_flights_in_turn(encoded_runner):
-    module = encoded_runner.module
-    windows = np.zeros((2, 5, 4), np.int32)
+def test_the_sample_of_windows_holds_the_newest_of_all_episodes_in_turn():
+    shown, windows = WindowSample(), np.zeros((2, 5, 4), np.int32)
     for step in range(300):
         windows[:, 0] = [[2, 0, 5000, step], [4, 0, 5000, 1000 + step]]
         windows[:, 1:, 3] = 1
-        module.features(windows)
-    assert len(module.met) == 128
-    assert [int(kept[0, 3]) for kept in module.met] == [step + 1000 * (step % 2) for step in range(172, 300)]
-    assert {len(kept) for kept in module.met} == {3, 5}
+        shown.add(windows)
+    expected = [step + 1000 * (step % 2) for step in range(172, 300)]
+    assert [int(window[0, 3]) for window in shown.windows] == expected
+    assert {len(window) for window in shown.windows} == {3, 5}
     windows[:] = 0
-    assert module.met[-1][0, 0] == 4  # a copy
-    assert len(pickle.loads(pickle.dumps(module.__getstate__()["met"]))) == 0
+    assert shown.windows[-1][0, 0] == 4  # a copy
+    again = WindowSample()
+    again.load(shown.arrays(), shown.steps)
+    again.add(windows)
+    shown.add(windows)
+    assert again.steps == shown.steps
+    assert all(map(np.array_equal, again.windows, shown.windows))
+
+
+def test_computing_features_samples_no_window(encoded_runner):
+    before = encoded_runner.shown.steps
+    encoded_runner.module.features(np.zeros((2, 5, 4), np.int32) + [[[0, 0, 5000, 0]]] * 2)
+    assert encoded_runner.shown.steps == before
 
 
 def drift_of(runner, rounds=1):
@@ -267,7 +278,7 @@ def drift_of(runner, rounds=1):
 def test_drift_is_measured_every_tenth_round_on_what_the_policy_met(encoded_runner, encoder):
     first, _ = drift_of(encoded_runner)
     evae, about = load_encoder(encoder)
-    expected = drift_metrics(evae, encoded_runner.module.met, {"reconstruction_step": 0.5})
+    expected = drift_metrics(evae, encoded_runner.shown.windows, {"reconstruction_step": 0.5})
     assert first == pytest.approx(expected | {"drift": expected["policy_reconstruction"] / 0.5})
     assert about["figures"] == {"reconstruction_step": 0.5}
     assert drift_of(encoded_runner)[0] == drift_of(encoded_runner, 8)[0] == {}
@@ -280,7 +291,7 @@ def test_without_its_file_an_encoder_is_flown_but_not_measured_and_nothing_else_
     flights = []
     for there in (True, False):
         path = shutil.copytree(encoder.parent, tmp_path / str(there)) / encoder.name
-        runner = PlainEnvRunner(config=build_ppo(make_config(*SHORT), path), worker_index=0)
+        runner = PlainEnvRunner(config=build_algorithm(make_config(*SHORT), path), worker_index=0)
         if not there:
             path.unlink()
         told, _ = drift_of(runner)

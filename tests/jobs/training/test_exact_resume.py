@@ -7,14 +7,16 @@ import ray
 import torch
 from safetensors.numpy import load_file
 
+from jobs.config.algorithms import ALGORITHMS
 from jobs.run.files import RunError, read_json, write_json
 from jobs.run.ray_cluster import start_ray
 from jobs.run.torch_threads import torch_threads
-from jobs.training.algorithm import NOTICE, PPO
-from jobs.training.ppo import build_ppo
-from jobs.training.snapshots import FOLDER, generators, set_generators
+from jobs.training.algorithms import build_algorithm
+from jobs.training.ppo.algorithm import NOTICE, PPO
+from jobs.training.ppo.train import FIGURES, LOSSES
+from jobs.training.sampling.snapshots import FOLDER, generators, set_generators
 from jobs.training.train import METRICS, export_policy, read_metrics
-from models.kinds import KINDS
+from models.kinds import KINDS, resolve
 from tests.support.configs import make_config
 from tests.support.policies import ALIKE, TRAINED
 from tests.support.runs import write_encoder, write_networks
@@ -39,7 +41,8 @@ OWN = {
     "privileged": PRIVILEGED,
     "begun": BEGUN,
 }
-SAME = [name for name in METRICS if not name.startswith("perf/")]
+ROW = resolve(ALGORITHMS["ppo"].algorithm)
+SAME = [name for name in [*METRICS, *LOSSES, *FIGURES] if not name.startswith("perf/")]
 CONDITIONS = "train.conditions=[{},{faults.sparsity:0.5},{env.control_hz:100}]"
 
 
@@ -56,12 +59,13 @@ def built(folder, name, *words):
     config = make_config(*OWN.get(name, [f"model={name}"]), *SMALL, *words)
     encoder = write_encoder(folder, config) if KINDS[config.model.name].encoder else None
     init = write_networks(folder / "init", config) if config.train.init else None
-    return config, encoder, lambda: PPO(config=build_ppo(config, encoder, init))
+    return config, encoder, lambda: PPO(config=build_algorithm(config, encoder, init))
 
 
 def rows(algorithm, iterations):
     """What the next iterations report, but for the time that they took."""
-    told = [read_metrics({**algorithm.train(), "trial_restarts": 0}, 1.0) for _ in range(iterations)]
+    results = [{**algorithm.train(), "trial_restarts": 0} for _ in range(iterations)]
+    told = [read_metrics(result, 1.0, ROW) for result in results]
     return json.dumps([{name: row[name] for name in SAME} for row in told])
 
 

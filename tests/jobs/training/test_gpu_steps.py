@@ -10,12 +10,13 @@ import torch
 from jobs.config.config import ConfigError
 from jobs.run import ray_cluster
 from jobs.run.device import LEARNER_DEVICE, learner_device
-from jobs.training import gpu_steps, ppo_learner
-from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.gpu_steps import GpuSteps
+from jobs.training.algorithms import build_algorithm
 from jobs.training.inputs import check_inputs
-from jobs.training.ppo import build_ppo
-from jobs.training.ppo_learner import VALUE_WARMUP, PlainPPOLearner
+from jobs.training.ppo import gpu_steps
+from jobs.training.ppo import learner as ppo_learner
+from jobs.training.ppo.gpu_steps import GpuSteps
+from jobs.training.ppo.learner import VALUE_WARMUP, PlainPPOLearner
+from jobs.training.sampling.env_runner import PlainEnvRunner
 from models.policy.event_set import EventSet
 from tests.support.configs import SHORT, make_config
 
@@ -29,7 +30,7 @@ CUDA = pytest.param(
 
 @pytest.fixture(scope="module", params=["event_image", "event_set"])
 def ppo(request):
-    return build_ppo(make_config(*SHORT, f"model={request.param}", "algo.entropy_coeff=0.03"))
+    return build_algorithm(make_config(*SHORT, f"model={request.param}", "algo.entropy_coeff=0.03"))
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +184,7 @@ def test_networks_over_pictures_and_sets_of_events_go_to_the_device(ppo, flights
 
 
 def test_dense_networks_stay_with_the_processor(monkeypatch):
-    dense = build_ppo(make_config(*SHORT, "model=event_columns"))
+    dense = build_algorithm(make_config(*SHORT, "model=event_columns"))
     runner = PlainEnvRunner(config=dense, worker_index=0)
     assert make_learner(dense, runner.env, monkeypatch, "cuda")._gpu is None
     runner.stop()

@@ -10,8 +10,11 @@ from envs.corridor import CorridorEnv
 from envs.kinematics import MIRRORED_ACTIONS
 from envs.scene.planning import cost_to_go
 from jobs.config.config import ConfigError
-from jobs.training.imitation import COSTS, MIRRORED, ImitationLearner, Lessons, TaughtEnvRunner
-from jobs.training.ppo import build_ppo, corridor_settings
+from jobs.training.algorithms import build_algorithm
+from jobs.training.imitation.env_runner import TaughtEnvRunner
+from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, LabelledSteps
+from jobs.training.imitation.learner import ImitationLearner
+from jobs.training.sampling.corridors import corridor_settings
 from models.kinds import KINDS
 from tests.support.configs import SHORT, make_config
 from tests.support.episodes import infos_of
@@ -31,7 +34,7 @@ def config():
 @pytest.fixture(scope="module")
 def rolled_out(config):
     """An env runner, and its rounds: of the teacher alone, half and half, and of the student alone."""
-    runner = TaughtEnvRunner(config=build_ppo(config), worker_index=0)
+    runner = TaughtEnvRunner(config=build_algorithm(config), worker_index=0)
     rounds = [(runner.teacher_share, runner.sample(num_timesteps=140)) for _ in range(4)]
     yield runner, rounds
     runner.stop()
@@ -39,7 +42,7 @@ def rolled_out(config):
 
 @pytest.fixture
 def learner(config, rolled_out):
-    return build_ppo(config).build_learner(env=rolled_out[0].env)
+    return build_algorithm(config).build_learner(env=rolled_out[0].env)
 
 
 def optimiser(learner):
@@ -105,7 +108,7 @@ def test_steps_of_all_batches_are_learnt_from_and_none_is_kept_after_the_last(
     steps = [sum(map(len, batch)) for batch in episodes]
     for k, batch in enumerate(episodes):
         told = learner.update(episodes=batch, timesteps={SAMPLED: 999 if k < 3 else 1000}, minibatch_size=16)
-        assert len(learner._lessons) == (sum(steps[: k + 1]) if k < 3 else 0)
+        assert len(learner._steps) == (sum(steps[: k + 1]) if k < 3 else 0)
     assert len(drawn) == 3 * 7 + 20
     assert {size for size, _ in drawn} == {16}
     rates = [rate for _, rate in drawn]
@@ -119,7 +122,7 @@ def test_after_the_last_batch_the_networks_begin_anew(config, rolled_out):
     episodes = [copy.deepcopy(episodes) for _, episodes in rolled_out[1][:2]]
     weights, rates = [], (1e-3, 1e-5)
     for rate in rates:
-        learner = build_ppo(config).build_learner(env=rolled_out[0].env)
+        learner = build_algorithm(config).build_learner(env=rolled_out[0].env)
         first = copy.deepcopy(learner.module["default_policy"].state_dict())
         optimiser(learner)["lr"] = rate
         torch.manual_seed(1)
@@ -153,7 +156,7 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
             *SHORT, "algo=imitation", "algo.num_env_runners=0", *own, f"algo.mirrored={mirrored}"
         )
         encoder = write_encoder(tmp_path, config) if KINDS[config.model.name].encoder else None
-        runner = TaughtEnvRunner(config=build_ppo(config, encoder), worker_index=0)
+        runner = TaughtEnvRunner(config=build_algorithm(config, encoder), worker_index=0)
         shown = []
         remember = type(runner)._remember
 
@@ -170,12 +173,12 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
         np.testing.assert_array_equal(one.get_actions(), other.get_actions())
         assert MIRRORED not in one.extra_model_outputs
     seen = np.concatenate([episode.get_observations()[:-1] for episode in told[True]])
-    kept, met = np.zeros((len(shown[0][1]), *seen.shape[1:]), seen.dtype), len(runner.module.met)
+    kept, met = np.zeros((len(shown[0][1]), *seen.shape[1:]), seen.dtype), len(runner.shown.windows)
     expected = []
     for observations, first in shown:
         kept = runner.module.remember_mirrored(kept, observations, first)
         expected.append(kept)
-    assert len(runner.module.met) == met
+    assert len(runner.shown.windows) == met
     expected = {row.tobytes() for step in expected for row in step}
     found = np.concatenate([episode.get_extra_model_outputs(MIRRORED) for episode in told[True]])
     assert {row.tobytes() for row in found} <= expected
@@ -184,13 +187,13 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
 
 def test_a_mirrored_step_is_learnt_with_the_costs_of_the_mirrored_actions(rolled_out):
     config = make_config(*WORDS, *SETTINGS, "algo.mirrored=true")
-    runner = TaughtEnvRunner(config=build_ppo(config), worker_index=0)
-    learner = build_ppo(config).build_learner(env=runner.env)
+    runner = TaughtEnvRunner(config=build_algorithm(config), worker_index=0)
+    learner = build_algorithm(config).build_learner(env=runner.env)
     episodes = runner.sample(num_timesteps=140)
     runner.stop()
     rows = learner._rows(episodes)
     learner.update(episodes=episodes, timesteps={SAMPLED: 1}, minibatch_size=16)
-    lessons, count = learner._lessons.arrays(), len(rows[COSTS])
+    lessons, count = learner._steps.arrays(), len(rows[COSTS])
     assert lessons["seen"] == 2 * count
     np.testing.assert_array_equal(lessons["stacks"][:count], rows["obs"])
     np.testing.assert_array_equal(lessons["stacks"][count:], rows[MIRRORED])
@@ -221,7 +224,7 @@ def test_without_a_teacher_nothing_can_be_asked_of_it(word):
 
 def test_a_teacher_of_limited_sight_says_what_a_way_so_far_costs():
     config = make_config(*WORDS, *SETTINGS, "algo.teacher_sight_m=5")
-    runner = TaughtEnvRunner(config=build_ppo(config), worker_index=0)
+    runner = TaughtEnvRunner(config=build_algorithm(config), worker_index=0)
     runner.sample(num_timesteps=64)
     for row, costs in enumerate(runner.costs()):
         env = runner.env.unwrapped.envs[row]
@@ -240,14 +243,14 @@ def rows_of(first, count):
 
 
 def test_lessons_are_all_kept_up_to_a_bound_and_beyond_it_a_fair_sample():
-    lessons = Lessons(100 * (3 * 2 + 3 * 4))
+    lessons = LabelledSteps(100 * (3 * 2 + 3 * 4))
     torch.manual_seed(0)
     for first in range(0, 80, 16):
         lessons.add(*rows_of(first, 16))
     np.testing.assert_array_equal(lessons.arrays()["costs"][:, 0], np.arange(80))
     counts = np.zeros(400)
     for _ in range(100):
-        lessons = Lessons(100 * (3 * 2 + 3 * 4))
+        lessons = LabelledSteps(100 * (3 * 2 + 3 * 4))
         for first in range(0, 400, 50):
             lessons.add(*rows_of(first, 50))
         kept = lessons.arrays()["costs"][:, 0].astype(int)
@@ -262,7 +265,7 @@ def test_lessons_are_all_kept_up_to_a_bound_and_beyond_it_a_fair_sample():
 
 @pytest.mark.parametrize("seen", [0, 60, 150])
 def test_lessons_go_on_from_their_arrays(seen):
-    lessons, again = Lessons(100 * (3 * 2 + 3 * 4)), Lessons(100 * (3 * 2 + 3 * 4))
+    lessons, again = LabelledSteps(100 * (3 * 2 + 3 * 4)), LabelledSteps(100 * (3 * 2 + 3 * 4))
     if seen:
         lessons.add(*rows_of(0, seen))
     again.load(lessons.arrays())
@@ -275,7 +278,7 @@ def test_lessons_go_on_from_their_arrays(seen):
 
 
 def test_algo_imitation_names_both_parts(config):
-    ppo = build_ppo(config)
+    ppo = build_algorithm(config)
     assert ppo.env_runner_cls is TaughtEnvRunner
     assert ppo.learner_class is ImitationLearner
     assert ppo.lr == 1e-3
@@ -286,7 +289,9 @@ def test_every_kind_of_policy_can_be_taught(name, tmp_path):
     own = "model.encoder=finetuned" if name == "finetuned" else f"model={name}"
     few = "algo.imitation.fit_steps=2", "algo.minibatch_size=8"
     config = make_config(*SHORT, "algo=imitation", "algo.num_env_runners=0", own, *few)
-    ppo = build_ppo(config, write_encoder(tmp_path, config) if KINDS[config.model.name].encoder else None)
+    ppo = build_algorithm(
+        config, write_encoder(tmp_path, config) if KINDS[config.model.name].encoder else None
+    )
     runner = TaughtEnvRunner(config=ppo, worker_index=0)
     learner = ppo.build_learner(env=runner.env)
     before = [value.clone() for value in learner.module["default_policy"].pi.parameters()]

@@ -6,8 +6,8 @@ import torch
 
 from jobs.config.config import ConfigError
 from jobs.run.folder import finish, locate_run, open_run, run_name
+from jobs.training.algorithms import build_algorithm
 from jobs.training.inputs import check_inputs, prepare_inputs
-from jobs.training.ppo import build_ppo
 from models.policy import load_policy
 from tests.support.configs import SHORT, make_config
 from tests.support.policies import kinds, save_untrained
@@ -65,7 +65,7 @@ def test_a_run_keeps_a_copy_of_the_policy_that_it_begins_from(tmp_path, name):
     assert prepare_inputs(config, folder, again) == found
     assert again.told == {}
     networks = load_policy(folder.init).networks.state_dict()
-    ppo = build_ppo(config, found, folder.init / "networks.safetensors")
+    ppo = build_algorithm(config, found, folder.init / "networks.safetensors")
     module = ppo.rl_module_spec.build()
     for own, value in module.networks().state_dict().items():
         if own in networks:  # a fine-tuned encoder acts from a table
@@ -77,7 +77,7 @@ def test_a_shipped_policy_can_be_trained_on(tmp_path):
     config = make_config(f"runs_dir={tmp_path}", "train.init=models/pretrained/bytestream-s0")
     check_inputs(config)
     path = prepare_inputs(config, locate_run(config), Tracker())
-    module = build_ppo(config, path, path.parent / "networks.safetensors").rl_module_spec.build()
+    module = build_algorithm(config, path, path.parent / "networks.safetensors").rl_module_spec.build()
     expected = load_policy("models/pretrained/bytestream-s0").networks
     assert torch.equal(module.pi[0].weight, expected["pi"][0].weight)
 

@@ -9,8 +9,10 @@ from ray.rllib.core.rl_module.rl_module import RLModule
 
 from envs.events import unpack_window
 from jobs.config.config import ConfigError
-from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.ppo import build_ppo, corridor_settings, make_corridors, policy_about, policy_spec
+from jobs.training.algorithms import build_algorithm
+from jobs.training.policy import policy_about, policy_spec
+from jobs.training.sampling.corridors import TrainingCorridors, corridor_settings
+from jobs.training.sampling.env_runner import PlainEnvRunner
 from models.encoder.table import EncoderTable
 from models.encoder.weights import EncoderFileError, load_encoder
 from models.kinds import KINDS
@@ -42,7 +44,7 @@ def make_own(name, *overrides):
 
 def make_ppo(name, encoder, *overrides):
     config = make_own(name, *overrides)
-    return build_ppo(config, encoder if KINDS[config.model.name].encoder else None)
+    return build_algorithm(config, encoder if KINDS[config.model.name].encoder else None)
 
 
 def is_frozen(name):
@@ -192,7 +194,7 @@ def test_the_networks_are_built_from_what_the_configuration_says():
 def test_each_episode_of_a_training_draws_one_of_its_conditions():
     conditions = "train.conditions=[{},{faults.sparsity: 0.5, env.control_hz: 100}]"
     settings = corridor_settings(make_config("model=event_columns", conditions))
-    env = make_corridors({**settings, "num_envs": 4})
+    env = TrainingCorridors({**settings, "num_envs": 4})
     seen = set()
     for seed in range(4):
         env.reset(seed=seed)
@@ -327,15 +329,15 @@ def test_the_same_seed_gives_the_same_flights(ppo):
 
 def test_an_encoder_of_another_sensor_is_refused_with_both_values(encoder):
     with pytest.raises(ConfigError, match=r"another sensor.*contrast_threshold: 0\.2 there, 0\.3 here"):
-        build_ppo(make_config("camera.contrast_threshold=0.3"), encoder)
+        build_algorithm(make_config("camera.contrast_threshold=0.3"), encoder)
 
 
 def test_an_encoder_of_another_model_is_not_fine_tuned(encoder):
     with pytest.raises(ConfigError, match=r"encoder: must be one of .*'eventnet'.* to be fine-tuned, got"):
-        build_ppo(make_own("finetuned", "model.coding=eventnet"), encoder)
+        build_algorithm(make_own("finetuned", "model.coding=eventnet"), encoder)
 
 
 def test_a_policy_gets_an_encoder_if_and_only_if_it_has_one(encoder):
     for name, path, rule in (("bytestream", None, "a file"), ("event_image", encoder, "None")):
         with pytest.raises(ValueError, match=f"encoder_path must be {rule} for {name}"):
-            build_ppo(make_config(f"model={name}"), path)
+            build_algorithm(make_config(f"model={name}"), path)

@@ -7,10 +7,11 @@ import torch
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.utils.postprocessing.value_predictions import compute_value_targets
 
-from jobs.training import ppo_learner
-from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.ppo import build_ppo
-from jobs.training.ppo_learner import PlainPPOLearner, advantages
+from jobs.training.algorithms import build_algorithm
+from jobs.training.ppo import learner as ppo_learner
+from jobs.training.ppo.learner import PlainPPOLearner
+from jobs.training.ppo.losses import advantages
+from jobs.training.sampling.env_runner import PlainEnvRunner
 from tests.support.configs import SHORT, make_config
 from tests.support.runs import write_encoder
 
@@ -21,7 +22,7 @@ NORM = "gradients_default_optimizer_global_norm"
 @pytest.fixture(scope="module")
 def ppo(tmp_path_factory):
     config = make_config(*SHORT, "algo.entropy_coeff=0.03")
-    return build_ppo(config, write_encoder(tmp_path_factory.mktemp("encoder"), config))
+    return build_algorithm(config, write_encoder(tmp_path_factory.mktemp("encoder"), config))
 
 
 @pytest.fixture(scope="module")

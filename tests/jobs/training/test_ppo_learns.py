@@ -9,8 +9,8 @@ from gymnasium.vector.utils import batch_space
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.tune.registry import register_env
 
-from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.ppo import build_ppo
+from jobs.training.algorithms import build_algorithm
+from jobs.training.sampling.env_runner import PlainEnvRunner
 from tests.support.configs import make_config
 
 COLUMNS = np.array([10, 32, 54])  # of the only event of a step; its place names the action that is rewarded
@@ -52,7 +52,7 @@ class Identity(VectorEnv):
 def test_ppo_learns_which_action_the_observation_names():
     config = make_config("model=event_columns", "algo.num_envs_per_env_runner=8", "algo.lr=1e-3")
     register_env("identity", lambda context: Identity(context["num_envs"]))
-    ppo = build_ppo(config).environment("identity", env_config={}).callbacks(RLlibCallback)
+    ppo = build_algorithm(config).environment("identity", env_config={}).callbacks(RLlibCallback)
     runner = PlainEnvRunner(config=ppo, worker_index=0)
     learner = ppo.build_learner(env=runner.env)
     torch.manual_seed(0)

@@ -10,7 +10,7 @@ from jobs.config.config import ConfigError
 from jobs.run.folder import open_run
 from jobs.training import pretrain
 from jobs.training.collect import record
-from jobs.training.gpu_steps import exact
+from jobs.training.ppo.gpu_steps import exact
 from jobs.training.pretrain import EvaeTraining, check_sources, on_processor, restore, save_checkpoint
 from models.encoder.evae import EventVAE
 from models.kinds import EvaeSettings

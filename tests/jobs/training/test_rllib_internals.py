@@ -8,8 +8,9 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.env_runner_group import EnvRunnerGroup
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
-from jobs.training import env_runner, ppo_learner
-from jobs.training.rllib_internals import ENV_RUNNER, GROUP, LEARNER, MODULE, TESTED_RAY, require
+from jobs.training.ppo import learner as ppo_learner
+from jobs.training.sampling import env_runner
+from jobs.training.sampling.rllib_internals import ENV_RUNNER, GROUP, LEARNER, MODULE, TESTED_RAY, require
 
 
 def defined(part, name):

@@ -7,11 +7,11 @@ import pytest
 import torch
 from ray.exceptions import ActorDiedError, ActorUnavailableError
 
-from jobs.training import rounds
-from jobs.training.env_runner import PlainEnvRunner, RolloutError
-from jobs.training.ppo import build_ppo
-from jobs.training.rounds import Rounds
-from jobs.training.snapshots import generators, set_generators
+from jobs.training.algorithms import build_algorithm
+from jobs.training.sampling import rounds
+from jobs.training.sampling.env_runner import PlainEnvRunner, RolloutError
+from jobs.training.sampling.rounds import Rounds
+from jobs.training.sampling.snapshots import generators, set_generators
 from tests.support.configs import SHORT, make_config
 
 pytestmark = pytest.mark.system  # they build RLlib's algorithm many times
@@ -92,7 +92,7 @@ class Manager:
 
 @pytest.fixture(scope="module")
 def ppo():
-    return build_ppo(make_config(*SHORT, "model=event_columns", "algo.train_batch_size_per_learner=40"))
+    return build_algorithm(make_config(*SHORT, "model=event_columns", "algo.train_batch_size_per_learner=40"))
 
 
 @pytest.fixture

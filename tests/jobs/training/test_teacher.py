@@ -7,10 +7,12 @@ import torch
 
 from envs.corridor import CorridorEnv
 from envs.scene.planning import cost_to_go
-from jobs.training.env_runner import PlainEnvRunner
-from jobs.training.ppo import build_ppo, corridor_settings, policy_about, policy_spec
-from jobs.training.ppo_learner import advantages, shaping
-from jobs.training.teacher import COST_TO_GO, PricedEnvRunner
+from jobs.training.algorithms import build_algorithm
+from jobs.training.policy import policy_about, policy_spec
+from jobs.training.ppo.learner import advantages, shaping
+from jobs.training.sampling.corridors import corridor_settings
+from jobs.training.sampling.env_runner import PlainEnvRunner
+from jobs.training.sampling.teacher import COST_TO_GO, PricedEnvRunner
 from models.policy import load_policy, save_policy
 from models.policy.rllib_module import PRIVILEGED
 from tests.support.configs import SHORT, make_config
@@ -25,14 +27,14 @@ WEIGHT = 12.0
 @pytest.fixture(scope="module")
 def rolled_out():
     """The environments of an env runner with a teacher, and two rounds of it."""
-    runner = PricedEnvRunner(config=build_ppo(make_config(*COLUMNS)), worker_index=0)
+    runner = PricedEnvRunner(config=build_algorithm(make_config(*COLUMNS)), worker_index=0)
     rounds = [runner.sample(num_timesteps=64) for _ in range(2)]
     yield runner.env, rounds
     runner.stop()
 
 
 def make_learner(env, *words, **built):
-    return build_ppo(make_config(*COLUMNS, *words), **built).build_learner(env=env)
+    return build_algorithm(make_config(*COLUMNS, *words), **built).build_learner(env=env)
 
 
 def module_of(learner):
@@ -103,7 +105,7 @@ def test_the_best_actions_stay_the_best():
 def test_each_place_of_an_episode_has_its_cost_and_all_else_is_as_without_a_teacher(rolled_out):
     config = make_config(*COLUMNS)
     plain, env = (
-        PlainEnvRunner(config=build_ppo(config), worker_index=0),
+        PlainEnvRunner(config=build_algorithm(config), worker_index=0),
         CorridorEnv(corridor_settings(config)["config"]),
     )
     for episodes in rolled_out[1]:
@@ -124,7 +126,7 @@ def test_with_a_delay_a_cost_is_that_of_the_place_where_the_next_action_is_taken
     config = make_config(*COLUMNS, "env.action_delay_ms=20")
     assert policy_about(config)["world"]["action_delay_ms"] == 20.0
     assert "action_delay_ms" not in policy_about(make_config(*COLUMNS))["world"]
-    runner, env = PricedEnvRunner(config=build_ppo(config), worker_index=0), CorridorEnv()
+    runner, env = PricedEnvRunner(config=build_algorithm(config), worker_index=0), CorridorEnv()
     compared = 0
     for episode in runner.sample(num_timesteps=64):
         infos = infos_of(episode)
@@ -224,7 +226,9 @@ def test_in_the_warm_up_only_the_value_network_learns_and_ppo_then_begins_anew(r
     words = f"model={kind}", "train.init=X", "train.value_warmup=200"
     env, rounds, init = rolled_out[0], rolled_out[1], trained
     if kind != "event_columns":
-        runner = PlainEnvRunner(config=build_ppo(make_config(*COLUMNS, f"model={kind}")), worker_index=0)
+        runner = PlainEnvRunner(
+            config=build_algorithm(make_config(*COLUMNS, f"model={kind}")), worker_index=0
+        )
         env, rounds, init = runner.env, [runner.sample(num_timesteps=64) for _ in range(2)], None
         runner.stop()
     learner, fresh = (make_learner(env, *words, init=init) for _ in range(2))

@@ -14,7 +14,8 @@ from ray.exceptions import ActorDiedError, RayTaskError
 
 from jobs.run.folder import open_run
 from jobs.training import train as training
-from jobs.training.ppo import EpisodeMetrics
+from jobs.training.ppo.train import PPO
+from jobs.training.sampling.metrics import EpisodeMetrics
 from jobs.training.train import TrainingError, read_metrics, reported_so_far
 from models.policy import load_policy
 from tests.support.configs import TINY, make_config
@@ -46,7 +47,7 @@ def result(**learner):
 
 
 def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
-    metrics = read_metrics(result(), 2.0)
+    metrics = read_metrics(result(), 2.0, PPO)
     assert metrics["train/episode_return"] == 12.5
     assert metrics["train/value_loss"] == 2.0
     assert metrics["perf/env_steps_per_second"] == 1024.0
@@ -57,7 +58,7 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_the_training(bad):
     with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
-        read_metrics(result(vf_loss=bad), 2.0)
+        read_metrics(result(vf_loss=bad), 2.0, PPO)
 
 
 # What Ray's memory monitor writes, shortened.
@@ -90,7 +91,7 @@ def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_pa
     for errors in (
         (raised,),
         (lost, raised),
-        (raised.replace("ValueError", "jobs.training.env_runner.RolloutError: KeyError"),),
+        (raised.replace("ValueError", "jobs.training.sampling.env_runner.RolloutError: KeyError"),),
     ):
         with pytest.raises(
             TrainingError, match=r"^training stopped: \w+Error: no; the same command continues"

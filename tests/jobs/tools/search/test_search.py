@@ -96,7 +96,7 @@ class Diverging:
 @pytest.fixture
 def a_trial(tmp_path, monkeypatch):
     """One of such a training, which Tune keeps."""
-    monkeypatch.setattr(trial, "build_ppo", lambda *asked: None)
+    monkeypatch.setattr(trial, "build_algorithm", lambda *asked: None)
     monkeypatch.setattr(trial, "PPO", Diverging)
     one = SearchTrial.__new__(SearchTrial)
     one.__dict__.update(_logdir=str(tmp_path / "log"), _storage=trial_storage(tmp_path))

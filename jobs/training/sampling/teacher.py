@@ -8,8 +8,8 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 from envs.scene import Scene
 from envs.scene.planning import CostToGo, cost_to_go
-from jobs.training.env_runner import PlainEnvRunner, Step
-from jobs.training.snapshots import Snapshot
+from jobs.training.sampling.env_runner import PlainEnvRunner, Step
+from jobs.training.sampling.snapshots import Snapshot
 
 # In an info: of the cheapest way (`envs.scene.planning`) to the goal line from where the next action acts.
 COST_TO_GO = "cost_to_go"

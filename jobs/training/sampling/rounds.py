@@ -14,9 +14,9 @@ from ray.rllib.env.env_runner_group import EnvRunnerGroup
 
 from jobs.run.ray_cluster import logs_folder
 from jobs.run.trial_errors import low_memory
-from jobs.training.env_runner import MAX_SAMPLE_S, Part, RolloutError
-from jobs.training.rllib_internals import GROUP, require
-from jobs.training.snapshots import Snapshot
+from jobs.training.sampling.env_runner import MAX_SAMPLE_S, Part, RolloutError
+from jobs.training.sampling.rllib_internals import GROUP, require
+from jobs.training.sampling.snapshots import Snapshot
 
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 MAX_PAUSE_S = 600.0  # until an env runner has started again: a busy machine takes minutes

@@ -7,7 +7,7 @@ import pyarrow.fs
 import pytest
 
 from jobs.run.checkpoints import mend, seal
-from jobs.training import algorithm
+from jobs.training.ppo import algorithm
 from tests.support.runs import trial_storage
 
 

@@ -24,8 +24,9 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from jobs.config.plugins import one_line
 from jobs.run.watchdog import ending_after
-from jobs.training.rllib_internals import ENV_RUNNER, require
-from jobs.training.snapshots import Snapshot, generators, set_generators
+from jobs.training.sampling.rllib_internals import ENV_RUNNER, require
+from jobs.training.sampling.snapshots import Snapshot, generators, set_generators
+from jobs.training.sampling.window_sample import WindowSample
 from models.policy.networks import logits_by
 
 MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
@@ -105,7 +106,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         In a process of its own an error is kept and raised by the next call: RLlib would otherwise go
         on without the env runner, and fail for lack of it.
         """
-        self._refused = ""
+        self._refused, self.shown = "", WindowSample()
         try:
             super().__init__(**settings)
             require(self, ENV_RUNNER)
@@ -163,13 +164,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             RolloutError: The process could not be built.
         """
         self._check_built()
-        values = {"metrics": self._callbacks[0].state(), "steps": self.module.steps}
-        met = list(self.module.met)
-        arrays = {
-            **generators(),
-            "met": np.concatenate(met) if met else np.empty(0),
-            "met_rows": np.array([len(window) for window in met], np.int64),
-        }
+        values = {"metrics": self._callbacks[0].state(), "steps": self.shown.steps}
+        arrays = {**generators(), **self.shown.arrays()}
         if not self._needs_initial_reset:
             values["names"] = [name for name, _ in self._episodes]
             actions = [taken for _, taken in self._episodes]
@@ -198,10 +194,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         with ending_after(MAX_SAMPLE_S):
             problem = "" if self._needs_initial_reset else self._replay(snapshot)
         self._needs_initial_reset |= bool(problem)
-        met = np.split(arrays["met"], np.cumsum(arrays["met_rows"])[:-1]) if len(arrays["met_rows"]) else []
-        self.module.met.clear()
-        self.module.met.extend(met)
-        self.module.steps = snapshot.values["steps"]
+        self.shown.load(arrays, snapshot.values["steps"])
         set_generators(arrays)
         return problem
 
@@ -287,6 +280,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
     def _remember(self, observations: Any, first: np.ndarray) -> None:
         """Add what each environment shows to what the policy keeps; `first` (N,): its episode begins."""
+        if self.module.encoder is not None:
+            self.shown.add(observations)
         self._stacks = self.module.remember(self._stacks, observations, first)
 
     @torch.no_grad()

@@ -30,9 +30,10 @@ from torch import Tensor, nn
 
 from jobs.run.device import learner_device
 from jobs.run.torch_threads import torch_threads
-from jobs.training.gpu_steps import NORM, TOTAL, GpuSteps
-from jobs.training.rllib_internals import LEARNER, require
-from jobs.training.teacher import log_costs
+from jobs.training.ppo.gpu_steps import NORM, TOTAL, GpuSteps
+from jobs.training.ppo.losses import advantages, shaping
+from jobs.training.sampling.rllib_internals import LEARNER, require
+from jobs.training.sampling.teacher import log_costs
 from models.policy.dense_update import Rows, Settings, update_dense
 from models.policy.event_set import EventSet
 from models.policy.networks import is_mlp
@@ -56,41 +57,6 @@ MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
 REWARD_SCALE = "reward_scale"
 SHAPING = "shaping"  # of these: rewards are shaped by the potential -SHAPING `log_costs`
 VALUE_WARMUP = "value_warmup"  # of these: environment steps in which only the value network learns
-
-
-def advantages(
-    values: np.ndarray, rewards: np.ndarray, terminated: bool, gamma: float, lambda_: float
-) -> np.ndarray:
-    """Generalised advantage estimates of a piece of an episode (Schulman et al. 2016), float64 (T,).
-
-    Args:
-        values: Of its T + 1 observations, (T + 1,).
-        rewards: Of its T steps, (T,).
-        terminated: Whether it ended for good, so that its last observation has no value.
-        gamma: Discount per step.
-        lambda_: Weight of longer estimates.
-    """
-    values = values.astype(np.float64)
-    values[-1] *= not terminated
-    errors = rewards + gamma * values[1:] - values[:-1]
-    estimate, estimates = 0.0, []
-    for error in reversed(errors.tolist()):
-        estimate = error + gamma * lambda_ * estimate
-        estimates.append(estimate)
-    return np.array(estimates[::-1])
-
-
-def shaping(potentials: np.ndarray, terminated: bool, gamma: float) -> np.ndarray:
-    """What a potential adds to the rewards of a piece of an episode (Ng, Harada and Russell 1999), (T,).
-
-    Args:
-        potentials: Of its T + 1 places, (T + 1,).
-        terminated: Whether it ended for good; its last place then has the potential 0.
-        gamma: Discount per step.
-    """
-    after = potentials[1:].copy()
-    after[-1] *= not terminated
-    return gamma * after - potentials[:-1]
 
 
 def shared_threads(config: Any) -> int:
@@ -177,12 +143,12 @@ class PlainPPOLearner(PPOTorchLearner):
             self.get_optimizer(DEFAULT_MODULE_ID).state.clear()  # Adam counts the steps of all weights alike
         return figures | {LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY: self._explained_variance(rows)}
 
-    def kept(self) -> dict[str, np.ndarray]:
-        """What the next updates depend on beside RLlib's own state."""
+    def own_state(self) -> dict[str, np.ndarray]:
+        """Return what the next updates depend on, besides RLlib's own state."""
         return {}
 
-    def keep(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on with what an earlier process had `kept`, among other arrays."""
+    def set_own_state(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Continue from the `own_state` of an earlier process, which is among these arrays."""
 
     def _threads(self) -> int:
         """As many as there are env runners, which wait meanwhile; one for networks too small to share."""

@@ -1,8 +1,8 @@
 """The private names of RLlib that this package relies on; another version may lack any of them.
 
-`jobs.training.env_runner` and `jobs.training.ppo_learner` replace RLlib's loops over single steps and
-minibatches, and `jobs.training.rounds` that over env runners, for which RLlib has no public interface. A
-test compares these lists with what they use.
+`sampling.env_runner` and `ppo.learner` replace RLlib's loops over single steps and minibatches, and
+`sampling.rounds` its loop over env runners. RLlib has no public interface for them. A test compares these
+lists with what the three files use.
 """
 
 from collections.abc import Sequence

@@ -1,0 +1,167 @@
+"""How a policy may be trained: a table of algorithms, and the settings of each.
+
+To add an algorithm of RLlib's, write `conf/algo/NAME.yaml` with `name: rllib`. To add one of your own, write
+a folder `jobs/training/NAME` with a `jobs.training.algorithms.Algorithm`, a row here, and its YAML file.
+A row names its algorithm as "module:attribute", so that a configuration is checked without importing Ray.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import pydantic
+from pydantic import BeforeValidator, Field
+from pydantic.dataclasses import dataclass
+
+from envs.config import STRICT, Fraction, Positive
+from models.kinds import checked
+
+Count = Annotated[int, Field(ge=1)]
+NonNegative = Annotated[float, Field(ge=0)]
+Runners = Annotated[int, Field(ge=0, le=10_000)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class ImitationConfig:
+    """Imitation of a planner that knows the geometry (DAgger: Ross et al. 2011).
+
+    Attributes:
+        temperature: Labels are softmax(-cost / temperature); costs as in `envs.scene.planning`.
+        guided_batches: In the first batches the teacher acts too: in all steps of the first, then in half as
+            many in each; 0: never.
+        fit_steps: Gradient steps after each batch, on steps of all batches.
+        final_steps: Gradient steps after the last, from the first weights, with a step size that falls to 0.
+        keep_mb: Memory for the steps that are kept [MB]; beyond it, a random sample of all.
+    """
+
+    temperature: Positive
+    guided_batches: Annotated[int, Field(ge=0)]
+    fit_steps: Count
+    final_steps: Count
+    keep_mb: Positive
+
+
+def _imitation(values: object) -> object:
+    """The settings of a mapping, which pydantic would not take for a dataclass where it is strict."""
+    return checked(ImitationConfig, dict(values)) if isinstance(values, Mapping) else values
+
+
+@dataclass(frozen=True, config=STRICT)
+class AlgoConfig:
+    """PPO, each word as RLlib spells it (appendix D.1.2).
+
+    Attributes:
+        critic: What the value network sees: what the policy does, or also what the cheapest way to the goal
+            line costs, of a teacher that knows the geometry.
+        shaping: Of the potential -shaping * log(1 + that cost), by which rewards are shaped in training only;
+            0: they are not.
+        imitation: Learn from a teacher instead; of the others then only lr, sizes, grad_clip, mirrored and
+            teacher_sight_m count.
+        mirrored: Learn each step a second time, left and right exchanged (`models.policy.mirror`).
+        teacher_sight_m: How far ahead the teacher plans [m], in imitation, critic and shaping alike; None: to
+            the goal line.
+    """
+
+    lr: Positive
+    lr_schedule: Literal["constant", "linear"]
+    gamma: Fraction
+    lambda_: Fraction
+    clip_param: Positive
+    num_epochs: Count
+    minibatch_size: Count
+    train_batch_size_per_learner: Count
+    vf_loss_coeff: NonNegative
+    entropy_coeff: NonNegative
+    grad_clip: Positive
+    reward_scale: Positive
+    num_envs_per_env_runner: Count
+    num_env_runners: Runners
+    critic: Literal["observation", "teacher"] = "observation"
+    shaping: NonNegative = 0.0
+    imitation: Annotated[ImitationConfig | None, BeforeValidator(_imitation)] = None
+    mirrored: bool = False
+    teacher_sight_m: Positive | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _minibatch_fits(self) -> "AlgoConfig":
+        if self.minibatch_size > self.train_batch_size_per_learner:
+            raise ValueError("minibatch_size must not exceed train_batch_size_per_learner")
+        if self.mirrored and self.imitation is None:
+            rule = "must be false without algo.imitation, because PPO learns only from what it did"
+            raise ValueError(f"mirrored {rule}, got true")
+        taught = self.imitation is not None or self.critic == "teacher" or self.shaping > 0.0
+        if self.teacher_sight_m is not None and not taught:
+            rule = "must be null without a teacher (algo=imitation, algo.critic=teacher, algo.shaping)"
+            raise ValueError(f"teacher_sight_m {rule}, got {self.teacher_sight_m}")
+        return self
+
+    @property
+    def name(self) -> str:
+        """The row of `ALGORITHMS`."""
+        return "ppo" if self.imitation is None else "imitation"
+
+
+@dataclass(frozen=True, config=STRICT)
+class RLlibConfig:
+    """An algorithm of RLlib's, configured by its user.
+
+    Attributes:
+        name: "rllib", the row of `ALGORITHMS`.
+        algorithm: RLlib's name, such as DQN, SAC, APPO or IMPALA.
+        settings: What `AlgorithmConfig.training` of that algorithm takes.
+        num_env_runners: Processes that roll out episodes; 0: the learner's own process does.
+        num_envs_per_env_runner: Environments that each steps together.
+    """
+
+    imitation: ClassVar[None] = None
+
+    name: Literal["rllib"]
+    algorithm: Annotated[str, Field(pattern=r"^[A-Za-z0-9]+$")]
+    settings: dict[str, Any]
+    num_env_runners: Runners
+    num_envs_per_env_runner: Count
+
+
+Algo = AlgoConfig | RLlibConfig
+
+
+class Row(NamedTuple):
+    """One algorithm.
+
+    Attributes:
+        settings: The dataclass of its settings.
+        algorithm: Its `jobs.training.algorithms.Algorithm`, as "module:attribute".
+    """
+
+    settings: type
+    algorithm: str
+
+
+ALGORITHMS = {
+    "ppo": Row(AlgoConfig, "jobs.training.ppo.train:PPO"),
+    "imitation": Row(AlgoConfig, "jobs.training.imitation.train:IMITATION"),
+    "rllib": Row(RLlibConfig, "jobs.training.rllib.train:RLLIB"),
+}
+
+
+def read_algo(**values: object) -> Algo:
+    """Return the settings of an algorithm, checked; without a `name` they are those of PPO.
+
+    Raises:
+        pydantic.ValidationError: A setting is missing, unknown to this algorithm, or has a wrong value.
+        ValueError: There is no algorithm of this name.
+    """
+    settings: Any = _row(values.get("name", "ppo")).settings
+    return settings(**values)
+
+
+def algo_keys(values: Mapping[str, object] | None = None) -> list[str]:
+    """Return the settings of the algorithm that some values configure, of all algorithms if None."""
+    rows = ALGORITHMS.values() if values is None else [_row(values.get("name", "ppo"))]
+    return list(dict.fromkeys(field.name for row in rows for field in dataclasses.fields(row.settings)))
+
+
+def _row(name: object) -> Row:
+    if name not in ALGORITHMS:
+        raise ValueError(f"name must be one of {', '.join(ALGORITHMS)}, got {name!r}")
+    return ALGORITHMS[str(name)]

@@ -1,0 +1,52 @@
+"""Env runners of imitation: the student flies, the teacher labels every step and acts in some."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS
+from jobs.training.sampling.snapshots import Snapshot
+from jobs.training.sampling.teacher import TeacherEnvRunner
+
+
+class TaughtEnvRunner(TeacherEnvRunner):
+    """A `PlainEnvRunner` whose steps carry the teacher's costs, and its mirror image if asked for."""
+
+    @property
+    def _settings(self) -> Any:
+        return self.config.learner_config_dict[SETTINGS]
+
+    @property
+    def teacher_share(self) -> float:
+        """Return the fraction of this round's steps in which the teacher acts."""
+        done = self._callbacks[0].rounds
+        return 0.5**done if done < self._settings["guided_batches"] else 0.0
+
+    def snapshot(self) -> Snapshot:
+        """Return the state of `PlainEnvRunner.snapshot`, and the mirrored observations."""
+        snapshot = super().snapshot()
+        if self._settings.get(MIRRORED) and "stacks" in snapshot.arrays:
+            snapshot.arrays[MIRRORED] = self._mirrored
+        return snapshot
+
+    def _replay(self, snapshot: Snapshot) -> str:
+        if self._settings.get(MIRRORED):
+            self._mirrored = snapshot.arrays[MIRRORED]
+        return super()._replay(snapshot)
+
+    def _remember(self, observations: Any, first: np.ndarray) -> None:
+        super()._remember(observations, first)
+        if self._settings.get(MIRRORED):
+            before = np.zeros_like(self._stacks) if first.all() else self._mirrored
+            self._mirrored = self.module.remember_mirrored(before, observations, first)
+
+    def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        actions, outputs = super()._decide(stacks)
+        costs = self.costs()
+        costs = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
+        if self.teacher_share > 0.0:
+            by_teacher = torch.rand(len(stacks)).numpy() < self.teacher_share
+            actions = np.where(by_teacher, costs.argmin(axis=1), actions)
+        mirrored = {MIRRORED: self._mirrored} if self._settings.get(MIRRORED) else {}
+        return actions, {**outputs, COSTS: costs, **mirrored}

@@ -1,0 +1,109 @@
+"""The learner of imitation (DAgger: Ross et al. 2011).
+
+The env runners fly the student, in the first batches mixed with the teacher. The teacher labels every
+step with the cost of each action, also where the student strayed. The learner stores all steps, and after
+each batch fits the policy's networks to the labels. After the last batch it restarts from the initial
+weights: networks that first learnt from few corridors generalise worse than networks that see all
+corridors from the start (Ash and Adams 2020). The value network learns nothing.
+
+With mirroring, each step is stored a second time with left and right exchanged, observation and label.
+"""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.learner.learner import ENTROPY_KEY, POLICY_LOSS_KEY
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from envs.kinematics import MIRRORED_ACTIONS
+from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, LabelledSteps
+from jobs.training.ppo.learner import PlainPPOLearner, shared_threads
+
+# Fraction of the newest steps in which the student's likeliest action is the cheapest.
+AGREEMENT_KEY = "agreement"
+
+
+class ImitationLearner(PlainPPOLearner):
+    """Fits the policy to the teacher's labels by cross-entropy, on the steps of all batches."""
+
+    def build(self) -> None:
+        """Build PPO's learner, an empty store of steps, and a copy of the initial weights."""
+        super().build()
+        self._settings: dict[str, Any] = self.config.learner_config_dict[SETTINGS]
+        self._mirrored: bool = self._settings.get(MIRRORED, False)
+        self._steps = LabelledSteps(1e6 * self._settings["keep_mb"])
+        self._first = copy.deepcopy(self.module[DEFAULT_MODULE_ID].unwrapped().state_dict())
+
+    def update(self, *, timesteps: Mapping[str, int] | None = None, **asked: Any) -> Any:
+        """Fit to all steps so far, longer after the last batch; arguments and result as of PPO's learner."""
+        sampled = dict(timesteps or {}).get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
+        self._last = sampled >= self._settings["env_steps"]
+        return super().update(timesteps=timesteps, **asked)
+
+    def own_state(self) -> dict[str, np.ndarray]:
+        """Return the stored steps."""
+        return self._steps.arrays()
+
+    def set_own_state(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Continue with the stored steps of `own_state`."""
+        self._steps.load(arrays)
+
+    def _threads(self) -> int:
+        """Return `shared_threads` for dense networks too: minibatches of 512 rows are worth it."""
+        return shared_threads(self.config)
+
+    def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
+        """Return the steps of all episodes, one after the other, as columns."""
+        columns = {
+            Columns.OBS: [np.asarray(episode.get_observations())[:-1] for episode in episodes],
+            Columns.ACTIONS: [episode.get_actions() for episode in episodes],
+        }
+        for name in (Columns.ACTION_DIST_INPUTS, COSTS, *([MIRRORED] if self._mirrored else [])):
+            columns[name] = [episode.get_extra_model_outputs(name) for episode in episodes]
+        return {name: torch.from_numpy(np.concatenate(parts)) for name, parts in columns.items()}
+
+    def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
+        """Take gradient steps on random rows of all steps so far; return the means of their figures."""
+        likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
+        self._steps.add(rows[Columns.OBS].numpy(), costs.numpy())
+        if self._mirrored:
+            self._steps.add(rows[MIRRORED].numpy(), costs.numpy()[:, MIRRORED_ACTIONS])
+        count = self._settings["final_steps" if self._last else "fit_steps"]
+        optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
+        if self._last:
+            self.module[DEFAULT_MODULE_ID].unwrapped().load_state_dict(self._first)
+            optimizer.state.clear()
+        figures: dict[str, Tensor] = {}
+        for step in range(count):
+            if self._last:
+                optimizer.param_groups[0]["lr"] = self.config.lr * (1.0 - step / count)
+            for name, figure in self._step(self._steps.draw(minibatch_size)).items():
+                # Into one array: a tensor kept for each step lies between the minibatches in memory, and the
+                # allocator then does not use their places again (gigabytes in 20,000 steps).
+                if not step:
+                    figures[name] = torch.empty(count)
+                figures[name][step] = figure
+        if self._last:
+            self._steps = LabelledSteps(0)  # a checkpoint would hold them otherwise
+        means = {name: values.mean() for name, values in figures.items()}
+        return means | {AGREEMENT_KEY: (costs.gather(1, likeliest) == 0.0).float().mean()}
+
+    def _on_gpu(self) -> None:
+        """Return None: the stored steps do not fit on the GPU."""
+
+    def _loss(self, module: Any, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the cross-entropy of the labels softmax(-cost / temperature), and the policy's entropy."""
+        logits = module._forward_train(rows)[Columns.ACTION_DIST_INPUTS]
+        labels = torch.softmax(-rows[COSTS] / self._settings["temperature"], dim=-1)
+        loss = cross_entropy(logits, labels)
+        logps = torch.log_softmax(logits.detach(), dim=-1)
+        figures = {POLICY_LOSS_KEY: loss.detach(), ENTROPY_KEY: -(logps.exp() * logps).sum(-1).mean()}
+        return loss, figures

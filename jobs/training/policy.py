@@ -1,0 +1,69 @@
+"""The policy of a training: what its networks are built from, and what its manifest records."""
+
+import dataclasses
+from pathlib import Path
+
+from envs.config import sensor_settings, settings_hash
+from envs.kinematics import NUM_ACTIONS
+from jobs.config.config import Config, ConfigError
+from jobs.config.errors import differences
+from jobs.config.plugins import plugin_digests
+from jobs.run.files import RunError
+from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
+from models.kinds import KINDS, PolicySpec
+
+
+def policy_spec(config: Config) -> PolicySpec:
+    """What the policy's networks are built from."""
+    camera = config.env.camera
+    return PolicySpec(config.model, camera.width, camera.height, NUM_ACTIONS)
+
+
+def policy_about(config: Config) -> dict[str, object]:
+    """What a policy's manifest records of its environment and training, beside its `policy_spec`."""
+    sensor = sensor_settings(config.env)
+    return {
+        "exp": config.exp,
+        "observation": KINDS[config.model.name].observation,
+        "window_capacity": config.env.window_capacity,
+        "sensor": sensor,
+        "sensor_hash": settings_hash(sensor),
+        "world": {name: getattr(config.env, name) for name in ("scene", "layout")}
+        | {"faults": dataclasses.asdict(config.env.faults)}
+        | ({"action_delay_ms": config.env.action_delay_ms} if config.env.action_delay_ms > 0 else {}),
+        "conditions": config.train.conditions,
+        "seed": config.seed,
+        "algo": dataclasses.asdict(config.algo),
+        **({} if config.train.init is None else {"init": config.train.init}),
+        **({"plugins": plugin_digests()} if config.plugins else {}),
+    }
+
+
+def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, EncoderManifest] | None:
+    """The encoder file with its manifest; None for a policy without one.
+
+    Raises:
+        ConfigError: It was made for another sensor, or for another model than the one to fine-tune.
+        RunError: It is damaged.
+        ValueError: A policy that needs one got none, or the other way round.
+    """
+    name, needed = config.model.name, KINDS[config.model.name].encoder
+    if policy_spec(config).finetuned and config.train.init is not None:  # its networks hold their encoder
+        return None
+    if needed != (path is not None):
+        raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")
+    if path is None:
+        return None
+    try:
+        _, about = load_encoder(path)
+    except EncoderFileError as error:
+        marker = Path(path).parent.parent / "stages" / "pretrain.json"
+        raise RunError(f"{error}; delete {marker}, and the same command makes the encoder anew") from None
+    differ = differences(about["sensor"], sensor_settings(config.env))
+    if differ:
+        remedy = "use its settings, or pretrain an encoder for these"
+        raise ConfigError(f"encoder: was made for another sensor: {differ}; {remedy}")
+    spec = policy_spec(config)
+    if spec.finetuned and spec.evae != about["model"]:
+        raise ConfigError(f"encoder: must be one of {spec.evae} to be fine-tuned, got {about['model']}")
+    return path, about

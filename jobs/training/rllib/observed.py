@@ -1,0 +1,61 @@
+"""A corridor whose observation is what a policy's networks read: one flat vector of features."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from envs.corridor import CorridorEnv
+from jobs.config.conditions import episode_draw
+from models.encoder.frozen import encoder_of
+from models.encoder.weights import load_encoder
+from models.kinds import PolicySpec
+from models.policy.features import feature_of
+from models.policy.memory import remember, windows_us
+
+
+class ObservedCorridor(gymnasium.Env):
+    """The environment of `CorridorEnv`, seen through the features and the memory of a policy.
+
+    RLlib's default networks read float32 vectors, so a policy of dense layers is trained by any algorithm.
+    """
+
+    def __init__(self, context: Mapping[str, Any]) -> None:
+        """Make the environment.
+
+        Args:
+            context: `config` and `conditions` as of `TrainingCorridors`, `spec` (the policy), and
+                `encoder_file` of a policy with a frozen encoder, else None.
+        """
+        self._env = CorridorEnv(context["config"], draw=episode_draw(context.get("conditions", [{}])))
+        self._spec: PolicySpec = context["spec"]
+        file = context["encoder_file"]
+        self._encoder = None if file is None else encoder_of(load_encoder(file)[0])
+        self._shape = (self._spec.depth, *feature_of(self._spec).shape(self._spec))
+        self.observation_space = spaces.Box(-np.inf, np.inf, (int(np.prod(self._shape)),), np.float32)
+        self.action_space = self._env.action_space
+        self._stack = np.zeros((1, *self._shape), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, Any]:
+        """Start an episode, as `CorridorEnv.reset` does."""
+        shown, info = self._env.reset(seed=seed, options=options)
+        return self._seen(shown, first=True), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Any]:
+        """Simulate one control step, as `CorridorEnv.step` does."""
+        shown, reward, terminated, truncated, info = self._env.step(action)
+        return self._seen(shown, first=False), reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._env.close()
+
+    def _seen(self, shown: np.ndarray, first: bool) -> np.ndarray:
+        windows = shown[None]
+        features = feature_of(self._spec).from_observations(windows, self._spec, self._encoder)
+        began = np.array([first])
+        duration_us = windows_us(windows, self._spec)
+        self._stack = remember(self._stack, features, began, self._spec, duration_us)
+        return self._stack.reshape(-1)

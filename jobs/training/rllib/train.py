@@ -1,0 +1,112 @@
+"""An algorithm of RLlib's with the networks that RLlib gives it; its policy is exported like any other."""
+
+from pathlib import Path
+from typing import Any, cast
+
+from ray.rllib.algorithms.registry import get_algorithm_class
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from torch import nn
+
+from jobs.config.algorithms import RLlibConfig
+from jobs.config.config import Config, ConfigError
+from jobs.training.algorithms import Algorithm
+from jobs.training.policy import policy_spec, pretrained_encoder
+from jobs.training.rllib.observed import ObservedCorridor
+from jobs.training.sampling.corridors import corridor_settings
+from jobs.training.sampling.metrics import EPISODES, EpisodeMetrics
+from jobs.training.trainable import guarded
+from models.kinds import PolicySpec
+from models.policy.networks import assemble
+
+# Where RLlib's modules of an algorithm with discrete actions have the networks that act: below, and the head.
+ACTING = (("pi_encoder", "pi"), ("encoder.actor_encoder", "pi"), ("encoder.encoder", "pi"), ("encoder", "af"))
+
+
+def build(config: Config, encoder_path: str | Path | None = None, init: Path | None = None) -> Any:
+    """Return RLlib's configuration of the algorithm that `algo.algorithm` names.
+
+    Raises:
+        ConfigError: There is none of this name, it refuses a setting, the policy has other networks than
+            dense layers, or training is to begin from a policy.
+    """
+    algo, spec = cast(RLlibConfig, config.algo), policy_spec(config)
+    _check(config, spec)
+    pretrained_encoder(config, encoder_path)
+    context = {
+        **corridor_settings(config),
+        "spec": spec,
+        "encoder_file": str(encoder_path) if spec.frozen else None,
+    }
+    built = (
+        _class(algo, default=True)
+        .environment(ObservedCorridor, env_config=context, disable_env_checking=True)
+        .framework("torch")
+        .env_runners(
+            num_env_runners=algo.num_env_runners,
+            num_envs_per_env_runner=algo.num_envs_per_env_runner,
+        )
+        .learners(num_learners=0)
+        .rl_module(model_config=DefaultModelConfig(fcnet_hiddens=spec.hidden, fcnet_activation="tanh"))
+        .callbacks(EpisodeMetrics)
+        .reporting(metrics_num_episodes_for_smoothing=EPISODES, min_time_s_per_iteration=0)
+        .debugging(seed=config.seed, log_level="ERROR")
+    )
+    try:
+        return built.training(**algo.settings)
+    except TypeError as error:
+        raise ConfigError(f"algo.settings: {algo.algorithm} has no such setting: {error}") from None
+
+
+def _check(config: Config, spec: PolicySpec) -> None:
+    """Raise ConfigError for a policy that RLlib's default networks cannot be."""
+    if config.train.init is not None:
+        raise ConfigError(f"train.init: must be null for algo.name=rllib, got {config.train.init!r}")
+    if spec.finetuned or "hidden" not in spec.manifest():
+        rule = "must be event_columns, bytestream or another of dense layers for algo.name=rllib"
+        raise ConfigError(f"model.name: {rule}, got {config.model.name!r}")
+
+
+def _class(algo: RLlibConfig, default: bool = False) -> Any:
+    """Return RLlib's class of the algorithm, or its default configuration."""
+    try:
+        found, config = get_algorithm_class(algo.algorithm, return_config=True)
+    except Exception as error:
+        rule = f"must be an algorithm of RLlib's, got {algo.algorithm!r}"
+        raise ConfigError(f"algo.algorithm: {rule}: {error}") from None
+    return config if default else found
+
+
+def trainable(config: Config) -> type:
+    """Return RLlib's class of the algorithm, as Tune runs it here."""
+    return guarded(_class(cast(RLlibConfig, config.algo)))
+
+
+def networks(module: Any, spec: PolicySpec) -> nn.ModuleDict:
+    """Return the networks of a policy that acts as a trained module of RLlib's: copies of its dense layers.
+
+    A Q-network's logits are its Q-values, or the advantages of a dueling one: the likeliest action is the
+    greedy one. The value network is not exported, because only training reads it.
+
+    Raises:
+        ValueError: The module has other layers than the policy.
+    """
+    own, names = assemble(spec), {name for name, _ in module.named_modules()}
+    where: tuple[str, ...] = next((pair for pair in ACTING if names.issuperset(pair)), ())
+    theirs = [layer for name in where for layer in _linear(module.get_submodule(name))]
+    ours = _linear(own["pi"])
+    if [layer.weight.shape for layer in theirs] != [layer.weight.shape for layer in ours]:
+        got = [tuple(layer.weight.shape) for layer in theirs]
+        raise ValueError(f"the trained module must have the layers of model.hidden={spec.hidden}, got {got}")
+    for layer, trained in zip(ours, theirs, strict=True):
+        layer.load_state_dict(trained.state_dict())
+    for layer in _linear(own["vf"]):
+        nn.init.zeros_(layer.weight)
+        nn.init.zeros_(layer.bias)
+    return own
+
+
+def _linear(module: nn.Module) -> list[nn.Linear]:
+    return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
+
+
+RLLIB = Algorithm(build, trainable, networks, losses={"train/loss": "total_loss"}, figures={})

@@ -1,0 +1,1 @@
+"""Sampling of episodes for a learner: corridors, env runners, rounds, snapshots and metrics."""

@@ -1,0 +1,122 @@
+"""Metrics of the episodes that an env runner samples."""
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from ray.rllib.callbacks.callbacks import RLlibCallback
+
+from jobs.rollout.diagnostics import drift_metrics
+from jobs.training.sampling.env_runner import PlainEnvRunner
+from models.encoder.evae import EventVAE
+from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
+
+EPISODES = 100  # that a rate is averaged over
+DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
+
+
+class EpisodeMetrics(RLlibCallback):
+    """Metrics of episodes, from the environments' infos; rewards are not scaled.
+
+    An iteration ends two or three episodes, so metrics are means over the last `EPISODES`. Episodes
+    count in the order in which they began, those of one round of sampling together: of those begun
+    at once the short ones end first, and these are crashes.
+
+    Attributes:
+        rounds: Of sampling, so far.
+    """
+
+    def __init__(self) -> None:
+        """Begin without episodes."""
+        self._episodes: deque[dict[str, float]] = deque(maxlen=EPISODES)
+        self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
+        self._unfinished: dict[str, float] = {}
+        self.rounds = 0
+        self._encoder: tuple[EventVAE, EncoderManifest] | None = None
+
+    def on_sample_end(
+        self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
+    ) -> None:
+        """Count events and the outcome of each episode that ended; measure drift at times."""
+        if isinstance(env_runner, PlainEnvRunner) and self.rounds % DRIFT_EVERY == 0:
+            for name, value in self._drift(env_runner).items():
+                metrics_logger.log_value(name, value, window=1)
+        self.rounds += 1
+        events, dropped = (
+            np.concatenate([_column(chunk, key) for chunk in samples])
+            for key in ("num_events", "dropped_events")
+        )
+        metrics_logger.log_value("events_per_step", float(events.mean()), window=1)
+        metrics_logger.log_value("dropped_events", float(dropped.sum()), window=1)
+        self._count(samples)
+        for name in self._episodes[0] if self._episodes else ():
+            mean = float(np.mean([episode[name] for episode in self._episodes]))
+            metrics_logger.log_value(name, mean, window=1)
+
+    def _count(self, samples: Any) -> None:
+        """Add the episodes that ended to those of the metrics, as soon as it is their turn."""
+        self._begun.append({chunk.id_: None for chunk in samples if chunk.id_ not in self._unfinished})
+        for chunk in samples:
+            self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
+            if chunk.is_done:
+                ended = outcome(chunk.get_infos(-1), self._unfinished.pop(chunk.id_))
+                next(begun for begun in self._begun if chunk.id_ in begun)[chunk.id_] = ended
+        broken_off = self._unfinished.keys() - {chunk.id_ for chunk in samples}
+        for name in broken_off:
+            del self._unfinished[name], next(begun for begun in self._begun if name in begun)[name]
+        while self._begun and None not in self._begun[0].values():
+            self._episodes.extend(ended for ended in self._begun.popleft().values() if ended)
+
+    def state(self) -> dict[str, Any]:
+        """What the next metrics depend on, for JSON."""
+        return {
+            "rounds": self.rounds,
+            "episodes": list(self._episodes),
+            "begun": [dict(begun) for begun in self._begun],
+            "unfinished": dict(self._unfinished),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from a `state`."""
+        self.rounds = state["rounds"]
+        self._episodes = deque(state["episodes"], maxlen=EPISODES)
+        self._begun = deque(dict(begun) for begun in state["begun"])
+        self._unfinished = dict(state["unfinished"])
+
+    def _drift(self, runner: PlainEnvRunner) -> dict[str, float]:
+        """Return the `jobs.rollout.diagnostics.drift_metrics` of the windows that the encoder was shown.
+
+        They are empty without an encoder, and if its file is gone or lean: the frozen part that acts has
+        no decoder.
+        """
+        file, windows = runner.module.model_config["encoder_file"], runner.shown.windows
+        if file is None or not windows:
+            return {}
+        if self._encoder is None:
+            try:
+                with torch.random.fork_rng(devices=[]):  # a model is made with random weights first
+                    self._encoder = load_encoder(file.path)
+            except EncoderFileError:
+                return {}
+        evae, manifest = self._encoder
+        if manifest["sha256"] != file.digest or evae.decoder is None:
+            return {}
+        return drift_metrics(evae, windows, manifest.get("figures", {}))
+
+
+def outcome(info: Mapping[str, float], episode_return: float) -> dict[str, float]:
+    """The metrics of an episode that has ended, from its last info."""
+    return {
+        "episode_return": episode_return,
+        "success_rate": float(info["success"]),
+        "collision_rate": float(info["collision"]),
+        "distance_m": float(info["distance_m"]),
+    }
+
+
+def _column(chunk: Any, key: str) -> np.ndarray:
+    """Return one number of the infos after each step of a piece of an episode, (T,)."""
+    infos = chunk.get_infos()
+    return infos[key][1:] if isinstance(infos, Mapping) else np.array([info[key] for info in infos[1:]])
