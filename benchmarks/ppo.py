@@ -51,7 +51,7 @@ RIVALS = tuple(f"stable-baselines3, {size}" for size in MINIBATCHES)
 class TensorByTensor(PlainPPOLearner):
     """Updates dense networks as all others."""
 
-    _dense = False
+    _compiled = False
 
 
 class EncodedCorridors(VecEnv):

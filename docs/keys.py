@@ -15,9 +15,11 @@ from pathlib import Path
 import hydra
 from omegaconf import OmegaConf
 
+from jobs.config.algorithms import AlgoConfig
 from jobs.config.config import Config
 from jobs.config.env_keys import ENV_KEYS, fields_of
 from jobs.config.registry import JOBS, Job
+from models.kinds import EncoderModel
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 FILES = {  # where the comments stand: the section that a file begins in
@@ -150,7 +152,7 @@ def kinds() -> dict[str, dict[str, tuple[object, str]]]:
             owner = typing.get_type_hints(owner, include_extras=True)[field]
         found[key.rpartition(".")[0]][key] = _field(owner, path[-1])
     for name, kind in hints.items():
-        owner = typing.get_args(kind)[0] if name in ("model", "algo") else kind  # with an encoder; by PPO
+        owner = {"model": EncoderModel, "algo": AlgoConfig}.get(name, kind)
         if name != "env" and dataclasses.is_dataclass(owner):
             found[name] = {f"{name}.{field}": _field(owner, field) for field in fields_of(owner)}  # type: ignore[arg-type]
         elif name != "env":

@@ -78,7 +78,7 @@ class CorridorEnv(gymnasium.Env):
 
     def __init__(
         self,
-        config: EnvConfig | None = None,
+        config: EnvConfig | Mapping[str, Any] | None = None,
         render_mode: Any = None,
         draw: Draw | None = None,
         **fields: Any,
@@ -86,7 +86,7 @@ class CorridorEnv(gymnasium.Env):
         """Make the environment.
 
         Args:
-            config: The settings; None: `EnvConfig()`.
+            config: The settings, or a mapping of fields, as RLlib's `env_config`; None: `EnvConfig()`.
             render_mode: "rgb_array" for pictures, or None.
             draw: Draws the settings of each episode from `config` and a generator of the episode; the
                 observation space must stay the same.
@@ -97,6 +97,8 @@ class CorridorEnv(gymnasium.Env):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f'render_mode must be None or "rgb_array"; got {render_mode!r}.')
+        if isinstance(config, Mapping):
+            fields, config = {**config, **fields}, None
         self.config = self._nominal = dataclasses.replace(config or EnvConfig(), **fields)
         self._draw = draw
         self.render_mode = render_mode

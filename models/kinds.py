@@ -2,9 +2,10 @@
 
     observation --feature, once per step--> stack of the last ones --network--> logits and value
 
-To add a kind: a row in `KINDS`, a module with its feature and network unless existing ones do, and
-`conf/model/NAME.yaml` with its settings. A row names features and networks as "module:attribute",
-so that a configuration is checked without importing torch.
+To add a kind of policy: a row in `KINDS`, a module with its feature and network unless existing ones do,
+and `conf/model/NAME.yaml` with its settings. A network with sizes of its own brings the dataclass of its
+settings. A row names features and networks as "module:attribute", so that a configuration is checked
+without importing torch.
 
 The ranges of all settings stand here; configurations, encoder files and policy folders share them.
 """
@@ -14,7 +15,7 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, cast
 
 import pydantic
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
 T = TypeVar("T")
@@ -68,8 +69,22 @@ class EvaeSettings:
         return self
 
 
+class Model:
+    """What the settings of every kind of policy have.
+
+    Attributes:
+        name: The kind.
+        stack: Latest features that the policy reads.
+    """
+
+    has_encoder: ClassVar[bool] = False
+
+    name: str
+    stack: int
+
+
 @dataclass(frozen=True, config=STRICT)
-class EncoderModel:
+class EncoderModel(Model):
     """A policy whose dense layers read the latents of an event VAE (appendix A.1, D.1.2).
 
     Attributes:
@@ -114,16 +129,14 @@ class EncoderModel:
         return self
 
     def evae(self, width: int, height: int) -> EvaeSettings:
-        """Settings of its event VAE on a sensor of so many pixels."""
+        """Return settings of its event VAE on a sensor of so many pixels."""
         own = (self.context, self.latent, self.norm, self.target, self.time_bins, self.coding)
         return EvaeSettings(cast(Variant, self.name), width, height, *own, pool_rank=self.pool_rank)
 
 
 @dataclass(frozen=True, config=STRICT)
-class DenseModel:
+class DenseModel(Model):
     """A policy whose dense layers read features that are computed without an encoder; see `EncoderModel`."""
-
-    has_encoder: ClassVar[bool] = False
 
     name: KindName
     stack: Stack
@@ -132,16 +145,24 @@ class DenseModel:
 
 
 @dataclass(frozen=True, config=STRICT)
-class FixedModel:
+class FixedModel(Model):
     """A policy whose network has fixed sizes and is trained end to end on a stack of features."""
-
-    has_encoder: ClassVar[bool] = False
 
     name: KindName
     stack: Stack
 
 
-Model = EncoderModel | DenseModel | FixedModel
+@dataclass(frozen=True, config=STRICT)
+class RecurrentModel(Model):
+    """A policy whose network remembers by itself, as a GRU (Cho et al. 2014).
+
+    Attributes:
+        units: Numbers of its state.
+    """
+
+    name: KindName
+    stack: Stack
+    units: Size
 
 
 class Kind(NamedTuple):
@@ -150,7 +171,7 @@ class Kind(NamedTuple):
     Attributes:
         observation: What the environment shows it (`envs.observations`).
         feature: What is kept of each step, a `models.policy.features.Feature`.
-        network: What reads the stack of features, a function as in `models.policy.networks`.
+        network: What reads the stack of features, a `models.policy.networks.Network`.
         settings: The dataclass of its settings, which says whether it has an event VAE.
         onnx: The feature as a function of tensors, as in `models.policy.onnx`; None: no ONNX export.
         min_side: Smallest side of the sensor that its network takes [pixels].
@@ -175,7 +196,7 @@ _FEATURES, _NETWORKS, _ONNX = "models.policy.features", "models.policy.networks"
 _LATENT = Kind(
     observation="window",
     feature=f"{_FEATURES}:LATENT",
-    network=f"{_NETWORKS}:two_mlps",
+    network=f"{_NETWORKS}:TWO_MLPS",
     settings=EncoderModel,
     onnx=f"{_ONNX}:table_latent",
 )
@@ -185,21 +206,28 @@ KINDS = {
     "event_columns": Kind(
         observation="window",
         feature=f"{_FEATURES}:COLUMNS",
-        network=f"{_NETWORKS}:two_mlps",
+        network=f"{_NETWORKS}:TWO_MLPS",
         settings=DenseModel,
+        onnx=f"{_ONNX}:columns",
+    ),
+    "event_columns_gru": Kind(
+        observation="window",
+        feature=f"{_FEATURES}:COLUMNS",
+        network="models.policy.recurrent:GRU",
+        settings=RecurrentModel,
         onnx=f"{_ONNX}:columns",
     ),
     "event_set": Kind(
         observation="window",
         feature=f"{_FEATURES}:EVENT_SET",
-        network=f"{_NETWORKS}:event_set",
+        network=f"{_NETWORKS}:EVENT_SET",
         settings=FixedModel,
         onnx=f"{_ONNX}:event_set",
     ),
     "event_image": Kind(
         observation="event_image",
         feature=f"{_FEATURES}:EVENT_IMAGE",
-        network=f"{_NETWORKS}:nature_cnn",
+        network=f"{_NETWORKS}:NATURE_CNN",
         settings=FixedModel,
         onnx=f"{_ONNX}:event_image",
         min_side=MIN_IMAGE,
@@ -208,7 +236,7 @@ KINDS = {
     "rgb": Kind(
         observation="luminance",
         feature=f"{_FEATURES}:GREY",
-        network=f"{_NETWORKS}:nature_cnn",
+        network=f"{_NETWORKS}:NATURE_CNN",
         settings=FixedModel,
         onnx=f"{_ONNX}:grey",
         min_side=MIN_IMAGE,
@@ -224,6 +252,10 @@ RENAMED = {
 }
 
 
+class TrialError(ValueError):
+    """A feature or a network that does not do what its row says."""
+
+
 @dataclass(frozen=True, config=STRICT)
 class PolicySpec:
     """All that a policy's networks are built from.
@@ -234,18 +266,18 @@ class PolicySpec:
         num_actions: Actions to choose from.
     """
 
-    model: Model
+    model: InstanceOf[Model]
     width: Size
     height: Size
     num_actions: Size = 3
 
     @property
     def kind(self) -> Kind:
-        """Its row in `KINDS`, with another feature and network where PPO trains the encoder on."""
+        """Return the row in `KINDS`, with another feature and network if PPO trains the encoder on."""
         kind = KINDS[self.model.name]
         if not self.finetuned:
             return kind
-        return kind._replace(feature=f"{_FEATURES}:EVENT_ROWS", network=f"{_NETWORKS}:finetuned_mlps")
+        return kind._replace(feature=f"{_FEATURES}:EVENT_ROWS", network=f"{_NETWORKS}:FINETUNED_MLPS")
 
     @property
     def finetuned(self) -> bool:
@@ -259,7 +291,7 @@ class PolicySpec:
 
     @property
     def evae(self) -> EvaeSettings:
-        """Settings of its event VAE.
+        """Return settings of its event VAE.
 
         Raises:
             ValueError: It has none.
@@ -270,33 +302,33 @@ class PolicySpec:
 
     @property
     def memory_ms(self) -> list[float]:
-        """Time constants of what it keeps of the past [ms]; none: it keeps a stack."""
-        return [] if isinstance(self.model, FixedModel) else self.model.memory_ms
+        """Return the time constants of its memory [ms]; none if it reads a stack of features."""
+        return list(getattr(self.model, "memory_ms", []))
 
     @property
     def depth(self) -> int:
-        """Features that it keeps of an episode, as `models.policy.memory` does."""
+        """Return features that it keeps of an episode, as `models.policy.memory` does."""
         return 1 + len(self.memory_ms) if self.memory_ms else self.model.stack
 
     @property
     def hidden(self) -> list[int]:
-        """Neurons of each of its dense layers.
+        """Return the neurons of each of its dense layers.
 
         Raises:
             ValueError: It has none.
         """
-        if isinstance(self.model, FixedModel):
+        if not hasattr(self.model, "hidden"):
             raise ValueError(f"{self.model.name} has no dense layers")
-        return self.model.hidden
+        return list(self.model.hidden)
 
     def manifest(self) -> dict[str, object]:
-        """Its settings as JSON values, for `read_spec`."""
+        """Return its settings as JSON values, for `read_spec`."""
         sizes = {"width": self.width, "height": self.height, "num_actions": self.num_actions}
-        return {**dataclasses.asdict(self.model), **sizes}
+        return {**dataclasses.asdict(cast(Any, self.model)), **sizes}
 
 
 def find_kind(name: object) -> Kind:
-    """The kind of a name.
+    """Return the kind of a name.
 
     Raises:
         ValueError: There is none of this name.
@@ -307,7 +339,7 @@ def find_kind(name: object) -> Kind:
 
 
 def needed_plugins(manifest: Mapping[str, object]) -> str:
-    """What to add to the refusal of a policy whose training had plug-ins; empty for any other."""
+    """Return what to add to the refusal of a policy whose training had plug-ins; empty for any other."""
     plugins = manifest.get("plugins")
     if not isinstance(plugins, Mapping) or not plugins:
         return ""
@@ -315,13 +347,13 @@ def needed_plugins(manifest: Mapping[str, object]) -> str:
 
 
 def renamed(name: object) -> str:
-    """What to add to the refusal of a kind's name of an earlier version; empty for any other name."""
+    """Return what to add to the refusal of a kind's name of an earlier version; empty for any other name."""
     now = RENAMED.get(name) if isinstance(name, str) else None
     return f", which is called {now} now" if now else ""
 
 
 def read_model(**values: object) -> Model:
-    """The settings of a model, checked; `name` says which kind it is, and so which settings it has.
+    """Return the settings of a model, checked; `name` says which kind it is, and so which settings it has.
 
     Raises:
         pydantic.ValidationError: A setting is missing, unknown to this kind, or has a wrong value.
@@ -332,13 +364,13 @@ def read_model(**values: object) -> Model:
 
 
 def model_keys(*kinds: str) -> list[str]:
-    """The settings of some kinds, of all if none is named."""
-    sections = [KINDS[name].settings for name in kinds or KINDS]
+    """Return the settings of some kinds, of all if none is named."""
+    sections: list[Any] = [KINDS[name].settings for name in kinds or KINDS]
     return list(dict.fromkeys(field.name for section in sections for field in dataclasses.fields(section)))
 
 
 def read_spec(values: Mapping[str, object]) -> PolicySpec:
-    """The specification of a manifest, which may hold more than that.
+    """Return the specification of a manifest, which may hold more than that.
 
     Raises:
         ValueError: A setting is missing, of another type or out of its range; the message names it.
@@ -358,7 +390,7 @@ def read_spec(values: Mapping[str, object]) -> PolicySpec:
 
 
 def checked(section: Callable[..., T], values: Mapping[str, object]) -> T:
-    """The dataclass of some values.
+    """Return the dataclass of some values.
 
     Raises:
         ValueError: On one line, each setting that was refused, with the rule and the value.
@@ -379,7 +411,7 @@ def _check_coding(name: str, coding: str, pool_rank: int) -> None:
 
 
 def _one_line(problem: Mapping[str, Any]) -> str:
-    """A refusal of pydantic's, with key, rule and value."""
+    """Return a refusal of pydantic's, with key, rule and value."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "value_error":
         return f"{key} {problem['msg'].removeprefix('Value error, ')}".strip()

@@ -109,6 +109,8 @@ class RLlibConfig:
         name: "rllib", the row of `ALGORITHMS`.
         algorithm: RLlib's name, such as DQN, SAC, APPO or IMPALA.
         settings: What `AlgorithmConfig.training` of that algorithm takes.
+        lr_schedule: Whether settings.lr stays, or falls to 0 at the last environment step.
+        reward_scale: Multiplies the rewards that it learns from.
         num_env_runners: Processes that roll out episodes; 0: the learner's own process does.
         num_envs_per_env_runner: Environments that each steps together.
     """
@@ -118,6 +120,8 @@ class RLlibConfig:
     name: Literal["rllib"]
     algorithm: Annotated[str, Field(pattern=r"^[A-Za-z0-9]+$")]
     settings: dict[str, Any]
+    lr_schedule: Literal["constant", "linear"]
+    reward_scale: Positive
     num_env_runners: Runners
     num_envs_per_env_runner: Count
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, InstanceOf
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 
@@ -19,7 +19,7 @@ from jobs.config.algorithms import Algo, algo_keys, read_algo
 from jobs.config.conditions import axis_errors, condition_errors
 from jobs.config.env_keys import BESIDE_ENV, ENV_GROUPS, ENV_KEYS, fields_of, flat_env, key_of
 from jobs.config.errors import SET_BY_JOBS, ConfigError, nearest, redacted
-from jobs.config.plugins import load_plugins
+from jobs.config.plugins import kind_errors, load_plugins
 from jobs.config.registry import JOBS
 from jobs.config.scenes import scene_errors
 from jobs.config.schema import (
@@ -32,7 +32,7 @@ from jobs.config.schema import (
     TrackingConfig,
     TrainConfig,
 )
-from models.kinds import KINDS, Model, model_keys, read_model
+from models.kinds import KINDS, Model, PolicySpec, model_keys, read_model
 
 __all__ = ["HELD_OUT_SCENE", "Config", "ConfigError", "as_dict", "known_keys", "parse"]
 
@@ -64,7 +64,7 @@ class Config:
     resume: str | None
     runs_dir: Name
     env: EnvConfig
-    model: Model
+    model: InstanceOf[Model]
     algo: Algo
     recording: RecordingConfig
     collect: CollectConfig
@@ -108,6 +108,7 @@ def parse(values: Mapping[str, object]) -> Config:
     if config is not None and not errors:
         errors += [
             *_image_errors(config),
+            *kind_errors(PolicySpec(config.model, config.env.camera.width, config.env.camera.height)),
             *axis_errors(getattr(config.own, "axes", {}), config.env),
             *condition_errors("train.conditions", config.train.conditions, config.env),
             *condition_errors("collect.conditions", config.collect.conditions, config.env),

@@ -14,7 +14,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,7 +24,7 @@ from envs.config import ADDED_FAULTS, TASKS, VEHICLES
 from envs.scene.layouts import LAYOUTS
 from envs.scene.shapes import SHAPES
 from jobs.config.errors import ConfigError
-from models.kinds import KINDS
+from models.kinds import KINDS, PolicySpec, TrialError
 
 GROUP = "evade.plugins"  # of the entry points of installed packages
 VARIABLE = "EVADE_PLUGINS"  # of a Ray worker: the names of its plug-ins
@@ -65,7 +65,8 @@ def _load(name: str, before: Mapping[str, Mapping[str, Any]]) -> None:
     """Import a plug-in, unless it is loaded already, and check the rows that are new since `before`."""
     path = Path(name).resolve() if name.endswith(".py") or os.sep in name else None
     stem = path.stem if path else _module_of(name)
-    if stem in _loaded and (path is None or path in _files(_loaded[stem])):
+    shipped = stem in os.environ.get(VARIABLE, "").split(",")  # a worker has it in another place
+    if stem in _loaded and (path is None or shipped or path in _files(_loaded[stem])):
         return
     if path is None:
         _import_module(stem)
@@ -147,6 +148,32 @@ def _check(what: str, name: str, row: Any) -> None:
     elif what == "kind of policy":
         resolve(row.feature)
         resolve(row.network)
+
+
+def kind_errors(spec: PolicySpec) -> Iterator[str]:
+    """Yield what is wrong with the feature or the network of a plug-in's kind, tried on a few events.
+
+    Args:
+        spec: The policy; nothing is tried of a kind that no plug-in added, nor of one with an encoder.
+    """
+    kind, name = KINDS[spec.model.name], spec.model.name
+    owners = {part.partition(":")[0].partition(".")[0] for part in (kind.feature, kind.network)}
+    culprits = owners & {module.partition(".")[0] for module in _loaded}
+    if not culprits or spec.frozen or spec.finetuned:
+        return
+    from models.policy.trial import try_policy  # loads torch, which takes long
+
+    try:
+        try_policy(spec)
+    except Exception as error:
+        said = str(error) if isinstance(error, TrialError) else one_line(error)
+        yield f"model.name: {name!r} of plug-in {', '.join(sorted(culprits))}: {said}"
+
+
+def changed_plugins(digests: Mapping[str, str]) -> list[str]:
+    """Return the names of the loaded plug-ins whose content is another than in `digests`, name -> SHA-256."""
+    now = plugin_digests() if digests else {}
+    return [name for name, digest in digests.items() if now.get(name, digest) != digest]
 
 
 def with_plugins(runtime_env: Mapping[str, Any]) -> dict[str, Any]:

@@ -32,20 +32,20 @@ class Agent(Protocol):
 
     @property
     def observation(self) -> Observation:
-        """What it sees."""
+        """Return what it sees."""
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Begin one episode per environment, each just reset with its seed."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Actions (B,) for observations (B, ...)."""
+        """Return actions (B,) for observations (B, ...)."""
 
     def keep(self, places: np.ndarray) -> None:
-        """Go on with some episodes of the batch, int (n,), in that order; the others have ended."""
+        """Keep the running episodes (indices into the batch, in order); drop the finished ones."""
 
 
 def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[str, Any]] = ()) -> Agent:
-    """A baseline by its name, or the policy of a folder.
+    """Return a baseline by its name, or the policy of a folder.
 
     Args:
         name: "straight", "random", "oracle", or the path of a policy folder.
@@ -73,14 +73,14 @@ class StraightAgent:
     observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Nothing to remember."""
+        """Do nothing: it has no memory."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Zeros (B,)."""
+        """Return zeros (B,)."""
         return np.zeros(len(observations), np.int64)
 
     def keep(self, places: np.ndarray) -> None:
-        """Nothing to forget."""
+        """Do nothing: it has no memory."""
 
 
 class RandomAgent:
@@ -93,7 +93,7 @@ class RandomAgent:
         self._streams = episode_streams(seeds)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Actions (B,)."""
+        """Return actions (B,)."""
         return np.array([stream.integers(NUM_ACTIONS) for stream in self._streams])
 
     def keep(self, places: np.ndarray) -> None:
@@ -121,7 +121,7 @@ class PolicyAgent:
         self._streams = episode_streams(seeds)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Actions (B,); draws come from each episode's own stream."""
+        """Return actions (B,); draws come from each episode's own stream."""
         self.logits = logits = self.policy.logits(observations).astype(np.float64)
         if not self.stochastic:
             return logits.argmax(axis=1)
@@ -149,7 +149,7 @@ class OracleAgent:
             self._plans.append((plan, MOVES * step_m, env))
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """For each episode the action that ends closest to its plan, where it will be taken."""
+        """Return for each episode the action that ends closest to its plan, where the action takes effect."""
         return np.array([follow(plan, moves_m, *env.place_of_action()) for plan, moves_m, env in self._plans])
 
     def keep(self, places: np.ndarray) -> None:
@@ -158,18 +158,18 @@ class OracleAgent:
 
 
 def episode_streams(seeds: Sequence[int]) -> list[np.random.Generator]:
-    """One random stream per episode; it depends on the episode's seed alone."""
+    """Return one random stream per episode; it depends on the episode's seed alone."""
     return [np.random.default_rng(np.random.SeedSequence([int(seed), 0x9110])) for seed in seeds]
 
 
 def follow(path_x_m: np.ndarray, moves_m: np.ndarray, x_m: float, y_m: float) -> int:
-    """The action whose move (moves_m: (3, 2), x and y [m]) ends closest in x to the path."""
+    """Return the action whose move (moves_m: (3, 2), x and y [m]) ends closest in x to the path."""
     places = np.interp(y_m + moves_m[:, 1], np.arange(len(path_x_m)) * LATTICE_M, path_x_m)
     return int(np.abs(x_m + moves_m[:, 0] - places).argmin())
 
 
 def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 2.0) -> np.ndarray:
-    """The cheapest path to the goal line on a lattice of the three directions (`envs.scene.planning`).
+    """Return the cheapest path to the goal line on a lattice of the three directions (`envs.scene.planning`).
 
     Args:
         scene: The true geometry.

@@ -64,7 +64,7 @@ class DriftSampler:
 
     @property
     def windows(self) -> list[np.ndarray]:
-        """The sampled windows, packed, in the order in which they were met."""
+        """Return the sampled windows, packed, in the order in which they were met."""
         return [window for _, window in self._kept]
 
     def add(self, env: CorridorEnv, seed: int, observation: np.ndarray) -> None:
@@ -80,7 +80,7 @@ class DriftSampler:
             self._kept = [kept for kept in self._kept if kept[0] % self._every == 0]
 
     def metrics(self) -> dict[str, float]:
-        """The `drift_metrics` of the samples; none without samples, or for a lean encoder without decoder."""
+        """Return the `drift_metrics` of the samples; empty without samples or without a decoder."""
         if not self.windows:
             return {}
         evae, manifest = load_encoder(self._file)
@@ -92,7 +92,7 @@ class DriftSampler:
 def drift_metrics(
     evae: EventVAE, windows: Sequence[np.ndarray], held_out: Mapping[str, float]
 ) -> dict[str, float]:
-    """Metrics of an event VAE on the windows that a policy met.
+    """Return metrics of an event VAE on the windows that a policy met.
 
     Args:
         evae: In eval mode.
@@ -112,7 +112,7 @@ def drift_metrics(
 
 
 def mean_drift(trainings: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Mean over trainings of their encoders' `drift_metrics`; those without an encoder are left out."""
+    """Return the mean `drift_metrics` of trainings; those without an encoder are left out."""
     measured = [metrics for metrics in trainings if metrics]
     names = dict.fromkeys(name for metrics in measured for name in metrics)
     return {

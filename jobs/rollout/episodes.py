@@ -71,7 +71,7 @@ def roll_out(
 def _roll_out_batch(
     agent: Agent, env: CorridorVectorEnv, seeds: Sequence[int], watch: Watch | None
 ) -> np.ndarray:
-    """One episode per environment, until the last one ends; nothing is spent on those that have ended."""
+    """Roll out one episode per environment until the last ends; finished ones cost nothing more."""
     observations, _ = env.reset(seed=list(seeds))
     agent.reset(env.envs, seeds)
     totals = np.zeros((len(seeds), 4))
@@ -97,7 +97,7 @@ def _roll_out_batch(
 
 
 def _those(observations: Any, places: np.ndarray) -> Any:
-    """Some of a batch of observations, which is an array or a tuple."""
+    """Select some of a batch of observations, which is an array or a tuple."""
     return tuple(observations[k] for k in places) if isinstance(observations, tuple) else observations[places]
 
 
@@ -149,7 +149,7 @@ class TrajectoryRecorder:
             self._height_m = env.config.camera_height_m
 
     def trajectories(self, agent: str, episodes: np.ndarray) -> list[Trajectory]:
-        """The trajectories, with the outcomes of their EPISODE rows."""
+        """Return the trajectories, with the outcomes of their EPISODE rows."""
         outcomes = {int(episode["seed"]): outcome_of(episode) for episode in episodes}
         return [
             Trajectory(agent, seed, self._scenes[seed], np.array(points), outcomes[seed], self._height_m)
@@ -158,7 +158,7 @@ class TrajectoryRecorder:
 
 
 def outcome_of(episode: np.void) -> str:
-    """How an EPISODE () ended: "goal", "collision" or "time limit"."""
+    """Return how an EPISODE () ended: "goal", "collision" or "time limit"."""
     if episode["success"]:
         return "goal"
     return "collision" if episode["collision"] else "time limit"

@@ -63,7 +63,7 @@ class Recorder:
         console.print(f"{reason}, {consequence}: {part.task.name}", markup=False)
 
     def reason(self, part: Part) -> str:
-        """Why a part has no result."""
+        """Return why a part has no result."""
         key = part.task.key
         return self._failed.get(key) or self._lost.get(key, "its process ended")
 
@@ -79,7 +79,7 @@ def run_serially(parts: Sequence[Part], recorder: Recorder) -> None:
 
 
 def attempt(evaluation: Callable[[], PartResult]) -> PartResult | str:
-    """The result of an evaluation, or, if it raises, the error in one line: it must stop no other."""
+    """Return the result of an evaluation, or, if it raises, the error in one line: it must stop no other."""
     try:
         return evaluation()
     except Exception as error:
@@ -87,7 +87,7 @@ def attempt(evaluation: Callable[[], PartResult]) -> PartResult | str:
 
 
 def evaluate_part(part: Part) -> PartResult:
-    """The episodes of a part, the drift of its policy's encoder, and the accuracy of its simulation.
+    """Return the episodes of a part, the drift of its policy's encoder, and the accuracy of its simulation.
 
     Raises:
         ValueError: If a number of an episode is NaN or infinite.
@@ -108,5 +108,5 @@ def evaluate_part(part: Part) -> PartResult:
 
 @functools.lru_cache(maxsize=2)
 def cached_agent(agent: str, action: str, table: tuple[tuple[str, object], ...] = ()) -> Agent:
-    """`make_agent`, kept by a process from part to part: an agent forgets its episodes when it is reset."""
+    """Return `make_agent`'s result, cached per process: an agent forgets its episodes when it is reset."""
     return make_agent(agent, action, table)

@@ -9,8 +9,10 @@ from typing import Any
 from envs.config import EnvConfig, sensor_differences, settings_hash
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import ENV_KEYS, env_with
+from jobs.config.plugins import changed_plugins
 from jobs.rollout.agents import BASELINES
 from jobs.run.folder import Run, latest_policies, named_policy
+from jobs.run.progress import console
 from models.kinds import find_kind, needed_plugins
 from models.policy.policy import (
     MANIFEST,
@@ -52,12 +54,12 @@ class EvaluatedPolicy:
 
     @property
     def name(self) -> str:
-        """Group and training: "bytestream s0"."""
+        """Return group and training: "bytestream s0"."""
         return self.group if self.training is None else f"{self.group} s{self.training}"
 
 
 def read_policy(agent: str) -> EvaluatedPolicy:
-    """What a policy folder says about itself; a baseline has only its name.
+    """Return what a policy folder says about itself; a baseline has only its name.
 
     Raises:
         ConfigError: If the folder's manifest is damaged, or lacks what tells one training from another.
@@ -71,6 +73,10 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     missing = [name for name in ("name", "seed", "sensor") if name not in manifest]
     if missing:
         raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")
+    changed = changed_plugins(manifest.get("plugins") or {})
+    if changed:
+        said = f"{', '.join(changed)} changed since the training of {agent}; its results may differ from then"
+        console.print(f"Plug-in {said}", markup=False)
     group = str(manifest.get("exp", manifest["name"]))
     try:
         identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
@@ -84,7 +90,7 @@ def read_policy(agent: str) -> EvaluatedPolicy:
 
 
 def find_policy(config: Config, run: Run) -> EvaluatedPolicy:
-    """The policy of a run folder, or else the newest one of its model.
+    """Return the policy of a run folder, or else the newest one of its model.
 
     Raises:
         ConfigError: If there is none; the message names the models that have one.
@@ -103,7 +109,7 @@ def find_policy(config: Config, run: Run) -> EvaluatedPolicy:
 def find_policies(
     key: str, name: str, config: Config, run: Run, pretrained: Path = PRETRAINED
 ) -> list[EvaluatedPolicy]:
-    """The policies and baselines that a name stands for.
+    """Return the policies and baselines that a name stands for.
 
     A group of published policies, such as bytestream, stands for all its trainings: bytestream-s0, -s1, ..
 
@@ -142,7 +148,7 @@ def find_policies(
 
 
 def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedPolicy:
-    """The one trained policy that a name stands for; arguments as `find_policies`.
+    """Return the one trained policy that a name stands for; arguments as `find_policies`.
 
     Raises:
         ConfigError: If there is none; the message names the published ones.
@@ -160,7 +166,7 @@ def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedP
 def find_study_policies(
     config: Config, run: Run, pretrained: Path = PRETRAINED
 ) -> tuple[EvaluatedPolicy, ...]:
-    """The policies that `study.policies` names, each once, groups together in the order of the names.
+    """Return the policies that `study.policies` names, each once, groups together in the order of the names.
 
     Raises:
         ConfigError: If there is no such policy, or two have the same group and training seed.
@@ -184,7 +190,7 @@ def find_study_policies(
 
 
 def load_trained(key: str, name: str, env: EnvConfig) -> tuple[Path, Policy]:
-    """The folder of the policy that a key of the configuration names, and the policy.
+    """Return the folder of the policy that a key of the configuration names, and the policy.
 
     Raises:
         ConfigError: There is none, it is damaged, or it was trained with another sensor.
@@ -201,7 +207,7 @@ def load_trained(key: str, name: str, env: EnvConfig) -> tuple[Path, Policy]:
 
 
 def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
-    """The simulation with the sensor settings of a manifest, named as `sensor_settings` names them.
+    """Return the simulation with the sensor settings of a manifest, named as `sensor_settings` names them.
 
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is out of range.
@@ -210,13 +216,13 @@ def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
 
 
 def with_own_filter(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
-    """The simulation with the neighbour filter of a policy, to which it belongs as its networks do."""
+    """Return the simulation with the neighbour filter of a policy, to which it belongs as its networks do."""
     own = {name: policy.sensor[name] for name in FILTER if name in policy.sensor}
     return replace(env, **own)
 
 
 def own_sensor_differences(policy: EvaluatedPolicy, env: EnvConfig) -> Differences:
-    """Where the sensor that a policy was trained with is not the environment's; nothing for a baseline."""
+    """Return the sensor settings in which training and environment differ; none for a baseline."""
     return sensor_differences(dict(policy.sensor), env) if policy.sensor else {}
 
 

@@ -79,10 +79,10 @@ class _Recorder:
         self.agent.reset(envs, seeds)
 
     def keep(self, places: np.ndarray) -> None:
-        """The one episode has ended."""
+        """Return the one episode has ended."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """The agent's action (1,)."""
+        """Return the agent's action (1,)."""
         actions, env = self.agent(observations), self.env
         info = env.info()
         encoder, (logits,) = self.agent.policy.encoder, self.agent.logits

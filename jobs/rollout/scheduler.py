@@ -58,7 +58,7 @@ def evaluate_tasks(
 
 
 def plan_parts(tasks: Sequence[EvaluationTask], store: EpisodeStore, measure_accuracy: bool) -> list[Part]:
-    """The parts of tasks; the first of each simulation measures its accuracy, if it is to be known."""
+    """Return the parts of tasks; the first of each simulation measures its accuracy, if it is to be known."""
     parts = [part for task in tasks for part in split(task)]
     if not measure_accuracy:
         return [Part(part) for part in parts]
@@ -70,7 +70,7 @@ def plan_parts(tasks: Sequence[EvaluationTask], store: EpisodeStore, measure_acc
 
 
 def default_executor(cluster: ClusterConfig, folder: Path) -> Executor:
-    """Computes with Tune where it pays: a handful of episodes is done before Ray has started.
+    """Return Tune's executor where it pays: a handful of episodes is done before Ray has started.
 
     Pyrender always runs in a process of its own, because a failing driver can end it.
 

@@ -68,7 +68,7 @@ class EpisodeStore:
         self.folder = folder
 
     def missing(self, task: EvaluationTask) -> EvaluationTask:
-        """The task with only those seeds whose episodes are not stored."""
+        """Return the task with only those seeds whose episodes are not stored."""
         stored = self._read(task.key)
         seeds = set() if stored is None else set(stored.episodes["seed"].tolist())
         return dataclasses.replace(task, seeds=tuple(seed for seed in task.seeds if seed not in seeds))
@@ -105,7 +105,7 @@ class EpisodeStore:
             write_json(self._accuracy_file(part), dataclasses.asdict(result.accuracy))
 
     def result(self, task: EvaluationTask) -> TaskResult:
-        """What is stored of a task, with the episodes of its seeds in their order.
+        """Return what is stored of a task, with the episodes of its seeds in their order.
 
         Raises:
             KeyError: If episodes are missing.
@@ -117,7 +117,7 @@ class EpisodeStore:
         return dataclasses.replace(stored, episodes=stored.episodes[[places[seed] for seed in task.seeds]])
 
     def accuracy(self, task: EvaluationTask) -> SimulationAccuracy | None:
-        """How exact a task's simulation is; None if that was not measured, or is damaged."""
+        """Return how exact a task's simulation is; None if that was not measured, or is damaged."""
         file = self._accuracy_file(task)
         return self._undamaged(file, lambda values: SimulationAccuracy(**values))
 
@@ -128,7 +128,7 @@ class EpisodeStore:
         return self.folder / "accuracy" / f"{task.simulation}.json"
 
     def _read(self, key: str) -> TaskResult | None:
-        """All that is stored under a key; None if there is nothing, or if it is damaged."""
+        """Return all that is stored under a key; None if there is nothing, or if it is damaged."""
 
         def parse(values: Mapping[str, Any]) -> TaskResult:
             episodes = episodes_of(values["episodes"], values.get("columns", KEYED_COLUMNS))
@@ -137,7 +137,7 @@ class EpisodeStore:
         return self._undamaged(self._file(key), parse)
 
     def _undamaged(self, file: Path, parse: Callable[[Any], Stored]) -> Stored | None:
-        """What a file holds; None if there is none. A damaged one is put aside."""
+        """Return what a file holds; None if there is none. A damaged one is put aside."""
         if not file.is_file():
             return None
         try:

@@ -46,17 +46,17 @@ class EvaluationTask:
 
     @property
     def name(self) -> str:
-        """Condition and policy: "rate 100 bytestream s0"."""
+        """Return condition and policy: "rate 100 bytestream s0"."""
         return " ".join((*map(text_of, self.condition), self.policy.name))
 
     @functools.cached_property
     def simulation(self) -> str:
-        """Hash of what decides how exact its events are: the simulation without its faults."""
+        """Return the hash of what decides how exact the events are: the simulation without its faults."""
         return settings_hash(hashed_settings(dataclasses.replace(self.env, faults=FaultsConfig())))
 
     @property
     def part_id(self) -> tuple[str, int]:
-        """What tells the parts of a task apart: its key and the first seed."""
+        """Return what tells the parts of a task apart: its key and the first seed."""
         return self.key, self.seeds[0]
 
 
@@ -68,7 +68,7 @@ def make_task(
     trials: int,
     table: tuple[tuple[str, Any], ...] = (),
 ) -> EvaluationTask:
-    """The task of the first `trials` corridors, see `EvaluationTask`, with its key."""
+    """Return the task of the first `trials` corridors, see `EvaluationTask`, with its key."""
     seen = seen_settings(env, policy.observation)
     facts: dict[str, object] = {
         "env": hashed_settings(seen),
@@ -89,6 +89,6 @@ def text_of(value: object) -> str:
 
 
 def split(task: EvaluationTask) -> list[EvaluationTask]:
-    """A task in parts of nearly the same size and at most `MAX_EPISODES`."""
+    """Return a task in parts of nearly the same size and at most `MAX_EPISODES`."""
     parts = np.array_split(np.arange(len(task.seeds)), -(-len(task.seeds) // MAX_EPISODES))
     return [dataclasses.replace(task, seeds=task.seeds[part[0] : part[-1] + 1]) for part in parts]

@@ -84,7 +84,7 @@ def _tuner(
 
 
 def time_limit_s(part: Part) -> float:
-    """How long a part may take before its process counts as hanging [s]."""
+    """Return how long a part may take before its process counts as hanging [s]."""
     env = part.task.env
     return MAX_START_S + len(part.task.seeds) * env.time_limit_s * env.control_hz * MAX_STEP_S
 
@@ -110,12 +110,12 @@ class TrialCallback(tune.Callback):
         self._unfinished: list[Part] = []
 
     def take_unfinished(self) -> list[Part]:
-        """The parts that Tune gave up too early, which is what it does with a trial that has not begun."""
+        """Return the parts that Tune gave up too early: it gives up trials that have not begun."""
         unfinished, self._unfinished = self._unfinished, []
         return unfinished
 
     def __reduce__(self) -> tuple[type["TrialCallback"], tuple[None]]:
-        """Tune pickles its callbacks; the recorder, whose progress bar cannot be pickled, stays behind."""
+        """Pickle without the recorder: Tune pickles its callbacks, and a progress bar cannot be pickled."""
         return TrialCallback, (None,)
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
@@ -160,7 +160,7 @@ def _part_of(trial: Trial) -> Part:
 
 
 def policy_files(parts: Sequence[Part]) -> dict[str, dict[str, bytes]]:
-    """The files of every policy, for workers that may not see their folders."""
+    """Return the files of every policy, for workers that may not see their folders."""
     folders = {part.task.policy.agent for part in parts} - BASELINES.keys()
     return {
         folder: {file.name: file.read_bytes() for file in Path(folder).iterdir() if file.is_file()}
@@ -169,7 +169,7 @@ def policy_files(parts: Sequence[Part]) -> dict[str, dict[str, bytes]]:
 
 
 def with_files(part: Part, files: Files) -> Part:
-    """The part, its policy's folder replaced by one that this process has written itself."""
+    """Return the part, its policy's folder replaced by one that this process has written itself."""
     policy = part.task.policy
     if policy.agent in BASELINES:
         return part

@@ -260,14 +260,14 @@ def learn() -> None:
 
     from models.encoder.products import orthogonal_
     from models.policy.dense_update import Rows, Settings, update_dense
-    from models.policy.networks import logits_by, mlp
+    from models.policy.networks import by_dense_layers, mlp
 
     networks = [mlp(2, (2,), outputs) for outputs in (3, 1)]
     optimizer = torch.optim.Adam(nn.ModuleList(networks).parameters(), fused=True)
     stacks, none, one = np.zeros((1, 2), np.float32), np.zeros((1, 0), np.float32), np.zeros(1, np.float32)
     rows = Rows(stacks, none, np.zeros(1, np.int64), one, one, one)
     orthogonal_(networks[0][0].weight, 1.0)
-    logits_by(nn.Flatten(), networks[0])(stacks)
+    by_dense_layers(nn.Flatten(), networks[0])(stacks, none)
     settings = Settings(1, 0.2, 1.0, 1.0, 0.0, 1.0, 1e-3, 0.9, 0.999, 1e-8)
     update_dense(networks, optimizer, rows, np.zeros((1, 1), np.int64), settings)
 

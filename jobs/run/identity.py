@@ -5,10 +5,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
+from jobs.config.algorithms import AlgoConfig
 from jobs.config.config import Config, as_dict
 from jobs.config.env_keys import ENV_FIELDS
 from jobs.config.plugins import plugin_digests
-from jobs.config.schema import AlgoConfig, CollectConfig, PretrainConfig, RecordingConfig, TrainConfig
+from jobs.config.schema import CollectConfig, PretrainConfig, RecordingConfig, TrainConfig
 from models.kinds import ADDED_MODEL_SETTINGS
 
 # The settings that can change what is trained: not the job, nor where a run is computed and recorded.

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 from torch import nn
 
+from core.places import resolve
 from jobs.config.algorithms import ALGORITHMS
 from jobs.config.config import Config
-from models.kinds import PolicySpec, resolve
+from models.kinds import PolicySpec
 
 
 class Algorithm(NamedTuple):

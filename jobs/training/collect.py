@@ -86,12 +86,12 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
 
 
 def data_file(folder: Run, split: str) -> Path:
-    """Where the recording of a split lives in a run folder."""
+    """Return where the recording of a split lives in a run folder."""
     return folder.data / f"{split}.h5"
 
 
 def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
-    """The policy and the recordings that a run still has to collect; none if it has collected.
+    """Return the policy and the recordings that a run still has to collect; none if it has collected.
 
     Raises:
         ConfigError: `collect.policy` or `collect.recordings` names one that does not fit.
@@ -111,7 +111,7 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
 
 
 def check_policy(folder: Run) -> Path | None:
-    """The folder of the policy that a run still has to record episodes of; None if there is none.
+    """Return the folder of the policy that a run still has to record episodes of; None if there is none.
 
     Raises:
         ConfigError: `collect.policy` names none, or one for another sensor.
@@ -184,7 +184,7 @@ class EventBlock:
 
     @property
     def events(self) -> np.ndarray:
-        """All so far; none may be added while this is in use."""
+        """Return all so far; none may be added while this is in use."""
         return self._room[: self._size]
 
     def add(self, parts: Sequence[np.ndarray], clock_us: int) -> None:
@@ -247,14 +247,14 @@ def _record_stint(
 
 
 def _shown_to(agent: Agent) -> Observation:
-    """What an environment observes; the episodes of an agent that sees no events have them all the same."""
+    """Return what an environment observes; it has events also for an agent that sees none."""
     return "events" if agent.observation in WITHOUT_EVENTS else agent.observation
 
 
 def stints(
     shares: Sequence[tuple[EnvConfig, int]], policy: Path | None, policy_share: float
 ) -> list[tuple[EnvConfig, int, Path | None]]:
-    """Each agent's share of each scene: environment, control steps, and the policy or None for random."""
+    """Return environment, control steps and policy of each share; the policy is None for random."""
     parts = []
     for config, num_steps in shares:
         of_policy = 0 if policy is None else round(policy_share * num_steps)
@@ -278,10 +278,10 @@ class HoldingAgent:
         self._action = self._rng.integers(NUM_ACTIONS)
 
     def keep(self, places: np.ndarray) -> None:
-        """Its one episode has ended."""
+        """Do nothing: the one episode has ended."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """The action, int (1,)."""
+        """Return the action, int (1,)."""
         if self._rng.random() < 1.0 / self._hold_steps:
             self._action = self._rng.integers(NUM_ACTIONS)
         return np.array([self._action])
@@ -290,7 +290,7 @@ class HoldingAgent:
 def run_episode(
     env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
-    """One episode of an environment and an agent that were just reset; `started` is what the reset gave.
+    """Run one episode of an environment and an agent after their reset; `started` is the reset's result.
 
     Returns:
         The events of each step as they are observed, those before the sensor's faults, and the time at
@@ -307,7 +307,7 @@ def run_episode(
 def steps_of(
     env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int
 ) -> Iterator[int]:
-    """The steps of such an episode, to look at the environment after each one.
+    """Return the steps of such an episode, to look at the environment after each one.
 
     Yields:
         The time at which the step ended [us since the start].

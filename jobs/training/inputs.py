@@ -60,7 +60,7 @@ def prepare_inputs(config: Config, folder: Run, tracker: Tracker) -> Path | None
 
 
 def check_init(folder: Run) -> tuple[Path, Policy]:
-    """The folder of the policy that a run begins from, the run's own copy if it has one, and the policy.
+    """Return folder and policy that a run begins from; the folder is the run's own copy if it has one.
 
     Raises:
         ConfigError: `train.init` names none, or one of other settings, of another sensor or encoder.

@@ -14,13 +14,13 @@ from models.kinds import KINDS, PolicySpec
 
 
 def policy_spec(config: Config) -> PolicySpec:
-    """What the policy's networks are built from."""
+    """Return what the policy's networks are built from."""
     camera = config.env.camera
     return PolicySpec(config.model, camera.width, camera.height, NUM_ACTIONS)
 
 
 def policy_about(config: Config) -> dict[str, object]:
-    """What a policy's manifest records of its environment and training, beside its `policy_spec`."""
+    """Return what a policy's manifest records of its environment and training, beside its `policy_spec`."""
     sensor = sensor_settings(config.env)
     return {
         "exp": config.exp,
@@ -40,7 +40,7 @@ def policy_about(config: Config) -> dict[str, object]:
 
 
 def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | Path, EncoderManifest] | None:
-    """The encoder file with its manifest; None for a policy without one.
+    """Return the encoder file with its manifest; None for a policy without one.
 
     Raises:
         ConfigError: It was made for another sensor, or for another model than the one to fine-tune.

@@ -97,7 +97,7 @@ def check_sources(config: Config) -> None:
 
 
 def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
-    """The weights that a run's event VAE still has to begin from; None for random ones.
+    """Return the weights that a run's event VAE still has to begin from; None for random ones.
 
     Raises:
         ConfigError: `pretrain.encoder` names no encoder, or one of another model or without a decoder.
@@ -172,7 +172,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
 
 
 def read_split(folder: Run, split: str, denoise: bool) -> tuple[Recording, Recording | None]:
-    """What was recorded of a split, and, to `denoise`, what is to be decoded from it."""
+    """Return what was recorded of a split, and, to `denoise`, what is to be decoded from it."""
     seen = read_recording(data_file(folder, split))
     return seen, read_recording(data_file(folder, f"{split}_true")) if denoise else None
 
@@ -221,7 +221,7 @@ class EvaeTraining:
         true: Recording | None = None,
         device: str = "cpu",
     ) -> "EvaeTraining":
-        """A training from random weights; `seed` is that of the experiment and the number of its stream.
+        """Return a training from random weights; `seed`: the experiment's, and the number of the stream.
 
         On any `device`, as torch names it, it begins from the same weights and sees the same windows.
 
@@ -242,7 +242,7 @@ class EvaeTraining:
         return cls(evae, optimizer, recording, true, settings, rng)
 
     def step(self, iteration: int) -> dict[str, float]:
-        """One update on a batch of sampled windows; returns the losses that `train_step` does."""
+        """Take one update on a batch of sampled windows; return the losses of `train_step`."""
         evae, settings = self.evae.train(), self.settings
         windows = sample_windows(self.recording, settings, settings.batch_windows, self.rng)
         batch = batch_windows(windows, evae.grid)
@@ -254,18 +254,18 @@ class EvaeTraining:
 
 
 def on_processor(evae: EventVAE) -> EventVAE:
-    """The model itself, or a copy of one that is on a GPU."""
+    """Return the model itself, or a copy of one that is on a GPU."""
     return evae if evae.decoder[0].weight.device.type == "cpu" else copy.deepcopy(evae).cpu()
 
 
 def evae_settings(config: Config) -> EvaeSettings:
-    """The settings of an experiment's event VAE."""
+    """Return the settings of an experiment's event VAE."""
     camera = config.env.camera
     return PolicySpec(config.model, camera.width, camera.height).evae
 
 
 def beta(settings: PretrainConfig, iteration: int) -> float:
-    """Weight of the KL divergence at an iteration (appendix B.2, or a constant)."""
+    """Return weight of the KL divergence at an iteration (appendix B.2, or a constant)."""
     if settings.beta_schedule == "appendix":
         return appendix_beta(iteration)
     return settings.beta
@@ -312,13 +312,13 @@ def _window_by_count(recording: Recording, num_events: int, rng: np.random.Gener
 
 
 def cut_window(recording: Recording, start_us: int, window_us: int, most_events: int) -> Window:
-    """The newest `most_events` of the events with start_us < t <= start_us + window_us."""
+    """Return the newest `most_events` of the events with start_us < t <= start_us + window_us."""
     first, stop = (recording.count_until(t_us) for t_us in (start_us, start_us + window_us))
     return recording.events[max(first, stop - most_events) : stop], start_us, window_us
 
 
 def true_windows(true: Recording, windows: Sequence[Window], most_events: int) -> list[Window]:
-    """What a recording holds of the time of windows that have `most_events` at most, the newest."""
+    """Return what a recording holds of the time of windows that have `most_events` at most, the newest."""
     found = []
     for events, start_us, window_us in windows:
         first_us = start_us if len(events) < most_events else int(events["t"][0]) - 1
@@ -330,7 +330,7 @@ def true_windows(true: Recording, windows: Sequence[Window], most_events: int) -
 def held_out_windows(
     recording: Recording, settings: PretrainConfig, grid: Grid, true: Recording | None = None
 ) -> HeldOut:
-    """Fixed windows of unseen episodes, one and four control steps long, and what each is to decode to."""
+    """Return fixed windows of unseen episodes, one and four control steps long, each with its target."""
     rng = np.random.default_rng(0)
     start, end, episode = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
     following = np.searchsorted(episode, episode, side="right")  # the first step of the next episode
@@ -347,7 +347,7 @@ def held_out_windows(
 
 
 def held_out_figures(evae: EventVAE, held_out: HeldOut) -> dict[str, float]:
-    """Figures of `evae.validate` for each window length; `collapsed` is 1 if it is so at all."""
+    """Return figures of `evae.validate` for each window length; `collapsed` is 1 if it is so at all."""
     evae.eval()
     found = {
         name: validate(evae, batch, event_targets(decoded, evae.target))
@@ -388,7 +388,7 @@ def freeze(
 
 @torch.no_grad()
 def example_pictures(evae: EventVAE, held_out: HeldOut) -> tuple[np.ndarray, np.ndarray]:
-    """Target pictures and their reconstructions, the first few of each length: (K, H, W) each."""
+    """Return target pictures and their reconstructions, the first few of each length: (K, H, W) each."""
     targets = [event_targets(decoded, evae.target)[:PICTURE_WINDOWS] for _, decoded in held_out.values()]
     drawn = [reconstruct(evae(batch)[0], evae.target)[:PICTURE_WINDOWS] for batch, _ in held_out.values()]
     shown = [pictures(torch.cat(values), evae.target, evae.grid).numpy() for values in (targets, drawn)]
@@ -396,12 +396,12 @@ def example_pictures(evae: EventVAE, held_out: HeldOut) -> tuple[np.ndarray, np.
 
 
 def encoder_file(folder: Run) -> Path:
-    """Where the frozen encoder lives in a run folder."""
+    """Return where the frozen encoder lives in a run folder."""
     return folder.encoder / ENCODER
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints of a pretraining, the newest first."""
+    """Return the checkpoints of a pretraining, the newest first."""
     return sorted(folder.glob(CHECKPOINTS), reverse=True)
 
 

@@ -102,7 +102,7 @@ class Relay(tune.Callback):
             keep_state(Path(checkpoint.path).parents[1])
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Say that the training goes on, or stop it if its code raised."""
+        """Report that the training continues, or stop it if its code raised."""
         error = newest_error(trial.error_file)
         raised = RAISED.findall(error)
         if raised and not raised[-1].startswith("ray.exceptions."):
@@ -155,12 +155,12 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
 
 
 def stopped(error: Exception | str) -> str:
-    """What to say of a training that an error ended."""
+    """Return the message for a training that an error ended."""
     return f"training stopped: {last_line(error)}; the same command continues from its last checkpoint"
 
 
 def last_line(error: Exception | str) -> str:
-    """The line of a worker's error that names its cause."""
+    """Return the line of a worker's error that names its cause."""
     ended = low_memory(str(error))
     if ended is not None:
         return f"its process was ended {ended}; stop other programs, or take a machine with more"
@@ -193,7 +193,7 @@ def export_policy(
 
 
 def _tuner(config: Config, folder: Run, built: Any) -> tune.Tuner:
-    """The experiment in the run folder: continued if it is there, else new."""
+    """Return the experiment in the run folder: the one that is there, else a new one."""
     path, trainable = storage(config.cluster, folder.train), algorithm_of(config).trainable(config)
     said = mend_state(folder.train)
     if said:
@@ -230,7 +230,7 @@ def on_disk(checkpoint: tune.Checkpoint) -> bool:
 
 
 def restored(path: str, trainable: type, built: Any) -> tune.Tuner:
-    """The experiment of a folder, to go on."""
+    """Return the experiment of a folder, ready to continue."""
     return tune.Tuner.restore(path, trainable, resume_errored=True, param_space=built)
 
 
@@ -275,7 +275,7 @@ def relayed_to(name: str, listen: Callable[[Mapping[str, Any]], None]) -> Iterat
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
-    """Environment steps and metrics of the last whole line of a results file; 0 and none without one.
+    """Return environment steps and metrics of the last whole line of a results file; 0 and none without one.
 
     Raises:
         RunError: A line is damaged.
@@ -319,7 +319,7 @@ def _lookup(result: Mapping[str, object], path: tuple[str, ...]) -> float:
 
 
 def _note(metrics: Mapping[str, float]) -> str:
-    """The figures that a person watches."""
+    """Return the figures that a person watches."""
     parts = [f"{metrics['perf/env_steps_per_second']:,.0f} steps/s"]
     if not math.isnan(metrics["train/episode_return"]):
         parts.append(f"return {metrics['train/episode_return']:.1f}")

@@ -77,7 +77,7 @@ class EventContextNetwork(nn.Module):
         self.norms = nn.ModuleList(nn.BatchNorm1d(size) for size in sizes[1:] if norm == "batch")
 
     def forward(self, batch: EventBatch) -> Tensor:
-        """Context (B, D) of a batch of windows, or (B, 2 D) by EventNet's coding.
+        """Return context (B, D) of a batch of windows, or (B, 2 D) by EventNet's coding.
 
         Raises:
             ValueError: The batch was made for another grid, or has fewer than two events
@@ -94,7 +94,7 @@ class EventContextNetwork(nn.Module):
         return self._rotated(context, winning_bin) if squash else context
 
     def plain(self, batch: EventBatch) -> Tensor:
-        """The same context, event by event: what the fused form is tested against.
+        """Return the same context, event by event: what the fused form is tested against.
 
         Raises:
             ValueError: As `forward`.
@@ -123,7 +123,7 @@ class EventContextNetwork(nn.Module):
         return self._rotated(best, winning_bin)
 
     def cell_features(self) -> Tensor:
-        """Features (cells, D) >= 0 of every distinct event, by the running statistics."""
+        """Return features (cells, D) >= 0 of every distinct event, by the running statistics."""
         cells = np.arange((2 if self.uses_polarity else 1) * self.grid.width * self.grid.height)
         h, weight, bias = self._last_layer(self._inputs(cells), None, 0)
         features = torch.relu(affine(h, weight, bias))
@@ -138,7 +138,7 @@ class EventContextNetwork(nn.Module):
         return list(zip(self.layers, self.norms if len(self.norms) else [None] * 3, strict=True))
 
     def _address(self, batch: EventBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cell and row of code of every event, and the codes (one row of zeros without time)."""
+        """Return cell and row of code of every event, and the codes (one row of zeros without time)."""
         if batch.grid != self.grid:
             raise ValueError(
                 f"the batch has {batch.grid}, the model {self.grid}: make it with the model's grid"
@@ -152,13 +152,13 @@ class EventContextNetwork(nn.Module):
         return cell, np.zeros_like(batch.bin) if self.coding == "none" else batch.bin, codes
 
     def _rotated(self, magnitude: Tensor, winning_bin: Tensor) -> Tensor:
-        """Real and imaginary parts (B, 2 D) of magnitudes (B, D) with the phase of bins (B, D)."""
+        """Return real and imaginary parts (B, 2 D) of magnitudes (B, D) with the phase of bins (B, D)."""
         dtype = str(magnitude.dtype).removeprefix("torch.")
         phase = torch.from_numpy(np.array(eventnet_phase(self.grid.time_bins, dtype))).to(magnitude.device)
         return torch.cat([magnitude * part[winning_bin.long()] for part in phase], dim=1)
 
     def _inputs(self, cell: np.ndarray) -> Tensor:
-        """Inputs (N, 3 or 2) of cells: x, y scaled to [-1, 1], then p."""
+        """Return inputs (N, 3 or 2) of cells: x, y scaled to [-1, 1], then p."""
         width, height = self.grid.width, self.grid.height
         columns = [
             2.0 * (cell % width) / max(width - 1, 1) - (width > 1),
@@ -168,7 +168,7 @@ class EventContextNetwork(nn.Module):
         return torch.from_numpy(np.stack(columns, axis=1)).to(self.layers[0].weight)
 
     def _share(self, multiplicity: np.ndarray, events: int) -> Tensor | None:
-        """Fraction of the batch's events in each present cell; None without batch statistics."""
+        """Return fraction of the batch's events in each present cell; None without batch statistics."""
         if not (self.learns and len(self.norms)):
             return None
         if events < 2:
@@ -187,7 +187,7 @@ class EventContextNetwork(nn.Module):
 def folded(
     layer: nn.Linear, norm: nn.BatchNorm1d | None, h: Tensor, share: Tensor | None, events: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One affine map (h, weight, bias) equal to `norm(layer(h))` over the batch of events.
+    """Return one affine map (h, weight, bias) equal to `norm(layer(h))` over the batch of events.
 
     The batch mean and variance of W h follow from those of h: W mean(h) and diag(W cov(h) W^T).
     So the normalisation costs a small covariance instead of passes over all features, and
@@ -230,7 +230,7 @@ class Events(NamedTuple):
 
 
 def newest_first(events: Events) -> Events:
-    """Each window's events by falling bin: of equals the newest wins."""
+    """Return each window's events by falling bin: of equals the newest wins."""
     window = np.repeat(np.arange(len(events.offsets) - 1), np.diff(events.offsets))
     order = np.lexsort((-events.bin, window))
     return events._replace(cell=events.cell[order], bin=events.bin[order])
@@ -244,7 +244,7 @@ def _largest(values: Tensor, rank: int) -> Tensor:
 def max_on_device(
     h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
 ) -> tuple[Tensor, Tensor]:
-    """What `MaxContext` computes, by operations of torch on the device of its inputs."""
+    """Return what `MaxContext` computes, by operations of torch on the device of its inputs."""
     features = torch.relu(affine(h, weight, bias))
     features = torch.tanh(features) if squash else features
     return max_context(features, events.codes, (events.cell, events.bin), events.offsets, rank)
@@ -260,7 +260,7 @@ class MaxContext(torch.autograd.Function):
     def forward(
         ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
     ) -> tuple[Tensor, Tensor]:
-        """Context (B, D) and the bin (B, D) of the event it is from, 0 without one."""
+        """Return context (B, D) and the bin (B, D) of the event it is from, 0 without one."""
         activation = affine(h, weight, bias).relu_()
         features = (activation.tanh_() if squash else activation).numpy()
         context = np.zeros((len(events.offsets) - 1, len(bias)), features.dtype)
@@ -279,7 +279,7 @@ class MaxContext(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of h, weight and bias: only winning events with an active feature have one."""
+        """Return gradients of h, weight and bias: only winning events with an active feature have one."""
         h, weight, winner = ctx.saved_tensors
         if ctx.slope is not None:
             gradient = gradient * torch.from_numpy(ctx.slope)
@@ -290,7 +290,7 @@ class MaxContext(torch.autograd.Function):
 
 
 def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
-    """Derivative of tanh (B, D) where it took the winners' features (cells, D); anything without a winner."""
+    """Return the slope of tanh (B, D) at the winners' features (cells, D); anything without a winner."""
     if len(features) == 0:
         return np.ones(winner.shape, features.dtype)
     return 1.0 - features[np.maximum(winner, 0), np.arange(winner.shape[1])] ** 2
@@ -331,7 +331,7 @@ def _maximum(features, events, context, winner) -> None:  # type: ignore[no-unty
 
 @numba.njit(cache=True, error_model="numpy")
 def _ranked(features, events, rank, context, winner) -> None:  # type: ignore[no-untyped-def]
-    """As `_maximum`, with the rank-th largest value of the events and 0, of equals the later.
+    """Compute `_maximum` with the rank-th largest value of the events and 0, of equals the later.
 
     Each event is sorted into the `rank` largest so far; a value that one level gives up goes to the next.
     """

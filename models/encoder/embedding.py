@@ -50,7 +50,7 @@ def temporal_embedding(t: npt.ArrayLike, context: int) -> np.ndarray:
 
 
 def time_code(t: npt.ArrayLike, context: int, coding: str = "additive") -> np.ndarray:
-    """What a coding adds to the features of events at normalised times: float64 (..., context).
+    """Return what a coding adds to the features of events at normalised times: float64 (..., context).
 
     Raises:
         ValueError: As `temporal_embedding`, or the coding is unknown.
@@ -67,7 +67,7 @@ def time_code(t: npt.ArrayLike, context: int, coding: str = "additive") -> np.nd
 
 
 def bin_centres(time_bins: int) -> np.ndarray:
-    """Normalised times (time_bins,) of the bins; left edges would triple the latent's error."""
+    """Return normalised times (time_bins,) of the bins; left edges would triple the latent's error."""
     return (np.arange(time_bins) + 0.5) / time_bins
 
 
@@ -99,7 +99,7 @@ def eventnet_phase(time_bins: int, dtype: str = "float32") -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def time_bin(t_us: int, start_us: int, window_us: int, time_bins: int) -> int:
-    """Bin of an event: clip(floor(time_bins (t_us - start_us) / window_us), 0, time_bins - 1).
+    """Return bin of an event: clip(floor(time_bins (t_us - start_us) / window_us), 0, time_bins - 1).
 
     Exact, in integers: a float32 clock would lose microseconds after 17 s. An event outside
     its window takes the nearest bin. Assumes window_us in [1, 2^46] and time_bins <= 65536,

@@ -97,7 +97,7 @@ class EventVAE(nn.Module):
 
     @classmethod
     def of(cls, settings: EvaeSettings) -> "EventVAE":
-        """The untrained model of some settings."""
+        """Return the untrained model of some settings."""
         return cls(**dataclasses.asdict(settings))
 
     def forward(self, batch: EventBatch, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -116,7 +116,7 @@ class EventVAE(nn.Module):
         return self.decoder(z), mu, logvar
 
     def freeze(self) -> "EventVAE":
-        """Eval mode, and no parameter or running statistic moves any more; returns self."""
+        """Set eval mode, and let no parameter or running statistic move any more; return self."""
         return self.eval().requires_grad_(False)
 
 
@@ -126,7 +126,7 @@ def target_shape(target: str, grid: Grid) -> tuple[int, ...]:
 
 
 def event_targets(batch: EventBatch, target: str) -> Tensor:
-    """Pictures that the decoder learns, float32 (B, outputs), row-major (`target_shape`).
+    """Return pictures that the decoder learns, float32 (B, outputs), row-major (`target_shape`).
 
     "signed": polarity of each pixel's last event, -1, 0 or +1. "occupancy": 1 where the pixel
     had any event, else 0. "aged": where it had any, the time of its newest one in (0, 1), newest
@@ -143,7 +143,7 @@ def event_targets(batch: EventBatch, target: str) -> Tensor:
 
 
 def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
-    """Mean over windows and outputs of the target's error, see `EventVAE`.
+    """Return mean over windows and outputs of the target's error, see `EventVAE`.
 
     The cross entropy takes logits because sigmoid followed by log is infinite from 17 on.
     """
@@ -155,14 +155,14 @@ def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
 
 
 def reconstruct(logits: Tensor, target: str) -> Tensor:
-    """Target's values from logits: Tanh in [-1, 1], Sigmoid in [0, 1] (appendix A.1), or as they are."""
+    """Return a target's values from logits: Tanh, Sigmoid (appendix A.1), or the logits themselves."""
     if target == "counts":
         return logits
     return torch.tanh(logits) if target == "signed" else torch.sigmoid(logits)
 
 
 def pictures(values: Tensor, target: str, grid: Grid) -> Tensor:
-    """Values of a target (B, outputs) as pictures to look at, (B, H, W) in about [-1, 1].
+    """Return values of a target (B, outputs) as pictures to look at, (B, H, W) in about [-1, 1].
 
     Of "counts" each pixel shows its cell: the larger of ON and, below 0, OFF.
     """
@@ -175,7 +175,7 @@ def pictures(values: Tensor, target: str, grid: Grid) -> Tensor:
 
 
 def kl_divergence(mu: Tensor, logvar: Tensor) -> Tensor:
-    """KL( N(mu, exp(logvar)) || N(0, 1) ) of each window, summed over the latent: (B,).
+    """Return KL( N(mu, exp(logvar)) || N(0, 1) ) of each window, summed over the latent: (B,).
 
     0.5 (mu^2 + expm1(logvar) - logvar), which keeps small values that 1 + logvar - exp(logvar)
     cancels. Above logvar 10 exp continues along its tangent, so that value and gradient stay
@@ -187,7 +187,7 @@ def kl_divergence(mu: Tensor, logvar: Tensor) -> Tensor:
 
 
 def appendix_beta(iteration: int) -> float:
-    """The appendix's KL weight (B.2): 0 up to iteration 1000, then 1e-3 * iteration / 10000.
+    """Return the appendix's KL weight (B.2): 0 up to iteration 1000, then 1e-3 * iteration / 10000.
 
     The appendix leaves iteration 1000 open; it is 0 here.
     """
@@ -198,7 +198,7 @@ def train_step(
     evae: EventVAE, optimizer: torch.optim.Optimizer, batch: EventBatch, targets: Tensor, beta: float,
     rng: np.random.Generator, max_norm: float = 1.0,
 ) -> dict[str, float]:  # fmt: skip
-    """One update of the model on one batch.
+    """Take one update of the model on one batch.
 
     Args:
         evae: Model in train mode.
@@ -230,7 +230,7 @@ def train_step(
 
 @torch.no_grad()
 def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, float]:
-    """Figures of the model on held-out windows, z = mu; the model must be in eval mode.
+    """Return figures of the model on held-out windows, z = mu; the model must be in eval mode.
 
     Returns:
         reconstruction (mean error of a pixel), mean_picture (the same error for the targets' own
@@ -262,7 +262,7 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
 
 
 def ranking_area(scores: np.ndarray, positive: np.ndarray) -> float:
-    """Area under the ROC curve: how often a positive has the higher score of a random pair.
+    """Return area under the ROC curve: how often a positive has the higher score of a random pair.
 
     Exact: the share of the pairs (positive, negative), a tie counts half (Mann and Whitney 1947).
 
@@ -300,5 +300,5 @@ def collapsed(figures: Mapping[str, float]) -> bool:
 
 
 def active_units(mu: Tensor) -> float:
-    """Number of latent units whose mean varies by more than 0.01 over the windows of `mu` (B, latent)."""
+    """Return how many latent units vary by more than 0.01 over the windows of `mu` (B, latent)."""
     return float((mu.detach().var(0, correction=0) > ACTIVE_VARIANCE).sum())

@@ -68,14 +68,34 @@ class EventBatch:
 
     @classmethod
     def known(cls, grid: Grid, address: np.ndarray, offsets: np.ndarray) -> "EventBatch":
-        """A batch of addresses (2, N) that this file has computed, which need no second look."""
+        """Return a batch of addresses (2, N) that this file has computed, which need no second look."""
         batch = object.__new__(cls)
         batch.__dict__.update(grid=grid, code=address[0], bin=address[1], offsets=offsets)
         return batch
 
     def __len__(self) -> int:
-        """Number of windows."""
+        """Return number of windows."""
         return len(self.offsets) - 1
+
+    @property
+    def window(self) -> np.ndarray:
+        """Return the window of each event, int64 (N,)."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+    @property
+    def x(self) -> np.ndarray:
+        """Return the column of each event, int32 (N,)."""
+        return self.code % self.grid.width
+
+    @property
+    def y(self) -> np.ndarray:
+        """Return the row of each event, int32 (N,)."""
+        return self.code // self.grid.width % self.grid.height
+
+    @property
+    def on(self) -> np.ndarray:
+        """Return which events are ON, bool (N,)."""
+        return self.code >= self.grid.width * self.grid.height
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -88,12 +108,12 @@ def _within(values: np.ndarray, limit: int) -> bool:
 
 
 def address_events(events: Any, start_us: int, window_us: int, grid: Grid) -> np.ndarray:
-    """As `index_events`, of events whose fields t, x, y, p have names."""
+    """Compute `index_events` of events whose fields t, x, y, p have names."""
     return index_events(tuple(events[name] for name in "txyp"), start_us, window_us, grid)
 
 
 def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, grid: Grid) -> np.ndarray:
-    """Addresses of one window's events.
+    """Return addresses of one window's events.
 
     Args:
         fields: t [us], x, y [pixels], p (-1 or +1): integer arrays (N,) in this order.
@@ -164,7 +184,7 @@ def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> Even
 
 
 def _flat_rows(windows: np.ndarray | Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The rows (R, 4) of all windows, and where each window starts and the last ends (B + 1,)."""
+    """Return the rows (R, 4) of all windows, and where each window starts and the last ends (B + 1,)."""
     for number, window in enumerate(windows):
         if window.shape[1:] != (4,) or not len(window) or window.dtype.kind != "i":
             rule = "a packed window is int32 (count + 1, 4)"
@@ -177,7 +197,7 @@ def _flat_rows(windows: np.ndarray | Sequence[np.ndarray]) -> tuple[np.ndarray, 
 
 @numba.njit(cache=True, error_model="numpy")
 def _index_packed(rows, starts, grid):  # type: ignore[no-untyped-def]
-    """Addresses int32 (2, N) and offsets (B + 1,) of packed windows; the first refused window, or -1."""
+    """Return addresses int32 (2, N), offsets (B + 1,), and the first refused window or -1."""
     offsets = np.zeros(len(starts), np.int64)
     for b in range(len(starts) - 1):
         count, window_us = rows[starts[b], 0], rows[starts[b], 2]
@@ -196,7 +216,7 @@ def _index_packed(rows, starts, grid):  # type: ignore[no-untyped-def]
 
 
 def _refuse(number: int, window: np.ndarray, grid: Grid) -> None:
-    """Raises ValueError with what `_index_packed` refused in a window."""
+    """Raise ValueError with what `_index_packed` refused in a window."""
     count, window_us = int(window[0, 0]), int(window[0, 2])
     if not 0 <= count < len(window):
         raise ValueError(f"window {number} announces {count} events, its capacity is {len(window) - 1}")
@@ -207,12 +227,12 @@ def _refuse(number: int, window: np.ndarray, grid: Grid) -> None:
 
 
 def cut_packed(window: np.ndarray) -> np.ndarray:
-    """The used rows of a packed window, int32 (count + 1, 4), as a copy to keep."""
+    """Return the used rows of a packed window, int32 (count + 1, 4), as a copy to keep."""
     return window[: int(window[0, 0]) + 1].copy()
 
 
 def thin(batch: EventBatch, most: int) -> EventBatch:
-    """At most `most` events of each window, evenly over their order.
+    """Return at most `most` events of each window, evenly over their order.
 
     Of N > most the one in the middle of each of `most` equal parts is kept.
     """
@@ -229,7 +249,7 @@ def thin(batch: EventBatch, most: int) -> EventBatch:
 
 
 def event_rows(batch: EventBatch, size: int) -> np.ndarray:
-    """Windows as arrays of fixed size, int16 (B, size, 4): [kind, time bin, x, y] of each event.
+    """Return windows as arrays of fixed size, int16 (B, size, 4): [kind, time bin, x, y] of each event.
 
     kind is 1 for ON, 2 for OFF, 0 for no event: the rows after those of the window's events. Assumes at
     most `size` events in each window, and sides and time bins of at most 2^15.
@@ -288,7 +308,7 @@ def _unroll(rows, grid, address, offsets) -> int:  # type: ignore[no-untyped-def
 
 
 def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distinct non-negative integers, how often each occurs, and the place of each value among them.
+    """Return distinct non-negative integers, how often each occurs, and the place of each value among them.
 
     Returns:
         present (U,) in rising order, multiplicity (U,), rank int32 (N,) with present[rank] == values.
@@ -307,5 +327,5 @@ def _join(parts: list[np.ndarray], grid: Grid) -> EventBatch:
 
 
 def _sums(sizes: list[int]) -> np.ndarray:
-    """0 and the running sums of sizes, int64 (B + 1,); of few, faster than by numpy."""
+    """Return 0 and the running sums of sizes, int64 (B + 1,); for few, faster than numpy."""
     return np.array(list(itertools.accumulate(sizes, initial=0)), np.int64)

@@ -48,12 +48,12 @@ class PictureContextNetwork(nn.Module):
                 nn.init.zeros_(layer.bias)
 
     def forward(self, batch: EventBatch) -> Tensor:
-        """Context (B, D) of a batch of windows."""
+        """Return context (B, D) of a batch of windows."""
         return self.layers(event_pictures(batch).to(self.layers[0].weight))
 
 
 def nature_layers(shape: Sequence[int], outputs: int) -> list[nn.Module]:
-    """Three convolutions and a dense layer with the sizes of Mnih et al. (Nature 2015).
+    """Return three convolutions and a dense layer with the sizes of Mnih et al. (Nature 2015).
 
     Args:
         shape: Channels, height and width of a picture, `models.kinds.MIN_IMAGE` pixels each way.
@@ -71,26 +71,26 @@ def nature_layers(shape: Sequence[int], outputs: int) -> list[nn.Module]:
 
 
 def last_polarity(batch: EventBatch) -> np.ndarray:
-    """Polarity of each pixel's last event, -1, 0 or +1: float32 (B, H W), row-major."""
+    """Return polarity of each pixel's last event, -1, 0 or +1: float32 (B, H W), row-major."""
     pictures = np.zeros((len(batch), batch.grid.width * batch.grid.height), np.float32)
     _draw_windows(batch.code, batch.offsets, pictures)
     return pictures
 
 
 def newest_time(batch: EventBatch) -> np.ndarray:
-    """Time of each pixel's newest event within its window, 0 where there is none: float32 (B, H W).
+    """Return time of each pixel's newest event within its window, 0 where there is none: float32 (B, H W).
 
     Times are the centres of their bins, in (0, 1), newest near 1.
     """
     pixels = batch.grid.width * batch.grid.height
     picture = np.zeros((len(batch), pixels), np.float32)
     time = ((batch.bin + 0.5) / batch.grid.time_bins).astype(np.float32)
-    np.maximum.at(picture, (_window(batch), batch.code % pixels), time)
+    np.maximum.at(picture, (batch.window, batch.code % pixels), time)
     return picture
 
 
 def cell_counts(batch: EventBatch, cells: int) -> np.ndarray:
-    """OFF, then ON events in each of cells x cells equal parts of the sensor: float32 (B, 2 cells cells).
+    """Count OFF, then ON events in cells x cells equal parts of the sensor: float32 (B, 2 cells cells).
 
     A pixel (x, y) belongs to column x cells // width and row y cells // height; row-major.
     """
@@ -98,17 +98,12 @@ def cell_counts(batch: EventBatch, cells: int) -> np.ndarray:
     sign, y = np.divmod(row, batch.grid.height)
     cell = (sign * cells + y * cells // batch.grid.height) * cells + x * cells // batch.grid.width
     size = 2 * cells * cells
-    counts = np.bincount(_window(batch) * size + cell, minlength=len(batch) * size)
+    counts = np.bincount(batch.window * size + cell, minlength=len(batch) * size)
     return counts.reshape(len(batch), size).astype(np.float32)
 
 
-def _window(batch: EventBatch) -> np.ndarray:
-    """The window of each event, int64 (N,)."""
-    return np.repeat(np.arange(len(batch)), np.diff(batch.offsets))
-
-
 def event_pictures(batch: EventBatch) -> Tensor:
-    """Event images float32 (B, 1, H, W) on a scale where ON is 1."""
+    """Return event images float32 (B, 1, H, W) on a scale where ON is 1."""
     last = torch.from_numpy(last_polarity(batch))
     pictures = torch.where(last < 0, OFF_SHARE, last)
     return pictures.reshape(-1, 1, batch.grid.height, batch.grid.width)
@@ -136,13 +131,14 @@ class PictureEncoder:
         self.layers = nn.Sequential(evae.ecn.layers, evae.encoder).eval()
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Latent mu (latent,) of one window. Raises ValueError as `event_batch.index_events`."""
-        return self._mu(batch_windows([(events, start_us, window_us)], self.grid))[0]
+        """Return latent mu (latent,) of one window. Raises ValueError as `event_batch.index_events`."""
+        return self.encode_batch(batch_windows([(events, start_us, window_us)], self.grid))[0]
 
     def encode_windows(self, windows: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
-        """Latents (B, latent) of packed windows. Raises ValueError as `event_batch.batch_packed`."""
-        return self._mu(batch_packed(windows, self.grid))
+        """Return latents (B, latent) of packed windows. Raises ValueError as `event_batch.batch_packed`."""
+        return self.encode_batch(batch_packed(windows, self.grid))
 
-    def _mu(self, batch: EventBatch) -> np.ndarray:
+    def encode_batch(self, batch: EventBatch) -> np.ndarray:
+        """Return the latents (B, latent) of a batch."""
         with torch.inference_mode():
             return self.layers(event_pictures(batch))[:, : self.latent_size].numpy()

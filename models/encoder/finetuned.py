@@ -35,7 +35,7 @@ class FinetunedEncoder(nn.Module):
         return super().train(False)
 
     def forward(self, stacks: Tensor) -> Tensor:
-        """Latents of all windows, oldest first.
+        """Return latents of all windows, oldest first.
 
         Raises:
             ValueError: A row is no event of the sensor.

@@ -15,7 +15,7 @@ Encoder = EncoderTable | PictureEncoder
 
 
 def encoder_part(evae: EventVAE) -> nn.ModuleDict:
-    """The encoder half of an event VAE, with every tensor as a buffer.
+    """Return the encoder half of an event VAE, with every tensor as a buffer.
 
     Buffers are part of every checkpoint and of no optimiser: the encoder is frozen by construction.
     """
@@ -28,7 +28,7 @@ def encoder_part(evae: EventVAE) -> nn.ModuleDict:
 
 
 def read_encoder_part(path: str, digest: str, settings: EvaeSettings) -> nn.ModuleDict:
-    """The `encoder_part` of an encoder file, or one full of NaN if that file is not there.
+    """Return the `encoder_part` of an encoder file, or one full of NaN if that file is not there.
 
     A checkpoint may be opened where its encoder file no longer exists; its own state then
     replaces the NaN, and `tabulate` refuses any that are left.
@@ -51,14 +51,14 @@ def read_encoder_part(path: str, digest: str, settings: EvaeSettings) -> nn.Modu
 
 
 def encoder_of(evae: EventVAE) -> Encoder:
-    """The frozen encoder of a model: a lookup table, or convolutions for event images."""
+    """Return the frozen encoder of a model: a lookup table, or convolutions for event images."""
     return (
         PictureEncoder(evae) if evae.settings.variant == "event_image_vae" else EncoderTable.from_evae(evae)
     )
 
 
 def tabulate(part: nn.Module, settings: EvaeSettings) -> Encoder:
-    """The frozen encoder of an `encoder_part` or a `FinetunedEncoder`, of a model with these settings.
+    """Return the frozen encoder of an `encoder_part` or a `FinetunedEncoder`, of a model with these settings.
 
     Raises:
         ValueError: The part was never given its weights.

@@ -122,7 +122,7 @@ def _copy(part, room) -> None:  # type: ignore[no-untyped-def]
 
 
 def _of(number: Any) -> Any:
-    """The signature of `add_product` for matrices of a type of numbers, in any layout."""
+    """Return the signature of `add_product` for matrices of a type of numbers, in any layout."""
     matrix = types.Array(number, 2, "A")
     return types.void(matrix, matrix, matrix, types.boolean)
 
@@ -180,14 +180,14 @@ def add_rows(rows, out) -> None:  # type: ignore[no-untyped-def]
 
 
 def aligned(size: int) -> np.ndarray:
-    """An empty float32 (size,) that begins at a line of the cache: vectors of it never lie across two."""
+    """Return an empty float32 (size,) that begins at a cache line, so that no vector crosses two."""
     room = np.empty(size + LINE // 4, np.float32)
     return room[-room.ctypes.data % LINE // 4 :][:size]
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def dot(a, b):  # type: ignore[no-untyped-def]
-    """The sum of products of two vectors: CHAINS of them side by side, then one after the other."""
+    """Return the sum of products of two vectors: CHAINS of them side by side, then one after the other."""
     sums = np.zeros(CHAINS, a.dtype)
     whole = len(a) // CHAINS * CHAINS
     for k in range(0, whole, CHAINS):
@@ -203,7 +203,7 @@ def dot(a, b):  # type: ignore[no-untyped-def]
 
 @functools.lru_cache(maxsize=1)
 def _helpers(threads: int) -> ThreadPoolExecutor:
-    """Threads that help the one that asks."""
+    """Return threads that help the one that asks."""
     return ThreadPoolExecutor(threads - 1)
 
 
@@ -211,7 +211,7 @@ os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads do not follo
 
 
 def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray, anew: bool) -> None:
-    """As `add_product`, by as many threads as torch has, which share the rows or the columns of `out`."""
+    """Run `add_product` on as many threads as torch has; they share the rows or columns of `out`."""
     threads = torch.get_num_threads()
     if threads == 1 or out.size * len(b) < SHARED:
         add_product(a, b, out, anew)
@@ -234,7 +234,7 @@ class Product(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
-        """The product (M, N)."""
+        """Return the product (M, N)."""
         ctx.save_for_backward(a, b)
         out = a.new_empty(len(a), b.shape[1]) if bias is None else bias.detach().repeat(len(a), 1)
         add_product_shared(a.detach().numpy(), b.detach().numpy(), out.numpy(), bias is None)
@@ -242,7 +242,7 @@ class Product(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of those that need one, in the layout of their memory."""
+        """Return gradients of those that need one, in the layout of their memory."""
         (a, b), (to_a, to_b, to_bias) = ctx.saved_tensors, ctx.needs_input_grad
         of_bias = gradient.new_zeros(gradient.shape[1]) if to_bias else None
         if of_bias is not None:
@@ -281,7 +281,7 @@ class Linear(nn.Linear):
     """A dense layer whose outputs and gradients are `affine`'s."""
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Outputs (..., M) of inputs (..., K)."""
+        """Return outputs (..., M) of inputs (..., K)."""
         return affine(inputs, self.weight, self.bias)
 
 

@@ -117,7 +117,7 @@ class EncoderTable:
         return np.zeros(shape, np.int16 if dtype == np.int8 else dtype)
 
     def update(self, context: np.ndarray, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Context after more events of the same window; `context`, as of `empty`, is left as it was.
+        """Return context after more events of the same window; `context`, as of `empty`, is left as it was.
 
         Raises:
             ValueError: As `models.encoder.event_batch.index_events`, or `context` is not one of this table's.
@@ -139,11 +139,11 @@ class EncoderTable:
         kernel(self.features, self.embedding, batch.code, batch.bin, batch.offsets, contexts)
 
     def latent(self, context: np.ndarray) -> np.ndarray:
-        """Latent mu (latent,) of a context."""
+        """Return latent mu (latent,) of a context."""
         return self._latents(context[None])[0]
 
     def _latents(self, contexts: np.ndarray) -> np.ndarray:
-        """Latents (B, latent) of contexts (B, ...)."""
+        """Return latents (B, latent) of contexts (B, ...)."""
         read = contexts if self.pool_rank == 1 else np.ascontiguousarray(contexts[:, -1])
         values = read.astype(self.head[1].dtype, copy=False)
         if self.phase is not None:
@@ -152,7 +152,7 @@ class EncoderTable:
         return _mlp(values, *self.hidden, *self.head)
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Latent mu (latent,) of one window; without events, that of the zero context.
+        """Return latent mu (latent,) of one window; without events, that of the zero context.
 
         Args:
             events: Structured array with integer fields t [us], x, y [pixels], p (-1 or +1).
@@ -162,18 +162,18 @@ class EncoderTable:
         Raises:
             ValueError: As `models.encoder.event_batch.index_events`.
         """
-        return self._encode(batch_windows([(events, start_us, window_us)], self.grid))[0]
+        return self.encode_batch(batch_windows([(events, start_us, window_us)], self.grid))[0]
 
     def encode_windows(self, windows: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
-        """Latents (B, latent) of packed windows, int32 (rows, 4) of any lengths; as `encode`'s, bit for bit.
+        """Return latents (B, latent) of packed windows int32 (rows, 4) of any lengths; `encode`'s bytes.
 
         Raises:
             ValueError: As `models.encoder.event_batch.batch_packed`.
         """
-        return self._encode(batch_packed(windows, self.grid))
+        return self.encode_batch(batch_packed(windows, self.grid))
 
-    def _encode(self, batch: EventBatch) -> np.ndarray:
-        """Latents (B, latent) of a batch."""
+    def encode_batch(self, batch: EventBatch) -> np.ndarray:
+        """Return the latents (B, latent) of a batch on this table's `grid`."""
         own = self.empty()
         contexts = np.zeros((len(batch), *own.shape), own.dtype)
         self._raise(batch if self.most_events is None else thin(batch, self.most_events), contexts)
@@ -181,7 +181,7 @@ class EncoderTable:
 
 
 def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
-    """The model in float64 without its decoder, with another resolution of time unless that is None."""
+    """Return the model in float64 without its decoder, with another number of time bins unless None."""
     settings = evae.settings
     exact = EventVAE.of(settings if time_bins is None else replace(settings, time_bins=time_bins))
     del exact.decoder  # which nothing reads here, and which is large in float64
@@ -193,7 +193,7 @@ def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
 def _rounded(
     features: np.ndarray, embedding: np.ndarray, precision: str, dtype: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-    """Rows of features and embedding in their precision, and what one unit of theirs is worth."""
+    """Return rows of features and embedding in their precision, and what one unit of theirs is worth."""
     if precision == "model":
         return features.astype(dtype), embedding.astype(dtype), 1.0
     highest = features.max(axis=0) + 1.0  # the embedding lies in [-1, 1]
@@ -317,7 +317,7 @@ def _raise_to_newest(features, embedding, code, bins, offsets, contexts) -> None
 
 @numba.njit(cache=True, error_model="numpy")
 def _mlp(contexts, hidden_weight, hidden_bias, weight, bias):  # type: ignore[no-untyped-def]
-    """Second half of the encoder: ReLU layer, then mu, (B, latent) of contexts (B, K)."""
+    """Return second half of the encoder: ReLU layer, then mu, (B, latent) of contexts (B, K)."""
     hidden = dense(contexts, hidden_weight, hidden_bias)
     return dense(np.maximum(hidden, np.float32(0.0)), weight, bias)
 
@@ -325,7 +325,7 @@ def _mlp(contexts, hidden_weight, hidden_bias, weight, bias):  # type: ignore[no
 # Reordering the sums lets them use vector registers (20 times faster); it decides no event.
 @numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def dense(inputs, weight, bias):  # type: ignore[no-untyped-def]
-    """The products inputs (B, K) @ weight (M, K).T + bias (M,).
+    """Return the products inputs (B, K) @ weight (M, K).T + bias (M,).
 
     Two rows of either at a time, so that a number is loaded half as often. An odd last one comes twice:
     so its sums are added in the same order in any batch, which BLAS does not promise.

@@ -122,7 +122,7 @@ def load_encoder(path: str | Path) -> tuple[EventVAE, EncoderManifest]:
 
 
 def lean_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors without the decoder, weights and biases in float16; running statistics as they are."""
+    """Return the tensors without the decoder: weights and biases in float16, statistics unchanged."""
     kept = {name: tensor for name, tensor in tensors.items() if not name.startswith(DECODER)}
     rounded = (".weight", ".bias")
     return {name: tensor.half() if name.endswith(rounded) else tensor for name, tensor in kept.items()}
@@ -161,14 +161,14 @@ def read_manifest(path: Path) -> EncoderManifest:
 
 
 def with_checksum(manifest: Mapping[str, object]) -> dict[str, object]:
-    """A manifest, and the checksum of its values as JSON holds them."""
+    """Return a manifest, and the checksum of its values as JSON holds them."""
     text = json.dumps(manifest, allow_nan=False)
     canonical = json.dumps(json.loads(text), sort_keys=True, separators=(",", ":"))
     return {**manifest, CHECKSUM: hashlib.sha256(canonical.encode()).hexdigest()[:12]}
 
 
 def without_checksum(manifest: Any) -> Any:
-    """A manifest without its checksum; one that has none as it is.
+    """Return a manifest without its checksum; one that has none as it is.
 
     Raises:
         DamagedManifestError: Its values are not those that the checksum was made of.
@@ -182,7 +182,7 @@ def without_checksum(manifest: Any) -> Any:
 
 
 def expected_tensors(settings: EvaeSettings) -> dict[str, Tensor]:
-    """State of a model with these settings: shapes and dtypes, without memory for values."""
+    """Return state of a model with these settings: shapes and dtypes, without memory for values."""
     with torch.device("meta"):
         return EventVAE.of(settings).state_dict()
 
@@ -211,7 +211,7 @@ def check_tensors(path: Path, tensors: dict[str, Tensor], settings: EvaeSettings
 
 
 def tensor_path(path: str | Path) -> Path:
-    """The tensors' file as a Path.
+    """Return the tensors' file as a Path.
 
     Raises:
         EncoderFileError: It does not end in .safetensors.
@@ -223,7 +223,7 @@ def tensor_path(path: str | Path) -> Path:
 
 
 def read_limited(path: Path, limit: int) -> bytes:
-    """The bytes of a file of at most `limit` bytes.
+    """Return the bytes of a file of at most `limit` bytes.
 
     Raises:
         EncoderFileError: It cannot be read, is a link, a pipe or a device, or is larger; that is

@@ -143,7 +143,7 @@ def update_dense(
 
 
 def _adam_state(optimizer: torch.optim.Adam, value: torch.Tensor) -> dict[str, Any]:
-    """Adam's state of one parameter; of its first step, as torch begins it."""
+    """Return Adam's state of one parameter; of its first step, as torch begins it."""
     state = optimizer.state[value]
     if not state:
         state["step"] = torch.zeros(())
@@ -152,7 +152,7 @@ def _adam_state(optimizer: torch.optim.Adam, value: torch.Tensor) -> dict[str, A
 
 
 def _flat(networks: Sequence[nn.Sequential], adam: Adam, most: int) -> list[Network]:
-    """The arrays of each network, with room for the outputs of minibatches of up to `most` rows."""
+    """Return the arrays of each network, with room for the outputs of minibatches of up to `most` rows."""
     made, begin = [], 0
     for network in networks:
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]
@@ -166,7 +166,7 @@ def _flat(networks: Sequence[nn.Sequential], adam: Adam, most: int) -> list[Netw
 
 @compiled
 def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no-untyped-def]
-    """Figures as `update_dense` returns them, the norm NaN if one was not finite; and Adam's steps so far."""
+    """Return `update_dense`'s figures, the norm NaN if one was not finite, and Adam's steps so far."""
     epochs, count = orders.shape
     size = min(settings.minibatch_size, count)
     seen, more = rows.stacks.shape[1], rows.privileged.shape[1]
@@ -202,7 +202,7 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
 
 @compiled
 def _part(flat, begin, rows, columns):  # type: ignore[no-untyped-def]
-    """A matrix that begins at a place of an array."""
+    """Return a matrix that begins at a place of an array."""
     return flat[begin : begin + rows * columns].reshape((rows, columns))
 
 
@@ -303,7 +303,7 @@ def _backward(inputs, network):  # type: ignore[no-untyped-def]
 
 @compiled
 def _step(adam, settings, scale, taken):  # type: ignore[no-untyped-def]
-    """One step of Adam (Kingma and Ba 2015) along `scale` times the gradient, its `taken`-th."""
+    """Take the `taken`-th step of Adam (Kingma and Ba 2015) along `scale` times the gradient."""
     scale, eps, two = F32(scale), F32(settings.eps), F32(math.sqrt(1.0 - settings.beta2**taken))
     size = F32(settings.lr / (1.0 - settings.beta1**taken))
     keep1, keep2 = F32(settings.beta1), F32(settings.beta2)

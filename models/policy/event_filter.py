@@ -25,11 +25,11 @@ class EventFilter:
 
     @classmethod
     def begin(cls, support: int, tau_us: int, width: int, height: int) -> "EventFilter":
-        """That of an episode without events yet, on a sensor of so many pixels."""
+        """Return the filter of an episode without events yet, on a sensor of so many pixels."""
         return cls(support, tau_us, quiet_sensor(width, height))
 
     def __call__(self, events: Any) -> dict[str, np.ndarray]:
-        """The events that pass, in their order.
+        """Return the events that pass, in their order.
 
         Args:
             events: Integer arrays t [us], x, y, p by name, in time order, not before those of the last call.
@@ -50,7 +50,7 @@ class EventFilter:
 
 
 def filter_of(sensor: Mapping[str, Any], width: int, height: int) -> EventFilter | None:
-    """The filter of a policy's sensor settings, as a manifest holds them; None without one."""
+    """Return the filter of a policy's sensor settings, as a manifest holds them; None without one."""
     if not sensor.get("filter_support"):
         return None
     return EventFilter.begin(int(sensor["filter_support"]), int(sensor["filter_tau_us"]), width, height)

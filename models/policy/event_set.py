@@ -44,7 +44,7 @@ class EventSet(nn.Module):
         self.join = nn.Sequential(Linear(stack * (2 * WIDTH + 1), OUTPUTS), nn.ReLU())
 
     def forward(self, stacks: Tensor) -> Tensor:
-        """Each event's features times its gate; maximum, mean and number over each window.
+        """Pool each event's features times its gate: maximum, mean and number over each window.
 
         The fused form on a CPU, the plain one elsewhere.
 
@@ -59,7 +59,7 @@ class EventSet(nn.Module):
         return self._joined((largest, total, number), stacks.shape[:2])
 
     def plain(self, stacks: Tensor) -> Tensor:
-        """The same features, row by row: on a GPU, in exported files, and to test the fused form against."""
+        """Compute the features row by row: on a GPU, in exported files, and to test the fused form."""
         kind, time, x, y = stacks.to(self.gate[0].weight)[..., None].unbind(-2)
         on = (kind == ROW_ON).to(kind) - (kind == ROW_OFF).to(kind)
         there = (kind != ROW_EMPTY).to(kind)
@@ -69,13 +69,13 @@ class EventSet(nn.Module):
         return self._joined(pooled, stacks.shape[:2])
 
     def _pooled(self, batch: EventBatch) -> tuple[Tensor, Tensor]:
-        """Maximum and sum (windows, WIDTH) of the events of each window."""
+        """Return maximum and sum (windows, WIDTH) of the events of each window."""
         cells, _, cell = distinct(batch.code)
         times, _, time = distinct(batch.bin)
         return GatedPool.apply(*self.factors(cells, times), Events(cell, time, batch.offsets))
 
     def factors(self, cells: np.ndarray, times: np.ndarray) -> tuple[Tensor, Tensor]:
-        """What the features of events are the products of.
+        """Return what the features of events are the products of.
 
         Args:
             cells: int (P,), as `EventBatch.code`.
@@ -92,14 +92,14 @@ class EventSet(nn.Module):
         return self.place(torch.cat(places, dim=-1)), gates
 
     def _joined(self, pooled: tuple[Tensor, Tensor, Tensor], shape: Sequence[int]) -> Tensor:
-        """The trunk's outputs (B, OUTPUTS) of maxima, sums and numbers of all windows."""
+        """Return the trunk's outputs (B, OUTPUTS) of maxima, sums and numbers of all windows."""
         largest, total, number = (part.reshape(*shape, -1) for part in pooled)
         mean = total / number.clamp_min(1.0)
         return self.join(torch.cat([largest, mean, number / EVENTS], dim=-1).flatten(1))
 
 
 def along(place: Tensor, side: int) -> Tensor:
-    """Fourier features (..., 1 + 2 OCTAVES) of places (..., 1) along a side of so many pixels."""
+    """Return Fourier features (..., 1 + 2 OCTAVES) of places (..., 1) along a side of so many pixels."""
     scaled = place * (2.0 / max(side - 1, 1)) - 1.0
     # Each factor is a Python number: a tensor of them would be copied to a GPU, which cannot be recorded.
     turns = torch.cat([scaled * (math.pi * 2.0 ** (octave - 1)) for octave in range(OCTAVES)], dim=-1)
@@ -107,7 +107,7 @@ def along(place: Tensor, side: int) -> Tensor:
 
 
 def _inputs(x: Tensor, y: Tensor, on: Tensor) -> list[Tensor]:
-    """What `EventSet.place` sees of an event, from the features of its column and row."""
+    """Return what `EventSet.place` sees of an event, from the features of its column and row."""
     parts = [1, OCTAVES, OCTAVES]
     (place_x, sin_x, cos_x), (place_y, sin_y, cos_y) = x.split(parts, -1), y.split(parts, -1)
     return [place_x, place_y, on, sin_x, sin_y, cos_x, cos_y]
@@ -140,7 +140,7 @@ class EventTables:
         self._weight, self._bias = (value.detach().numpy().copy() for value in net.join[0].parameters())
 
     def __call__(self, stacks: np.ndarray) -> np.ndarray:
-        """Features (B, OUTPUTS) of stacks int16 (B, stack, EVENTS, 4).
+        """Return features (B, OUTPUTS) of stacks int16 (B, stack, EVENTS, 4).
 
         Raises:
             ValueError: A row is no event of the sensor.
@@ -161,7 +161,7 @@ class GatedPool(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, places: Tensor, gates: Tensor, events: Events) -> tuple[Tensor, Tensor]:
-        """Two tensors (B, F)."""
+        """Return maximum and sum (B, F)."""
         factors = Factors(places.detach().numpy(), gates.detach().numpy())
         shape = len(events.offsets) - 1, places.shape[1]
         largest, total = (np.zeros(shape, factors.places.dtype) for _ in range(2))
@@ -173,7 +173,7 @@ class GatedPool(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, of_largest: Tensor, of_total: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of places and gates: every event has that of the sum, a winner that of the maximum."""
+        """Return the gradients of places and gates: of the sum by every event, of the maximum by winners."""
         factors = Factors(*(value.detach().numpy() for value in ctx.saved_tensors))
         found = Factors(*map(np.zeros_like, factors))
         gradients = of_largest.contiguous().numpy(), of_total.contiguous().numpy()

@@ -1,7 +1,7 @@
 """The features of a policy: what it keeps of one control step, an array of fixed size.
 
-Each `Feature` says its type and shape, and how it is computed from a batch of observations or from
-the events of one step. `models.kinds.KINDS` names the feature of each kind of policy.
+Each `Feature` says its type and shape, and how it is computed from a batch of event windows or of pictures.
+`models.kinds.KINDS` names the feature of each kind of policy.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ class Feature(NamedTuple):
         from_observations: (B observations, policy, encoder) -> features (B, ...) of that shape.
         from_events: (step, policy, encoder) -> feature; None: it cannot be computed from events.
 
-    The encoder is that of a policy with a frozen one, else None.
+    The encoder is that of a policy with a frozen one, else None. `of_windows` makes both functions of one.
     """
 
     dtype: type
@@ -53,8 +53,32 @@ class Feature(NamedTuple):
     from_events: Callable[[Step, PolicySpec, Any], np.ndarray] | None
 
 
+def of_windows(
+    dtype: type,
+    shape: Callable[[PolicySpec], tuple[int, ...]],
+    compute: Callable[[EventBatch, PolicySpec, Any], np.ndarray],
+    grid: Callable[[PolicySpec, Any], Grid] = lambda spec, encoder: Grid(spec.width, spec.height, 1),
+) -> Feature:
+    """Return the feature that one function computes from event windows, in training and from events alike.
+
+    Args:
+        dtype: As of `Feature`.
+        shape: As of `Feature`.
+        compute: (batch of B windows, policy, encoder) -> features (B, ...).
+        grid: (policy, encoder) -> sensor size and time bins of the batch.
+    """
+
+    def from_observations(windows: Windows, spec: PolicySpec, encoder: Any) -> np.ndarray:
+        return compute(batch_packed(windows, grid(spec, encoder)), spec, encoder)
+
+    def from_events(step: Step, spec: PolicySpec, encoder: Any) -> np.ndarray:
+        return compute(batch_windows([step], grid(spec, encoder)), spec, encoder)[0]
+
+    return Feature(dtype, shape, from_observations, from_events)
+
+
 def feature_of(spec: PolicySpec) -> Feature:
-    """The feature of a policy."""
+    """Return the feature of a policy."""
     feature: Feature = resolve(spec.kind.feature)
     return feature
 
@@ -78,16 +102,15 @@ def push_features(stacks: np.ndarray, features: np.ndarray, first: np.ndarray) -
 
 
 def column_counts(batch: EventBatch) -> np.ndarray:
-    """log(1 + count) of the ON, then of the OFF events in each image column, float32 (B, 2 * width)."""
+    """Return log(1 + count) of the ON, then of the OFF events in each column, float32 (B, 2 * width)."""
     width, height, _ = batch.grid
-    window = np.repeat(np.arange(len(batch)), np.diff(batch.offsets))
-    place = (2 * window + (batch.code < width * height)) * width + batch.code % width
+    place = (2 * batch.window + (batch.code < width * height)) * width + batch.code % width
     counts = np.bincount(place, minlength=2 * width * len(batch))
     return np.log1p(counts).astype(np.float32).reshape(len(batch), 2 * width)
 
 
 def event_picture(code: np.ndarray, width: int, height: int) -> np.ndarray:
-    """255 where a pixel's last event was ON, 125 where it was OFF, else 0: uint8 (H, W).
+    """Return 255 where a pixel's last event was ON, 125 where OFF, else 0: uint8 (H, W).
 
     The rule of `envs.events.event_image` (appendix D.1.2); `code` of events in time order, as in
     `models.encoder.event_batch.EventBatch`.
@@ -97,42 +120,21 @@ def event_picture(code: np.ndarray, width: int, height: int) -> np.ndarray:
     return picture.reshape(height, width)
 
 
-def _grid(spec: PolicySpec, time_bins: int = 1) -> Grid:
-    return Grid(spec.width, spec.height, time_bins)
+def _latents(batch: EventBatch, spec: PolicySpec, encoder: Encoder) -> np.ndarray:
+    return encoder.encode_batch(batch)
 
 
-def _latents_of_windows(windows: Windows, spec: PolicySpec, encoder: Encoder) -> np.ndarray:
-    return encoder.encode_windows(windows)
+def _columns(batch: EventBatch, spec: PolicySpec, encoder: None) -> np.ndarray:
+    return column_counts(batch)
 
 
-def _latent_of_step(step: Step, spec: PolicySpec, encoder: Encoder) -> np.ndarray:
-    return encoder.encode(*step)
+def _grid_of_encoder(spec: PolicySpec, encoder: Encoder) -> Grid:
+    return encoder.grid
 
 
-def _columns_of_windows(windows: Windows, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return column_counts(batch_packed(windows, _grid(spec)))
-
-
-def _columns_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return column_counts(batch_windows([step], _grid(spec)))[0]
-
-
-def _set_of_windows(windows: Windows, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return event_rows(thin(batch_packed(windows, _grid(spec, TIMES)), EVENTS), EVENTS)
-
-
-def _set_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return event_rows(thin(batch_windows([step], _grid(spec, TIMES)), EVENTS), EVENTS)[0]
-
-
-def _encoded_of_windows(windows: Windows, spec: PolicySpec, encoder: None) -> np.ndarray:
-    batch = batch_packed(windows, _grid(spec, spec.evae.time_bins))
-    return event_rows(thin(batch, ENCODED_EVENTS), ENCODED_EVENTS)
-
-
-def _encoded_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    batch = batch_windows([step], _grid(spec, spec.evae.time_bins))
-    return event_rows(thin(batch, ENCODED_EVENTS), ENCODED_EVENTS)[0]
+def _thinned_rows(most: int) -> Callable[[EventBatch, PolicySpec, Any], np.ndarray]:
+    """Return the feature that keeps at most so many events of a window, as rows."""
+    return lambda batch, spec, encoder: event_rows(thin(batch, most), most)
 
 
 def _picture_shape(spec: PolicySpec) -> tuple[int, ...]:
@@ -140,7 +142,7 @@ def _picture_shape(spec: PolicySpec) -> tuple[int, ...]:
 
 
 def _pictures(observations: np.ndarray, spec: PolicySpec, dtype: type) -> np.ndarray:
-    """The observations, if they are pictures of this sensor."""
+    """Return the observations, if they are pictures of this sensor."""
     shape = _picture_shape(spec)
     if observations.dtype != dtype or observations.shape[1:] != shape:
         rule = f"must be {np.dtype(dtype)} (B, {shape[0]}, {shape[1]})"
@@ -153,16 +155,27 @@ def _same_pictures(pictures: np.ndarray, spec: PolicySpec, encoder: None) -> np.
 
 
 def _picture_of_step(step: Step, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return event_picture(batch_windows([step], _grid(spec)).code, spec.width, spec.height)
+    batch = batch_windows([step], Grid(spec.width, spec.height, 1))
+    return event_picture(batch.code, spec.width, spec.height)
 
 
 def _grey_of_luminance(luminance: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:
     return grey_picture(_pictures(luminance, spec, np.float32))
 
 
-LATENT = Feature(np.float32, lambda spec: (spec.evae.latent,), _latents_of_windows, _latent_of_step)
-COLUMNS = Feature(np.float32, lambda spec: (2 * spec.width,), _columns_of_windows, _columns_of_step)
-EVENT_SET = Feature(np.int16, lambda spec: (EVENTS, 4), _set_of_windows, _set_of_step)
-EVENT_ROWS = Feature(np.int16, lambda spec: (ENCODED_EVENTS, 4), _encoded_of_windows, _encoded_of_step)
+LATENT = of_windows(np.float32, lambda spec: (spec.evae.latent,), _latents, _grid_of_encoder)
+COLUMNS = of_windows(np.float32, lambda spec: (2 * spec.width,), _columns)
+EVENT_SET = of_windows(
+    np.int16,
+    lambda spec: (EVENTS, 4),
+    _thinned_rows(EVENTS),
+    lambda spec, encoder: Grid(spec.width, spec.height, TIMES),
+)
+EVENT_ROWS = of_windows(
+    np.int16,
+    lambda spec: (ENCODED_EVENTS, 4),
+    _thinned_rows(ENCODED_EVENTS),
+    lambda spec, encoder: Grid(spec.width, spec.height, spec.evae.time_bins),
+)
 EVENT_IMAGE = Feature(np.uint8, _picture_shape, _same_pictures, _picture_of_step)
 GREY = Feature(np.uint8, _picture_shape, _grey_of_luminance, None)

@@ -39,5 +39,5 @@ def remember(
 
 
 def windows_us(observations: Windows, spec: PolicySpec) -> np.ndarray | int:
-    """How long the packed window of each observation is [us]; 0 for a policy that does not ask."""
+    """Return how long the packed window of each observation is [us]; 0 for a policy that does not ask."""
     return np.array([window[0, 2] for window in observations]) if spec.memory_ms else 0

@@ -12,7 +12,7 @@ from models.kinds import PolicySpec
 
 
 def mirror(observations: Any, spec: PolicySpec) -> Any:
-    """Observations with left and right exchanged.
+    """Return observations with left and right exchanged.
 
     Args:
         observations: B packed windows, of one length or of several, or pictures (B, H, W).
@@ -37,7 +37,7 @@ def _mirror_windows(windows: Any, width: int) -> Any:
 
 
 def _mirror_window(window: np.ndarray, width: int) -> np.ndarray:
-    """Of rows [t, x, y, p] after a head whose first number counts them."""
+    """Return a packed window with left and right exchanged."""
     mirrored = window.copy()
     events = mirrored[1 : 1 + int(window[0, 0])]
     events[:, 1] = width - 1 - events[:, 1]

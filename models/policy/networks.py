@@ -2,8 +2,7 @@
 
     logits = pi(trunk(stack)),   value = vf(trunk(stack))
 
-`models.kinds.KINDS` names the function that builds those of each kind of policy: it takes the shape of
-the stack and the policy, and returns the parts. Weights come from `initialise`, or from a file.
+`models.kinds.KINDS` names the `Network` of each kind of policy. Weights come from `initialise` or a file.
 """
 
 import copy
@@ -11,6 +10,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from operator import contains
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -30,21 +30,17 @@ PARTS = ("trunk", "pi", "vf")
 # Of the last layer's weights; all other layers have sqrt(2) (stable-baselines' policies).
 LAST_GAIN = {"pi": 0.01, "vf": 1.0}
 CNN_OUTPUTS = 512
+Run = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+Gradients = Literal["compiled", "torch", "gpu"]
 
 
 def build_networks(spec: PolicySpec, seed: int = 0) -> nn.ModuleDict:
-    """The networks of a policy with the initial weights of a seed."""
+    """Return the networks of a policy with the initial weights of a seed."""
     return initialise(assemble(spec), seed)
 
 
-def assemble(spec: PolicySpec) -> nn.ModuleDict:
-    """The parts of a policy's networks (`PARTS`), to be initialised or loaded."""
-    shape = (spec.depth, *feature_of(spec).shape(spec))
-    return nn.ModuleDict(dict(zip(PARTS, resolve(spec.kind.network)(shape, spec), strict=True)))
-
-
 def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
-    """Orthogonal weights and zero biases, as in stable-baselines' policies; returns the networks."""
+    """Set orthogonal weights and zero biases, as in stable-baselines' policies; return the networks."""
     for offset, name in enumerate(("pi", "vf", "trunk")):
         generator = torch.Generator().manual_seed(seed + offset)
         layers = [part for part in networks[name].modules() if isinstance(part, nn.Linear | nn.Conv2d)]
@@ -56,27 +52,33 @@ def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
     return networks
 
 
-def logits_by(trunk: nn.Module, pi: nn.Module) -> Callable[[np.ndarray], np.ndarray]:
-    """What computes the logits float32 (B, actions) of stacks (B, depth, ...), by the weights of this moment.
+def by_dense_layers(trunk: nn.Module, pi: nn.Module) -> Run:
+    """Run dense networks without torch, with the same bytes in any batch.
 
-    Dense networks and event sets give the same bytes in any batch, and run without torch, whose calls take
-    ten times as long as the arithmetic of a few rows. All others run by torch.
+    Torch's calls take ten times as long as the arithmetic of a few rows.
     """
-    if isinstance(trunk, nn.Flatten) and is_mlp(pi):
-        return _dense_layers(pi)
-    if isinstance(trunk, EventSet) and isinstance(pi, nn.Linear):
-        features, decide = EventTables(trunk), _dense_layers(nn.Sequential(pi))
-        return lambda stacks: decide(features(stacks))
+    logits_of = _dense_layers(cast(nn.Sequential, pi))
+    return lambda stacks, state: (logits_of(stacks), state)
 
-    def by_torch(stacks: np.ndarray) -> np.ndarray:
+
+def by_event_tables(trunk: nn.Module, pi: nn.Module) -> Run:
+    """Run an event set without torch, with the same bytes in any batch."""
+    features, decide = EventTables(cast(EventSet, trunk)), _dense_layers(nn.Sequential(pi))
+    return lambda stacks, state: (decide(features(stacks)), state)
+
+
+def by_torch(trunk: nn.Module, pi: nn.Module) -> Run:
+    """Run a network that has no faster form."""
+
+    def run(stacks: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         with torch.inference_mode():
-            return pi(trunk(torch.from_numpy(stacks))).numpy()
+            return pi(trunk(torch.from_numpy(stacks))).numpy(), state
 
-    return by_torch
+    return run
 
 
 def _dense_layers(network: nn.Sequential) -> Callable[[np.ndarray], np.ndarray]:
-    """What computes the outputs of dense layers with tanh between them, float32 (B, outputs)."""
+    """Return what computes the outputs of dense layers with tanh between them, float32 (B, outputs)."""
     linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     first, *layers = [
         [value.detach().numpy().copy() for value in (layer.weight, layer.bias)] for layer in linear
@@ -92,14 +94,58 @@ def _dense_layers(network: nn.Sequential) -> Callable[[np.ndarray], np.ndarray]:
     return outputs_of
 
 
+def _no_state(spec: PolicySpec) -> int:
+    return 0
+
+
+class Network(NamedTuple):
+    """How the networks of a kind of policy are built, run and trained.
+
+    Attributes:
+        build: (shape of the stack of features, policy) -> the parts `PARTS`.
+        run: (trunk, pi) -> the policy by the weights of this moment, a function from stacks (B, depth, ...)
+            and states (B, S) to logits float32 (B, actions) and the next states.
+        gradients: What computes PPO's gradients. "compiled": `models.policy.dense_update`, for `mlp`s
+            without a trunk alone; "torch"; "gpu": torch, on a GPU if the learner has one.
+        state: The policy -> numbers S of a recurrent network's state; 0: it has none.
+    """
+
+    build: Callable[[Sequence[int], PolicySpec], tuple[nn.Module, ...]]
+    run: Callable[[nn.Module, nn.Module], Run] = by_torch
+    gradients: Gradients = "torch"
+    state: Callable[[PolicySpec], int] = _no_state
+
+
+def network_of(spec: PolicySpec) -> Network:
+    """Return the network of a policy; a plug-in's plain function is built, and run by torch."""
+    named = resolve(spec.kind.network)
+    return named if isinstance(named, Network) else Network(named)
+
+
+def assemble(spec: PolicySpec) -> nn.ModuleDict:
+    """Return the parts of a policy's networks (`PARTS`), to be initialised or loaded.
+
+    Raises:
+        ValueError: The row of the network says that it is compiled, but it has other layers than `mlp`.
+    """
+    shape, network = (spec.depth, *feature_of(spec).shape(spec)), network_of(spec)
+    parts = dict(zip(PARTS, network.build(shape, spec), strict=True))
+    plain = isinstance(parts["trunk"], nn.Flatten) and is_mlp(parts["pi"]) and is_mlp(parts["vf"])
+    if network.gradients == "compiled" and not plain:
+        raise ValueError(
+            f"{spec.model.name}: only networks of nn.Flatten() and `mlp`s have compiled gradients"
+        )
+    return nn.ModuleDict(parts)
+
+
 def two_mlps(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
-    """Two separate networks of dense tanh layers (appendix D.1.2; stable-baselines' MlpPolicy)."""
+    """Return two separate networks of dense tanh layers (appendix D.1.2; stable-baselines' MlpPolicy)."""
     inputs, hidden = math.prod(shape), spec.hidden
     return nn.Flatten(), mlp(inputs, hidden, spec.num_actions), mlp(inputs, hidden, 1)
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
-    """Dense tanh layers and a linear head."""
+    """Return dense tanh layers and a linear head."""
     layers: list[nn.Module] = []
     for fan_in, fan_out in itertools.pairwise([inputs, *hidden]):
         layers += [Linear(fan_in, fan_out), nn.Tanh()]
@@ -115,7 +161,7 @@ def is_mlp(network: nn.Module) -> bool:
 
 
 def widened(network: nn.Module, inputs: int) -> nn.Module:
-    """A copy whose first layer has so many more inputs, of weight 0; if negative, without its last ones."""
+    """Return a copy whose first layer has more inputs, of weight 0; fewer if `inputs` is negative."""
     wider = copy.deepcopy(network)
     first = next(layer for layer in wider.modules() if isinstance(layer, nn.Linear))
     first.weight = nn.Parameter(nn.functional.pad(first.weight.detach(), (0, inputs)))
@@ -124,7 +170,7 @@ def widened(network: nn.Module, inputs: int) -> nn.Module:
 
 
 def nature_cnn(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
-    """Convolutions that policy and value share, over the stacked pictures as channels.
+    """Return convolutions that policy and value share, over the stacked pictures as channels.
 
     They are those of `models.encoder.event_images.nature_layers`, as in stable-baselines' CnnPolicy, which
     appendix D.1.2 names. Pictures need `models.kinds.MIN_IMAGE` pixels each way.
@@ -134,13 +180,13 @@ def nature_cnn(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
 
 
 def event_set(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
-    """A network over sets of events that policy and value share (`models.policy.event_set`)."""
+    """Return a network over sets of events that policy and value share (`models.policy.event_set`)."""
     trunk = EventSet(shape[0], (spec.width, spec.height))
     return trunk, Linear(OUTPUTS, spec.num_actions), Linear(OUTPUTS, 1)
 
 
 def finetuned_mlps(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
-    """The networks of `two_mlps` behind an encoder that they share and that PPO trains on."""
+    """Return the networks of `two_mlps` behind an encoder that they share and that PPO trains on."""
     _, pi, vf = two_mlps((shape[0], spec.evae.latent), spec)
     return FinetunedEncoder(spec.evae), pi, vf
 
@@ -151,3 +197,9 @@ class Bytes(nn.Module):
     def forward(self, pictures: Tensor) -> Tensor:
         """Scale uint8 (...) to float32 (...)."""
         return pictures.float().div_(255.0)
+
+
+TWO_MLPS = Network(two_mlps, by_dense_layers, "compiled")
+NATURE_CNN = Network(nature_cnn, gradients="gpu")
+EVENT_SET = Network(event_set, by_event_tables, "gpu")
+FINETUNED_MLPS = Network(finetuned_mlps)

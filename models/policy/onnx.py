@@ -6,6 +6,7 @@ For robots without Python. The graph is the whole policy, with the preprocessing
     window_us    int64 (), length of the window [us]        (policies that see events)
     luminance    float32 (H, W), linear                     (policies that see luminance)
     last_stack   (depth, ...), next_stack of the step before; for an episode's first step anything
+    last_state   float32 (S,), next_state of the step before  (recurrent networks; behind first)
     first        bool (), whether this is an episode's first step
     last_us      int64 (H + 2, W + 2), next_us of the step before  (policies with a neighbour filter)
 
@@ -13,10 +14,15 @@ and gives::
 
     logits       float32 (actions,), unnormalised log-probabilities
     next_stack   as last_stack: float32, uint8 for pictures, int32 for sets of events
+    next_state   as last_state
     next_us      as last_us: when each pixel fired last, since the end of this step [us]
+    dropped      int64 (), events or pixels that were left out because `Policy` refuses them
 
-`tests/models/policy/test_onnx.py` compares it with `models.policy.Policy` in onnxruntime. Needs the extra
-`onnx` of this package.
+The file leaves out events outside of the image or with another p than -1 and +1, every event if window_us is
+not in 1 .. MAX_WINDOW_US, and takes pixels that are not finite for black.
+
+`tests/models/policy/test_onnx.py` compares the file with `models.policy.Policy` in onnxruntime. The extra
+`onnx` of this package is needed.
 """
 
 import importlib.util
@@ -30,11 +36,12 @@ from torch import Tensor, nn
 from core.neighbour_filter import NEVER
 from core.pictures import GAMMA, GREY_OFF, GREY_ON
 from core.places import resolve
-from models.encoder.event_batch import ROW_OFF, ROW_ON
+from models.encoder.event_batch import MAX_WINDOW_US, ROW_OFF, ROW_ON
 from models.encoder.event_images import OFF_SHARE, PictureEncoder
 from models.kinds import KINDS
 from models.policy.event_filter import EventFilter, filter_of
 from models.policy.event_set import EVENTS, TIMES, EventSet
+from models.policy.networks import network_of
 from models.policy.policy import Policy
 
 NEEDED = ("onnx", "onnxscript")
@@ -65,12 +72,14 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
     stack = torch.zeros(graph.shape, dtype=graph.dtype)
     names = {"input_names": [*seen, "last_stack", "first"], "output_names": ["logits", "next_stack"]}
     inputs = [*examples, stack, torch.tensor(True)]
+    own = []
+    if graph.state_size:
+        own.append(("state", torch.zeros(graph.state_size)))
     if graph.filter is not None:
-        inputs.append(torch.from_numpy(graph.filter.last_us.copy()))
-        names = {
-            "input_names": [*names["input_names"], "last_us"],
-            "output_names": [*names["output_names"], "next_us"],
-        }
+        own.append(("us", torch.from_numpy(graph.filter.last_us.copy())))
+    inputs += [value for _, value in own]
+    names["input_names"] += [f"last_{name}" for name, _ in own]
+    names["output_names"] += [*(f"next_{name}" for name, _ in own), "dropped"]
     program: Any = torch.onnx.export(
         graph,
         tuple(inputs),
@@ -96,6 +105,7 @@ class PolicyGraph(nn.Module):
         self.tau_us = torch.tensor([1e3 * time_ms for time_ms in spec.memory_ms])
         self.filter = filter_of(policy.manifest.get("sensor", {}), spec.width, spec.height)
         self.sees_events = policy.feature.from_events is not None
+        self.state_size = network_of(spec).state(spec)
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
         self.read = self.trunk.plain if isinstance(self.trunk, EventSet) else self.trunk
         self.feature = resolve(KINDS[spec.model.name].onnx or "")
@@ -114,7 +124,7 @@ class PolicyGraph(nn.Module):
                 self.register_buffer(name, torch.from_numpy(array.copy()))
 
     def examples(self) -> tuple[list[str], tuple[Tensor, ...], tuple[object, ...]]:
-        """Names, examples and free sizes of what the policy sees."""
+        """Return names, examples and free sizes of what the policy sees."""
         if self.sees_events:
             events = torch.tensor([[0, 0, 0, 1], [1, 0, 0, -1], [2, 0, 0, 1]])
             count = torch.export.Dim("count", min=0, max=MAX_EVENTS)
@@ -122,30 +132,48 @@ class PolicyGraph(nn.Module):
         return ["luminance"], (torch.zeros(self.size),), (None,)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """What the module's docstring lists; inputs too."""
+        """Return the outputs that the module's docstring lists, of the inputs that it lists."""
+        inputs, dropped = self._valid(*inputs)
         if self.filter is None:
-            return self._step(*inputs)
-        events, window_us, stack, first, last_us = inputs
+            return *self._step(*inputs), dropped
+        events, window_us, stack, first, *state, last_us = inputs
         passing, next_us = _filtered(self.filter, events, torch.where(first, NEVER, last_us))
-        return *self._step(events[passing], window_us, stack, first), next_us - window_us
+        return *self._step(events[passing], window_us, stack, first, *state), next_us - window_us, dropped
 
-    def _step(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits and the next stack."""
-        *seen, stack, first = inputs
+    def _valid(self, *inputs: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Return the inputs without what `Policy` refuses, and how much that was."""
+        if not self.sees_events:
+            luminance, *rest = inputs
+            finite = torch.isfinite(luminance)
+            return (torch.where(finite, luminance, 0.0), *rest), (~finite).sum()
+        events, window_us, *rest = inputs
+        _, x, y, p = events.unbind(1)
+        height, width = self.size
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (p.abs() == 1)
+        inside = inside & (window_us >= 1) & (window_us <= MAX_WINDOW_US)
+        return (events[inside], window_us.clamp(1, MAX_WINDOW_US), *rest), (~inside).sum()
+
+    def _step(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the logits, the next stack and, of a recurrent network, its next state."""
+        *given, state = inputs if self.state_size else (*inputs, torch.zeros(0))
+        *seen, stack, first = given
         feature = self.feature(self, *seen).to(self.dtype)
         newest = feature[None]
         kept = newest + (stack[:-1] - newest) * self._rest(*seen) if len(self.tau_us) else stack[1:]
         pushed = torch.cat([kept, newest])
         stack = torch.where(first, feature[None].expand(self.shape), pushed)
+        if self.state_size:
+            _, after = self.trunk(stack[None, None], torch.where(first, 0.0, state)[None])
+            return self.pi(after)[0], stack, after[0]
         return self.pi(self.read(stack[None]))[0], stack
 
     def _rest(self, events: Tensor, window_us: Tensor) -> Tensor:
-        """Share (K, 1) of each mean that outlives the step (`models.policy.memory`)."""
+        """Return share (K, 1) of each mean that outlives the step (`models.policy.memory`)."""
         return torch.exp(-window_us.float() / self.tau_us)[:, None]
 
 
 def _filtered(chosen: EventFilter, events: Tensor, last_us: Tensor) -> tuple[Tensor, Tensor]:
-    """Which events pass (`models.policy.event_filter`), bool (N,), and when each pixel fired last.
+    """Return which events pass (`models.policy.event_filter`), bool (N,), and each pixel's last time.
 
     Every event is compared with all others: exact, and quick for up to some thousand.
     """
@@ -165,7 +193,7 @@ def _filtered(chosen: EventFilter, events: Tensor, last_us: Tensor) -> tuple[Ten
 
 
 def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """Largest (or `pool_rank`-th) table row over the events, then the encoder's dense layers (appendix C)."""
+    """Return the latent: the largest (or `pool_rank`-th) table row, then the dense layers (appendix C)."""
     there = torch.ones_like(events[:, :1], dtype=torch.bool)
     if policy.most_events is not None:
         events, there = _thinned(events, policy.most_events)
@@ -182,14 +210,14 @@ def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tens
 
 
 def picture_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """Mean of the latent of the event image, with OFF as a share of ON."""
+    """Return mean of the latent of the event image, with OFF as a share of ON."""
     picture = event_image(policy, events, window_us)
     shares = torch.where(picture == GREY_ON, 1.0, torch.where(picture == GREY_OFF, OFF_SHARE, 0.0))
     return policy.layers(shares[None, None])[0, : policy.latent]
 
 
 def event_set(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """Rows of events, as `models.encoder.event_batch.event_rows`."""
+    """Return rows of events, as `models.encoder.event_batch.event_rows`."""
     events, there = _thinned(events, EVENTS)
     t, x, y, p = events.unbind(1)
     rows = torch.stack([torch.where(p > 0, ROW_ON, ROW_OFF), _bins(t, window_us, TIMES), x, y], dim=1)
@@ -197,7 +225,7 @@ def event_set(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
 
 
 def _thinned(events: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """At most so many events, evenly over their order (`event_batch.thin`), and which are any."""
+    """Return at most so many events, evenly over their order (`event_batch.thin`), and which are any."""
     count = torch.ones_like(events[:, 0]).sum()
     kept = count.clamp(max=most)
     k = torch.arange(most)
@@ -207,13 +235,13 @@ def _thinned(events: Tensor, most: int) -> tuple[Tensor, Tensor]:
 
 
 def _bins(t: Tensor, window_us: Tensor, time_bins: int) -> Tensor:
-    """Time bin of each event (`models.encoder.embedding.time_bin`)."""
+    """Return time bin of each event (`models.encoder.embedding.time_bin`)."""
     offset = torch.minimum(t.clamp(min=0), window_us)
     return torch.div(offset * time_bins, window_us, rounding_mode="floor").clamp(max=time_bins - 1)
 
 
 def columns(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """log(1 + count) of ON, then of OFF events in each column."""
+    """Return log(1 + count) of ON, then of OFF events in each column."""
     _, x, _, p = events.unbind(1)
     width = policy.size[1]
     place = x + width * (p < 0)
@@ -222,7 +250,7 @@ def columns(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
 
 
 def event_image(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """255 or 125 by each pixel's last event: the one with the highest number."""
+    """Return 255 or 125 by each pixel's last event, the one with the highest number."""
     _, x, y, p = events.unbind(1)
     numbered = 2 * torch.ones_like(p).cumsum(0) + (p > 0)
     none = torch.zeros(policy.size[0] * policy.size[1], dtype=torch.int64)
@@ -231,11 +259,11 @@ def event_image(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tenso
 
 
 def grey(policy: PolicyGraph, luminance: Tensor) -> Tensor:
-    """Gamma-encoded 8-bit picture."""
+    """Return gamma-encoded 8-bit picture."""
     return torch.round(255.0 * luminance.clamp(0.0, 1.0) ** (1.0 / GAMMA))
 
 
 def _code(policy: PolicyGraph, events: Tensor) -> Tensor:
-    """Row of each event in a table: ((p > 0) * height + y) * width + x."""
+    """Return row of each event in a table: ((p > 0) * height + y) * width + x."""
     _, x, y, p = events.unbind(1)
     return ((p > 0) * policy.size[0] + y) * policy.size[1] + x

@@ -37,7 +37,7 @@ from models.kinds import PolicySpec, needed_plugins, read_spec
 from models.policy.event_filter import filter_of
 from models.policy.features import LATENT, Step, Windows, feature_of
 from models.policy.memory import remember, windows_us
-from models.policy.networks import assemble, logits_by
+from models.policy.networks import TWO_MLPS, assemble, network_of
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # the shipped policies, a folder each
 MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.safetensors"
@@ -48,6 +48,7 @@ FORMAT = 2
 ENV_FIELDS = ("control_hz", "speed_mps", "filter_support", "filter_tau_us")
 FIDELITY_FIELDS = ("tolerance", "max_step_m", "samples", "cull_m")
 REMEDY = "copy it again, or delete stages/train.json of its run folder and give the command again"
+PREPARED = ("feature", "_network", "_run")  # attributes of a policy that are functions
 MAX_BYTES = 1 << 28  # of one file, which is read whole
 
 
@@ -101,18 +102,33 @@ class Policy:
         self.networks, self.spec, self.encoder = networks, spec, encoder
         self.deterministic, self.rng = deterministic, rng
         self.manifest: PolicyManifest = {} if manifest is None else manifest
-        self.feature = feature_of(spec) if encoder is None else LATENT
-        self._logits_of = logits_by(networks["trunk"], networks["pi"])
+        self._prepare()
         self.reset()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but functions, so that a policy is copied or pickled in mid-episode."""
+        return {name: value for name, value in self.__dict__.items() if name not in PREPARED}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Continue where a copy or a pickle was made."""
+        self.__dict__.update(state)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Look up the feature and the network, and take the weights of this moment."""
+        tabulated = self.encoder is not None
+        self.feature = LATENT if tabulated else feature_of(self.spec)
+        self._network = TWO_MLPS if tabulated and self.spec.finetuned else network_of(self.spec)
+        self._run = self._network.run(self.networks["trunk"], self.networks["pi"])
 
     @property
     def observation(self) -> str:
-        """What the environment must show it: "window", "event_image" or "luminance"."""
+        """Return what the environment must show it: "window", "event_image" or "luminance"."""
         return self.spec.kind.observation
 
     @property
     def env_fields(self) -> dict[str, Any]:
-        """Fields of `envs.config.EnvConfig` with which an environment shows it what it was trained to see.
+        """Return the fields of `envs.config.EnvConfig` that show the policy what it was trained to see.
 
         `CorridorEnv(**policy.env_fields)` observes as in training, its neighbour filter included.
         """
@@ -131,12 +147,14 @@ class Policy:
     def reset(self, num_envs: int = 1) -> None:
         """Forget everything: the next observations are the first of `num_envs` episodes."""
         self._stacks: np.ndarray = np.zeros((num_envs, *self.stack_shape), self.feature.dtype)
+        self._state = np.zeros((num_envs, self._network.state(self.spec)), np.float32)
         self._first = np.ones(num_envs, bool)
         self._filter = filter_of(self.manifest.get("sensor", {}), self.spec.width, self.spec.height)
 
     def keep(self, places: np.ndarray) -> None:
-        """Go on with some of the episodes, int (n,): observations are now theirs alone, in that order."""
-        self._stacks, self._first = self._stacks[places], self._first[places]
+        """Keep only the episodes at these indices, int (n,); later batches must follow this order."""
+        parts = self._stacks, self._state, self._first
+        self._stacks, self._state, self._first = (part[places] for part in parts)
 
     def __call__(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Choose an action for each episode.
@@ -159,7 +177,7 @@ class Policy:
         return int(self._choose(self.event_logits(events, start_us, window_us)[None])[0])
 
     def event_logits(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Unnormalised log-probabilities float32 (actions,) of one episode's next step, from its events.
+        """Return unnormalised log-probabilities float32 (actions,) of one episode's step from its events.
 
         The events are filtered as in training (`env_fields`).
 
@@ -181,7 +199,7 @@ class Policy:
         return self._logits(feature[None], window_us, None)[0]
 
     def logits(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
-        """Unnormalised log-probabilities float32 (B, actions); arguments as in a call."""
+        """Return unnormalised log-probabilities float32 (B, actions); arguments as in a call."""
         features = self.feature.from_observations(observations, self.spec, self.encoder)
         return self._logits(features, windows_us(observations, self.spec), restarted)
 
@@ -196,7 +214,8 @@ class Policy:
         first = self._first if restarted is None else self._first | restarted
         self._stacks = remember(self._stacks, features, first, self.spec, window_us)
         self._first = np.zeros(len(features), bool)
-        logits = self._logits_of(self._stacks)
+        state = np.where(first[:, None], np.float32(0.0), self._state)
+        logits, self._state = self._run(self._stacks, state)
         if not np.isfinite(logits).all():
             raise ValueError("the policy's logits must be finite, got NaN or infinity; train it anew")
         return logits
@@ -292,12 +311,12 @@ def load_policy(
 
 
 def _files(spec: PolicySpec) -> tuple[str, ...]:
-    """The files of a policy beside its manifest, which holds their SHA-256."""
+    """Return the files of a policy beside its manifest, which holds their SHA-256."""
     return (*(ENCODER_FILES if spec.frozen else ()), NETWORKS)
 
 
 def read_policy_manifest(file: Path) -> dict[str, Any]:
-    """The values of a policy's manifest as they were written; an empty one if they are no JSON object.
+    """Return the values of a policy's manifest as they were written; an empty one if they are no JSON object.
 
     Raises:
         PolicyFileError: It is damaged.
@@ -336,13 +355,13 @@ def _load_encoder(folder: Path, spec: PolicySpec) -> Encoder:
 
 
 def _tabulated(trunk: nn.Module, spec: PolicySpec) -> Encoder:
-    """The lookup table of a fine-tuned encoder; it thins windows as in training."""
+    """Return the lookup table of a fine-tuned encoder; it thins windows as in training."""
     table: Any = tabulate(trunk, spec.evae)
     return dataclasses.replace(table, most_events=EVENTS)
 
 
 def load_networks(file: Path, spec: PolicySpec) -> nn.ModuleDict:
-    """The networks of the file's tensors, which must fit one by one and be finite.
+    """Return the networks of the file's tensors, which must fit one by one and be finite.
 
     They are built without memory for their weights, so that wrong sizes in a manifest cost nothing.
     """

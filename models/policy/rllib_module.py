@@ -23,10 +23,12 @@ from models.kinds import EvaeSettings, PolicySpec
 from models.policy.features import Windows, feature_of
 from models.policy.memory import remember, windows_us
 from models.policy.mirror import mirror
-from models.policy.networks import PARTS, build_networks, widened
+from models.policy.networks import PARTS, build_networks, network_of, widened
 from models.policy.policy import load_networks
 
+STATE = "h"  # RLlib's key of the one part of a recurrent state
 PRIVILEGED = "privileged"  # of a batch: what the value network alone is told, float32 (B, numbers)
+SEQUENCE = 32  # steps through which the gradient of a recurrent network flows
 VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
 
 
@@ -45,7 +47,7 @@ class EncoderFile(NamedTuple):
 
 
 def stack_space(spec: PolicySpec) -> gym.spaces.Box:
-    """What the networks read: (depth, *feature), as `models.policy.memory` keeps it."""
+    """Return what the networks read: (depth, *feature), as `models.policy.memory` keeps it."""
     feature = feature_of(spec)
     whole = np.issubdtype(feature.dtype, np.integer)
     low, high = (np.iinfo(feature.dtype).min, np.iinfo(feature.dtype).max) if whole else (-np.inf, np.inf)
@@ -76,10 +78,12 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         networks["vf"] = widened(networks["vf"], self.privileged)
         self.encoder = part
         self.trunk, self.pi, self.vf = (networks[name] for name in PARTS)
+        self.network = network_of(self.spec)
+        self.state_size = self.network.state(self.spec)
         self._table: Encoder | None = None
 
     def get_non_inference_attributes(self) -> list[str]:
-        """What an env runner does without."""
+        """Return what an env runner does without."""
         return ["vf"]
 
     def train(self, mode: bool = True) -> "PolicyModule":
@@ -92,12 +96,12 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return self
 
     def networks(self) -> nn.ModuleDict:
-        """The networks, as `models.policy.networks.assemble` names them, without what is `PRIVILEGED`."""
+        """Return the networks, named as in `networks.assemble`, without what is `PRIVILEGED`."""
         own = {**{name: getattr(self, name) for name in PARTS}, "vf": widened(self.vf, -self.privileged)}
         return nn.ModuleDict(own)
 
     def features(self, observations: Windows) -> np.ndarray:
-        """Features (B, ...) of B observations, as those of `models.policy.policy.Policy`."""
+        """Return features (B, ...) of B observations, as those of `models.policy.policy.Policy`."""
         if self.encoder is not None:
             self._table = self._table or tabulate(self.encoder, self.model_config["encoder_file"].settings)
         return self._features(observations)
@@ -106,12 +110,12 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return feature_of(self.spec).from_observations(observations, self.spec, self._table)
 
     def remember(self, kept: np.ndarray, observations: Windows, first: np.ndarray) -> np.ndarray:
-        """What the networks read, with the features of the newest observations (`models.policy.memory`)."""
+        """Return what the networks read after the newest observations (`models.policy.memory`)."""
         features = self.features(observations)
         return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
 
     def remember_mirrored(self, kept: np.ndarray, observations: Windows, first: np.ndarray) -> np.ndarray:
-        """As `remember`, of what would be seen if left and right were exchanged; to be called after it."""
+        """Return `remember` for the mirrored observations. Call it after `remember`."""
         features = self._features(mirror(observations, self.spec))
         return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
 
@@ -126,19 +130,34 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
             self._table = None
 
     def __getstate__(self) -> dict[str, object]:
-        """Everything but the windows and the table, which is built from the encoder where it is needed."""
+        """Return everything but the table, which is built from the encoder where it is needed."""
         return {**self.__dict__, "_table": None}
 
-    def _forward(self, batch: dict[str, Tensor], **kwargs: object) -> dict[str, Tensor]:
-        return {Columns.ACTION_DIST_INPUTS: self.pi(self.trunk(batch[Columns.OBS]))}
+    def get_initial_state(self) -> dict[str, Tensor]:
+        """Return the state at the start of an episode, as RLlib asks for it; empty unless recurrent."""
+        return {STATE: torch.zeros(self.state_size)} if self.state_size else {}
 
-    def _forward_train(self, batch: dict[str, Tensor], **kwargs: object) -> dict[str, Tensor]:
-        """The same, and what the trunk gives, so that the value's loss need not run it again."""
-        embeddings = self.trunk(batch[Columns.OBS])
-        return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), Columns.EMBEDDINGS: embeddings}
+    def _embed(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Any]]:
+        """Return the trunk's outputs, and the next state as RLlib wants it.
 
-    def compute_values(self, batch: dict[str, Tensor], embeddings: Tensor | None = None) -> Tensor:
-        """Values float32 (B,) of the batch's observations, and of what is `PRIVILEGED`.
+        A recurrent network reads sequences (B, T, depth, ...), all others rows (B, depth, ...).
+        """
+        if not self.state_size:
+            return self.trunk(batch[Columns.OBS]), {}
+        embeddings, state = self.trunk(batch[Columns.OBS], batch[Columns.STATE_IN][STATE])
+        return embeddings, {Columns.STATE_OUT: {STATE: state}}
+
+    def _forward(self, batch: dict[str, Any], **kwargs: object) -> dict[str, Any]:
+        embeddings, state = self._embed(batch)
+        return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), **state}
+
+    def _forward_train(self, batch: dict[str, Any], **kwargs: object) -> dict[str, Any]:
+        """Return the trunk's outputs too, so that the loss of the value need not run the trunk again."""
+        embeddings, state = self._embed(batch)
+        return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), Columns.EMBEDDINGS: embeddings, **state}
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Tensor | None = None) -> Tensor:
+        """Return the values float32 (B,), or (B, T) of sequences, of observations and what is `PRIVILEGED`.
 
         Without the trunk's embeddings no gradient is kept: RLlib asks so for the targets, of
         the whole batch, whose graph would be a gigabyte of activations.
@@ -147,12 +166,14 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         if embeddings is not None:
             return self._judge(embeddings, *told)
         with torch.no_grad():
+            if self.state_size:
+                return self._judge(self._embed(batch)[0], *told)
             parts = zip(*(column.split(VALUE_ROWS) for column in (batch[Columns.OBS], *told)), strict=True)
             return torch.cat([self._judge(self.trunk(stacks), *more) for stacks, *more in parts])
 
     def _judge(self, embeddings: Tensor, *privileged: Tensor) -> Tensor:
-        """Values float32 (B,)."""
-        return self.vf(torch.cat([embeddings, *privileged], dim=1)).squeeze(-1)
+        """Return the values float32 (B,) or (B, T)."""
+        return self.vf(torch.cat([embeddings, *privileged], dim=-1)).squeeze(-1)
 
 
 def _begin(networks: nn.ModuleDict, file: Path, spec: PolicySpec) -> None:
@@ -171,7 +192,7 @@ def module_spec(
     init: Path | None = None,
     privileged: int = 0,
 ) -> RLModuleSpec:
-    """Specification of the module.
+    """Return RLlib's specification of the module.
 
     Args:
         spec: What the networks are built from.
@@ -193,5 +214,6 @@ def module_spec(
         model_config={
             **{"spec": spec, "encoder_file": file, "seed": seed},
             **{name: value for name, value in added.items() if value},
+            **({"max_seq_len": SEQUENCE} if network_of(spec).state(spec) else {}),
         },
     )

@@ -151,3 +151,13 @@ def test_the_loop_of_cleanrl_reads_the_last_info_of_each_episode(kind):
             assert infos["final_info"]["t_us"].tolist() == [STEPS * 5000] * 2
     envs.close()
     assert lengths == [STEPS] * 4
+
+
+def test_rllib_hands_the_class_its_env_config():
+    from ray.rllib.env.env_context import EnvContext
+
+    context = EnvContext({"observation": "event_image", "scene": "gates"}, worker_index=1)
+    env = CorridorEnv(context)
+    assert (env.config.observation, env.config.scene) == ("event_image", "gates")
+    with pytest.raises(ValueError, match="no_such_field"):
+        CorridorEnv(EnvContext({"no_such_field": 1}, worker_index=1))

@@ -19,7 +19,10 @@ HELD_OUT = EnvConfig(scene="poles_eval", split="eval")
 SIDE = 40
 SENSOR = {"sensor": {"width": SIDE, "height": SIDE}, "sensor_hash": "0123456789ab"}
 ABOUT = {**SENSOR, "figures": {"return": 1.5}}
-TRAINED = ("bytestream", "event_columns", "event_set", "event_image", "event_image_vae", "rgb", "finetuned")
+TRAINED = (
+    *("bytestream", "event_columns", "event_columns_gru", "event_set"),
+    *("event_image", "event_image_vae", "rgb", "finetuned"),
+)
 
 
 # Kinds that share their networks with rgb, or their encoder with bytestream.
@@ -70,6 +73,7 @@ def make_spec(name, **changes):
         "hidden": [64, 64],
         "context": 64,
         "latent": 8,
+        "units": 16,
         "norm": "batch",
     }
     own |= {"target": "signed", "time_bins": 32, "coding": "additive", "pool_rank": 1, "encoder": "frozen"}

@@ -72,7 +72,7 @@ class GpuSteps:
         self._recorded: Recorded | None = None
 
     def values(self, module: nn.Module, told: Mapping[str, Tensor]) -> Tensor:
-        """What `module.compute_values` gives, computed on the device; on the processor, float32 (B,)."""
+        """Compute `module.compute_values` on the device; return it on the processor, float32 (B,)."""
         self._load_weights(module)
         with exact():
             return self._module.compute_values({name: self._there(part) for name, part in told.items()}).cpu()
@@ -150,7 +150,7 @@ class GpuSteps:
             own.copy_(given)
 
     def _load_moments(self, optimizer: torch.optim.Optimizer) -> None:
-        """Adam's state, zeros before its first step, and its step size of this moment."""
+        """Return Adam's state, zeros before its first step, and its step size of this moment."""
         (group,) = optimizer.param_groups
         self._lr.fill_(float(group["lr"]))
         for own, given in zip(self._parameters, group["params"], strict=True):
@@ -166,7 +166,7 @@ class GpuSteps:
         return state
 
     def _give_back(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
-        """Weights and moments, to the processor."""
+        """Copy weights and moments back to the processor."""
         for given, own in zip(_tensors(module), _tensors(self._module), strict=True):
             given.copy_(own)
         (group,) = optimizer.param_groups
@@ -176,7 +176,7 @@ class GpuSteps:
                 kept[name] = value.cpu().clone() if name not in kept else kept[name].copy_(value)
 
     def _record(self, part: Tensor, grad_clip: float, variant: Hashable) -> Recorded | None:
-        """A recorded step of as many rows; None without a GPU.
+        """Return a recorded step of as many rows; None without a GPU.
 
         Where it has to be recorded first, that moves weights and moments: they are to be loaded afterwards.
         """
@@ -201,7 +201,7 @@ class GpuSteps:
         return self._recorded
 
     def _step(self, picked: Tensor, grad_clip: float) -> None:
-        """One gradient step on the rows that are picked; what is reported of it is added to the sums."""
+        """Take one gradient step on the picked rows, and add its figures to the sums."""
         total, figures = self._loss(self._module, {name: part[picked] for name, part in self._rows.items()})
         self._adam.zero_grad(set_to_none=True)
         total.backward()
@@ -215,12 +215,12 @@ class GpuSteps:
 
 
 def _tensors(module: nn.Module) -> list[Tensor]:
-    """All that a module learns or counts."""
+    """Return all that a module learns or counts."""
     return [value.detach() for value in (*module.parameters(), *module.buffers())]
 
 
 @contextlib.contextmanager
 def exact() -> Iterator[None]:
-    """The same digits each time, in whole float32."""
+    """Make torch give the same digits each time, in full float32."""
     with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
         yield

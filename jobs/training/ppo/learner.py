@@ -6,7 +6,8 @@ dispatches, times and logs, which takes longer than the gradient of two small ne
 is done once per iteration, and no pipeline of connectors makes the batch. Policies of dense layers
 alone take their steps in `models.policy.dense_update`. RLlib appends a row to each episode to
 bootstrap its value: it masks that row in the loss, but counts it in minibatches and in the mean and
-deviation of the advantages. Here it is in neither.
+deviation of the advantages. Here it is in neither. Recurrent networks learn from sequences of steps
+(Hausknecht and Stone 2015): each begins with the state in which the env runner acted.
 """
 
 import math
@@ -31,13 +32,12 @@ from torch import Tensor, nn
 from jobs.run.device import learner_device
 from jobs.run.torch_threads import torch_threads
 from jobs.training.ppo.gpu_steps import NORM, TOTAL, GpuSteps
-from jobs.training.ppo.losses import advantages, shaping
+from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, advantages, mean_over, sequences, shaping
+from jobs.training.sampling.env_runner import STATES
 from jobs.training.sampling.rllib_internals import LEARNER, require
 from jobs.training.sampling.teacher import log_costs
 from models.policy.dense_update import Rows, Settings, update_dense
-from models.policy.event_set import EventSet
-from models.policy.networks import is_mlp
-from models.policy.rllib_module import PRIVILEGED
+from models.policy.rllib_module import PRIVILEGED, SEQUENCE, STATE
 
 READ = (
     Columns.OBS,
@@ -51,7 +51,6 @@ GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
 # Of a minibatch, in the order in which `update_dense` returns them.
 FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
 MOST_THREADS = 8
-LARGE = nn.Conv2d, EventSet  # parts of a network whose gradients a GPU computes, if there is one
 MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
 # Of the learner's own settings: it multiplies rewards; episodes keep the true ones.
 REWARD_SCALE = "reward_scale"
@@ -59,8 +58,14 @@ SHAPING = "shaping"  # of these: rewards are shaped by the potential -SHAPING `l
 VALUE_WARMUP = "value_warmup"  # of these: environment steps in which only the value network learns
 
 
+def _minibatch(parts: dict[str, Tensor], picked: Tensor) -> dict[str, Any]:
+    """Return some sequences as the loss reads them."""
+    rows = {name: part[picked] for name, part in parts.items()}
+    return {**rows, Columns.STATE_IN: {STATE: rows.pop(STATES)}}
+
+
 def shared_threads(config: Any) -> int:
-    """Threads of a learner while the env runners wait: one for each of them, at most `MOST_THREADS`.
+    """Return threads of a learner while the env runners wait: one for each of them, at most `MOST_THREADS`.
 
     The number of cores does not count: sums are added in another order by other threads, and a training
     that is resumed on another machine must give the same weights.
@@ -72,14 +77,14 @@ class PlainPPOLearner(PPOTorchLearner):
     """PPO for one module with discrete actions, without the divergence penalty, on one device."""
 
     def build(self) -> None:
-        """As RLlib's."""
+        """Build RLlib's learner, and its steps on a GPU if there is one."""
         super().build()
         require(self, LEARNER)
         self._warming_up = False
         self._gpu = self._on_gpu()
 
     def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
-        """Adam with all its steps in one call."""
+        """Register an Adam that updates all parameters in one call."""
         parameters = [value for value in self._module[module_id].parameters() if value.requires_grad]
         self.register_optimizer(
             module_id=module_id,
@@ -98,7 +103,7 @@ class PlainPPOLearner(PPOTorchLearner):
         minibatch_size: int | None = None,
         **kwargs: Any,
     ) -> Any:
-        """All epochs over the steps of one iteration, shuffled in each.
+        """Take all epochs over the steps of one iteration, shuffled in each.
 
         Args:
             training_data: Episodes, as RLlib hands them over; or else
@@ -133,11 +138,13 @@ class PlainPPOLearner(PPOTorchLearner):
         return self.metrics.reduce()
 
     def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
-        """All epochs over the rows; the figures of the last."""
+        """Take all epochs over the rows; return the figures of the last."""
         orders = torch.stack([torch.randperm(len(rows[Columns.ACTIONS])) for _ in range(num_epochs)])
-        learn = self._epochs_of_dense if self._dense and not self._warming_up else self._epochs
+        learn = self._epochs_compiled if self._compiled and not self._warming_up else self._epochs
         if self._gpu is not None:
             learn = partial(self._epochs_on_gpu, self._gpu)
+        elif self._policy.state_size:
+            learn = self._epochs_of_sequences
         figures = learn(rows, orders, minibatch_size)
         if self._warming_up:
             self.get_optimizer(DEFAULT_MODULE_ID).state.clear()  # Adam counts the steps of all weights alike
@@ -151,25 +158,29 @@ class PlainPPOLearner(PPOTorchLearner):
         """Continue from the `own_state` of an earlier process, which is among these arrays."""
 
     def _threads(self) -> int:
-        """As many as there are env runners, which wait meanwhile; one for networks too small to share."""
-        return 1 if self._dense else shared_threads(self.config)
+        """Return one thread per env runner, which wait meanwhile; one for networks too small to share."""
+        return 1 if self._compiled else shared_threads(self.config)
 
     @property
-    def _dense(self) -> bool:
-        """Whether the policy is two networks of dense layers that share nothing."""
-        module = self.module[DEFAULT_MODULE_ID].unwrapped()
-        return isinstance(module.trunk, nn.Flatten) and is_mlp(module.pi) and is_mlp(module.vf)
+    def _policy(self) -> Any:
+        """Return the `PolicyModule` that learns."""
+        return self.module[DEFAULT_MODULE_ID].unwrapped()
+
+    @property
+    def _compiled(self) -> bool:
+        """Whether `models.policy.dense_update` takes the gradient steps."""
+        return bool(self._policy.network.gradients == "compiled")
 
     def _rows(self, episodes: Sequence[SingleAgentEpisode]) -> dict[str, Tensor]:
-        """The steps of all episodes, one after the other, with the targets of the loss."""
-        config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
+        """Return the steps of all episodes, one after the other, with the targets of the loss."""
+        config, module = self.config, self._policy
         shown = [np.asarray(episode.get_observations()) for episode in episodes]
         ends = np.cumsum([len(observations) for observations in shown])
         stacks, privileged = np.concatenate(shown), np.empty((ends[-1], module.privileged), np.float32)
         if module.privileged:
             privileged[:, 0] = np.concatenate([log_costs(episode) for episode in episodes])
         told = {Columns.OBS: torch.from_numpy(stacks), PRIVILEGED: torch.from_numpy(privileged)}
-        values = self._values(told).numpy()
+        values = self._values(told, episodes).numpy()
         estimates = [
             advantages(
                 of_episode, self._rewards(episode), episode.is_terminated, config.gamma, config.lambda_
@@ -191,21 +202,26 @@ class PlainPPOLearner(PPOTorchLearner):
             Postprocessing.ADVANTAGES: standard.astype(np.float32),
             Postprocessing.VALUE_TARGETS: (estimate + values[taken]).astype(np.float32),
         }
+        if module.state_size:
+            columns[STATES] = np.concatenate(
+                [episode.get_extra_model_outputs(STATES) for episode in episodes]
+            )
+            columns[STARTS] = np.concatenate([np.arange(len(episode)) for episode in episodes])
         return {name: torch.from_numpy(column) for name, column in columns.items()}
 
     def _rewards(self, episode: SingleAgentEpisode) -> np.ndarray:
-        """What is learnt from: an episode's rewards, shaped if asked for, and scaled."""
+        """Return an episode's rewards as the learner reads them: shaped if asked for, and scaled."""
         settings, rewards = self.config.learner_config_dict, episode.get_rewards()
         if settings.get(SHAPING, 0.0):
             potentials = -settings[SHAPING] * log_costs(episode)
             rewards = rewards + shaping(potentials, episode.is_terminated, self.config.gamma)
         return settings.get(REWARD_SCALE, 1.0) * rewards
 
-    def _epochs_of_dense(
+    def _epochs_compiled(
         self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
     ) -> dict[str, Any]:
-        """As `_epochs`, compiled."""
-        config, module = self.config, self.module[DEFAULT_MODULE_ID].unwrapped()
+        """Take the steps of `_epochs` in one compiled call."""
+        config, module = self.config, self._policy
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
         adam = optimizer.param_groups[0]
         beta1, beta2 = adam["betas"]
@@ -227,18 +243,18 @@ class PlainPPOLearner(PPOTorchLearner):
         return dict(zip(FIGURES, means.tolist(), strict=True))
 
     def _on_gpu(self) -> GpuSteps | None:
-        """What takes the steps of a network over pictures or sets of events on a GPU; None: the processor."""
-        module, device = self.module[DEFAULT_MODULE_ID].unwrapped(), learner_device()
-        if device == "cpu" or not any(isinstance(layer, LARGE) for layer in module.trunk.modules()):
+        """Return the steps on a GPU if the learner has one and the network wants it, else None."""
+        module, device = self._policy, learner_device()
+        if device == "cpu" or module.network.gradients != "gpu":
             return None
         return GpuSteps(module, self.get_optimizer(DEFAULT_MODULE_ID), self._loss, device)
 
     def _epochs_on_gpu(
         self, gpu: GpuSteps, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
     ) -> dict[str, Tensor]:
-        """As `_epochs`, on the GPU."""
+        """Take the steps of `_epochs` on the GPU."""
         told = gpu.take(
-            self.module[DEFAULT_MODULE_ID].unwrapped(),
+            self._policy,
             self.get_optimizer(DEFAULT_MODULE_ID),
             {name: rows[name] for name in READ},
             orders,
@@ -249,23 +265,55 @@ class PlainPPOLearner(PPOTorchLearner):
         total, norm = told.pop(TOTAL), told.pop(NORM)
         return {**told, PPOTorchLearner.TOTAL_LOSS_KEY: total, GRADIENT_NORM_KEY: norm}
 
-    def _values(self, told: dict[str, Tensor]) -> Tensor:
-        """Of what the value network is told, float32 (B,), where the gradients are computed."""
-        module = self.module[DEFAULT_MODULE_ID].unwrapped()
+    def _values(self, told: dict[str, Tensor], episodes: Sequence[SingleAgentEpisode]) -> Tensor:
+        """Return the values of all observations of some episodes, float32 (B,)."""
+        if self._policy.state_size:
+            return self._values_of_sequences(told, episodes)
+        return self._values_of_rows(told)
+
+    def _values_of_rows(self, told: dict[str, Tensor]) -> Tensor:
+        """Return the values of rows, float32 (B,)."""
+        module = self._policy
         return module.compute_values(told) if self._gpu is None else self._gpu.values(module, told)
 
+    def _values_of_sequences(self, told: dict[str, Tensor], episodes: Sequence[SingleAgentEpisode]) -> Tensor:
+        """Return the values of a recurrent network, episode by episode, each from its first state."""
+        lengths = [len(episode) + 1 for episode in episodes]
+        parts = {name: column.split(lengths) for name, column in told.items()}
+        values = []
+        for number, episode in enumerate(episodes):
+            first = torch.from_numpy(episode.get_extra_model_outputs(STATES)[:1])
+            own = {name: part[number][None] for name, part in parts.items()}
+            values.append(self._policy.compute_values({**own, Columns.STATE_IN: {STATE: first}})[0])
+        return torch.cat(values)
+
+    def _epochs_of_sequences(
+        self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
+    ) -> dict[str, Any]:
+        """Pass over the rows in sequences of at most `SEQUENCE` successive steps, shuffled as wholes."""
+        parts = sequences(rows, SEQUENCE)
+        size = max(1, minibatch_size // SEQUENCE)
+        for order in orders:
+            # An order of sequences from one of rows: each comes where its first row does.
+            first = parts[FIRST_ROW]
+            ranks = torch.empty_like(order)
+            ranks[order] = torch.arange(len(order))
+            shuffled = ranks[first].argsort().split(size)
+            figures = [self._step(_minibatch(parts, picked)) for picked in shuffled]
+        return {name: torch.stack([one[name] for one in figures]).mean() for name in FIGURES}
+
     def _epochs(self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int) -> dict[str, Any]:
-        """Passes over the rows, in the order of each; means over the minibatches of the last."""
+        """Pass over the rows once per order; return means over the minibatches of the last pass."""
         for order in orders:
             parts = [rows[key][order].split(minibatch_size) for key in READ]
             figures = [self._step(dict(zip(READ, part, strict=True))) for part in zip(*parts, strict=True)]
         return {name: torch.stack([one[name] for one in figures]).mean() for name in FIGURES}
 
     def _step(self, rows: dict[str, Tensor]) -> dict[str, Tensor]:
-        """One gradient step; its losses, entropy and the gradient's norm before the clip."""
+        """Take one gradient step; return its losses, entropy and the gradient's norm before the clip."""
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
         parameters = optimizer.param_groups[0]["params"]
-        total, figures = self._loss(self.module[DEFAULT_MODULE_ID].unwrapped(), rows)
+        total, figures = self._loss(self._policy, rows)
         optimizer.zero_grad(set_to_none=True)
         total.backward()
         norm = nn.utils.clip_grad_norm_(parameters, self._grad_clip, error_if_nonfinite=True)
@@ -274,27 +322,28 @@ class PlainPPOLearner(PPOTorchLearner):
 
     @property
     def _grad_clip(self) -> float:
-        """The largest norm of a gradient."""
+        """Return the largest norm of a gradient."""
         return math.inf if self.config.grad_clip is None else self.config.grad_clip
 
     @property
     def _entropy_coeff(self) -> float:
-        """The weight of the entropy now."""
+        """Return the weight of the entropy now."""
         return float(self.entropy_coeff_schedulers_per_module[DEFAULT_MODULE_ID].get_current_value())
 
     def _loss(self, module: Any, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """The clipped surrogate, the value's squared error and the entropy, joined as RLlib joins them."""
+        """Return the sum of clipped surrogate, squared error of the value and entropy, as RLlib's."""
         config = self.config
         out = module._forward_train(rows)
         logps = torch.log_softmax(out[Columns.ACTION_DIST_INPUTS], dim=-1)
-        logp = logps.gather(1, rows[Columns.ACTIONS].long()[:, None]).squeeze(1)
+        logp = logps.gather(-1, rows[Columns.ACTIONS].long()[..., None]).squeeze(-1)
         ratio, advantages = torch.exp(logp - rows[Columns.ACTION_LOGP]), rows[Postprocessing.ADVANTAGES]
         clipped = ratio.clamp(1.0 - config.clip_param, 1.0 + config.clip_param)
-        policy_loss = -torch.minimum(advantages * ratio, advantages * clipped).mean()
+        mean = partial(mean_over, rows.get(TAKEN))
+        policy_loss = -mean(torch.minimum(advantages * ratio, advantages * clipped))
         embeddings = out[Columns.EMBEDDINGS].detach() if self._warming_up else out[Columns.EMBEDDINGS]
         values = module.compute_values(rows, embeddings=embeddings)
         errors = (values - rows[Postprocessing.VALUE_TARGETS]).square().clamp(max=config.vf_clip_param)
-        value_loss, entropy = errors.mean(), -(logps.exp() * logps).sum(-1).mean()
+        value_loss, entropy = mean(errors), -mean((logps.exp() * logps).sum(-1))
         total = policy_loss + config.vf_loss_coeff * value_loss - self._entropy_coeff * entropy
         if self._warming_up:
             total = config.vf_loss_coeff * value_loss
@@ -303,8 +352,14 @@ class PlainPPOLearner(PPOTorchLearner):
 
     @torch.no_grad()
     def _explained_variance(self, rows: dict[str, Tensor]) -> Tensor:
-        """Share of the targets' variance that the values explain after the update; at least -1, as RLlib."""
+        """Return the fraction of the targets' variance that the values explain; at least -1, as RLlib's."""
         targets = rows[Postprocessing.VALUE_TARGETS]
-        values = self._values({name: rows[name] for name in (Columns.OBS, PRIVILEGED)})
+        if self._policy.state_size:
+            parts = sequences(rows, SEQUENCE)
+            every = _minibatch(parts, torch.arange(len(parts[FIRST_ROW])))
+            values = self._policy.compute_values(every)[every[TAKEN]]
+            targets = every[Postprocessing.VALUE_TARGETS][every[TAKEN]]
+        else:
+            values = self._values_of_rows({name: rows[name] for name in (Columns.OBS, PRIVILEGED)})
         unexplained = (targets - values).var() / targets.var().clamp_min(1e-12)
         return (1.0 - unexplained).clamp_min(-1.0)

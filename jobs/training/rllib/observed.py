@@ -27,10 +27,11 @@ class ObservedCorridor(gymnasium.Env):
 
         Args:
             context: `config` and `conditions` as of `TrainingCorridors`, `spec` (the policy), and
-                `encoder_file` of a policy with a frozen encoder, else None.
+                `encoder_file` of a policy with a frozen encoder, else None; `reward_scale`.
         """
         self._env = CorridorEnv(context["config"], draw=episode_draw(context.get("conditions", [{}])))
         self._spec: PolicySpec = context["spec"]
+        self._reward_scale: float = context["reward_scale"]
         file = context["encoder_file"]
         self._encoder = None if file is None else encoder_of(load_encoder(file)[0])
         self._shape = (self._spec.depth, *feature_of(self._spec).shape(self._spec))
@@ -46,7 +47,7 @@ class ObservedCorridor(gymnasium.Env):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Any]:
         """Simulate one control step, as `CorridorEnv.step` does."""
         shown, reward, terminated, truncated, info = self._env.step(action)
-        return self._seen(shown, first=False), reward, terminated, truncated, info
+        return self._seen(shown, first=False), self._reward_scale * reward, terminated, truncated, info
 
     def close(self) -> None:
         """Free the renderer."""

@@ -13,7 +13,7 @@ from jobs.training.algorithms import Algorithm
 from jobs.training.policy import policy_spec, pretrained_encoder
 from jobs.training.rllib.observed import ObservedCorridor
 from jobs.training.sampling.corridors import corridor_settings
-from jobs.training.sampling.metrics import EPISODES, EpisodeMetrics
+from jobs.training.sampling.metrics import EPISODES, REWARD_SCALE, EpisodeMetrics
 from jobs.training.trainable import guarded
 from models.kinds import PolicySpec
 from models.policy.networks import assemble
@@ -35,6 +35,7 @@ def build(config: Config, encoder_path: str | Path | None = None, init: Path | N
     context = {
         **corridor_settings(config),
         "spec": spec,
+        REWARD_SCALE: algo.reward_scale,
         "encoder_file": str(encoder_path) if spec.frozen else None,
     }
     built = (
@@ -51,8 +52,11 @@ def build(config: Config, encoder_path: str | Path | None = None, init: Path | N
         .reporting(metrics_num_episodes_for_smoothing=EPISODES, min_time_s_per_iteration=0)
         .debugging(seed=config.seed, log_level="ERROR")
     )
+    settings = dict(algo.settings)
+    if algo.lr_schedule == "linear" and isinstance(settings.get("lr"), float):
+        settings["lr"] = [[0, settings["lr"]], [config.train.env_steps, 0.0]]
     try:
-        return built.training(**algo.settings)
+        return built.training(**settings)
     except TypeError as error:
         raise ConfigError(f"algo.settings: {algo.algorithm} has no such setting: {error}") from None
 

@@ -27,8 +27,8 @@ from jobs.run.watchdog import ending_after
 from jobs.training.sampling.rllib_internals import ENV_RUNNER, require
 from jobs.training.sampling.snapshots import Snapshot, generators, set_generators
 from jobs.training.sampling.window_sample import WindowSample
-from models.policy.networks import logits_by
 
+STATES = "recurrent_state"  # column of a step: the state of a recurrent network before it, float32 (S,)
 MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
 
 
@@ -116,7 +116,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             self._refused = one_line(error)
 
     def assert_healthy(self) -> None:
-        """As RLlib's; a process that could not be built answers too."""
+        """Check RLlib's parts; a process that could not be built answers too."""
         if not self._refused:
             super().assert_healthy()
 
@@ -126,7 +126,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             raise RolloutError(self._refused)
 
     def get_spaces(self) -> Any:
-        """As RLlib's, which asks this first.
+        """Return RLlib's spaces; RLlib asks for these first.
 
         Raises:
             RolloutError: The process could not be built.
@@ -148,7 +148,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             raise RolloutError(one_line(error)) from error
 
     def take_part(self) -> Part:
-        """One round of sampling, with what it began from and where it led.
+        """Sample one round; return it with the state before and after.
 
         Raises:
             RolloutError: With the type and text of whatever was raised.
@@ -158,7 +158,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return Part(self.worker_index, began, self.sample(), self.get_metrics(), self.snapshot())
 
     def snapshot(self) -> Snapshot:
-        """All that the next rounds depend on but the weights; episodes as the actions that led there.
+        """Return all that the next rounds depend on except the weights; episodes are their actions so far.
 
         Raises:
             RolloutError: The process could not be built.
@@ -171,6 +171,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             actions = [taken for _, taken in self._episodes]
             arrays |= {
                 "stacks": self._stacks,
+                STATES: self._state,
                 "actions": np.concatenate(actions),
                 "actions_taken": np.array([len(taken) for taken in actions], np.int64),
                 "episode_seed": self._infos["episode_seed"],
@@ -179,7 +180,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return Snapshot(values, arrays)
 
     def resume(self, snapshot: Snapshot) -> str:
-        """Go on where another process stood; the weights come by `set_state`.
+        """Continue from the snapshot of another process; the weights come by `set_state`.
 
         Returns:
             Why the episodes begin anew instead, in a few words; empty if they go on.
@@ -208,14 +209,15 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         except ValueError as error:
             return one_line(error)
         observations, self._over, self._infos = told
-        self._stacks = arrays["stacks"]
+        self._stacks, none = arrays["stacks"], np.zeros((len(self._over), 0), np.float32)
+        self._state = arrays.get(STATES, none)
         if not np.array_equal(self.module.features(observations), self._stacks[:, -1]):
             return "the simulation shows something else than before"
         self._episodes = list(zip(snapshot.values["names"], actions, strict=True))
         return ""
 
     def apply(self, func: Callable[..., Any], *values: Any, **named: Any) -> Any:
-        """As RLlib's, which ends the process where `func` raises; but a rollout's error is passed on."""
+        """Call a function as RLlib does, but pass a rollout's error on instead of ending the process."""
 
         def handed_on(runner: Any, *values: Any, **named: Any) -> Any:
             try:
@@ -247,7 +249,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             raise ValueError("PlainEnvRunner rolls out num_timesteps of drawn actions and nothing else")
         if force_reset or self._needs_initial_reset:
             self._reset_all()
-        self._logits_of = logits_by(self.module.trunk, self.module.pi)
+        self._run = self.module.network.run(self.module.trunk, self.module.pi)
         steps: list[Step] = []
         taken = 0
         while taken < num_timesteps:
@@ -264,16 +266,18 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         observations, infos = self.env.unwrapped.reset(seed=seed)
         first, space = np.ones(self.env.num_envs, bool), self.module.observation_space
         self._stacks = np.zeros((len(first), *space.shape), space.dtype)
+        self._state = np.zeros((len(first), self.module.state_size), np.float32)
         self._remember(observations, first)
         self._infos, self._over = infos, ~first
         self._episodes = [_begun() for _ in first]
         self._needs_initial_reset = False
 
     def _step(self) -> Step:
-        """One step of every episode; those that are over start anew instead."""
+        """Step every episode; finished ones start again instead."""
         stacks, over = self._stacks, self._over
         actions, outputs = self._decide(stacks)
         observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
+        self._state = np.where(over[:, None], np.float32(0.0), self._state)
         self._remember(observations, over)
         self._over = terminated | truncated
         return Step(stacks, actions, outputs, rewards, terminated, truncated, infos, over)
@@ -286,13 +290,15 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Drawn actions (N,), and by name the logits (N, actions)."""
-        logits = torch.from_numpy(self._logits_of(stacks))
+        """Return drawn actions (N,), and by name the logits (N, actions) and a recurrent network's states."""
+        before = {STATES: self._state} if self.module.state_size else {}
+        decided, self._state = self._run(stacks, self._state)
+        logits = torch.from_numpy(decided)
         actions = torch.multinomial(torch.softmax(logits, dim=-1), 1, replacement=True)
-        return actions[:, 0].numpy(), {Columns.ACTION_DIST_INPUTS: logits.numpy()}
+        return actions[:, 0].numpy(), {Columns.ACTION_DIST_INPUTS: logits.numpy(), **before}
 
     def _cut(self, steps: list[Step]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
-        """The episodes that ended in these steps, and the pieces of those that go on."""
+        """Return the episodes that ended in these steps, and the pieces of the running ones."""
         over = np.stack([step.over for step in steps])
         ended = np.stack([step.terminated | step.truncated for step in steps])
         stacks = np.stack([*(step.stacks for step in steps), self._stacks])
@@ -330,9 +336,9 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     def _episode(
         self, row: int, stacks: np.ndarray, columns: dict[str, np.ndarray], infos: dict[str, np.ndarray]
     ) -> SingleAgentEpisode:
-        """The next piece of the episode in a row."""
+        """Return the next piece of the episode in a row."""
         name, before = self._episodes[row]
-        self._episodes[row] = name, np.concatenate([before, columns["actions"].astype(np.uint8)])
+        self._episodes[row] = name, np.concatenate([before, columns["actions"].astype(np.int16)])
         return SingleAgentEpisode(
             name,
             observations=InfiniteLookbackBuffer(stacks),
@@ -348,8 +354,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
 
 def _begun() -> tuple[str, np.ndarray]:
-    """An episode that begins: its name, and the actions so far."""
-    return uuid.uuid4().hex, np.empty(0, np.uint8)
+    """Return an episode that begins: its name, and the actions so far."""
+    return uuid.uuid4().hex, np.empty(0, np.int16)
 
 
 def _logps(logits: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -359,5 +365,5 @@ def _logps(logits: np.ndarray, actions: np.ndarray) -> np.ndarray:
 
 
 def _by_name(infos: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Infos of T steps as arrays (T, N); names with an underscore are Gymnasium's masks."""
+    """Return infos of T steps as arrays (T, N); names with an underscore are Gymnasium's masks."""
     return {name: np.stack([info[name] for info in infos]) for name in infos[0] if name[0] != "_"}

@@ -14,6 +14,7 @@ from models.encoder.evae import EventVAE
 from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
 
 EPISODES = 100  # that a rate is averaged over
+REWARD_SCALE = "reward_scale"  # in an `env_config`: environments have multiplied rewards by it
 DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
 
 
@@ -33,7 +34,7 @@ class EpisodeMetrics(RLlibCallback):
         self._episodes: deque[dict[str, float]] = deque(maxlen=EPISODES)
         self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
         self._unfinished: dict[str, float] = {}
-        self.rounds = 0
+        self.rounds, self._reward_scale = 0, 1.0
         self._encoder: tuple[EventVAE, EncoderManifest] | None = None
 
     def on_sample_end(
@@ -44,6 +45,8 @@ class EpisodeMetrics(RLlibCallback):
             for name, value in self._drift(env_runner).items():
                 metrics_logger.log_value(name, value, window=1)
         self.rounds += 1
+        if env_runner is not None:
+            self._reward_scale = env_runner.config.env_config.get(REWARD_SCALE, 1.0)
         events, dropped = (
             np.concatenate([_column(chunk, key) for chunk in samples])
             for key in ("num_events", "dropped_events")
@@ -59,7 +62,8 @@ class EpisodeMetrics(RLlibCallback):
         """Add the episodes that ended to those of the metrics, as soon as it is their turn."""
         self._begun.append({chunk.id_: None for chunk in samples if chunk.id_ not in self._unfinished})
         for chunk in samples:
-            self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + float(chunk.get_return())
+            earned = float(chunk.get_return()) / self._reward_scale
+            self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + earned
             if chunk.is_done:
                 ended = outcome(chunk.get_infos(-1), self._unfinished.pop(chunk.id_))
                 next(begun for begun in self._begun if chunk.id_ in begun)[chunk.id_] = ended
@@ -70,7 +74,7 @@ class EpisodeMetrics(RLlibCallback):
             self._episodes.extend(ended for ended in self._begun.popleft().values() if ended)
 
     def state(self) -> dict[str, Any]:
-        """What the next metrics depend on, for JSON."""
+        """Return what the next metrics depend on, for JSON."""
         return {
             "rounds": self.rounds,
             "episodes": list(self._episodes),
@@ -79,7 +83,7 @@ class EpisodeMetrics(RLlibCallback):
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from a `state`."""
+        """Continue from a `state`."""
         self.rounds = state["rounds"]
         self._episodes = deque(state["episodes"], maxlen=EPISODES)
         self._begun = deque(dict(begun) for begun in state["begun"])
@@ -107,7 +111,7 @@ class EpisodeMetrics(RLlibCallback):
 
 
 def outcome(info: Mapping[str, float], episode_return: float) -> dict[str, float]:
-    """The metrics of an episode that has ended, from its last info."""
+    """Return the metrics of an episode that has ended, from its last info."""
     return {
         "episode_return": episode_return,
         "success_rate": float(info["success"]),

@@ -49,7 +49,7 @@ class Rounds:
             self.snapshots = {LOCAL: group.local_env_runner.snapshot()}
 
     def take(self) -> list[Part]:
-        """One round: the parts of all env runners, by index.
+        """Sample one round with every env runner; return their parts by index.
 
         Raises:
             RolloutError: What an env runner raised; or one has died for good, or does not come back.
@@ -84,7 +84,7 @@ class Rounds:
         self.problems += filter(None, said)
 
     def _sampled(self, due: list[int]) -> list[Part]:
-        """What the env runners sampled that are alive."""
+        """Return what the env runners sampled that are alive."""
         if not self._indices:
             return [self._group.local_env_runner.take_part()]
         results = self._manager.foreach_actor(
@@ -108,7 +108,7 @@ class Rounds:
     def _until_answered(
         self, ask: Callable[[Any], tuple[Any, ...]], indices: Sequence[int]
     ) -> dict[int, Any]:
-        """What env runners return, by index; those that are being started again are waited for."""
+        """Return what env runners return, by index; those that are being started again are waited for."""
         answers: dict[int, Any] = {}
         while missing := [index for index in indices if index not in answers]:
             results = self._manager.foreach_actor(

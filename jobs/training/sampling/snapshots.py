@@ -33,7 +33,7 @@ class Snapshot:
 
 
 def generators() -> dict[str, np.ndarray]:
-    """The states of torch's and numpy's generators of this process."""
+    """Return the states of torch's and numpy's generators of this process."""
     _, words, *rest = np.random.get_state()  # noqa: NPY002  the one that RLlib seeds
     return {
         "torch_generator": torch.get_rng_state().numpy(),
@@ -62,7 +62,7 @@ def write_snapshots(checkpoint: Path, snapshots: dict[str, Snapshot]) -> None:
 
 
 def read_snapshots(checkpoint: Path) -> dict[str, Snapshot] | None:
-    """The snapshots of a checkpoint; None if it has none, as those of earlier versions.
+    """Return the snapshots of a checkpoint; None if it has none, as those of earlier versions.
 
     Raises:
         RunError: They have another layout.
@@ -78,6 +78,6 @@ def read_snapshots(checkpoint: Path) -> dict[str, Snapshot] | None:
 
 
 def _read(path: Path) -> Snapshot:
-    """One snapshot, of the files that `path` names without their ending."""
+    """Return one snapshot, of the files that `path` names without their ending."""
     with np.load(path.with_suffix(".npz"), allow_pickle=False) as arrays:
         return Snapshot(json.loads(path.with_suffix(".json").read_text()), dict(arrays))

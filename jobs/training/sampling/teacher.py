@@ -26,7 +26,7 @@ class TeacherEnvRunner(PlainEnvRunner):
         super().__init__(**settings)
 
     def costs(self) -> np.ndarray:
-        """What each action costs where it is taken, float64 (N, actions): now, but for a delay of actions."""
+        """Return the cost of each action where it takes effect, float64 (N, actions)."""
         sight_m = self.config.learner_config_dict.get(SIGHT_M, math.inf)
         return np.stack([self._costs(row, sight_m) for row in range(self.env.num_envs)])
 
@@ -62,7 +62,7 @@ class PricedEnvRunner(TeacherEnvRunner):
 
 
 def log_costs(episode: SingleAgentEpisode) -> np.ndarray:
-    """log(1 + `COST_TO_GO`) of the steps of an episode, float64 (T + 1,).
+    """Return log(1 + `COST_TO_GO`) of the steps of an episode, float64 (T + 1,).
 
     Costs are about 1 where a way is free, and 1000 where none is left; logarithms are 0.7 and 7.
     """

@@ -288,3 +288,69 @@ def test_a_row_of_a_kind_is_checked_whatever_it_is():
     for row in (7, SimpleNamespace(feature="x"), Kind("window", "nothing:A", "nothing:B", DenseModel)):
         with pytest.raises((ValueError, ImportError, AttributeError)):
             plugins._check("kind of policy", "wrong", row)
+
+
+ODD = """
+import numpy as np
+from torch import nn
+from models.kinds import KINDS, FixedModel, Kind
+from models.policy.features import Feature
+def feature(windows, spec, encoder):
+    return {made}
+def network(shape, spec):
+    return {parts}
+ODD = Feature(np.float32, lambda spec: (2,), feature, None)
+KINDS["odd"] = Kind("window", "own_odd:ODD", "own_odd:network", FixedModel)
+"""
+GOOD = "np.ones((len(windows), 2), np.float32)"
+LAYERS = "nn.Flatten(), nn.Linear(6, 3), nn.Linear(6, 1)"
+
+
+@pytest.mark.parametrize(
+    ("made", "parts", "message"),
+    [
+        (GOOD, LAYERS, None),
+        ("np.ones((len(windows), 3), np.float32)", LAYERS, r"its feature must be float32 \(3, 2\), got"),
+        ("np.full((len(windows), 2), np.nan, np.float32)", LAYERS, "its feature must be finite, got NaN"),
+        ("np.ones((len(windows), 2))", LAYERS, r"its feature must be float32 \(3, 2\), got float64"),
+        ("[[1.0, 1.0]]", LAYERS, r"its feature must be float32 \(3, 2\), got list"),
+        ("windows.nothing", LAYERS, "AttributeError: .*plug-in own_odd, line 7"),
+        (GOOD, "nn.Flatten(), nn.Linear(6, 4), nn.Linear(6, 1)", r"its logits must be float32 \(3, 3\)"),
+        (GOOD, "nn.Flatten(), nn.Linear(6, 3), nn.Linear(6, 2)", r"its value must be float32 \(3, 1\)"),
+        (GOOD, "nn.Flatten(), nn.Linear(6, 3)", "ValueError"),
+        (GOOD, "nn.Flatten(), nn.Linear(5, 3), nn.Linear(6, 1)", "RuntimeError"),
+    ],
+)
+def test_a_feature_or_a_network_that_cannot_work_is_refused_by_its_name_at_the_start(
+    write, made, parts, message
+):
+    path = write(ODD.format(made=made, parts=parts), "own_odd.py")
+    values = compose("+exp=train", "model=event_image")
+    values = {**values, "plugins": [path], "model": {"name": "odd", "stack": 3}}
+    if message is None:
+        parse(values)
+        return
+    with pytest.raises(ConfigError, match=rf"^model\.name: 'odd' of plug-in own_odd: {message}"):
+        parse(values)
+
+
+def test_a_worker_takes_a_plug_in_from_where_it_was_shipped(write, tmp_path, monkeypatch):
+    """Its path is the driver's: relative, or of a file that lies elsewhere in the worker."""
+    write(HEAD + GROVE, "shipped/own_grove.py")
+    monkeypatch.syspath_prepend(str(tmp_path / "shipped"))
+    monkeypatch.setenv(plugins.VARIABLE, "own_grove")
+    plugins.load_in_worker()
+    for path in ("own_grove.py", str(tmp_path / "elsewhere" / "own_grove.py")):
+        plugins.load_plugins([path])
+    with pytest.raises(ConfigError, match="own_other"):
+        plugins.load_plugins(["own_other.py"])
+
+
+def test_a_plug_in_that_changed_since_a_training_is_named(write):
+    path = write(HEAD + GROVE)
+    plugins.load_plugins([path])
+    digests = plugins.plugin_digests()
+    assert plugins.changed_plugins(digests) == []
+    assert plugins.changed_plugins({"own_plugin": "0" * 12, "never_loaded": "1" * 12}) == ["own_plugin"]
+    write(HEAD + GROVE + "# another content\n")
+    assert plugins.changed_plugins(digests) == ["own_plugin"]

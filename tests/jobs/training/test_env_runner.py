@@ -1,6 +1,6 @@
-import pickle
 import itertools
 import math
+import pickle
 import shutil
 from types import SimpleNamespace
 

@@ -7,6 +7,7 @@ import ray
 import torch
 from safetensors.numpy import load_file
 
+from core.places import resolve
 from jobs.config.algorithms import ALGORITHMS
 from jobs.run.files import RunError, read_json, write_json
 from jobs.run.ray_cluster import start_ray
@@ -16,7 +17,7 @@ from jobs.training.ppo.algorithm import NOTICE, PPO
 from jobs.training.ppo.train import FIGURES, LOSSES
 from jobs.training.sampling.snapshots import FOLDER, generators, set_generators
 from jobs.training.train import METRICS, export_policy, read_metrics
-from models.kinds import KINDS, resolve
+from models.kinds import KINDS
 from tests.support.configs import make_config
 from tests.support.policies import ALIKE, TRAINED
 from tests.support.runs import write_encoder, write_networks

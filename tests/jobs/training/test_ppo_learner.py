@@ -59,7 +59,7 @@ def scaled(episodes, factor):
 
 def tensor_by_tensor(monkeypatch):
     """Let the learner update dense networks as all others."""
-    monkeypatch.setattr(PlainPPOLearner, "_dense", False)
+    monkeypatch.setattr(PlainPPOLearner, "_compiled", False)
 
 
 @pytest.mark.system

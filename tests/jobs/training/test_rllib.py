@@ -18,7 +18,10 @@ from tests.support.configs import compose, make_config
 COLUMNS = "model=event_columns", "model.hidden=[8,8]", "env.control_hz=20"
 SMALL = (
     *("algo=dqn", *COLUMNS, "algo.num_envs_per_env_runner=2"),
-    *("algo.settings.num_steps_sampled_before_learning_starts=20", "algo.settings.train_batch_size_per_learner=8"),
+    *(
+        "algo.settings.num_steps_sampled_before_learning_starts=20",
+        "algo.settings.train_batch_size_per_learner=8",
+    ),
 )
 
 
@@ -47,7 +50,7 @@ def test_a_users_dqn_trains_reports_and_is_exported_as_a_policy_that_acts_greedi
     for _ in range(20):
         with torch.no_grad():
             values = module.compute_q_values({"obs": torch.from_numpy(seen[None].copy())})["qf_preds"][0]
-        logits = policy._logits_of(seen.reshape(1, *policy.stack_shape))[0]
+        logits = policy._run(seen.reshape(1, *policy.stack_shape), np.zeros((1, 0)))[0][0]
         assert logits.argmax() == values.argmax()
         seen, _, over, cut, _ = env.step(int(logits.argmax()))
         if over or cut:
@@ -82,8 +85,9 @@ def test_a_checkpoint_of_ppo_is_opened_by_rllibs_own_command(tmp_path):
     ],
 )
 def test_what_rllib_cannot_train_is_refused_with_the_key(words, message):
+    columns = () if "model=event_image" in words else COLUMNS
     with pytest.raises(ConfigError, match=message):
-        build_algorithm(make_config("algo=dqn", *(words if "model=event_image" in words else (*COLUMNS, *words))))
+        build_algorithm(make_config("algo=dqn", *columns, *words))
 
 
 def test_an_unknown_algorithm_and_a_setting_of_another_are_refused():

@@ -194,7 +194,7 @@ def test_a_critic_learns_from_what_it_is_told(rolled_out, compiled, monkeypatch)
     env, (episodes, _) = rolled_out
     learner = make_learner(env, "algo.critic=teacher")
     if not compiled:
-        monkeypatch.setattr(type(learner), "_dense", False)
+        monkeypatch.setattr(type(learner), "_compiled", False)
     rows = learner._rows(episodes)
     expected = np.concatenate(
         [np.log1p([info[COST_TO_GO] for info in infos_of(one)[:-1]]) for one in episodes]

@@ -8,13 +8,14 @@ from core.places import resolve
 from envs.config import CameraConfig, EnvConfig, Observation
 from envs.corridor import CorridorEnv
 from envs.events import EVENT, event_image, pack_window
-from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec
+from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec, RecurrentModel
 from models.policy import Policy
 from models.policy.features import Feature, Step, feature_of, grey_picture, push_features
-from models.policy.networks import build_networks
+from models.policy.networks import Network, build_networks
 
 WIDTH, HEIGHT, WINDOW_US = 6, 4, 5000
 SIZES = (WIDTH, HEIGHT, 3)
+OWN = {DenseModel: {"hidden": [8]}, RecurrentModel: {"units": 8}}  # settings beside name and stack
 COLUMNS = PolicySpec(DenseModel("event_columns", 3, [8]), *SIZES)
 PICTURE = PolicySpec(FixedModel("event_image", 3), *SIZES)
 
@@ -82,8 +83,7 @@ def test_the_events_of_a_step_give_what_their_window_and_their_image_give(seed, 
 
 @pytest.mark.parametrize("name", ["event_columns", "event_set"])
 def test_windows_of_any_lengths_give_the_features_of_each(name):
-    hidden = {"hidden": [8]} if KINDS[name].settings is DenseModel else {}
-    spec = PolicySpec(KINDS[name].settings(name=name, stack=3, **hidden), *SIZES)
+    spec = PolicySpec(KINDS[name].settings(name=name, stack=3, **OWN.get(KINDS[name].settings, {})), *SIZES)
     rng = np.random.default_rng(0)
     steps = [make_events(rng, count) for count in (5, 0, 400, 1)]
     feature = feature_of(spec)
@@ -152,8 +152,9 @@ def test_the_first_feature_fills_the_stack_and_later_ones_push_out_the_oldest(dt
 @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if not kind.encoder])
 def test_each_kind_takes_what_the_environment_shows_it(name):
     env = CorridorEnv(EnvConfig(observation=KINDS[name].observation, camera=CameraConfig(40, 48)))
-    hidden = {"hidden": [8]} if KINDS[name].settings is DenseModel else {}
-    spec = PolicySpec(KINDS[name].settings(name=name, stack=3, **hidden), 40, 48, 3)
+    spec = PolicySpec(
+        KINDS[name].settings(name=name, stack=3, **OWN.get(KINDS[name].settings, {})), 40, 48, 3
+    )
     policy = Policy(build_networks(spec), spec)
     observation, _ = env.reset(seed=0)
     for _ in range(3):
@@ -167,7 +168,7 @@ def test_each_kind_takes_what_the_environment_shows_it(name):
 def test_the_table_of_kinds_names_what_there_is():
     for kind in KINDS.values():
         assert isinstance(resolve(kind.feature), Feature)
-        assert callable(resolve(kind.network))
+        assert isinstance(resolve(kind.network), Network)
         assert kind.onnx is None or callable(resolve(kind.onnx))
         assert kind.observation in get_args(Observation)
         EnvConfig(observation=kind.observation)

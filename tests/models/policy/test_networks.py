@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -10,7 +11,7 @@ from torch import nn
 from models.encoder.event_batch import Grid
 from models.encoder.event_images import PictureContextNetwork, nature_layers
 from models.kinds import MIN_IMAGE, EncoderModel, FixedModel, PolicySpec
-from models.policy.networks import PARTS, assemble, build_networks, is_mlp, logits_by, mlp
+from models.policy.networks import PARTS, Network, assemble, build_networks, is_mlp, mlp, network_of
 
 ENCODER = EncoderModel("bytestream", 64, 8, "batch", "signed", 32, "additive", "frozen", 3, [64, 64])
 MLP = PolicySpec(ENCODER, 64, 64, 3)
@@ -58,7 +59,11 @@ def test_logits_without_torch_are_those_of_the_networks_in_any_batch(hidden):
     networks["pi"][-1].weight.data.mul_(100.0)  # so that logits differ
     trunk, pi = networks["trunk"], networks["pi"]
     stacks = (3.0 * np.random.default_rng(0).normal(size=(9, 3, 8))).astype(np.float32)
-    read = logits_by(trunk, pi)
+    run = network_of(spec).run(trunk, pi)
+
+    def read(stacks):
+        return run(stacks, np.zeros((len(stacks), 0)))[0]
+
     logits = read(stacks)
     with torch.no_grad():
         expected = pi(trunk(torch.from_numpy(stacks))).numpy()
@@ -127,12 +132,21 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("what", OTHERS)
-def test_only_what_mlp_builds_is_computed_as_such(what):
+def test_only_what_mlp_builds_may_be_compiled_and_all_else_is_run_by_torch(what, monkeypatch):
     torch.manual_seed(0)
     network, stacks = OTHERS[what](), np.random.default_rng(0).normal(size=(4, 2, 3)).astype(np.float32)
     assert not is_mlp(network)
+    row = Network(lambda shape, spec: (nn.Flatten(), network, mlp(6, (), 1)))
     with torch.no_grad():
         expected = network(torch.from_numpy(stacks).flatten(1)).numpy()
-    assert np.array_equal(logits_by(nn.Flatten(), network)(stacks), expected)
+    logits, state = row.run(nn.Flatten(), network)(stacks, np.zeros((4, 0)))
+    assert np.array_equal(logits, expected)
+    assert state.shape == (4, 0)
+    monkeypatch.setattr("models.policy.networks.resolve", lambda name: row._replace(gradients="compiled"))
+    monkeypatch.setattr(
+        "models.policy.networks.feature_of", lambda spec: SimpleNamespace(shape=lambda spec: (3,))
+    )
+    with pytest.raises(ValueError, match="have compiled gradients"):
+        assemble(MLP)
     assert is_mlp(mlp(6, (), 3))
     assert is_mlp(mlp(6, (4, 4), 3))

@@ -16,23 +16,15 @@ MODULE = '''
 import numpy as np
 from torch import nn
 
-from models.policy.features import Feature
+from models.policy.features import of_windows
 
 
-def halves(events, width):
-    return np.array([(events["x"] < width // 2).sum(), (events["x"] >= width // 2).sum()], np.float32)
+def halves(batch, spec, encoder):
+    place = 2 * batch.window + (batch.x >= spec.width // 2)
+    return np.bincount(place, minlength=2 * len(batch)).reshape(-1, 2).astype(np.float32)
 
 
-def of_windows(windows, spec, encoder):
-    rows = [window[1 : window[0, 0] + 1] for window in windows]
-    return np.stack([halves({"x": row[:, 1]}, spec.width) for row in rows])
-
-
-def of_step(step, spec, encoder):
-    return halves(step.events, spec.width)
-
-
-HALVES = Feature(np.float32, lambda spec: (2,), of_windows, of_step)
+HALVES = of_windows(np.float32, lambda spec: (2,), halves)
 
 
 def linear(shape, spec):

@@ -40,11 +40,16 @@ def steps():
 def fly_exported(file, shown, shape, dtype):
     """Logits of each step of one flight, by onnxruntime alone."""
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    stack, first, logits = np.full(shape, 7, dtype), np.array(True), []
+    memory, first, logits = {"last_stack": np.full(shape, 7, dtype)}, np.array(True), []
+    memory |= {
+        one.name: np.ones(one.shape, np.float32) for one in session.get_inputs() if "state" in one.name
+    }
+    names = [one.name for one in session.get_outputs()]
     for inputs in shown:
-        out, stack = session.run(None, {**inputs, "last_stack": stack, "first": first})
-        first = np.array(False)
-        logits.append(out)
+        out = dict(zip(names, session.run(None, {**inputs, **memory, "first": first}), strict=True))
+        memory, first = {name: out[name.replace("last", "next")] for name in memory}, np.array(False)
+        assert out["dropped"] == 0
+        logits.append(out["logits"])
     return np.array(logits)
 
 
@@ -93,6 +98,42 @@ def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(fol
     assert np.ptp(np.array(expected), axis=0).max() > 0.01 * scale
 
 
+REFUSED = {
+    "left": [10, -1, 3, 1],
+    "right": [10, SIDE, 3, 1],
+    "above": [10, 3, -1, -1],
+    "below": [10, 3, SIDE, 1],
+    "polarity": [10, 3, 3, 0],
+}
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_set", "event_image"])
+def test_what_the_policy_refuses_is_left_out_and_counted(name, tmp_path):
+    policy = load_policy(save(tmp_path / "policy", name))
+    session = onnxruntime.InferenceSession(str(export_onnx(policy, tmp_path / "policy.onnx")))
+    dtype = policy._stacks.dtype if policy._stacks.dtype != np.int16 else np.int32
+    own = {"last_stack": np.zeros(policy.stack_shape, dtype), "first": np.array(True)}
+
+    def run(rows, window_us=5000):
+        events = np.array(rows, np.int64).reshape(-1, 4)
+        return session.run(["logits", "dropped"], {"events": events, "window_us": np.array(window_us), **own})
+
+    good = [[5, 1, 2, 1], [9, 7, 3, -1], [20, 7, 4, 1]]
+    expected, none = run(good)
+    assert none == 0
+    for rows in REFUSED.values():
+        with pytest.raises(ValueError, match="has x="):
+            policy.event_logits(dict(zip("txyp", np.array([rows]).T, strict=True)), 0, 5000)
+        logits, dropped = run([good[0], rows, *good[1:]])
+        assert dropped == 1
+        np.testing.assert_array_equal(logits, expected)
+    logits, dropped = run([*REFUSED.values()])
+    assert dropped == len(REFUSED)
+    np.testing.assert_array_equal(logits, run([])[0])
+    assert run(good, window_us=0)[1] == len(good)
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("support", [1, 3])
 def test_the_file_filters_the_events_of_each_step_as_the_policy_does(support, tmp_path):
@@ -106,7 +147,7 @@ def test_the_file_filters_the_events_of_each_step_as_the_policy_does(support, tm
     for events in steps():
         rows = np.stack([events[name].astype(np.int64) for name in "txyp"], axis=1)
         inputs = {"events": rows, "window_us": np.array(5000), "last_stack": stack, "first": first}
-        logits, stack, last_us = session.run(None, {**inputs, "last_us": last_us})
+        logits, stack, last_us, _ = session.run(None, {**inputs, "last_us": last_us})
         events["t"] += start_us
         expected = policy.event_logits(events, start_us, 5000)
         np.testing.assert_allclose(logits, expected, rtol=1e-4, atol=1e-5)

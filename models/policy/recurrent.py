@@ -1,0 +1,77 @@
+"""A gated recurrent unit (GRU, Cho et al. 2014) that policy and value share, trained on sequences.
+
+    r, z = sigmoid(W x + U h),   n = tanh(W x + r * U h),   h <- n + z (h - n)
+
+The state h begins at zero with each episode. A sequence is computed step by step in the order in which a
+policy acts, so the logits of a sequence are those of its steps, apart from the order of sums in a batch.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from models.encoder.products import Linear
+from models.kinds import PolicySpec
+from models.policy.networks import Network, Run
+
+
+class GatedUnit(nn.Module):
+    """One GRU over the stacks of an episode's steps, flattened."""
+
+    def __init__(self, inputs: int, units: int) -> None:
+        """Make it for so many inputs; its state has `units` numbers."""
+        super().__init__()
+        self.units = units
+        self.inward = Linear(inputs, 3 * units)
+        self.inner = Linear(units, 3 * units)
+
+    def forward(self, stacks: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the states after each step.
+
+        Args:
+            stacks: float32 (B, T, depth, ...), T successive steps of B episodes.
+            state: float32 (B, units), before the first step.
+
+        Returns:
+            States after each step (B, T, units), and after the last (B, units).
+        """
+        given, states = self.inward(stacks.flatten(2)), []
+        for step in given.unbind(1):
+            state = self.after(step, state)
+            states.append(state)
+        return torch.stack(states, 1), state
+
+    def after(self, given: Tensor, state: Tensor) -> Tensor:
+        """Return the state (B, units) after one step, of its weighted inputs (B, 3 units)."""
+        reset, update, new = given.split(self.units, 1)
+        own_reset, own_update, own_new = self.inner(state).split(self.units, 1)
+        news = torch.tanh(new + torch.sigmoid(reset + own_reset) * own_new)
+        return news + torch.sigmoid(update + own_update) * (state - news)
+
+
+def gru(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
+    """Build a GRU over the stack, and a linear layer each for policy and value."""
+    units = state_size(spec)
+    return GatedUnit(math.prod(shape), units), Linear(units, spec.num_actions), Linear(units, 1)
+
+
+def state_size(spec: PolicySpec) -> int:
+    """Return how many numbers the state has."""
+    return int(spec.model.units)  # type: ignore[attr-defined]
+
+
+def by_steps(trunk: nn.Module, pi: nn.Module) -> Run:
+    """Run a recurrent network for one step of each episode."""
+
+    def run(stacks: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        with torch.inference_mode():
+            _, after = trunk(torch.from_numpy(stacks)[:, None], torch.from_numpy(state))
+            return pi(after).numpy(), after.numpy()
+
+    return run
+
+
+GRU = Network(gru, by_steps, state=state_size)

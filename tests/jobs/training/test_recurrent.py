@@ -1,0 +1,138 @@
+import copy
+
+import numpy as np
+import pytest
+import torch
+from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
+from ray.rllib.core.columns import Columns
+from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
+
+from jobs.config.config import ConfigError
+from jobs.training.algorithms import build_algorithm
+from jobs.training.ppo.learner import PlainPPOLearner, _minibatch
+from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, sequences
+from jobs.training.sampling.env_runner import STATES, PlainEnvRunner
+from models.policy.rllib_module import STATE
+from tests.support.configs import SHORT, make_config
+
+GRU = *SHORT, "model=event_columns_gru", "model.units=8"
+
+
+@pytest.fixture(scope="module")
+def sampled():
+    ppo = build_algorithm(make_config(*GRU, "algo.entropy_coeff=0.03"))
+    runner = PlainEnvRunner(config=ppo, worker_index=0)
+    episodes = [runner.sample(num_timesteps=90) for _ in range(2)]
+    learner = ppo.build_learner(env=runner.env)
+    learner.module["default_policy"].unwrapped().load_state_dict(runner.module.state_dict(), strict=False)
+    yield runner, learner, episodes
+    runner.stop()
+
+
+def test_rows_are_cut_into_sequences_that_end_with_their_piece_and_hold_each_row_once():
+    steps = torch.tensor([0, 1, 2, 3, 4, 0, 1, 0])  # of pieces of 5, 2 and 1 steps
+    rows = {STARTS: steps, "number": torch.arange(8), STATES: torch.arange(16.0).reshape(8, 2)}
+    parts = sequences(rows, 2)
+    assert parts[FIRST_ROW].tolist() == [0, 2, 4, 5, 7]
+    assert parts["number"][parts[TAKEN]].tolist() == list(range(8))
+    assert parts[TAKEN].tolist() == [[True, True], [True, True], [True, False], [True, True], [True, False]]
+    assert parts[STATES].tolist() == rows[STATES][[0, 2, 4, 5, 7]].tolist()
+
+
+def test_the_states_of_an_episode_begin_at_zero_and_the_learner_repeats_the_decisions(sampled):
+    _, learner, (first, _) = sampled
+    module = learner.module["default_policy"].unwrapped()
+    for episode in first:
+        states = episode.get_extra_model_outputs(STATES)
+        if episode.t_started == 0:
+            assert not states[0].any()
+            assert states[1:].any()
+        shown = torch.from_numpy(np.asarray(episode.get_observations())[:-1])[None]
+        with torch.no_grad():
+            out = module._forward_train(
+                {Columns.OBS: shown, Columns.STATE_IN: {STATE: torch.from_numpy(states[:1])}}
+            )
+        logits = episode.get_extra_model_outputs(Columns.ACTION_DIST_INPUTS)
+        np.testing.assert_allclose(out[Columns.ACTION_DIST_INPUTS][0].numpy(), logits, rtol=1e-4, atol=1e-5)
+
+
+def test_the_gradient_of_a_minibatch_is_that_of_its_sequences_one_by_one(sampled):
+    """And steps that only fill a sequence have no part in it."""
+    _, learner, (first, _) = sampled
+    module = learner.module["default_policy"].unwrapped()
+    parts = sequences(learner._rows(first), 16)
+    counts = parts[TAKEN].sum(1).tolist()
+    assert min(counts) < 16
+
+    def gradient(picked, length=None):
+        rows = _minibatch(parts, torch.tensor(picked))
+        if length is not None:
+            rows = {
+                name: value if name in (Columns.STATE_IN, FIRST_ROW) else value[:, :length]
+                for name, value in rows.items()
+            }
+        module.zero_grad()
+        learner._loss(module, rows)[0].backward()
+        return torch.cat([value.grad.flatten() for value in module.parameters()])
+
+    whole = gradient(list(range(len(counts))))
+    single = sum(count * gradient([k], count) for k, count in enumerate(counts)) / sum(counts)
+    torch.testing.assert_close(whole, single, rtol=1e-3, atol=1e-6)
+
+
+def test_an_update_improves_the_loss_and_moves_every_weight(sampled):
+    _, learner, (_, second) = sampled
+    before = copy.deepcopy(learner.module["default_policy"].unwrapped().state_dict())
+    learner.update(episodes=copy.deepcopy(second), num_epochs=2, minibatch_size=64)
+    after = learner.module["default_policy"].unwrapped().state_dict()
+    assert isinstance(learner, PlainPPOLearner)
+    assert all(not torch.equal(before[name], after[name]) for name in before)
+
+
+def for_rllib(episode, module):
+    """The episode with the states that RLlib's own env runner would have recorded."""
+    states = torch.from_numpy(episode.get_extra_model_outputs(STATES)[:1])
+    shown = torch.from_numpy(np.asarray(episode.get_observations())[:-1])[None]
+    with torch.no_grad():
+        after = module.trunk(shown, states)[0][0].numpy()
+    episode = copy.deepcopy(episode)
+    del episode.extra_model_outputs[STATES]
+    episode.extra_model_outputs[Columns.STATE_OUT] = InfiniteLookbackBuffer({STATE: after})
+    return episode
+
+
+@pytest.mark.system
+def test_rllibs_learner_sees_the_same_sequences(sampled):
+    runner, learner, (first, _) = sampled
+    own = learner.config.copy(copy_frozen=False)
+    theirs = own.training(learner_class=PPOTorchLearner).build_learner(env=runner.env)
+    ours = own.training(learner_class=PlainPPOLearner).build_learner(env=runner.env)
+    for one in (theirs, ours):
+        one.module["default_policy"].unwrapped().load_state_dict(runner.module.state_dict(), strict=False)
+    ours.set_state(theirs.get_state())
+    module = theirs.module["default_policy"].unwrapped()
+    begun = [episode for episode in first if episode.t_started == 0]
+    results = [
+        theirs.update(episodes=[for_rllib(episode, module) for episode in begun], num_epochs=1),
+        ours.update(episodes=copy.deepcopy(begun), num_epochs=1),
+    ]
+    for name in ("entropy", "vf_loss"):
+        expected, found = (float(result["default_policy"][name].peek()) for result in results)
+        assert found == pytest.approx(expected, rel=1e-3), name
+
+
+def test_a_runner_resumes_with_the_states_of_its_episodes(sampled):
+    runner, _, _ = sampled
+    snapshot = copy.deepcopy(runner.snapshot())
+    expected = runner.sample(num_timesteps=40)
+    assert not runner.resume(snapshot)
+    again = runner.sample(num_timesteps=40)
+    for one, other in zip(expected, again, strict=True):
+        for name in (STATES, Columns.ACTION_DIST_INPUTS):
+            a, b = one.get_extra_model_outputs(name), other.get_extra_model_outputs(name)
+            np.testing.assert_array_equal(a, b)
+
+
+def test_imitation_refuses_a_recurrent_policy():
+    with pytest.raises(ConfigError, match=r"^model\.name: must be a policy without a recurrent network"):
+        build_algorithm(make_config("model=event_columns_gru", "algo=imitation"))
