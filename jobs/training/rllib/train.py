@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, cast
 
-from ray.rllib.algorithms.registry import get_algorithm_class
+from ray.rllib.algorithms.registry import ALGORITHMS
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from torch import nn
 
@@ -72,11 +72,10 @@ def _check(config: Config, spec: PolicySpec) -> None:
 
 def _class(algo: RLlibConfig, default: bool = False) -> Any:
     """Return RLlib's class of the algorithm, or its default configuration."""
-    try:
-        found, config = get_algorithm_class(algo.algorithm, return_config=True)
-    except Exception as error:
-        rule = f"must be an algorithm of RLlib's, got {algo.algorithm!r}"
-        raise ConfigError(f"algo.algorithm: {rule}: {error}") from None
+    if algo.algorithm not in ALGORITHMS:
+        names = ", ".join(ALGORITHMS)
+        raise ConfigError(f"algo.algorithm: must be one of {names}, got {algo.algorithm!r}")
+    found, config = ALGORITHMS[algo.algorithm]()
     return config if default else found
 
 

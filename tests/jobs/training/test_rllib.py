@@ -79,7 +79,7 @@ def test_a_checkpoint_of_ppo_is_opened_by_rllibs_own_command(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("algo.algorithm=Nope",), r"algo\.algorithm: must be an algorithm of RLlib's, got 'Nope'"),
+        (("algo.algorithm=Nope",), r"algo\.algorithm: must be one of APPO, .*, got 'Nope'"),
         (("+algo.settings.no_such=1",), r"algo\.settings: DQN has no such setting: .*no_such"),
         (("model=event_image",), r"model\.name: must be event_columns, .*got 'event_image'"),
     ],
