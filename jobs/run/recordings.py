@@ -1,6 +1,7 @@
 """Read event files as every command does: by the keys `recording.*`, and print what the reader tells."""
 
 import dataclasses
+import math
 import re
 import time
 import warnings
@@ -39,7 +40,7 @@ def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[Eve
     Raises:
         ValueError: As `envs.recordings.read_parts`.
     """
-    count, told = 0, time.monotonic()
+    count, told = 0, math.inf  # the first part may have to compile its reader
     given = options(path, settings)
     most = given.pop("max_events")
     parts = read_parts(path, **given)
@@ -56,6 +57,7 @@ def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[Eve
                 f"{path}: contains more than max_events={most} events; raise max_events, or give start_us "
                 "and end_us"
             )
+        told = min(told, time.monotonic())
         if time.monotonic() - told > TELL_EVERY_S:
             told = time.monotonic()
             console.print(f"{Path(path).name}: {count / 1e6:,.1f} million events read", markup=False)
