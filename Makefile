@@ -76,7 +76,7 @@ system-libraries: $(INSTALLED) # OpenGL without a screen, for renderer=pyrender
 demo: setup ## watch a shipped policy: its result and a film, in less than a minute
 	$(LAUNCH) +exp=demo $(ARGS)
 
-bytestream: setup ## from nothing to an evaluated policy (9 to 19 minutes; ARGS="budget=smoke": a minute)
+bytestream: setup ## from nothing to an evaluated policy (4 to 8 minutes; ARGS="budget=smoke": a minute)
 	$(LAUNCH) +exp=bytestream $(ARGS)
 
 train-all: setup ## train every policy with three seeds into models/pretrained (hours; give it again to continue)

@@ -1,7 +1,7 @@
 """From nothing to a policy: collect, pretrain, train, evaluate (appendix B and D).
 
 Run: python -m platform.launch +exp=bytestream
-Expect: 9 to 19 minutes on 2 cores with budget=short; a table of success rates and
+Expect: 4 to 8 minutes on 2 cores with budget=short; a table of success rates and
 distances with intervals, the name of the policy in MLflow's model registry, and the command that
 opens the dashboard. A policy without an event
 VAE, such as +exp=event_columns, begins with its training. A stopped run continues where it
