@@ -12,13 +12,39 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import AfterValidator, ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass
+from pydantic_core import ArgsKwargs
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+def plain_numbers(cls: type, given: Any) -> Any:
+    """Replace NumPy's integers and truth values among the arguments of a class by Python's."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: plain(part) for name, part in value.items()}
+        return value.item() if isinstance(value, np.integer | np.bool_) else value
+
+    if isinstance(given, ArgsKwargs):
+        return ArgsKwargs(tuple(map(plain, given.args)), plain(given.kwargs or {}))
+    return plain(given)
+
+
+PLAIN = cast(Any, classmethod(plain_numbers))  # of every class of settings, before its other checks
 
 
 def _layout_value(value: Any) -> Any:
@@ -116,6 +142,8 @@ class CameraConfig:
             of a row leave together, and a pixel that waits for its turn fires no other event.
     """
 
+    _plain = model_validator(mode="before")(PLAIN)
+
     width: Annotated[int, Field(ge=1, le=4096)] = 64
     height: Annotated[int, Field(ge=1, le=4096)] = 64
     fov_deg: Annotated[float, Field(ge=1, le=170)] = 90.0
@@ -184,6 +212,8 @@ class FaultsConfig:
         added: How much of each fault that a plug-in adds, such as {"flicker": 0.2}; 0 is none of it.
     """
 
+    _plain = model_validator(mode="before")(PLAIN)
+
     sparsity: Fraction = 0.0
     background_activity: Annotated[float, Field(ge=0, le=100)] = 0.0
     background_activity_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
@@ -210,6 +240,8 @@ class FidelityConfig:
         samples: Anti-aliasing of the renderer; None: chosen.
         cull_m: Obstacles farther than this are not drawn [m]; None: chosen.
     """
+
+    _plain = model_validator(mode="before")(PLAIN)
 
     tolerance: Annotated[float, Field(ge=1e-3, le=1)] = 0.05
     max_step_m: Positive | None = None
@@ -256,6 +288,8 @@ class EnvConfig:
         split: Which corridors: those of one split never occur in another, whatever the seed.
         renderer: "raycast", "pyrender", or "auto": the cheapest that can draw the scene.
     """
+
+    _plain = model_validator(mode="before")(PLAIN)
 
     scene: str = "poles"
     layout: dict[str, Value] = dataclasses.field(default_factory=dict)

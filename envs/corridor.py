@@ -93,10 +93,13 @@ class CorridorEnv(gymnasium.Env):
             fields: To replace in `config`.
 
         Raises:
+            TypeError: A field is unknown; clients that probe for an argument expect this exception.
             ValueError: A setting or the render mode is refused.
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f'render_mode must be None or "rgb_array"; got {render_mode!r}.')
+        for name in fields.keys() - {field.name for field in dataclasses.fields(EnvConfig)}:
+            raise TypeError(f"{type(self).__name__}() got an unexpected keyword argument {name!r}")
         if isinstance(config, Mapping):
             fields, config = {**config, **fields}, None
         self.config = self._nominal = dataclasses.replace(config or EnvConfig(), **fields)
@@ -109,6 +112,35 @@ class CorridorEnv(gymnasium.Env):
         self._sensor = Sensor(self.config, planned_config(self.config, self._dynamics))
         self.series: tuple[int | None, int] = None, 0
         self._vehicles, self._row = Vehicles(1), 0
+        self._actions: list[Any] = []  # of this episode
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies and pickles need: the settings, the episode and its actions."""
+        arguments = {"config": self._nominal, "render_mode": self.render_mode, "draw": self._draw}
+        set_later = {"action_space", "observation_space", "spec", "_np_random", "_np_random_seed"}
+        return {
+            "arguments": arguments,
+            "attributes": {name: getattr(self, name) for name in set_later},
+            "series": self.series,
+            "actions": list(self._actions),
+            "over": bool(self._vehicles.rows["over"][self._row]),
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the environment again, and repeat the episode's actions: the same bytes follow."""
+        self.__init__(**state["arguments"])  # type: ignore[misc]
+        self.restore(state)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Repeat the episode of a state that `__getstate__` returned for the same settings."""
+        seed, number = state["series"]
+        if seed is not None:
+            self.begin(seed, {"episode_number": number})
+            for action in state["actions"]:
+                self.step(action)
+        self._vehicles.rows["over"][self._row] = state["over"]
+        for name, value in state["attributes"].items():
+            setattr(self, name, value)
 
     def join(self, vehicles: Vehicles, row: int) -> None:
         """Share `vehicles` with other environments; this one is row `row` from the next reset."""
@@ -128,7 +160,7 @@ class CorridorEnv(gymnasium.Env):
             ValueError: An unknown option, or an episode that is no integer >= 0.
         """
         self.begin(seed, options)
-        return self._observation(), self.info()
+        return self.observe(), self.info()
 
     def begin(self, seed: int | None, options: Mapping[str, object] | None) -> None:
         """Start an episode like `reset`, but do not compute the observation."""
@@ -148,6 +180,7 @@ class CorridorEnv(gymnasium.Env):
         spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
         self._sensor.reset(self.scene, (spawn_x, 0.0), faults_rng)
         spawn = spawn_x, 0.0
+        self._actions = []
         self._vehicles.start(self._row, config, self.scene, self._sensor, spawn, self._dynamics)
 
     def _set_config(self, config: EnvConfig) -> None:
@@ -179,9 +212,14 @@ class CorridorEnv(gymnasium.Env):
             self._vehicles.step(actions, active)
         except StepError as error:
             raise ValueError(f"{self.name_step()}: {error}") from error
+        self.remember(own)
         info, vehicle = self.info(), self._vehicles.rows[row]
         terminated = info["success"] or info["collision"]
-        return self._observation(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
+        return self.observe(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
+
+    def remember(self, action: np.ndarray) -> None:
+        """Remember an action of this episode for copies of the environment."""
+        self._actions.append(action)
 
     def render(self) -> Any:
         """Draw luminance beside the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
@@ -241,7 +279,7 @@ class CorridorEnv(gymnasium.Env):
         vehicle, (seed, number) = self._vehicles.rows[self._row], self.series
         return f"episode {number}, step {vehicle['steps']}, seed {seed}"
 
-    def _observation(self) -> np.ndarray:
+    def observe(self) -> np.ndarray:
         """Return the observation of the last step."""
         if self.config.observation != "window":
             return observe(self.config, self.seen_events, self.luminance)
@@ -258,8 +296,9 @@ class CorridorEnv(gymnasium.Env):
 class CorridorVectorEnv(VectorEnv):
     """Several episodes at once; each has the bytes of a `CorridorEnv` with the same seed.
 
-    An episode that is over is reset by the next step (AutoresetMode.NEXT_STEP), whose
-    action is ignored and whose reward is 0. All returned arrays are fresh.
+    `autoreset_mode` says what happens to an episode that is over, as in Gymnasium's SyncVectorEnv.
+    By default the next step resets it (NEXT_STEP); its action is ignored and its reward is 0.
+    All returned arrays are fresh.
     """
 
     metadata = {**CorridorEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -270,6 +309,8 @@ class CorridorVectorEnv(VectorEnv):
         config: EnvConfig | Sequence[EnvConfig] | None = None,
         render_mode: Any = None,
         draw: Draw | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **fields: Any,
     ) -> None:
         """Make `num_envs` environments; the arguments not named here are those of `CorridorEnv`.
@@ -279,6 +320,9 @@ class CorridorVectorEnv(VectorEnv):
             config: One for all, or several, which the environments take in turn.
             render_mode: See `CorridorEnv`.
             draw: See `CorridorEnv`.
+            max_episode_steps: Steps after which an episode is truncated; None: see `time_limit_s`.
+            autoreset_mode: NEXT_STEP; SAME_STEP, with infos "final_obs" and "final_info";
+                or DISABLED, where the caller resets by `options={"reset_mask": bool (num_envs,)}`.
             fields: To replace in every config.
 
         Raises:
@@ -295,7 +339,11 @@ class CorridorVectorEnv(VectorEnv):
         spaces_seen = {repr(env.observation_space) for env in self.envs}
         if len(spaces_seen) > 1:
             raise ValueError(f"configs must have one observation space; got {sorted(spaces_seen)}.")
-        self.metadata = {**self.metadata, "render_fps": self.envs[0].metadata["render_fps"]}
+        self._mode, self._max_steps = AutoresetMode(autoreset_mode), max_episode_steps
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be >= 1 or None; got {max_episode_steps}.")
+        render_fps = self.envs[0].metadata["render_fps"]
+        self.metadata = {**self.metadata, "render_fps": render_fps, "autoreset_mode": self._mode}
         self.single_observation_space = self.envs[0].observation_space
         self.single_action_space = self.envs[0].action_space
         if any(env.action_space != self.single_action_space for env in self.envs):
@@ -318,12 +366,15 @@ class CorridorVectorEnv(VectorEnv):
 
         Args:
             seed: One per environment, or one number, see `envs.kinematics.spread_seeds`.
-            options: As for `CorridorEnv.reset`, for all.
+            options: As for `CorridorEnv.reset`, for all; "reset_mask", bool (num_envs,), resets some alone.
 
         Raises:
-            ValueError: The number of seeds is not that of environments.
+            ValueError: The number of seeds is not that of environments, or the mask is none.
         """
         seeds = kinematics.spread_seeds(seed, self.num_envs)
+        if options is not None and "reset_mask" in options:
+            rest = {name: value for name, value in options.items() if name != "reset_mask"}
+            return self._reset_some(np.asarray(options["reset_mask"]), seeds, rest)
         self._over[:] = False
         for env, own_seed in zip(self.envs, seeds, strict=True):
             env.begin(own_seed, options)
@@ -344,9 +395,78 @@ class CorridorVectorEnv(VectorEnv):
         self._step_active(np.asarray(actions), ~over)
         for row in np.flatnonzero(over):
             self.envs[row].begin(None, None)
-        results = self._results(np.arange(self.num_envs))
-        self._over = results[2] | results[3]
-        return results
+        observations, rewards, terminated, truncated, infos = self._results(np.arange(self.num_envs))
+        ended = terminated | truncated
+        if self._mode is AutoresetMode.SAME_STEP and ended.any():
+            observations, infos = self._reset_now(ended, observations, infos)
+        self._over = ended & (self._mode is AutoresetMode.NEXT_STEP)
+        return observations, rewards, terminated, truncated, infos
+
+    def _reset_now(self, ended: np.ndarray, last: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Reset the episodes that have ended; return observations, and infos with what they ended with."""
+        final, observations = np.full(self.num_envs, None, object), list(last)
+        final_info = {name: values.copy() for name, values in infos.items() if not name.startswith("_")}
+        for row in np.flatnonzero(ended):
+            final[row] = last[row]
+            observations[row], _ = self.envs[row].reset()
+        extra = {"final_obs": final, "_final_obs": ended.copy(), "_final_info": ended.copy()}
+        masks = {f"_{name}": ended.copy() for name in final_info}
+        return self._batch(observations), self.infos() | extra | {"final_info": final_info | masks}
+
+    def _reset_some(
+        self, mask: np.ndarray, seeds: Sequence[int | None], options: Mapping[str, object]
+    ) -> tuple[Any, dict[str, np.ndarray]]:
+        """Reset the environments of a mask; the others keep their last observation."""
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            rule = f"reset_mask must be bool ({self.num_envs},)"
+            raise ValueError(f"{rule}; got {mask.dtype} of shape {mask.shape}.")
+        for row in np.flatnonzero(mask).tolist():
+            self.envs[row].begin(seeds[row], options)
+        self._over &= ~mask
+        return self._batch([env.observe() for env in self.envs]), self.infos()
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:
+        """Seeds of all environments' generators."""
+        return tuple(env.np_random_seed for env in self.envs)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of every environment, or read an attribute, as Gymnasium's SyncVectorEnv."""
+        found = [env.get_wrapper_attr(name) for env in self.envs]
+        return tuple(value(*args, **kwargs) if callable(value) else value for value in found)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute of every environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every environment to one value, or to its own of a list or tuple."""
+        own = values if isinstance(values, list | tuple) else [values] * self.num_envs
+        for env, value in zip(self.envs, own, strict=True):
+            env.set_wrapper_attr(name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies and pickles need, see `CorridorEnv`."""
+        states = [env.__getstate__() for env in self.envs]
+        arguments = {"render_mode": self.render_mode, "draw": states[0]["arguments"]["draw"]}
+        arguments |= {"autoreset_mode": self._mode, "max_episode_steps": self._max_steps}
+        configs = [state["arguments"]["config"] for state in states]
+        attributes = {name: getattr(self, name) for name in ("action_space", "observation_space", "spec")}
+        return {
+            "arguments": {"num_envs": self.num_envs, "config": configs, **arguments},
+            "states": states,
+            "over": self._over.copy(),
+            "attributes": attributes,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the environments again, and repeat their episodes."""
+        self.__init__(**state["arguments"])  # type: ignore[misc]
+        for env, own in zip(self.envs, state["states"], strict=True):
+            env.restore(own)
+        self._over = state["over"].copy()
+        for name, value in state["attributes"].items():
+            setattr(self, name, value)
 
     def step_some(
         self, actions: np.ndarray, some: np.ndarray
@@ -375,6 +495,9 @@ class CorridorVectorEnv(VectorEnv):
         """Return the results of `step` for some environments."""
         rows = self._vehicles.rows[some]
         terminated, truncated = rows["success"] | rows["collision"], rows["truncated"]
+        if self._max_steps is not None:
+            truncated = truncated | ~terminated & (rows["steps"] >= self._max_steps)
+            self._vehicles.rows["over"][some] |= truncated
         return self._observations(some), rows["reward"], terminated, truncated, self._infos(some)
 
     def _step_active(self, taken: np.ndarray, active: np.ndarray) -> None:
@@ -391,6 +514,8 @@ class CorridorVectorEnv(VectorEnv):
             self._vehicles.step(taken.astype(self._number), active)
         except StepError as error:
             raise ValueError(f"{self.envs[error.row].name_step()}: {error}") from error
+        for row in np.flatnonzero(active):
+            self.envs[row].remember(taken[row])
 
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
