@@ -113,9 +113,10 @@ def evt_parts(
     states = {} if states is None else states
     state = states.setdefault(encoding, new_state())
     state[State.WORD], before = 0, state.copy()
-    most = len(words) * {"evt2": 1, "evt21": 32, "evt3": 12}[encoding]
+    # About as many as such words usually encode; denser ones take several arrays.
+    usual = len(words) * {"evt2": 2, "evt21": 4, "evt3": 1}[encoding] // 2
     while state[State.WORD] < len(words):
-        events = np.empty(min(request.part_events, most) + 32, EVENT)
+        events = np.empty(min(request.part_events, usual) + 32, EVENT)
         triggers = np.empty(min(MAX_TRIGGERS, len(words)), TRIGGER)
         n, k = decode(encoding, words, state, events, triggers, endianness)
         _count(request, tally, state, before)
@@ -154,9 +155,9 @@ def _count(request: Request, tally: Tally, state: np.ndarray, before: np.ndarray
         if new[place]:
             tally.damage[name] += int(new[place])
     before[:] = state
-    if state[State.RESERVED] > FEW_RESERVED + state[State.WORD] // 8:
+    if new[State.RESERVED] > max(FEW_RESERVED, new[State.WORD] // 8):
         raise request.refusal(
-            f"has {state[State.RESERVED]} of {state[State.WORD]} words of types that this encoding does not "
+            f"has {new[State.RESERVED]} of {new[State.WORD]} words of types that this encoding does not "
             "have; the file is damaged or of another encoding: give format as evt2, evt21 or evt3"
         )
 

@@ -6,11 +6,12 @@ whole is read; the walk ends where the file does. It needs lz4 and zstd, which c
 
 import bz2
 import contextlib
+import os
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 MAX_RECORD = 1 << 31
 
@@ -71,16 +72,21 @@ def _walk(path: Path) -> Iterator[Topic | Message]:
         yield from walk(path)
 
 
+def _present(file: BinaryIO, size: int) -> bytes:
+    """Return the next bytes, as many as there are: memory for a damaged size would be taken before."""
+    return file.read(min(size, os.fstat(file.fileno()).st_size))
+
+
 def _walk_bag(path: Path) -> Iterator[Topic | Message]:
     """Walk through a bag of ROS 1."""
     known: dict[bytes, Topic] = {}
     with path.open("rb") as file:
         file.readline()
-        while (header := _fields(file.read)) is not None:
+        while (header := _fields(lambda size: _present(file, size))) is not None:
             (size,) = struct.unpack("<I", file.read(4))
             if size > MAX_RECORD:
                 return
-            data = file.read(size)
+            data = _present(file, size)
             if header.get(b"op") == b"\x05":
                 yield from _walk_chunk(_unpacked(data, header[b"compression"].decode()), known)
             else:
@@ -147,7 +153,7 @@ def _walk_mcap(path: Path) -> Iterator[Topic | Message]:
             code, size = struct.unpack("<BQ", head)
             if size > MAX_RECORD or code == 0:
                 return
-            data = file.read(size)
+            data = _present(file, size)
             if code == 6:  # a chunk
                 for name, record in _mcap_chunk(data):
                     yield from _mcap_record(name, record, known, kinds)

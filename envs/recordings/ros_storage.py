@@ -55,6 +55,8 @@ def open_bags(request: Request) -> list[Bag]:
         raise request.refusal(
             "is a folder without .db3 or .mcap files; give the folder or a file of a rosbag2"
         ) from None
+    if path.is_file() and not _magic(path).startswith((MAGIC_BAG, MAGIC_DB3, MAGIC_MCAP)):
+        raise request.refusal("is no ROS bag; give its format, or leave format out") from None
     return [_whole_or_cut(one) for one in files]
 
 

@@ -3,8 +3,8 @@
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from itertools import islice
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, islice
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -95,11 +95,10 @@ def _parts(
         lines = io.TextIOWrapper(raw, "utf-8-sig")
         for _ in islice(lines, table.skip):
             pass
-        while some := list(islice(lines, min(request.part_events, PART_LINES))):
-            if not some[-1].endswith("\n") and not _is_whole(some[-1], table, columns):
-                tally.damage[CUT_LINE] += 1
-                some = some[:-1]
-            t, x, y, p, *nanoseconds = _numbers(some, table, columns).T
+        whole = _whole_lines(lines, tally, table, columns)
+        for line in whole:  # of each part the first; the others never lie in memory together
+            part = chain([line], islice(whole, min(request.part_events, PART_LINES) - 1))
+            t, x, y, p, *nanoseconds = _numbers(part, table, columns).T
             if nanoseconds:
                 t_us = np.rint(t * 1e6 + nanoseconds[0] * 1e-3)
             else:
@@ -107,12 +106,21 @@ def _parts(
             yield Part(assemble(request, tally, t_us, x, y, p)[0])
 
 
-def _numbers(lines: list[str], table: Table, columns: list[int]) -> np.ndarray:
+def _whole_lines(lines: IO[str], tally: Tally, table: Table, columns: list[int]) -> Iterator[str]:
+    """Yield the lines of a file; a last one that was cut off is counted."""
+    for line in lines:
+        if line.endswith("\n") or _is_whole(line, table, columns):
+            yield line
+        else:
+            tally.damage[CUT_LINE] += 1
+
+
+def _numbers(lines: Iterable[str], table: Table, columns: list[int]) -> np.ndarray:
     """Return the numbers of some columns of lines, float64 (N, columns)."""
     if table.has_words:
-        lines = [
+        lines = (
             re.sub("true|false", lambda word: TRUTH[word[0].lower()], line, flags=re.I) for line in lines
-        ]
+        )
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "loadtxt: input contained no data")
         return np.loadtxt(

@@ -86,7 +86,9 @@ def number_type(space: spaces.Space) -> type:
 def wrong_actions(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
     """Return which of some actions are not in a Discrete(K) or a Box, bool (B,)."""
     if isinstance(space, spaces.Discrete):
-        return (actions < 0) | (actions >= space.n) | (actions.dtype.kind not in "iu")
+        if actions.dtype.kind not in "iu":  # text and objects cannot be compared with numbers
+            return np.ones(len(actions), bool)
+        return (actions < 0) | (actions >= space.n)
     if actions.dtype.kind not in "iuf":
         return np.ones(len(actions), bool)
     inside = (actions >= space.low) & (actions <= space.high)

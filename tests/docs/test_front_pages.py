@@ -6,9 +6,11 @@ import json
 import re
 from collections import defaultdict
 
+import numpy as np
 import pytest
 
 from docs.tables import DATA, ROOT, stale
+from envs.events import EVENT
 from envs.recordings import write_events
 from jobs.config.config import parse
 from jobs.rollout.policies import BASELINES, PRETRAINED, find_study_policies
@@ -160,7 +162,7 @@ def test_the_robust_policy_does_as_the_pages_say():
 
 def test_the_readme_counts_the_formats_that_can_be_written(tmp_path):
     with pytest.raises(ValueError, match="format") as error:
-        write_events(tmp_path / "a.unknown", [], 1, 1, "unknown")
+        write_events(tmp_path / "a.unknown", np.empty(0, EVENT), 1, 1, "unknown")
     formats = re.findall(r"\b(npz|hdf5|txt|csv|aedat4|evt3|evt2|dat)\b", str(error.value))
     words = {8: "eight", 9: "nine", 10: "ten"}
     assert f"Write {words[len(set(formats))]} formats" in text_of("README.md")

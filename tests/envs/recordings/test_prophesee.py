@@ -357,7 +357,7 @@ def test_words_and_pixels_that_do_not_exist_are_left_out_and_counted(tmp_path):
     for content, damage in (
         (b"% evt 3.0\n\x00", {CUT: 1}),
         (words3(*good, 0x3000 | 2037, 0x4800), {OUTSIDE: 1}),
-        (words3(*good, 0x3000 | 2030, 0x4000, 0x5000, 0x5001), {}),
+        (words3(*good, 0x3000 | 2027, 0x4000, 0x5000, 0x5001), {}),
         (words3(*good, 0x3000 | 2036, 0x4000, 0x5001), {OUTSIDE: 1}),
         (words3(*good, 0x1000, 0xB000), {RESERVED: 2}),
         (EVT21_GOOD + EVT21_BEYOND, {OUTSIDE: 1}),

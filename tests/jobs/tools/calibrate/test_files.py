@@ -13,12 +13,13 @@ from envs.events import EVENT
 from envs.recordings import write_events
 from envs.recordings.light import light_of_grey
 from jobs.config.config import ConfigError, parse
+from jobs.config.schema import RecordingConfig
 from jobs.tools.calibrate import calibrate, sources
 from jobs.tools.calibrate.camera_file import camera_text
 from jobs.tools.calibrate.estimate import DEAD, LEAK, NAMES, OFF, ON, Calibration, Footage
 from jobs.tools.calibrate.found import Found, missing
 from jobs.tools.calibrate.likeness import likeness, net_images
-from jobs.tools.calibrate.sources import read_frames, read_recording
+from jobs.tools.calibrate.sources import read_frames, read_source
 from tests.support.configs import CONF, compose
 from tests.support.planted import moving_footage, planted, still_planted
 
@@ -26,10 +27,6 @@ from tests.support.planted import moving_footage, planted, still_planted
 def composed(conf, *words):
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
         return OmegaConf.to_container(hydra.compose("config", list(words)), resolve=True)
-
-
-# These axes change what a pixel remembers, which a refractory period forbids.
-WITHOUT_MEMORY = ("~study.axes.memory", "~study.axes.memory_400hz")
 
 
 # Of which a calibration takes how light becomes a response, and nothing else.
@@ -69,7 +66,7 @@ def test_what_was_found_is_a_camera_that_others_can_take(tmp_path):
     calibration = Calibration(found, np.zeros((36, 48), bool))
     text = camera_text(calibration, "x.raw", calibrate.assumed(CONFIGURED, still=False))
     (conf / "camera" / "mine.yaml").write_text(text)
-    config = parse(composed(conf, "+exp=train", *WITHOUT_MEMORY, "camera=mine"))
+    config = parse(composed(conf, "+exp=train", "camera=mine"))
     assert (config.env.camera.width, config.env.camera.height) == (48, 36)
     assert config.env.camera.contrast_threshold == 0.31
     assert config.env.camera.refractory_us == 500
@@ -80,9 +77,7 @@ def test_what_was_found_is_a_camera_that_others_can_take(tmp_path):
     groups = {name: keys for name, keys in yaml.safe_load(text).items() if name != "defaults"}
     assert not absent & {f"{group}.{key}" for group, keys in groups.items() for key in keys}
     assert all(f"# {name}: not found, nothing told it" in text for name in absent)
-    later = parse(
-        composed(conf, "+exp=train", *WITHOUT_MEMORY, "camera=mine", "camera.refractory_us=7", "light=night")
-    )
+    later = parse(composed(conf, "+exp=train", "camera=mine", "camera.refractory_us=7", "light=night"))
     assert (later.env.camera.refractory_us, later.env.faults.shot_noise_hz) == (7, 5.0)
 
 
@@ -109,7 +104,7 @@ def test_frames_and_bare_rows_are_read_as_they_were_written(tmp_path):
     events = planted(footage)
     rows = zip(events["t"], events["x"], events["y"], events["p"] > 0, strict=True)
     (tmp_path / "events.txt").write_text("".join(f"{1e-6 * t:.6f} {x} {y} {int(p)}\n" for t, x, y, p in rows))
-    read = read_recording(tmp_path / "events.txt", frames)
+    read = read_source(tmp_path / "events.txt", frames, RecordingConfig())
     assert np.array_equal(read.events, events)
     assert (read.width, read.height) == (8, 8)
 
@@ -165,10 +160,11 @@ def test_events_beside_the_frames_are_refused_where_the_recording_names_no_size(
         else:
             path.write_text(f"t_us,x,y,p\n10,{x},3,1\n")
         if is_inside:
-            assert (read_recording(path, frames).width, read_recording(path, frames).height) == (6, 4)
+            found = read_source(path, frames, RecordingConfig())
+            assert (found.width, found.height) == (6, 4)
         else:
             with pytest.raises(ValueError, match=str(path)):
-                read_recording(path, frames)
+                read_source(path, frames, RecordingConfig())
 
 
 def run(tmp_path, *words):
