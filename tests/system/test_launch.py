@@ -108,7 +108,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["faults.sparsity=1.5"], "faults.sparsity: Input should be less than or equal to 1, got 1.5"),
         (["env.scene=moon"], "env.scene: must be one of cones, dynamic, gates, poles, "),
         (["collect.scenes=[moon]"], "collect.scenes: must be one of cones, dynamic, gates, poles, "),
-        (["study.scene=moon"], "study.scene: must be one of cones, dynamic, gates, poles, "),
+        (["+exp=hold", "study.scene=moon"], "study.scene: must be one of cones, dynamic, gates, poles, "),
         (
             ["+env.layout.num_obstacles=100000"],
             "env.layout: layout num_obstacles=100000 cannot be placed 2.0 m apart",
@@ -117,7 +117,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["+env.split=eval"], "env.split: no such key, got 'eval'; every job chooses it itself"),
         (["seed=null"], "seed: Input should be a valid integer, got None"),
         (["seed="], "seed: Input should be a valid integer, got ''"),
-        (["job=os.system"], "job: must be one of ablation, calibrate, "),
+        (["job=os.system"], "job: must be one of calibrate, codings, "),
         (["budget=huge"], "budget: must be one of paper, short, smoke, got 'huge'"),
         (["env=3"], "env=3: "),
         (["seed=[1"], "seed=[1: "),

@@ -26,7 +26,7 @@ def trade_config(tmp_path, *policies, **changes):
     config = small_config(tmp_path, job="trade", exp="trade")
     settings = dataclasses.replace(config.own, policies=list(policies or ["bytestream-s0"]), **changes)
     return in_store(
-        dataclasses.replace(config, trade=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)),
+        dataclasses.replace(config, own=settings, env=dataclasses.replace(config.env, time_limit_s=0.05)),
         tmp_path,
     )
 

@@ -65,7 +65,7 @@ def test_what_cannot_be_searched_is_told_before_anything_starts(space, message):
     "values", ["[]", "3", "{low: 2}", "{low: 2, high: 1}", "{low: 0, high: 1, log: true}"]
 )
 def test_what_is_no_space_is_refused(values):
-    with pytest.raises(ConfigError, match=r"^tune\.space\.algo\.lr: must be "):
+    with pytest.raises(ConfigError, match=r"^search\.space\.algo\.lr: must be "):
         searching(f"{{algo.lr: {values}}}")
 
 
