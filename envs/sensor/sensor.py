@@ -56,7 +56,7 @@ class Sensor:
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
         self._seen_us = np.zeros(config.camera.width, np.int64)
-        self._way: tuple[np.ndarray, float] | None = None  # of the last step, and its share flown
+        self._way: tuple[np.ndarray, float] | None = None  # of the last step, and its share travelled
         self.true_events = np.empty(0, EVENT)
         self.plan: RenderPlan
 

@@ -60,7 +60,13 @@ def _missing(path: Path, columns: Sequence[str]) -> dict[str, object]:
 
 
 def episodes_of(rows: Sequence[Sequence[object]], columns: Sequence[str]) -> np.ndarray:
-    """Return rows of values under these columns as EPISODE (n,); missing later columns get their defaults."""
+    """Return rows of values under these columns as EPISODE (n,); missing later columns get their defaults.
+
+    Raises:
+        ValueError: A row has more or fewer values than there are columns.
+    """
+    if any(len(row) != len(columns) for row in rows):
+        raise ValueError(f"rows must have {len(columns)} values, one for each column")
     found = np.zeros(len(rows), EPISODE)
     for name in COLUMNS:
         if name in columns:

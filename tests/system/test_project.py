@@ -133,7 +133,7 @@ def test_a_sweep_trains_and_ships_its_policies_first_only_if_told_to():
     assert "job=train" not in planned()
     told = planned("train=true", "ARGS=budget=smoke")
     flown = "+exp=robustness 'study.policies=[rgb,straight,oracle]' budget=smoke"
-    parts = ["job=train", "+exp=ship budget=smoke", flown]
+    parts = ["job=train", "launch publish budget=smoke", flown]
     assert sorted(map(told.index, parts)) == list(map(told.index, parts))
 
 

@@ -63,11 +63,11 @@ def test_each_simulation_is_measured_once_whatever_is_evaluated_in_it(tmp_path, 
 def test_what_raises_or_dies_stops_no_other_and_is_evaluated_by_the_next_run(tmp_path, store, executor):
     tasks = planned(sweep_config(tmp_path, axes=SEEN), "straight").tasks
     keys = {task.condition: task.key for task in tasks}
-    raised, died = ("speed", "10"), ("rate", "100")
+    raised, died = ("speed", 10), ("rate", 100)
     executor.broken = {raised: "ValueError: no", died: ""}
     results, failed = evaluate_tasks(tasks, store, executor)
     assert failed == {keys[raised]: "ValueError: no", keys[died]: "its process ended 3 times"}
-    assert set(results) == {keys["speed", "20"]}
+    assert set(results) == {keys["speed", 20]}
     executor.broken = {}
     executor.evaluated.clear()
     assert evaluate_tasks(tasks, store, executor)[1] == {}

@@ -49,7 +49,8 @@ def test_a_study_is_published_with_its_data_figures_and_page_and_the_plan_stays(
     assert re.search(
         r"\| `bytestream` \| tolerates dead pixels \| D.3 \| `event_image` \| undecided \| \S+ m", text
     )
-    assert "| nominal | poles_eval | 80 [" in text
+    estimates = (docs / "data" / "robustness_estimates.csv").read_text()
+    assert "\nnominal,poles_eval,bytestream,3,60,0.8000," in estimates
     assert "\n\n\n" not in text
     assert str(tmp_path) not in text
     names = {f"results_{name}.png" for name in ("axes", "contacts", "survival", "map", "claims")}

@@ -318,12 +318,14 @@ def test_a_refusal_leaves_neither_run_folder_nor_store(tmp_path):
         raise ConfigError("algo.num_env_runners: too many")
     undo()
     assert list(tmp_path.iterdir()) == []
-    folder = open_run(small_config(tmp_path))
+    more = tmp_path / "more"  # MLflow keeps the connection to a removed file as long as a process lives
+    more.mkdir()
+    folder = open_run(small_config(more))
     with open_tracker(folder.config, folder):
         finish(folder, "train", {"eval/distance_m": 1.0})
     undo()
     assert (folder.path / "stages" / "train.json").is_file()
-    assert (tmp_path / "mlflow.db").is_file()
+    assert (more / "mlflow.db").is_file()
 
 
 URI, EXPERIMENT = "MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"
