@@ -15,7 +15,6 @@ import numpy as np
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, EnvConfig
-from envs.corridor import CorridorEnv
 from jobs.analysis.tables import show_table
 from jobs.analysis.video import coloured, frame, last_polarity, open_film
 from jobs.config.config import Config, ConfigError
@@ -32,8 +31,6 @@ ACTIONS = ("forward", "left", "right")
 HEADINGS = ("Recording", "Policy", "Steps", "Events/step", "Forward", "Left", "Right", "p50", "p95", "p99")
 FILM_FPS, SLOWEST_FPS = 50.0, 5.0
 FAR = 5.0  # times the event rate of the training, or less than its reciprocal: a warning
-RATE_EPISODES, RATE_STEPS = 3, 100  # of the simulation whose event rate is measured
-FORWARD = ACTIONS.index("forward")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -86,7 +83,7 @@ def run(config: Config) -> list[Choice]:
             f"{fitted.gaps:,} gaps, {fitted.closed_us / 1e6:,.1f} s together, are closed in all times.",
             markup=False,
         )
-    _tell_rate(recorded, trained_rate(policy, config.seed))
+    _tell_rate(recorded, trained_rate(policy))
     choices, name = choose(policy, recorded), f"{found.group}-s{found.training}"
     show_table("A policy looks at a recording", HEADINGS, [line(recorded.name, name, choices)], words=2)
     console.print(
@@ -124,31 +121,20 @@ def choose(policy: Policy, recorded: Recorded) -> list[Choice]:
     return choices
 
 
-def trained_rate(policy: Policy, seed: int) -> float:
-    """Return the events of a control step, on average, in the simulation that a policy was trained in.
-
-    A vehicle that flies straight on, in corridors of the policy's camera; the policy's file does not say it.
-    """
-    env = CorridorEnv(**{**policy.env_fields, "observation": "events"})
-    counts: list[int] = []
-    for episode in range(RATE_EPISODES):
-        env.reset(seed=seed + episode)
-        ended = False
-        while not ended and len(counts) < RATE_STEPS * (episode + 1):
-            _, _, terminated, truncated, info = env.step(FORWARD)
-            counts.append(int(info["num_events"]))
-            ended = terminated or truncated
-    return float(np.mean(counts))
+def trained_rate(policy: Policy) -> float | None:
+    """Return the mean events of a control step in the training of a policy, None if its file lacks them."""
+    rate = policy.manifest.get("figures", {}).get("sim/events_per_step")
+    return None if rate is None else float(rate)
 
 
-def _tell_rate(recorded: Recorded, trained: float) -> None:
+def _tell_rate(recorded: Recorded, trained: float | None) -> None:
     """Print a warning if a recording's event rate is far from what the policy knows."""
     rate = recorded.events.size / len(recorded.ends_us)
-    if not trained / FAR <= rate <= trained * FAR:
+    if trained is not None and not trained / FAR <= rate <= trained * FAR:
         console.print(
             f"The recording has {rate:.1f} events a control step, and the policy was trained with about "
             f"{trained:.0f}: it has not seen such input. Record with another contrast threshold or lens, or "
-            "train a policy whose encoder knows such recordings (docs/pretrain.md).",
+            "train a policy whose encoder knows such recordings (docs/encoder.md).",
             markup=False,
         )
 

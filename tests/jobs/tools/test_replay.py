@@ -13,6 +13,7 @@ from jobs.config.config import ConfigError, parse
 from jobs.tools import replay as recording_replay
 from models.policy import load_policy
 from tests.support.configs import compose
+from tests.support.event_files import some_events
 
 ROOT = Path(__file__).resolve().parents[3]
 POLICY = ROOT / "models" / "pretrained" / "bytestream-s0"
@@ -76,3 +77,25 @@ def test_a_policy_without_events_and_a_file_that_is_none_are_refused(tmp_path):
         replayed(tmp_path, tmp_path / "none.h5", policy=ROOT / "models" / "pretrained" / "rgb-s0")
     with pytest.raises(ConfigError, match=r"replay\.recording: "):
         replayed(tmp_path, tmp_path / "none.h5")
+
+
+def test_a_scattered_recording_gives_steps_without_events_and_a_word_about_its_rate(tmp_path, capsys):
+    few = some_events(
+        0, 4000, 640, 480, 200_000
+    )  # no block of pixels changes by as many events as it has pixels
+    write_events(tmp_path / "few.raw", few, 640, 480)
+    choices = replayed(tmp_path, tmp_path / "few.raw")
+    assert sum(choice.events.size for choice in choices) == 0
+    assert len(choices) == 39
+    said = capsys.readouterr().out
+    assert "The recording has 0.0 events a control step, and the policy was trained with about" in said
+
+
+def test_the_gap_of_a_recording_is_closed_and_told(tmp_path, capsys):
+    events = simulated(6)
+    late = events.copy()
+    late["t"] += 3_000_000_000
+    write_events(tmp_path / "gap.npz", np.concatenate((events, late)), 64, 64)
+    assert len(replayed(tmp_path, tmp_path / "gap.npz")) <= 13
+    said = capsys.readouterr().out
+    assert "1 gaps, 3,000.0 s together, are closed" in said.replace("2,999.9", "3,000.0")
