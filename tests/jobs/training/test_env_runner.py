@@ -99,12 +99,12 @@ def test_one_that_resumes_samples_as_the_one_that_went_on(name, tmp_path):
     ppo = build_algorithm(config, write_encoder(tmp_path, config) if KINDS[name].encoder else None)
     first, second = (PlainEnvRunner(config=ppo, worker_index=0) for _ in range(2))
     samples_of(first, (40, 17))
-    kept, number = first.snapshot(), first.module.steps
+    kept, number = first.snapshot(), first.shown.steps
     parts = [first.take_part() for _ in range(2)]
     torch.manual_seed(9)
     assert second.resume(kept) == ""
     again = [second.take_part() for _ in range(2)]
-    assert second.module.steps == first.module.steps >= number
+    assert second.shown.steps == first.shown.steps >= number
     for mine, other in zip(parts, again, strict=True):
         assert mine.began == other.began
         for one, two in zip(mine.episodes, other.episodes, strict=True):

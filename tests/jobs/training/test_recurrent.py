@@ -9,7 +9,7 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from jobs.config.config import ConfigError
 from jobs.training.algorithms import build_algorithm
-from jobs.training.ppo.learner import PlainPPOLearner, _minibatch
+from jobs.training.ppo.learner import REWARD_SCALE, PlainPPOLearner, _minibatch
 from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, sequences
 from jobs.training.sampling.env_runner import STATES, PlainEnvRunner
 from models.policy.rllib_module import STATE
@@ -89,13 +89,14 @@ def test_an_update_improves_the_loss_and_moves_every_weight(sampled):
     assert all(not torch.equal(before[name], after[name]) for name in before)
 
 
-def for_rllib(episode, module):
-    """The episode with the states that RLlib's own env runner would have recorded."""
+def for_rllib(episode, module, reward_scale):
+    """The episode with the states that RLlib's env runner would have recorded, and with scaled rewards."""
     states = torch.from_numpy(episode.get_extra_model_outputs(STATES)[:1])
     shown = torch.from_numpy(np.asarray(episode.get_observations())[:-1])[None]
     with torch.no_grad():
         after = module.trunk(shown, states)[0][0].numpy()
     episode = copy.deepcopy(episode)
+    episode.set_rewards(new_data=reward_scale * episode.get_rewards())
     del episode.extra_model_outputs[STATES]
     episode.extra_model_outputs[Columns.STATE_OUT] = InfiniteLookbackBuffer({STATE: after})
     return episode
@@ -112,8 +113,9 @@ def test_rllibs_learner_sees_the_same_sequences(sampled):
     ours.set_state(theirs.get_state())
     module = theirs.module["default_policy"].unwrapped()
     begun = [episode for episode in first if episode.t_started == 0]
+    scale = learner.config.learner_config_dict[REWARD_SCALE]
     results = [
-        theirs.update(episodes=[for_rllib(episode, module) for episode in begun], num_epochs=1),
+        theirs.update(episodes=[for_rllib(episode, module, scale) for episode in begun], num_epochs=1),
         ours.update(episodes=copy.deepcopy(begun), num_epochs=1),
     ]
     for name in ("entropy", "vf_loss"):
