@@ -8,10 +8,11 @@ import pytest
 
 from jobs.run.checkpoints import mend, seal
 from jobs.training.ppo import algorithm
+from jobs.training.trainable import Trainable
 from tests.support.runs import trial_storage
 
 
-class Small(algorithm.Trainable):
+class Small(Trainable):
     """Of a single weight; notes where its checkpoints are made, and may meet a full disk."""
 
     full = False
