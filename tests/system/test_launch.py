@@ -108,7 +108,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["faults.sparsity=1.5"], "faults.sparsity: Input should be less than or equal to 1, got 1.5"),
         (["env.scene=moon"], "env.scene: must be one of cones, dynamic, gates, poles, "),
         (["collect.scenes=[moon]"], "collect.scenes: must be one of cones, dynamic, gates, poles, "),
-        (["+exp=hold", "study.scene=moon"], "study.scene: must be one of cones, dynamic, gates, poles, "),
+        (["job=study", "study.scene=moon"], "study.scene: must be one of cones, dynamic, gates, poles, "),
         (
             ["+env.layout.num_obstacles=100000"],
             "env.layout: layout num_obstacles=100000 cannot be placed 2.0 m apart",
