@@ -59,12 +59,12 @@ def test_what_no_measurement_could_test_is_drawn_apart():
 
 def test_the_page_tells_what_the_model_and_the_points_are():
     published = from_plain(read_json(REPOSITORY / "docs" / "data" / "scaling.json"))
-    page = (REPOSITORY / "docs" / "cluster.md").read_text()
+    page = " ".join((REPOSITORY / "docs" / "deploy.md").read_text().split())
     rates = [STEPS / sum(iteration_s(published.costs, cores)) for cores in (1, 2, 10, 100)]
-    for rate, where in zip(rates, ("1 core", "2 (", "10,", "100, and"), strict=True):
+    for rate, where in zip(rates, ("1 core", "2 (", "10,", "100."), strict=True):
         assert f"{round(rate, -2):,.0f}{' steps/s' if where == '1 core' else ''} on {where}" in page
     measured = [rate for (_, runners), rate in published.rates.items() if runners <= 2]
     assert all(f"{value:,.0f}" in page for value in measured)
     assert all(f"{3600 * published.sweeps[cores]:,.0f}" in page for cores in (1, 2))
-    assert f"predicts {2 * 3600 / published.costs.cell_s:,.0f}:" in page
-    assert f"at about {3600 / published.costs.trial_s:,.0f} an hour" in page
+    assert f"(model: {2 * 3600 / published.costs.cell_s:,.0f})" in page
+    assert f"at about {3600 / published.costs.trial_s:,.0f} the driver" in page
