@@ -145,7 +145,7 @@ def new_page(name: str) -> str:
 def _results(study: Study, _: str) -> str:
     blocks = [_summary(study, ""), *(_figure(study, name) for name in _figures(study))]
     blocks += [_family(study, name, heading=True) for name in study.families]
-    if "spread" in study.said:
+    if study.said.get("spread"):
         blocks.append(f"### By {study.said['spread']['rows']} and by {study.said['spread']['columns']}\n\n"
                       f"{_spread(study, '')}")  # fmt: skip
     if study.doses:
@@ -160,7 +160,7 @@ def _summary(study: Study, _: str) -> str:
     results = study.results
     said = [tables.lead_sentence(results, own) if name == "lead" else tables.family_sentence(family, own)
             for name, (family, own) in study.families.items()]  # fmt: skip
-    if "spread" in study.said:
+    if study.said.get("spread"):
         overall, _each, names, mean = _crossed(study)
         said.append(tables.spread_sentence(overall, names, mean))
     if not study.said.get("variants"):

@@ -79,7 +79,7 @@ def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_reru
 def test_a_failed_task_stands_in_the_table_and_its_child_comes_when_it_is_evaluated(tmp_path):
     config = in_store(sweep_config(tmp_path), tmp_path)
     executor = FakeExecutor()
-    executor.broken = {("rate", "100"): "ValueError: no"}
+    executor.broken = {("rate", 100): "ValueError: no"}
     run(config, executor)
     table = open_run(config).path / "study" / "table.md"
     assert "| rate | 100 | failed |" in table.read_text()
