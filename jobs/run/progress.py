@@ -56,23 +56,26 @@ class _PlainLines:
 
     def __init__(self, title: str, total: int, unit: str, done: int) -> None:
         self.title, self.total, self.unit = title, total, unit
-        self.done, self.first = done, done
+        self.done = done
         self.started = self.shown = time.monotonic()
+        self.counted: tuple[float, int] | None = None  # when, and at how many, the first units were reported
         self.note = ""
 
     def advance(self, count: int, note: str = "") -> None:
         self.done += count
+        # The speed leaves out what comes before the first units, as the start of a cluster.
+        self.counted = self.counted or (time.monotonic(), self.done)
         self.note = note or self.note
         if time.monotonic() - self.shown >= PLAIN_LINE_EVERY_S and self.done < self.total:
             self.show(self.note)
 
     def show(self, note: str, final: bool = False) -> None:
         self.shown = time.monotonic()
-        elapsed = self.shown - self.started
-        rate = (self.done - self.first) / elapsed if elapsed > 0 else 0.0
+        since, first = self.counted or (self.shown, self.done)
+        rate = (self.done - first) / (self.shown - since) if self.done > first else 0.0
         parts = [f"{self.title}: {self.done:,}/{self.total:,} {self.unit}"]
         if final:
-            parts.append(f"in {clock(elapsed)}")
+            parts.append(f"in {clock(self.shown - self.started)}")
         elif rate > 0:
             parts.append(f"{rate:,.0f}/s, {clock((self.total - self.done) / rate)} left")
         if note or final:

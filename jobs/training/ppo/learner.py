@@ -292,7 +292,9 @@ class PlainPPOLearner(PPOTorchLearner):
     ) -> dict[str, Any]:
         """Pass over the rows in sequences of at most `SEQUENCE` successive steps, shuffled as wholes."""
         parts = sequences(rows, SEQUENCE)
-        size = max(1, minibatch_size // SEQUENCE)
+        # Short sequences make more than steps / SEQUENCE of them.
+        everything = minibatch_size >= len(rows[Columns.ACTIONS])
+        size = len(parts[FIRST_ROW]) if everything else max(1, minibatch_size // SEQUENCE)
         for order in orders:
             # An order of sequences from one of rows: each comes where its first row does.
             first = parts[FIRST_ROW]

@@ -18,7 +18,7 @@ from jobs.training.sampling.corridors import corridor_settings
 from models.kinds import KINDS
 from tests.support.configs import SHORT, make_config
 from tests.support.episodes import infos_of
-from tests.support.policies import TRAINED, kinds
+from tests.support.policies import TAUGHT, kinds
 from tests.support.runs import write_encoder
 
 WORDS = (*SHORT, "algo=imitation", "model=event_columns", "algo.num_env_runners=0", "train.env_steps=1000")
@@ -146,7 +146,7 @@ def test_labels_are_learnt(learner, rolled_out):
     assert losses[-1] < 0.8 * losses[0]
 
 
-@pytest.mark.parametrize("name", kinds(TRAINED, quick=("event_columns",)))
+@pytest.mark.parametrize("name", kinds(TAUGHT, quick=("event_columns",)))
 def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(name, tmp_path, monkeypatch):
     """And nothing else is rolled out than without them; RLlib's own pieces are cut alike."""
     own = ("model.encoder=finetuned",) if name == "finetuned" else (f"model={name}",)
@@ -284,7 +284,7 @@ def test_algo_imitation_names_both_parts(config):
     assert ppo.lr == 1e-3
 
 
-@pytest.mark.parametrize("name", kinds(TRAINED, quick=("bytestream",)))
+@pytest.mark.parametrize("name", kinds(TAUGHT, quick=("bytestream",)))
 def test_every_kind_of_policy_can_be_taught(name, tmp_path):
     own = "model.encoder=finetuned" if name == "finetuned" else f"model={name}"
     few = "algo.imitation.fit_steps=2", "algo.minibatch_size=8"

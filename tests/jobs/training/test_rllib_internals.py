@@ -16,7 +16,7 @@ from jobs.training.sampling.rllib_internals import ENV_RUNNER, GROUP, LEARNER, M
 def defined(part, name):
     """Whether a class of RLlib has a method of this name, or gives itself an attribute of it."""
     sources = (inspect.getsource(base) for base in part.__mro__ if base.__module__.startswith("ray."))
-    return hasattr(part, name) or any(f"self.{name}" in source for source in sources)
+    return hasattr(part, name) or any(re.search(rf"self\.{name}\b", source) for source in sources)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import sys
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, sensor_settings
 from envs.corridor import CorridorEnv
@@ -18,6 +17,7 @@ from models.policy.networks import build_networks
 from models.policy.policy import ENCODER, MANIFEST
 from tests.support.policies import (
     ABOUT,
+    RECURRENT,
     SIDE,
     TRAINED,
     make_evae,
@@ -69,9 +69,14 @@ def expected_logits(name, flights):
     stacks = []
     for observations in flights:
         features = list(feature_of(spec).from_observations(observations, spec, table))
-        stacks.append(np.stack((features[:1] * 2 + features)[-3:]))
+        padded = features[:1] * 2 + features
+        stacks.append(np.stack([np.stack(padded[step : step + 3]) for step in range(len(features))]))
+    shown = torch.from_numpy(np.stack(stacks))
     with torch.no_grad():
-        return networks["pi"](networks["trunk"](torch.from_numpy(np.stack(stacks)))).numpy()
+        if name in RECURRENT:
+            _, last = networks["trunk"](shown, torch.zeros(len(shown), spec.model.units))
+            return networks["pi"](last).numpy()
+        return networks["pi"](networks["trunk"](shown[:, -1])).numpy()
 
 
 def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(name, folder):
@@ -164,12 +169,10 @@ def test_actions_are_int64_and_the_likeliest_ones(name, folder):
 
 
 def test_a_stochastic_policy_draws_actions_with_their_probabilities():
-    class Fixed(nn.Module):
-        def forward(self, stacks):
-            return torch.log(torch.tensor([0.2, 0.5, 0.3])).repeat(len(stacks), 1) + 40.0
-
-    count, spec = 4000, make_spec("event_columns")
-    networks = nn.ModuleDict({"trunk": nn.Identity(), "pi": Fixed()})
+    count, spec, networks = 4000, make_spec("event_columns"), make_networks("event_columns")
+    *_, last = networks["pi"].modules()
+    last.weight.data.zero_()
+    last.bias.data = torch.log(torch.tensor([0.2, 0.5, 0.3])) + 40.0
     policy = Policy(networks, spec, deterministic=False, rng=np.random.default_rng(4))
     policy.reset(count)
     actions = policy(np.repeat(make_windows(np.random.default_rng(5), 1), count, axis=0))

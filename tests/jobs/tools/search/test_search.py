@@ -1,6 +1,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,8 +97,8 @@ class Diverging:
 @pytest.fixture
 def a_trial(tmp_path, monkeypatch):
     """One of such a training, which Tune keeps."""
-    monkeypatch.setattr(trial, "build_algorithm", lambda *asked: None)
-    monkeypatch.setattr(trial, "PPO", Diverging)
+    algorithm = SimpleNamespace(build=lambda *asked: None, trainable=lambda config: Diverging)
+    monkeypatch.setattr(trial, "algorithm_of", lambda config: algorithm)
     one = SearchTrial.__new__(SearchTrial)
     one.__dict__.update(_logdir=str(tmp_path / "log"), _storage=trial_storage(tmp_path))
     return one
