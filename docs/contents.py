@@ -18,8 +18,8 @@ CONTENTS = {
 # A page of the sidebar -> pages below it, which it lists itself.
 BELOW = {
     "studies": (
-        "dose_response_taught", "dose_response", "ppo_claims", "taught_claims", "ppo_paper", "ppo_event_set",
-        "encoder_seeds", "camera_rates", "ablation", "training_lengths", "representations",
+        "pooling", "dose_response_taught", "dose_response", "ppo_claims", "taught_claims", "ppo_paper",
+        "ppo_event_set", "encoder_seeds", "camera_rates", "ablation", "training_lengths", "representations",
     ),
     "events": ("notebooks/events",),
     "encoder": ("notebooks/encoder",),

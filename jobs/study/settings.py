@@ -26,8 +26,9 @@ class Settings:
         seeds: Of the trainings of each variant.
         variants: Name -> what it changes, key -> value, with the place in a list as a number. `train.init`
             names the first variant: its policy of the same seed is trained on. `seeds` gives a variant fewer
-            trainings. `encoder_seed` names one of the seeds: all trainings of the variant see by the first
-            variant's encoder of that seed. `tags` are facts for the families, `published` as below.
+            trainings. Variants whose encoders learn from the same settings share them, seed by seed;
+            `encoder_seed` names one of the seeds: all trainings of the variant see by the encoder of that
+            seed. `tags` are facts for the families, `published` as below.
         published: Where published policies of a group are, but for "-s0" and so on; VARIANT is the group.
         train: Whether the variants are trained; false: the published policies are evaluated.
         families: Name -> tests that are corrected together, or a file of conf/claims (jobs/study/spec.py).

@@ -24,7 +24,7 @@ ENCODER_FILES = (
     "stages/collect.json",
     "stages/pretrain.json",
 )
-# Settings that change nothing an encoder learns from: such a variant uses the encoder of the first.
+# Settings that change nothing an encoder learns from: variants that differ in these alone share encoders.
 SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden")
 INIT = "train.init"
 STATED = ("algo", "train", "collect", "pretrain")  # sections that a manifest states, beside the model's
@@ -99,7 +99,7 @@ def train_variants(config: Config) -> dict[Training, Run]:
     """Train every variant with every seed unless that is done; return the runs."""
     trained = dict[Training, Run]()
     for name, seed in trainings_of(config):
-        first = trained.get((_first(config), encoder_seed_of(config, name, seed)))
+        first = trained.get((encoder_owner(config, name), encoder_seed_of(config, name, seed)))
         trained[name, seed] = train_variant(config, name, seed, first)
     return trained
 
@@ -145,11 +145,22 @@ def encoder_seed_of(config: Config, name: str, seed: int) -> int:
     return int(named)
 
 
+def encoder_owner(config: Config, name: str) -> str:
+    """Return the first variant whose encoders learn from the same settings, often the variant itself."""
+    own = _encoder_changes(config, name)
+    return next(other for other in config.own.variants if _encoder_changes(config, other) == own)
+
+
 def shares_encoder(config: Config, name: str) -> bool:
-    """Whether a variant uses an encoder of the first: there is one, and it learns from nothing changed."""
-    changes = changes_of(config, name)
-    same = changes.get(INIT) is None and all(key.startswith(SAME_ENCODER) for key in changes)
-    return config.model.has_encoder and same
+    """Whether a variant uses the encoders of an earlier one: it has one, and starts from no policy."""
+    if changes_of(config, name).get(INIT) is not None or encoder_owner(config, name) == name:
+        return False
+    return variant_config(config, name, config.own.seeds[0]).model.has_encoder
+
+
+def _encoder_changes(config: Config, name: str) -> dict[str, Any]:
+    """Return the settings that a variant changes and that its encoder learns from."""
+    return {key: value for key, value in changes_of(config, name).items() if not key.startswith(SAME_ENCODER)}
 
 
 def changes_of(config: Config, name: str) -> dict[str, Any]:
@@ -191,7 +202,7 @@ def _set(values: Any, key: str, value: Any) -> None:
 
 
 def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Run:
-    """Train a variant unless that is done, on the encoder of a run of the first where it may."""
+    """Train a variant unless that is done, on the encoder of the run `first` where it may."""
     own = open_run(variant_config(config, name, seed))
     if finished(own, "train") is None:
         console.print(f"Train {name}, seed {seed}", markup=False)

@@ -23,6 +23,8 @@ JOBS = {
     "calibrated_camera": "study",
     "camera_rates": "study",
     "encoder_seeds": "study",
+    "false_events": "study",
+    "pooling": "study",
     "learning_rates": "study",
     "training_lengths": "study",
     "memory_seconds": "study",
