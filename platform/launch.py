@@ -24,7 +24,7 @@ from jobs.config.command_line import experiments, given_keys, hydra_words, once_
 from jobs.config.registry import CONF, JOBS
 from jobs.run.libraries import hold
 from jobs.run.provenance import REPOSITORY as ROOT
-from jobs.run.signals import end_on_signals
+from jobs.run.signals import end_on_signals, signal_of
 from jobs.run.undo import undo
 
 ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
@@ -63,7 +63,7 @@ def main() -> int:
         if values is not None:
             run(values)
     except KeyboardInterrupt as error:
-        number = getattr(error, "number", signal.SIGINT)
+        number = signal_of(error)
         ended = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
         with contextlib.suppress(OSError):  # a terminal that is closed
             print(f"evade: {ended}; the same command continues where it stopped", file=sys.stderr)

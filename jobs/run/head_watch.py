@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from jobs.run.signals import Ended
+from jobs.run.signals import ENDING, signal_of
 
 # Ray waits 60 s for a head that is gone, and then ends the process in the middle of what it does.
 SILENCE_S = 40.0
@@ -43,7 +43,7 @@ def watching_head(
         with _heard(watch.lost):
             yield
     except KeyboardInterrupt as error:
-        if isinstance(error, Ended) or not watch.lost.is_set():
+        if signal_of(error) in ENDING or not watch.lost.is_set():
             raise
         watch.told.set()
         raise HeadLostError(watch.reason) from None

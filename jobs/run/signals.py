@@ -10,6 +10,9 @@ from types import FrameType
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 
 
+_received: list[int] = []  # of ENDING, since `end_on_signals`
+
+
 class Ended(KeyboardInterrupt):
     """The process was asked to end by the signal `number`."""
 
@@ -18,9 +21,18 @@ class Ended(KeyboardInterrupt):
         super().__init__(signal.Signals(number).name)
 
 
+def signal_of(error: KeyboardInterrupt) -> int:
+    """Return the number of the signal that raised an error; SIGINT if none of `ENDING` was received.
+
+    Ray catches `Ended` while it waits in C++ and raises a plain KeyboardInterrupt in its place.
+    """
+    return error.number if isinstance(error, Ended) else (_received or [signal.SIGINT])[-1]
+
+
 def end_on_signals() -> None:
     """Raise `Ended` in the main thread on SIGTERM and SIGHUP; an ignored signal (nohup) stays ignored."""
     if threading.current_thread() is threading.main_thread():
+        _received.clear()
         for number in ENDING:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, _end)
@@ -40,4 +52,5 @@ def keeping_handlers() -> Iterator[None]:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
+    _received.append(number)
     raise Ended(number)

@@ -92,8 +92,7 @@ def _write_cell(panel: Axes, success: np.ndarray, points: float, row: int, colum
 
 def forest(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     """Draw each test of a family with its interval, a panel for each unit, coloured by the verdict."""
-    family, findings = drawn.families[said["family"]]
-    tested = [one for one in findings if one.difference and one.difference.interval]
+    family, tested = drawn.families[said["family"]][0], tested_of(drawn, said)
     units = list(dict.fromkeys(scale_of(one.contrast) for one in tested))
     sizes = [sum(scale_of(one.contrast) == unit for one in tested) for unit in units]
     figure = Figure(figsize=(9.6, 1.2 + 0.42 * sum(sizes)), layout="constrained")
@@ -116,6 +115,12 @@ def forest(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
         panel.set_xlabel(f"Difference [{unit[2]}]; grey: too small to matter", fontsize=8)
         tidy(panel, "x")
     return figure
+
+
+def tested_of(drawn: Drawn, said: Mapping[str, Any]) -> list[Finding]:
+    """Return the findings of a figure's family that have an interval; single trainings have none."""
+    findings = drawn.families[said["family"]][1]
+    return [one for one in findings if one.difference and one.difference.interval]
 
 
 def _label(one: Finding) -> str:
@@ -419,6 +424,13 @@ KINDS: dict[str, Callable[[Drawn, Mapping[str, Any]], Figure]] = {
     "dots": dots,
     "spread": spread,
     "variants": variants,
+}
+# What a kind cannot be drawn without, of the kinds for which data may lack it.
+NEEDED: dict[str, Callable[[Drawn, Mapping[str, Any]], object]] = {
+    "map": lambda drawn, said: drawn.changes,
+    "forest": tested_of,
+    "axes": lambda drawn, said: numeric_axes(drawn.results),
+    "dots": lambda drawn, said: drawn.families[said["family"]][1],
 }
 CAPTIONS = {
     "map": "Success [%] of each group under each condition. Colour: the change against the baseline "

@@ -20,7 +20,7 @@ from jobs.study import tables
 from jobs.study.changes import Change, changes_of, content, replicated
 from jobs.study.contrasts import Finding, by_condition, judge
 from jobs.study.doses import Dose, read_doses
-from jobs.study.figures import CAPTIONS, KINDS, Drawn
+from jobs.study.figures import CAPTIONS, KINDS, NEEDED, Drawn
 from jobs.study.learned import learned
 from jobs.study.results import Condition, Results, place, read_published, value_of
 from jobs.study.spec import Family, families_of, read_study
@@ -102,13 +102,22 @@ def _verdicts(data: Path, name: str) -> dict[tuple[str, ...], str]:
 
 
 def figures(study: Study) -> dict[str, Figure]:
-    """Return name -> each figure of a study; of other data than the file's own the name is the data's."""
-    drawn = Drawn(study.said, study.results, study.changes, study.summaries, study.families, study.doses)
+    """Return name -> each figure of a study that its data suffice for."""
+    drawn = _drawn(study)
     return {name: KINDS[said["kind"]](drawn, said) for name, said in _figures(study).items()}
 
 
 def _figures(study: Study) -> dict[str, Mapping[str, Any]]:
-    return dict(study.said.get("figures") or {})
+    drawn, asked = _drawn(study), dict(study.said.get("figures") or {})
+    return {
+        name: said
+        for name, said in asked.items()
+        if said["kind"] not in NEEDED or NEEDED[said["kind"]](drawn, said)
+    }
+
+
+def _drawn(study: Study) -> Drawn:
+    return Drawn(study.said, study.results, study.changes, study.summaries, study.families, study.doses)
 
 
 def part(study: Study, name: str) -> str:

@@ -3,7 +3,7 @@ import signal
 import pytest
 
 from jobs.run.head_watch import watching_head
-from jobs.run.signals import ENDING, Ended, end_on_signals, keeping_handlers
+from jobs.run.signals import ENDING, Ended, end_on_signals, keeping_handlers, signal_of
 
 
 @pytest.fixture(autouse=True)
@@ -43,3 +43,21 @@ def test_a_signal_is_not_taken_for_a_lost_head():
     end_on_signals()
     with pytest.raises(Ended), watching_head(ask=lambda seconds: True, ended=lambda: ""):
         signal.raise_signal(signal.SIGTERM)
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_the_signal_is_known_where_ray_raises_a_plain_interrupt_in_its_place(number):
+    end_on_signals()
+    assert signal_of(KeyboardInterrupt()) == signal.SIGINT
+
+    def waiting_in_c():
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt from None
+
+    with pytest.raises(KeyboardInterrupt) as error, watching_head(ask=lambda s: True, ended=lambda: ""):
+        waiting_in_c()
+    assert signal_of(error.value) == number
+    end_on_signals()
+    assert signal_of(KeyboardInterrupt()) == signal.SIGINT

@@ -13,8 +13,9 @@ from jobs.study.figures import (
     still_going,
     worst_conditions,
 )
-from jobs.study.page import published
+from jobs.study.page import compute, figures, published
 from jobs.study.results import Results, read_cells
+from jobs.study.spec import read_study
 from tests.support.episodes import flights
 from tests.support.sweep_folders import ABOUT, write_sweep
 
@@ -95,3 +96,12 @@ def test_published_figures_are_drawn_from_their_data(name, kind):
     figure = KINDS[kind](drawn, said)
     marks = sum(len(panel.lines) + len(panel.texts) for panel in figure.axes)
     assert marks >= len(study.results.trained)
+
+
+def test_figures_that_need_more_than_was_evaluated_are_left_out(swept):
+    """A study of one training along one axis without numbers has nothing to compare."""
+    about = {**ABOUT, "groups": {"bytestream": [0]}, "axes": {"nominal": {"poles_eval": {}}}}
+    alone = {(NOMINAL, "bytestream"): {0: swept[NOMINAL, "bytestream"][0]}}
+    said = read_study("robustness")
+    study = compute("alone", said, Results(about, alone), [], None)
+    assert set(figures(study)) == {"results_survival", "results_contacts"} & set(said["figures"])
