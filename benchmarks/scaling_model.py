@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from jobs.analysis.plots import AMBER, BLUE, GREEN, MUTED
+from jobs.analysis.colours import AMBER, BLUE, GREEN, MUTED
 
 STEPS = 2048  # of an iteration (appendix D.1.2)
 BANDWIDTH = 1e9  # of the network between nodes [bytes/s]: 10 Gbit/s

@@ -19,7 +19,8 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT
 from envs.recordings import Recording, read_recording
-from jobs.analysis.plots import COLOURS, EVENT_COLOURS, GRID, INK, MUTED, tidy
+from jobs.analysis.colours import COLOURS, GRID, INK, MUTED
+from jobs.analysis.plots import EVENT_COLOURS, tidy
 from jobs.analysis.statistics import half_width
 from jobs.analysis.tables import publish_plot, publish_table, write_csv
 from jobs.config.config import Config

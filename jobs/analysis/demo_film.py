@@ -1,13 +1,14 @@
 """The film of a recorded episode: camera, events, latent, choice, and the way from above."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from core.pictures import grey_picture
+from jobs.analysis.colours import COLOURS, INK
 from jobs.analysis.ground_plan import ground_plan
-from jobs.analysis.plots import COLOURS, INK
 from jobs.analysis.video import Decode, coloured, open_film, signs
 from jobs.rollout.episodes import outcome_of
 from jobs.rollout.recorded import Moment, RecordedEpisode
@@ -20,7 +21,30 @@ ACTIONS = (("left", 1), ("forward", 0), ("right", 2))  # as a person looks, with
 TEXT, DIM, WALL, TRAIL, CHOSEN = "#f1f5f9", "#94a3b8", "#64748b", "#38bdf8", "#f59e0b"
 GROUND, OBSTACLE, GOAL = "#15181f", "#cbd5e1", "#34d399"
 FONT, SMALL = ImageFont.load_default(18), ImageFont.load_default(15)
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 Box = tuple[int, int, int, int]  # left, top, width, height
+
+
+@functools.lru_cache(maxsize=1024)  # of the texts of a film most are the same in every frame
+def _written(text: str, font: Font, anchor: str) -> tuple[Image.Image, int, int]:
+    """A text as a mask, and where its left and top lie from its anchor [pixels]."""
+    left, top, right, bottom = (round(edge) for edge in font.getbbox(text, anchor=anchor))
+    mask = Image.new("L", (right - left, bottom - top))
+    ImageDraw.Draw(mask).text((-left, -top), text, 255, font, anchor)
+    return mask, left, top
+
+
+def _write(
+    picture: Image.Image,
+    at: tuple[float, float],
+    text: str,
+    colour: str,
+    font: Font,
+    anchor: str,
+) -> None:
+    """Write a text on a picture, where Pillow's `ImageDraw.text` would."""
+    mask, left, top = _written(text, font, anchor)
+    picture.paste(colour, (round(at[0]) + left, round(at[1]) + top), mask)
 
 
 def write_film(path: Path, recorded: RecordedEpisode, title: str, decode: Decode | None) -> Path:
@@ -84,8 +108,10 @@ def _background(recorded: RecordedEpisode, title: str) -> Image.Image:
         draw.line(_on_plan(recorded, np.array([(side_m, 0.0), (side_m, goal_m)])), WALL, 3)
     draw.line(_on_plan(recorded, np.array([(-half_m, goal_m), (half_m, goal_m)])), GOAL, 3)
     draw.rectangle((0, 0, WIDTH, TOP - 1), INK)  # obstacles beside the shown part too
-    draw.text((GAP, HEAD // 2), title, TEXT, FONT, anchor="lm")
-    draw.text((GAP, TOP - LINE // 2), "from above: start on the left, goal on the right", DIM, SMALL, "lm")
+    _write(picture, (GAP, HEAD // 2), title, TEXT, FONT, "lm")
+    _write(
+        picture, (GAP, TOP - LINE // 2), "from above: start on the left, goal on the right", DIM, SMALL, "lm"
+    )
     return picture
 
 
@@ -105,18 +131,18 @@ def _frame(
     draw = ImageDraw.Draw(picture)
     draw.circle(way[1], 7, CHOSEN, TEXT, 2)
     if place == len(moments) - 1:
-        _draw_end(draw, recorded)
+        _draw_end(picture, recorded)
     facts = f"step {place + 1} of {len(moments)}   {moment.t_us / 1e6:4.2f} s   {moment.y_m:5.1f} m"
-    draw.text((WIDTH - GAP, HEAD // 2), facts, TEXT, FONT, anchor="rm")
+    _write(picture, (WIDTH - GAP, HEAD // 2), facts, TEXT, FONT, "rm")
     left = GAP
     for name, panel in _panels(moment, decode):
-        draw.text((left, HEAD + LINE // 2), name, DIM, SMALL, anchor="lm")
+        _write(picture, (left, HEAD + LINE // 2), name, DIM, SMALL, "lm")
         picture.paste(_enlarged(panel), (left, HEAD + LINE))
         left += SIDE + GAP
     right = WIDTH - GAP - left
-    _draw_choice(draw, (left, HEAD, right, 150), moment)
+    _draw_choice(picture, (left, HEAD, right, 150), moment)
     if moment.latent is not None:
-        _draw_latent(draw, (left, HEAD + 160, right, SIDE + LINE - 160), moment.latent, largest)
+        _draw_latent(picture, (left, HEAD + 160, right, SIDE + LINE - 160), moment.latent, largest)
     return picture
 
 
@@ -138,25 +164,25 @@ def _enlarged(panel: np.ndarray) -> Image.Image:
     return Image.fromarray(panel).resize(size, Image.Resampling.NEAREST)
 
 
-def _draw_choice(draw: ImageDraw.ImageDraw, box: Box, moment: Moment) -> None:
+def _draw_choice(picture: Image.Image, box: Box, moment: Moment) -> None:
     """The probability of each action as a bar; the one that is taken in another colour."""
-    left, top, width, _ = box
-    draw.text((left, top + LINE // 2), "probability of each action (taken: amber)", DIM, SMALL, anchor="lm")
+    draw, (left, top, width, _) = ImageDraw.Draw(picture), box
+    _write(picture, (left, top + LINE // 2), "probability of each action (taken: amber)", DIM, SMALL, "lm")
     start, length = left + 74, width - 74 - 56
     for row, (name, action) in enumerate(ACTIONS):
         share, y = moment.probabilities[action], top + LINE + 8 + row * 36
-        draw.text((left, y + 12), name, TEXT, SMALL, anchor="lm")
+        _write(picture, (left, y + 12), name, TEXT, SMALL, "lm")
         draw.rectangle((start, y, start + length, y + 24), GROUND)
         colour = CHOSEN if action == moment.action else WALL
         draw.rectangle((start, y, start + share * length, y + 24), colour)
-        draw.text((left + width, y + 12), f"{share:.0%}", TEXT, SMALL, anchor="rm")
+        _write(picture, (left + width, y + 12), f"{share:.0%}", TEXT, SMALL, "rm")
 
 
-def _draw_latent(draw: ImageDraw.ImageDraw, box: Box, latent: np.ndarray, largest: float) -> None:
+def _draw_latent(picture: Image.Image, box: Box, latent: np.ndarray, largest: float) -> None:
     """Each number of the latent as a bar up or down; `largest` is the size of a full one."""
-    left, top, width, height = box
+    draw, (left, top, width, height) = ImageDraw.Draw(picture), box
     text = f"latent: the {len(latent)} numbers that the policy sees of the events"
-    draw.text((left, top + LINE // 2), text if width > 400 else "latent", DIM, SMALL, anchor="lm")
+    _write(picture, (left, top + LINE // 2), text if width > 400 else "latent", DIM, SMALL, "lm")
     draw.rectangle((left, top + LINE, left + width, top + height), GROUND)
     middle, half = top + (LINE + height) / 2, (height - LINE) / 2 - 3
     pitch = width / len(latent)
@@ -166,10 +192,10 @@ def _draw_latent(draw: ImageDraw.ImageDraw, box: Box, latent: np.ndarray, larges
     draw.line((left, middle, left + width, middle), WALL)
 
 
-def _draw_end(draw: ImageDraw.ImageDraw, recorded: RecordedEpisode) -> None:
+def _draw_end(picture: Image.Image, recorded: RecordedEpisode) -> None:
     """Mark where and how the episode ends."""
     outcome, row = outcome_of(recorded.episode), recorded.episode
     ((x, y),) = _on_plan(recorded, np.array([row["x_m"], row["distance_m"]]))
-    draw.circle((x, y), 10, COLOURS[outcome], TEXT, 2)
+    ImageDraw.Draw(picture).circle((x, y), 10, COLOURS[outcome], TEXT, 2)
     near_goal = x > 0.8 * WIDTH
-    draw.text((x + (-18 if near_goal else 18), y), outcome, TEXT, FONT, anchor="rm" if near_goal else "lm")
+    _write(picture, (x + (-18 if near_goal else 18), y), outcome, TEXT, FONT, "rm" if near_goal else "lm")

@@ -12,49 +12,26 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
-from envs.observations import OFF_RGB, ON_RGB
 from envs.scene import Scene
+from jobs.analysis.colours import (
+    BASELINE_STYLES,
+    BLUE,
+    COLOURS,
+    EVENTS,
+    GREEN,
+    GRID,
+    GROUP_STYLES,
+    INK,
+    MUTED,
+    OTHER_STYLES,
+    RED,
+    TAUGHT,
+)
 from jobs.analysis.ground_plan import ground_plan
 from jobs.analysis.statistics import half_width
 from jobs.rollout.episodes import Trajectory
 
-INK, MUTED, GRID = "#1f2430", "#6b7280", "#e5e7eb"
-BLACK, SLATE = "#111827", "#64748b"
-BLUE, CYAN, GREEN, LIME = "#2563eb", "#0891b2", "#059669", "#65a30d"
-AMBER, BROWN, RED, PINK, PURPLE, VIOLET = "#d97706", "#b45309", "#dc2626", "#db2777", "#7c3aed", "#9333ea"
-GREYS = ("#9ca3af", "#6b7280", "#374151", "#111827")  # of what is shown for comparison, from light to dark
-OFF_ON = [np.array(colour) / 255.0 for colour in (OFF_RGB, (21, 24, 31), ON_RGB)]
-EVENT_COLOURS = LinearSegmentedColormap.from_list("events", OFF_ON)  # OFF, no event, ON
-# Colours by what is drawn.
-COLOURS = {
-    # outcomes of episodes
-    "goal": BLUE, "collision": RED, "time limit": BROWN,
-    # settings of the simulator
-    "default": BLACK, "most exact": BLACK, "together": SLATE, "tolerance": BLUE, "renders": GREEN,
-    "anti-aliasing": AMBER, "pyrender": PURPLE, "encoding": PINK, "culling": CYAN, "memory": RED,
-    # settings of the encoder
-    "precision": LIME, "time bins": VIOLET, "newest events": BROWN, "torch": RED, "chunks": GREEN,
-    "context": CYAN,
-    # codings of time, targets of the decoder, memory modes
-    "additive": BLUE, "eventnet": AMBER, "none": MUTED,
-    "occupancy": BLUE, "signed": AMBER, "aged": GREEN, "counts": PINK,
-    "reference": BLUE, "frame": AMBER, "legacy": RED,
-}  # fmt: skip
-# Colour and marker of each group of policies: Okabe and Ito's colours, which the colour-blind tell apart
-# too, without the yellow; then of the baselines, and of groups that have no look of their own.
-GROUP_STYLES = {
-    "bytestream": ("#0072b2", "o"), "bytestream_xy": ("#56b4e9", "s"), "event_columns": ("#009e73", "^"),
-    "event_set": ("#000000", "D"), "event_image": ("#d55e00", "v"), "event_image_vae": ("#e69f00", "P"),
-    "rgb": ("#cc79a7", "X"), "bytestream_1500k": ("#7a5195", "<"), "bytestream_paper": ("#5b6b1f", "h"),
-    "bytestream_robust": ("#b0003a", ">"), "bytestream_hold": ("#3a3ac8", "p"),
-}  # fmt: skip
-BASELINE_STYLES = {
-    "oracle": ("#6b7280", "."),
-    "straight": ("#9ca3af", "."),
-    "random": ("#c4c9d1", "."),
-}
-OTHER_STYLES = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
-TAUGHT = "taught_"  # before the name of a kind: the group of +exp=taught
+EVENT_COLOURS = LinearSegmentedColormap.from_list("events", EVENTS / 255.0)
 
 
 def style_of(group: str) -> tuple[str, str]:

@@ -1,23 +1,31 @@
 """Films of episodes: what the camera sees, its events, and what the latents hold of them."""
 
 import contextlib
+import re
+import subprocess
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
+import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from core.files import replaced
 from core.pictures import GREY_OFF, GREY_ON, grey_picture
 from envs.events import event_image
-from jobs.analysis.plots import EVENT_COLOURS, INK
+from jobs.analysis.colours import EVENTS, INK
 from jobs.run.files import RunError
+from models.encoder.evae import pictures, reconstruct
+from models.encoder.event_batch import batch_packed
+from models.encoder.weights import load_encoder
+from models.policy.policy import ENCODER
 
 ZOOM, GAP, BAR = 5, 12, 40
 FILM_FPS, FRAMES_PER_FLIGHT_S = 25, 50
 QUALITY = 7  # 0 to 10, best
+FRAMES = ("-map", "0:v:0", "-c", "copy", "-f", "null", "-")  # ffmpeg then counts them
 
 Decode = Callable[[np.ndarray], np.ndarray]
 
@@ -73,10 +81,7 @@ class Film:
         Raises:
             RunError: It does not.
         """
-        try:
-            held = imageio_ffmpeg.count_frames_and_secs(str(self.part))[0] if self._frames else 0
-        except RuntimeError:
-            held = 0
+        held = frames_of(self.part) if self._frames else 0
         if held != self._frames:
             raise self._failure(str(held))
 
@@ -118,6 +123,31 @@ def _start_writer(part: Path, picture: np.ndarray, fps: float) -> Generator[None
     return writer
 
 
+def frames_of(film: Path) -> int:
+    """Return how many frames a film holds, without decoding them; 0 if it cannot be read."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(film), *FRAMES]
+    done = subprocess.run(command, capture_output=True, check=False)  # noqa: S603  ffmpeg of a package
+    counts = re.findall(rb"frame=\s*(\d+)", done.stderr)
+    return int(counts[-1]) if counts and done.returncode == 0 else 0
+
+
+def latent_decoder(policy: Path) -> Decode | None:
+    """Return what draws, from an event window, the picture that a policy's latents hold.
+
+    None for a lean policy, which has no decoder.
+    """
+    evae, _ = load_encoder(policy / ENCODER)
+    if evae.decoder is None:
+        return None
+
+    @torch.no_grad()
+    def decode(window: np.ndarray) -> np.ndarray:
+        logits = evae(batch_packed(window[None], evae.grid))[0]
+        return pictures(reconstruct(logits, evae.target), evae.target, evae.grid)[0].numpy()
+
+    return decode
+
+
 def last_polarity(events: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The last polarity of each pixel, -1, 0 or +1, (H, W); events in time order."""
     return signs(event_image(events, shape[1], shape[0]))
@@ -130,7 +160,8 @@ def signs(image: np.ndarray) -> np.ndarray:
 
 def coloured(picture: np.ndarray) -> np.ndarray:
     """A picture in [-1, 1] as uint8 (H, W, 3): OFF orange, ON blue."""
-    return EVENT_COLOURS((np.clip(picture, -1, 1) + 1) / 2, bytes=True)[:, :, :3]
+    mixed = [np.interp(picture, (-1, 0, 1), channel) for channel in EVENTS.T]
+    return np.stack(mixed, axis=-1).round().astype(np.uint8)
 
 
 def frame(panels: Sequence[tuple[str, np.ndarray]], caption: str) -> np.ndarray:

@@ -19,9 +19,9 @@ from pydantic.dataclasses import dataclass
 from envs.config import STRICT, EnvConfig
 from jobs.analysis.demo_film import write_film
 from jobs.analysis.tables import events_texts, show_table
+from jobs.analysis.video import latent_decoder
 from jobs.config.config import Config
 from jobs.config.schema import Name
-from jobs.evaluation.evaluate import latent_decoder
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
 from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, own_sensor_differences, with_own_filter

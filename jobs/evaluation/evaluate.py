@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 
 from envs.config import WITHOUT_EVENTS, EnvConfig
 from envs.corridor import CorridorEnv
@@ -28,7 +27,7 @@ from jobs.analysis.tables import (
     summary_columns,
     summary_metrics,
 )
-from jobs.analysis.video import Decode, open_film
+from jobs.analysis.video import latent_decoder, open_film
 from jobs.config.config import HELD_OUT_SCENE, TRAINED_SCENE, Config, ConfigError, as_dict
 from jobs.rollout.agents import BASELINES, make_agent
 from jobs.rollout.diagnostics import report_event_error
@@ -49,9 +48,6 @@ from jobs.rollout.tasks import EvaluationTask, make_task
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console
 from jobs.tracking.tracker import Tracker, open_tracker
-from models.encoder.evae import pictures, reconstruct
-from models.encoder.event_batch import batch_packed
-from models.encoder.weights import load_encoder
 from models.policy import load_policy
 from models.policy.policy import ENCODER, MANIFEST
 
@@ -273,20 +269,3 @@ def film_episode(name: str, action: str, env_config: EnvConfig, seed: int, path:
 
         roll_out(agent, env_config, [seed], watch=watch)
     return path
-
-
-def latent_decoder(policy: Path) -> Decode | None:
-    """What draws, from an event window, the picture that a policy's latents hold.
-
-    None for a lean policy, which has no decoder.
-    """
-    evae, _ = load_encoder(policy / ENCODER)
-    if evae.decoder is None:
-        return None
-
-    @torch.no_grad()
-    def decode(window: np.ndarray) -> np.ndarray:
-        logits = evae(batch_packed(window[None], evae.grid))[0]
-        return pictures(reconstruct(logits, evae.target), evae.target, evae.grid)[0].numpy()
-
-    return decode

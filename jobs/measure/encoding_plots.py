@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from jobs.analysis.plots import COLOURS, MUTED, tidy
+from jobs.analysis.colours import COLOURS, MUTED
+from jobs.analysis.plots import tidy
 from jobs.measure.encodings import repeats
 from jobs.measure.measured import Measured
 

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import COLOURS, INK, MUTED, tidy
+from jobs.analysis.colours import COLOURS, INK, MUTED
+from jobs.analysis.plots import tidy
 from jobs.measure.measured import Measured
 
 MIN_ERROR = 1e-3  # that is drawn on a logarithmic axis

@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import INK, MUTED, tidy
+from jobs.analysis.colours import INK, MUTED
+from jobs.analysis.plots import tidy
 
 Range = tuple[float, float, float]  # a value and the ends of its interval
 STYLES = (("o", "#2563eb"), ("^", "#d97706"), ("s", "#111827"))  # of scenes, told apart without colour too

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import MUTED, style_of, tidy
+from jobs.analysis.colours import MUTED
+from jobs.analysis.plots import style_of, tidy
 from jobs.config.conditions import axis_numbers, moving_settings
 from jobs.rollout.tasks import text_of
 from jobs.study.results import Value

@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import INK, MUTED, panel_grid, style_of
+from jobs.analysis.colours import INK, MUTED
+from jobs.analysis.plots import panel_grid, style_of
 
 MAX_ACROSS = 2  # panels side by side
 

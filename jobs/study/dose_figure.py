@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jobs.analysis.plots import INK, MUTED, panel_grid, tidy
+from jobs.analysis.colours import INK, MUTED
+from jobs.analysis.plots import panel_grid, tidy
 from jobs.study.changes import Change
 from jobs.study.results import Condition
 

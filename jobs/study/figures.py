@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from envs.scene import make_scene
-from jobs.analysis.plots import AMBER, BLUE, GREEN, GREYS, INK, MUTED, RED, panel_grid, style_of, tidy
+from jobs.analysis.colours import AMBER, BLUE, GREEN, GREYS, INK, MUTED, RED
+from jobs.analysis.plots import panel_grid, style_of, tidy
 from jobs.analysis.statistics import Difference
 from jobs.config.conditions import NOMINAL, axis_numbers
 from jobs.rollout.agents import BASELINES

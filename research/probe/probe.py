@@ -19,7 +19,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Split
-from jobs.analysis.plots import BROWN, COLOURS, CYAN, GREYS, INK, MUTED, VIOLET, tidy
+from jobs.analysis.colours import BROWN, COLOURS, CYAN, GREYS, INK, MUTED, VIOLET
+from jobs.analysis.plots import tidy
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count

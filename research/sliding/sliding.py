@@ -20,7 +20,8 @@ from pydantic.dataclasses import dataclass
 from envs.config import STRICT, CameraConfig, EnvConfig, FaultsConfig
 from envs.recordings import downscale_events
 from envs.scene.range_scan import NEAR_M
-from jobs.analysis.plots import AMBER, BLUE, INK, tidy
+from jobs.analysis.colours import AMBER, BLUE, INK
+from jobs.analysis.plots import tidy
 from jobs.analysis.statistics import CONFIDENCE
 from jobs.analysis.tables import markdown_table, save_plot, show_table
 from jobs.config.config import Config, ConfigError

@@ -13,21 +13,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from jobs.analysis.plots import (
-    AMBER,
-    BLACK,
-    BLUE,
-    BROWN,
-    CYAN,
-    GREEN,
-    INK,
-    MUTED,
-    PINK,
-    PURPLE,
-    RED,
-    SLATE,
-    tidy,
-)
+from jobs.analysis.colours import AMBER, BLACK, BLUE, BROWN, CYAN, GREEN, INK, MUTED, PINK, PURPLE, RED, SLATE
+from jobs.analysis.plots import tidy
 from tests.soak.dashboard import Dashboard
 from tests.soak.processes import samples, shared_memory
 

@@ -18,7 +18,8 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import LUMINANCE_FLOOR, STRICT, CameraConfig, FaultsConfig, with_floor
 from envs.recordings.event_file import EventFile
-from jobs.analysis.plots import AMBER, BLUE, GREEN, INK, tidy
+from jobs.analysis.colours import AMBER, BLUE, GREEN, INK
+from jobs.analysis.plots import tidy
 from jobs.analysis.tables import save_plot, show_table
 from jobs.config.config import Config
 from jobs.config.schema import Name

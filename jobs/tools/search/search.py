@@ -25,7 +25,8 @@ from ray.tune.search.optuna import OptunaSearch
 
 from core.files import naming
 from envs.config import STRICT, settings_hash
-from jobs.analysis.plots import BLUE, GREYS, INK, tidy
+from jobs.analysis.colours import BLUE, GREYS, INK
+from jobs.analysis.plots import tidy
 from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import Searched
 from jobs.config.config import Config, ConfigError

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from jobs.analysis.plots import BASELINE_STYLES, GROUP_STYLES, TAUGHT, style_of
+from jobs.analysis.colours import BASELINE_STYLES, GROUP_STYLES, TAUGHT
+from jobs.analysis.plots import style_of
 from jobs.config.conditions import NOMINAL
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.policies import PRETRAINED

@@ -5,7 +5,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from jobs.analysis.plots import COLOURS
+from jobs.analysis.colours import COLOURS
 from jobs.config.config import ConfigError
 from jobs.run.folder import locate_run
 from models.kinds import DenseModel, Target
