@@ -20,7 +20,7 @@ def quiet_sensor(width: int, height: int) -> np.ndarray:
 
 
 def filter_neighbours(events: np.ndarray, last_us: np.ndarray, support: int, tau_us: int) -> np.ndarray:
-    """The events that pass, in their order.
+    """Return the events that pass, in their order.
 
     Args:
         events: Events with fields t [us], x, y, in time order and within the sensor; t >= 0 and not before

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def main() -> int:
-    """The command `evade`: the launcher of `python -m platform.launch`, from any folder.
+    """Run the command `evade`: the launcher of `python -m platform.launch`, from any folder.
 
     The launcher is loaded from its file beside this package, because outside the repository
     root `platform` is the standard library's module.

@@ -27,7 +27,7 @@ Box = tuple[int, int, int, int]  # left, top, width, height
 
 @functools.lru_cache(maxsize=1024)  # of the texts of a film most are the same in every frame
 def _written(text: str, font: Font, anchor: str) -> tuple[Image.Image, int, int]:
-    """A text as a mask, and where its left and top lie from its anchor [pixels]."""
+    """Return a text as a mask, and the offset of its left and top from its anchor [pixels]."""
     left, top, right, bottom = (round(edge) for edge in font.getbbox(text, anchor=anchor))
     mask = Image.new("L", (right - left, bottom - top))
     ImageDraw.Draw(mask).text((-left, -top), text, 255, font, anchor)
@@ -77,14 +77,14 @@ def _scale(recorded: RecordedEpisode) -> float:
 
 
 def _shown_m(recorded: RecordedEpisode) -> tuple[float, float]:
-    """From which x to which the plan shows the corridor [m]: what lies beside the way, or up to the walls."""
+    """Return the range of x that the plan shows [m]: the surroundings of the way, at most up to the walls."""
     x_m = [moment.x_m for moment in recorded.moments]
     wall_m = 0.5 * recorded.scene.width_m + MARGIN_M
     return max(-wall_m, min(x_m) - SIDES_M), min(wall_m, max(x_m) + SIDES_M)
 
 
 def _on_plan(recorded: RecordedEpisode, xy_m: np.ndarray) -> list[tuple[float, float]]:
-    """Where points (N, 2) [m] of the corridor are drawn: forward is to the right, the right is down."""
+    """Return where points (N, 2) [m] of the corridor are drawn: forward is right, right is down."""
     scale, (first_m, _) = _scale(recorded), _shown_m(recorded)
     x_m, y_m = np.atleast_2d(xy_m).T
     across, down = (y_m + MARGIN_M) * scale, TOP + (x_m - first_m) * scale
@@ -92,7 +92,7 @@ def _on_plan(recorded: RecordedEpisode, xy_m: np.ndarray) -> list[tuple[float, f
 
 
 def _background(recorded: RecordedEpisode, title: str) -> Image.Image:
-    """What stays the same: the corridor from above, and the title."""
+    """Draw the constant part of the film: the corridor from above, and the title."""
     scene, (first_m, last_m) = recorded.scene, _shown_m(recorded)
     height = int(TOP + (last_m - first_m) * _scale(recorded))
     picture = Image.new("RGB", (WIDTH, height + height % 2), GROUND)
@@ -118,7 +118,7 @@ def _background(recorded: RecordedEpisode, title: str) -> Image.Image:
 def _frame(
     canvas: Image.Image, recorded: RecordedEpisode, place: int, shown: tuple[Decode | None, float]
 ) -> Image.Image:
-    """The picture of one moment; what has been passed stays on the canvas.
+    """Draw one moment; the way so far stays on the canvas.
 
     `shown` is what draws the latent's picture, if anything, and the size of a full bar of the latent.
     """
@@ -165,7 +165,7 @@ def _enlarged(panel: np.ndarray) -> Image.Image:
 
 
 def _draw_choice(picture: Image.Image, box: Box, moment: Moment) -> None:
-    """The probability of each action as a bar; the one that is taken in another colour."""
+    """Draw the probability of each action as a bar; the chosen action has another colour."""
     draw, (left, top, width, _) = ImageDraw.Draw(picture), box
     _write(picture, (left, top + LINE // 2), "probability of each action (taken: amber)", DIM, SMALL, "lm")
     start, length = left + 74, width - 74 - 56
@@ -179,7 +179,7 @@ def _draw_choice(picture: Image.Image, box: Box, moment: Moment) -> None:
 
 
 def _draw_latent(picture: Image.Image, box: Box, latent: np.ndarray, largest: float) -> None:
-    """Each number of the latent as a bar up or down; `largest` is the size of a full one."""
+    """Draw each number of the latent as a bar up or down; `largest` is the size of a full bar."""
     draw, (left, top, width, height) = ImageDraw.Draw(picture), box
     text = f"latent: the {len(latent)} numbers that the policy sees of the events"
     _write(picture, (left, top + LINE // 2), text if width > 400 else "latent", DIM, SMALL, "lm")

@@ -6,7 +6,7 @@ from envs.scene import Scene
 
 
 def ground_plan(scene: Scene, height_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """What a vehicle at a height can hit, walls aside.
+    """Return what a vehicle at a height can hit, except the walls.
 
     Args:
         scene: The corridor.

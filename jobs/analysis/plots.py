@@ -55,7 +55,7 @@ def tidy(panel: Axes, grid: str = "both") -> None:
 def panel_grid(
     count: int, max_across: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of `count` panels in rows of at most `max_across`.
+    """Create a figure of `count` panels in rows of at most `max_across`.
 
     Args:
         count: Panels.

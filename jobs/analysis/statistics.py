@@ -147,7 +147,7 @@ def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | 
 
 
 def _within(found: Difference, bounds: Interval | None) -> Difference:
-    """With an interval that ends at the bounds, if there are any."""
+    """Return the difference with an interval that ends at the bounds, if there are any."""
     if bounds is None or found.interval is None:
         return found
     low, high = found.interval
@@ -216,7 +216,7 @@ def _tested(value: float, parts: Sequence[tuple[float, int]], least: float, most
 
 
 def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple[float, float]:
-    """Standard error and its degrees of freedom, joined as Welch and Satterthwaite do.
+    """Return the standard error and its degrees of freedom, combined as by Welch and Satterthwaite.
 
     Args:
         parts: Parts of the variance with their degrees of freedom; what has none is left out.
@@ -252,7 +252,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def trainings_needed(
     ours: np.ndarray, theirs: np.ndarray, gain: float, family: int = 1, bounds: Interval | None = None
 ) -> int | None:
-    """How many trainings of each side would show a difference of `gain` in four of five studies.
+    """Compute how many trainings of each side show a difference of `gain` in four of five studies.
 
     The power of the test of `crossed_difference` (noncentral t), in as many corridors as these; it must also
     pass the first step of Holm's adjustment, so that the number suffices whatever the other tests say.
@@ -315,7 +315,7 @@ def spread_of(values: np.ndarray) -> Spread:
 
 
 def corridor_spread(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Standard deviation between corridors of the difference of two groups, beyond what chance makes.
+    """Estimate the standard deviation between corridors of the difference of two groups, without chance.
 
     What a corridor does to both alike is no part of it.
 
@@ -367,7 +367,7 @@ class CrossedSpread(NamedTuple):
 
 
 def crossed_spread(values: np.ndarray) -> CrossedSpread:
-    """From which of two crossed factors values differ (analysis of variance without replication, F tests).
+    """Estimate which of two crossed factors values depend on (two-way analysis of variance, F tests).
 
     Args:
         values: Shape (rows, columns), two of each at least.
@@ -385,7 +385,7 @@ def crossed_spread(values: np.ndarray) -> CrossedSpread:
 
 
 def _factor(values: np.ndarray, rest: float) -> tuple[float, float | None]:
-    """Standard deviation of the rows, and the p of its test, by the variance of the rest."""
+    """Return the standard deviation of the rows, and the p of its test, by the variance of the rest."""
     rows, columns = values.shape
     between = columns * float(values.mean(axis=1).var(ddof=1))
     spread = float(np.sqrt(max(between - rest, 0.0) / columns))

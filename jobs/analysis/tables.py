@@ -91,13 +91,13 @@ def events_texts(events_per_step: float, dropped: int) -> tuple[str, str]:
 
 
 def summary_cells(row: Summary) -> tuple[str, ...]:
-    """The label of a summary, then a text for each of `SUMMARY_HEADINGS`."""
+    """Return the label of a summary, then a text for each of `SUMMARY_HEADINGS`."""
     events = events_texts(row.events_per_step, row.dropped)
     return (*row.label, str(row.episodes), percent_text(row.success), estimate_text(row.distance_m), *events)
 
 
 def summary_columns(names: Sequence[str], rows: Sequence[Summary]) -> dict[str, list[str | float]]:
-    """The columns of a tracker's table; the first, all words of the labels joined, is unique."""
+    """Return the columns of a tracker's table; the first, all words of the labels joined, is unique."""
     ends = [row.distance_m.interval or (row.distance_m.value,) * 2 for row in rows]
     return {
         " · ".join(names): [" · ".join(row.label) for row in rows],
@@ -112,7 +112,7 @@ def summary_columns(names: Sequence[str], rows: Sequence[Summary]) -> dict[str, 
 
 
 def estimate_metrics(name: str, estimate: Estimate | Difference | None) -> dict[str, float]:
-    """An estimate as metrics: its value, and the ends of its interval as name_low and name_high, if any."""
+    """Return an estimate as metrics: its value, and the ends of any interval as name_low and name_high."""
     if estimate is None:
         return {}
     ends = zip((f"{name}_low", f"{name}_high"), estimate.interval or (), strict=False)
@@ -120,7 +120,7 @@ def estimate_metrics(name: str, estimate: Estimate | Difference | None) -> dict[
 
 
 def summary_metrics(row: Summary) -> dict[str, float]:
-    """The metrics of a summary under the names that trackers and tables share; NaN: not measured."""
+    """Return the metrics of a summary under the names that trackers and tables share; NaN: not measured."""
     return {
         **estimate_metrics("eval/success_rate", row.success),
         "eval/distance_m_low": float("nan"),

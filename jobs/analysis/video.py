@@ -86,7 +86,7 @@ class Film:
             raise self._failure(str(held))
 
     def _failure(self, held: str) -> RunError:
-        """The error of a film that ffmpeg could not write."""
+        """Return the error of a film that ffmpeg could not write."""
         rule = f"a film there must hold {self._frames} frames, got {held}: ffmpeg could not write them"
         return RunError(f"{self.part.parent}: {rule}; make room there, and give the same command again")
 
@@ -149,17 +149,17 @@ def latent_decoder(policy: Path) -> Decode | None:
 
 
 def last_polarity(events: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The last polarity of each pixel, -1, 0 or +1, (H, W); events in time order."""
+    """Return the last polarity of each pixel, -1, 0 or +1, (H, W); events in time order."""
     return signs(event_image(events, shape[1], shape[0]))
 
 
 def signs(image: np.ndarray) -> np.ndarray:
-    """An event image as polarities -1, 0 or +1, of the same shape."""
+    """Return an event image as polarities -1, 0 or +1, of the same shape."""
     return np.select([image == GREY_ON, image == GREY_OFF], [1, -1])
 
 
 def coloured(picture: np.ndarray) -> np.ndarray:
-    """A picture in [-1, 1] as uint8 (H, W, 3): OFF orange, ON blue."""
+    """Return a picture in [-1, 1] as uint8 (H, W, 3): OFF orange, ON blue."""
     mixed = [np.interp(picture, (-1, 0, 1), channel) for channel in EVENTS.T]
     return np.stack(mixed, axis=-1).round().astype(np.uint8)
 

@@ -42,7 +42,7 @@ class ImitationConfig:
 
 
 def _imitation(values: object) -> object:
-    """The settings of a mapping, which pydantic would not take for a dataclass where it is strict."""
+    """Convert a mapping to the settings, because pydantic in strict mode takes no mapping for a dataclass."""
     return checked(ImitationConfig, dict(values)) if isinstance(values, Mapping) else values
 
 
@@ -97,7 +97,7 @@ class AlgoConfig:
 
     @property
     def name(self) -> str:
-        """The row of `ALGORITHMS`."""
+        """Return the row of `ALGORITHMS`."""
         return "ppo" if self.imitation is None else "imitation"
 
 

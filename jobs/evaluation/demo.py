@@ -59,7 +59,7 @@ class Shown(NamedTuple):
 
 
 def find_shown(config: Config) -> Shown:
-    """What `config` shows.
+    """Find the policy and the environment that `config` asks for.
 
     Raises:
         ConfigError: There is no such policy.
@@ -95,7 +95,7 @@ def run(config: Config) -> np.void:
 
 
 def title_of(name: str, env: EnvConfig, seed: int) -> str:
-    """What stands above a film."""
+    """Return the title of a film."""
     amounts = dataclasses.asdict(env.faults)
     amounts |= amounts.pop("added")
     faults = [f"{key} {value:g}" for key, value in amounts.items() if value]
@@ -104,7 +104,7 @@ def title_of(name: str, env: EnvConfig, seed: int) -> str:
 
 
 def line(name: str, recorded: RecordedEpisode) -> tuple[str, ...]:
-    """A text for each of `HEADINGS`."""
+    """Return a text for each of `HEADINGS`."""
     row, env = recorded.episode, recorded.env
     return (
         *(name, env.scene, str(row["seed"]), "yes" if row["success"] else "no", outcome_of(row)),

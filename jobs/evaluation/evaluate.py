@@ -120,7 +120,7 @@ def evaluate(
 
 
 def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationTask]:
-    """All agents in the held-out scene with the first renderer, and the policy with the others.
+    """Return tasks: all agents in the held-out scene with the first renderer, and the policy with the others.
 
     A training in another scene than `poles` is evaluated there too, of which `poles_eval` says nothing. The
     policy is evaluated with both choices of action, because they can differ by tens of points; the configured
@@ -139,7 +139,7 @@ def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationT
 
 
 def published(name: str) -> EvaluatedPolicy:
-    """A policy of models/pretrained.
+    """Return a policy of models/pretrained.
 
     Raises:
         ConfigError: There is none of this name.
@@ -172,7 +172,7 @@ def label_of(task: EvaluationTask) -> Label:
 def evaluate_all(
     tasks: Sequence[EvaluationTask], store: EpisodeStore, executor: Executor
 ) -> dict[Label, TaskResult]:
-    """The results of the tasks, without those that a second renderer cannot draw.
+    """Return the results of the tasks, without those that a second renderer cannot draw.
 
     Raises:
         RuntimeError: A task of the first renderer failed.
@@ -216,7 +216,7 @@ def publish(folder: Run, tracker: Tracker, summaries: Sequence[Summary], shown: 
 
 
 def evaluation_metrics(summaries: Sequence[Summary]) -> dict[str, float]:
-    """All metrics of the first summary under their plain names, and two of others with a suffix.
+    """Return all metrics of the first summary under their plain names, and two of others with a suffix.
 
     The others are those of the same agent, and those of the same scene.
     """
@@ -232,7 +232,7 @@ def evaluation_metrics(summaries: Sequence[Summary]) -> dict[str, float]:
 
 
 def drift_by_label(results: Mapping[Label, TaskResult]) -> dict[str, float]:
-    """All drift metrics of the first task under plain names; of the policy's others, the drift alone."""
+    """Return all drift metrics of the first task under plain names, and the drift of the policy's others."""
     found: dict[str, float] = {}
     first = next(iter(results))
     for label, result in results.items():
@@ -243,13 +243,13 @@ def drift_by_label(results: Mapping[Label, TaskResult]) -> dict[str, float]:
 
 
 def metric_suffix(label: Sequence[str], first: Sequence[str]) -> str:
-    """The words in which a label differs from the first, for names of metrics: "_poles"."""
+    """Return the words in which a label differs from the first, for names of metrics: "_poles"."""
     words = [word for word, usual in zip(label, first, strict=True) if word != usual]
     return "".join(f"_{word.removeprefix('policy ')}" for word in words)
 
 
 def seed_to_film(episodes: np.ndarray) -> int:
-    """The corridor to film: the first success of the policy, or else its longest episode."""
+    """Choose the corridor to film: the first success of the policy, or else its longest episode."""
     order = np.lexsort((episodes["seed"], -episodes["distance_m"], ~episodes["success"]))
     return int(episodes["seed"][order[0]])
 

@@ -47,7 +47,7 @@ def cost_values(row: Measured) -> tuple[str | float, ...]:
 
 
 def default_encodings(evae: EventVAE) -> list[Encoding]:
-    """The lookup table as it is used, the network itself, and the table with one setting changed."""
+    """Return the lookup table as it is used, the network itself, and the table with one setting changed."""
     table = EncoderTable.from_evae(evae)
     forms = [("default", "", encode_whole(table)), ("torch", "plain network", encode_by_network(evae))]
     for precision in ("int16", "int8"):
@@ -62,12 +62,12 @@ def default_encodings(evae: EventVAE) -> list[Encoding]:
 
 
 def encode_whole(table: EncoderTable) -> Encode:
-    """All events at once."""
+    """Encode all events at once."""
     return lambda window: table.encode(*window)
 
 
 def encode_newest(table: EncoderTable, most: int) -> Encode:
-    """The newest `most` events alone."""
+    """Encode the newest `most` events only."""
     return lambda window: table.encode(window[0][-most:], *window[1:])
 
 
@@ -189,7 +189,7 @@ def _encode_all(encode: Encode, windows: Sequence[Window]) -> None:
 
 
 def repeats(rows: Sequence[Measured]) -> list[Measured]:
-    """The default, and the rows that compute the same: their costs differ by the noise of timing alone."""
+    """Return the default and the rows that compute the same; their costs differ only by timing noise."""
     (default,) = (row for row in rows if row.knob == "default")
     return [row for row in rows if (row.knob, row.setting) in UNCHANGED and row.error == default.error]
 

@@ -162,7 +162,7 @@ class Plan(NamedTuple):
 
 
 def find_encoder_policies(config: Config) -> list[EvaluatedPolicy]:
-    """The policies that are evaluated, each once.
+    """Return the policies that are evaluated, each once.
 
     Raises:
         ConfigError: If `trade.policies` names none, or one without a frozen encoder of single events.
@@ -180,7 +180,7 @@ def find_encoder_policies(config: Config) -> list[EvaluatedPolicy]:
 
 
 def plan(config: Config, policy: EvaluatedPolicy, scene: str) -> Plan:
-    """The settings of a policy in a scene as tasks.
+    """Return the settings of a policy in a scene as tasks.
 
     Raises:
         ConfigError: If the policy's own sensor and a setting exclude each other.
@@ -203,7 +203,7 @@ def plan(config: Config, policy: EvaluatedPolicy, scene: str) -> Plan:
 
 
 def changes(timed: bool) -> list[tuple[str, str, Setting, Setting]]:
-    """What is changed: nothing, each setting of the simulator, each of the encoder, and several at once.
+    """Return the changes: none, each setting of the simulator, each of the encoder, and several at once.
 
     Args:
         timed: Whether the encoder sees time.
@@ -224,7 +224,7 @@ def changes(timed: bool) -> list[tuple[str, str, Setting, Setting]]:
 
 
 def exact_env(env: EnvConfig) -> EnvConfig:
-    """The converged simulation, see `envs.event_error`."""
+    """Return the converged simulation, see `envs.event_error`."""
     corridor = CorridorEnv(env, observation="none")
     corridor.reset(seed=0)
     return converged(env, corridor.scene)
@@ -241,7 +241,7 @@ def _task(
 def measure_plans(
     config: Config, plans: Sequence[Plan], results: Mapping[str, TaskResult]
 ) -> list[list[TradedSetting]]:
-    """The rows of each scene: what was evaluated, and cost and errors on recorded episodes."""
+    """Measure the rows of each scene: evaluated success, cost, and errors on recorded episodes."""
     able = [own._replace(tasks=[task for task in own.tasks if task.key in results]) for own in plans]
     seeds = range(config.own.replays)
     total = len(seeds) * sum(len(own.tasks) for own in able)
@@ -269,7 +269,7 @@ def traded_setting(
     plans: Sequence[tuple[Plan, Mapping[Condition, Measured]]],
     results: Mapping[str, TaskResult],
 ) -> TradedSetting:
-    """The row of a setting in a scene, compared with the default of the same trainings.
+    """Return the row of a setting in a scene, compared with the default of the same trainings.
 
     Args:
         condition: Knob and setting.
@@ -307,7 +307,7 @@ def traded_setting(
 
 
 def _outcome(pairs: Sequence[tuple[np.ndarray, np.ndarray]], other_action: Sequence[float]) -> Outcome:
-    """What trainings reach, from the successes of each and those with the default in the same corridors."""
+    """Compare the successes of each training with its default in the same corridors."""
     reached, usual = (np.stack(part).astype(np.float64) for part in zip(*pairs, strict=True))
     difference = crossed_mean(reached - usual, (-1.0, 1.0))
     return Outcome(len(pairs), reached.size, rate_estimate(reached), difference, float(np.mean(other_action)))
@@ -325,7 +325,7 @@ def speed_ratio(ratios: Sequence[float]) -> Estimate:
 def facts_of(
     config: Config, folder: Run, policies: Sequence[EvaluatedPolicy], failed: Mapping[str, str]
 ) -> TradeFacts:
-    """What made the numbers."""
+    """Return where the numbers come from."""
     trade = config.own
     return {
         "run": folder.path.name,

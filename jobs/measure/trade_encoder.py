@@ -131,7 +131,7 @@ def control_steps(recording: Recording, count: int) -> list[Window]:
 
 
 def cost_cells(row: Measured, network_us: float) -> tuple[str, ...]:
-    """A text for each of `HEADINGS`; "times faster" refers to the network's cost of 2,000 events."""
+    """Return a text for each of `HEADINGS`; "times faster" refers to the network's cost of 2,000 events."""
     costs = f"{row.outcome['step_us']:,.0f}", f"{row.cost_us:,.0f}", f"{network_us / row.cost_us:,.0f}"
     errors = short(100 * row.error), short(100 * row.outcome["error_max"])
     return (row.knob, row.setting, *costs, *errors, f"{100 * row.outcome['explained']:.1f}")

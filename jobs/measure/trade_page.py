@@ -104,12 +104,12 @@ class TradedSetting(NamedTuple):
 
     @property
     def together(self) -> Outcome:
-        """What all trainings reach."""
+        """Return the result of all trainings together."""
         return self.outcomes[ALL]
 
 
 def verdicts(rows: Sequence[TradedSetting]) -> list[Verdict]:
-    """A verdict for each row, by the rule that the page states; `rows` are the family of the tests."""
+    """Return a verdict for each row, by the rule that the page states; `rows` are the family of the tests."""
     tested = [row.together.difference.p for row in rows if row.knob != DEFAULT]
     adjusted = iter(holm([1.0 if p is None else p for p in tested]))
     return [_verdict(row, 1.0 if row.knob == DEFAULT else next(adjusted)) for row in rows]
@@ -127,7 +127,7 @@ def _verdict(row: TradedSetting, p: float) -> Verdict:
 
 
 def on_front(rows: Sequence[TradedSetting]) -> list[bool]:
-    """Which settings of a scene no other one beats: more exact or as exact, and faster beyond doubt."""
+    """Return the settings of a scene that no other beats: at least as exact, and significantly faster."""
     return [
         row.known_error is not None
         and not any(
@@ -150,7 +150,7 @@ def _high(speed: Estimate) -> float:
 
 
 def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
-    """What is published of each setting, by `SETTING_FIELDS`: a line for each group and one for all."""
+    """Return the published values of each setting, by `SETTING_FIELDS`: a line per group and one for all."""
     fronts = [front for own in by_scene(rows) for front in on_front(own)]
     found = []
     for row, verdict, front in zip(rows, verdicts(rows), fronts, strict=True):
@@ -169,7 +169,7 @@ def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
 
 
 def by_scene(rows: Sequence[TradedSetting]) -> list[list[TradedSetting]]:
-    """The rows of each scene."""
+    """Return the rows of each scene."""
     scenes = dict.fromkeys(row.scene for row in rows)
     return [[row for row in rows if row.scene == scene] for scene in scenes]
 
@@ -203,7 +203,7 @@ def _points(setting: Mapping[str, str], end: str) -> float:
 
 
 def headings(groups: Sequence[str]) -> tuple[str, ...]:
-    """Of a scene's table."""
+    """Return the headings of a scene's table."""
     costs = ("Knob", "Setting", "Steps/s", "Speed [times the default's]")
     errors = ("Event error [%]", "Latent error [% of sd]", "Other action [%]")
     reached = [f"{word} `{group}`" for group in groups for word in ("Success [%]", "- default [points]")]
@@ -211,7 +211,7 @@ def headings(groups: Sequence[str]) -> tuple[str, ...]:
 
 
 def trade_lines(rows: Sequence[TradedSetting], groups: Sequence[str]) -> list[tuple[str, ...]]:
-    """The rows as text, one for each of `headings`; all rows are the family of the verdicts."""
+    """Return the rows as text, one for each of `headings`; all rows are the family of the verdicts."""
     return [
         (
             row.knob,
@@ -237,12 +237,12 @@ def _reached(row: TradedSetting, group: str) -> tuple[str, str]:
 
 
 def points_text(difference: Difference) -> str:
-    """A difference of rates in points, with its interval."""
+    """Return a difference of rates in points, with its interval."""
     return estimate_text(difference, 100, "+.0f")
 
 
 def trade_metrics(row: TradedSetting, group: str = ALL) -> dict[str, float]:
-    """The metrics of a row under the names that trackers know; what was not measured is left out."""
+    """Return the metrics of a row under the tracker's names, without values that were not measured."""
     outcome = row.outcomes[group]
     values = {
         "perf/env_steps_per_second": row.steps_per_s,
@@ -270,7 +270,7 @@ class Choice(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As `TradedSetting.name`."""
+        """Return `TradedSetting.name`."""
         return self.rows[0].name
 
     @property
@@ -285,7 +285,7 @@ class Choice(NamedTuple):
 
 
 def choices(rows: Sequence[TradedSetting]) -> list[Choice]:
-    """The settings, each over all scenes, in the order of the rows; those that a scene lacks are left out."""
+    """Return the settings that all scenes have, in the order of the rows."""
     found: dict[tuple[str, str], list[tuple[TradedSetting, Verdict]]] = {}
     for row, verdict in zip(rows, verdicts(rows), strict=True):
         found.setdefault((row.knob, row.setting), []).append((row, verdict))

@@ -154,7 +154,7 @@ def _take_steps(env: CorridorEnv, steps: int) -> None:
 
 
 def changed(default: EnvConfig, setting: Setting) -> EnvConfig:
-    """The default with some settings replaced; "renders" is a number per control step."""
+    """Return the default with some settings replaced; "renders" is a number per control step."""
     for key, value in setting.items():
         if key == "renders":
             step_m = default.speed_mps / default.control_hz
@@ -166,12 +166,12 @@ def changed(default: EnvConfig, setting: Setting) -> EnvConfig:
 
 
 def setting_text(setting: Setting) -> str:
-    """A setting as text, such as "tolerance 0.1"."""
+    """Return a setting as text, such as "tolerance 0.1"."""
     return ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in setting.items())
 
 
 def setting_cells(row: Measured, on_front: bool) -> tuple[str, ...]:
-    """A text for each of `HEADINGS`."""
+    """Return a text for each of `HEADINGS`."""
     events, renders = row.outcome["events"], row.outcome["renders"]
     numbers = (f"{row.cost_us:,.0f}", f"{100 * row.error:.1f}", f"{events:.0f}", f"{renders:.1f}")
     return (row.knob, row.setting, *numbers, "*" if on_front else "")

@@ -273,7 +273,7 @@ def learn() -> None:
 
 
 def some_events() -> np.ndarray:
-    """A hundred events."""
+    """Return a hundred events."""
     from envs.events import EVENT
 
     events = np.zeros(100, EVENT)

@@ -46,12 +46,12 @@ class Run:
 
     @property
     def encoder(self) -> Path:
-        """The frozen encoder, its manifest and checkpoints."""
+        """Return the frozen encoder, its manifest and checkpoints."""
         return self.path / "encoder"
 
     @property
     def init(self) -> Path:
-        """A copy of the policy that the training begins from."""
+        """Return a copy of the policy that the training begins from."""
         return self.path / "init"
 
     @property
@@ -61,7 +61,7 @@ class Run:
 
     @property
     def policy(self) -> Path:
-        """The trained policy, as `models.policy.load_policy` reads it."""
+        """Return the trained policy, as `models.policy.load_policy` reads it."""
         return self.path / "policy"
 
     @property

@@ -84,7 +84,7 @@ def head_answers(seconds: float) -> bool:
 
 
 def ended_process() -> str:
-    """A process of the running Ray that this one has started, that is essential, and has ended; or ""."""
+    """Return an essential process of Ray that this process has started and that has ended; or ""."""
     from ray._private import worker
 
     node = worker._global_node

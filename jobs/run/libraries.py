@@ -32,7 +32,7 @@ NUMPY = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_bitalg", "AVX512_SPR": "avx
 
 
 def processor() -> dict[str, str]:
-    """What Linux says of the first processor: `vendor_id`, `model name`, `flags` and more; else nothing."""
+    """Return Linux's entry of the first processor: `vendor_id`, `model name`, `flags` and more, if any."""
     try:
         first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")
     except OSError:
@@ -43,7 +43,7 @@ def processor() -> dict[str, str]:
 
 
 def held(flags: set[str]) -> dict[str, str]:
-    """The settings for a processor with these `flags`, as Linux names them; none for digits without AVX2."""
+    """Return the settings for a processor with these `flags` of Linux; none without AVX2."""
     if not {"avx2", "fma"} <= flags:
         return ONE_THREAD
     above = [feature for feature, flag in NUMPY.items() if flag in flags]  # numpy warns of those that are not
@@ -57,6 +57,6 @@ def hold() -> None:
 
 
 def of_workers() -> dict[str, str]:
-    """The environment of a Ray worker: the instructions of this process, but one thread."""
+    """Return the environment of a Ray worker: the instructions of this process, but one thread."""
     names = [*SAME_DIGITS, "NPY_DISABLE_CPU_FEATURES"]
     return {name: os.environ[name] for name in names if name in os.environ} | ONE_THREAD

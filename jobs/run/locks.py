@@ -52,7 +52,7 @@ def held_alone(folder: Path) -> Iterator[None]:
 
 
 def private_folder(place: str | None = None) -> Path:
-    """A temporary folder of this user that no other user can read or fill with links; made if it is missing.
+    """Return a temporary folder that no other user can read or fill with links; create it if it is missing.
 
     Args:
         place: The folder that it lies in; the system's temporary folder if None.

@@ -84,7 +84,7 @@ class _PlainLines:
 
 
 def clock(seconds: float) -> str:
-    """A duration as text: 45 s, 3 min 20 s, 2 h 05 min."""
+    """Return a duration as text: 45 s, 3 min 20 s, 2 h 05 min."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

@@ -23,13 +23,13 @@ class Provenance(TypedDict):
 
 
 def provenance() -> Provenance:
-    """The commit and the machine of this process."""
+    """Return the commit and the machine of this process."""
     python = ".".join(map(str, sys.version_info[:3]))
     return {"commit": git_commit(), "host": os.uname().nodename, "cpus": os.cpu_count(), "python": python}
 
 
 def git_commit() -> str:
-    """The repository's commit, with "-dirty" behind it if files differ from it; or "unknown"."""
+    """Return the repository's commit, with "-dirty" behind it if files differ from it; or "unknown"."""
     commit = _git("rev-parse", "HEAD")
     if commit is None:
         return "unknown"
@@ -37,7 +37,7 @@ def git_commit() -> str:
 
 
 def _git(*arguments: str) -> str | None:
-    """The output of a git command, or None without git or a repository."""
+    """Return the output of a git command, or None without git or a repository."""
     try:
         command = ["git", "-C", str(REPOSITORY), *arguments]
         result = subprocess.run(  # noqa: S603  own words, no shell
@@ -49,7 +49,7 @@ def _git(*arguments: str) -> str | None:
 
 
 def command() -> str:
-    """The command that is running, without the words that say where it runs and writes; no local paths."""
+    """Return the command that is running, without local paths and without where it runs and writes."""
     words = [
         re.sub(r"(?<![\w/.-])(?:\.\.)?/[^\s,\]]*/", "", word)  # what stands within the repository stays
         for word in sys.argv[1:]
@@ -59,5 +59,5 @@ def command() -> str:
 
 
 def today() -> str:
-    """The date, UTC."""
+    """Return the date, UTC."""
     return datetime.now(UTC).strftime("%Y-%m-%d")

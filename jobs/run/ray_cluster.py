@@ -173,7 +173,7 @@ def on_loopback() -> Iterator[None]:
 
 
 def ray_folder() -> Path:
-    """Where a local Ray keeps its sockets, logs, locks and staged files: no other user can enter it.
+    """Return the folder of a local Ray's sockets, logs, locks and staged files, private to this user.
 
     Tune copies the state of an experiment through it and unpickles what it finds there. It lies in
     /tmp where the path of the temporary folder is too long for a socket.
@@ -188,14 +188,14 @@ def ray_folder() -> Path:
 
 
 def logs_folder() -> Path:
-    """The logs of the running Ray."""
+    """Return the logs of the running Ray."""
     from ray._private import worker
 
     return Path(worker._global_node.get_logs_dir_path())
 
 
 def session_folder() -> Path | None:
-    """A folder of the running Ray, which goes when its logs do; None without Ray."""
+    """Return a folder of the running Ray, which goes when its logs do; None without Ray."""
     from ray._private import worker
 
     return None if worker._global_node is None else Path(worker._global_node.get_session_dir_path())
@@ -217,7 +217,7 @@ def fit(tuner: Any) -> Any:
 
 
 def storage(cluster: ClusterConfig, folder: Path) -> str:
-    """Where the nodes of a cluster store the files of a folder of a run: a path or an address.
+    """Return where the nodes of a cluster store the files of a run's folder: a path or an address.
 
     Args:
         cluster: Names the storage, if it is not the run folder itself.

@@ -48,7 +48,7 @@ def met(
 
 
 def settings_of(env: EnvConfig) -> dict[str, object]:
-    """The settings that tell conditions apart, by their keys; a scene as the fields of its layout."""
+    """Return the settings that tell conditions apart, by their keys; a scene as the fields of its layout."""
     values: dict[str, Any] = {}
     for key in COMPARED:
         value: Any = env
@@ -70,7 +70,7 @@ def _is_drawn(scene: str) -> bool:
 
 
 def _drawn_settings(condition: Mapping[str, Any], trained: EnvConfig) -> dict[str, list[object]]:
-    """Of each setting the values that a condition may draw, of a range its ends."""
+    """Return, for each setting, the values that a condition may draw; for a range, its ends."""
     ends = {key: _ends(value) for key, value in condition.items() if key != WEIGHT}
     scenes = [scene for scene in ends.pop("env.scene", [trained.scene]) if _is_drawn(scene)]
     worlds = [settings_of(env_with(trained, {"env.scene": scene})) for scene in scenes]

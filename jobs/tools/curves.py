@@ -32,7 +32,7 @@ def read_curves(folder: Path) -> dict[tuple[str, int], Curve]:
 
 
 def as_csv(curves: Sequence[Curve]) -> str:
-    """The curves as one table, a row per point."""
+    """Return the curves as one table, a row per point."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -64,7 +64,7 @@ class PublishedTraining(NamedTuple):
 
 
 def published_trainings(folder: Path) -> list[PublishedTraining]:
-    """What the manifests and the learning curves of the published policies say, by group and seed."""
+    """Read the manifests and learning curves of the published policies, by group and seed."""
     return [_published(folder, curve) for _, curve in sorted(read_curves(folder).items())]
 
 

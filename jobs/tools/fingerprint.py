@@ -91,7 +91,7 @@ def run(config: Config) -> dict[str, str]:
 
 
 def machine() -> dict[str, str]:
-    """What this processor is, and what computes on it."""
+    """Describe this processor, and the libraries that compute on it."""
     known = processor()
     flags = set(known.get("flags", "").split())
     name = (
@@ -105,12 +105,12 @@ def machine() -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """The versions of the packages that compute."""
+    """Return the versions of the packages that compute."""
     return {package: version(package).partition("+")[0] for package in PACKAGES}
 
 
 def digest(arrays: Arrays) -> str:
-    """The first 16 digits of the SHA-256 of all bytes, one array after the other."""
+    """Return the first 16 digits of the SHA-256 of all bytes, one array after the other."""
     whole = hashlib.sha256()
     for array in arrays:
         whole.update(np.ascontiguousarray(array).tobytes())
@@ -118,7 +118,7 @@ def digest(arrays: Arrays) -> str:
 
 
 def stages(config: Config) -> Iterator[tuple[str, Arrays]]:
-    """The stages in the order of a training: name, and the arrays that it makes."""
+    """Yield the stages in the order of a training: name, and the arrays that it makes."""
     yield "pictures", pictures()
     recording = recorded(config)
     yield "events", [recording.events, *recording.index.values()]
@@ -142,13 +142,13 @@ def stages(config: Config) -> Iterator[tuple[str, Arrays]]:
 
 
 def pictures() -> Iterator[np.ndarray]:
-    """A picture of each scene, float32 (H, W)."""
+    """Return a picture of each scene, float32 (H, W)."""
     for name in SCENES:
         yield RaycastRenderer(make_scene(name, np.random.default_rng(0)), 64, 64).render(0.1, 5.0, 2.0, 0.05)
 
 
 def recorded(config: Config) -> Recording:
-    """A few steps of random flight in each scene, with false events and dead pixels."""
+    """Record a few steps of random flight in each scene, with false events and dead pixels."""
     faults = FaultsConfig(sparsity=0.1, background_activity=0.1)
     envs = [
         dataclasses.replace(config.env, scene=scene, faults=faults, observation="events") for scene in SCENES
@@ -157,18 +157,18 @@ def recorded(config: Config) -> Recording:
 
 
 def weights(network: torch.nn.Module) -> list[np.ndarray]:
-    """All parameters and buffers, in the order of the module."""
+    """Return all parameters and buffers, in the order of the module."""
     return [value.detach().numpy() for value in network.state_dict().values()]
 
 
 def tabulated(evae: EventVAE) -> list[np.ndarray]:
-    """What the table of an encoder computes."""
+    """Return the outputs of an encoder's table."""
     table = EncoderTable.from_evae(evae.eval())
     return [table.features, table.embedding]
 
 
 def learnt(config: Config) -> list[np.ndarray]:
-    """The weights of a policy after two updates of the experiment's learner."""
+    """Return the weights of a policy after two updates of the experiment's learner."""
     torch.manual_seed(0)
     logging.getLogger("ray").setLevel(logging.ERROR)  # it calls its own settings outdated
     ppo = algorithm_of(config).build(config, None, None)

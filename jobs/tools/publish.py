@@ -45,7 +45,7 @@ class Training:
 
     @property
     def name(self) -> str:
-        """The name of its policy's folder."""
+        """Return the name of its policy's folder."""
         return f"{self.group}-s{self.seed}"
 
 
@@ -81,7 +81,7 @@ def run(config: Config) -> dict[str, int]:
 
 
 def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
-    """The training of each group and seed that was finished last, by group and seed."""
+    """Return the training of each group and seed that was finished last, by group and seed."""
     found: dict[tuple[str, int], Training] = {}
     markers = sorted(runs_dir.glob("*/stages/train.json"), key=lambda marker: marker.stat().st_mtime_ns)
     for marker in markers:
@@ -110,7 +110,7 @@ def publish(training: Training, folder: Path) -> Path:
 
 
 def learning_curve(training: Training) -> Curve:
-    """The success and distance of a training at about `MAX_POINTS` of its iterations."""
+    """Return the success and distance of a training at about `MAX_POINTS` of its iterations."""
     lines = read_json_lines(training.path / "train" / "results.jsonl")
     rows = [row for row in lines if row["train/success_rate"] is not None]
     kept = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(int))

@@ -140,7 +140,7 @@ def _tell_rate(recorded: Recorded, trained: float | None) -> None:
 
 
 def line(recording: str, policy: str, choices: list[Choice]) -> tuple[str, ...]:
-    """A text for each of `HEADINGS`."""
+    """Return a text for each of `HEADINGS`."""
     likeliest = np.array([choice.probabilities.argmax() for choice in choices])
     shares = [f"{100 * (likeliest == action).mean():.0f}" for action in range(len(ACTIONS))]
     latency = np.percentile([1e3 * choice.seconds for choice in choices], (50, 95, 99))

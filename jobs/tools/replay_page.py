@@ -85,7 +85,7 @@ def run(config: Config) -> dict[str, int]:
 def record(
     config: Config, cells: Sequence[Cell], advance: Callable[[int], None]
 ) -> Iterator[RecordedEpisode]:
-    """The episode of each policy under its condition, one after the other: each takes tens of MB."""
+    """Yield the episode of each policy under its condition, one by one: each takes tens of MB."""
     stochastic = config.evaluate.action == "stochastic"
     folders = dict.fromkeys(policy.agent for policy, *_ in cells)
     agents = {folder: PolicyAgent(load_policy(folder), stochastic) for folder in folders}
@@ -107,7 +107,7 @@ def write_page(folder: Run, data: Mapping[str, object]) -> Path:
 
 
 def page_data(cells: Sequence[Cell], recorded: Iterable[RecordedEpisode]) -> dict[str, object]:
-    """What the page shows, as JSON holds it; each choice is a place in its list.
+    """Return the data of the page as JSON values; each choice is an index into its list.
 
     Args:
         cells: Whose episodes these are, and under which conditions.
@@ -130,7 +130,7 @@ def page_data(cells: Sequence[Cell], recorded: Iterable[RecordedEpisode]) -> dic
 
 
 def plan(recorded: RecordedEpisode) -> dict[str, object]:
-    """The corridor of an episode from above, to the centimetre, and the pixels of its camera."""
+    """Return the corridor of an episode from above, to the centimetre, and the pixels of its camera."""
     scene, env = recorded.scene, recorded.env
     circles, corners = (shapes.round(2).tolist() for shapes in ground_plan(scene, env.camera_height_m))
     return {
@@ -140,7 +140,7 @@ def plan(recorded: RecordedEpisode) -> dict[str, object]:
 
 
 def packed_episode(recorded: RecordedEpisode) -> dict[str, object]:
-    """The numbers of an episode, and its moments as zlib of `columns` in base64."""
+    """Return the numbers of an episode, and its moments as zlib of `columns` in base64."""
     row, control_hz = recorded.episode, recorded.env.control_hz
     shown = shown_steps(len(recorded.moments), control_hz)
     moments = [recorded.moments[step] for step in shown]
@@ -157,7 +157,7 @@ def packed_episode(recorded: RecordedEpisode) -> dict[str, object]:
 
 
 def shown_steps(steps: int, control_hz: float) -> list[int]:
-    """Which steps of an episode are shown: `FRAMES_PER_S` of them a second, and the last."""
+    """Choose the steps of an episode to show: `FRAMES_PER_S` of them a second, and the last."""
     stride = max(1, round(control_hz / FRAMES_PER_S))
     return sorted({*range(0, steps, stride), steps - 1})
 
@@ -165,7 +165,7 @@ def shown_steps(steps: int, control_hz: float) -> list[int]:
 def columns_of(
     shown: Sequence[int], moments: Sequence[Moment], latents: np.ndarray
 ) -> Mapping[str, np.ndarray]:
-    """The moments as arrays of small integers, in the order of the bytes; the template reads them.
+    """Return the moments as arrays of small integers, in the order of the bytes; the template reads them.
 
     Args:
         shown: Their steps, (F,).
@@ -192,12 +192,12 @@ def columns_of(
 
 
 def planes(column: np.ndarray) -> bytes:
-    """The low bytes of all numbers, then their high bytes, if they have any: zlib packs these better."""
+    """Return the low bytes of all numbers, then any high bytes: zlib packs these better."""
     return np.ascontiguousarray(column).view("u1").reshape(-1, column.itemsize).T.tobytes()
 
 
 def pixels(events: np.ndarray | None) -> np.ndarray:
-    """The pixels with events of an event image (H, W), as `columns_of` codes them.
+    """Return the pixels with events of an event image (H, W), as `columns_of` codes them.
 
     Raises:
         ValueError: The image is too large for 16 bits.

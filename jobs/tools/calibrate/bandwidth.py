@@ -25,7 +25,7 @@ UNLIMITED = "frames and events fit an unlimited bandwidth as well"
 def misfit(
     trains: Trains, luminance: np.ndarray, times_us: np.ndarray, camera: CameraConfig, refractory_us: float
 ) -> np.ndarray:
-    """How far the events of each pixel are off one staircase, in thresholds, float64 (P,), summed.
+    """Compute the deviation of each pixel's events from one staircase, in thresholds, float64 (P,), summed.
 
     Args:
         trains: Events of P pixels.
@@ -91,7 +91,7 @@ def time_constant_s(cutoff_hz: float, luminance: np.ndarray, camera: CameraConfi
 
 
 def lowest(cutoffs: np.ndarray, totals: np.ndarray) -> np.ndarray:
-    """Where the parabola in log cutoff through the least of each row (D, F) and its neighbours is lowest."""
+    """Find the vertex of a parabola in log cutoff through the least of each row (D, F) and its neighbours."""
     place = np.clip(totals.argmin(axis=1), 1, totals.shape[1] - 2)
     rows = np.arange(len(totals))
     before, at, after = (totals[rows, place + k] for k in (-1, 0, 1))

@@ -110,14 +110,14 @@ def run(config: Config) -> Calibration:
 
 
 def line(name: str, part: Found) -> tuple[str, ...]:
-    """A text for each of `HEADINGS`."""
+    """Return a text for each of `HEADINGS`."""
     if part.value is None:
         return name, "-", "-", part.reason
     return name + unit(name), f"{part.value:.3g}", f"{part.low:.3g} to {part.high:.3g}", ""
 
 
 def _still(file: EventFile, luminance: float) -> Footage:
-    """The frames of a still scene that lasts as long as the events."""
+    """Return the frames of a still scene that lasts as long as the events."""
     if not len(file.events) or file.height is None or file.width is None:
         raise ValueError("has no events")
     span_us = int(file.events["t"][0]) - 1, int(file.events["t"][-1])
@@ -125,7 +125,7 @@ def _still(file: EventFile, luminance: float) -> Footage:
 
 
 def within(footage: Footage, events: np.ndarray) -> Footage:
-    """The frames during which events were recorded.
+    """Return the frames during which events were recorded.
 
     Raises:
         ValueError: Fewer than two.
@@ -141,7 +141,7 @@ def within(footage: Footage, events: np.ndarray) -> Footage:
 
 
 def assumed(camera: CameraConfig, still: bool) -> CameraConfig:
-    """What of the configured camera is taken as it is; all else is found, or is that of an ideal camera.
+    """Name the settings taken from the configured camera; all others are estimated, or ideal.
 
     That is how light becomes a response, and of a still scene the thresholds and the refractory period.
     """
@@ -187,7 +187,7 @@ def _compare(
 
 
 def texts(row: Likeness) -> tuple[str, ...]:
-    """A text for each of `SIMULATED` but the first."""
+    """Return a text for each of `SIMULATED` but the first."""
     return (
         f"{row.rate_hz:.2f}", f"{100 * row.on_share:.1f}", f"{100 * row.same_share:.1f}",
         f"{row.median_ms:.1f}", f"{row.neighbours:.2f}", f"{row.real:.3f}",

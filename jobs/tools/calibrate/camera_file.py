@@ -8,7 +8,7 @@ UNITS = {"hz": " [Hz]", "us": " [us]"}
 
 
 def camera_text(calibration: Calibration, source: str, taken: CameraConfig) -> str:
-    """A file that `camera=NAME` takes from conf/camera; what was not found is named, and keeps its default.
+    """Return the text of a file in conf/camera; it names the settings that were not found.
 
     Args:
         calibration: What was found.
@@ -51,7 +51,7 @@ def assumptions(calibration: Calibration, taken: CameraConfig) -> list[tuple[str
 
 
 def value_text(name: str, part: Found) -> str:
-    """A value as YAML: whole microseconds, else three digits."""
+    """Return a value as YAML: whole microseconds, else three digits."""
     if name == DEAD:
         return str(round(part.value or 0.0))
     text = f"{part.value:.3g}"
@@ -59,5 +59,5 @@ def value_text(name: str, part: Found) -> str:
 
 
 def unit(key: str) -> str:
-    """The unit that a key ends with, in brackets."""
+    """Return the unit that a key ends with, in brackets."""
     return UNITS.get(key.rsplit("_", 1)[-1], "")

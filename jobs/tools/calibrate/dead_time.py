@@ -17,13 +17,13 @@ AGREE = 2.5  # most that what deaf intervals say and the shortest one may differ
 
 
 def intervals_us(trains: Trains) -> np.ndarray:
-    """All intervals between successive events of a pixel, ascending, float64 (M,) [us]."""
+    """Return all intervals between successive events of a pixel, ascending, float64 (M,) [us]."""
     same = np.diff(trains.pixel) == 0
     return np.sort(np.diff(trains.t_us)[same].astype(np.float64))
 
 
 def shortest_us(trains: Trains) -> float:
-    """The shortest interval that has four others within a tenth of it [us]; infinite if there is none."""
+    """Return the shortest interval with four others within a tenth of it [us]; infinite if there is none."""
     intervals = intervals_us(trains)
     far = np.searchsorted(intervals, (1.0 + NEAR) * intervals, side="right")
     credible = intervals[far - np.arange(intervals.size) >= FEWEST_NEAR]
@@ -33,7 +33,7 @@ def shortest_us(trains: Trains) -> float:
 def refractory_period(
     trains: Trains, light: Light, thresholds: tuple[float, float], rng: np.random.Generator
 ) -> Found:
-    """The refractory period [us], the median of what deaf intervals say; its interval over these."""
+    """Estimate the refractory period [us], the median over deaf intervals, with its interval over these."""
     at = looked_up(light.response, light.times_us, trains.pixel, trains.t_us)
     same = np.diff(trains.pixel) == 0
     polarity, lasted = trains.p[1:][same], np.diff(trains.t_us)[same].astype(np.float64)

@@ -56,7 +56,7 @@ class Footage(NamedTuple):
 
     @property
     def flat(self) -> np.ndarray:
-        """The luminance as float32 (K, H * W)."""
+        """Return the luminance as float32 (K, H * W)."""
         return self.luminance.reshape(len(self.luminance), -1)
 
     @property
@@ -78,7 +78,7 @@ class Calibration(NamedTuple):
 
 
 def still_footage(shape: tuple[int, int], luminance: float, span_us: tuple[int, int]) -> Footage:
-    """The frames of a uniform scene that never changes."""
+    """Return the frames of a uniform scene that never changes."""
     return Footage(np.full((2, *shape), luminance, np.float32), np.array(span_us, np.int64))
 
 
@@ -92,7 +92,7 @@ def simulate(footage: Footage, camera: CameraConfig, faults: FaultsConfig, seed:
 
 
 def estimate(events: np.ndarray, footage: Footage, camera: CameraConfig, seed: int = 0) -> Calibration:
-    """The settings of the sensor that sent the events while it saw the frames.
+    """Estimate the settings of the sensor that sent the events while it saw the frames.
 
     Args:
         events: EVENT, sorted by t; those before the first or after the last frame do not count.
@@ -146,7 +146,7 @@ def refuse_motion(events: np.ndarray, span_us: tuple[int, int], shape: tuple[int
 def by_light(
     trains: Trains, footage: Footage, camera: CameraConfig, rng: np.random.Generator
 ) -> dict[str, Found]:
-    """What the events of changing light tell: thresholds, mismatch, bandwidth, dead time."""
+    """Estimate what changing light shows: thresholds, mismatch, bandwidth, dead time."""
     if footage.is_still:
         return dict.fromkeys(BY_LIGHT, missing(NEEDS_LIGHT))
     flat, times_us = footage.flat, footage.times_us
@@ -167,7 +167,7 @@ def by_light(
 
 
 def by_noise(trains: Trains, footage: Footage, camera: CameraConfig, sound: np.ndarray) -> dict[str, Found]:
-    """What the sound pixels, bool (P,), whose light rests tell: leakage and shot noise."""
+    """Estimate leakage and shot noise from the sound pixels, bool (P,), whose light is constant."""
     light = light_behind(footage.flat, footage.times_us, camera)
     least = min(camera.contrast_threshold, camera.contrast_threshold_off or camera.contrast_threshold)
     still = sound & (np.ptp(light.response, axis=0) < STILL * least)
@@ -193,7 +193,7 @@ def _rough(
 
 
 def with_found(camera: CameraConfig, found: Mapping[str, Found]) -> CameraConfig:
-    """A camera with the settings of a camera that were found."""
+    """Return a camera with the settings of a camera that were found."""
     values: dict[str, Any] = _values(found, "camera.")
     if "refractory_us" in values:
         values["refractory_us"] = round(values["refractory_us"])
@@ -209,13 +209,13 @@ def settings(
 
 
 def _values(found: Mapping[str, Found], group: str) -> dict[str, float]:
-    """The fields of a group that have a value."""
+    """Return the fields of a group that have a value."""
     chosen = {name: part.value for name, part in found.items() if name.startswith(group)}
     return {name.removeprefix(group): value for name, value in chosen.items() if value is not None}
 
 
 def corrected(found: dict[str, Found], again: dict[str, Found]) -> dict[str, Found]:
-    """What was found, times what it should have been over what it was in the simulated recording.
+    """Correct an estimate by the ratio of true to estimated value in the simulated recording.
 
     The simulated recording is as uncertain as the recorded one, so the intervals grow by the root of two; and
     they reach half as far as the correction at least. What no camera can have is not taken.
@@ -236,7 +236,7 @@ def corrected(found: dict[str, Found], again: dict[str, Found]) -> dict[str, Fou
 
 
 def possible(name: str, part: Found) -> Found:
-    """A setting as it was found, if a camera can have that value; a mismatch only if it is not 0 as well."""
+    """Return a found setting if a camera can have its value; a mismatch only if it is not 0 as well."""
     if name == MISMATCH and part.low < NEGLIGIBLE:
         return at_most(part.high)
     try:

@@ -46,20 +46,20 @@ def trains_of(events: np.ndarray, width: int) -> Trains:
 
 
 def of_pixels(trains: Trains, chosen: np.ndarray) -> Trains:
-    """The trains of the chosen pixels, bool (P,), which keep their numbers."""
+    """Return the trains of the chosen pixels, bool (P,), which keep their numbers."""
     kept = chosen[trains.pixel]
     return Trains(*(part[kept] for part in trains))
 
 
 def of_columns(trains: Trains, pixels: np.ndarray) -> Trains:
-    """The trains of some pixels, int64 (Q,) ascending, numbered by their place there."""
+    """Return the trains of some pixels, int64 (Q,) ascending, numbered by their place there."""
     place = np.minimum(np.searchsorted(pixels, trains.pixel), max(pixels.size - 1, 0))
     kept = pixels[place] == trains.pixel if pixels.size else np.zeros(trains.pixel.size, bool)
     return Trains(place[kept], trains.t_us[kept], trains.p[kept])
 
 
 def light_behind(luminance: np.ndarray, times_us: np.ndarray, camera: CameraConfig) -> Light:
-    """The responses that a camera's bandwidth leaves of frames, float32 (K, P), white = 1.
+    """Return the responses of the frames after a camera's bandwidth, float32 (K, P), white = 1.
 
     A bandwidth of 0 leaves all.
     """
@@ -86,12 +86,12 @@ def looked_up(values: np.ndarray, times_us: np.ndarray, pixel: np.ndarray, t_us:
 
 
 def with_bandwidth(camera: CameraConfig, cutoff_hz: float) -> CameraConfig:
-    """The same camera with another bandwidth [Hz]; 0: unlimited."""
+    """Return the camera with another bandwidth [Hz]; 0: unlimited."""
     return dataclasses.replace(camera, cutoff_hz=cutoff_hz)
 
 
 def luminance_of(response: np.ndarray, camera: CameraConfig) -> np.ndarray:
-    """The luminance, white = 1, that pixels respond to so; float64 (N,)."""
+    """Return the luminance, white = 1, of these responses; float64 (N,)."""
     levels = np.array(response, np.float64)
     light_of(
         Curve(*response_curve(camera.response, camera.luminance_floor or LUMINANCE_FLOOR)),

@@ -26,22 +26,22 @@ class Found(NamedTuple):
 
 
 def missing(reason: str) -> Found:
-    """A setting that cannot be told."""
+    """Return a setting that cannot be estimated."""
     return Found(None, reason=reason)
 
 
 def at_most(value: float) -> Found:
-    """A setting that may as well be 0."""
+    """Return a setting that may be 0."""
     return missing(f"at most {value:.2g}")
 
 
 def resampled(pixels: int, rng: np.random.Generator) -> np.ndarray:
-    """How often each of so many pixels is drawn, in `DRAWS` draws of as many with replacement; (DRAWS, P)."""
+    """Count how often each pixel is drawn in each of `DRAWS` resamples with replacement; (DRAWS, P)."""
     return rng.multinomial(pixels, np.full(pixels, 1.0 / pixels), DRAWS).astype(np.float64)
 
 
 def with_interval(value: float, drawn: np.ndarray) -> Found:
-    """A value, and the middle 95 % of what it is in resamples, (D,); what is no number does not count."""
+    """Return a value with the middle 95 % of its resamples, (D,); values that are no number do not count."""
     drawn = drawn[np.isfinite(drawn)]
     low, high = np.quantile(drawn, TAILS) if drawn.size else (np.nan, np.nan)
     return Found(float(value), float(low), float(high))

@@ -11,7 +11,7 @@ TIMES, SIGMAS, FEWEST = 2.0, 8.0, 10.0
 
 
 def unexplained(trains: Trains, light: Light, thresholds: tuple[float, float]) -> np.ndarray:
-    """Events of each pixel beyond what the rises and falls of its response are worth, float64 (P,), >= 0."""
+    """Count events of each pixel beyond those of the rises and falls of its response, float64 (P,), >= 0."""
     count = np.bincount(trains.pixel, minlength=light.response.shape[1]).astype(np.float64)
     rise = light.travel[-1]
     fall = rise - (light.response[-1] - light.response[0])

@@ -44,7 +44,7 @@ def net_images(events: np.ndarray, times_us: np.ndarray, shape: tuple[int, int])
 def likeness(
     events: np.ndarray, recorded: np.ndarray, times_us: np.ndarray, shape: tuple[int, int]
 ) -> Likeness:
-    """Of EVENT, beside the recorded ones, both between the first and the last frame at these times [us]."""
+    """Compare EVENT with the recorded events between the first and the last frame at these times [us]."""
     trains = trains_of(events, shape[1])
     same = np.diff(trains.pixel) == 0
     lasted = np.diff(trains.t_us)[same] * 1e-3

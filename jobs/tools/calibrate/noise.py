@@ -41,7 +41,7 @@ class Rates(NamedTuple):
 
 
 def still_rates(trains: Trains, still: np.ndarray, span_us: tuple[int, int]) -> Rates:
-    """Of the still pixels, bool (P,), in the later three quarters of a span [us]."""
+    """Compute the rates of the still pixels, bool (P,), in the later three quarters of a span [us]."""
     begin = span_us[0] + BURN_IN * (span_us[1] - span_us[0])
     late = trains.t_us > begin
     counts = np.stack(
@@ -60,7 +60,7 @@ def still_rates(trains: Trains, still: np.ndarray, span_us: tuple[int, int]) -> 
 def simulated_rates(
     leak_hz: float, shot_hz: float, camera: CameraConfig, luminance: float, span_us: tuple[int, int]
 ) -> Rates:
-    """The same of simulated pixels; equal arguments give equal numbers."""
+    """Compute the rates of simulated pixels; equal arguments give equal numbers."""
     side = math.isqrt(SIMULATED_PIXELS)
     camera = dataclasses.replace(camera, width=side, height=side)
     eye, frame = EventCamera(camera), np.full((side, side), luminance, np.float32)

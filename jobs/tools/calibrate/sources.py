@@ -38,7 +38,7 @@ def read_frames(path: str | Path, delay_us: int) -> Footage:
 
 
 def read_greys(path: str | Path) -> np.ndarray:
-    """The pictures of such a text file, uint8 (K, H, W); raises as `read_frames`."""
+    """Read the pictures of such a text file, uint8 (K, H, W); raises as `read_frames`."""
     path, left, pictures = Path(path), MAX_PIXELS, []
     for name in _frame_rows(path)[1]:
         pictures.append(_picture(path.parent / name, left))
@@ -49,7 +49,7 @@ def read_greys(path: str | Path) -> np.ndarray:
 
 
 def _frame_rows(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Times [us], int64 (K,), and names of the pictures."""
+    """Read times [us], int64 (K,), and names of the pictures."""
     rows = [line.split() for line in path.read_text().splitlines() if line.strip() and line[0] != "#"]
     if len(rows) < 2 or any(len(row) != 2 for row in rows):
         raise ValueError(f'{path}: must have a line "seconds picture" for each of two frames or more')

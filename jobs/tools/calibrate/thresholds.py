@@ -57,7 +57,7 @@ class Equations(NamedTuple):
 
 
 def staircase(trains: Trains, light: Light, refractory_us: float) -> Stairs:
-    """The events of P pixels as steps of staircases.
+    """Return the events of P pixels as steps of staircases.
 
     What the light did in a dead time is taken off the response: at its end a pixel takes the light of that
     moment as its level.
@@ -80,7 +80,7 @@ def staircase(trains: Trains, light: Light, refractory_us: float) -> Stairs:
 
 
 def equations(trains: Trains, light: Light, refractory_us: float) -> Equations:
-    """The equations of all P pixels of `light`."""
+    """Return the equations of all P pixels of `light`."""
     response, on, off, rise, _, half = staircase(trains, light, refractory_us)
     rows = 2 * light.response.shape[1]
     sums = [np.bincount(half, a * b, rows) for a in (response, rise) for b in (on, -off, response)]
@@ -116,13 +116,13 @@ def thresholds(found: Equations, rng: np.random.Generator) -> tuple[Found, Found
 
 
 def is_singular(matrix: np.ndarray) -> np.ndarray:
-    """Which of the equations, (..., 2, 2), have no solution of their own; bool (...)."""
+    """Tell which of the equations, (..., 2, 2), have no unique solution; bool (...)."""
     determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
     return ~(np.abs(determinant) > 1e-9 * np.square(matrix).sum(axis=(-2, -1)))
 
 
 def mismatch(found: Equations, values: tuple[float, float], rng: np.random.Generator) -> Found:
-    """Standard deviation of the thresholds over pixels, as a share of the mean.
+    """Compute the standard deviation of the thresholds over pixels, as a share of the mean.
 
     A pixel's thresholds are found twice, from halves of its runs. What is the same in both is the pixel,
     what differs is chance: the covariance of the two is the variance over pixels. Where that may as well be

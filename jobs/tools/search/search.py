@@ -102,7 +102,7 @@ def run(config: Config) -> dict[str, float]:
 
 
 def _inputs(config: Config, folder: Run, tracker: Tracker) -> Files:
-    """The encoder that trials share, unless each has its own; the policy that they begin from."""
+    """Return the encoder that trials share, unless each has its own; the policy that they begin from."""
     facts = encoder_facts(config)
     points = [{key: value} for key, values in config.own.space.items() for value in extremes(values)]
     if facts is not None and any(encoder_facts(with_settings(config, point)) != facts for point in points):
@@ -175,7 +175,7 @@ def search(
 
 
 def _tuner(config: Config, place: Path, files: Files, begun: Earlier) -> tune.Tuner:
-    """The search in its folder: continued if it is there, else new."""
+    """Return the search in its folder: continued if it is there, else new."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     path, most = storage(config.cluster, place), config.train.env_steps
     trial = tune.with_resources(tune.with_parameters(SearchTrial, base=config, files=files), {"cpu": 1})
@@ -224,24 +224,24 @@ def _optuna(config: Config, begun: Earlier) -> OptunaSearch:
 
 
 def measurement(result: Mapping[str, Any]) -> Row:
-    """What is kept of a result of Tune's."""
+    """Return the stored part of a result of Tune's."""
     kept = {name: result[name] for name in ("env_steps", "distance_m", "success_rate", "metrics")}
     return {"trial": result["trial_id"], "settings": read_settings(result["config"]), **kept}
 
 
 def of_trial(rows: Sequence[Row], trial: str) -> list[Row]:
-    """The measurements of one trial, by steps."""
+    """Return the measurements of one trial, by steps."""
     return sorted((row for row in rows if row["trial"] == trial), key=lambda row: row["env_steps"])
 
 
 def ranked(rows: Sequence[Row]) -> list[Row]:
-    """The last measurement of each trial: those that were trained longest first, of these the best first."""
+    """Return the last measurement of each trial, by trained steps, then by result, highest first."""
     last = [of_trial(rows, trial)[-1] for trial in dict.fromkeys(row["trial"] for row in rows)]
     return sorted(last, key=lambda row: (row["env_steps"], row["distance_m"]), reverse=True)
 
 
 def child_run(rows: Sequence[Row]) -> ChildRun:
-    """A trial as a finished run in MLflow, with its curves over environment steps."""
+    """Return a trial as a finished run in MLflow, with its curves over environment steps."""
     settings, curves = rows[-1]["settings"], {}
     for name in ("distance_m", "success_rate"):
         curves[f"tune/{name}"] = {row["env_steps"]: row[name] for row in rows}
@@ -258,7 +258,7 @@ def child_run(rows: Sequence[Row]) -> ChildRun:
 
 
 def words(settings: Mapping[str, Any]) -> str:
-    """Settings as words of a command line."""
+    """Return settings as words of a command line."""
     texts = {
         key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in settings.items()
     }
@@ -282,13 +282,13 @@ def report(folder: Run, name: str, rows: Sequence[Row], tracker: Tracker) -> Row
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    """A text for each of `HEADINGS`."""
+    """Return a text for each of `HEADINGS`."""
     figures = f"{row['env_steps']:,}", f"{row['distance_m']:.1f}", f"{100 * row['success_rate']:.0f}"
     return (row["trial"], words(row["settings"]), *figures)
 
 
 def plot_curves(rows: Sequence[Row], order: Sequence[Row]) -> Figure:
-    """Each trial's distance over its steps; the best in colour, the others in grey."""
+    """Plot each trial's distance over its steps; the best in colour, the others in grey."""
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     panel = figure.subplots()
     for place, last in reversed(list(enumerate(order))):

@@ -21,7 +21,7 @@ FIXED_KEYS = ("train.env_steps", "algo.num_env_runners", "algo.lr_schedule")
 
 
 def search_space(space: Mapping[str, Any]) -> dict[str, Any]:
-    """The space as Tune has it; values of lists travel as JSON, so that they may be lists themselves."""
+    """Return the space for Tune; values that are lists travel as JSON, so that a list may be one value."""
     return {key: _domain(values) for key, values in space.items()}
 
 
@@ -42,12 +42,12 @@ def sampled(settings: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, 
 
 
 def read_settings(sampled: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a trial, from what Tune has drawn."""
+    """Return the settings of a trial, from what Tune has drawn."""
     return {key: json.loads(value) if isinstance(value, str) else value for key, value in sampled.items()}
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
-    """The configuration of a trial: with some settings replaced, and all work in one process.
+    """Return the configuration of a trial: with some settings replaced, and all work in one process.
 
     Raises:
         ConfigError: One is unknown, or its value is refused.
@@ -66,7 +66,7 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
 
 
 def space_errors(config: Config) -> Iterator[str]:
-    """One line for each key that cannot be searched, and for each of its values that would be refused."""
+    """Return one line for each key that cannot be searched, and for each value that would be refused."""
     for key, values in config.own.space.items():
         if key.partition(".")[0] in FIXED or key in FIXED_KEYS:
             yield f"search.space: {key} must be the same for all trials"
@@ -79,12 +79,12 @@ def space_errors(config: Config) -> Iterator[str]:
 
 
 def extremes(values: Any) -> list[Any]:
-    """All values of a list, the ends of a range."""
+    """Return all values of a list, the ends of a range."""
     return values if isinstance(values, list) else [values["low"], values["high"]]
 
 
 def encoder_facts(config: Config) -> dict[str, Any] | None:
-    """What decides a frozen encoder: trials that have it in common share one; None without an encoder."""
+    """Return what determines a frozen encoder; trials with equal facts share one; None without an encoder."""
     if not KINDS[config.model.name].encoder:
         return None
     parts = {name: dataclasses.asdict(getattr(config, name)) for name in ("collect", "pretrain")}

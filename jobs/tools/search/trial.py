@@ -33,7 +33,7 @@ class Unrecorded:
     """A tracker that records nothing: only the driver writes."""
 
     def __getattr__(self, name: str) -> Any:
-        """A function that does nothing."""
+        """Return a function that does nothing."""
         return lambda *args, **kwargs: None
 
 
@@ -88,7 +88,7 @@ class SearchTrial(Trainable):
         return {"env_steps": self._steps, **figures, "metrics": metrics, "done": done}
 
     def measured(self) -> dict[str, float]:
-        """How the policy does in validation corridors: those of training and evaluation are others."""
+        """Evaluate the policy in validation corridors, which neither training nor evaluation uses."""
         asked = self._experiment
         env = dataclasses.replace(asked.env, split="validation")
         with unfinished(self.checkpoints()) as folder:
