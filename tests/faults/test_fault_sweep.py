@@ -105,7 +105,7 @@ def test_two_sweeps_started_at_once_share_a_store(tmp_path):
     first, other = (launch(tmp_path, *SEEING, f"seed={seed}") for seed in (0, 1))
     assert first.end() == 0, first.said
     assert other.end() == 0, other.said
-    assert len(list(first.runs.glob("*/sweep/episodes/*.json"))) == 2 * TASKS
+    assert len(list(first.runs.glob("*/study/episodes/*.json"))) == 2 * TASKS
     client, experiment = open_store(f"sqlite:///{tmp_path}/mlflow.db", "evade")
     runs = client.search_runs([experiment])
     assert {run.info.status for run in runs} == {"FINISHED"}

@@ -132,7 +132,7 @@ class Job:
 
     def kept(self) -> dict[str, list]:
         """The episodes of its sweep that are kept, by cell."""
-        files = self.runs.glob("*/sweep/episodes/*.json")
+        files = self.runs.glob("*/study/episodes/*.json")
         return {path.stem: json.loads(path.read_text())["episodes"] for path in files}
 
     def wait(self, condition: Callable[[], object]) -> None:

@@ -195,7 +195,7 @@ def test_a_sweep_evaluates_the_policy_just_trained_on_loopback_alone_and_a_rerun
     for axis in ("control_hz", "contrast_threshold", "sparsity", "background_activity"):
         assert axis in job.said
     again = launch(flown[0], *SWEEP)
-    assert "Sweep:" not in again
+    assert "Study:" not in again
     client = MlflowClient(f"sqlite:///{flown[0] / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("evade").experiment_id
     (parent,) = client.search_runs([experiment], "tags.kind = 'sweep'")
