@@ -7,6 +7,7 @@ load, and the launcher checks a scene's name without it.
 from typing import TYPE_CHECKING
 
 from envs.scene.layouts import LAYOUTS, Layout
+from envs.scene.moving import MovingBody, at_velocity
 from envs.scene.obstacles import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
 from envs.scene.textures import Texture
 
@@ -21,8 +22,10 @@ __all__ = [
     "OBSTACLE",
     "POLE",
     "Layout",
+    "MovingBody",
     "Scene",
     "Texture",
+    "at_velocity",
     "make_scene",
 ]
 

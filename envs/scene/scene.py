@@ -32,6 +32,7 @@ from envs.scene.layouts import (
     with_overrides,
 )
 from envs.scene.mesh_file import is_mesh_path, read_mesh
+from envs.scene.moving import MovingBody, bodies_at
 from envs.scene.textures import Texture
 
 # The sun stands behind the start and to the right, so that the sides of a pole differ.
@@ -59,6 +60,7 @@ class Scene:
         ground_texture, wall_texture, obstacle_texture: See `envs.scene.textures`.
         mesh: More surfaces, as vertices (V, 3) [m], faces (F, 3) counter-clockwise seen from
             outside, and baked luminance (V,); only pyrender draws them. None: nothing more.
+        moving: Bodies that move, which only the ray caster draws.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Scene:
     wall_texture: Texture = PLAIN_SURFACE
     obstacle_texture: Texture = PLAIN_SURFACE
     mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    moving: tuple[MovingBody, ...] = ()
 
     def __post_init__(self) -> None:
         """Store read-only copies of the arrays; ValueError names the wrong value and the rule."""
@@ -86,11 +89,16 @@ class Scene:
         object.__setattr__(self, "obstacles", obstacles)
         if self.mesh is not None:
             object.__setattr__(self, "mesh", bodies.checked_mesh(*self.mesh))
+        if self.moving:
+            if self.mesh is not None:
+                raise ValueError("a scene with a mesh cannot have bodies that move: no renderer draws both")
+            bodies.checked_obstacles(bodies_at(self.moving, 0.0), self.obstacle_texture.depth)
 
     @cached_property
     def kinds(self) -> frozenset[int]:
-        """Kinds of obstacles that are there: POLE, CONE, ELLIPSOID, BOX."""
-        return frozenset(np.unique(self.obstacles["kind"]).tolist())
+        """Kinds of obstacles that are there, standing or moving: POLE, CONE, ELLIPSOID, BOX."""
+        moving = {int(one.body["kind"]) for one in self.moving}
+        return frozenset(np.unique(self.obstacles["kind"]).tolist()) | moving
 
     @cached_property
     def _sections(self) -> dict[float, np.ndarray]:
