@@ -367,8 +367,9 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
 def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
     """Return the settings that give an event its meaning: data, encoder and policy must share them.
 
-    Those of the neighbour filter are among them where there is one, and `LATER_SETTINGS` where they are
-    not the defaults: what was made before they existed has its hash still.
+    Those of the neighbour filter are among them where there is one, the vehicle where it is not the kinematic
+    one, and `LATER_SETTINGS` where they are not the defaults: what was made before they existed has its
+    hash still.
     """
     camera = dataclasses.asdict(config.camera)
     for name in LATER_SETTINGS:
@@ -377,6 +378,8 @@ def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
     own: dict[str, Setting] = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
     if config.filter_support > 0:
         own |= {"filter_support": config.filter_support, "filter_tau_us": config.filter_tau_us}
+    if config.vehicle != "kinematic":
+        own |= {"vehicle": config.vehicle, "body": dict(config.body)}
     return {**camera, **own, **dataclasses.asdict(config.fidelity)}
 
 

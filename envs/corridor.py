@@ -70,6 +70,7 @@ class CorridorEnv(gymnasium.Env):
 
     Attributes:
         config: The settings of this episode, `EnvConfig`.
+        dynamics: The vehicle of this episode, `envs.vehicles.dynamics.Dynamics`.
         scene: The corridor of this episode.
         series: Seed of the series of episodes, and the number of this one in it.
     """
@@ -106,10 +107,10 @@ class CorridorEnv(gymnasium.Env):
         self._draw = draw
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.config.control_hz}
-        self._dynamics = make_dynamics(self.config)
-        self.action_space = self._dynamics.action_space
+        self.dynamics = make_dynamics(self.config)
+        self.action_space = self.dynamics.action_space
         self.observation_space = observation_space(self.config)
-        self._sensor = Sensor(self.config, planned_config(self.config, self._dynamics))
+        self._sensor = Sensor(self.config, planned_config(self.config, self.dynamics))
         self.series: tuple[int | None, int] = None, 0
         self._vehicles, self._row = Vehicles(1), 0
         self._actions: list[Any] = []  # of this episode
@@ -181,14 +182,14 @@ class CorridorEnv(gymnasium.Env):
         self._sensor.reset(self.scene, (spawn_x, 0.0), faults_rng)
         spawn = spawn_x, 0.0
         self._actions = []
-        self._vehicles.start(self._row, config, self.scene, self._sensor, spawn, self._dynamics)
+        self._vehicles.start(self._row, config, self.scene, self._sensor, spawn, self.dynamics)
 
     def _set_config(self, config: EnvConfig) -> None:
         """Switch to the settings drawn for the next episode."""
         if config != self.config:
             self._sensor.close()
-            self.config, self._dynamics = config, make_dynamics(config)
-            self._sensor = Sensor(config, planned_config(config, self._dynamics))
+            self.config, self.dynamics = config, make_dynamics(config)
+            self._sensor = Sensor(config, planned_config(config, self.dynamics))
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Simulate one control step.
@@ -266,13 +267,17 @@ class CorridorEnv(gymnasium.Env):
         if not vehicle["delay"]:
             return self.camera_pose()[:2]
         if vehicle["parts"]:
-            x_m, y_m = self._vehicles.state_of_action(self._row)[:2]
+            x_m, y_m = self.state_of_action()[:2]
             return float(x_m), float(y_m)
         left, right = ((self._vehicles.decided(self._row) == action).sum() for action in (1, 2))
         forward = vehicle["delay"] - left - right
         moves = vehicle["forward"] + forward, vehicle["left"] + left, vehicle["right"] + right
         way = self.config.speed_mps, self.config.control_hz
         return kinematics.planned_position(vehicle["spawn_x_m"], moves, way)
+
+    def state_of_action(self) -> np.ndarray:
+        """Return the state of a vehicle with a body when its next decision is taken, float64 (S,)."""
+        return self._vehicles.state_of_action(self._row)
 
     def name_step(self) -> str:
         """Return episode, step and seed as text for an error."""

@@ -30,6 +30,7 @@ from jobs.run.undo import undo
 ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
 OPEN_GROUPS = (
     "env.layout",
+    "env.body",
     "faults.added",
     "study.axes",
     "search.space",

@@ -24,7 +24,7 @@ from gymnasium import spaces
 
 from core.places import resolve
 from envs.config import VEHICLES, EnvConfig
-from envs.kinematics import NUM_ACTIONS
+from envs.kinematics import MIRRORED_ACTIONS, NUM_ACTIONS
 
 WAY_S = 0.01  # at most; the way of a control step is cut into straight parts of equal time
 
@@ -41,6 +41,8 @@ class Dynamics(NamedTuple):
         parameters: float64 (P,), handed to `move`.
         wind: float64 (2,) [m/s], handed to `move`.
         commands: float64 (K, C), the command of each action of a Discrete; None: an action is a command.
+        sideways: Largest sideways speed [m/s] and acceleration [m/s^2] that a planner may count on; None: the
+            vehicle cannot be planned for (`envs.vehicles.planning`).
     """
 
     action_space: spaces.Space
@@ -51,6 +53,7 @@ class Dynamics(NamedTuple):
     parameters: np.ndarray = np.zeros(0)
     wind: np.ndarray = np.zeros(2)
     commands: np.ndarray | None = None
+    sideways: tuple[float, float] | None = None
 
 
 def make_dynamics(config: EnvConfig) -> Dynamics:
@@ -68,6 +71,21 @@ def make_kinematic(config: EnvConfig) -> Dynamics:
     if config.body:
         raise ValueError(f"body must be empty for vehicle 'kinematic'; got {config.body!r}")
     return Dynamics(spaces.Discrete(NUM_ACTIONS), np.int64(0), config.speed_mps)
+
+
+def mirrored_actions(dynamics: Dynamics) -> list[int]:
+    """Return the action that each action of a Discrete becomes when left and right are exchanged.
+
+    Raises:
+        ValueError: A command has no mirror image among the others.
+    """
+    if dynamics.commands is None:
+        return MIRRORED_ACTIONS
+    images = dynamics.commands * np.where(np.arange(dynamics.commands.shape[1]) == 0, -1.0, 1.0)
+    apart = np.abs(images[:, None] - dynamics.commands).max(axis=2)
+    if (apart.min(axis=1) > 1e-9).any():
+        raise ValueError("commands must come in pairs, left and right, to be mirrored")
+    return [int(action) for action in apart.argmin(axis=1)]
 
 
 def planned_config(config: EnvConfig, dynamics: Dynamics) -> EnvConfig:

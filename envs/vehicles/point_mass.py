@@ -117,6 +117,7 @@ def make_point_mass(config: EnvConfig, nominal: PointMass = PointMass()) -> Dyna
         parameters=np.array(parameters),
         wind=np.array(body.wind),
         commands=commands,
+        sideways=_sideways(body),
     )
 
 
@@ -132,6 +133,14 @@ def make_crazyflie(config: EnvConfig) -> Dynamics:
     return make_point_mass(
         config, PointMass(tau_s=0.219, max_acceleration_mps2=3.57, max_speed_mps=14.6, drag_per_s=0.244)
     )
+
+
+def _sideways(body: PointMass) -> tuple[float, float]:
+    """Return the largest sideways speed and acceleration of the primitives, `Dynamics.sideways`."""
+    limit_mps2 = body.max_acceleration_mps2 / body.mass_ratio
+    if body.command == "acceleration":
+        return body.side_speed_mps, limit_mps2
+    return body.side_speed_mps, min(limit_mps2, body.side_speed_mps / (body.tau_s * body.mass_ratio))
 
 
 def _commands(body: PointMass, speed_mps: float) -> tuple[np.ndarray | None, Any]:

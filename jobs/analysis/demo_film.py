@@ -17,7 +17,7 @@ WIDTH, SIDE, GAP, HEAD, LINE = 1248, 320, 16, 44, 26  # pixels
 MARGIN_M, SIDES_M = 2.0, 14.0  # shown before start and behind goal; beside the way
 TOP = HEAD + LINE + SIDE + LINE + GAP // 2  # of the plan
 SLOWER, MAX_FPS, MIN_FPS = 4, 50, 10
-ACTIONS = (("left", 1), ("forward", 0), ("right", 2))  # as a person looks, with their numbers
+HEADINGS = (("left", 1), ("forward", 0), ("right", 2))  # as a person looks, with their numbers
 TEXT, DIM, WALL, TRAIL, CHOSEN = "#f1f5f9", "#94a3b8", "#64748b", "#38bdf8", "#f59e0b"
 GROUND, OBSTACLE, GOAL = "#15181f", "#cbd5e1", "#34d399"
 FONT, SMALL = ImageFont.load_default(18), ImageFont.load_default(15)
@@ -168,14 +168,29 @@ def _draw_choice(picture: Image.Image, box: Box, moment: Moment) -> None:
     """Draw the probability of each action as a bar; the chosen action has another colour."""
     draw, (left, top, width, _) = ImageDraw.Draw(picture), box
     _write(picture, (left, top + LINE // 2), "probability of each action (taken: amber)", DIM, SMALL, "lm")
+    if moment.probabilities.size > len(HEADINGS):
+        _draw_choices(picture, box, moment)
+        return
     start, length = left + 74, width - 74 - 56
-    for row, (name, action) in enumerate(ACTIONS):
+    for row, (name, action) in enumerate(HEADINGS):
         share, y = moment.probabilities[action], top + LINE + 8 + row * 36
         _write(picture, (left, y + 12), name, TEXT, SMALL, "lm")
         draw.rectangle((start, y, start + length, y + 24), GROUND)
         colour = CHOSEN if action == moment.action else WALL
         draw.rectangle((start, y, start + share * length, y + 24), colour)
         _write(picture, (left + width, y + 12), f"{share:.0%}", TEXT, SMALL, "rm")
+
+
+def _draw_choices(picture: Image.Image, box: Box, moment: Moment) -> None:
+    """The probability of each of many actions, from the left to the right command, as bars upwards."""
+    draw, (left, top, width, height) = ImageDraw.Draw(picture), box
+    bottom, pitch = top + height - LINE, width / moment.probabilities.size
+    for action, share in enumerate(moment.probabilities.tolist()):
+        x, high = left + (action + 0.15) * pitch, share * (bottom - top - LINE - 8)
+        colour = CHOSEN if action == moment.action else WALL
+        draw.rectangle((x, bottom - high, x + 0.7 * pitch, bottom), colour)
+    _write(picture, (left, bottom + LINE // 2), "left", TEXT, SMALL, "lm")
+    _write(picture, (left + width, bottom + LINE // 2), "right", TEXT, SMALL, "rm")
 
 
 def _draw_latent(picture: Image.Image, box: Box, latent: np.ndarray, largest: float) -> None:

@@ -27,7 +27,10 @@ NETWORK_KEYS = (
     "env.window_capacity",
     "env.filter_support",
     "env.filter_tau_us",
-)  # the policy's network is built for them, or its window
+    "env.vehicle",
+    "env.body.command",
+    "env.body.primitives",
+)  # the policy's network is built for them, or its window, or its actions
 WEIGHT = "weight"
 
 

@@ -113,7 +113,7 @@ def parse(values: Mapping[str, object]) -> Config:
             *condition_errors("train.conditions", config.train.conditions, config.env),
             *condition_errors("collect.conditions", config.collect.conditions, config.env),
             *_size_errors(config),
-            *_vehicle_errors(config.env),
+            *_vehicle_errors(config),
             *scene_errors(list(_named_scenes(config)), config.env),
         ]
     if config is None or errors:
@@ -186,8 +186,9 @@ def _section(section: Callable[..., Part], values: object, name: str, errors: li
     return _build(section, values, name, errors)
 
 
-def _vehicle_errors(env: EnvConfig) -> list[str]:
-    """Return one line if the vehicle cannot be made, or has other actions than policies choose among."""
+def _vehicle_errors(config: Config) -> list[str]:
+    """Return one line if the vehicle cannot be made, or has no discrete actions."""
+    env = config.env
     if env.vehicle == "kinematic" and not env.body:
         return []
     from envs.vehicles.dynamics import make_dynamics  # loads numba, which takes long
@@ -196,10 +197,12 @@ def _vehicle_errors(env: EnvConfig) -> list[str]:
         space = make_dynamics(env).action_space
     except ValueError as error:
         return [f"env.{error}"]
-    if str(space) == "Discrete(3)":
-        return []
-    rule = "must have three actions, among which policies choose, such as env.body.primitives=3"
-    return [f"env.vehicle: {rule}; the actions of {env.vehicle!r} are {space}. Fly it through Gymnasium"]
+    if str(space).startswith("Discrete("):
+        sight_m = getattr(config.algo, "teacher_sight_m", None)
+        rule = f"must be null for vehicle {env.vehicle!r}, whose teacher plans to the goal line"
+        return [] if sight_m is None else [f"algo.teacher_sight_m: {rule}, got {sight_m}"]
+    rule = "must have discrete actions, among which policies choose, such as +env.body.primitives=15"
+    return [f"env.vehicle: {rule}; the actions of {env.vehicle!r} are {space}"]
 
 
 def _build(

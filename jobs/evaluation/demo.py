@@ -24,7 +24,7 @@ from jobs.config.config import Config
 from jobs.config.schema import Name
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
-from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, own_sensor_differences, with_own_filter
+from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, own_sensor_differences, with_own_parts
 from jobs.rollout.recorded import RecordedEpisode, record_episode
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console
@@ -49,7 +49,7 @@ class Shown(NamedTuple):
 
     Attributes:
         policy: It.
-        env: The held-out corridors, with the filter that the policy was trained to see through.
+        env: The held-out corridors, with the filter and the vehicle of the policy's training.
         agent: It acts by its likeliest or its drawn actions, as `evaluate.action` says.
     """
 
@@ -65,7 +65,7 @@ def find_shown(config: Config) -> Shown:
         ConfigError: There is no such policy.
     """
     policy = find_one_policy("demo.policy", config.own.policy, config, locate_run(config))
-    env = with_own_filter(policy, dataclasses.replace(config.env, split="eval"))
+    env = with_own_parts(policy, dataclasses.replace(config.env, split="eval"))
     return Shown(policy, env, PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic"))
 
 

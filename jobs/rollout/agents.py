@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
+from gymnasium.spaces import Discrete
 
 from envs.config import Observation
 from envs.corridor import CorridorEnv
-from envs.kinematics import DIAGONAL, NUM_ACTIONS
+from envs.kinematics import DIAGONAL
 from envs.scene import Scene
 from envs.scene.planning import LATTICE_M, SIDE_PRICE, cost_to_go
+from envs.vehicles.planning import plan_body
 
 if TYPE_CHECKING:
     from models.policy import Policy
@@ -73,11 +75,12 @@ class StraightAgent:
     observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Do nothing: it has no memory."""
+        """Look up the action of the vehicle, one for all episodes."""
+        self._straight = envs[0].dynamics.straight
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return zeros (B,)."""
-        return np.zeros(len(observations), np.int64)
+        """Return the same action for each episode, (B,)."""
+        return np.stack([self._straight] * len(observations))
 
     def keep(self, places: np.ndarray) -> None:
         """Do nothing: it has no memory."""
@@ -90,11 +93,11 @@ class RandomAgent:
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Open one stream per episode, so that no episode depends on its neighbours."""
-        self._streams = episode_streams(seeds)
+        self._streams, self._count = episode_streams(seeds), num_actions(envs[0])
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return actions (B,)."""
-        return np.array([stream.integers(NUM_ACTIONS) for stream in self._streams])
+        return np.array([stream.integers(self._count) for stream in self._streams])
 
     def keep(self, places: np.ndarray) -> None:
         """Forget the streams of the others."""
@@ -116,7 +119,14 @@ class PolicyAgent:
         self.observation = cast(Observation, policy.observation)
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Forget the episodes before."""
+        """Forget the episodes before.
+
+        Raises:
+            ValueError: The vehicle has another number of actions than the policy.
+        """
+        own, theirs = self.policy.spec.num_actions, num_actions(envs[0])
+        if own != theirs:
+            raise ValueError(f"the policy chooses among {own} actions, and the vehicle has {theirs}")
         self.policy.reset(len(envs))
         self._streams = episode_streams(seeds)
 
@@ -140,21 +150,41 @@ class OracleAgent:
     observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Plan one path per episode."""
-        self._plans = []
+        """Plan one path per episode, or the cost-to-go of a vehicle with a body."""
+        self._plans, self._bodies = [], envs[0].dynamics.move is not None
         for env in envs:
+            if self._bodies:
+                self._plans.append((plan_body(env.scene, env.config, env.dynamics), None, env))
+                continue
             step_m = env.config.speed_mps / env.config.control_hz
             vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
             plan = plan_path(env.scene, env.camera_pose()[0], *vehicle)
             self._plans.append((plan, MOVES * step_m, env))
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return for each episode the action that ends closest to its plan, where the action takes effect."""
+        """Return for each episode the action that ends closest to its plan, where the action takes effect.
+
+        Of a vehicle with a body, it is the cheapest.
+        """
+        if self._bodies:
+            return np.array([plan.of_actions(env.state_of_action()).argmin() for plan, _, env in self._plans])
         return np.array([follow(plan, moves_m, *env.place_of_action()) for plan, moves_m, env in self._plans])
 
     def keep(self, places: np.ndarray) -> None:
         """Forget the other plans."""
         self._plans = [self._plans[k] for k in places]
+
+
+def num_actions(env: CorridorEnv) -> int:
+    """Return how many actions a vehicle has.
+
+    Raises:
+        ValueError: Its actions are not discrete.
+    """
+    space = env.action_space
+    if not isinstance(space, Discrete):
+        raise ValueError(f"agents choose among discrete actions, such as body.primitives=15; got {space}")
+    return int(space.n)
 
 
 def episode_streams(seeds: Sequence[int]) -> list[np.random.Generator]:

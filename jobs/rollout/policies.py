@@ -25,6 +25,7 @@ from models.policy.policy import (
 
 SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
 FILTER = ("filter_support", "filter_tau_us")
+KINEMATIC: dict[str, Any] = {"vehicle": "kinematic", "body": {}}
 Differences = dict[str, tuple[object, object]]  # sensor setting -> (the policy's value, the environment's)
 
 
@@ -209,16 +210,25 @@ def load_trained(key: str, name: str, env: EnvConfig) -> tuple[Path, Policy]:
 def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
     """Return the simulation with the sensor settings of a manifest, named as `sensor_settings` names them.
 
+    A manifest that names no vehicle is that of a kinematic one.
+
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is out of range.
     """
+    if sensor:
+        env = replace(env, **KINEMATIC)
     return env_with(env, {SENSOR_KEYS.get(name, name): value for name, value in sensor.items()})
 
 
-def with_own_filter(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
-    """Return the simulation with the neighbour filter of a policy, to which it belongs as its networks do."""
+def with_own_parts(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
+    """Return the simulation with a policy's neighbour filter and vehicle.
+
+    They belong to it as its networks do. If the simulation has that vehicle already, its body stays.
+    """
     own = {name: policy.sensor[name] for name in FILTER if name in policy.sensor}
-    return replace(env, **own)
+    vehicle = {name: policy.sensor.get(name, usual) for name, usual in KINEMATIC.items()}
+    same = not policy.sensor or vehicle["vehicle"] == env.vehicle
+    return replace(env, **own, **({} if same else vehicle))
 
 
 def own_sensor_differences(policy: EvaluatedPolicy, env: EnvConfig) -> Differences:

@@ -24,7 +24,7 @@ class Moment(NamedTuple):
         num_events: Events of this control step, faults included [-].
         observation: What the policy was shown.
         latent: What its encoder makes of it, float32 (L,); None for a policy without encoder.
-        probabilities: Of the actions forward, left, right; float64 (3,).
+        probabilities: Of the actions, float64 (K,).
         action: The one that was taken.
         x_m, y_m: Where the vehicle is [m].
         t_us: Simulated time [us].

@@ -8,6 +8,7 @@ folder. Nothing moves: the recording is what it is, whatever the policy chooses 
 import csv
 import io
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,8 +28,7 @@ from jobs.run.recordings import refused
 from jobs.training.real_recordings import Recorded, read_whole
 from models.policy import Policy, load_policy
 
-ACTIONS = ("forward", "left", "right")
-HEADINGS = ("Recording", "Policy", "Steps", "Events/step", "Forward", "Left", "Right", "p50", "p95", "p99")
+SHOWN_ACTIONS = 3  # columns of the table of numbers; the CSV file has the probabilities of more
 FILM_FPS, SLOWEST_FPS = 50.0, 5.0
 FAR = 5.0  # times the event rate of the training, or less than its reciprocal: a warning
 
@@ -52,7 +52,7 @@ class Choice(NamedTuple):
     Attributes:
         start_us, end_us: The step [us].
         events: EVENT of it.
-        probabilities: Of the actions, float64 (3,).
+        probabilities: Of the actions, float64 (K,).
         seconds: What the choice took.
     """
 
@@ -85,15 +85,27 @@ def run(config: Config) -> list[Choice]:
         )
     _tell_rate(recorded, trained_rate(policy))
     choices, name = choose(policy, recorded), f"{found.group}-s{found.training}"
-    show_table("A policy looks at a recording", HEADINGS, [line(recorded.name, name, choices)], words=2)
+    shown = policy.action_names if len(policy.action_names) <= SHOWN_ACTIONS else ()
+    headings = (
+        "Recording",
+        "Policy",
+        "Steps",
+        "Events/step",
+        *map(str.capitalize, shown),
+        "p50",
+        "p95",
+        "p99",
+    )
+    show_table("A policy looks at a recording", headings, [line(recorded.name, name, choices)], words=2)
     console.print(
         "Latency from events to action [ms]; actions by the likeliest, in % of the steps.", markup=False
     )
     folder = open_run(config).path / "replay"
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(folder / "choices.csv", table_text(choices))
+    write_atomic(folder / "choices.csv", table_text(choices, policy.action_names))
     shape = env.camera.height, env.camera.width
-    path = write_film(folder / "replay.mp4", choices, shape, f"{recorded.name}   {name}", env.control_hz)
+    title, names = f"{recorded.name}   {name}", policy.action_names
+    path = write_film(folder / "replay.mp4", choices, shape, (title, names), env.control_hz)
     console.print(f"Film: {path}", markup=False)
     return choices
 
@@ -140,36 +152,48 @@ def _tell_rate(recorded: Recorded, trained: float | None) -> None:
 
 
 def line(recording: str, policy: str, choices: list[Choice]) -> tuple[str, ...]:
-    """Return a text for each of `HEADINGS`."""
-    likeliest = np.array([choice.probabilities.argmax() for choice in choices])
-    shares = [f"{100 * (likeliest == action).mean():.0f}" for action in range(len(ACTIONS))]
+    """Return a text for each heading of the table."""
+    likeliest, count = [choice.probabilities.argmax() for choice in choices], choices[0].probabilities.size
+    shares = [f"{100 * np.equal(likeliest, action).mean():.0f}" for action in range(count)]
+    shares = shares if count <= SHOWN_ACTIONS else []
     latency = np.percentile([1e3 * choice.seconds for choice in choices], (50, 95, 99))
     per_step = np.mean([choice.events.size for choice in choices])
     return recording, policy, str(len(choices)), f"{per_step:.0f}", *shares, *(f"{ms:.2f}" for ms in latency)
 
 
-def table_text(choices: list[Choice]) -> str:
+def table_text(choices: list[Choice], names: Sequence[str]) -> str:
     """CSV with a row for each control step: its end [us], its events, and the actions' probabilities."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("end_us", "events", *ACTIONS))
+    writer.writerow(("end_us", "events", *names))
     for choice in choices:
         writer.writerow((choice.end_us, choice.events.size, *(f"{p:.4f}" for p in choice.probabilities)))
     return text.getvalue()
 
 
-def write_film(path: Path, choices: list[Choice], shape: tuple[int, int], title: str, hz: float) -> Path:
-    """Write an MP4 file with a frame for each control step: its events, and the choice; return it."""
+def write_film(
+    path: Path, choices: list[Choice], shape: tuple[int, int], said: tuple[str, Sequence[str]], hz: float
+) -> Path:
+    """Write an MP4 file with a frame for each control step: its events, and the choice; return it.
+
+    `said` is the title, and the name of each action.
+    """
+    title, names = said
+    # As a person looks, from the left.
+    order = (1, 0, 2) if len(names) == SHOWN_ACTIONS else range(len(names))
     with open_film(path, hz, None, float(np.clip(hz / 4, SLOWEST_FPS, FILM_FPS))) as film:
         for choice in choices:
-            odds = "   ".join(
-                f"{name} {p:.2f}" for name, p in zip(ACTIONS, choice.probabilities, strict=True)
-            )
+            likeliest = sorted(zip(choice.probabilities, names, strict=True), reverse=True)[:SHOWN_ACTIONS]
+            odds = "   ".join(f"{name} {p:.2f}" for p, name in likeliest)
             panel = coloured(last_polarity(choice.events, shape))
             bars = np.zeros((*shape, 3), np.uint8)
-            for place, action in enumerate((1, 0, 2)):  # left, forward, right, as a person looks
-                height, width = round(choice.probabilities[action] * shape[0]), shape[1] // 3
-                bars[shape[0] - height :, place * width + 1 : (place + 1) * width - 1] = (245, 158, 11)
-            panels = [(title, panel), ("left, forward, right", bars)]
+            for place, action in enumerate(order):
+                height, width = round(choice.probabilities[action] * shape[0]), shape[1] // len(names)
+                bars[shape[0] - height :, place * width + (width > 2) : (place + 1) * width - (width > 2)] = (
+                    245,
+                    158,
+                    11,
+                )
+            panels = [(title, panel), ("actions, from left to right", bars)]
             film.add(frame(panels, f"{choice.end_us / 1e6:.2f} s   {odds}"))
     return path

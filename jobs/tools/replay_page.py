@@ -26,7 +26,7 @@ from jobs.config.config import Config
 from jobs.config.schema import Name, NonNegative
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
-from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, with_own_filter
+from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, with_own_parts
 from jobs.rollout.recorded import Moment, RecordedEpisode, record_episode
 from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run, finish, locate_run, open_run
@@ -92,7 +92,7 @@ def record(
     for policy, scene, noise, control_hz in cells:
         faults = dataclasses.replace(config.env.faults, background_activity=noise)
         env = dataclasses.replace(config.env, scene=scene, control_hz=control_hz, faults=faults, split="eval")
-        yield record_episode(agents[policy.agent], with_own_filter(policy, env), config.seed)
+        yield record_episode(agents[policy.agent], with_own_parts(policy, env), config.seed)
         advance(1)
 
 

@@ -132,11 +132,10 @@ def signature(manifest: Mapping[str, Any]) -> "ModelSignature":
     from mlflow.models import ModelSignature
     from mlflow.types import ColSpec, ParamSchema, ParamSpec, Schema, TensorSpec
 
-    from jobs.tracking.served_policy import ACTIONS
+    from models.policy.policy import action_names
 
-    given = Schema(
-        [ColSpec("long", "step"), ColSpec("long", "action"), *(ColSpec("float", name) for name in ACTIONS)]
-    )
+    logits = [ColSpec("float", name) for name in action_names(manifest)]
+    given = Schema([ColSpec("long", "step"), ColSpec("long", "action"), *logits])
     if find_kind(manifest["name"]).observation == "luminance":
         shape = (-1, manifest["height"], manifest["width"])
         return ModelSignature(Schema([TensorSpec(np.dtype(np.float32), shape)]), given)

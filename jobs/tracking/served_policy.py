@@ -15,8 +15,6 @@ from mlflow.pyfunc import PythonModel
 
 from models.policy import Policy, load_policy
 
-ACTIONS = ("forward", "left", "right")  # columns of logits, in the order of the actions
-
 
 class ServedPolicy(PythonModel):
     """A policy folder behind MLflow's interface."""
@@ -39,20 +37,21 @@ class ServedPolicy(PythonModel):
 
         Returns:
             A row per decision: `step` (0 at the episode's start, then one after each control step),
-            `action` and a logit for each of `ACTIONS`.
+            `action` and a logit for each of `Policy.action_names`.
 
         Raises:
             ValueError: Events before the episode's start, or not in time order.
         """
         policy = Policy(self.loaded.networks, self.loaded.spec, self.loaded.encoder)
+        names = self.loaded.action_names
         if policy.observation == "luminance":
             logits = [policy.logits(picture[None])[0] for picture in np.asarray(model_input)]
         else:
             window_us = int((params or {})["window_us"])
             logits = [policy.event_logits(*step) for step in control_steps(model_input, window_us)]
-        table = np.reshape(logits, (-1, len(ACTIONS)))
+        table = np.reshape(logits, (-1, len(names)))
         columns: dict[str, np.ndarray] = {"step": np.arange(len(table)), "action": table.argmax(axis=1)}
-        return pd.DataFrame(columns | dict(zip(ACTIONS, table.T, strict=True)))
+        return pd.DataFrame(columns | dict(zip(names, table.T, strict=True)))
 
 
 def control_steps(events: pd.DataFrame, window_us: int) -> Iterator[tuple[dict[str, np.ndarray], int, int]]:

@@ -19,11 +19,10 @@ import numpy as np
 from envs.config import WITHOUT_EVENTS, EnvConfig, Observation, Split, sensor_settings, settings_hash
 from envs.corridor import CorridorEnv, Info
 from envs.events import EVENT
-from envs.kinematics import NUM_ACTIONS
 from envs.recordings import Recording, write_recording
 from jobs.config.conditions import episode_draw
 from jobs.config.config import Config
-from jobs.rollout.agents import Agent, make_agent
+from jobs.rollout.agents import Agent, make_agent, num_actions
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.policies import load_trained
 from jobs.run.checkpoints import seal
@@ -273,9 +272,9 @@ class HoldingAgent:
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Draw the first action; the stream continues from episode to episode."""
-        config = envs[0].config
+        config, self._count = envs[0].config, num_actions(envs[0])
         self._hold_steps = max(1.0, MEAN_HOLD_M * config.control_hz / config.speed_mps)
-        self._action = self._rng.integers(NUM_ACTIONS)
+        self._action = self._rng.integers(self._count)
 
     def keep(self, places: np.ndarray) -> None:
         """Do nothing: the one episode has ended."""
@@ -283,7 +282,7 @@ class HoldingAgent:
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the action, int (1,)."""
         if self._rng.random() < 1.0 / self._hold_steps:
-            self._action = self._rng.integers(NUM_ACTIONS)
+            self._action = self._rng.integers(self._count)
         return np.array([self._action])
 
 

@@ -3,8 +3,10 @@
 import dataclasses
 from pathlib import Path
 
+from gymnasium.spaces import Discrete
+
 from envs.config import sensor_settings, settings_hash
-from envs.kinematics import NUM_ACTIONS
+from envs.vehicles.dynamics import make_dynamics
 from jobs.config.config import Config, ConfigError
 from jobs.config.errors import differences
 from jobs.config.plugins import plugin_digests
@@ -15,13 +17,15 @@ from models.kinds import KINDS, PolicySpec
 
 def policy_spec(config: Config) -> PolicySpec:
     """Return what the policy's networks are built from."""
-    camera = config.env.camera
-    return PolicySpec(config.model, camera.width, camera.height, NUM_ACTIONS)
+    camera, actions = config.env.camera, make_dynamics(config.env).action_space
+    if not isinstance(actions, Discrete):  # `jobs.config` refuses such vehicles
+        raise ValueError(f"a policy chooses among discrete actions, got {actions}")
+    return PolicySpec(config.model, camera.width, camera.height, int(actions.n))
 
 
 def policy_about(config: Config) -> dict[str, object]:
     """Return what a policy's manifest records of its environment and training, beside its `policy_spec`."""
-    sensor = sensor_settings(config.env)
+    sensor, commands = sensor_settings(config.env), make_dynamics(config.env).commands
     return {
         "exp": config.exp,
         "observation": KINDS[config.model.name].observation,
@@ -34,6 +38,7 @@ def policy_about(config: Config) -> dict[str, object]:
         "conditions": config.train.conditions,
         "seed": config.seed,
         "algo": dataclasses.asdict(config.algo),
+        **({} if commands is None else {"commands": commands.tolist()}),
         **({} if config.train.init is None else {"init": config.train.init}),
         **({"plugins": plugin_digests()} if config.plugins else {}),
     }

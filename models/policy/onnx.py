@@ -17,6 +17,7 @@ and gives::
     next_state   as last_state
     next_us      as last_us: when each pixel fired last, since the end of this step [us]
     dropped      int64 (), events or pixels that were left out because `Policy` refuses them
+    command      float32 (C,), of the likeliest action, as the vehicle's Box takes it  (vehicles with a body)
 
 The file leaves out events outside of the image or with another p than -1 and +1, every event if window_us is
 not in 1 .. MAX_WINDOW_US, and takes pixels that are not finite for black.
@@ -80,6 +81,7 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
     inputs += [value for _, value in own]
     names["input_names"] += [f"last_{name}" for name, _ in own]
     names["output_names"] += [*(f"next_{name}" for name, _ in own), "dropped"]
+    names["output_names"] += [] if graph.commands is None else ["command"]
     program: Any = torch.onnx.export(
         graph,
         tuple(inputs),
@@ -106,6 +108,8 @@ class PolicyGraph(nn.Module):
         self.filter = filter_of(policy.manifest.get("sensor", {}), spec.width, spec.height)
         self.sees_events = policy.feature.from_events is not None
         self.state_size = network_of(spec).state(spec)
+        commands = policy.commands
+        self.commands = None if commands is None else torch.from_numpy(commands.astype(np.float32))
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
         self.read = self.trunk.plain if isinstance(self.trunk, EventSet) else self.trunk
         self.feature = resolve(KINDS[spec.model.name].onnx or "")
@@ -133,6 +137,11 @@ class PolicyGraph(nn.Module):
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the outputs that the module's docstring lists, of the inputs that it lists."""
+        outputs = self._decided(*inputs)
+        return outputs if self.commands is None else (*outputs, self.commands[outputs[0].argmax()])
+
+    def _decided(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return all outputs but the command."""
         inputs, dropped = self._valid(*inputs)
         if self.filter is None:
             return *self._step(*inputs), dropped

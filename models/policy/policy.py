@@ -45,8 +45,9 @@ ENCODER_FILES = (ENCODER, "encoder.json")
 REQUIRED = ("sha256", "name", "sensor", "sensor_hash")
 FORMAT = 2
 # Of a manifest's sensor settings: those that are the environment's own, and those of its simulation.
-ENV_FIELDS = ("control_hz", "speed_mps", "filter_support", "filter_tau_us")
+ENV_FIELDS = ("control_hz", "speed_mps", "filter_support", "filter_tau_us", "vehicle", "body")
 FIDELITY_FIELDS = ("tolerance", "max_step_m", "samples", "cull_m")
+HEADINGS = ("forward", "left", "right")  # the actions of the kinematic vehicle
 REMEDY = "copy it again, or delete stages/train.json of its run folder and give the command again"
 PREPARED = ("feature", "_network", "_run")  # attributes of a policy that are functions
 MAX_BYTES = 1 << 28  # of one file, which is read whole
@@ -71,6 +72,7 @@ class PolicyManifest(TypedDict, total=False):
     sensor_hash: str
     world: dict[str, Any]
     conditions: list[dict[str, Any]]
+    commands: list[list[float]]
     figures: dict[str, float]
 
 
@@ -82,6 +84,8 @@ class Policy:
         manifest: Sensor settings and hash, training settings and metrics; empty if it is from no folder.
         encoder: Makes the latents that the networks read, frozen or fine-tuned; None without one.
         deterministic: True: the most likely action; False: one drawn from the distribution.
+        commands: float64 (K, C), the command of each action of a vehicle with a body, as its Box takes it;
+            None for the kinematic vehicle's three headings.
     """
 
     def __init__(
@@ -102,6 +106,7 @@ class Policy:
         self.networks, self.spec, self.encoder = networks, spec, encoder
         self.deterministic, self.rng = deterministic, rng
         self.manifest: PolicyManifest = {} if manifest is None else manifest
+        self.commands = _commands_of(self.manifest, spec)
         self._prepare()
         self.reset()
 
@@ -172,9 +177,19 @@ class Policy:
         """
         return self._choose(self.logits(observations, restarted))
 
-    def act(self, events: Any, start_us: int, window_us: int) -> int:
-        """Choose the action of one episode from the events of its control step; see `event_logits`."""
-        return int(self._choose(self.event_logits(events, start_us, window_us)[None])[0])
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Return a name for each action: of a heading, or of the numbers of its command."""
+        return action_names(self.manifest)
+
+    def act(self, events: Any, start_us: int, window_us: int) -> Any:
+        """Choose the action of one episode from the events of its control step; see `event_logits`.
+
+        Returns:
+            The number of the heading; for a vehicle with a body the command, float64 (C,).
+        """
+        action = int(self._choose(self.event_logits(events, start_us, window_us)[None])[0])
+        return action if self.commands is None else self.commands[action].copy()
 
     def event_logits(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
         """Return unnormalised log-probabilities float32 (actions,) of one episode's step from its events.
@@ -227,6 +242,31 @@ class Policy:
         cumulative = np.cumsum(weights, axis=1)
         drawn = self.rng.random((len(logits), 1)) * cumulative[:, -1:]
         return (cumulative <= drawn).sum(axis=1)
+
+
+def action_names(manifest: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the name of each action of a policy's manifest, in the order of its logits."""
+    if "commands" not in manifest:
+        return HEADINGS
+    return tuple(" ".join(f"{number:+.3f}" for number in command) for command in manifest["commands"])
+
+
+def _commands_of(manifest: PolicyManifest, spec: PolicySpec) -> np.ndarray | None:
+    """Return the commands of a manifest.
+
+    Raises:
+        PolicyFileError: They are not finite, or not one for each action.
+    """
+    if "commands" not in manifest:
+        return None
+    try:
+        commands = np.array(manifest["commands"], np.float64)
+    except (ValueError, TypeError):
+        commands = np.empty(0)
+    if commands.ndim != 2 or len(commands) != spec.num_actions or not np.isfinite(commands).all():
+        rule = f"commands must be {spec.num_actions} lists of finite numbers, one for each action"
+        raise PolicyFileError(f"{MANIFEST}: {rule}, got {manifest['commands']!r:.80}")
+    return commands
 
 
 def save_policy(

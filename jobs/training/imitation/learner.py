@@ -38,7 +38,8 @@ class ImitationLearner(PlainPPOLearner):
         """Build PPO's learner, an empty store of steps, and a copy of the initial weights."""
         super().build()
         self._settings: dict[str, Any] = self.config.learner_config_dict[SETTINGS]
-        self._mirrored: bool = self._settings.get(MIRRORED, False)
+        mirrored = self._settings.get(MIRRORED, False)  # or the mirrored action of each, of other vehicles
+        self._mirrored: list[int] = MIRRORED_ACTIONS if mirrored is True else mirrored or []
         self._steps = LabelledSteps(1e6 * self._settings["keep_mb"])
         self._first = copy.deepcopy(self.module[DEFAULT_MODULE_ID].unwrapped().state_dict())
 
@@ -75,7 +76,7 @@ class ImitationLearner(PlainPPOLearner):
         likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
         self._steps.add(rows[Columns.OBS].numpy(), costs.numpy())
         if self._mirrored:
-            self._steps.add(rows[MIRRORED].numpy(), costs.numpy()[:, MIRRORED_ACTIONS])
+            self._steps.add(rows[MIRRORED].numpy(), costs.numpy()[:, self._mirrored])
         count = self._settings["final_steps" if self._last else "fit_steps"]
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
         if self._last:

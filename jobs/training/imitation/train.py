@@ -6,6 +6,7 @@ from typing import cast
 
 from ray.rllib.algorithms.ppo import PPOConfig
 
+from envs.vehicles.dynamics import make_dynamics, mirrored_actions
 from jobs.config.algorithms import AlgoConfig
 from jobs.config.config import Config, ConfigError
 from jobs.training.imitation.env_runner import TaughtEnvRunner
@@ -31,7 +32,8 @@ def learner_settings(config: Config) -> dict[str, object]:
     algo = cast(AlgoConfig, config.algo)
     own = dataclasses.asdict(algo.imitation) if algo.imitation else {}
     if algo.mirrored:  # only then: Tune resumes a training only under the keys that it began with
-        own[MIRRORED] = True
+        kinematic = config.env.vehicle == "kinematic"
+        own[MIRRORED] = True if kinematic else mirrored_actions(make_dynamics(config.env))
     return shared_settings(algo) | {SETTINGS: {**own, "env_steps": config.train.env_steps}}
 
 

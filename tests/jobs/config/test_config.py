@@ -35,9 +35,11 @@ JOBS = {
     "taught": "study",
     "ablation": "study",
     "hold": "study",
+    "body_speed": "study",
     "renderer": "study",
 }
 POLICIES = {
+    "body_hold": "event_columns",
     "bytestream": "bytestream",
     "bytestream_finetuned": "bytestream",
     "bytestream_hold": "bytestream",
@@ -109,16 +111,25 @@ def test_every_job_has_a_module_whose_settings_are_those_of_its_file():
     [
         (
             ["env.vehicle=point_mass"],
-            r"env.vehicle: must have three actions, .*the actions of 'point_mass' are",
+            r"env.vehicle: must have discrete actions, .*the actions of 'point_mass' are",
         ),
         (["env.vehicle=boat"], r"env.vehicle: must be one of kinematic, point_mass, .*got 'boat'"),
         (["env.vehicle=point_mass", "+env.body.tau=1"], r"env.body has no 'tau'; it has command, "),
         (["+env.body.tau_s=1"], r"env.body must be empty for vehicle 'kinematic'"),
+        (
+            ["vehicle=point_mass", "algo=imitation", "algo.teacher_sight_m=20"],
+            r"algo.teacher_sight_m: must be null for vehicle 'point_mass', .*got 20",
+        ),
+        (
+            ["vehicle=point_mass", "train.conditions=[{env.body.primitives: 5}]"],
+            r"env.body.primitives: must be the same for all of a training",
+        ),
         (["env.task=race"], r"env.task: must be one of corridor, got 'race'"),
     ],
 )
 def test_a_vehicle_that_jobs_cannot_fly_is_refused(words, rule):
     assert parse(compose("+exp=event_columns", "env.vehicle=point_mass", "+env.body.primitives=3"))
+    assert parse(compose("+exp=event_columns", "vehicle=crazyflie")).env.vehicle == "crazyflie"
     with pytest.raises(ConfigError, match=rule):
         parse(compose("+exp=event_columns", *words))
 
@@ -264,6 +275,7 @@ OF_EXPERIMENTS = (
     "_first",
     "long",
     "_hold",
+    "_body",
     *(f"_{job}" for job in JOBS_THERE),
 )  # lengths that name an experiment instead of an algorithm
 

@@ -10,7 +10,7 @@ from jobs.config.config import ConfigError, parse
 from jobs.evaluation import demo
 from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.executors import Part, evaluate_part
-from jobs.rollout.policies import find_policies, with_own_filter
+from jobs.rollout.policies import find_policies, with_own_parts
 from jobs.rollout.recorded import record_episode
 from jobs.rollout.tasks import make_task
 from jobs.run.folder import locate_run
@@ -38,7 +38,7 @@ def test_the_printed_line_is_the_evaluations_own_row_and_the_film_has_a_frame_fo
     demo.run(config)
     printed = capsys.readouterr().out
     (policy,) = find_policies("demo.policy", name, config, locate_run(config))
-    env = with_own_filter(policy, dataclasses.replace(config.env, split="eval"))
+    env = with_own_parts(policy, dataclasses.replace(config.env, split="eval"))
     assert env.filter_support == (1 if name == "bytestream_hold-s0" else 0)
     task = make_task(("poles_eval", "raycast"), policy, config.evaluate.action, env, 4)
     row = evaluate_part(Part(task)).episodes[3]

@@ -11,9 +11,9 @@ from envs.corridor import CorridorEnv
 from jobs.run.files import write_json
 from jobs.run.folder import open_run
 from jobs.tracking.model_registry import register, register_training
-from jobs.tracking.served_policy import ACTIONS
 from jobs.tracking.tracker import open_tracker
 from models.policy import load_policy
+from models.policy.policy import HEADINGS
 from tests.support.configs import small_config
 from tests.support.policies import save_training
 
@@ -60,7 +60,7 @@ def test_a_registered_policy_gives_the_logits_and_actions_of_the_policy_itself(s
     expected = np.concatenate([policy.logits(shown[None]) for shown in seen(policy.observation)])
     for _ in range(2):  # it remembers no flight before
         found = model.predict(as_input(policy.observation))
-        np.testing.assert_array_equal(found[list(ACTIONS)].to_numpy(), expected)
+        np.testing.assert_array_equal(found[list(HEADINGS)].to_numpy(), expected)
         np.testing.assert_array_equal(found["action"], expected.argmax(axis=1))
         np.testing.assert_array_equal(found["step"], np.arange(STEPS + 1))
     assert len(np.unique(expected, axis=0)) > 2

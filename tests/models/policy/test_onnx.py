@@ -16,6 +16,7 @@ from tests.support.patience import HANG_S
 from tests.support.policies import ABOUT, SIDE, TRAINED, kinds, make_networks, make_spec, save
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+COMMANDS = [[-0.25, 1.0], [0.0, 1.0], [0.25, 1.0]]
 EDGES = [(1, 0, 0, 1), (5000, SIDE - 1, SIDE - 1, -1), (4999, SIDE - 1, 0, 1), (5000, 0, SIDE - 1, -1)]
 
 
@@ -49,6 +50,7 @@ def fly_exported(file, shown, shape, dtype):
         out = dict(zip(names, session.run(None, {**inputs, **memory, "first": first}), strict=True))
         memory, first = {name: out[name.replace("last", "next")] for name in memory}, np.array(False)
         assert out["dropped"] == 0
+        assert "command" not in out or out["command"].tolist() == COMMANDS[out["logits"].argmax()]
         logits.append(out["logits"])
     return np.array(logits)
 
@@ -58,7 +60,7 @@ def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
     if name == "memory":
         spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0])
-        return save_policy(path, build_networks(spec, seed=3), spec, ABOUT)
+        return save_policy(path, build_networks(spec, seed=3), spec, {**ABOUT, "commands": COMMANDS})
     changes = {
         "bytestream_xy": {"variant": "bytestream_xy"},
         "eventnet": {"coding": "eventnet"},
@@ -78,6 +80,8 @@ def folder(request, tmp_path_factory):
 def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(folder, tmp_path):
     policy = load_policy(folder)
     file = export_onnx(policy, tmp_path / "policy.onnx")
+    given = [one.name for one in onnxruntime.InferenceSession(str(file)).get_outputs()]
+    assert ("command" in given) == (policy.commands is not None)
     feature = policy.feature
     if feature.from_events is None:
         rng = np.random.default_rng(0)
