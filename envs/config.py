@@ -375,7 +375,7 @@ def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
     for name in LATER_SETTINGS:
         if camera[name] == getattr(CameraConfig, name):
             del camera[name]
-    own: dict[str, Setting] = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
+    own: dict[str, Any] = {"control_hz": config.control_hz, "speed_mps": config.speed_mps}
     if config.filter_support > 0:
         own |= {"filter_support": config.filter_support, "filter_tau_us": config.filter_tau_us}
     if config.vehicle != "kinematic":

@@ -75,7 +75,7 @@ def plan_body(scene: Scene, config: EnvConfig, dynamics: Dynamics) -> BodyPlan:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _costs(prices, stride, row_s, step_mps, half):
+def _costs(prices: np.ndarray, stride: int, row_s: float, step_mps: float, half: int) -> np.ndarray:
     """Return the least price to the last row from each row, velocity and column."""
     last, columns = prices.shape[0] - 1, prices.shape[1]
     rows = (last + stride - 1) // stride + 1
@@ -99,7 +99,7 @@ def _costs(prices, stride, row_s, step_mps, half):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _between(values, place):
+def _between(values: np.ndarray, place: float) -> float:
     """Return the value at a place between two elements; outside, that of the edge."""
     place = min(max(place, 0.0), len(values) - 1.0)
     first = min(int(place), len(values) - 2)
@@ -107,7 +107,7 @@ def _between(values, place):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _cost_at(costs, column, row, speed):
+def _cost_at(costs: np.ndarray, column: float, row: float, speed: float) -> float:
     """Return the cost-to-go between rows, velocities and columns, all in lattice steps."""
     row = min(max(row, 0.0), len(costs) - 1.0)
     j = max(0, min(int(row), len(costs) - 2))
@@ -138,7 +138,7 @@ def _label_by(move: Callable[..., None] | None) -> Any:
             total = 0.0
             for _ in range(steps):
                 before_m = own[1]
-                move(own, commands[k], wind, parameters, WAY_S)
+                move(own, commands[k], wind, parameters, WAY_S)  # type: ignore[misc]  # a body moves
                 row = min(max(own[1] / LATTICE_M, 0.0), len(prices) - 1.0)
                 price = _between(prices[int(row + 0.5)], (own[0] - first_x_m) / LATTICE_M)
                 total += price * max(0.0, own[1] - before_m) / LATTICE_M

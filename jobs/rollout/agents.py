@@ -4,7 +4,7 @@
 something between them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -145,34 +145,31 @@ class PolicyAgent:
 
 
 class OracleAgent:
-    """Plans on a lattice with the true geometry, then follows the plan."""
+    """Plans with the true geometry; of a vehicle with a body it takes the cheapest command."""
 
     observation: Observation = "none"
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Plan one path per episode, or the cost-to-go of a vehicle with a body."""
-        self._plans, self._bodies = [], envs[0].dynamics.move is not None
-        for env in envs:
-            if self._bodies:
-                self._plans.append((plan_body(env.scene, env.config, env.dynamics), None, env))
-                continue
-            step_m = env.config.speed_mps / env.config.control_hz
-            vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
-            plan = plan_path(env.scene, env.camera_pose()[0], *vehicle)
-            self._plans.append((plan, MOVES * step_m, env))
+        """Plan each episode."""
+        self._choices = [_planned(env) for env in envs]
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return for each episode the action that ends closest to its plan, where the action takes effect.
-
-        Of a vehicle with a body, it is the cheapest.
-        """
-        if self._bodies:
-            return np.array([plan.of_actions(env.state_of_action()).argmin() for plan, _, env in self._plans])
-        return np.array([follow(plan, moves_m, *env.place_of_action()) for plan, moves_m, env in self._plans])
+        """Return the planned action of each episode, (B,)."""
+        return np.array([choose() for choose in self._choices])
 
     def keep(self, places: np.ndarray) -> None:
         """Forget the other plans."""
-        self._plans = [self._plans[k] for k in places]
+        self._choices = [self._choices[k] for k in places]
+
+
+def _planned(env: CorridorEnv) -> Callable[[], int]:
+    """Return what chooses the planned action of an episode, where the action takes effect."""
+    if env.dynamics.move is not None:
+        body = plan_body(env.scene, env.config, env.dynamics)
+        return lambda: int(body.of_actions(env.state_of_action()).argmin())
+    step_m = env.config.speed_mps / env.config.control_hz
+    plan = plan_path(env.scene, env.camera_pose()[0], env.config.vehicle_radius_m, env.config.camera_height_m)
+    return lambda: follow(plan, MOVES * step_m, *env.place_of_action())
 
 
 def num_actions(env: CorridorEnv) -> int:
