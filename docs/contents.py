@@ -3,6 +3,8 @@
 A page that is not there is left out: commands write some of them.
 """
 
+from pathlib import Path
+
 CONTENTS = {
     "Start": ("start", "watch", "models", "limits"),
     "Learn": ("task", "events", "camera", "encoder", "statistics", "glossary"),
@@ -11,21 +13,20 @@ CONTENTS = {
         "hyperparameters", "deploy", "dashboard", "troubleshooting",
     ),
     "Results": ("results", "claims", "studies", "data"),
-    "Engineering": ("simulator", "encoder_accuracy", "trade", "numerics", "performance", "reliability"),
+    "Engineering": ("simulator", "trade", "numerics", "performance", "reliability"),
     "Reference": ("environment", "vehicles", "keys", "api", "code"),
-    "Project": ("differences", "alternatives", "contributing", "security", "citation"),
+    "Project": ("differences", "security", "citation"),
 }  # fmt: skip
 # A page of the sidebar -> pages below it, which it lists itself.
 BELOW = {
     "studies": (
-        "pooling", "dose_response_taught", "dose_response", "ppo_claims", "taught_claims", "ppo_paper",
-        "ppo_event_set", "encoder_seeds", "camera_rates", "ablation", "training_lengths", "representations",
+        "dose_response_taught", "ppo_paper", "ppo_event_set", "encoder_seeds", "camera_rates", "ablation",
+        "training_lengths", "representations", "pooling",
+        *(f"plans/{page.stem}" for page in sorted((Path(__file__).parent / "plans").glob("*.md"))),
     ),
     "events": ("notebooks/events",),
     "encoder": ("notebooks/encoder",),
     "train": ("notebooks/policy",),
-    "results": ("robustness",),
-    "data": ("results_tables",),
     "api": ("modules",),
 }  # fmt: skip
 

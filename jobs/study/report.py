@@ -24,7 +24,7 @@ from jobs.study.doses import measure_doses, read_doses, write_doses
 from jobs.study.page import Study, compute, figures, fill, marked, new_page, part, published
 from jobs.study.results import FOLDERS, check_whole, publish, read_results
 from jobs.study.spec import read_study
-from jobs.study.tables import write_changes, write_estimates
+from jobs.study.tables import write_changes, write_estimates, write_tests
 from jobs.tools.replay_page import PAGE
 
 DOCS = Path("docs")
@@ -135,9 +135,10 @@ def study_of(data: Path, mark: str) -> Study:
 
 
 def write_values(folder: Path, study: Study) -> None:
-    """Write every estimate and every change of a study as CSV."""
+    """Write every estimate, every change and every test of a study as CSV."""
     write_estimates(folder / f"{study.name}_estimates.csv", study.summaries)
     write_changes(folder / f"{study.name}_changes.csv", study.changes)
+    write_tests(folder / f"{study.name}_tests.csv", study.families, study.results)
 
 
 def write_figures(images: Path, drawn: Mapping[str, Figure]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from jobs.analysis.statistics import crossed_mean
 from jobs.analysis.tables import estimate_text, markdown_table, percent_text, write_csv
 from jobs.study.changes import Change, replicated
-from jobs.study.contrasts import UNDECIDED, Finding, Row
+from jobs.study.contrasts import UNDECIDED, Finding, Row, by_condition
 from jobs.study.doses import Dose
 from jobs.study.results import RATE, Condition, Results, place, text_of
 from jobs.study.spec import LEARNED, Contrast, Family, changed_conditions
@@ -28,6 +28,10 @@ CHANGES = (
     *("Axis", "Value", "Group", "baseline_axis", "baseline_value", "trainings"),
     *("success_rate", "baseline_success_rate", "difference", "difference_low", "difference_high"),
     *("p", "certain", "broken"),
+)
+TESTS = (
+    *("family", "Group", "test", "against", "condition", "verdict"),
+    *("difference", "difference_low", "difference_high", "unit", "p_adjusted", "trainings_needed"),
 )
 WORST = 3  # conditions that break most are named, and what ties with them
 
@@ -388,6 +392,39 @@ def write_changes(file: Path, changes: Sequence[Change]) -> None:
         for one in changes
     ]
     write_csv(file, CHANGES, rows)
+
+
+def write_tests(
+    file: Path, families: Mapping[str, tuple[Family, Sequence[Finding]]], results: Results
+) -> None:
+    """Write every test of a study as CSV; of a family of one test also its conditions, which are not tested."""
+    rows = []
+    for name, (family, findings) in families.items():
+        rows += [(name, *_test_cells(family, one)) for one in findings]
+        if len(findings) == 1 and findings[0].contrast.theirs is not None:
+            (one,) = findings
+            scale, form, unit = scale_of(one.contrast)
+            rows += [(name, *_sides(one.contrast), condition_text(row.condition), "",
+                      *_numbers(row.difference.value * scale, _scaled(row.difference.interval, scale), form),
+                      unit, "", "") for row in by_condition(one.contrast, results)]  # fmt: skip
+    write_csv(file, TESTS, rows)
+
+
+def _test_cells(family: Family, one: Finding) -> tuple[str, ...]:
+    scale, form, unit = scale_of(one.contrast)
+    value = _numbers(one.difference.value * scale, _scaled(one.difference.interval, scale), form)
+    tested = family.adjust != "none"
+    p = _p_text(one) if tested else ""
+    needed = _needed_text(one) if family.power else ""
+    return (*_sides(one.contrast), "", one.verdict if tested else "", *value, unit, p, needed)
+
+
+def _sides(contrast: Contrast) -> tuple[str, str, str]:
+    return contrast.ours.group, contrast.name, "" if _alone(contrast) else contrast.theirs.group  # type: ignore[union-attr]
+
+
+def _scaled(interval: tuple[float, float] | None, scale: float) -> tuple[float, float] | None:
+    return None if interval is None else (scale * interval[0], scale * interval[1])
 
 
 def _numbers(value: float, interval: tuple[float, float] | None, form: str) -> tuple[str, str, str]:

@@ -63,6 +63,13 @@ def mean(values):
     return sum(values) / len(values)
 
 
+def claim_rows():
+    """Return the cells of the table of claims: claim, against, and the verdicts of three studies."""
+    lines = (ROOT / "docs" / "claims.md").read_text().splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
+    return [row for row in cells if len(row) == 5 and "`: " in row[0]]
+
+
 def planned(*words):
     """Return the groups of a command's sweep, its corridors, and its episodes; shared ones count once."""
     config = parse(compose(*words))
@@ -114,11 +121,7 @@ def test_the_first_pages_count_conditions_and_episodes():
 
 @pytest.mark.parametrize("page", FINDINGS)
 def test_the_paper_has_eleven_claims_and_one_is_reversed_with_ten_seeds(page):
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in (ROOT / "docs" / "claims.md").read_text().splitlines()
-        if line.startswith("| `")
-    ]
+    rows = claim_rows()
     claims = {row[0].partition(":")[2] for row in rows}
     assert said(r"None of the paper's (\d+) claims is confirmed", page) == [len(claims)]
     assert not [row for row in rows if "holds" in row[2:]]
@@ -187,12 +190,13 @@ def test_what_the_gallery_says_of_other_textures_is_what_the_data_say():
     assert found == [len(failed), len(first), len(early), len(rows) // len(first), round(half)]
 
 
-def test_the_page_of_claims_says_what_the_results_say():
-    def rows(page, columns):
-        lines = [line for line in (ROOT / "docs" / page).read_text().splitlines() if line.startswith("| `")]
-        cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-        return [tuple(row[at] for at in columns) for row in cells if len(row) > max(columns)]
-
-    shown = [(*row[0].split(": ", 1), *row[1:]) for row in rows("claims.md", range(5))]
-    assert sorted(shown) == sorted(rows("results.md", (0, 1, 3, 4, 8, 9)))
+def test_the_page_of_claims_has_the_verdicts_of_the_three_studies():
+    verdicts = []
+    for study in ("robustness", "ppo_claims", "taught_claims"):
+        with (DATA / f"{study}_tests.csv").open() as file:
+            own = {(f"`{row['Group']}`: {row['test']}", f"`{row['against']}`"): row["verdict"]
+                   for row in csv.DictReader(file) if row["family"] == "claims"}  # fmt: skip
+        verdicts.append(own)
+    shown = {tuple(row[:2]): row[2:] for row in claim_rows()}
+    assert shown == {at: [own.get(at, "-") for own in verdicts] for at in verdicts[0]}
     assert len(shown) == 20

@@ -26,7 +26,7 @@ A value outside its range raises an error that states the rule and the value; pa
 NaN or infinite.
 
 The event error is measured on a few short flights. Finer textures reach [0.07](simulator.md) at a
-tolerance of 0.05. [Another table](results_tables.md#event-error) lists the event error of each condition of
+tolerance of 0.05. [Results](results.md#event-errors) lists the event error of each condition of
 the sweep.
 
 {table}

@@ -148,7 +148,7 @@ def test_the_figure_of_costs_has_no_line_and_its_axis_of_shares_begins_at_zero()
 
 
 def test_the_published_costs_are_those_of_the_page():
-    page = " ".join((REPOSITORY / "docs" / "encoder_accuracy.md").read_text().split())
+    page = " ".join((REPOSITORY / "docs" / "encoder.md").read_text().split())
     with (REPOSITORY / "docs" / "data" / "encoder_costs.csv").open() as file:
         rows = {(row["knob"], row["setting"]): row for row in csv.DictReader(file)}
     usual, network = rows["default", ""], rows["torch", "plain network"]

@@ -13,7 +13,7 @@ from jobs.run.provenance import REPOSITORY
 DOCS = REPOSITORY / "docs"
 PAGE = (DOCS / "data.md").read_text()
 OF_STUDIES = (  # NAME_... on the page
-    *("episodes.csv.gz", "trainings.csv", "about.json", "estimates.csv", "changes.csv", "doses.csv"),
+    *("episodes.csv.gz", "trainings.csv", "about.json", "estimates.csv", "changes.csv", "tests.csv", "doses.csv"),
 )
 OTHERS = r"learning|scene_\w+|concept_\w+"  # that the page tells of in a sentence
 

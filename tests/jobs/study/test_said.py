@@ -39,5 +39,5 @@ def test_late_actions_change_what_the_page_says(sweep):
 
 
 def test_a_page_about_trainings_that_have_been_replaced_says_so():
-    text = (REPOSITORY / "docs" / "dose_response.md").read_text()
+    text = (REPOSITORY / "docs" / "dose_response_taught.md").read_text()
     assert "stands for trainings shipped at commit 2991870" in text
