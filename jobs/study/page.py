@@ -15,14 +15,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jobs.analysis.tables import markdown_table
-from jobs.config.conditions import NOMINAL
 from jobs.study import tables
 from jobs.study.changes import Change, changes_of, content, replicated
 from jobs.study.contrasts import Finding, by_condition, judge
 from jobs.study.doses import Dose, read_doses
 from jobs.study.figures import CAPTIONS, KINDS, NEEDED, Drawn
 from jobs.study.learned import learned
-from jobs.study.results import Condition, Results, place, read_published, value_of
+from jobs.study.results import Condition, Results, read_published, value_of
 from jobs.study.spec import Family, families_of, read_study
 from jobs.study.spread import crossed_tables, factors
 from jobs.study.summaries import MET, Summary, success_lines, summaries_of
@@ -270,34 +269,18 @@ def _headline(study: Study, _: str) -> str:
 def _provenance(study: Study, _: str) -> str:
     """Return what made the results; a simulation that several conditions share is counted once."""
     facts, results, name = study.results.facts, study.results, study.name
-    groups = ", ".join(f"`{group}` ({len(seeds)})" for group, seeds in results.groups.items())
     different = {(group, content(trainings)): trainings for (_, group), trainings in results.cells.items()}
     count = sum(len(own) for trainings in different.values() for own in trainings.values())
-    files = ", ".join(
-        f"[`_{one}`](data/{name}_{one})" for one in ("trainings.csv", "estimates.csv", "changes.csv")
-    )
-    return " ".join(filter(None, (
-        f"Made on {facts['date']} by `{facts['command']}`, then `python -m platform.launch +exp=report`; run "
-        f"`{facts['run']}`, evaluated at commit {', '.join(commit[:7] for commit in facts['evaluated_at'])}.",
-        f"Groups (trainings): {groups}; {facts['trials']} corridors, {count:,} episodes, "
-        f"actions {facts['action']}.",
-        _coarse(results),
-        f"Data: [`data/{name}_episodes.csv.gz`](data/{name}_episodes.csv.gz), {files}.",
-    )))  # fmt: skip
-
-
-def _coarse(results: Results) -> str:
-    """Return which conditions were simulated more coarsely than the rest; "" if none was."""
-    found = results.facts.get("exactness", ())
-    finest = min((one["asked"] for one in found), default=0.0)
-    errors = [f"{condition_text(place(one['condition']))} {100 * one['event_error']:.1f} %"
-              for one in found if one["asked"] > finest]  # fmt: skip
-    usual = [one["event_error"] for one in found if one["condition"][0] == NOMINAL]
-    beside = f"; with nothing changed {100 * usual[0]:.1f} %" if usual else ""
+    runs = sum(len(seeds) for seeds in results.groups.values())
+    commits = ", ".join(commit[:7] for commit in facts["evaluated_at"])
+    files = {
+        "episodes": "episodes.csv.gz", "runs": "trainings.csv", "estimates": "estimates.csv",
+        "changes": "changes.csv", "tests": "tests.csv", "groups and event errors": "about.json",
+    }  # fmt: skip
+    links = ", ".join(f"[{what}](data/{name}_{file})" for what, file in files.items())
     return (
-        f"Event error of conditions that were simulated more coarsely: {', '.join(errors)}{beside}."
-        if errors
-        else ""
+        f"Made on {facts['date']} by `{facts['command']}`, evaluated at commit {commits}: {runs} runs, "
+        f"{facts['trials']} corridors, {count:,} episodes, actions {facts['action']}. Data: {links}."
     )
 
 

@@ -1,5 +1,7 @@
 """What hand-written pages say in numbers of the published sweep is what its data say."""
 
+import re
+
 import pytest
 
 from jobs.run.provenance import REPOSITORY
@@ -36,6 +38,19 @@ def test_late_actions_change_what_the_page_says(sweep):
         ]
         ends.append((round(100 * min(found)), round(100 * max(found))))
     assert ends == [(-7, 17), (-34, -5)]
+
+
+def test_how_many_runs_lose_half_of_their_success_is_what_the_data_say(sweep):
+    text = (REPOSITORY / "docs" / "results.md").read_text()
+    found = re.search(r"new textures halve the success of (\d+) of (\d+) runs or worse, 25 % false events of (\d+)", text)
+    groups = sweep.trained
+    halved = []
+    for at in (("world", "texture_change"), ("background_activity", 0.25)):
+        pairs = [(sweep.values(at, group).mean(axis=1), sweep.values(("nominal", "poles_eval"), group).mean(axis=1))
+                 for group in groups if (at, group) in sweep.cells]  # fmt: skip
+        halved.append(sum(int((own <= usual / 2)[usual > 0].sum()) for own, usual in pairs))
+    runs = sum(len(sweep.groups[group]) for group in groups)
+    assert [int(number) for number in found.groups()] == [halved[0], runs, halved[1]]
 
 
 def test_a_page_about_trainings_that_have_been_replaced_says_so():
