@@ -80,9 +80,8 @@ def main(docs: Path, target: Path) -> None:
     write_figures(target / "images", drawn)
     for name, text in texts.items():
         write_atomic(target / name, text)
-    for name, study in found.items():
-        if name not in UNMARKED:
-            write_values(target / "data", study)
+    for study in found.values():
+        write_values(target / "data", study)
     write_csv(target / "data" / "trainings.csv", PublishedTraining._fields, published_trainings(PRETRAINED))
     for name in (*texts, *(f"images/{name}.png" for name in drawn)):
         sys.stdout.write(f"{target / name}\n")

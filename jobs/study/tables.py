@@ -397,7 +397,7 @@ def write_changes(file: Path, changes: Sequence[Change]) -> None:
 def write_tests(
     file: Path, families: Mapping[str, tuple[Family, Sequence[Finding]]], results: Results
 ) -> None:
-    """Write every test of a study as CSV; of a family of one test also its conditions, which are not tested."""
+    """Write every test as CSV; of a family of one test also its conditions, which are not tested."""
     rows = []
     for name, (family, findings) in families.items():
         rows += [(name, *_test_cells(family, one)) for one in findings]

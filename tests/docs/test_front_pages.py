@@ -66,7 +66,9 @@ def mean(values):
 def claim_rows():
     """Return the cells of the table of claims: claim, against, and the verdicts of three studies."""
     lines = (ROOT / "docs" / "claims.md").read_text().splitlines()
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
+    cells = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")
+    ]
     return [row for row in cells if len(row) == 5 and "`: " in row[0]]
 
 

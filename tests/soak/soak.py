@@ -3,7 +3,7 @@
 Run: make test-soak ARGS="minutes=60 seed=0", or python -m tests.soak.soak
 Expect: an undisturbed round first (some minutes), then the hour, then the end of the last rounds; a
 report, its plot and its numbers in `build/soak`; exit status 1 if a table differs, a job does not go on,
-or anything is left behind. With `page=docs/reliability.md` the report goes into that page, and its plot
+or anything is left behind. With `page=FILE` the report goes between that page's comments `soak`, and its plot
 into docs/images/soak.png. `size=small` computes less in each round, `every=30` injects a fault every 30 s,
 and `only=driver,Ctrl` injects only faults whose names have one of these words.
 """

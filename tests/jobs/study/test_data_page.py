@@ -13,7 +13,15 @@ from jobs.run.provenance import REPOSITORY
 DOCS = REPOSITORY / "docs"
 PAGE = (DOCS / "data.md").read_text()
 OF_STUDIES = (  # NAME_... on the page
-    *("episodes.csv.gz", "trainings.csv", "about.json", "estimates.csv", "changes.csv", "tests.csv", "doses.csv"),
+    *(
+        "episodes.csv.gz",
+        "trainings.csv",
+        "about.json",
+        "estimates.csv",
+        "changes.csv",
+        "tests.csv",
+        "doses.csv",
+    ),
 )
 OTHERS = r"learning|scene_\w+|concept_\w+"  # that the page tells of in a sentence
 
@@ -46,7 +54,7 @@ def test_every_file_is_told_of():
     table = PAGE.split("| file | a row is |")[1].split("\n\n")[0]
     names = {f"{path.name}/" if path.is_dir() else path.name for path in (DOCS / "data").iterdir()}
     told = set(re.findall(r"`(?:models/pretrained/)?([\w.]+/?)`", table))
-    studies = {name.removesuffix("_about.json") for name in names if name.endswith("_about.json")}
+    studies = {name.partition("_episodes.")[0] for name in names if "_episodes." in name}
     told |= {f"{study}_{part}" for study in studies for part in OF_STUDIES}
     assert names - told == set()
 

@@ -42,13 +42,15 @@ def test_late_actions_change_what_the_page_says(sweep):
 
 def test_how_many_runs_lose_half_of_their_success_is_what_the_data_say(sweep):
     text = (REPOSITORY / "docs" / "results.md").read_text()
-    found = re.search(r"new textures halve the success of (\d+) of (\d+) runs or worse, 25 % false events of (\d+)", text)
+    found = re.search(
+        r"new textures halve the success of (\d+) of (\d+) runs or worse, 25 % false events of (\d+)", text
+    )
     groups = sweep.trained
     halved = []
     for at in (("world", "texture_change"), ("background_activity", 0.25)):
-        pairs = [(sweep.values(at, group).mean(axis=1), sweep.values(("nominal", "poles_eval"), group).mean(axis=1))
-                 for group in groups if (at, group) in sweep.cells]  # fmt: skip
-        halved.append(sum(int((own <= usual / 2)[usual > 0].sum()) for own, usual in pairs))
+        both = [[sweep.values(one, group).mean(axis=1) for one in (at, sweep.nominal)]
+                for group in groups if (at, group) in sweep.cells]  # fmt: skip
+        halved.append(sum(int((own <= usual / 2)[usual > 0].sum()) for own, usual in both))
     runs = sum(len(sweep.groups[group]) for group in groups)
     assert [int(number) for number in found.groups()] == [halved[0], runs, halved[1]]
 
