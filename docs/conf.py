@@ -35,8 +35,12 @@ exclude_patterns = ["_build", "_templates"]
 
 
 def _skip_fields(_app, _what, _name, member, skip, _options):
-    """Whether to leave a member out: fields of a NamedTuple are described by its docstring."""
-    return skip or (getattr(member, "__doc__", None) or "").startswith("Alias for field number")
+    """Whether to leave a member out: fields of a NamedTuple, which its docstring describes; validators."""
+    return (
+        skip
+        or isinstance(member, classmethod)
+        or (getattr(member, "__doc__", None) or "").startswith("Alias for field number")
+    )
 
 
 def _escape(_app, _what, _name, _obj, _options, lines):

@@ -14,15 +14,18 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from benchmarks.scaling_model import from_plain, plot_scaling
+from jobs.analysis.plots import plot_learning_curves
 from jobs.analysis.tables import write_csv
 from jobs.measure.encoding_plots import plot_encoding_costs
 from jobs.measure.encodings import read_costs
+from jobs.measure.front_plots import plot_costs
+from jobs.measure.measured import Measured
 from jobs.measure.trade_page import draw_settings
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json, write_atomic
 from jobs.study.page import Study, figures, marked
 from jobs.study.report import filled_pages, study_of, write_figures, write_values
-from jobs.tools.curves import PublishedTraining, published_trainings
+from jobs.tools.curves import PublishedTraining, by_reward, published_trainings, read_curves
 
 DOCS = Path(__file__).resolve().parent
 # Studies whose pages have no marks: study -> its data, with a figure of their name each.
@@ -59,10 +62,27 @@ def other_figures(data: Path) -> dict[str, Figure]:
     if (data / "trade_settings.csv").is_file():
         with (data / "trade_settings.csv").open() as file:
             found["trade"] = draw_settings(list(csv.DictReader(file)))
+    if (data / "simulator_costs.csv").is_file():
+        with (data / "simulator_costs.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        measured = [
+            Measured(
+                row["knob"],
+                row["setting"],
+                float(row["step_us"]),
+                float(row["event_error_percent"]) / 100,
+                {},
+            )
+            for row in rows
+        ]
+        front = [place for place, row in enumerate(rows) if row["front"] == "1"]
+        found["trade_poles"] = plot_costs("poles", measured, front, 0.05)
     if (data / "encoder_costs.csv").is_file():
         found["encoder_inference"] = plot_encoding_costs(read_costs(data / "encoder_costs.csv"))
     if (data / "scaling.json").is_file():
         found["scaling"] = plot_scaling(from_plain(read_json(data / "scaling.json")))
+    curves = [curve for _, curve in sorted(read_curves(PRETRAINED).items())]
+    found["learning"] = plot_learning_curves(by_reward(PRETRAINED, curves))
     return found
 
 

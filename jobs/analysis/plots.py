@@ -15,7 +15,6 @@ from matplotlib.patches import Circle, Patch, Polygon
 from envs.scene import Scene
 from jobs.analysis.colours import (
     BASELINE_STYLES,
-    BLUE,
     COLOURS,
     EVENTS,
     GREEN,
@@ -28,7 +27,6 @@ from jobs.analysis.colours import (
     TAUGHT,
 )
 from jobs.analysis.ground_plan import ground_plan
-from jobs.analysis.statistics import half_width
 from jobs.rollout.episodes import Trajectory
 
 EVENT_COLOURS = LinearSegmentedColormap.from_list("events", EVENTS / 255.0)
@@ -163,40 +161,25 @@ class Curve:
 
 
 def plot_learning_curves(curves: Sequence[Curve]) -> Figure:
-    """Draw success in training against steps: a panel per experiment, a line per training, the mean in bold.
+    """Draw success in training against steps: a line for each experiment, the mean of its trainings.
 
-    The mean, with its 95 % interval over trainings, is drawn where every one has a point before and after.
+    The mean is drawn where every training has a point before and after; the legend names its end, best first.
     """
-    names = list(dict.fromkeys(curve.exp for curve in curves))
-    figure, panels = panel_grid(len(names), 4, (2.9, 2.3), (0.4, 0.5), sharey=True)
-    for panel, name in zip(panels, names, strict=True):
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    panel = figure.subplots()
+    means = []
+    for name in dict.fromkeys(curve.exp for curve in curves if curve.env_steps.size):
         own = [curve for curve in curves if curve.exp == name and curve.env_steps.size]
-        for curve in own:
-            panel.plot(curve.env_steps / 1e3, 100 * curve.success_rate, color=BLUE, lw=0.8, alpha=0.5)
-        if own:
-            _draw_mean(panel, own)
-        plural = "s" if len(own) != 1 else ""
-        panel.set_title(f"{name}, {len(own)} training{plural}", loc="left", fontsize=9, color=INK)
-        panel.set(ylim=(-3, 103))
-        panel.tick_params(labelsize=8)
-        tidy(panel, "y")
-    figure.supxlabel("Environment steps [thousands]", fontsize=9)
-    figure.supylabel("Success of the last 100 episodes [%]", fontsize=9)
+        first, last = max(one.env_steps[0] for one in own), min(one.env_steps[-1] for one in own)
+        steps = np.linspace(first, last, 100)
+        every = [np.interp(steps, one.env_steps, one.success_rate) for one in own]
+        means.append((name, len(own), steps, 100 * np.mean(every, axis=0)))
+    for name, count, steps, mean in sorted(means, key=lambda one: -one[-1][-1]):
+        colour, marker = style_of(name)
+        label = f"{name}: {mean[-1]:.0f} %, {count} seed{'s' if count > 1 else ''}"
+        panel.plot(steps / 1e3, mean, color=colour, marker=marker, markevery=12, ms=6, lw=1.8, label=label)
+    panel.set(ylim=(-3, 103), xlabel="Environment steps [thousands]")
+    panel.set_ylabel("Success of the last 100 training episodes [%]")
+    tidy(panel, "y")
+    figure.legend(loc="outside right upper", frameon=False, fontsize=9)
     return figure
-
-
-def _draw_mean(panel: Axes, curves: Sequence[Curve]) -> None:
-    """Draw the mean of the curves with its interval, where all of them have points."""
-    first, last = max(curve.env_steps[0] for curve in curves), min(curve.env_steps[-1] for curve in curves)
-    steps = np.linspace(first, last, 100)
-    every = np.array([np.interp(steps, curve.env_steps, curve.success_rate) for curve in curves])
-    mean = 100 * every.mean(axis=0)
-    if len(curves) > 1:
-        half = 100 * half_width(every)
-        ends = np.clip([mean - half, mean + half], 0, 100)
-        panel.fill_between(steps / 1e3, *ends, color=BLUE, alpha=0.15, lw=0)
-    panel.plot(steps / 1e3, mean, color=BLUE, lw=2.2)
-    panel.annotate(
-        f"{mean[-1]:.0f} %", (steps[-1] / 1e3, mean[-1]), (-2, -14), textcoords="offset points",
-        ha="right", fontsize=9, color=INK,
-    )  # fmt: skip

@@ -2,37 +2,33 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from jobs.analysis.colours import COLOURS, INK, MUTED
+from jobs.analysis.colours import BLUE, COLOURS, MUTED
 from jobs.analysis.plots import tidy
-from jobs.measure.measured import Measured
+from jobs.measure.measured import Measured, name_of
 
 MIN_ERROR = 1e-3  # that is drawn on a logarithmic axis
 
 
 def plot_costs(scene: str, settings: Sequence[Measured], front: Sequence[int], tolerance: float) -> Figure:
-    """Draw the cost of settings against their event error; those of the front are ringed."""
-    figure = Figure(figsize=(9.6, 5.6), layout="constrained")
-    panel = figure.subplots()
-    places = np.array([(setting.cost_us, max(setting.error, MIN_ERROR)) for setting in settings])
-    x, y = places[list(front)].T
-    panel.scatter(x, y, s=130, facecolors="none", edgecolors=INK, zorder=5, label="no other is better")
-    for knob in dict.fromkeys(setting.knob for setting in settings):
-        own = [place for place, setting in enumerate(settings) if setting.knob == knob]
-        marker, size, order = ("*", 260, 4) if knob == "default" else ("o", 34, 3)
-        x, y = places[own].T
-        panel.scatter(x, y, marker=marker, s=size, zorder=order, color=COLOURS[knob], label=knob)
-        for place in own if knob != "default" else []:
-            text = settings[place].setting.rpartition(" ")[2]
-            panel.annotate(text, places[place], (5, 4), textcoords="offset points", fontsize=7, color=INK)
-    panel.axhline(tolerance, color=MUTED, lw=0.8, ls=":", label="tolerance asked")
-    panel.set(xscale="log", yscale="log", xlabel="Process time of an environment step [us]")
-    panel.set_ylabel("Event error: share of events that differ")
-    panel.set_title(f"Scene {scene}", loc="left", fontsize=10)
-    tidy(panel)
-    panel.legend(frameon=False, fontsize=8)
+    """Draw a row for each setting: its cost and its event error; those of the front are named by a star."""
+    figure = Figure(figsize=(9.6, 0.22 * len(settings) + 1.0), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    rows = range(len(settings))
+    values = [one.cost_us for one in settings], [max(one.error, MIN_ERROR) for one in settings]
+    for panel, own in zip(panels, values, strict=True):
+        for row, value in zip(rows, own, strict=True):
+            marker = "s" if settings[row].knob == "default" else "o"
+            panel.plot(value, row, marker, ms=6, color=BLUE, mfc=BLUE if row in front else "none")
+        panel.axvline(own[0], color=MUTED, lw=0.8)
+        panel.set(xscale="log", ylim=(len(settings) - 0.5, -0.5))
+        tidy(panel)
+    names = [name_of(one.knob, one.setting) for one in settings]
+    panels[0].set_yticks(rows, [f"{name} *" if row in front else name for row, name in enumerate(names)])
+    panels[0].set_xlabel(f"Process time of a step in {scene} [us]")
+    panels[1].axvline(tolerance, color=MUTED, lw=0.8, ls=":")
+    panels[1].set_xlabel("Event error: share of events that differ")
     return figure
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from envs.scene import make_scene
-from jobs.analysis.colours import AMBER, BLUE, GREEN, GREYS, INK, MUTED, RED
+from jobs.analysis.colours import AMBER, BLACK, BLUE, GREEN, GREYS, INK, MUTED, PINK, RED
 from jobs.analysis.plots import panel_grid, style_of, tidy
 from jobs.analysis.statistics import Difference
 from jobs.config.conditions import NOMINAL, axis_numbers
@@ -193,42 +193,40 @@ def numeric_axes(results: Results) -> list[str]:
 
 
 def axes_map(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
-    """Draw success along the axes of numbers: a row for each group, in front of all others in grey."""
+    """Draw success along the axes of numbers: the groups of `said` with intervals, all others in grey."""
     axes = {axis: [one for one in drawn.summaries if one.condition[0] == axis]
             for axis in numeric_axes(drawn.results)}  # fmt: skip
     there = {one.group for own in axes.values() for one in own}
-    rows = [group for group in drawn.results.groups if group in there and group not in BASELINES]
-    size = 1.75 * len(axes) + 1.5, 1.15 * len(rows) + 0.9
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(rows), len(axes), squeeze=False, sharey=True, sharex="col")
-    for column, (axis, found) in enumerate(axes.items()):
+    groups = [group for group in drawn.results.groups if group in there and group not in BASELINES]
+    front = [group for group in said.get("groups") or groups if group in there] or groups
+    figure, panels = panel_grid(len(axes), 3, (3.3, 2.5), (0.4, 0.6), sharey=True)
+    for panel, (axis, found) in zip(panels, axes.items(), strict=True):
         values = list(dict.fromkeys(one.condition[1] for one in found))
-        for row, group in enumerate(rows):
-            panel = panels[row, column]
-            for other in rows:
-                _draw_group(panel, [one for one in found if one.group == other], values, other == group)
-            panel.set_xticks(range(len(values)), [text_of(value) for value in values])
-            panel.set(ylim=(-4, 104))
-            panel.tick_params(labelsize=6.5)
-            tidy(panel, "y")
-        panels[0, column].set_title(TITLES.get(axis, axis), fontsize=7.5, color=INK)
-    for row, group in enumerate(rows):
-        panels[row, 0].set_ylabel(group.replace("_", "\n"), fontsize=7.5, color=style_of(group)[0])
-    figure.supylabel("Success [%]", fontsize=8)
+        for group in groups:
+            own = [one for one in found if one.group == group]
+            place = 0.12 * (front.index(group) - (len(front) - 1) / 2) if group in front else None
+            _draw_group(panel, own, values, place)
+        panel.set_xticks(range(len(values)), [text_of(value) for value in values])
+        panel.set(ylim=(-4, 104), xlabel=TITLES.get(axis, axis))
+        tidy(panel, "y")
+    panels[0].set_ylabel("Success [%]")
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 5), frameon=False)
     return figure
 
 
-def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object], own: bool) -> None:
-    """Draw a group's success over the places of the values: in its colour with its interval, or in grey."""
-    x = [values.index(one.condition[1]) for one in found]
+def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object], place: float | None) -> None:
+    """Draw a group's success over the places of the values: aside by `place` with intervals, or in grey."""
+    x = np.array([values.index(one.condition[1]) for one in found], float)
     y = [100 * one.success.value for one in found]
-    if not own:
+    if place is None:
         panel.plot(x, y, color=GREYS[0], lw=0.6, alpha=0.6, zorder=1)
         return
     colour, marker = style_of(found[0].group) if found else (INK, "o")
     ends = np.array([100 * np.array(one.success.interval or (0.0, 1.0)) for one in found]).reshape(-1, 2)
-    panel.fill_between(x, ends[:, 0], ends[:, 1], color=colour, alpha=0.15, lw=0, zorder=2)
-    panel.plot(x, y, color=colour, marker=marker, ms=3.5, lw=1.6, zorder=3)
+    panel.vlines(x + place, ends[:, 0], ends[:, 1], color=colour, alpha=0.5, lw=1.2, zorder=2)
+    name = found[0].group if found else ""
+    panel.plot(x + place, y, color=colour, marker=marker, ms=5, lw=1.6, zorder=3, label=name)
 
 
 def contacts(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
@@ -288,11 +286,11 @@ def lines(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
                       if at[0] == axis and (at, group) in results.cells}  # fmt: skip
             name = str(tags[group][said["lines"]])
             label = name if axis == said["axes"][0] else f"{name}, by {axis}"
-            colour, marker = ((BLUE, "o"), (RED, "s"), (MUTED, "D"), (GREEN, "^"))[place % 4]
+            colour, marker = ((BLUE, "o"), (AMBER, "s"), (BLACK, "D"), (PINK, "^"))[place % 4]
             x = np.array([float(at) for at in sorted(points)]) * (0.96 + 0.04 * place)
             y = 100 * np.array([points[at] for at in sorted(points)])
-            panel.plot(x, y.mean(axis=1), color=colour, lw=1.4, label=label)
-            panel.plot(x, y, marker, color=colour, ms=3.5, alpha=0.7)
+            panel.plot(x, y.mean(axis=1), color=colour, lw=1.4, marker=marker, ms=6, label=label)
+            panel.plot(x, y, marker, color=colour, ms=3.5, alpha=0.6)
         _label_rates(panel, results, said["axes"][0], value)
     panels[0].set(ylabel="Success [%]", ylim=(-3, 103))
     panels[-1].legend(frameon=False, fontsize=8)
@@ -348,14 +346,14 @@ def spread(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     mean = 100 * np.mean(list(tables.values()), axis=0)
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
-    _draw_numbers(left, mean)
+    _draw_numbers(left, mean, float(mean.min()), float(mean.max()))
     left.set_xticks(range(len(mean)))
     left.set_yticks(range(len(mean)))
-    left.set(xlabel=names["columns"].capitalize(), ylabel=names["rows"].capitalize())
+    left.set(xlabel=names["columns"][0].upper() + names["columns"][1:], ylabel=names["rows"].capitalize())
     left.set_title("Success [%], mean of the conditions", loc="left", fontsize=10)
     overall, each = factors(tables)
     rows = {"mean of these": overall, **{condition_text(at): one for at, one in each.items()}}
-    shown = {names["rows"]: (BLUE, "o"), names["columns"]: (RED, "s"), "neither": (MUTED, "D")}
+    shown = {names["rows"]: (BLUE, "o"), names["columns"]: (AMBER, "s"), "neither": (BLACK, "D")}
     for place, (label, (colour, marker)) in enumerate(shown.items()):
         values = [one.spread[place] for one in rows.values()]
         right.plot(values, np.arange(len(rows)) + 0.18 * (place - 1), marker, color=colour, ms=6, label=label)
@@ -368,11 +366,11 @@ def spread(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _draw_numbers(panel: Axes, values: np.ndarray) -> None:
-    """Draw a map of numbers from 0 to 100."""
-    panel.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+def _draw_numbers(panel: Axes, values: np.ndarray, low: float = 0.0, high: float = 100.0) -> None:
+    """Draw a map of numbers, coloured from `low` to `high`."""
+    panel.imshow(values, cmap="cividis", vmin=low, vmax=high, aspect="auto")
     for row, column in np.ndindex(values.shape):
-        colour = "black" if values[row, column] > 55 else "white"
+        colour = "black" if values[row, column] > low + 0.55 * (high - low) else "white"
         panel.text(
             column, row, f"{values[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=9
         )
@@ -442,8 +440,8 @@ CAPTIONS = {
     "survival": "Share of episodes that have not ended before a distance [%]; a thin line for each "
     "training, a thick one for all. Blue: nothing changed. Red: the condition in which the "
     "group succeeds least, named above.",
-    "axes": "Success along every axis of numbers. Coloured: the mean of the row's own group with its "
-    "95 % interval; grey: the other trained groups. Values stand at equal distances.",
+    "axes": "Success along every axis of numbers. Markers: means of the named groups with 95 % intervals, "
+    "set aside of each other. Grey: the other groups. Values stand at equal distances.",
     "contacts": "Where episodes end in contact, all corridors laid over each other: large dots with "
     "nothing changed, small ones under all changes in the same scene.",
     "doses": "Change of success against the measured event error, with 95 % intervals that are not "

@@ -31,6 +31,16 @@ def read_curves(folder: Path) -> dict[tuple[str, int], Curve]:
     }
 
 
+def by_reward(folder: Path, curves: Sequence[Curve]) -> list[Curve]:
+    """Return the curves of policies in `folder` that learnt from rewards, not by imitation."""
+    manifests = [read_json(folder / f"{one.exp}-s{one.seed}" / MANIFEST) for one in curves]
+    return [
+        one
+        for one, about in zip(curves, manifests, strict=True)
+        if not about.get("algo", {}).get("imitation")
+    ]
+
+
 def as_csv(curves: Sequence[Curve]) -> str:
     """Return the curves as one table, a row per point."""
     text = io.StringIO()

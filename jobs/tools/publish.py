@@ -24,7 +24,7 @@ from jobs.run.files import read_json, read_json_lines, write_atomic
 from jobs.run.folder import group_name, open_run
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
-from jobs.tools.curves import as_csv, read_curves
+from jobs.tools.curves import as_csv, by_reward, read_curves
 from jobs.tracking.model_registry import register_training
 from jobs.tracking.tracker import open_tracker
 from models.policy import load_policy
@@ -69,7 +69,7 @@ def run(config: Config) -> dict[str, int]:
     published |= {(training.group, training.seed): learning_curve(training) for training in trainings}
     curves = [published[key] for key in sorted(published)]
     write_atomic(PRETRAINED / "curves.csv", as_csv(curves))
-    plot = plot_learning_curves(curves)
+    plot = plot_learning_curves(by_reward(PRETRAINED, curves))
     save_plot(PLOT, plot)
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:

@@ -105,8 +105,8 @@ class Network(NamedTuple):
         build: (shape of the stack of features, policy) -> the parts `PARTS`.
         run: (trunk, pi) -> the policy by the weights of this moment, a function from stacks (B, depth, ...)
             and states (B, S) to logits float32 (B, actions) and the next states.
-        gradients: What computes PPO's gradients. "compiled": `models.policy.dense_update`, for `mlp`s
-            without a trunk alone; "torch"; "gpu": torch, on a GPU if the learner has one.
+        gradients: What computes PPO's gradients. "compiled": `models.policy.dense_update`, for dense
+            networks without a trunk alone; "torch"; "gpu": torch, on a GPU if the learner has one.
         state: The policy -> numbers S of a recurrent network's state; 0: it has none.
     """
 
