@@ -3,10 +3,11 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from jobs.analysis.statistics import crossed_mean
+from jobs.analysis.statistics import Difference, crossed_mean
 from jobs.analysis.tables import estimate_text, markdown_table, percent_text, write_csv
 from jobs.study.changes import Change, replicated
 from jobs.study.contrasts import UNDECIDED, Finding, Row, by_condition
@@ -412,7 +413,8 @@ def write_tests(
 
 def _test_cells(family: Family, one: Finding) -> tuple[str, ...]:
     scale, form, unit = scale_of(one.contrast)
-    value = _numbers(one.difference.value * scale, _scaled(one.difference.interval, scale), form)
+    difference = cast(Difference, one.difference)  # findings without one are left out
+    value = _numbers(difference.value * scale, _scaled(difference.interval, scale), form)
     tested = family.adjust != "none"
     p = _p_text(one) if tested else ""
     needed = _needed_text(one) if family.power else ""
