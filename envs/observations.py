@@ -17,10 +17,11 @@ def observation_space(config: EnvConfig) -> spaces.Space:
     Returns:
         "window": int32 (capacity + 1, 4), see `envs.events.pack_window`, or (N + 1, 4) of all N
         events where the capacity is None; "event_image":
-        uint8 (H, W); "luminance": float32 (H, W); "events": rows [t [us], x, y, p], int64;
-        "none": uint8 (0,).
+        uint8 (H, W, 1); "luminance": float32 (H, W, 1); "events": rows [t [us], x, y, p], int64;
+        "none": uint8 (0,). Pictures have a channel axis because the networks of other libraries,
+        such as stable-baselines3's CnnPolicy, take nothing else for a picture.
     """
-    shape = (config.camera.height, config.camera.width)
+    shape = (config.camera.height, config.camera.width, 1)
     if config.observation == "window":
         capacity, most = config.window_capacity, np.iinfo(np.int32).max
         if capacity is None:
@@ -44,9 +45,9 @@ def observe(config: EnvConfig, events: np.ndarray, luminance: np.ndarray) -> np.
         luminance: float32 (H, W), the last render.
     """
     if config.observation == "event_image":
-        return event_image(events, config.camera.width, config.camera.height)
+        return event_image(events, config.camera.width, config.camera.height)[:, :, None]
     if config.observation == "luminance":
-        return luminance.copy()
+        return luminance[:, :, None].copy()
     if config.observation == "none":
         return np.empty(0, np.uint8)
     return np.stack([events[name].astype(np.int64) for name in EVENT.fields or ()], axis=1)

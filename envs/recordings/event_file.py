@@ -32,6 +32,7 @@ TRIGGER = np.dtype([("t", "<i8"), ("channel", "<i2"), ("p", "i1")])  # us; +1 ri
 OUTSIDE = "events outside the sensor"
 RESERVED = "words of types that the encoding does not have"
 CUT = "bytes of an entry that was cut off"
+CUT_TABLE = "tables of contents that were cut off"
 CUT_PACKETS = "packets that are damaged or were cut off"
 OLD_CLOCK = "events of an older clock at the start"
 TORN = "events whose second was not carried"

@@ -3,12 +3,13 @@
 import json
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
-from envs.recordings.event_file import Opened, Part, Request, Tally, assemble
+from envs.recordings.event_file import CUT_PACKETS, Opened, Part, Request, Tally, assemble
 from envs.recordings.hdf5_checks import (
     ERRORS,
     attribute,
@@ -18,7 +19,10 @@ from envs.recordings.hdf5_checks import (
     listing,
     numbers,
     opened,
+    read_rows,
 )
+from envs.recordings.hdf5_cut import ERRORS as CUT_ERRORS
+from envs.recordings.hdf5_cut import is_cut, until_cut
 from envs.recordings.metavision_hdf5 import metavision_parts
 from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
 from envs.recordings.npz import table_order
@@ -261,8 +265,13 @@ def _parts(request: Request, tally: Tally, found: Found, count: int) -> Iterator
                 raise ValueError("it must have one is_noise of 0 or 1 for each event")
             for first in range(0, count, request.part_events):
                 rows = slice(first, min(count, first + request.part_events))
+                if is_cut(file):
+                    reads = [partial(read_rows, file[path]) for path in dict.fromkeys(found.paths)]
+                    rows = until_cut(tally, rows, *reads)
                 labels = _labels(file, rows) if has_labels else None
                 yield _part(request, tally, file, found, rows, offset, labels)
+                if tally.damage[CUT_PACKETS]:
+                    return
     except ERRORS as error:
         raise _refused(request, error) from None
 
@@ -289,7 +298,7 @@ def _part(
         raise ValueError(f"{found.paths[0]} are no whole microseconds; give time_unit")
     t_us = microseconds(request, t, None, usual)
     if t_us.dtype.kind in "iu" and len(t_us) and not 0 <= int(t_us.max()) + abs(offset) < 1 << 62:
-        raise ValueError(f"{found.paths[0]} are no whole microseconds of a recording; give time_unit")
+        raise ValueError(f"{found.paths[0]} are not below 2**62 with their offset; shift them")
     t_us = t_us.astype(np.int64, copy=False) + offset if t_us.dtype.kind in "iu" else t_us + offset
     events, good = assemble(request, tally, t_us, x, y, p)
     return Part(events, None if labels is None else labels[good])
@@ -327,6 +336,16 @@ def _sized(request: Request, file: h5py.File, found: Found) -> Request:
 
 
 def _said_size(file: h5py.File, group: str) -> tuple[int | None, int | None]:
+    """Return width and height as far as the file says them, and what says so was not cut off."""
+    try:
+        return _size_of(file, group)
+    except CUT_ERRORS:
+        if not is_cut(file):
+            raise
+        return None, None
+
+
+def _size_of(file: h5py.File, group: str) -> tuple[int | None, int | None]:
     """Return width and height by attributes, by data sets beside the events, or by a recording's settings."""
     given = file.attrs
     if "width" in given and "height" in given:

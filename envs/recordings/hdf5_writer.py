@@ -99,9 +99,16 @@ class Adding:
         self._count, self._next_ms = 0, 0
 
     def __call__(self, events: np.ndarray, is_noise: np.ndarray | None) -> None:
-        """Add events; raises ValueError if they last too long, OSError if the disk is full."""
-        if not len(events):
-            return
+        """Add events; raises ValueError if they last too long, OSError if the disk is full.
+
+        Some rows of all columns at a time, so that a file that is cut off has whole events.
+        """
+        for first in range(0, len(events), CHUNK):
+            rows = slice(first, first + CHUNK)
+            self._add(events[rows], None if is_noise is None else is_noise[rows])
+
+    def _add(self, events: np.ndarray, is_noise: np.ndarray | None) -> None:
+        """Add some events."""
         if self._offset_us is None:
             self._offset_us = int(events["t"][0])
             self._file["t_offset"][()] = self._offset_us

@@ -1,14 +1,17 @@
 """Read the events of HDF5 files in Metavision's layout (`/CD/events`), with its ECF packing."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import h5py
 import numpy as np
 
 from envs.events import EVENT
 from envs.recordings.ecf import FILTER_ECF, MAX_CHUNK_EVENTS, decode_ecf
-from envs.recordings.event_file import TRIGGER, Part, Request, Tally, assemble, check_declared
-from envs.recordings.hdf5_checks import check_chunks, check_own, filters
+from envs.recordings.event_file import CUT_PACKETS, TRIGGER, Part, Request, Tally, assemble, check_declared
+from envs.recordings.hdf5_checks import check_chunks, check_own, filters, read_rows
+from envs.recordings.hdf5_cut import ERRORS as CUT_ERRORS
+from envs.recordings.hdf5_cut import is_cut, until_cut
 
 EVENTS, TRIGGERS = "CD/events", "EXT_TRIGGER/events"
 
@@ -27,17 +30,24 @@ def metavision_parts(request: Request, tally: Tally, file: h5py.File) -> Iterato
     if FILTER_ECF not in filters(data):
         check_chunks(data, EVENTS)
         for first in range(0, len(data), request.part_events):
-            yield Part(_assembled(request, tally, data[first : first + request.part_events]), None, triggers)
+            rows = slice(first, min(len(data), first + request.part_events))
+            if is_cut(file):
+                rows = until_cut(tally, rows, partial(read_rows, data))
+            yield Part(_assembled(request, tally, data[rows]), None, triggers)
             triggers = triggers[:0]
+            if tally.damage[CUT_PACKETS]:
+                return
         return
     if filters(data) != [FILTER_ECF] or data.chunks[0] > MAX_CHUNK_EVENTS:
         raise ValueError(f"{EVENTS} has another filter beside Metavision's, or larger chunks")
     chunks = max(1, request.part_events // data.chunks[0])
     for first in range(0, len(data), chunks * data.chunks[0]):
-        stop = min(len(data), first + chunks * data.chunks[0])
-        some = [_chunk(request, tally, data, place) for place in range(first, stop, data.chunks[0])]
-        yield Part(np.concatenate([np.empty(0, EVENT), *some]), None, triggers)
+        places = range(first, min(len(data), first + chunks * data.chunks[0]), data.chunks[0])
+        some = [np.empty(0, EVENT), *_chunks(request, tally, file, places)]
+        yield Part(np.concatenate(some), None, triggers)
         triggers = triggers[:0]
+        if tally.damage[CUT_PACKETS]:
+            return
 
 
 def _rows(file: h5py.File, name: str, fields: str | tuple[str, ...]) -> h5py.Dataset:
@@ -73,6 +83,18 @@ def _triggers(request: Request, file: h5py.File) -> np.ndarray:
     triggers["t"], triggers["channel"] = rows["t"], rows["id"]
     triggers["p"] = np.where(rows["p"] > 0, 1, -1)
     return triggers
+
+
+def _chunks(request: Request, tally: Tally, file: h5py.File, places: range) -> Iterator[np.ndarray]:
+    """Yield the events of some chunks, up to the first that is missing in a file that was cut off."""
+    for place in places:
+        try:
+            yield _chunk(request, tally, file[EVENTS], place)
+        except CUT_ERRORS:
+            if not is_cut(file):
+                raise
+            tally.damage[CUT_PACKETS] += 1
+            return
 
 
 def _chunk(request: Request, tally: Tally, data: h5py.Dataset, first: int) -> np.ndarray:

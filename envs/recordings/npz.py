@@ -11,8 +11,9 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import CUT, Opened, Part, Request, Tally, assemble
+from envs.recordings.event_file import CUT, CUT_TABLE, Opened, Part, Request, Tally, assemble
 from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
+from envs.recordings.npz_cut import cut_members
 from envs.recordings.text import read_text
 
 MAX_HEADER_BYTES = 1 << 16
@@ -62,23 +63,26 @@ def read_npz(request: Request) -> Opened:
         ValueError: There are no such arrays, or one is pickled, of another length, or contains
             another number of bytes than it declares.
     """
-    try:
-        archive = zipfile.ZipFile(request.path)
-        names = archive.namelist()
-    except BROKEN as error:
-        raise _broken(request, error) from None
-    texts = [name for name in names if name.lower().endswith((".txt", ".csv"))]
-    if not any(name.endswith(".npy") for name in names) and len(texts) == 1:
-        return read_text(request, lambda: archive.open(texts[0]))
-    try:
-        arrays = {
-            name.removesuffix(".npy"): _header(request, name.removesuffix(".npy"), _opener(archive, name))
-            for name in names
-            if name.endswith(".npy")
-        }
-        return _opened(request, "npz", arrays)
-    except BROKEN as error:
-        raise _broken(request, error) from None
+    members, is_cut = _members(request)
+    texts = [name for name in members if name.lower().endswith((".txt", ".csv"))]
+    if not any(name.endswith(".npy") for name in members) and len(texts) == 1:
+        opened = read_text(request, members[texts[0]])
+    else:
+        try:
+            arrays = {
+                name.removesuffix(".npy"): _header(request, name.removesuffix(".npy"), open_bytes)
+                for name, open_bytes in members.items()
+                if name.endswith(".npy")
+            }
+            opened = _opened(request, "npz", arrays)
+        except BROKEN as error:
+            if is_cut and str(error).startswith(str(request.path)):
+                raise request.refusal(
+                    f"was cut off before the end of its columns ({', '.join(members)}); copy it again"
+                ) from None
+            raise _broken(request, error) from None
+    opened.tally.damage.update({CUT_TABLE: 1} if is_cut else {})
+    return opened
 
 
 def read_npy(request: Request) -> Opened:
@@ -99,6 +103,18 @@ def _broken(request: Request, error: Exception) -> ValueError:
     if str(error).startswith(str(request.path)):
         return ValueError(str(error))
     return request.refusal(f"is no readable array file ({error}); copy or save it again")
+
+
+def _members(request: Request) -> tuple[dict[str, Callable[[], IO[bytes]]], bool]:
+    """Return functions that open the members of a zip file, and whether it was cut off."""
+    try:
+        archive = zipfile.ZipFile(request.path)
+        return {name: _opener(archive, name) for name in archive.namelist()}, False
+    except BROKEN as error:
+        found = cut_members(request.path)
+        if not found:
+            raise _broken(request, error) from None
+        return found, True
 
 
 def _opener(archive: zipfile.ZipFile, name: str) -> Callable[[], IO[bytes]]:
@@ -176,12 +192,28 @@ def _columns(request: Request, arrays: dict[str, Array]) -> list[Column]:
     if set(COLUMNS) <= by_name.keys():
         return [Column(by_name[name], None) for name in COLUMNS]
     if len(rows) != 1:
+        _refuse_objects(request, arrays)
         missing = next((name for name in COLUMNS if name not in by_name), "t")
         raise request.refusal(
             f"has no array {missing!r}; {_listing(arrays)}: give columns= with the names of the arrays of "
             "t, x, y and p, or group= with the name of one array of rows"
         )
     return _row_columns(request, found[rows[0]])
+
+
+def _refuse_objects(request: Request, arrays: dict[str, Array]) -> None:
+    """Refuse an array that has the name of a column and contains no numbers."""
+    for place in roles(request, arrays)[0].values() if request.group is None else ():
+        array = list(arrays.values())[place]
+        if array.dtype.kind not in "iufb":
+            raise _no_numbers(request, array)
+
+
+def _no_numbers(request: Request, array: Array) -> ValueError:
+    """Return the refusal for an array of something else."""
+    return request.refusal(
+        f"array {array.name} has dtype {array.dtype} and shape {array.shape}; save numbers"
+    )
 
 
 def _is_rows(array: Array) -> bool:
@@ -300,9 +332,7 @@ def _next(request: Request, file: IO[bytes], array: Array, size: int) -> np.ndar
     """Read the next rows of an array; fewer if the file ends."""
     row = int(np.prod(array.shape[1:], dtype=np.int64))
     if array.dtype.hasobject or array.dtype.itemsize > 64 * 8 or row > 64:
-        raise request.refusal(
-            f"array {array.name} has dtype {array.dtype} and shape {array.shape}; save numbers"
-        )
+        raise _no_numbers(request, array)
     raw = file.read(size * row * array.dtype.itemsize)
     got = len(raw) // (row * array.dtype.itemsize)
     values = np.frombuffer(raw, array.dtype, got * row)
@@ -334,13 +364,6 @@ def _part(
     if not np.isin(labels, (0, 1)).all():
         raise request.refusal("must have one is_noise of 0 or 1 for each event; repair or remove it")
     return Part(events, labels.astype(bool)[good])
-
-
-def _values(array: np.ndarray, field: str | int | None) -> np.ndarray:
-    """Return a column of an array."""
-    if field is None:
-        return array
-    return array[field] if isinstance(field, str) else array[:, field]
 
 
 def _sized(request: Request, arrays: dict[str, Array], used: list[Array]) -> Request:

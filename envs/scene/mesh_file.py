@@ -114,11 +114,16 @@ def _material_albedo(part: "trimesh.Trimesh", linear: bool) -> np.ndarray:
     if texels is None:
         return np.array(PLAIN_ALBEDO) if factor is None else _luma(factor, linear)
     tint = 1.0 if factor is None or not pbr else _linear(factor, linear)
-    return ((_linear(texels, False) * tint) @ LUMA)[part.faces]
+    return _weighted(_linear(texels, False) * tint)[part.faces]
 
 
 def _luma(colours: Any, linear: bool) -> np.ndarray:
-    return _linear(colours, linear) @ LUMA
+    return _weighted(_linear(colours, linear))
+
+
+def _weighted(rgb: np.ndarray) -> np.ndarray:
+    """Return the luminance of red, green and blue (..., 3); BLAS would round it by the number of threads."""
+    return np.asarray((rgb * LUMA).sum(axis=-1))
 
 
 def _linear(colours: Any, linear: bool) -> np.ndarray:

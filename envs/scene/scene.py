@@ -123,8 +123,11 @@ class Scene:
         return sections
 
     def shade(self, albedo: Any, normals: Any) -> np.ndarray:
-        """Return the Lambertian luminance of surfaces of `albedo` (...,) with `normals` (..., 3); float64."""
-        towards_sun = np.maximum(0.0, np.asarray(normals, np.float64) @ np.asarray(self.sun))
+        """Return the Lambertian luminance of surfaces of `albedo` (...,) with `normals` (..., 3); float64.
+
+        Without BLAS, which rounds by the number of threads.
+        """
+        towards_sun = np.maximum(0.0, (np.asarray(normals, np.float64) * np.asarray(self.sun)).sum(axis=-1))
         return np.asarray(albedo, np.float64) * (self.ambient + self.diffuse * towards_sun)
 
     def first_contact(self, a_m: Any, b_m: Any, radius_m: float, height_m: float = 2.0) -> float:

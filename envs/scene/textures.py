@@ -101,10 +101,17 @@ def noise_waves(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndarray:
-    """Return the sum of the waves at the texels, (size, size) float64, q along rows and s along columns."""
+    """Return the sum of the waves at the texels, (size, size) float64, q along rows and s along columns.
+
+    Wave by wave: BLAS would round a product of matrices by the number of threads and the processor.
+    """
     turns = 2j * math.pi / size * np.arange(size)
-    along_s, along_q = np.exp(np.outer(turns, cycles[:, 0])), np.exp(np.outer(turns, cycles[:, 1]))
-    return ((along_q * amplitudes) @ along_s.T).real
+    along_s, along_q = np.exp(np.outer(cycles[:, 0], turns)), np.exp(np.outer(cycles[:, 1], turns))
+    total = np.zeros((size, size))
+    for s, q, amplitude in zip(along_s, along_q, amplitudes, strict=True):
+        wave = (q * amplitude)[:, None]
+        total += wave.real * s.real - wave.imag * s.imag
+    return total
 
 
 @functools.cache

@@ -142,12 +142,12 @@ def _picture_shape(spec: PolicySpec) -> tuple[int, ...]:
 
 
 def _pictures(observations: np.ndarray, spec: PolicySpec, dtype: type) -> np.ndarray:
-    """Return the observations, if they are pictures of this sensor."""
+    """Return the observations without an axis for one channel, if they are pictures of this sensor."""
     shape = _picture_shape(spec)
-    if observations.dtype != dtype or observations.shape[1:] != shape:
-        rule = f"must be {np.dtype(dtype)} (B, {shape[0]}, {shape[1]})"
+    if observations.dtype != dtype or observations.shape[1:] not in (shape, (*shape, 1)):
+        rule = f"must be {np.dtype(dtype)} (B, {shape[0]}, {shape[1]}, 1), or without the 1"
         raise ValueError(f"observations {rule}, got {observations.dtype} {observations.shape}")
-    return observations
+    return observations.reshape(-1, *shape)
 
 
 def _same_pictures(pictures: np.ndarray, spec: PolicySpec, encoder: None) -> np.ndarray:

@@ -15,7 +15,7 @@ def mirror(observations: Any, spec: PolicySpec) -> Any:
     """Return observations with left and right exchanged.
 
     Args:
-        observations: B packed windows, of one length or of several, or pictures (B, H, W).
+        observations: B packed windows, of one length or of several, or pictures (B, H, W) or (B, H, W, 1).
         spec: The policy, whose kind says which.
 
     Returns:
@@ -45,7 +45,7 @@ def _mirror_window(window: np.ndarray, width: int) -> np.ndarray:
 
 
 def _mirror_pictures(pictures: np.ndarray, width: int) -> np.ndarray:
-    return np.ascontiguousarray(pictures[..., ::-1])
+    return np.ascontiguousarray(pictures[:, :, ::-1])
 
 
 MIRRORS: dict[str, Callable[[Any, int], Any]] = {

@@ -19,8 +19,9 @@ and gives::
     dropped      int64 (), events or pixels that were left out because `Policy` refuses them
     command      float32 (C,), of the likeliest action, as the vehicle's Box takes it  (vehicles with a body)
 
-The file leaves out events outside of the image or with another p than -1 and +1, every event if window_us is
-not in 1 .. MAX_WINDOW_US, and takes pixels that are not finite for black.
+The file leaves out events outside of the image or the window or with another p than -1 and +1, every event if
+they are not in time order or window_us is not in 1 .. MAX_WINDOW_US, and takes pixels that are not finite for
+black.
 
 `tests/models/policy/test_onnx.py` compares the file with `models.policy.Policy` in onnxruntime. The extra
 `onnx` of this package is needed.
@@ -156,10 +157,13 @@ class PolicyGraph(nn.Module):
             finite = torch.isfinite(luminance)
             return (torch.where(finite, luminance, 0.0), *rest), (~finite).sum()
         events, window_us, *rest = inputs
-        _, x, y, p = events.unbind(1)
+        t, x, y, p = events.unbind(1)
         height, width = self.size
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (p.abs() == 1)
-        inside = inside & (window_us >= 1) & (window_us <= MAX_WINDOW_US)
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (t >= 0) & (t <= window_us)
+        before = torch.cat([torch.full((1,), NEVER), t])[:-1]
+        inside = (
+            inside & (p.abs() == 1) & (before <= t).all() & (window_us >= 1) & (window_us <= MAX_WINDOW_US)
+        )
         return (events[inside], window_us.clamp(1, MAX_WINDOW_US), *rest), (~inside).sum()
 
     def _step(self, *inputs: Tensor) -> tuple[Tensor, ...]:

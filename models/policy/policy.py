@@ -36,6 +36,7 @@ from models.encoder.weights import (
 from models.kinds import PolicySpec, needed_plugins, read_spec
 from models.policy.event_filter import filter_of
 from models.policy.features import LATENT, Step, Windows, feature_of
+from models.policy.given import check_step, read_fields, read_observations
 from models.policy.memory import remember, windows_us
 from models.policy.networks import TWO_MLPS, assemble, network_of
 
@@ -49,6 +50,7 @@ ENV_FIELDS = ("control_hz", "speed_mps", "filter_support", "filter_tau_us", "veh
 FIDELITY_FIELDS = ("tolerance", "max_step_m", "samples", "cull_m")
 HEADINGS = ("forward", "left", "right")  # the actions of the kinematic vehicle
 REMEDY = "copy it again, or delete stages/train.json of its run folder and give the command again"
+OBSERVED = {"event_image": np.uint8, "luminance": np.float32}  # types of observations, else int32
 PREPARED = ("feature", "_network", "_run")  # attributes of a policy that are functions
 MAX_BYTES = 1 << 28  # of one file, which is read whole
 
@@ -167,7 +169,8 @@ class Policy:
         Args:
             observations: One per episode, as environments with `env_fields` show them, of the kind that
                 `observation` names: windows int32 (B, capacity + 1, 4), or a sequence of (count + 1, 4)
-                of any lengths; event images uint8 (B, H, W) or luminance float32 (B, H, W).
+                of any lengths; event images uint8 or luminance float32, (B, H, W, 1) or (B, H, W).
+                Lists and tensors of them are read like arrays.
             restarted: bool (B,), True where the observation is the first of a new episode
                 (with Gymnasium's NEXT_STEP autoreset: where the step before was terminated
                 or truncated); None: nowhere.
@@ -197,17 +200,20 @@ class Policy:
         The events are filtered as in training (`env_fields`).
 
         Args:
-            events: Integer arrays t, x, y, p by name, such as an EVENT array: the events of the
-                step in time order, t in (start_us, start_us + window_us].
+            events: The events of the step in time order, t in (start_us, start_us + window_us]: integers
+                t, x, y, p by name, such as an EVENT array, or rows of these four; arrays, lists or tensors.
+                Booleans of p are ON where true.
             start_us: Start of the step on the clock of the events [us].
             window_us: Length of the step [us].
 
         Raises:
-            ValueError: The policy does not see events.
+            ValueError: The policy does not see events, or these are not events of such a step.
         """
         if self.feature.from_events is None:
             rule = f"this policy takes {self.observation} images, not events"
             raise ValueError(f"{rule}: call it with observations")
+        events = read_fields(events)
+        check_step(events, start_us, window_us)
         if self._filter is not None:
             events = self._filter(events)
         feature = self.feature.from_events(Step(events, start_us, window_us), self.spec, self.encoder)
@@ -215,8 +221,9 @@ class Policy:
 
     def logits(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Return unnormalised log-probabilities float32 (B, actions); arguments as in a call."""
-        features = self.feature.from_observations(observations, self.spec, self.encoder)
-        return self._logits(features, windows_us(observations, self.spec), restarted)
+        seen = read_observations(observations, OBSERVED.get(self.observation, np.int32))
+        features = self.feature.from_observations(seen, self.spec, self.encoder)
+        return self._logits(features, windows_us(seen, self.spec), restarted)
 
     def _logits(
         self, features: np.ndarray, window_us: np.ndarray | int, restarted: np.ndarray | None
@@ -226,7 +233,7 @@ class Policy:
                 f"observations must be one for each of {len(self._stacks)} episodes, got {len(features)}: "
                 "call reset(num_envs) first"
             )
-        first = self._first if restarted is None else self._first | restarted
+        first = self._first if restarted is None else self._first | np.asarray(restarted, bool)
         self._stacks = remember(self._stacks, features, first, self.spec, window_us)
         self._first = np.zeros(len(features), bool)
         state = np.where(first[:, None], np.float32(0.0), self._state)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -50,7 +51,9 @@ def write_bag(
     path: Path, topics: dict[str, tuple[str, list]], store, is_ros1: bool, plugin: Any = None
 ) -> Path:
     """A bag with messages of some topics."""
-    bag = Writer1(path) if is_ros1 else Writer2(path, version=9, storage_plugin=plugin)
+    bag = (
+        Writer1(path) if is_ros1 else Writer2(path, version=9, storage_plugin=plugin or StoragePlugin.SQLITE3)
+    )
     with bag:
         for topic, (kind, messages) in topics.items():
             link = bag.add_connection(topic, kind, typestore=store)

@@ -76,6 +76,7 @@ def metavision(
 ) -> Path:
     """A file in the layout of Metavision, of chunks of 150 events that are packed already."""
     with h5py.File(path, "w") as file:
+        file.attrs["geometry"], file.attrs["format"] = geometry, "HDF5"
         packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         packing.set_chunk((150,))
         packing.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL)
@@ -86,7 +87,6 @@ def metavision(
         data = h5py.h5d.create(file.create_group("CD").id, b"events", kind, space, packing)
         for number, chunk in enumerate(chunks):
             data.write_direct_chunk((150 * number,), chunk, unpacked)
-        file.attrs["geometry"], file.attrs["format"] = geometry, "HDF5"
     return path
 
 
