@@ -119,7 +119,7 @@ def evt_parts(
         events = np.empty(min(request.part_events, usual) + 32, EVENT)
         triggers = np.empty(min(MAX_TRIGGERS, len(words)), TRIGGER)
         n, k = decode(encoding, words, state, events, triggers, endianness)
-        _count(request, tally, state, before)
+        _count(request, tally, state, before, n)
         yield Part(events[:n] if n > len(events) // 2 else events[:n].copy(), None, triggers[:k].copy())
         forget(int(state[State.WORD]))
 
@@ -142,11 +142,12 @@ def decode(
     return decode_evt2(pairs[:, upper], pairs[:, 1 - upper], state, events, triggers)
 
 
-def _count(request: Request, tally: Tally, state: np.ndarray, before: np.ndarray) -> None:
+def _count(request: Request, tally: Tally, state: np.ndarray, before: np.ndarray, events: int) -> None:
     """Add to the tally what a decoder counted since `before`, and refuse words of another encoding.
 
     Raises:
-        ValueError: More than an eighth of the words are of types that the encoding does not have.
+        ValueError: More than an eighth of the words are of types that the encoding does not have, or more
+            events lie beyond its last column than within it.
     """
     new = state - before
     tally.skipped += int(new[State.SKIPPED])
@@ -159,6 +160,11 @@ def _count(request: Request, tally: Tally, state: np.ndarray, before: np.ndarray
         raise request.refusal(
             f"has {new[State.RESERVED]} of {new[State.WORD]} words of types that this encoding does not "
             "have; the file is damaged or of another encoding: give format as evt2, evt21 or evt3"
+        )
+    if new[State.BEYOND] > max(FEW_RESERVED, events):
+        raise request.refusal(
+            f"has {new[State.BEYOND]} events beyond the last column of this encoding and {events} within it; "
+            "the file is damaged or of another encoding: give format as evt2, evt21 or evt3"
         )
 
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
 from envs.config import CameraConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv, Info
@@ -151,6 +151,39 @@ def test_the_loop_of_cleanrl_reads_the_last_info_of_each_episode(kind):
             assert infos["final_info"]["t_us"].tolist() == [STEPS * 5000] * 2
     envs.close()
     assert lengths == [STEPS] * 4
+
+
+PICTURES = {"camera": CameraConfig(width=36, height=36), "time_limit_s": 0.05}
+
+
+@pytest.mark.filterwarnings("ignore:.*is not within the observation space")
+def test_event_images_train_the_cnn_of_stable_baselines3(tmp_path):
+    envs = make_vec_env(NAME, 2, seed=0, env_kwargs=PICTURES | {"observation": "event_image"})
+    stacked = VecFrameStack(envs, 3)
+    for world, shape in ((envs, (36, 36, 1)), (stacked, (36, 36, 3))):
+        assert world.observation_space.shape == shape
+        policy = PPO("CnnPolicy", world, n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(16)
+        assert policy.num_timesteps == 16
+    envs.close()
+
+
+@pytest.mark.system
+def test_event_images_fit_the_default_encoder_of_rllib():
+    import torch
+    from ray.rllib.algorithms.ppo.ppo_catalog import PPOCatalog
+    from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPPOTorchRLModule
+    from ray.rllib.core.columns import Columns
+    from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+
+    env = CorridorEnv(observation="event_image")
+    module = RLModuleSpec(
+        module_class=DefaultPPOTorchRLModule,
+        observation_space=env.observation_space,
+        action_space=env.action_space,
+        catalog_class=PPOCatalog,
+    ).build()
+    seen = torch.from_numpy(env.reset(seed=0)[0][None].astype(np.float32))
+    assert module.forward_inference({Columns.OBS: seen})[Columns.ACTION_DIST_INPUTS].shape == (1, 3)
 
 
 def test_rllib_hands_the_class_its_env_config():

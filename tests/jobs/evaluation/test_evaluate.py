@@ -54,7 +54,7 @@ def test_a_policy_of_each_kind_is_evaluated_in_the_same_corridors_by_what_it_see
     for agent in ("straight", str(save_untrained(tmp_path, name=name))):
         roll_out(make_agent(agent), short, [3, 4], watch=watch)
     assert [len(seen) for seen in corridors.values()] == [1, 1]
-    shape = (4097, 4) if KINDS[name].observation == "window" else (64, 64)
+    shape = (4097, 4) if KINDS[name].observation == "window" else (64, 64, 1)
     assert shapes == {"none": {(0,)}, KINDS[name].observation: {shape}}
 
 

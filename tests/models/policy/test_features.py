@@ -128,7 +128,7 @@ def test_grey_is_what_a_display_decodes_to_the_luminance_again():
 def test_pictures_of_another_sensor_or_type_are_refused(name):
     spec = PolicySpec(FixedModel(name, 3), *SIZES)
     for bad in (np.zeros((1, HEIGHT, WIDTH + 1), np.uint8), np.zeros((1, HEIGHT, WIDTH), np.int64)):
-        with pytest.raises(ValueError, match=r"observations must be (uint8|float32) \(B, 4, 6\), got"):
+        with pytest.raises(ValueError, match=r"must be (uint8|float32) \(B, 4, 6, 1\), or .* got"):
             feature_of(spec).from_observations(bad, spec, None)
 
 

@@ -108,6 +108,8 @@ REFUSED = {
     "above": [10, 3, -1, -1],
     "below": [10, 3, SIDE, 1],
     "polarity": [10, 3, 3, 0],
+    "before": [-1, 3, 3, 1],
+    "after": [5001, 3, 3, 1],
 }
 
 
@@ -127,15 +129,18 @@ def test_what_the_policy_refuses_is_left_out_and_counted(name, tmp_path):
     expected, none = run(good)
     assert none == 0
     for rows in REFUSED.values():
-        with pytest.raises(ValueError, match="has x="):
+        with pytest.raises(ValueError, match=r"has [xp]=|within their control step"):
             policy.event_logits(dict(zip("txyp", np.array([rows]).T, strict=True)), 0, 5000)
-        logits, dropped = run([good[0], rows, *good[1:]])
+        logits, dropped = run(sorted([rows, *good]))
         assert dropped == 1
         np.testing.assert_array_equal(logits, expected)
-    logits, dropped = run([*REFUSED.values()])
+    logits, dropped = run(sorted(REFUSED.values()))
     assert dropped == len(REFUSED)
     np.testing.assert_array_equal(logits, run([])[0])
     assert run(good, window_us=0)[1] == len(good)
+    assert run(good[::-1])[1] == len(good)
+    with pytest.raises(ValueError, match="must be in time order"):
+        policy.event_logits(np.array(good[::-1]), 0, 5000)
 
 
 @pytest.mark.system

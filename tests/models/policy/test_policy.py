@@ -1,10 +1,13 @@
+import copy
 import dataclasses
 import hashlib
 import json
+import pickle
 import subprocess
 import sys
 
 import numpy as np
+import pandas
 import pytest
 import torch
 
@@ -151,6 +154,98 @@ def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path,
         acted.append(single.act(events, 5000 * step, 5000))
     assert acted == chosen
     assert len(set(chosen)) > 1
+
+
+def same_events(window):
+    """The events of a window in every form whose meaning is plain."""
+    events = step_events(window, 0)
+    rows = np.stack([events[name].astype(np.int64) for name in "txyp"], axis=1)
+    fields = {name: events[name] for name in "txyp"}
+    return {
+        "array": events,
+        "other order": events[["p", "y", "x", "t"]],
+        "rows": rows,
+        "list of rows": rows.tolist(),
+        "list of tuples": [tuple(row) for row in rows.tolist()],
+        "tensor": torch.from_numpy(rows),
+        "fields": fields,
+        "lists": {name: values.tolist() for name, values in fields.items()},
+        "tensors": {name: torch.from_numpy(rows[:, place].copy()) for place, name in enumerate("txyp")},
+        "table": pandas.DataFrame({name: values.astype(np.int64) for name, values in fields.items()}),
+        "booleans": {**fields, "p": events["p"] > 0},
+        "list of booleans": {**fields, "p": (events["p"] > 0).tolist()},
+        "tensor of booleans": {**fields, "p": torch.from_numpy(events["p"] > 0)},
+    }
+
+
+@pytest.mark.parametrize("support", [0, 1])
+def test_events_may_come_in_every_form_whose_meaning_is_plain(support, tmp_path):
+    spec = make_spec("event_columns")
+    about = {**ABOUT, "sensor": {**ABOUT["sensor"], "filter_support": support, "filter_tau_us": 1_000_000}}
+    folder = save_policy(tmp_path, build_networks(spec, seed=3), spec, about)
+    (window,) = make_windows(np.random.default_rng(4), 1, side=SIDE)
+    found = {}
+    for name, events in same_events(window).items():
+        found[name] = load_policy(folder).event_logits(events, 0, 5000).tolist()
+    assert len(set(map(tuple, found.values()))) == 1, found
+    empty = [], np.empty((0, 4)), {name: [] for name in "txyp"}
+    none = [load_policy(folder).event_logits(events, 0, 5000).tolist() for events in empty]
+    assert none[0] == none[1] == none[2] != found["array"]
+
+
+@pytest.mark.parametrize("support", [0, 2])
+@pytest.mark.parametrize(
+    ("events", "rule"),
+    [
+        (None, "by name or as rows .* of shape \\(\\)"),
+        ("events", "by name or as rows"),
+        ([1, 2, 3, 1], "of shape \\(4,\\)"),
+        ([[1, 2, 3, 1], [2, 2]], "by name or as rows"),
+        ([[1, 2, 3]], "of shape \\(1, 3\\)"),
+        ([[1.5, 2, 3, 1]], "field t must hold integers, got float64"),
+        ({"t": [1], "x": [1], "y": [1]}, "without p"),
+        ({"t": [1, 2], "x": [1], "y": [1], "p": [1]}, "shapes"),
+        ({"t": [True], "x": [1], "y": [1], "p": [1]}, "field t must hold integers, got bool"),
+        ([[10, 2, 3, 0]], "event 0 has p=0: recode 0 as -1"),
+        ([[10, 2, 3, 2]], "event 0 has p=2"),
+        ([[10, 2, 3, 1], [9, 2, 3, 1]], "in time order; event 1 has t=9 after 10: sort them"),
+        ([[6000, 2, 3, 1]], r"t in \[0, 5000\] us; got 6000 to 6000: give start_us"),
+        ([[10, -1, 3, 1]], "x=-1"),
+        ([[10, 2, SIDE, 1]], f"y={SIDE}"),
+    ],
+)
+def test_other_events_are_refused_by_one_rule(events, rule, support, tmp_path):
+    spec = make_spec("event_columns")
+    about = {**ABOUT, "sensor": {**ABOUT["sensor"], "filter_support": support, "filter_tau_us": 4000}}
+    policy = load_policy(save_policy(tmp_path, build_networks(spec, seed=3), spec, about))
+    with pytest.raises(ValueError, match=f"event.*{rule}"):
+        policy.event_logits(events, 0, 5000)
+
+
+def test_observations_may_be_lists_and_tensors(name, folder):
+    steps = make_observations(name, np.random.default_rng(1), 3)
+    found = []
+    for form in (np.asarray, torch.from_numpy, np.ndarray.tolist, list):
+        policy = load_policy(folder)
+        policy.reset(3)
+        found.append(policy.logits(form(steps)).tobytes())
+    assert len(set(found)) == 1
+    if name in ("event_image", "rgb"):
+        policy.reset(3)
+        assert policy.logits(steps[..., None]).tobytes() == found[0]
+
+
+def test_a_copy_goes_on_where_the_policy_was(name, folder):
+    steps = make_observations(name, np.random.default_rng(1), 12)
+    steps = steps.reshape(4, 3, *steps.shape[1:])
+    policy = load_policy(folder)
+    policy.reset(3)
+    for step in steps[:2]:
+        policy.logits(step)
+    copies = [copy.deepcopy(policy), pickle.loads(pickle.dumps(policy)), copy.copy(policy)]
+    expected = [policy.logits(step).tobytes() for step in steps[2:]]
+    for other in copies:
+        assert [other.logits(step).tobytes() for step in steps[2:]] == expected
 
 
 def test_a_policy_that_sees_no_events_says_so(tmp_path):
