@@ -27,7 +27,7 @@ def read_fields(events: Any) -> dict[str, np.ndarray]:
         ValueError: It is none of these.
     """
     is_named = isinstance(events, Mapping) or hasattr(events, "columns")  # a pandas table
-    given = events if is_named else _array(events)
+    given: Any = events if is_named else _array(events)
     if is_named or given.dtype.names:
         present = list(given if is_named else given.dtype.names)
         missing = [name for name in NAMES if name not in present]
@@ -93,7 +93,7 @@ def _typed(values: Any, dtype: type) -> np.ndarray:
     array = _array(values)
     if isinstance(values, np.ndarray | torch.Tensor) or array.dtype.kind not in "iuf":
         return array
-    cast = array.astype(dtype)
+    cast: np.ndarray = array.astype(dtype)
     return cast if np.issubdtype(dtype, np.floating) or np.array_equal(cast, array) else array
 
 
