@@ -1,7 +1,8 @@
 """Measure how well the pages read: words, sentence lengths, and Flesch's reading ease.
 
 Run from the repository root: python -m docs.reading [--check]
-Prints a row a page. With --check only the first pages are measured, and a page that breaks a limit stops it.
+Prints a row a page. With --check a page that breaks a limit stops it. Plans, which stay as they were written before
+the data, are in docs/plans and count apart.
 """
 
 import re
@@ -19,10 +20,12 @@ DOCS = ROOT / "docs"
 GENERATED = ("keys.md", "api.md", "changelog.md")  # tables of the schema, docstrings, the log of changes
 FIRST = ("README.md", *(f"docs/{name}.md" for name in ("index", "start", "task", "train", "sweep", "models")))
 MOST_MEDIAN, MOST_WORDS, LEAST_EASE = 18, 35, 45.0  # median and longest sentence [words], reading ease
+MOST_WORDS_ANYWHERE = 40  # of a sentence on any page
 MOST_SITE_WORDS, MOST_LINKS = 34_600, 45
 BLOCKS = (
     re.compile(r"^(`{3,}|:{3,}).*?^\1\s*$", re.MULTILINE | re.DOTALL),  # code and directives
     re.compile(r"<(video|iframe)\b.*?</\1>", re.DOTALL),
+    re.compile(r"^<!-- study .*?<!-- end of study -->", re.MULTILINE | re.DOTALL),  # written by jobs.study.page
     re.compile(r"<!--.*?-->", re.DOTALL),
     re.compile(r"^\s*\|.*$", re.MULTILINE),  # tables
     re.compile(r"^#+ .*$", re.MULTILINE),
@@ -100,7 +103,7 @@ def broken(page: str, found: Reading) -> list[str]:
 
 
 def site_words() -> int:
-    """Return the words of the site, without those that are generated from schema and docstrings."""
+    """Return the words of the site: without keys, API and changelog, and without the plans of docs/plans."""
     return sum(len(page.read_text().split()) for page in DOCS.glob("*.md") if page.name not in GENERATED)
 
 
@@ -110,8 +113,11 @@ def sidebar_links() -> int:
 
 
 def check() -> list[str]:
-    """Return what breaks a limit: sentences of the first pages, words and links of the site."""
+    """Return what breaks a limit: sentences of the first pages and of any, words and links of the site."""
     wrong = [line for page in FIRST for line in broken(page, measure((ROOT / page).read_text()))]
+    for page in sorted(DOCS.glob("*.md")):
+        if page.name not in GENERATED and (found := measure(page.read_text())).longest > MOST_WORDS_ANYWHERE:
+            wrong.append(f"{page.name}: a sentence of {found.longest} words: {found.sentence}")
     if (words := site_words()) > MOST_SITE_WORDS:
         wrong.append(f"the site has {words:,} words; at most {MOST_SITE_WORDS:,}")
     if (links := sidebar_links()) > MOST_LINKS:
@@ -128,6 +134,8 @@ def table() -> str:
         lines.append(f"{page.name:28}{one.words:8,}{one.median:8g}{one.longest:8}{one.ease:6.0f}")
     count = sum(page.name not in GENERATED for page in DOCS.glob("*.md"))
     lines.append(f"{count} pages of {site_words():,} words, {sidebar_links()} links in the sidebar")
+    plans = [page.read_text().split() for page in (DOCS / "plans").glob("*.md")]
+    lines.append(f"{len(plans)} plans of {sum(map(len, plans)):,} words")
     return "\n".join(lines) + "\n"
 
 
