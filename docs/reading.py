@@ -1,8 +1,8 @@
 """Measure how well the pages read: words, sentence lengths, and Flesch's reading ease.
 
 Run from the repository root: python -m docs.reading [--check]
-Prints a row a page. With --check a page that breaks a limit stops it. Plans, which stay as they were written before
-the data, are in docs/plans and count apart.
+Prints a row a page. With --check a page that breaks a limit stops it. Plans, which stay as they were written
+before the data, are in docs/plans and count apart.
 """
 
 import re
@@ -25,7 +25,9 @@ MOST_SITE_WORDS, MOST_LINKS = 34_600, 45
 BLOCKS = (
     re.compile(r"^(`{3,}|:{3,}).*?^\1\s*$", re.MULTILINE | re.DOTALL),  # code and directives
     re.compile(r"<(video|iframe)\b.*?</\1>", re.DOTALL),
-    re.compile(r"^<!-- study .*?<!-- end of study -->", re.MULTILINE | re.DOTALL),  # written by jobs.study.page
+    re.compile(
+        r"^<!-- study .*?<!-- end of study -->", re.MULTILINE | re.DOTALL
+    ),  # written by jobs.study.page
     re.compile(r"<!--.*?-->", re.DOTALL),
     re.compile(r"^\s*\|.*$", re.MULTILINE),  # tables
     re.compile(r"^#+ .*$", re.MULTILINE),

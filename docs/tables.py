@@ -9,6 +9,7 @@ import ast
 import csv
 import re
 import sys
+import tomllib
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -88,6 +89,17 @@ def modules_page() -> str:
     return "\n\n".join(["All modules\n===========", *blocks]) + "\n"
 
 
+def layer_table() -> str:
+    """Return the layers of each package, from the highest to the lowest, as import-linter checks them."""
+    found = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    rows = []
+    for contract in found:
+        for package in contract.get("containers", ()):
+            layers = (", ".join(f"`{name}`" for name in own.split(" | ")) for own in contract["layers"])
+            rows.append((f"`{package}`", " > ".join(layers)))
+    return markdown_table(("package", "layers"), rows, 2)
+
+
 def success_table() -> str:
     """Return the README's table: success [%] of some groups under some conditions, means over seeds."""
     rates: dict[tuple[str, ...], list[float]] = defaultdict(list)
@@ -104,6 +116,7 @@ def success_table() -> str:
 
 TABLES: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"success": success_table},
+    "docs/code.md": {"layers": layer_table},
     "docs/keys.md": {"keys": key_tables},
     "docs/api.md": {"modules": api_table},
     "docs/models.md": {name: lambda name=name: models_tables()[name] for name in ("robustness", "taught")},  # type: ignore[misc]

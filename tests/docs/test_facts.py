@@ -1,0 +1,43 @@
+"""Facts of the pages that went stale before are those of the files that decide them."""
+
+import csv
+import gzip
+import re
+import tomllib
+
+import imageio_ffmpeg
+
+from docs.draw_films import FAILURES, FILMS
+from docs.tables import DATA, ROOT
+
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+FILES = [*(ROOT / "docker").glob("*"), ROOT / "docs" / "deploy.md"]
+
+
+def test_images_and_the_citation_carry_the_version():
+    tags = {tag for path in FILES for tag in re.findall(r"evade:(\d[\w.]*)", path.read_text())}
+    assert tags == {VERSION}
+    (cited,) = re.findall(r"version = \{(.+?)\}", (ROOT / "docs" / "citation.md").read_text())
+    assert cited == VERSION
+    assert f"`v{VERSION}`" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_every_film_of_the_gallery_is_there_and_plays_at_ten_frames_a_second():
+    page = (ROOT / "docs" / "watch.md").read_text()
+    assert set(re.findall(r'src="(\w+)\.mp4"', page)) == {*FILMS, *FAILURES}
+    for name in (*FILMS, *FAILURES):
+        about = next(imageio_ffmpeg.read_frames(str(ROOT / "docs" / "films" / f"{name}.mp4")))
+        assert about["fps"] == 10
+
+
+def test_the_demo_of_the_first_page_is_four_times_slower_than_the_flight():
+    """1,123 steps of 5 ms are 5.6 s; the film's title names the factor."""
+    (steps,) = re.findall(r"goal after ([\d,]+) control steps", (ROOT / "docs" / "start.md").read_text())
+    about = next(imageio_ffmpeg.read_frames(str(ROOT / "docs" / "films" / "poles.mp4")))
+    assert abs(about["duration"] - 4 * int(steps.replace(",", "")) * 0.005) < 0.5
+
+
+def test_the_pages_count_the_episodes_that_the_file_has():
+    with gzip.open(DATA / "hold_episodes.csv.gz", "rt", newline="") as file:
+        count = sum(1 for _ in csv.DictReader(file))
+    assert f"All {count:,} episodes" in (ROOT / "docs" / "train.md").read_text()
