@@ -40,7 +40,7 @@ def run(config: Config) -> dict[str, Any]:
     pages = marked(path.read_text() for path in sorted(DOCS.glob("*.md")))
     named = {name.partition(":")[2] or name for name in pages}
     for name, folder in newest_studies(config).items():
-        if config.resume is not None or name in named:
+        if config.resume is not None or name in named or not named:  # elsewhere each gets a page
             written.append(write_study(name, folder, config, DOCS))
     if not written:
         where = config.resume or config.runs_dir

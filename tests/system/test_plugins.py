@@ -67,8 +67,8 @@ def test_its_policy_scene_and_fault_are_swept_and_reported(trained):
     said = evade(trained, *SWEEP)
     for point in (r"spot\s+│ 0\.9", r"world\s+│ forest"):
         assert re.search(point, said), said
-    assert "Written: docs/results.md" in evade(trained, "+exp=report")
-    assert "halves" in (trained / "docs" / "results.md").read_text()
+    assert "Written: docs/robustness.md" in evade(trained, "+exp=report")
+    assert "halves" in (trained / "docs" / "robustness.md").read_text()
 
 
 def test_without_it_a_job_says_which_plug_in_is_missing(trained):
@@ -83,20 +83,22 @@ BROKEN = {
     "a network that raises": (
         "    return nn.Flatten()",
         "    1 / 0\n    return nn.Flatten()",
-        "ZeroDivisionError: division by zero (plug-in forest, line",
+        "'halves' of plug-in forest: ZeroDivisionError: division by zero (plug-in forest, line",
+        2,  # refused before anything starts
     ),
     "a fault that raises": (
         "    return lambda events,",
         "    return lambda events, *rest: 1 / 0\n    return lambda events,",
         "ZeroDivisionError: division by zero (plug-in forest, line",
+        1,
     ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", BROKEN)
-def test_an_error_in_a_worker_names_it(tmp_path, what):
-    before, after, message = BROKEN[what]
+def test_an_error_of_a_plug_in_names_it(tmp_path, what):
+    before, after, message, status = BROKEN[what]
     assert PLUGIN.count(before) == 1
     (tmp_path / "forest.py").write_text(PLUGIN.replace(before, after))
-    assert message in evade(tmp_path, *TRAIN, status=1)
+    assert message in evade(tmp_path, *TRAIN, status=status)
