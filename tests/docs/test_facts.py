@@ -20,6 +20,7 @@ def test_images_and_the_citation_carry_the_version():
     (cited,) = re.findall(r"version = \{(.+?)\}", (ROOT / "docs" / "citation.md").read_text())
     assert cited == VERSION
     assert f"`v{VERSION}`" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"value: v{VERSION}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_every_film_of_the_gallery_is_there_and_plays_at_ten_frames_a_second():
