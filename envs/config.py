@@ -209,6 +209,14 @@ class FaultsConfig:
             of shot noise and leakage [decades].
         hot_pixel_share: Fraction of pixels that are hot for the whole episode.
         hot_pixel_hz: Events per second of a hot pixel.
+        dead_block: Fraction of the image that a rectangle of its proportions covers, at a random place,
+            whose pixels are dead for the whole episode.
+        flicker_depth: Amplitude by which the scene's light flickers, as a share of the light
+            (`envs.events.flicker`); pictures, which expose for longer, do not show it.
+        flicker_hz: Its frequency: 100 with mains of 50 Hz, 120 with 60 Hz.
+        burst_hz: Mean number of bursts of events without cause that begin in a second, a Poisson process.
+        burst_ms: Length of a burst [ms].
+        burst_activity_hz: Events per second of each pixel in a burst.
         added: How much of each fault that a plug-in adds, such as {"flicker": 0.2}; 0 is none of it.
     """
 
@@ -226,6 +234,12 @@ class FaultsConfig:
     noise_spread: Annotated[float, Field(ge=0, le=2)] = 0.0
     hot_pixel_share: Fraction = 0.0
     hot_pixel_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    dead_block: Fraction = 0.0
+    flicker_depth: Fraction = 0.0
+    flicker_hz: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    burst_hz: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    burst_ms: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    burst_activity_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     added: dict[AddedFault, Annotated[float, Field(ge=0, le=1e6)]] = dataclasses.field(default_factory=dict)
 
 
@@ -253,6 +267,10 @@ class FidelityConfig:
 LATER_SETTINGS = (
     *("cutoff_hz", "cutoff_grows_with_light"),
     *("latency_us", "latency_jitter_us", "readout_hz"),
+)
+LATER_FAULTS = (
+    *("dead_block", "flicker_depth", "flicker_hz"),
+    *("burst_hz", "burst_ms", "burst_activity_hz"),
 )
 # Of the environment, with the values that do what was done before they existed.
 LATER_ENV_SETTINGS: dict[str, object] = {"vehicle": "kinematic", "body": {}, "task": "corridor"}
@@ -333,9 +351,12 @@ class EnvConfig:
 def hashed_settings(config: EnvConfig) -> dict[str, Any]:
     """Return all settings as plain containers, to be hashed.
 
-    `LATER_ENV_SETTINGS` count only where they change something, so that older hashes stay valid.
+    `LATER_ENV_SETTINGS` and `LATER_FAULTS` count only where they change something, so that older hashes stay
+    valid.
     """
     settings = dataclasses.asdict(config)
+    faults = settings["faults"]
+    settings["faults"] = {name: faults[name] for name in faults if name not in LATER_FAULTS or faults[name]}
     return {name: value for name, value in settings.items() if LATER_ENV_SETTINGS.get(name, ...) != value}
 
 

@@ -11,6 +11,8 @@ with EVENT of the interval (t0_us, t1_us], and returns what they become: EVENT, 
 """
 
 import dataclasses
+import math
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -25,6 +27,7 @@ from envs.events.readout import Readout
 
 NO_NOISE = no_noise()
 LABELLED = np.dtype([*EVENT.descr, ("is_noise", "?")])
+Span = tuple[int, int]  # [us], without its begin
 Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
 
 
@@ -33,7 +36,7 @@ class PixelFaults:
     """The pixels' faults of one episode.
 
     Attributes:
-        dead: bool (H, W); these never fire, not even noise.
+        dead: bool (H, W), scattered ones and the block; these never fire, not even noise.
         live: int64 (L,), flat indices of the others.
         hot: int64 (K,), flat indices of the hot ones among these.
     """
@@ -44,7 +47,7 @@ class PixelFaults:
 
 
 def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.random.Generator) -> PixelFaults:
-    """Draw which pixels are dead (appendix D.3, induced sparsity) or hot.
+    """Draw which pixels are dead (scattered: appendix D.3, induced sparsity; or in a block) or hot.
 
     Args:
         shape: (H, W).
@@ -54,11 +57,35 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
     dead = np.zeros(shape, bool)
     if faults.sparsity > 0.0:
         dead.flat[rng.permutation(dead.size)[: round(faults.sparsity * dead.size)]] = True
+    if faults.dead_block > 0.0:
+        sides = [round(math.sqrt(faults.dead_block) * side) for side in shape]
+        top, left = (int(rng.integers(0, room - side + 1)) for room, side in zip(shape, sides, strict=True))
+        dead[top : top + sides[0], left : left + sides[1]] = True
     live = np.flatnonzero(~dead)
     hot = live[:0]
     if faults.hot_pixel_share > 0.0:
         hot = np.sort(rng.permutation(live)[: round(faults.hot_pixel_share * dead.size)])
     return PixelFaults(dead, live, hot)
+
+
+class Bursts:
+    """When bursts of false events begin and end: a Poisson process of beginnings, all of one length."""
+
+    def __init__(self, faults: FaultsConfig, t_us: int, rng: np.random.Generator) -> None:
+        """Begin at a time [us], without a burst; `rng` draws when the next begins."""
+        self._pause_us, self._length_us = 1e6 / faults.burst_hz, 1e3 * faults.burst_ms
+        self._rng, self._begun_us = rng, list[float]()
+        self._next_us = t_us + rng.exponential(self._pause_us)
+
+    def until(self, t0_us: int, t1_us: int) -> list[Span]:
+        """Return the parts of (t0_us, t1_us] that each burst fills; spans may overlap, as bursts may."""
+        while self._next_us < t1_us:
+            self._begun_us.append(self._next_us)
+            self._next_us += self._rng.exponential(self._pause_us)
+        ends = [(begun_us, begun_us + self._length_us) for begun_us in self._begun_us]
+        self._begun_us = [begun_us for begun_us, end_us in ends if end_us > t1_us]
+        spans = [(max(t0_us, round(begun)), min(t1_us, round(end))) for begun, end in ends]
+        return [span for span in spans if span[0] < span[1]]
 
 
 class RealSensor:
@@ -106,6 +133,8 @@ class RealSensor:
             self._noise = PixelNoise(camera, faults, own, alive, t_us, rng)
             if labels:
                 self._noise_labels = NoiseLabels(own, numbers, rest)
+        bursts = faults.burst_hz > 0.0 and faults.burst_ms > 0.0 and faults.burst_activity_hz > 0.0
+        self._bursts = Bursts(faults, t_us, rng) if bursts else None
         if has_readout(camera):
             self._readout = Readout(camera, t_us, rng, LABELLED if labels else EVENT)
         amounts = sorted(faults.added.items())
@@ -135,7 +164,9 @@ class RealSensor:
             of_light, labels = self._noise_labels.of((pixels, events["p"]), noise[1:], t1_us, kept)
             events = labelled(events, of_light)
         drawn = self._pixels, self._rng
-        events, is_noise = _with_faults(events, (t0_us, t1_us), self._faults, *drawn, noise, labels)
+        bursts = self._bursts.until(t0_us, t1_us) if self._bursts is not None else ()
+        span = t0_us, t1_us
+        events, is_noise = _with_faults(events, span, self._faults, *drawn, noise, labels, bursts)
         for name, apply in self._added.items():
             before, events = events, apply(events, t0_us, t1_us)
             _check_added(name, events, (t0_us, t1_us), self._pixels.dead.shape)
@@ -235,8 +266,9 @@ def _with_faults(
     rng: np.random.Generator,
     noise: Noise | None,
     labels: np.ndarray | None = None,
+    bursts: Sequence[Span] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`apply_faults`, and which of the events are noise, bool (N,).
+    """`apply_faults` and the false events of `bursts`, and which of the events are noise, bool (N,).
 
     All that is added is noise, except where `labels` (bool, one for each event of `noise`) says otherwise; so
     are those events that come as LABELLED with that label.
@@ -244,20 +276,22 @@ def _with_faults(
     t0_us, t1_us = span_us
     if t1_us <= t0_us:
         raise ValueError(f"faults need t1_us > t0_us; got {t0_us} and {t1_us}.")
-    if faults.sparsity > 0.0:
+    if faults.sparsity > 0.0 or faults.dead_block > 0.0:
         events = events[~pixels.dead[events["y"], events["x"]]]
     if faults.event_dropout > 0.0:
         events = events[rng.random(events.size) >= faults.event_dropout]
     events = disturb(events, faults, pixels.dead.shape, rng)
-    kinds = _expected(events.size, (t1_us - t0_us) * 1e-6, faults, pixels)
-    expected = sum(mean for _, mean in kinds)
+    kinds = _expected(events.size, span_us, faults, pixels, bursts)
+    expected = sum(mean for _, mean, _ in kinds)
     if expected > MAX_EVENTS_PER_FRAME:
         raise ValueError(
             f"faults may add {MAX_EVENTS_PER_FRAME} events to an interval; these rates add about "
             f"{expected:.3g} from {t0_us} to {t1_us} us. Lower the rates or shorten the interval."
         )
-    drawn = [where[rng.integers(0, where.size, int(rng.poisson(mean)))] for where, mean in kinds]
-    false = [_at_any_time(where, (t0_us, t1_us), rng) for where in drawn] + ([noise] if noise else [])
+    drawn = [
+        (where[rng.integers(0, where.size, int(rng.poisson(mean)))], span) for where, mean, span in kinds
+    ]
+    false = [_at_any_time(where, span, rng) for where, span in drawn] + ([noise] if noise else [])
     events, is_noise = unlabelled(events)
     if not sum(part[0].size for part in false):
         return events, is_noise
@@ -269,20 +303,23 @@ def _with_faults(
 
 
 def _expected(
-    num_events: int, seconds: float, faults: FaultsConfig, pixels: PixelFaults
-) -> list[tuple[np.ndarray, float]]:
-    """For each kind of noise that is on: flat pixels, and the mean number of false events of all of them."""
-    kinds = []
+    num_events: int, span_us: Span, faults: FaultsConfig, pixels: PixelFaults, bursts: Sequence[Span]
+) -> list[tuple[np.ndarray, float, Span]]:
+    """For each kind of noise that is on: flat pixels, the mean number of false events of all of them, and when."""
+    kinds, seconds = [], (span_us[1] - span_us[0]) * 1e-6
     background = faults.background_activity * num_events
     background += faults.background_activity_hz * seconds * pixels.live.size
     if background > 0.0 and pixels.live.size:
-        kinds.append((pixels.live, background))
+        kinds.append((pixels.live, background, span_us))
     if faults.hot_pixel_hz > 0.0 and pixels.hot.size:
-        kinds.append((pixels.hot, faults.hot_pixel_hz * seconds * pixels.hot.size))
+        kinds.append((pixels.hot, faults.hot_pixel_hz * seconds * pixels.hot.size, span_us))
+    for begin_us, end_us in bursts if pixels.live.size else ():
+        mean = faults.burst_activity_hz * (end_us - begin_us) * 1e-6 * pixels.live.size
+        kinds.append((pixels.live, mean, (begin_us, end_us)))
     return kinds
 
 
-def _at_any_time(where: np.ndarray, span_us: tuple[int, int], rng: np.random.Generator) -> Noise:
+def _at_any_time(where: np.ndarray, span_us: Span, rng: np.random.Generator) -> Noise:
     """Events at these flat pixels, times and polarities uniform."""
     times = rng.integers(*span_us, where.size) + 1
     return times, where, 2 * rng.integers(0, 2, where.size) - 1

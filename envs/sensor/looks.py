@@ -16,6 +16,7 @@ from envs.checks import LIMIT_M, LIMIT_S
 from envs.compiled import inlined, kernel
 from envs.events.crossings import Room, make_room, named
 from envs.events.emission import EVENT, Span
+from envs.events.flicker import Flicker, brightness, looks_needed
 from envs.events.lowpass import ColumnFilter
 from envs.events.ramps import Ramps, Watch, events_of_ramps, look_at, make_ramps
 from envs.raycast.columns import Workspace, make_workspace, paint_columns
@@ -70,6 +71,7 @@ class View(NamedTuple):
         seen_us: int64 (W,), when each column was looked at last [us].
         bandwidth: Of its photoreceptors.
         shifts: How far outlines may move between two looks.
+        flicker: How the scene's light flickers.
         scratch: Room for a step.
     """
 
@@ -82,6 +84,7 @@ class View(NamedTuple):
     seen_us: np.ndarray
     bandwidth: ColumnFilter
     shifts: Shifts
+    flicker: Flicker
     scratch: Scratch
 
 
@@ -112,7 +115,8 @@ def sense_way(view, way, parts):
     Args:
         view: `View`, whose last image becomes that at the end.
         way: `Way`.
-        parts: In how many parts of equal time the way is cut; in more for columns in which something is near.
+        parts: In how many parts of equal time the way is cut; in more if the light flickers faster, and for
+            columns in which something is near.
 
     Returns:
         First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
@@ -125,6 +129,7 @@ def sense_way(view, way, parts):
         return BAD_POSE, 0, 0, np.empty(0, EVENT)
     for column in range(view.seen_us.size):  # nothing was seen while the camera stood still
         view.seen_us[column] = max(view.seen_us[column], way.start_us)
+    parts = min(max(parts, looks_needed(view.flicker, way.moving_us)), way.moving_us)
     count, stretches = _divide(view, way, parts)
     before, after, followed = outlines.before[:count], outlines.after[:count], outlines.followed[:count]
     events, lost, columns, begun_us = np.empty(0, EVENT), 0, 0, way.start_us
@@ -188,11 +193,21 @@ def _look_along(view, way, stretch, ends, watch, kept):
             continue
         aim_along(room.frames[0], way, t_us)
         paint_columns(view.bodies, view.noise, painted.T, first, last, view.cull_m, room)
+        if view.flicker.depth > 0.0:
+            _dim(painted, first, last, brightness(view.flicker, t_us))
         bad, kept, more = look_at(painted, first, last, t_us, watch, kept)
         if bad >= 0:
             return bad, kept, lost, columns
         lost, columns = lost + more, columns + last - first
     return -1, kept, lost, columns
+
+
+@inlined
+def _dim(painted, first, last, factor):
+    """Multiply columns of an image (W, H) by a factor."""
+    for column in range(first, last):
+        for row in range(painted.shape[1]):
+            painted[column, row] *= factor
 
 
 @inlined

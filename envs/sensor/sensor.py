@@ -9,6 +9,7 @@ from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, RealSensor
 from envs.events.faults import NO_NOISE as NO_PIXEL_NOISE
 from envs.events.faults import has_readout
+from envs.events.flicker import NO_FLICKER, brightness_at, draw_flicker, looks_needed
 from envs.events.lowpass import UNLIMITED
 from envs.events.pixel_noise import PixelState
 from envs.events.ramps import ColumnCamera
@@ -56,6 +57,7 @@ class Sensor:
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
         self._seen_us = np.zeros(config.camera.width, np.int64)
+        self._flicker = NO_FLICKER
         self._way: tuple[np.ndarray, float] | None = None  # of the last step, and its share travelled
         self.true_events = np.empty(0, EVENT)
         self.plan: RenderPlan
@@ -69,6 +71,7 @@ class Sensor:
             return
         self._set_renderer(scene)
         self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
+        self._flicker = NO_FLICKER if self._pictures_alone else draw_flicker(self._config.faults, rng)
         self.luminance = self._picture(place, t_us)
         if not self._pictures_alone:
             self._seen_us[:] = t_us
@@ -112,7 +115,10 @@ class Sensor:
         way_m = outcome.share * self._config.speed_mps / self._config.control_hz
         if way is not None:
             way_m = outcome.share * float(np.hypot(*np.diff(way, axis=0).T).sum())
-        self.renders = min(sub_renders(way_m, self.plan.max_step_m), moving_us) if moving_us else 0
+        renders = sub_renders(way_m, self.plan.max_step_m)
+        if self._config.camera.memory == "reference":
+            renders = max(renders, looks_needed(self._flicker, moving_us))
+        self.renders = min(renders, moving_us)
         events = self._render_along(start, outcome.end, moving_us)
         self.t_us = end_us
         self.events = self.with_faults(events, start_us, end_us)
@@ -144,7 +150,7 @@ class Sensor:
         camera = self._config.camera
         size = (camera.width, camera.height) if self.sees_by_looks else (2, 2)  # 1 would be of another type
         scratch = scratch_for(*size, len(scene[0]))
-        return View(*scene, model, memory, self._seen_us, bandwidth, shifts, scratch)
+        return View(*scene, model, memory, self._seen_us, bandwidth, shifts, self._flicker, scratch)
 
     def pixel_noise(self) -> PixelState:
         """Return the state from which the compiled step fires the noise of this sensor's pixels."""
@@ -166,7 +172,9 @@ class Sensor:
         for first in range(0, self.renders, self._together):
             part = np.arange(first + 1, min(first + self._together, self.renders) + 1)
             times = start_us + moving_us * part // self.renders
-            frames = self._renderer.render_way(self._poses(start, end, part / self.renders, times))
+            frames = self._flickering(
+                self._renderer.render_way(self._poses(start, end, part / self.renders, times)), times
+            )
             batches.append(self._camera.steps(frames, times.tolist()))
             self.luminance, self.dropped = frames[-1], self.dropped + self._camera.dropped
         return batches[0] if len(batches) == 1 else np.concatenate((np.empty(0, EVENT), *batches))
@@ -174,10 +182,17 @@ class Sensor:
     def _picture(self, place: Point, t_us: int) -> np.ndarray:
         """Render luminance from a place (x, y) [m] at a time, float32 (H, W)."""
         poses = self._poses(place, place, np.ones(1), np.array([t_us]))
-        picture = self._renderer.render_way(poses)[0]
+        picture = self._flickering(self._renderer.render_way(poses), np.array([t_us]))[0]
         if not (picture.min() >= 0.0 and picture.max() < np.inf):
             raise ValueError("luminance must be finite and >= 0; the renderer gave something else")
         return picture
+
+    def _flickering(self, frames: np.ndarray, times_us: np.ndarray) -> np.ndarray:
+        """Return frames, float32 (K, H, W), under the light of their times."""
+        if self._flicker.depth == 0.0:
+            return frames
+        lit: np.ndarray = frames * brightness_at(self._flicker, times_us)[:, None, None]
+        return lit
 
     def close(self) -> None:
         """Free the renderer."""

@@ -5,10 +5,14 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from jobs.config.registry import CONF, JOBS
+from jobs.config.registry import CONF, JOBS, Job
 
 RENAMED_JOBS = {"ship": "publish", "tune": "search"}  # old name -> new
 RENAMED_SECTIONS = {"tune": "search", "video": "video_events"}
+TAKE_A_WORD = (  # Hydra's options
+    *("--cfg", "-c", "--package", "-p", "--info", "-i"),
+    *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
+)
 EXPERIMENT = re.compile(r"\+exp=(\w+)")
 
 
@@ -16,12 +20,37 @@ def hydra_words(words: Sequence[str], jobs: Mapping[str, object] = JOBS) -> list
     """Return the words for Hydra.
 
     A first word NAME stands for +exp=NAME. `+exp=NAME` is the file conf/exp/NAME.yaml or, without one, the
-    job of that name. Old names of jobs and of their settings stand for the new ones.
+    job of that name; NAME VERB is the job NAME_VERB. Behind the name of a job, words without = are its own
+    settings in the order of its file: `evade demo bytestream-s1` is `evade demo demo.policy=bytestream-s1`.
+    Old names of jobs and of their settings stand for the new ones.
     """
+    words = list(words)
+    if len(words) > 1 and f"{words[0]}_{words[1]}" in jobs:
+        words[:2] = [f"{words[0]}_{words[1]}"]
     named = words[0] if words else ""
+    words[1:] = _placed(words[1:], RENAMED_JOBS.get(named, named), jobs)
     known = RENAMED_JOBS.get(named, named) in jobs or (CONF / "exp" / f"{named}.yaml").is_file()
     first = [f"+exp={named}" if known else named] if words else []
     return [_job(_section(word), jobs) for word in [*first, *words[1:]]]
+
+
+def _placed(words: Sequence[str], name: str, jobs: Mapping[str, object]) -> list[str]:
+    """Return the words with each that stands alone as the next of the job's own settings."""
+    job = jobs.get(name)
+    keys = iter(job.own_keys() if isinstance(job, Job) else ())
+    placed = []
+    for before, word in zip(["", *words], words, strict=False):
+        alone = "=" not in word and not word.startswith(("-", "+", "~")) and before not in TAKE_A_WORD
+        key = next(keys, None) if alone else None
+        placed.append(word if key is None else f"{name}.{key}={_quoted(word)}")
+    return placed
+
+
+def _quoted(word: str) -> str:
+    """Return a word as a value in Hydra's grammar."""
+    if re.fullmatch(r"[\w./:@-]+", word):
+        return word
+    return "'" + word.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def given_keys(words: Sequence[str]) -> set[str]:

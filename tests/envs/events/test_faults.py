@@ -226,3 +226,70 @@ def test_what_a_fault_of_a_plug_in_adds_is_noise_and_what_it_keeps_is_as_it_was(
     assert is_noise[ends].sum() >= 4
     assert np.isin(events[~is_noise], before[~was_noise]).all()
     assert np.isin(events[is_noise & ~ends], before[was_noise]).all()
+
+
+@pytest.mark.parametrize(("share", "sides"), [(0.25, (4, 6)), (0.1, (3, 4)), (1.0, SHAPE), (1e-4, (0, 0))])
+def test_a_dead_block_is_one_rectangle_of_the_image_s_proportions(share, sides):
+    rng, tops = np.random.default_rng(0), set()
+    for _ in range(600):
+        dead = draw_pixel_faults(SHAPE, FaultsConfig(dead_block=share), rng).dead
+        assert dead.sum() == sides[0] * sides[1]
+        if dead.any():
+            rows, columns = dead.any(axis=1), dead.any(axis=0)
+            assert (rows.sum(), columns.sum()) == sides  # no gap: as many dead as the rectangle has
+            assert np.ptp(np.flatnonzero(rows)) == sides[0] - 1
+            assert np.ptp(np.flatnonzero(columns)) == sides[1] - 1
+            tops.add((int(rows.argmax()), int(columns.argmax())))
+    if sides[0]:
+        assert len(tops) == (SHAPE[0] - sides[0] + 1) * (SHAPE[1] - sides[1] + 1)  # any place
+
+
+def test_no_event_comes_from_a_dead_block():
+    events = some_events()
+    pixels, kept = faulty(events, 0, 5000, dead_block=0.25, background_activity_hz=1e4)
+    counts = counts_of(kept)
+    assert counts[pixels.dead].sum() == 0
+    assert (counts[~pixels.dead] > 0).all()
+
+
+BURSTS = {"burst_hz": 20.0, "burst_ms": 3.0, "burst_activity_hz": 500.0}
+
+
+def burst_events(seed, ends_us, **fields):
+    """What a camera in the dark reports until each of these times."""
+    camera = CameraConfig(width=SHAPE[1], height=SHAPE[0])
+    eye, rng = EventCamera(camera), np.random.default_rng(seed)
+    eye.reset(np.zeros(SHAPE, np.float32), 0)
+    real = RealSensor(camera, FaultsConfig(**BURSTS | fields), (eye.state, eye.pixels), rng, 0)
+    begins = [0, *ends_us[:-1]]
+    return [real.events(NO_EVENTS, begin, end) for begin, end in zip(begins, ends_us, strict=True)]
+
+
+def test_bursts_make_as_many_events_as_their_rates_say_however_time_is_divided():
+    mean = 20.0 * 3e-3 * 500.0 * SIZE  # a second
+    each = 3e-3 * 500.0 * SIZE
+    sigma = np.sqrt(20.0 * 100 * (each + each**2))  # of a compound Poisson number, in 100 s
+    for step_us in (5_000, 40_000, SECOND):
+        ends = list(range(step_us, 100 * SECOND + 1, step_us))
+        total = sum(events.size for events in burst_events(1, ends))
+        assert abs(total - 100 * mean) < 4 * sigma
+
+
+def test_bursts_are_bursts():
+    events = np.concatenate(burst_events(2, list(range(5_000, 20 * SECOND + 1, 5_000))))
+    assert (np.diff(events["t"]) >= 0).all()
+    begins = events["t"][np.concatenate(([True], np.diff(events["t"]) > 500))]
+    assert near(begins.size, 20.0 * 20 * np.exp(-20.0 * 3e-3))  # what begins while none is under way
+    filled = np.unique(events["t"] // 1000).size / 20_000
+    assert abs(filled - (1 - np.exp(-20.0 * 4e-3))) < 0.02  # 3 ms touch 4 of the clock's milliseconds
+    assert abs(events["p"].mean()) < 0.02
+
+
+@pytest.mark.parametrize("off", list(BURSTS))
+def test_bursts_that_lack_a_number_are_off_and_draw_nothing(off):
+    assert sum(events.size for events in burst_events(0, [SECOND], **{off: 0.0})) == 0
+
+
+def test_too_many_false_events_of_bursts_are_refused():
+    with pytest.raises(ValueError, match="Lower the rates"):
+        burst_events(0, [10 * SECOND], burst_hz=1e3, burst_ms=1e3, burst_activity_hz=1e6)
