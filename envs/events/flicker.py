@@ -1,8 +1,9 @@
 """Flicker of lamps on the mains: the whole scene's light rises and falls at twice the mains frequency.
 
-The luminance of a scene at time t is multiplied by 1 + depth * sin(2 pi (hz t + phase)), with a phase that is
-drawn once per episode. Lamps follow the power, so 50 Hz mains flicker at 100 Hz and 60 Hz mains at 120 Hz. The
-sine is a polynomial with an error below 1e-11: what decides an event must not depend on a library's sine.
+The luminance of a scene at time t is multiplied by 1 + depth * sin(2 pi (hz t + phase)), with a phase that
+is drawn once per episode. Lamps follow the power, so 50 Hz mains flicker at 100 Hz and 60 Hz mains at 120
+Hz. The sine is a polynomial with an error below 1e-11: what decides an event must not depend on a library's
+sine.
 """
 
 import math

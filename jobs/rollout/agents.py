@@ -2,17 +2,30 @@
 
 `straight` and `random` see nothing; `oracle` knows where everything stands. A result means
 something between them.
+
+Policies may come from elsewhere. An ONNX file is one that `models.policy.onnx` wrote, or any network with
+one input, the event image (its values 0 to 255 in whatever type the input has), whose first output is a
+number for each action. A Python function is called with the seed at the start of each episode, and returns
+a function from an observation to an action, 0, 1 or 2; what an episode remembers lives in between. Its
+attribute `observation` says what it sees, as `EnvConfig.observation`; without one it sees the event image::
+
+    model = PPO.load("model.zip")
+
+    def policy(seed):
+        return lambda image: model.predict(image[None], deterministic=True)[0]
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 from gymnasium.spaces import Discrete
 
+from core.places import resolve
 from envs.config import Observation
 from envs.corridor import CorridorEnv
+from envs.events import unpack_window
 from envs.kinematics import DIAGONAL
 from envs.scene import Scene
 from envs.scene.planning import LATTICE_M, SIDE_PRICE, cost_to_go
@@ -23,6 +36,12 @@ if TYPE_CHECKING:
 
 # Of one step in x and y, in step lengths: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])
+
+ONNX = ".onnx"
+ONNX_NUMBERS: Mapping[str, Any] = {
+    **{"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(bool)": np.bool_},
+    **{"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(uint8)": np.uint8},
+}
 
 
 class Agent(Protocol):
@@ -50,13 +69,18 @@ def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[s
     """Return a baseline by its name, or the policy of a folder.
 
     Args:
-        name: "straight", "random", "oracle", or the path of a policy folder.
+        name: "straight", "random", "oracle", the path of a policy folder or of an ONNX file, or
+            "module:attribute", a function whose module is imported or can be.
         action: "deterministic" or "stochastic": how a policy chooses.
         table: Names and values of settings of `EncoderTable.from_evae`, for a policy whose frozen
             encoder reads single events; empty: those of the policy.
     """
     if name in BASELINES:
         return BASELINES[name]()
+    if name.endswith(ONNX):
+        return OnnxAgent(name, action == "stochastic")
+    if ":" in name:
+        return FunctionAgent(resolve(name))
     # Imported here, because the baselines need no network.
     from models.encoder.table import EncoderTable
     from models.encoder.weights import load_encoder
@@ -142,6 +166,92 @@ class PolicyAgent:
         """Forget the other episodes."""
         self.policy.keep(places)
         self._streams = [self._streams[k] for k in places]
+
+
+class FunctionAgent:
+    """A Python function for each episode; episodes side by side do not know of each other."""
+
+    def __init__(self, begin: Callable[[int], Callable[[Any], Any]]) -> None:
+        """Take what begins an episode."""
+        self._begin = begin
+        self.observation: Observation = getattr(begin, "observation", "event_image")
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Begin an episode for each seed."""
+        self._acts = [self._begin(int(seed)) for seed in seeds]
+
+    def __call__(self, observations: Any) -> np.ndarray:
+        """Return actions (B,)."""
+        chosen = [act(observation) for act, observation in zip(self._acts, observations, strict=True)]
+        return np.array([int(np.asarray(action).item()) for action in chosen])
+
+    def keep(self, places: np.ndarray) -> None:
+        """Forget the other episodes."""
+        self._acts = [self._acts[k] for k in places]
+
+
+class OnnxAgent:
+    """An ONNX file, run by one thread of onnxruntime, one episode at a time."""
+
+    def __init__(self, path: str, stochastic: bool) -> None:
+        """Load the file; actions are drawn from its logits, or are the likeliest."""
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(path, options)
+        self._inputs = {one.name: one for one in self._session.get_inputs()}
+        self._outputs = [one.name for one in self._session.get_outputs()]
+        self._own = "first" in self._inputs  # written by models.policy.onnx
+        self.stochastic = stochastic
+        sees = ("luminance" if "luminance" in self._inputs else "window") if self._own else "event_image"
+        self.observation: Observation = sees  # type: ignore[assignment]
+
+    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
+        """Begin an episode for each seed."""
+        self._streams = episode_streams(seeds)
+        memory = {name: _empty(one) for name, one in self._inputs.items() if name.startswith("last_")}
+        self._memory: list[dict[str, np.ndarray]] = [dict(memory) for _ in seeds]
+        self._first = True
+
+    def __call__(self, observations: Any) -> np.ndarray:
+        """Return actions (B,)."""
+        logits = np.array([self._logits(k, one) for k, one in enumerate(observations)], np.float64)
+        self._first = False
+        if not self.stochastic:
+            return logits.argmax(axis=1)
+        gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])
+        return (logits + gumbel).argmax(axis=1)
+
+    def keep(self, places: np.ndarray) -> None:
+        """Forget the other episodes."""
+        self._streams = [self._streams[k] for k in places]
+        self._memory = [self._memory[k] for k in places]
+
+    def _logits(self, k: int, observation: np.ndarray) -> np.ndarray:
+        """Return the logits of an episode's next step, and remember what the file asks for."""
+        results = self._session.run(None, self._seen(observation) | self._memory[k])
+        named = dict(zip(self._outputs, results, strict=True))
+        self._memory[k] = {name: named["next_" + name.removeprefix("last_")] for name in self._memory[k]}
+        return np.asarray(results[0]).reshape(-1)
+
+    def _seen(self, observation: np.ndarray) -> Mapping[str, Any]:
+        """Return an observation as the file takes it."""
+        if not self._own:
+            ((name, one),) = self._inputs.items()
+            shape = [size if isinstance(size, int) else 1 for size in one.shape]
+            return {name: observation.astype(ONNX_NUMBERS[one.type]).reshape(shape)}
+        first = {"first": np.array(self._first)}
+        if self.observation == "luminance":
+            return {"luminance": observation, **first}
+        events, window_us = unpack_window(observation)
+        rows = np.stack([events[name].astype(np.int64) for name in ("t", "x", "y", "p")], axis=1)
+        return {"events": rows, "window_us": np.array(window_us), **first}
+
+
+def _empty(one: Any) -> np.ndarray:
+    """Return zeros of an input's shape and type."""
+    return np.zeros([size if isinstance(size, int) else 1 for size in one.shape], ONNX_NUMBERS[one.type])
 
 
 class OracleAgent:

@@ -1,5 +1,6 @@
 """Policies by name: the folder that a name stands for, what it says, and its sensor in training."""
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,8 +10,8 @@ from typing import Any
 from envs.config import EnvConfig, sensor_differences, settings_hash
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import ENV_KEYS, env_with
-from jobs.config.plugins import changed_plugins
-from jobs.rollout.agents import BASELINES
+from jobs.config.plugins import changed_plugins, load_plugins, one_line, plugin_digests
+from jobs.rollout.agents import BASELINES, ONNX, make_agent
 from jobs.run.folder import Run, latest_policies, named_policy
 from jobs.run.progress import console
 from models.kinds import find_kind, needed_plugins
@@ -88,6 +89,30 @@ def read_policy(agent: str) -> EvaluatedPolicy:
     named = manifest.get("conditions") or manifest.get("train", {}).get("conditions")
     seed, sensor, world = int(manifest["seed"]), manifest["sensor"], manifest.get("world", {})
     return EvaluatedPolicy(agent, group, seed, identity, sensor, observation, world, named or [{}])
+
+
+def read_foreign(name: str) -> EvaluatedPolicy:
+    """Return a policy that was not trained here: an ONNX file, or a function "file.py:attribute".
+
+    Raises:
+        ConfigError: There is no such file, module or attribute, or it cannot be loaded.
+    """
+    place, _, attribute = name.rpartition(":")
+    if name.endswith(ONNX):
+        path = Path(name).resolve()
+        if not path.is_file():
+            raise ConfigError(f"policy: must be an ONNX file that exists, got {name!r}")
+        agent, identity = str(path), hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    else:
+        load_plugins([place])
+        module = Path(place).stem if place.endswith(".py") else place
+        agent, identity = f"{module}:{attribute}", plugin_digests()[module]
+    try:
+        observation = make_agent(agent).observation
+    except Exception as error:
+        raise ConfigError(f"policy: {name!r} cannot be loaded: {one_line(error)}") from error
+    group = Path(name).stem if name.endswith(ONNX) else attribute
+    return EvaluatedPolicy(agent, group, None, identity, {}, observation)
 
 
 def find_policy(config: Config, run: Run) -> EvaluatedPolicy:

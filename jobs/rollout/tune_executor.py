@@ -160,18 +160,19 @@ def _part_of(trial: Trial) -> Part:
 
 
 def policy_files(parts: Sequence[Part]) -> dict[str, dict[str, bytes]]:
-    """Return the files of every policy, for workers that may not see their folders."""
-    folders = {part.task.policy.agent for part in parts} - BASELINES.keys()
+    """Return the files of every policy folder, for workers that may not see it."""
+    folders = [Path(agent) for agent in {part.task.policy.agent for part in parts} - BASELINES.keys()]
     return {
-        folder: {file.name: file.read_bytes() for file in Path(folder).iterdir() if file.is_file()}
+        str(folder): {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
         for folder in sorted(folders)
+        if folder.is_dir()
     }
 
 
 def with_files(part: Part, files: Files) -> Part:
-    """Return the part, its policy's folder replaced by one that this process has written itself."""
+    """Return the part, its policy's folder, if it has one, replaced by one that this process has written."""
     policy = part.task.policy
-    if policy.agent in BASELINES:
+    if policy.agent not in files:
         return part
     place = _unpacked.get(policy.identity)
     if place is None:

@@ -11,7 +11,6 @@ from envs.event_error import event_error
 from envs.events import EventCamera
 from envs.events.flicker import NO_FLICKER, Flicker, brightness_at, draw_flicker, looks_needed
 from envs.raycast import RaycastRenderer
-from envs.scene import make_scene
 
 STEPS, STEP_US, STEP_M = 8, 5000, 0.1
 

@@ -1,0 +1,1 @@
+"""The public benchmark: its frozen protocol, the results of a policy, their check, and the leaderboard."""

@@ -1,0 +1,109 @@
+"""Check a result of the benchmark: it must agree with itself, and a random part must repeat to the byte.
+
+Run: evade bench verify RESULT.json
+Expect: half a minute on two cores; the number of equal episodes, or the first that differs and exit status
+1. A changed episode is found with the probability of the share, so a result with many of them hardly
+passes.
+"""
+
+import dataclasses
+import math
+import secrets
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from envs.config import STRICT
+from jobs.bench.evaluated import Tasks, evaluate_cells, find_benchmarked
+from jobs.bench.protocol import Cell, Protocol, read_protocol, tasks_of
+from jobs.bench.result import RefusedResultError, Submission, read_result
+from jobs.config.config import Config
+from jobs.config.schema import Name
+from jobs.rollout.executors import Executor
+from jobs.rollout.scheduler import default_executor
+from jobs.rollout.store import EpisodeStore
+from jobs.run.progress import console
+
+Chosen = Sequence[tuple[Cell, int]]  # cell and corridor
+
+
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Which result is checked.
+
+    Attributes:
+        result: Its JSON file; the CSV file is beside it.
+        policy: Where the policy is here; None: its name in models/pretrained, or a baseline.
+        share: Of the episodes, which are repeated.
+    """
+
+    result: Name
+    policy: Name | None
+    share: Annotated[float, Field(gt=0, le=1)]
+
+
+def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
+    """Repeat a random part of a result's episodes.
+
+    Raises:
+        RefusedResultError: The result does not agree with itself, or an episode does not repeat.
+        ConfigError: The policy is not here.
+    """
+    protocol = read_protocol()
+    submission = read_result(Path(config.own.result), protocol)
+    result = submission.result
+    seed = "" if result.training is None else f"-s{result.training}"
+    policy, _ = find_benchmarked("bench_verify.policy", config.own.policy or result.policy + seed, config)
+    if policy.identity != result.identity:
+        rule = f"is of policy {result.identity}, got {policy.identity}; name the policy's place"
+        raise RefusedResultError(f"{config.own.result}: {rule}: bench_verify.policy=PLACE")
+    draw = secrets.randbits(32)
+    chosen = choose(submission, config.own.share, np.random.default_rng(draw))
+    tasks = some_of(tasks_of(protocol, result.part, policy, result.action), chosen)
+    with tempfile.TemporaryDirectory() as folder:
+        executor = executor or default_executor(config.cluster, Path(folder))
+        repeated = evaluate_cells(tasks, EpisodeStore(Path(folder)), executor, "Verify")
+    check_equal(submission, repeated, protocol)
+    said = f"{len(chosen)} of {total(submission)} episodes repeated (drawn by {draw}), all equal to the byte"
+    console.print(f"{result.name}: {said}", markup=False)
+    return {"repeated": float(len(chosen))}
+
+
+def total(submission: Submission) -> int:
+    """Return the number of episodes of a result."""
+    return sum(rows.size for rows in submission.episodes.values())
+
+
+def choose(submission: Submission, share: float, rng: np.random.Generator) -> Chosen:
+    """Draw a share of the episodes, one at least."""
+    every = [(cell, int(seed)) for cell, rows in submission.episodes.items() for seed in rows["seed"]]
+    places = rng.choice(len(every), math.ceil(share * len(every)), replace=False)
+    return [every[place] for place in np.sort(places)]
+
+
+def some_of(tasks: Tasks, chosen: Chosen) -> Tasks:
+    """Return the tasks with the chosen corridors alone."""
+    wanted = set(chosen)
+    found = {}
+    for cell, group in tasks.items():
+        seeds = [tuple(seed for seed in task.seeds if (cell, seed) in wanted) for task in group]
+        kept = [dataclasses.replace(task, seeds=own) for task, own in zip(group, seeds, strict=True) if own]
+        found |= {cell: kept} if kept else {}
+    return found
+
+
+def check_equal(submission: Submission, repeated: dict[Cell, np.ndarray], protocol: Protocol) -> None:
+    """Raise RefusedResultError for the first episode that has another byte than its repetition."""
+    for cell, rows in repeated.items():
+        theirs = submission.episodes[cell][rows["seed"]]
+        for here, there in zip(rows, theirs, strict=True):
+            if here.tobytes() != there.tobytes():
+                names = [name for name in here.dtype.names if here[name] != there[name]]
+                said = ", ".join(f"{name} {there[name]} instead of {here[name]}" for name in names)
+                where = f"{protocol.title} {cell[0]} {cell[1]}, corridor {here['seed']}"
+                raise RefusedResultError(f"{submission.result.name}: {where}: {said}")

@@ -1,0 +1,120 @@
+"""The protocol of a benchmark: a frozen YAML file whose cells become evaluation tasks.
+
+A cell is one corruption at one severity; severity 0 of the corruption "clean" changes nothing. All policies
+fly through the same corridors in all cells.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from envs.config import EnvConfig
+from jobs.config.conditions import axis_points
+from jobs.config.config import ConfigError
+from jobs.config.env_keys import env_with
+from jobs.config.registry import CONF
+from jobs.rollout.policies import EvaluatedPolicy, with_own_filter
+from jobs.rollout.tasks import EvaluationTask, make_task
+from jobs.study.plan import was_met
+
+PROTOCOL = CONF / "protocols" / "eventpolicy_c_v1.yaml"
+CLEAN = "clean"
+Cell = tuple[str, int]  # corruption and severity
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What `conf/protocols` says.
+
+    Attributes:
+        name, version: Of the benchmark.
+        sha256: Of the bytes of its file.
+        split: Whose corridors.
+        corridors: How many, from seed 0 on.
+        env: The simulation of the clean cell.
+        reference: The policy whose failures are 100 %, and its failures: corruption -> number.
+        parts: Part -> corruption -> setting -> values of the five severities, or one for all.
+    """
+
+    name: str
+    version: int
+    sha256: str
+    split: Literal["eval", "validation"]
+    corridors: int
+    env: EnvConfig
+    reference: Mapping[str, Any]
+    parts: Mapping[str, Mapping[str, Mapping[str, Sequence[Any]]]]
+
+    @property
+    def title(self) -> str:
+        """Return "EventPolicy-C v1"."""
+        return f"{self.name} v{self.version}"
+
+    def cells(self, part: str) -> dict[Cell, dict[str, Any]]:
+        """Return the cells of a part with what each changes, the clean one first."""
+        found: dict[Cell, dict[str, Any]] = {(CLEAN, 0): {}}
+        for corruption, axis in self.parts[part].items():
+            for severity, point in enumerate(axis_points(axis), 1):
+                found[corruption, severity] = dict(point)
+        return found
+
+
+def read_protocol(path: Path = PROTOCOL) -> Protocol:
+    """Return the protocol of a file."""
+    text = path.read_bytes()
+    values = yaml.safe_load(text)
+    env = env_with(EnvConfig(split=values["split"]), values.pop("env"))
+    return Protocol(sha256=hashlib.sha256(text).hexdigest(), env=env, **values)
+
+
+def tasks_of(
+    protocol: Protocol, part: str, policy: EvaluatedPolicy, action: str
+) -> dict[Cell, list[EvaluationTask]]:
+    """Return the evaluation tasks of each cell; several where corridors take turns.
+
+    Raises:
+        ConfigError: The policy needs another camera than the protocol's.
+    """
+    base = with_own_filter(policy, protocol.env)
+    for side in ("width", "height"):
+        own, ours = policy.sensor.get(side, 64), getattr(base.camera, side)
+        if own != ours:
+            raise ConfigError(f"bench.policy: must see {ours} pixels ({side}), got a policy of {own}")
+    found = {}
+    for cell, changes in protocol.cells(part).items():
+        turns = changes_in_turn(changes)
+        envs = [env_with(base, turn) for turn in turns]
+        tasks = [make_task(cell, policy, action, env, protocol.corridors) for env in envs]
+        found[cell] = [
+            dataclasses.replace(task, seeds=task.seeds[first :: len(turns)])
+            for first, task in enumerate(tasks)
+        ]
+    return found
+
+
+def changes_in_turn(changes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the changes of each group of corridors; a value that is a list gives one to each group."""
+    turns = max((len(value) for value in changes.values() if isinstance(value, list)), default=1)
+    return [
+        {
+            key: value[turn % len(value)] if isinstance(value, list) else value
+            for key, value in changes.items()
+        }
+        for turn in range(turns)
+    ]
+
+
+def met_in_training(protocol: Protocol, part: str, policy: EvaluatedPolicy) -> list[str]:
+    """Return the corruptions of which a policy's training drew a severity; none of a foreign policy."""
+    base = with_own_filter(policy, protocol.env)
+    met = [
+        corruption
+        for (corruption, _), changes in protocol.cells(part).items()
+        if any(was_met(policy, base, env_with(base, turn)) for turn in changes_in_turn(changes))
+    ]
+    return list(dict.fromkeys(met))

@@ -1,0 +1,325 @@
+"""The benchmark: its protocol, scores, results, their refusal, verification, and policies from elsewhere."""
+
+import dataclasses
+import hashlib
+import json
+import re
+
+import numpy as np
+import pytest
+
+from envs.config import EnvConfig, hashed_settings
+from jobs.bench import bench, bench_table, bench_verify
+from jobs.bench.evaluated import joined
+from jobs.bench.protocol import CLEAN, PROTOCOL, read_protocol, tasks_of
+from jobs.bench.result import RefusedResultError, read_result
+from jobs.bench.score import failure_counts, score
+from jobs.config.config import ConfigError, parse
+from jobs.rollout.agents import make_agent
+from jobs.rollout.episodes import EPISODE, roll_out
+from jobs.rollout.policies import read_foreign, read_policy
+from jobs.rollout.store import PartResult
+from tests.support.configs import compose
+from tests.support.fake_executor import FakeExecutor
+
+CELLS = 12 * 5 + 1
+
+
+def drawn(part):
+    """Episodes that depend on what decides them: the task's key, the policy and the corridor."""
+    task = part.task
+    episodes = np.zeros(len(task.seeds), EPISODE)
+    for episode, seed in zip(episodes, task.seeds, strict=True):
+        word = f"{task.key} {task.policy.identity} {seed}"
+        rng = np.random.default_rng(int(hashlib.sha256(word.encode()).hexdigest()[:12], 16))
+        episode["seed"], episode["success"] = seed, rng.random() < 0.6
+        episode["collision"] = not episode["success"]
+        episode["distance_m"], episode["steps"] = rng.uniform(0, 100), rng.integers(1, 1000)
+    return PartResult(episodes, {})
+
+
+@pytest.fixture
+def protocol(monkeypatch):
+    """The protocol, with a reference that fails a hundred times under each corruption."""
+    whole = read_protocol()
+    counts = {name: 100 for part in whole.parts.values() for name in part}
+    known = dataclasses.replace(whole, reference={**whole.reference, "failures": counts})
+    for module in (bench, bench_verify, bench_table):
+        monkeypatch.setattr(module, "read_protocol", lambda: known)
+    return known
+
+
+def configured(tmp_path, job, **own):
+    values = compose(f"+exp={job}")
+    return parse({**values, "runs_dir": str(tmp_path / "runs"), job: {**values[job], **own}})
+
+
+@pytest.fixture
+def result(protocol, tmp_path):
+    """The file of a result of `straight`, and what computed it."""
+    executor = FakeExecutor(drawn)
+    bench.run(configured(tmp_path, "bench", policy="random", source="here"), executor)
+    (file,) = (tmp_path / "runs").glob("*/bench/*.json")
+    return file, executor
+
+
+def test_the_protocol_has_twelve_corruptions_of_five_severities_and_names_its_bytes():
+    protocol = read_protocol()
+    cells = protocol.cells("C")
+    assert len(cells) == CELLS
+    assert cells[CLEAN, 0] == {}
+    assert protocol.sha256 == hashlib.sha256(PROTOCOL.read_bytes()).hexdigest()
+    assert (protocol.title, protocol.corridors, protocol.split) == ("EventPolicy-C v1", 50, "eval")
+    for name, axis in protocol.parts["C"].items():
+        moving = [values for values in axis.values() if len(values) == 5]
+        assert moving, name
+        for values in moving:
+            assert values == sorted(values) or values == sorted(values, reverse=True), name
+
+
+def test_every_corridor_of_every_cell_is_evaluated_once_and_takes_its_turn():
+    protocol = read_protocol()
+    tasks = tasks_of(protocol, "C", read_policy("straight"), "stochastic")
+    for cell, group in tasks.items():
+        assert sorted(seed for task in group for seed in task.seeds) == list(range(50)), cell
+    at_100, at_120 = tasks["flicker", 3]
+    assert (at_100.env.faults.flicker_hz, at_120.env.faults.flicker_hz) == (100.0, 120.0)
+    assert at_100.seeds == tuple(range(0, 50, 2))
+    whole = joined(task for group in tasks.values() for task in group)
+    assert len({task.key for task in whole}) == len(whole) == 6  # it sees no fault, and may come late
+
+
+def test_each_corruption_changes_its_own_settings_alone():
+    protocol = read_protocol()
+    nominal = hashed_settings(protocol.env)
+    tasks = tasks_of(protocol, "C", read_policy("models/pretrained/bytestream-s0"), "stochastic")
+    for (name, severity), group in tasks.items():
+        for task in group:
+            changed = dataclasses.replace(task.env, filter_support=0)
+            assert (hashed_settings(changed) == nominal) == (severity == 0), name
+            assert (task.env.scene, task.env.control_hz, task.env.split) == ("poles_eval", 200.0, "eval")
+
+
+def cells_of(rates, corridors=50, seed=0):
+    """Episodes of which these shares succeed."""
+    rng, found = np.random.default_rng(seed), {}
+    for cell, rate in rates.items():
+        found[cell] = np.zeros(corridors, EPISODE)
+        found[cell]["seed"], found[cell]["success"] = np.arange(corridors), rng.random(corridors) < rate
+    return found
+
+
+RATES = {(CLEAN, 0): 0.9} | {(name, k): 0.9 - 0.15 * k for name in ("a", "b", "c") for k in range(1, 6)}
+
+
+def test_the_reference_has_an_error_of_one_and_none_has_an_error_of_zero():
+    cells = cells_of(RATES)
+    scores = score([cells], failure_counts(cells))
+    assert scores.mce == 1.0
+    assert set(scores.errors.values()) == {1.0}
+    assert scores.worst_cell[1] == 5
+    perfect = cells_of(dict.fromkeys(RATES, 2.0))
+    assert score([perfect], failure_counts(cells)).mce == 0.0
+    assert score([perfect], failure_counts(cells)).interval == (0.0, 0.0)
+
+
+def test_one_more_failure_raises_the_error_of_its_corruption_by_one_of_the_reference_s():
+    cells = cells_of(RATES)
+    counts = failure_counts(cells)
+    before = score([cells], counts)
+    place = int(cells["b", 1]["success"].argmax())
+    cells["b", 1]["success"][place] = False
+    after = score([cells], counts)
+    assert after.errors["b"] == pytest.approx(before.errors["b"] + 1 / counts["b"], rel=1e-12)
+    assert after.mce == pytest.approx(before.mce + 1 / counts["b"] / 3, rel=1e-12)
+    assert (after.errors["a"], after.clean) == (before.errors["a"], before.clean)
+
+
+def test_the_interval_of_several_trainings_holds_the_mean_of_most_draws():
+    reference = dict.fromkeys(("a", "b", "c"), 150)
+    inside = 0
+    true = sum(50 * (1 - rate) for (name, _), rate in RATES.items() if name != CLEAN) / 150 / 3
+    for draw in range(40):
+        trainings = [cells_of(RATES, seed=100 * draw + k) for k in range(3)]
+        low, high = score(trainings, reference).interval
+        inside += low <= true <= high
+    assert inside >= 35
+
+
+def test_a_reference_that_never_fails_is_refused():
+    with pytest.raises(ValueError, match=r"\['b'\]"):
+        score([cells_of(RATES)], {"a": 3, "b": 0, "c": 2})
+
+
+def test_a_result_is_read_as_it_was_written_and_a_second_run_evaluates_nothing(protocol, result, tmp_path):
+    file, executor = result
+    read = read_result(file, protocol)
+    assert (read.result.name, read.result.source, read.result.kind) == ("random-C", "here", "baseline")
+    assert sum(rows.size for rows in read.episodes.values()) == CELLS * 50
+    before = file.read_bytes(), file.with_suffix(".csv").read_bytes(), len(executor.evaluated)
+    bench.run(configured(tmp_path, "bench", policy="random", source="here"), executor)
+    assert len(executor.evaluated) == before[2]
+    assert file.with_suffix(".csv").read_bytes() == before[1]
+
+
+def digits_of(text):
+    return [match.start() for match in re.finditer(r"\d", text)]
+
+
+def with_other_digit(text, place):
+    return text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :]
+
+
+@pytest.mark.parametrize("suffix", [".json", ".csv"])
+def test_a_result_with_one_digit_changed_is_refused(protocol, result, suffix):
+    file = result[0].with_suffix(suffix)
+    text, rng = file.read_text(), np.random.default_rng(0)
+    for place in rng.choice(digits_of(text), 40, replace=False):
+        file.write_text(with_other_digit(text, place))
+        with pytest.raises(RefusedResultError):
+            read_result(result[0], protocol)
+    file.write_text(text)
+    read_result(result[0], protocol)
+
+
+def forged(file, change):
+    """Change the CSV and everything that would tell, except the scores."""
+    from jobs.run.files import read_json, write_json
+
+    table = file.with_suffix(".csv")
+    text = change(table.read_text())
+    table.write_text(text)
+    values = read_json(file)
+    write_json(file, {**values, "episodes": hashlib.sha256(text.encode()).hexdigest()})
+
+
+def test_scores_that_do_not_follow_from_the_episodes_are_refused(protocol, result):
+    forged(result[0], lambda text: text.replace("False,True,", "True,False,", 1))
+    with pytest.raises(RefusedResultError, match="must be"):
+        read_result(result[0], protocol)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text.replace("invented_events,1,7,", "invented_events,1,8,", 1), "corridors 0 to 49"),
+        (lambda text: text.replace("invented_events,1,", "invented,1,", 1), "must be an episode"),
+        (lambda text: text.rsplit("\n", 2)[0] + "\n", "corridors 0 to 49"),
+        (lambda text: text.replace("Severity", "Strength", 1), "columns"),
+        (lambda text: re.sub(r"(leak,2,3,\w+,\w+,\w+,)[\d.]+", r"\1nan", text), "must be an episode"),
+    ],
+)  # fmt: skip
+def test_a_table_that_lacks_an_episode_or_has_another_is_refused(protocol, result, change, said):
+    forged(result[0], change)
+    with pytest.raises(RefusedResultError, match=said):
+        read_result(result[0], protocol)
+
+
+def test_a_result_of_another_protocol_is_refused(protocol, result):
+    other = dataclasses.replace(protocol, sha256="0" * 64)
+    with pytest.raises(RefusedResultError, match="protocol must be"):
+        read_result(result[0], other)
+
+
+def verify(tmp_path, file, executor, **own):
+    return bench_verify.run(configured(tmp_path, "bench_verify", result=str(file), **own), executor)
+
+
+def test_verification_repeats_a_twentieth_and_accepts_equal_bytes(protocol, result, tmp_path):
+    again = FakeExecutor(drawn)
+    assert verify(tmp_path, result[0], again) == {"repeated": 153.0}
+    own = read_result(result[0], protocol).episodes
+    assert len(again.evaluated) <= 153  # cells that are one simulation share their episodes
+    assert sum(rows.size for rows in own.values()) == 3050
+    drawn_again = FakeExecutor(drawn)
+    verify(tmp_path, result[0], drawn_again)
+    assert drawn_again.evaluated != again.evaluated
+
+
+def test_verification_refuses_one_byte(protocol, result, tmp_path):
+    def other(part):
+        found = drawn(part)
+        found.episodes["distance_m"] = np.nextafter(found.episodes["distance_m"], 1e9)
+        return found
+
+    with pytest.raises(RefusedResultError, match="distance_m"):
+        verify(tmp_path, result[0], FakeExecutor(other))
+
+
+def test_verification_refuses_another_policy(protocol, result, tmp_path):
+    with pytest.raises(RefusedResultError, match="is of policy random, got straight"):
+        verify(tmp_path, result[0], FakeExecutor(drawn), policy="straight")
+
+
+def test_the_leaderboard_has_the_best_first_and_refuses_what_is_forged(protocol, result, tmp_path):
+    folder, executor = result[0].parent, FakeExecutor(drawn)
+    bench.run(configured(tmp_path, "bench", policy="straight", name="ahead", met=["leak"]), executor)
+    assert bench_table.run(configured(tmp_path, "bench_table", folder=str(folder))) == {"results": 2.0}
+    (own,) = bench_table.entries(folder, protocol).values()
+    assert [entry.scores.mce for entry in own] == sorted(entry.scores.mce for entry in own)
+    text = (folder / "leaderboard.md").read_text()
+    assert protocol.sha256 in text
+    assert re.search(r"`ahead`.*leak", text)
+    assert (folder / "leaderboard_C.png").stat().st_size > 10_000
+    (folder / "ahead-C.json").rename(folder / "best-C.json")
+    (folder / "ahead-C.csv").rename(folder / "best-C.csv")
+    with pytest.raises(RefusedResultError, match=r"must be called ahead-C\.json"):
+        bench_table.entries(folder, protocol)
+    with pytest.raises(RefusedResultError, match="holds no JSON file"):
+        bench_table.entries(tmp_path, protocol)
+
+
+def test_a_corruption_that_does_not_exist_cannot_have_been_met(protocol, tmp_path):
+    with pytest.raises(ConfigError, match=r"bench\.met"):
+        bench.run(configured(tmp_path, "bench", policy="straight", met=["rain"]), FakeExecutor(drawn))
+
+
+def test_schema_forbids_more_and_less(protocol, result):
+    values = json.loads(result[0].read_text())
+    for change in ({**values, "more": 1}, {name: values[name] for name in values if name != "mce"}):
+        change.pop("checksum")
+        result[0].write_text(json.dumps(change))
+        with pytest.raises(RefusedResultError):
+            read_result(result[0], protocol)
+
+
+SHORT = EnvConfig(scene="poles_eval", split="eval", time_limit_s=0.1)
+
+
+def test_a_function_acts_in_its_own_episode_alone(tmp_path):
+    file = tmp_path / "turning_policy.py"
+    file.write_text(
+        "def policy(seed):\n"
+        "    seen = []\n"
+        "    def act(image):\n"
+        "        assert image.shape == (64, 64)\n"
+        "        seen.append(image)\n"
+        "        return (seed + len(seen)) % 3\n"
+        "    return act\n"
+    )
+    policy = read_foreign(f"{file}:policy")
+    assert (policy.group, policy.observation) == ("policy", "event_image")
+    together = roll_out(make_agent(policy.agent), SHORT, (0, 1, 2))
+    alone = np.concatenate([roll_out(make_agent(policy.agent), SHORT, (seed,)) for seed in (0, 1, 2)])
+    assert together.tobytes() == alone.tobytes()
+    assert len(set(together["x_m"])) == 3
+
+
+@pytest.mark.parametrize("name", ["missing.onnx", "json:dumps_nothing", "no_such_module_at_all:policy"])
+def test_a_policy_from_elsewhere_that_is_not_there_is_refused(name):
+    with pytest.raises(ConfigError, match=r"policy|plugins"):
+        read_foreign(name)
+
+
+def test_an_onnx_file_of_a_policy_flies_as_the_policy_does(tmp_path):
+    pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+    pytest.importorskip("onnxscript", reason="needs the extra onnx")
+    from models.policy import PRETRAINED, load_policy
+    from models.policy.onnx import export_onnx
+
+    folder = PRETRAINED / "event_columns-s0"
+    file = export_onnx(load_policy(folder), tmp_path / "columns.onnx")
+    seen = read_foreign(str(file))
+    assert (seen.observation, seen.group) == ("window", "columns")
+    theirs = roll_out(make_agent(str(folder), "stochastic"), SHORT, (0, 1, 2))
+    assert roll_out(make_agent(str(file), "stochastic"), SHORT, (0, 1, 2)).tobytes() == theirs.tobytes()
