@@ -305,7 +305,7 @@ def _with_faults(
 def _expected(
     num_events: int, span_us: Span, faults: FaultsConfig, pixels: PixelFaults, bursts: Sequence[Span]
 ) -> list[tuple[np.ndarray, float, Span]]:
-    """Return flat pixels, mean number of events of all of them, and when, of each kind of noise that is on."""
+    """Return pixels, mean number of events of all of them, and when, of each kind of noise that is on."""
     kinds, seconds = [], (span_us[1] - span_us[0]) * 1e-6
     background = faults.background_activity * num_events
     background += faults.background_activity_hz * seconds * pixels.live.size
