@@ -7,9 +7,9 @@ from pathlib import Path
 
 CONTENTS = {
     "Start": ("start", "watch", "models", "limits"),
-    "Learn": ("task", "events", "camera", "encoder", "statistics", "glossary"),
+    "Learn": ("task", "worlds", "events", "camera", "encoder", "statistics", "glossary"),
     "Do": (
-        "experiments", "train", "sweep", "use", "own_camera", "recordings", "calibrate", "extend",
+        "experiments", "train", "sweep", "benchmark", "use", "own_camera", "recordings", "calibrate", "extend",
         "hyperparameters", "deploy", "dashboard", "troubleshooting",
     ),
     "Results": ("results", "claims", "studies", "data"),

@@ -16,6 +16,9 @@ from pathlib import Path
 
 from docs.keys import tables as key_tables
 from jobs.analysis.tables import markdown_table
+from jobs.bench.bench_table import entries
+from jobs.bench.bench_table import table as leaderboard
+from jobs.bench.protocol import read_protocol
 from jobs.run.files import write_atomic
 from jobs.study.models import models_tables
 
@@ -114,10 +117,19 @@ def success_table() -> str:
     return markdown_table(("policy", *CONDITIONS), rows)
 
 
+def bench_table() -> str:
+    """Return the leaderboard of part C of the benchmark, of the results in docs/data/bench."""
+    folder = DATA / "bench"
+    if not any(folder.glob("*.json")):
+        return "No result yet."
+    return leaderboard(entries(folder, read_protocol())["C"])
+
+
 TABLES: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"success": success_table},
     "docs/code.md": {"layers": layer_table},
     "docs/keys.md": {"keys": key_tables},
+    "docs/benchmark.md": {"bench_C": bench_table},
     "docs/api.md": {"modules": api_table},
     "docs/models.md": {name: lambda name=name: models_tables()[name] for name in ("robustness", "taught")},  # type: ignore[misc]
 }

@@ -8,10 +8,11 @@ from pathlib import Path
 def main() -> int:
     """Run the command `evade`: the launcher of `python -m platform.launch`, from any folder.
 
-    The launcher is loaded from its file beside this package, because outside the repository
-    root `platform` is the standard library's module.
+    The launcher is loaded from its file, because outside the repository root `platform` is the standard
+    library's module. It lies beside this package, or where an installed wheel has its data.
     """
-    launcher = Path(__file__).resolve().parent.parent / "platform" / "launch.py"
+    homes = Path(__file__).resolve().parent.parent, Path(sys.prefix) / "share" / "evade"
+    launcher = next((home for home in homes if (home / "conf").is_dir()), homes[0]) / "platform" / "launch.py"
     spec = importlib.util.spec_from_file_location("evade_launch", launcher)
     if spec is None or spec.loader is None or not launcher.is_file():
         print(

@@ -143,13 +143,51 @@ class MeshLayout:
         refuse_unless(rules, "layout", self)
 
 
-AnyLayout = TypeVar("AnyLayout", bound=Layout | MeshLayout)
+@dataclass(frozen=True)
+class SphereLayout:
+    """A world of spheres, of a file or drawn as the DodgeDrone challenge draws them (`envs.scene.spheres`).
+
+    Attributes:
+        file: Path of a CSV file; "": drawn anew for each episode.
+        density: Times as many spheres as the challenge's generator draws, without a file.
+        length_m: The goal line [m].
+        width_m, wall_height_m: The lane and its walls, at which a flight ends [m]. The challenge's box has no
+            visible walls, so these are low.
+        spawn_half_m: A start is at x uniform in +- this [m].
+        moving: Whether bodies move too.
+        passable: Whether a way to the goal line must lead from every start.
+    """
+
+    file: str = ""
+    density: float = 1.0
+    length_m: float = 60.0
+    width_m: float = 20.0
+    wall_height_m: float = 0.1
+    spawn_half_m: float = 1.0
+    moving: bool = False
+    passable: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values; ValueError names the rule and what was given."""
+        check_types(self)
+        rules = {
+            "length_m, width_m and wall_height_m must be > 0": min(
+                self.length_m, self.width_m, self.wall_height_m
+            )
+            > 0,
+            "spawn_half_m must be < half of width_m": 2 * self.spawn_half_m < self.width_m,
+            "moving must be false: spheres that move are not simulated yet": not self.moving,
+        }
+        refuse_unless(rules, "layout", self)
+
+
+AnyLayout = TypeVar("AnyLayout", bound=Layout | MeshLayout | SphereLayout)
 POLES_EVAL = Layout(num_obstacles=80, width_m=50.0)
 
 # Cones are as wide as poles where the camera flies, 2 m above the ground; so are ellipsoids,
 # whose middle is there. Hence the places where a vehicle fits through are the same, and a
 # difference in success between these layouts and `poles_eval` is one of looks alone.
-LAYOUTS: dict[str, Layout | MeshLayout] = {
+LAYOUTS: dict[str, Layout | MeshLayout | SphereLayout] = {
     "poles": Layout(),
     "cones": Layout("cone", radius_min_m=0.75, radius_max_m=0.75, height_m=6.0),
     "gates": Layout("gate", 20, radius_min_m=1.2, radius_max_m=1.6, height_m=4.0, min_gap_m=4.5),
@@ -171,6 +209,7 @@ LAYOUTS: dict[str, Layout | MeshLayout] = {
         height_m=6.0,
         obstacle_texture=Texture("noise", period_m=1.0, contrast=0.8, velocity_mps=(3.0, 2.0), seed=2),
     ),
+    "spheres": SphereLayout(),
 }
 
 

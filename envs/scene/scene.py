@@ -27,12 +27,14 @@ from envs.scene.layouts import (
     SPAWN_RANGE_M,
     Layout,
     MeshLayout,
+    SphereLayout,
     draw_obstacles,
     refuse_unless,
     with_overrides,
 )
 from envs.scene.mesh_file import is_mesh_path, read_mesh
 from envs.scene.moving import MovingBody, bodies_at
+from envs.scene.spheres import is_sphere_path, sphere_obstacles
 from envs.scene.textures import Texture
 
 # The sun stands behind the start and to the right, so that the sides of a pole differ.
@@ -200,13 +202,13 @@ def make_scene(
     leaves nothing to draw.
 
     Args:
-        name: A key of LAYOUTS, or the path of a mesh file that `trimesh` can read, whose
-            surfaces stand in an otherwise empty lane.
+        name: A key of LAYOUTS, the path of a CSV file of spheres (`envs.scene.spheres`), or that of a mesh
+            file that `trimesh` can read, whose surfaces stand in an otherwise empty lane.
         rng: Source of all that is random.
         vehicle_radius_m: Radius of the vehicle that has to get through [m].
         height_m: Height at which it flies [m].
         **overrides: Values that replace fields of the layout, such as num_obstacles=60;
-            those of a mesh file are the fields of `MeshLayout`.
+            those of a mesh file are the fields of `MeshLayout`, of a file of spheres of `SphereLayout`.
 
     Raises:
         ValueError: If the name, an override or its value is not valid, if the obstacles
@@ -220,10 +222,15 @@ def make_scene(
     if name not in LAYOUTS and not is_mesh_path(name):
         known = ", ".join(sorted(LAYOUTS))
         raise ValueError(f"scene must be one of {known}, or the path of a mesh file, got {name!r}")
-    layout = with_overrides(LAYOUTS.get(name) or MeshLayout(file=name), overrides)
+    of_file = SphereLayout(file=name) if is_sphere_path(name) else MeshLayout(file=name)
+    layout = with_overrides(LAYOUTS.get(name) or of_file, overrides)
     if isinstance(layout, MeshLayout):
         scenes = iter([_mesh_corridor(name, layout)])
         remedy = "lower scale, widen the lane, fly at another height"
+    elif isinstance(layout, SphereLayout):
+        draws = 1 if layout.file else MAX_DRAWS
+        scenes = (_spheres(name, layout, rng) for _ in range(draws))
+        remedy = "lower spawn_half_m or density, fly at another height"
     else:
         scenes = (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
         remedy = "lower num_obstacles or the radii, raise min_gap_m, widen the lane"
@@ -247,6 +254,17 @@ def _corridor(name: str, layout: Layout, rng: np.random.Generator) -> Scene:
         ground_texture=layout.ground_texture,
         wall_texture=layout.wall_texture,
         obstacle_texture=layout.obstacle_texture,
+    )
+
+
+def _spheres(name: str, layout: SphereLayout, rng: np.random.Generator) -> Scene:
+    return Scene(
+        name=name,
+        obstacles=sphere_obstacles(layout, rng),
+        length_m=float(layout.length_m),
+        width_m=float(layout.width_m),
+        wall_height_m=float(layout.wall_height_m),
+        spawn_range_m=(-float(layout.spawn_half_m), float(layout.spawn_half_m)),
     )
 
 

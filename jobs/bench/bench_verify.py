@@ -27,6 +27,7 @@ from jobs.config.schema import Name
 from jobs.rollout.executors import Executor
 from jobs.rollout.scheduler import default_executor
 from jobs.rollout.store import EpisodeStore
+from jobs.rollout.tasks import EvaluationTask
 from jobs.run.progress import console
 
 Chosen = Sequence[tuple[Cell, int]]  # cell and corridor
@@ -89,7 +90,7 @@ def choose(submission: Submission, share: float, rng: np.random.Generator) -> Ch
 def some_of(tasks: Tasks, chosen: Chosen) -> Tasks:
     """Return the tasks with the chosen corridors alone."""
     wanted = set(chosen)
-    found = {}
+    found: dict[Cell, list[EvaluationTask]] = {}
     for cell, group in tasks.items():
         seeds = [tuple(seed for seed in task.seeds if (cell, seed) in wanted) for task in group]
         kept = [dataclasses.replace(task, seeds=own) for task, own in zip(group, seeds, strict=True) if own]

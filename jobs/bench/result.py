@@ -169,9 +169,9 @@ def _episodes_of(table: Path, text: str, protocol: Protocol, part: str) -> dict[
 
 def _values(row: list[str]) -> tuple[Any, ...]:
     """Return the values of an episode as EPISODE has them; every number must be written as it was."""
-    dtypes = [EPISODE[place] for place in range(len(EPISODE))]
-    read = {"b": {"True": True, "False": False}.__getitem__, "i": int, "f": float}
-    values = tuple(read[dtype.kind](text) for text, dtype in zip(row, dtypes, strict=True))
+    kinds = [EPISODE[name].kind for name in EPISODE.names or ()]
+    read: dict[str, Any] = {"b": {"True": True, "False": False}.__getitem__, "i": int, "f": float}
+    values = tuple(read[kind](text) for text, kind in zip(row, kinds, strict=True))
     if not all(math.isfinite(value) for value in values):
         raise ValueError("must be finite")
     return values

@@ -6,11 +6,13 @@ room of jobs/ (or of research/) has `run(config)` and, if the job has settings o
 """
 
 import importlib
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
-CONF = ROOT / "conf"
+HOME = ROOT if (ROOT / "conf").is_dir() else Path(sys.prefix) / "share" / "evade"  # of an installed wheel
+CONF = HOME / "conf"
 
 
 class Job(NamedTuple):

@@ -235,7 +235,7 @@ class OnnxAgent:
         self._memory[k] = {name: named["next_" + name.removeprefix("last_")] for name in self._memory[k]}
         return np.asarray(results[0]).reshape(-1)
 
-    def _seen(self, observation: np.ndarray) -> Mapping[str, Any]:
+    def _seen(self, observation: np.ndarray) -> dict[str, Any]:
         """Return an observation as the file takes it."""
         if not self._own:
             ((name, one),) = self._inputs.items()

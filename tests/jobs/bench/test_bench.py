@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from jobs.rollout.store import PartResult
 from tests.support.configs import compose
 from tests.support.fake_executor import FakeExecutor
 
+ROOT = Path(__file__).resolve().parents[3]
 CELLS = 12 * 5 + 1
 
 
@@ -323,3 +325,8 @@ def test_an_onnx_file_of_a_policy_flies_as_the_policy_does(tmp_path):
     assert (seen.observation, seen.group) == ("window", "columns")
     theirs = roll_out(make_agent(str(folder), "stochastic"), SHORT, (0, 1, 2))
     assert roll_out(make_agent(str(file), "stochastic"), SHORT, (0, 1, 2)).tobytes() == theirs.tobytes()
+
+
+def test_every_submission_in_the_repository_agrees_with_itself_and_with_the_protocol():
+    for file in sorted((ROOT / "docs" / "data" / "bench").glob("*.json")):
+        assert read_result(file, read_protocol()).result.name == file.stem

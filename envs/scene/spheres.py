@@ -1,0 +1,142 @@
+"""Worlds of spheres: the obstacle files of the ICRA 2022 DodgeDrone challenge, and its generator.
+
+A row of such a file is `prefab, x, y, z, qw, qx, qy, qz, sx, sy, sz`: the centre [m], x forward, y to the
+left and z up; the rotation, which a sphere does not show; and the scale, equal in all directions, whose
+half is the radius. A sphere at 1000, 1000, 1000 was removed, because it stood in an exclusion zone. Here y
+is forward and x to the right.
+
+Spheres may overlap each other and the ground. The ray caster assumes that bodies do not: of two that
+overlap it draws the nearer one whole, and of one in the ground its lower part too. `about` counts both.
+"""
+
+import csv
+import functools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.scene.layouts import SphereLayout
+from envs.scene.obstacles import ELLIPSOID, OBSTACLE
+
+REMOVED_M = 1000.0
+COLUMNS = ("prefab", "x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz")
+ALBEDO = 0.25  # that of poles
+MAX_SPHERES = 100_000
+# Of the challenge's final generator: spheres per square metre of ground, from x to x [m], 20 m wide.
+REGIONS = ((0.11, 0.0, 60.0), (0.21, 0.0, 60.0), (0.21, 40.0, 60.0))
+RADII_M = (0.05, 1.5)
+HALF_WIDTH_M, TOP_M = 10.0, 10.0
+ZONES = ((-3.0, 3.0), (57.0, 61.0))  # of takeoff and goal: no sphere within 3 m of the middle, below 5 m
+ZONE_HALF_M, ZONE_TOP_M = 3.0, 5.0
+
+
+class About(NamedTuple):
+    """What the ray caster does not draw as it is.
+
+    Attributes:
+        spheres: How many there are.
+        overlaps: Pairs of spheres that overlap.
+        in_ground: Spheres that the ground cuts.
+    """
+
+    spheres: int
+    overlaps: int
+    in_ground: int
+
+
+def is_sphere_path(name: str) -> bool:
+    """Whether the name of a scene is the path of a file of spheres."""
+    return Path(name).suffix.lower() == ".csv"
+
+
+def sphere_obstacles(layout: SphereLayout, rng: np.random.Generator) -> np.ndarray:
+    """Return the spheres of a layout's file, or draw them.
+
+    Raises:
+        ValueError: The file cannot be read, or breaks a rule; the message names the line.
+    """
+    if not layout.file:
+        return drawn_spheres(layout, rng)
+    file = Path(layout.file)
+    if not file.is_file():
+        raise ValueError(f"scene {layout.file!r} must be the path of a CSV file, and there is no such file")
+    return read_spheres(layout.file, (file.stat().st_mtime_ns, file.stat().st_size))
+
+
+@functools.lru_cache(maxsize=8)
+def read_spheres(path: str, stamp: tuple[int, int]) -> np.ndarray:
+    """Return the spheres of a file, (N,) OBSTACLE; `stamp` changes with the file.
+
+    Raises:
+        ValueError: A row breaks a rule.
+    """
+    with Path(path).open(encoding="utf-8", newline="") as file:
+        rows = [(number, row) for number, row in enumerate(csv.reader(file, skipinitialspace=True), 1) if row]
+    if len(rows) > MAX_SPHERES:
+        raise ValueError(f"scene {path!r} must have at most {MAX_SPHERES} spheres, got {len(rows)}")
+    if rows and rows[0][1][: len(COLUMNS)] == list(COLUMNS):
+        rows = rows[1:]
+    found = [_sphere(path, number, row) for number, row in rows]
+    spheres = np.array([sphere for sphere in found if sphere is not None], OBSTACLE)
+    spheres.flags.writeable = False
+    return spheres
+
+
+def _sphere(path: str, number: int, row: Sequence[str]) -> tuple[float, ...] | None:
+    """Return one row as the values of an OBSTACLE; None if it was removed."""
+    where = f"scene {path!r}, line {number}"
+    if len(row) != len(COLUMNS):
+        raise ValueError(f"{where}: must have the {len(COLUMNS)} values {', '.join(COLUMNS)}, got {len(row)}")
+    try:
+        values = [float(text) for text in row[1:]]
+    except ValueError:
+        raise ValueError(f"{where}: must have numbers behind the prefab, got {row[1:]}") from None
+    if not all(math.isfinite(value) and abs(value) <= 1e5 for value in values):
+        raise ValueError(f"{where}: numbers must be finite and within 100000, got {values}")
+    (x, y, z), scales = values[:3], values[7:]
+    if (x, y, z) == (REMOVED_M,) * 3:
+        return None
+    if not min(scales) > 0.0 or max(scales) - min(scales) > 1e-6 * max(scales):
+        rule = "sx, sy and sz must be equal and above 0: the camera draws spheres, and no turned ellipsoids"
+        raise ValueError(f"{where}: {rule}; got {scales}")
+    radius = 0.5 * scales[0]
+    return (ELLIPSOID, -y, x, z, radius, radius, radius, ALBEDO)
+
+
+def drawn_spheres(layout: SphereLayout, rng: np.random.Generator) -> np.ndarray:
+    """Draw the standing spheres of the challenge's generator, `layout.density` times as many."""
+    parts = []
+    for density, first_m, last_m in REGIONS:
+        area = (last_m - first_m) * 2.0 * HALF_WIDTH_M
+        places = rng.uniform(
+            (-HALF_WIDTH_M, first_m, 0.0),
+            (HALF_WIDTH_M, last_m, TOP_M),
+            (round(layout.density * density * area), 3),
+        )
+        parts.append(np.column_stack((places, rng.uniform(*RADII_M, len(places)))))
+    x, y, z, radius = np.concatenate(parts).T
+    low = (np.abs(x) < ZONE_HALF_M) & (z < ZONE_TOP_M)
+    kept = ~np.any([low & (y > first) & (y < last) for first, last in ZONES], axis=0)
+    spheres = np.zeros(int(kept.sum()), OBSTACLE)
+    spheres["kind"], spheres["albedo"] = ELLIPSOID, ALBEDO
+    for name, values in zip("xyz", (x, y, z), strict=True):
+        spheres[name] = values[kept]
+    for name in ("rx", "ry", "rz"):
+        spheres[name] = radius[kept]
+    return spheres
+
+
+def about(spheres: np.ndarray) -> About:
+    """Count what the ray caster does not draw as it is; of (N,) OBSTACLE."""
+    from scipy.spatial import cKDTree
+
+    places = np.stack([spheres[name] for name in "xyz"], axis=1)
+    overlaps = 0
+    if len(spheres) > 1:
+        pairs = cKDTree(places).query_pairs(2.0 * float(spheres["rx"].max()), output_type="ndarray")
+        apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+        overlaps = int((apart < spheres["rx"][pairs[:, 0]] + spheres["rx"][pairs[:, 1]]).sum())
+    return About(len(spheres), overlaps, int((spheres["z"] < spheres["rz"]).sum()))
