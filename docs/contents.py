@@ -9,8 +9,8 @@ CONTENTS = {
     "Start": ("start", "watch", "models", "limits"),
     "Learn": ("task", "worlds", "events", "camera", "encoder", "statistics", "glossary"),
     "Do": (
-        "experiments", "train", "sweep", "benchmark", "use", "own_camera", "recordings", "calibrate", "extend",
-        "hyperparameters", "deploy", "dashboard", "troubleshooting",
+        "experiments", "train", "sweep", "benchmark", "use", "own_camera", "recordings", "calibrate",
+        "extend", "hyperparameters", "deploy", "dashboard", "troubleshooting",
     ),
     "Results": ("results", "claims", "studies", "data"),
     "Engineering": ("simulator", "trade", "numerics", "performance", "reliability"),

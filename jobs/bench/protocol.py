@@ -18,7 +18,7 @@ from jobs.config.conditions import axis_points
 from jobs.config.config import ConfigError
 from jobs.config.env_keys import env_with
 from jobs.config.registry import CONF
-from jobs.rollout.policies import EvaluatedPolicy, with_own_filter
+from jobs.rollout.policies import EvaluatedPolicy, with_own_parts
 from jobs.rollout.tasks import EvaluationTask, make_task
 from jobs.study.plan import was_met
 
@@ -78,9 +78,12 @@ def tasks_of(
     """Return the evaluation tasks of each cell; several where corridors take turns.
 
     Raises:
-        ConfigError: The policy needs another camera than the protocol's.
+        ConfigError: The policy needs another camera or vehicle than the protocol's.
     """
-    base = with_own_filter(policy, protocol.env)
+    base = with_own_parts(policy, protocol.env)
+    if base.vehicle != protocol.env.vehicle:
+        rule = f"must fly a {protocol.env.vehicle} vehicle, as all policies do"
+        raise ConfigError(f"bench.policy: {rule}, got a policy of {base.vehicle}")
     for side in ("width", "height"):
         own, ours = policy.sensor.get(side, 64), getattr(base.camera, side)
         if own != ours:
@@ -111,7 +114,7 @@ def changes_in_turn(changes: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def met_in_training(protocol: Protocol, part: str, policy: EvaluatedPolicy) -> list[str]:
     """Return the corruptions of which a policy's training drew a severity; none of a foreign policy."""
-    base = with_own_filter(policy, protocol.env)
+    base = with_own_parts(policy, protocol.env)
     met = [
         corruption
         for (corruption, _), changes in protocol.cells(part).items()
