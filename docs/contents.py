@@ -17,13 +17,15 @@ CONTENTS = {
     "Reference": ("environment", "vehicles", "keys", "api", "code"),
     "Project": ("differences", "security", "citation"),
 }  # fmt: skip
+PLANS = sorted((Path(__file__).parent / "plans").glob("*.md"))
 # A page of the sidebar -> pages below it, which it lists itself.
 BELOW = {
     "studies": (
         "dose_response_taught", "ppo_paper", "ppo_event_set", "encoder_seeds", "camera_rates", "ablation",
         "training_lengths", "representations", "pooling",
-        *(f"plans/{page.stem}" for page in sorted((Path(__file__).parent / "plans").glob("*.md"))),
+        "plans/index",
     ),
+    "plans/index": tuple(f"plans/{page.stem}" for page in PLANS if page.stem != "index"),
     "events": ("notebooks/events",),
     "encoder": ("notebooks/encoder",),
     "train": ("notebooks/policy",),
@@ -34,4 +36,4 @@ BELOW = {
 def toctree(pages: tuple[str, ...], caption: str = "") -> str:
     """Return the directive that puts pages into the sidebar without showing a list of them."""
     head = [":hidden:", *([f":caption: {caption}"] if caption else [])]
-    return "\n".join(["```{toctree}", *head, "", *pages, "```", ""])
+    return "\n".join(["```{toctree}", *head, "", *(f"/{page}" for page in pages), "```", ""])
