@@ -27,7 +27,7 @@ FILMS = {  # name: the words of the demo
     "dense": ("env.scene=poles_dense",),
     "false_events": ("faults.background_activity=0.25",),
     "dead_pixels": ("faults.sparsity=0.5",),
-    "crash": ("demo.policy=bytestream-s0", "env.scene=texture_change", "fidelity.tolerance=0.2"),
+    "crash": ("demo.policy=bytestream-s1", "env.scene=texture_change", "fidelity.tolerance=0.2"),
 }
 FAILURES = {
     "fails_dense_25hz": ("env.scene=poles_dense", "env.control_hz=25"),

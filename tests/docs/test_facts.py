@@ -38,6 +38,12 @@ def test_the_demo_of_the_first_page_is_four_times_slower_than_the_flight():
     assert abs(about["duration"] - 4 * int(steps.replace(",", "")) * 0.005) < 0.5
 
 
+def test_the_slow_failure_lasts_as_its_title_says():
+    """102 steps of 40 ms, twice slower than real time."""
+    about = next(imageio_ffmpeg.read_frames(str(ROOT / "docs" / "films" / "fails_dense_25hz.mp4")))
+    assert abs(about["duration"] - 2 * 102 * 0.04) < 0.5
+
+
 def test_the_pages_count_the_episodes_that_the_file_has():
     with gzip.open(DATA / "hold_episodes.csv.gz", "rt", newline="") as file:
         count = sum(1 for _ in csv.DictReader(file))
