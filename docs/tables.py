@@ -27,9 +27,11 @@ DATA = ROOT / "docs" / "data"
 MODULES = {
     "The world and its events": (
         "envs.corridor", "envs.config", "envs.scene", "envs.scene.layouts", "envs.scene.shapes",
-        "envs.scene.obstacles", "envs.scene.textures", "envs.scene.range_scan", "envs.scene.planning",
+        "envs.scene.obstacles", "envs.scene.moving", "envs.scene.textures", "envs.scene.range_scan",
+        "envs.scene.planning",
         "envs.raycast", "envs.rasterize", "envs.events", "envs.events.faults", "envs.observations",
-        "envs.kinematics", "envs.vehicles.dynamics", "envs.vehicles.task", "envs.fidelity",
+        "envs.state_observation", "envs.kinematics", "envs.vehicles.dynamics", "envs.vehicles.planning",
+        "envs.vehicles.task", "envs.fidelity",
         "envs.event_error", "envs.recordings", "envs.recordings.video",
     ),
     "From events to actions": (

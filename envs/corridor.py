@@ -25,7 +25,7 @@ from envs import kinematics
 from envs.config import EnvConfig
 from envs.events.windows import pack_windows
 from envs.observations import observation_space, observe, picture
-from envs.scene import make_scene
+from envs.scene import MovingBody, make_scene
 from envs.sensor import Sensor
 from envs.vehicles import StepError, Vehicles
 from envs.vehicles.dynamics import make_dynamics, number_type, planned_config, wrong_actions
@@ -202,18 +202,17 @@ class CorridorEnv(gymnasium.Env):
         row = self._row
         if self._vehicles.rows["over"][row]:
             raise ResetNeeded("The episode is over or has not begun; call reset() before step().")
-        own, space = np.asarray(action), self.action_space
-        if own.shape != space.shape or wrong_actions(space, own[None]).any():
+        space = self.action_space
+        if not _is_action(space, action):
             raise ValueError(_bad_action(space, action))
         active = np.zeros(len(self._vehicles.rows), bool)
         active[row] = True
-        actions = np.zeros((active.size, *own.shape), number_type(space))
-        actions[row] = own
+        actions = np.full((active.size, *(space.shape or ())), action, number_type(space))
         try:
             self._vehicles.step(actions, active)
         except StepError as error:
             raise ValueError(f"{self.name_step()}: {error}") from error
-        self.remember(own)
+        self.remember(np.asarray(action))
         info, vehicle = self.info(), self._vehicles.rows[row]
         terminated = info["success"] or info["collision"]
         return self.observe(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
@@ -258,6 +257,16 @@ class CorridorEnv(gymnasium.Env):
         vehicle = self._vehicles.rows[self._row]
         return float(vehicle["x_m"]), float(vehicle["y_m"]), self.config.camera_height_m, 0.0
 
+    @property
+    def velocity_mps(self) -> tuple[float, float]:
+        """Velocity to the right and ahead [m/s]; a kinematic vehicle's is the mean of its last step."""
+        vehicle = self._vehicles.rows[self._row]
+        if vehicle["parts"] or not vehicle["t_us"]:
+            return float(vehicle["vx_mps"]), float(vehicle["vy_mps"])
+        per_s = 1e6 / vehicle["window_us"]
+        moved = vehicle["x_m"] - vehicle["start_x_m"], vehicle["y_m"] - vehicle["start_y_m"]
+        return float(moved[0] * per_s), float(moved[1] * per_s)
+
     def place_of_action(self) -> tuple[float, float]:
         """Return where the next decision takes effect if nothing is in the way: x, y [m].
 
@@ -274,6 +283,11 @@ class CorridorEnv(gymnasium.Env):
         moves = vehicle["forward"] + forward, vehicle["left"] + left, vehicle["right"] + right
         way = self.config.speed_mps, self.config.control_hz
         return kinematics.planned_position(vehicle["spawn_x_m"], moves, way)
+
+    @property
+    def moving(self) -> tuple[MovingBody, ...]:
+        """The bodies that move, on the paths that they are on now; a throw gives a ball a new one."""
+        return self._vehicles.moving(self._row)
 
     def state_of_action(self) -> np.ndarray:
         """Return the state of a vehicle with a body when its next decision is taken, float64 (S,)."""
@@ -600,6 +614,14 @@ def _infos_of(envs: Sequence[CorridorEnv], vehicles: Vehicles, some: np.ndarray)
         "dropped_events": lost,
         "t_us": rows["t_us"].copy(),
     }
+
+
+def _is_action(space: spaces.Space, action: Any) -> bool:
+    """Whether an action is in a Discrete, which is asked without arrays, or in a Box."""
+    if isinstance(space, spaces.Discrete):
+        return not isinstance(action, bool | np.bool_) and bool(space.contains(action))
+    own = np.asarray(action)
+    return own.shape == space.shape and not wrong_actions(space, own[None]).any()
 
 
 def _bad_action(space: spaces.Space, action: object) -> str:

@@ -87,10 +87,13 @@ def choose_renderer(name: str, scene: Scene) -> str:
     """Return the renderer called `name`; "auto" is the cheapest that can draw `scene`.
 
     Raises:
-        ValueError: The name is not known, or the ray caster is asked for a scene with a mesh.
+        ValueError: The name is not known, or the renderer cannot draw the scene: the ray caster no mesh, and
+            pyrender no bodies that move.
     """
     if name not in RENDERERS:
         raise ValueError(f"renderer must be one of {RENDERERS}; got {name!r}.")
+    if name == "pyrender" and scene.movers:
+        raise ValueError("renderer='pyrender' cannot draw bodies that move; use 'auto'.")
     if name == "raycast" and scene.mesh is not None:
         raise ValueError(f"renderer='raycast' cannot draw the mesh of scene {scene.name!r}; use 'auto'.")
     if name == "auto":
@@ -192,7 +195,8 @@ def _cull_m(tolerance: float, scene: Scene) -> float:
     of poles, be they 0.5 or 2 m wide and the image 16 or 200 pixels: what is far moves slowly.
     """
     cull_m = CULL_M * math.sqrt(0.05 / tolerance)
-    farthest = math.hypot(scene.width_m, scene.obstacles["y"].max(initial=0.0))
+    last_m = max([scene.obstacles["y"].max(initial=0.0), *(one.places_m[:, 1].max() for one in scene.movers)])
+    farthest = math.hypot(scene.width_m, last_m)
     return cull_m if cull_m < farthest else math.inf
 
 

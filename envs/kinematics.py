@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from envs.scene.collision import first_contact
+from envs.scene.collision import first_contact, first_moving_contact
 
 SPLITS = ("train", "validation", "eval")
 NUM_ACTIONS = 3  # forward, left 45 degrees, right 45 degrees
@@ -127,6 +127,32 @@ def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> O
     """
     segment = start[0], start[1], planned[0], planned[1]
     contact = first_contact(segment, lane.radius_m, lane.half_width_m, sections)
+    return _until(lane, contact, start, planned)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def advance_among(
+    lane: Lane, still_and_moving: tuple, shares: tuple[float, float], start: Point, planned: Point
+) -> Outcome:
+    """`advance` where bodies move too.
+
+    Args:
+        lane: `Lane`.
+        still_and_moving: (M, 7) sections that stand, and those that move, as `first_moving_contact` has them.
+        shares: The parts of the control step that have passed at `start` and at `planned`.
+        start: x and y [m].
+        planned: x and y [m].
+    """
+    sections, moving = still_and_moving
+    segment = start[0], start[1], planned[0], planned[1]
+    contact = first_contact(segment, lane.radius_m, lane.half_width_m, sections)
+    contact = min(contact, first_moving_contact(segment, lane.radius_m, moving, shares))
+    return _until(lane, contact, start, planned)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _until(lane: Lane, contact: float, start: Point, planned: Point) -> Outcome:
+    """Move from `start` towards `planned` until a share of the way, `contact`, or the goal line."""
     goal = math.inf
     if planned[1] > start[1]:  # a vehicle that stands or flies back does not reach it
         goal = (lane.length_m - start[1]) / (planned[1] - start[1])
@@ -143,20 +169,22 @@ def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> O
 
 
 @numba.njit(cache=True, error_model="numpy")
-def follow(lane: Lane, sections: np.ndarray, way: np.ndarray) -> Outcome:
+def follow(lane: Lane, still_and_moving: tuple, way: np.ndarray) -> Outcome:
     """Move along straight parts of equal time until the first contact or the goal line, as `advance` does.
 
     Args:
         lane: `Lane`.
-        sections: (M, 7), as of `advance`.
+        still_and_moving: As of `advance_among`.
         way: (N + 1, 2), places at the ends of the N parts [m].
     """
     last, parts = len(way) - 1, 0
-    outcome = advance(lane, sections, (way[0, 0], way[0, 1]), (way[1, 0], way[1, 1]))
+    places = (way[0, 0], way[0, 1]), (way[1, 0], way[1, 1])
+    outcome = advance_among(lane, still_and_moving, (0.0, 1.0 / last), *places)
     while parts < last - 1 and not (outcome.success or outcome.collision):
         parts += 1
         start = way[parts, 0], way[parts, 1]
-        outcome = advance(lane, sections, start, (way[parts + 1, 0], way[parts + 1, 1]))
+        end, shares = (way[parts + 1, 0], way[parts + 1, 1]), (parts / last, (parts + 1) / last)
+        outcome = advance_among(lane, still_and_moving, shares, start, end)
     end, success, collision = outcome.end, outcome.success, outcome.collision
     reward = end[1] - way[0, 1] + GOAL_REWARD * success + COLLISION_REWARD * collision
     return Outcome(end, (parts + outcome.share) / last, reward, success, collision)

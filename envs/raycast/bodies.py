@@ -54,6 +54,9 @@ def see_bodies(
     for i in range(len(bodies)):
         body = bodies[i]
         dx, dy = body.x - frame.eye_x, body.y - frame.eye_y
+        if body.moves:
+            late = frame.time - body.since
+            dx, dy = dx + body.vx * late, dy + body.vy * late
         reach = body.rx if body.kind != BOX else math.hypot(body.rx, body.ry)
         right = dx * frame.cos + dy * frame.sin
         forward = dy * frame.cos - dx * frame.sin
@@ -63,6 +66,8 @@ def see_bodies(
             continue
         seen[count] = body
         body = seen[count]
+        if body.moves:
+            put_at(body, frame.time)
         body.dx, body.dy, body.right, body.forward, body.at = dx, dy, right, forward, math.inf
         if not _is_outside(body, frame.eye_z, cull):
             continue
@@ -125,11 +130,21 @@ def _hides(one: Record, other: Record, frame: Record) -> bool:
 
 
 @kernel
+def put_at(body: Record, time: float) -> None:
+    """Move a body that moves to its place at a time [s]."""
+    late = time - body.since
+    body.x, body.y, body.since = body.x + body.vx * late, body.y + body.vy * late, time
+    body.bottom, body.top = body.bottom + body.vz * late, body.top + body.vz * late
+
+
+@kernel
 def silhouette_of(body: Record, frame: Record) -> tuple[float, float]:
     """Return the slopes of the left and right silhouette of a body, in view or not; +-inf as for a circle.
 
     Notes in the body where it is as seen from the eye.
     """
+    if body.moves:
+        put_at(body, frame.time)
     body.dx, body.dy = body.x - frame.eye_x, body.y - frame.eye_y
     body.right = body.dx * frame.cos + body.dy * frame.sin
     body.forward = body.dy * frame.cos - body.dx * frame.sin

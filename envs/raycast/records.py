@@ -60,6 +60,9 @@ BODY = _record(
         ("number", "i8"),  # its place among the bodies of the scene
         *_floats("x", "y", "bottom", "top", "rx", "ry", "albedo"),
         ("turn", "f8"),  # metres of texture per radian around it
+        # Whether it moves; if so, its velocity [m/s], and when it is at the place above [s].
+        ("moves", "i8"),
+        *_floats("vx", "vy", "vz", "since"),
         # Once it is in view: its axis from the eye, in the world and as the camera sees it, and
         # the slopes of its silhouette.
         *_floats("dx", "dy", "right", "forward", "low", "high"),

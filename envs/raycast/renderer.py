@@ -13,6 +13,7 @@ another.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,7 +21,8 @@ from envs.checks import check_image, check_pose
 from envs.raycast.columns import make_workspace, render_way
 from envs.raycast.noise import NO_NOISE, tabulate_ground, waves_of
 from envs.raycast.records import BODY, FRAME, Noise
-from envs.scene import CONE, ELLIPSOID, Scene, Texture
+from envs.scene import CONE, ELLIPSOID, MovingBody, Scene, Texture
+from envs.scene.moving import bodies_at
 from envs.scene.textures import PATTERNS, around
 
 
@@ -31,8 +33,9 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _make_bodies(scene: Scene) -> np.ndarray:
-    """Return the obstacles, (M,) BODY, as far as they stand above the ground."""
+    """Return the obstacles, (M,) BODY, as far as they stand above the ground; those that move come last."""
     o = scene.obstacles[scene.obstacles["z"] + scene.obstacles["rz"] > 0.0]
+    o = np.concatenate([o, bodies_at(scene.movers, 0.0)]) if scene.movers else o
     bottom, top = o["z"] - o["rz"], o["z"] + o["rz"]
     sunk = (bottom < 0.0) & (o["kind"] != ELLIPSOID)
     cut = sunk & (o["kind"] == CONE)
@@ -43,6 +46,7 @@ def _make_bodies(scene: Scene) -> np.ndarray:
     bodies["rx"][cut] *= (top / (top - bottom))[cut]
     bodies["bottom"], bodies["top"] = np.where(sunk, 0.0, bottom), top
     bodies["turn"] = [around(scene.obstacle_texture, radius) for radius in o["rx"].tolist()]
+    bodies["moves"][len(o) - len(scene.movers) :] = 1
     return bodies
 
 
@@ -53,7 +57,9 @@ def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[
     lit = scene.shade(np.ones(6), faces).tolist()
     frame["horizon"], frame["focal"], frame["samples"] = 0.5 * height, focal, samples
     frame["sky"], frame["floor"] = scene.sky_luminance, scene.shade(scene.ground_albedo, faces[0])
-    frame["tallest"] = max([scene.wall_height_m, *(scene.obstacles["z"] + scene.obstacles["rz"]).tolist()])
+    tops = [*(scene.obstacles["z"] + scene.obstacles["rz"]).tolist()]
+    tops += [float(one.places_m[:, 2].max() + one.body["rz"]) for one in scene.movers]
+    frame["tallest"] = max([scene.wall_height_m, *tops])
     frame["wall_half"], frame["wall_top"] = 0.5 * scene.width_m, scene.wall_height_m
     frame["wall_near"], frame["wall_far"] = scene.walls_y_m
     frame["wall_albedo"], frame["ambient"], frame["diffuse"] = scene.wall_albedo, scene.ambient, scene.diffuse
@@ -127,6 +133,24 @@ class RaycastRenderer:
         self.frame, waves = _make_frame(scene, self.height, focal, self.samples)
         self.noise, self._ground_texture = Noise(waves, NO_NOISE.ground, 0.0), scene.ground_texture
         self.room = make_workspace(len(self.bodies), self.height)
+        self._moving = scene.movers
+
+    def move_bodies(self, moving: Sequence[MovingBody], start_s: float, end_s: float) -> None:
+        """Let the bodies that move go straight from where they are at a time to where they are at another.
+
+        Args:
+            moving: As many as the scene has.
+            start_s: When they are where the path says [s].
+            end_s: When they are there again, later; at the same time: they rest [s].
+        """
+        own = self.bodies[len(self.bodies) - len(moving) :]
+        before, after = bodies_at(moving, start_s), bodies_at(moving, end_s)
+        span_s = end_s - start_s
+        for axis in "xyz":
+            own[f"v{axis}"] = (after[axis] - before[axis]) / span_s if span_s > 0.0 else 0.0
+        own["x"], own["y"], own["since"] = before["x"], before["y"], start_s
+        own["bottom"], own["top"] = before["z"] - before["rz"], before["z"] + before["rz"]
+        own["bottom"][own["kind"] != ELLIPSOID] = own["bottom"][own["kind"] != ELLIPSOID].clip(0.0)
 
     def expect_height(self, eye_m: float) -> None:
         """Expect to look along +y from `eye_m` above the ground [m]: noise on the ground then costs little.
@@ -156,7 +180,7 @@ class RaycastRenderer:
             y_m: Position forward [m].
             z_m: Height above the ground [m], >= 0.
             yaw_rad: Heading, 0 along +y, counter-clockwise seen from above [rad].
-            t_s: Time [s], which moves the textures; finite.
+            t_s: Time [s], which moves textures and bodies; finite.
 
         Returns:
             (height, width) float32 linear luminance, row 0 on top.
@@ -165,10 +189,12 @@ class RaycastRenderer:
             ValueError: If the pose or time is not finite, or the pose below the ground or
                 farther than 1000 km.
         """
+        if self._moving and math.isfinite(t_s):
+            self.move_bodies(self._moving, t_s, t_s)
         return self.render_way(np.array([[x_m, y_m, z_m, yaw_rad, t_s]], np.float64))[0]
 
     def render_way(self, poses: np.ndarray) -> np.ndarray:
-        """Render the images along a way in one call.
+        """Render the images along a way in one call; bodies move as `move_bodies` said last.
 
         Args:
             poses: float64 (K, 5), of each image what `render` takes: x, y, z [m], yaw [rad]

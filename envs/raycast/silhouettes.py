@@ -116,7 +116,11 @@ def follow_bodies(
     for i in range(len(bodies)):
         body = bodies[i]
         reach = body.rx if body.kind != BOX else math.hypot(body.rx, body.ry)
-        for x, y in ((way.start_x, way.start_y), (way.end_x, way.end_y)):
+        for end in range(2):
+            x, y = (way.end_x, way.end_y) if end else (way.start_x, way.start_y)
+            if body.moves:  # as seen from where the body was noted
+                late = (way.start_us + end * way.moving_us) * 1e-6 - body.since
+                x, y = x - body.vx * late, y - body.vy * late
             beside, forward = abs(body.x - x), body.y - y
             ahead = forward + reach > 0.0 and beside <= limit * forward + slack * reach
             if ahead and beside * beside + forward * forward <= (cull + reach) ** 2:
@@ -231,6 +235,10 @@ def _crossing(body: Record, side: int, u: float, way: Way) -> float:
     """
     moved = way.end_x - way.start_x - u * (way.end_y - way.start_y)
     away = body.x - way.start_x - u * (body.y - way.start_y)
+    if body.moves:
+        across = body.vx - u * body.vy
+        moved -= across * way.moving_us * 1e-6
+        away += across * (way.start_us * 1e-6 - body.since)
     reach = body.rx + abs(u) * body.ry if body.kind == BOX else body.rx * math.sqrt(1.0 + u * u)
     return way.start_us + (away + reach if side else away - reach) / moved * way.moving_us
 

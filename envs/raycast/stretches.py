@@ -88,10 +88,14 @@ def find_rows(
     for k in range(len(followed)):
         rows[k] = math.nan
         body = bodies[followed[k]]
-        still_m = (
-            (frame.focal + frame.horizon + BESIDE) * moved_m / min(shifts.level, _shift_of(body, shifts))
-        )
-        if body.y - max(body.rx, body.ry) - frame.eye_y > still_m + moved_m:
+        own_m = moved_m
+        if body.moves:
+            own_m += (math.hypot(body.vx, body.vy) + abs(body.vz)) * way.moving_us * 1e-6
+        still_m = (frame.focal + frame.horizon + BESIDE) * own_m / min(shifts.level, _shift_of(body, shifts))
+        ahead_m = body.y - max(body.rx, body.ry) - frame.eye_y
+        if body.moves:
+            ahead_m += body.vy * (frame.time - body.since)
+        if ahead_m > still_m + own_m:
             continue
         room.seen[0] = bodies[followed[k]]
         body = room.seen[0]

@@ -43,6 +43,28 @@ def first_contact(segment: tuple, radius: float, half_width: float, sections: np
 
 
 @numba.njit(cache=True, error_model="numpy")
+def first_moving_contact(segment: tuple, radius: float, moving: np.ndarray, shares: tuple) -> float:
+    """Return the smallest fraction of `segment` in contact with a section that moves, or inf.
+
+    Seen from the section, the way of the disc is straight too.
+
+    Args:
+        segment: As of `first_contact`.
+        radius: Radius of the disc [m].
+        moving: (N, 9) float64, a section at the begin of the step, and its way in the step, x, y [m].
+        shares: The parts of the step that have passed at the begin and at the end of the segment.
+    """
+    ax, ay, bx, by = segment
+    begin, end = shares
+    first = math.inf
+    for i in range(len(moving)):
+        dx, dy = moving[i, 7], moving[i, 8]
+        seen = ax - begin * dx, ay - begin * dy, bx - end * dx, by - end * dy
+        first = min(first, first_contact(seen, radius, math.inf, moving[i : i + 1, :7]))
+    return first
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _wall_contact(ax: float, bx: float, half: float) -> float:
     if abs(ax) >= half:
         return 0.0

@@ -16,12 +16,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from envs.scene.obstacles import OBSTACLE
+from envs.scene.moving import MovingBody, Throw, Throws
+from envs.scene.obstacles import ELLIPSOID, OBSTACLE
 from envs.scene.shapes import SHAPES
 from envs.scene.textures import Texture
 
 SPAWN_RANGE_M = (-10.0, 10.0)  # appendix D.1
 TRIES_PER_OBSTACLE = 200
+MAX_THROWS = 100  # of an episode
+THROWN_FROM_RAD = math.radians(30.0)  # at most so far beside straight ahead a ball comes from
 MAX_COVERED = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
 PLAIN_SURFACE = Texture()
 
@@ -73,7 +76,14 @@ class Layout:
         albedo_min, albedo_max: Albedos of obstacles are uniform between these.
         ground_albedo, wall_albedo: Of the rest.
         ground_texture, wall_texture, obstacle_texture: See `envs.scene.textures`.
-        passable: Whether a way to the goal line must lead from every start.
+        passable: Whether a way to the goal line must lead from every start; bodies that move do not count.
+        num_moving: How many spheres fly to and fro across the lane at the vehicle's height.
+        moving_radius_m: Their radius [m].
+        moving_min_mps, moving_max_mps: Their speeds are uniform between these [m/s].
+        throw_every_s: Mean time between two balls that are thrown at the vehicle [s]; 0: none is.
+        throw_distance_m: From the vehicle, where a ball starts [m].
+        throw_min_mps, throw_max_mps: How fast a ball comes nearer is uniform between these [m/s].
+        throw_radius_m: Radius of a ball [m].
     """
 
     shape: str = "pole"
@@ -94,6 +104,15 @@ class Layout:
     wall_texture: Texture = PLAIN_SURFACE
     obstacle_texture: Texture = PLAIN_SURFACE
     passable: bool = True
+    num_moving: int = 0
+    moving_radius_m: float = 0.5
+    moving_min_mps: float = 1.0
+    moving_max_mps: float = 3.0
+    throw_every_s: float = 0.0
+    throw_distance_m: float = 5.0
+    throw_min_mps: float = 1.5
+    throw_max_mps: float = 10.0
+    throw_radius_m: float = 0.1
 
     def __post_init__(self) -> None:
         """Check the values; ValueError names the rule and what was given."""
@@ -104,6 +123,17 @@ class Layout:
         size = math.hypot(half_x, shape.half_y_m(self.radius_max_m))
         rules = {
             "num_obstacles must be a whole number": float(self.num_obstacles).is_integer(),
+            "num_moving must be a whole number up to 1000": float(self.num_moving).is_integer()
+            and self.num_moving <= 1000,
+            "moving_radius_m must be > 0": self.moving_radius_m > 0,
+            "moving_min_mps must be > 0 and <= moving_max_mps": 0
+            < self.moving_min_mps
+            <= self.moving_max_mps,
+            "throw_every_s must be 0 or >= 0.1": self.throw_every_s == 0 or self.throw_every_s >= 0.1,
+            "throw_min_mps must be > 0 and <= throw_max_mps": 0 < self.throw_min_mps <= self.throw_max_mps,
+            "throw_radius_m must be > 0 and < throw_distance_m": 0
+            < self.throw_radius_m
+            < self.throw_distance_m,
             "radius_min_m must be > 0 and <= radius_max_m": 0 < self.radius_min_m <= self.radius_max_m,
             f"min_gap_m must be >= {2 * size:.6g}, or obstacles overlap": self.min_gap_m >= 2 * size,
             f"width_m must be > 20 (the spawn range) and > {2 * half_x:.6g}": self.width_m
@@ -274,6 +304,45 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
     bodies["z"] = bodies["rz"] = 0.5 * layout.height_m
     bodies["albedo"] = rng.uniform(layout.albedo_min, layout.albedo_max, count)
     return shape.compose(bodies)
+
+
+def draw_moving(layout: Layout, rng: np.random.Generator, height_m: float) -> tuple[MovingBody, ...]:
+    """Draw the spheres that fly across the lane and back at `height_m` [m], each from wall to wall."""
+    if not layout.num_moving:
+        return ()
+    count, half = int(layout.num_moving), 0.5 * layout.width_m - layout.moving_radius_m
+    start, y = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (count, 2)).T
+    speeds, sides = (
+        rng.uniform(layout.moving_min_mps, layout.moving_max_mps, count),
+        rng.choice([-1.0, 1.0], count),
+    )
+    albedo = rng.uniform(layout.albedo_min, layout.albedo_max, count)
+    found = []
+    for k in range(count):
+        x = np.array([start[k], sides[k] * half, -sides[k] * half, start[k]])
+        t_s = np.concatenate([[0.0], np.cumsum(np.maximum(np.abs(np.diff(x)), 1e-6)) / speeds[k]])
+        places = np.stack([x, np.full(4, y[k]), np.full(4, height_m)], axis=1)
+        found.append(
+            MovingBody(_sphere(layout.moving_radius_m, height_m, albedo[k]), t_s, places, repeats=True)
+        )
+    return tuple(found)
+
+
+def draw_throws(layout: Layout, rng: np.random.Generator, height_m: float) -> Throws | None:
+    """Draw when balls are thrown at the vehicle, whence, and how fast; None if none is."""
+    if not layout.throw_every_s:
+        return None
+    times = np.cumsum(layout.throw_every_s * rng.uniform(0.5, 1.5, MAX_THROWS))
+    bearings = rng.uniform(-THROWN_FROM_RAD, THROWN_FROM_RAD, MAX_THROWS)
+    speeds = rng.uniform(layout.throw_min_mps, layout.throw_max_mps, MAX_THROWS)
+    ball = _sphere(layout.throw_radius_m, height_m, rng.uniform(layout.albedo_min, layout.albedo_max))
+    throws = (Throw(*values) for values in np.stack([times, bearings, speeds], axis=1).tolist())
+    return Throws(ball, float(layout.throw_distance_m), tuple(throws))
+
+
+def _sphere(radius_m: float, height_m: float, albedo: float) -> np.void:
+    sphere: np.void = np.array([(ELLIPSOID, 0.0, 0.0, height_m, *[radius_m] * 3, albedo)], OBSTACLE)[0]
+    return sphere
 
 
 def _share_covered(layout: Layout, half: float) -> float:

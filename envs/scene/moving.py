@@ -5,12 +5,17 @@ its first place before the path begins, and at its last place when the path is o
 begins again there. Bodies never turn.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from envs.scene.obstacles import OBSTACLE
+from envs.scene.obstacles import OBSTACLE, body_sections
+
+THROWN_S = 30.0  # for which a thrown ball flies on
+NOWHERE = (1e9, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # a moving section that nothing touches
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +50,62 @@ class MovingBody:
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 
+    def places(self, t_s: np.ndarray) -> np.ndarray:
+        """Return where its centre is at times (T,) [s]: x, y, z [m], float64 (T, 3)."""
+        first, last = self.t_s[0], self.t_s[-1]
+        if self.repeats and last > first:
+            t_s = np.where(t_s > last, first + (t_s - first) % (last - first), t_s)
+        return np.stack([np.interp(t_s, self.t_s, axis) for axis in self.places_m.T], axis=-1)
+
     def place(self, t_s: float) -> np.ndarray:
         """Return where its centre is at a time [s]: x, y, z [m], float64 (3,)."""
-        first, last = self.t_s[0], self.t_s[-1]
-        if self.repeats and t_s > last > first:
-            t_s = first + (t_s - first) % (last - first)
-        return np.array([np.interp(t_s, self.t_s, axis) for axis in self.places_m.T])
+        place: np.ndarray = self.places(np.array([t_s]))[0]
+        return place
+
+
+class Throw(NamedTuple):
+    """A ball that is thrown at the vehicle.
+
+    Attributes:
+        t_s: When, or in the first control step that begins later [s].
+        bearing_rad: Where it comes from, to the right of straight ahead [rad].
+        speed_mps: How fast it comes nearer to a vehicle that keeps its velocity [m/s].
+    """
+
+    t_s: float
+    bearing_rad: float
+    speed_mps: float
+
+
+class Throws(NamedTuple):
+    """The throws of an episode, one after the other, all with the same ball.
+
+    Attributes:
+        ball: OBSTACLE (), an ellipsoid.
+        distance_m: From the vehicle, where each begins [m].
+        throws: By time.
+    """
+
+    ball: np.void
+    distance_m: float
+    throws: tuple[Throw, ...]
+
+    def waiting(self) -> MovingBody:
+        """Return the ball before the first throw: behind the start, where no camera looks."""
+        return MovingBody(self.ball, np.zeros(1), np.array([[0.0, -1e4, float(self.ball["z"])]]))
+
+    def thrown(self, number: int, t_s: float, state: tuple[float, float, float, float]) -> MovingBody:
+        """Return the ball on its way from a time [s] at a vehicle of `state` x, y [m], vx, vy [m/s].
+
+        It hits a vehicle that keeps its velocity in the middle, and flies on.
+        """
+        _, bearing_rad, speed_mps = self.throws[number]
+        x_m, y_m, vx_mps, vy_mps = state
+        right, ahead = math.sin(bearing_rad), math.cos(bearing_rad)
+        ball = self.ball.copy()
+        ball["x"], ball["y"] = x_m + self.distance_m * right, y_m + self.distance_m * ahead
+        velocity = vx_mps - speed_mps * right, vy_mps - speed_mps * ahead, 0.0
+        return at_velocity(ball, velocity, t_s, t_s + THROWN_S)
 
 
 def at_velocity(
@@ -72,3 +127,27 @@ def bodies_at(moving: Sequence[MovingBody], t_s: float) -> np.ndarray:
     for k, one in enumerate(moving):
         bodies["x"][k], bodies["y"][k], bodies["z"][k] = one.place(t_s)
     return bodies
+
+
+def moving_sections(
+    moving: Sequence[MovingBody], start_s: float, end_s: float, height_m: float, found: np.ndarray
+) -> None:
+    """Fill in the sections that bodies have at a height [m], and their ways from a time to another [s].
+
+    The section of a body that climbs or sinks is that half-way.
+
+    Args:
+        moving: M bodies.
+        start_s: When the section is where it says [s].
+        end_s: When it has moved [s].
+        height_m: Of the vehicle [m].
+        found: float64 (M, 9), sections as of `envs.scene.obstacles`, and their way x, y [m].
+    """
+    before, after = bodies_at(moving, start_s), bodies_at(moving, end_s)
+    level = before.copy()
+    level["z"] = 0.5 * (before["z"] + after["z"])
+    for k in range(len(moving)):
+        found[k], section = NOWHERE, body_sections(level[k : k + 1], height_m)
+        if len(section):
+            found[k, :7] = section[0]
+            found[k, 7:] = after["x"][k] - before["x"][k], after["y"][k] - before["y"][k]

@@ -28,12 +28,14 @@ from envs.scene.layouts import (
     Layout,
     MeshLayout,
     SphereLayout,
+    draw_moving,
     draw_obstacles,
+    draw_throws,
     refuse_unless,
     with_overrides,
 )
 from envs.scene.mesh_file import is_mesh_path, read_mesh
-from envs.scene.moving import MovingBody, bodies_at
+from envs.scene.moving import MovingBody, Throws, bodies_at
 from envs.scene.spheres import is_sphere_path, sphere_obstacles
 from envs.scene.textures import Texture
 
@@ -63,6 +65,7 @@ class Scene:
         mesh: More surfaces, as vertices (V, 3) [m], faces (F, 3) counter-clockwise seen from
             outside, and baked luminance (V,); only pyrender draws them. None: nothing more.
         moving: Bodies that move, which only the ray caster draws.
+        throws: Balls that are thrown at the vehicle; None: none is.
     """
 
     name: str
@@ -83,6 +86,7 @@ class Scene:
     obstacle_texture: Texture = PLAIN_SURFACE
     mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     moving: tuple[MovingBody, ...] = ()
+    throws: Throws | None = None
 
     def __post_init__(self) -> None:
         """Store read-only copies of the arrays; ValueError names the wrong value and the rule."""
@@ -91,16 +95,21 @@ class Scene:
         object.__setattr__(self, "obstacles", obstacles)
         if self.mesh is not None:
             object.__setattr__(self, "mesh", bodies.checked_mesh(*self.mesh))
-        if self.moving:
+        if self.movers:
             if self.mesh is not None:
                 raise ValueError("a scene with a mesh cannot have bodies that move: no renderer draws both")
-            bodies.checked_obstacles(bodies_at(self.moving, 0.0), self.obstacle_texture.depth)
+            bodies.checked_obstacles(bodies_at(self.movers, 0.0), self.obstacle_texture.depth)
 
     @cached_property
     def kinds(self) -> frozenset[int]:
         """Kinds of obstacles that are there, standing or moving: POLE, CONE, ELLIPSOID, BOX."""
-        moving = {int(one.body["kind"]) for one in self.moving}
+        moving = {int(one.body["kind"]) for one in self.movers}
         return frozenset(np.unique(self.obstacles["kind"]).tolist()) | moving
+
+    @property
+    def movers(self) -> tuple[MovingBody, ...]:
+        """Bodies that move, and last the ball that is thrown, if any."""
+        return self.moving if self.throws is None else (*self.moving, self.throws.waiting())
 
     @cached_property
     def _sections(self) -> dict[float, np.ndarray]:
@@ -232,7 +241,7 @@ def make_scene(
         scenes = (_spheres(name, layout, rng) for _ in range(draws))
         remedy = "lower spawn_half_m or density, fly at another height"
     else:
-        scenes = (_corridor(name, layout, rng) for _ in range(MAX_DRAWS))
+        scenes = (_corridor(name, layout, rng, height_m) for _ in range(MAX_DRAWS))
         remedy = "lower num_obstacles or the radii, raise min_gap_m, widen the lane"
     for scene in scenes:
         if not layout.passable or scene.passable(vehicle_radius_m, height_m):
@@ -243,10 +252,12 @@ def make_scene(
     )
 
 
-def _corridor(name: str, layout: Layout, rng: np.random.Generator) -> Scene:
+def _corridor(name: str, layout: Layout, rng: np.random.Generator, height_m: float) -> Scene:
     return Scene(
         name=name,
         obstacles=draw_obstacles(layout, rng),
+        moving=draw_moving(layout, rng, height_m),
+        throws=draw_throws(layout, rng, height_m),
         width_m=float(layout.width_m),
         wall_height_m=float(layout.wall_height_m),
         ground_albedo=layout.ground_albedo,

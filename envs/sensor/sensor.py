@@ -1,5 +1,6 @@
 """The vehicle's event camera: renders along the way, finds the events, applies the faults."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from envs.raycast.noise import NO_NOISE
 from envs.raycast.records import BODY, FRAME
 from envs.raycast.silhouettes import Way
 from envs.raycast.stretches import Shifts
-from envs.scene import Scene
+from envs.scene import MovingBody, Scene
 from envs.sensor.looks import BAD_POSE, View, scratch_for
 
 FAULTLESS = FaultsConfig()
@@ -123,6 +124,11 @@ class Sensor:
         self.t_us = end_us
         self.events = self.with_faults(events, start_us, end_us)
         self.dropped += self.lost
+
+    def move_bodies(self, moving: Sequence[MovingBody], start_s: float, end_s: float) -> None:
+        """Let the scene's bodies that move go straight from where they are at a time to another [s]."""
+        if self._config.observation != "none":
+            self._renderer.move_bodies(moving, start_s, end_s)
 
     @property
     def sees_by_looks(self) -> bool:

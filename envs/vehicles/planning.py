@@ -8,7 +8,7 @@ over the sideways velocity, whose steps are one push long, and over x. Places ha
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -17,7 +17,9 @@ import numba
 import numpy as np
 
 from envs.config import EnvConfig
-from envs.scene.planning import LATTICE_M, SIDE_PRICE, lattice_prices
+from envs.scene.moving import MovingBody
+from envs.scene.obstacles import OBSTACLE, body_sections
+from envs.scene.planning import BLOCKED, CLEARANCE_SCALE_M, LATTICE_M, SIDE_PRICE, lattice_prices
 from envs.scene.scene import Scene
 from envs.vehicles.dynamics import WAY_S, Dynamics
 
@@ -55,8 +57,42 @@ class BodyPlan:
         return label
 
 
-def plan_body(scene: Scene, config: EnvConfig, dynamics: Dynamics) -> BodyPlan:
+class Planner:
+    """The plans of one environment (`envs.corridor.CorridorEnv`), made again when they no longer hold.
+
+    A plan holds while the scene is the same, and what moves in it keeps to its path.
+    """
+
+    def __init__(self) -> None:
+        """Begin without a plan."""
+        self._scene: Scene | None = None
+        self._moving: tuple[MovingBody, ...] = ()
+        self._plan: BodyPlan
+
+    def costs(self, env: Any) -> np.ndarray:
+        """Return the cost of each action where it takes effect, float64 (K,)."""
+        if env.scene is not self._scene or env.moving != self._moving:
+            now = 1e-6 * env.info()["t_us"], env.camera_pose()[1]
+            self._plan = plan_body(env.scene, env.config, env.dynamics, env.moving, now)
+            self._scene, self._moving = env.scene, env.moving
+        return self._plan.of_actions(env.state_of_action())
+
+
+def plan_body(
+    scene: Scene,
+    config: EnvConfig,
+    dynamics: Dynamics,
+    moving: Sequence[MovingBody] = (),
+    now: tuple[float, float] = (0.0, 0.0),
+) -> BodyPlan:
     """Plan a corridor for a vehicle with a body.
+
+    Args:
+        scene: The corridor.
+        config: Its settings.
+        dynamics: The vehicle.
+        moving: What moves in it: each row is priced as it is when the vehicle comes there.
+        now: The time [s], and where the vehicle is, y [m].
 
     Raises:
         ValueError: The vehicle has no discrete commands, or does not say how it flies to a side.
@@ -66,12 +102,36 @@ def plan_body(scene: Scene, config: EnvConfig, dynamics: Dynamics) -> BodyPlan:
         raise ValueError(f"{rule}; got vehicle {config.vehicle!r} with {dynamics.action_space}")
     speed_mps, acceleration_mps2 = dynamics.sideways
     prices, first_x_m = lattice_prices(scene, 0.0, config.vehicle_radius_m, config.camera_height_m)
+    if moving:
+        y_m = LATTICE_M * np.arange(len(prices))
+        x_m = first_x_m + LATTICE_M * np.arange(prices.shape[1])
+        times_s = np.maximum(now[0], now[0] + (y_m - now[1]) / config.speed_mps)
+        for one in moving:
+            vehicle = config.vehicle_radius_m, config.camera_height_m
+            prices = np.maximum(prices, _moving_prices(one, (x_m, y_m), times_s, vehicle))
     stride = max(1, round(ROW_S * config.speed_mps / LATTICE_M))
     row_s = stride * LATTICE_M / config.speed_mps
     step_mps = min(acceleration_mps2 * row_s, speed_mps)
     half = int(speed_mps / step_mps + 1e-9)
     costs = _costs(prices, stride, row_s, step_mps, half)
     return BodyPlan(costs, prices, first_x_m, stride * LATTICE_M, step_mps, dynamics)
+
+
+def _moving_prices(
+    one: MovingBody, lattice: tuple[np.ndarray, np.ndarray], times_s: np.ndarray, vehicle: tuple[float, float]
+) -> np.ndarray:
+    """Return the price of each place of a lattice x (C,), y (R,) [m] at each row's time, (R, C)."""
+    (x_m, y_m), (radius_m, height_m) = lattice, vehicle
+    bodies = np.array([one.body] * len(times_s), OBSTACLE)
+    bodies["x"], bodies["y"], bodies["z"] = one.places(times_s).T
+    there = np.abs(bodies["z"] - height_m) <= bodies["rz"]
+    prices = np.zeros((len(y_m), len(x_m)))
+    x, y, _, _, hx, hy, r = body_sections(bodies[there], height_m).T[:, :, None]
+    across = np.maximum(np.abs(y_m[there][:, None] - y) - hy, 0.0)
+    clearance = np.hypot(np.maximum(np.abs(x_m - x) - hx, 0.0), across) - r - radius_m
+    price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
+    prices[there] = np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price)
+    return prices
 
 
 @numba.njit(cache=True, error_model="numpy")

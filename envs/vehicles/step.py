@@ -15,7 +15,7 @@ from numba.typed import List
 from envs.events import EVENT
 from envs.events.pixel_noise import fire
 from envs.fidelity import parts_of
-from envs.kinematics import Lane, advance, clock_us, follow, planned_position
+from envs.kinematics import Lane, advance_among, clock_us, follow, planned_position
 from envs.raycast.silhouettes import Way
 from envs.sensor import joined, sense_way
 
@@ -48,7 +48,7 @@ VEHICLE = np.dtype(
 
 @numba.njit(cache=True, error_model="numpy")
 def corridor_list(corridor, count):
-    """Return a list of `count` times the same corridor: level sections of its obstacles, and a `View`.
+    """Return a list of `count` times the same corridor: sections that stand, those that move, and a `View`.
 
     Or with the same `PixelState`.
     """
@@ -85,8 +85,8 @@ def step_all(rows, corridors, noisy, actions, ways, active):
     for row in range(rows.size):
         ends[row + 1], noise_ends[row + 1] = ends[row], noise_ends[row]
         if active[row]:
-            sections, view = corridors[row]
-            _move(rows[row], actions[row], sections, ways[row])
+            sections, moving, view = corridors[row]
+            _move(rows[row], actions[row], (sections, moving), ways[row])
             if rows[row].by_looks and rows[row].problem == GOOD:
                 events = _look(rows[row], view, ways[row])
                 found.append(events)
@@ -109,7 +109,7 @@ def step_all(rows, corridors, noisy, actions, ways, active):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _move(vehicle, action, sections, way):
+def _move(vehicle, action, still_and_moving, way):
     """Move a vehicle, and note the result in its record."""
     vehicle.steps += 1
     lane = Lane(vehicle.radius_m, vehicle.half_width_m, vehicle.length_m)
@@ -121,9 +121,10 @@ def _move(vehicle, action, sections, way):
         moves = vehicle.forward, vehicle.left, vehicle.right
         step_m = vehicle.speed_mps, vehicle.control_hz
         x_m, y_m = planned_position(vehicle.spawn_x_m, moves, step_m)
-        outcome = advance(lane, sections, start, (x_m, vehicle.spawn_y_m + y_m))
+        planned = x_m, vehicle.spawn_y_m + y_m
+        outcome = advance_among(lane, still_and_moving, (0.0, 1.0), start, planned)
     else:
-        outcome = follow(lane, sections, way[: vehicle.parts + 1])
+        outcome = follow(lane, still_and_moving, way[: vehicle.parts + 1])
     vehicle.start_x_m, vehicle.start_y_m = start
     vehicle.x_m, vehicle.y_m = outcome.end
     vehicle.share, vehicle.reward = outcome.share, outcome.reward

@@ -1,5 +1,6 @@
 """Vehicles side by side: their records, and the events of their last steps."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from envs.events import EVENT
 from envs.events.pixel_noise import PixelState
 from envs.kinematics import Outcome, Point, clock_us
 from envs.scene import Scene
+from envs.scene.moving import MovingBody, Throws, moving_sections
 from envs.sensor import Sensor, check_sensed
 from envs.vehicles import task
 from envs.vehicles.bodies import Bodies
@@ -18,6 +20,31 @@ from envs.vehicles.step import BAD_REWARD, GOOD, VEHICLE, corridor_list, set_cor
 
 NOTHING = np.zeros((0, 7))  # sections of a scene in which nothing stands
 NOTHING.flags.writeable = False  # as the sections of a scene, so that numba sees one type
+NOTHING_MOVES = np.zeros((0, 9))
+
+
+@dataclasses.dataclass
+class Moving:
+    """What moves in the scene of a vehicle.
+
+    Attributes:
+        bodies: On the paths that they are on now; the last one is the ball that is thrown, if any.
+        throws: Of the episode.
+        sections: float64 (M, 9), filled by `envs.scene.moving.moving_sections`.
+        thrown: How many throws there have been.
+    """
+
+    bodies: tuple[MovingBody, ...]
+    throws: Throws | None
+    sections: np.ndarray
+    thrown: int = 0
+
+    def throw(self, t_s: float, state: tuple[float, ...]) -> None:
+        """Throw the ball at a vehicle, x, y [m], vx, vy [m/s], if it is time to."""
+        throws = self.throws.throws if self.throws is not None else ()
+        if self.throws is not None and self.thrown < len(throws) and throws[self.thrown].t_s <= t_s:
+            ball = self.throws.thrown(self.thrown, t_s, (state[0], state[1], state[2], state[3]))
+            self.bodies, self.thrown = (*self.bodies[:-1], ball), self.thrown + 1
 
 
 class StepError(ValueError):
@@ -52,6 +79,7 @@ class Vehicles:
         self._noise_of: list[PixelState | None] = [None] * count
         self._bodies = Bodies(count)
         self._straight = np.zeros(count, np.int64)  # actions of kinematic vehicles where there is none
+        self._moving: dict[int, Moving] = {}  # of the rows in whose scenes something moves
         self._judges: dict[int, task.Judge] = {}  # of the rows whose task is not the corridor's
         self._decided = np.zeros((count, 0), np.int64)  # actions not yet taken, the delay's steps in turn
         self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
@@ -85,7 +113,9 @@ class Vehicles:
         self._set_delay(row, config.delay_steps, dynamics.straight)
         self._set_task(row, config.task)
         self._sensors[row] = sensor
-        corridor, noise = (scene.sections(config.camera_height_m), sensor.view()), sensor.pixel_noise()
+        moving = self._start_moving(row, scene)
+        corridor = scene.sections(config.camera_height_m), moving, sensor.view()
+        noise = sensor.pixel_noise()
         if self._corridors is None:
             self._corridors = corridor_list(corridor, len(self.rows))
             self._noise = corridor_list(noise, len(self.rows))
@@ -106,7 +136,7 @@ class Vehicles:
         sensor = self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
         self.rows["half_width_m"][row] = self.rows["length_m"][row] = np.inf
-        set_corridor(self._corridors, row, (NOTHING, sensor.view()))
+        set_corridor(self._corridors, row, (NOTHING, NOTHING_MOVES, sensor.view()))
 
     def step(self, actions: np.ndarray, active: np.ndarray) -> None:
         """Simulate one control step of the active vehicles; results are in `rows`, `events` and `ends`.
@@ -122,6 +152,7 @@ class Vehicles:
         rows = self.rows
         taken = self._exchange(actions, active)
         headings = taken
+        self._move_bodies(active)
         if self._bodies.dynamics:
             self._bodies.move(taken, active)
             rows["vx_mps"], rows["vy_mps"] = self._bodies.velocities
@@ -178,6 +209,10 @@ class Vehicles:
         """Return the state of a vehicle with a body when its next decision is taken, float64 (S,)."""
         return self._bodies.state_after(row, self.decided(row))
 
+    def moving(self, row: int) -> tuple[MovingBody, ...]:
+        """Return the bodies that move in a vehicle's scene, on the paths that they are on now."""
+        return self._moving[row].bodies if row in self._moving else ()
+
     def forget_events(self) -> None:
         """Forget the events of the last step."""
         self.events, self.ends = np.empty(0, EVENT), np.zeros(len(self.rows) + 1, np.int64)
@@ -193,6 +228,35 @@ class Vehicles:
         if missing > 0:
             self._decided = np.pad(self._decided, ((0, 0), (0, missing), *[(0, 0)] * action.ndim))
         self._decided[row] = action
+
+    def _start_moving(self, row: int, scene: Scene) -> np.ndarray:
+        """Begin an episode's moving bodies; return the array of their sections, (M, 9)."""
+        self._moving.pop(row, None)
+        if not scene.movers:
+            return NOTHING_MOVES
+        sections = np.zeros((len(scene.movers), 9))
+        self._moving[row] = Moving(scene.movers, scene.throws, sections)
+        return sections
+
+    def _move_bodies(self, active: np.ndarray) -> None:
+        """Move the bodies of the active vehicles' scenes through the next control step."""
+        for row, moving in self._moving.items():
+            if active[row]:
+                self._move_bodies_of(row, moving)
+
+    def _move_bodies_of(self, row: int, moving: Moving) -> None:
+        vehicle, sensor = self.rows[row], self._sensors[row]
+        start_us = int(vehicle["t_us"])
+        end_us = clock_us(int(vehicle["steps"]) + 1, float(vehicle["control_hz"]))
+        ahead = (
+            "vy_mps" if vehicle["parts"] else "speed_mps"
+        )  # the kinematic one is aimed at as if it went ahead
+        state = tuple(float(vehicle[name]) for name in ("x_m", "y_m", "vx_mps", ahead))
+        moving.throw(1e-6 * start_us, state)
+        span_s = 1e-6 * start_us, 1e-6 * end_us
+        moving_sections(moving.bodies, *span_s, float(vehicle["height_m"]), moving.sections)
+        if sensor is not None:
+            sensor.move_bodies(moving.bodies, *span_s)
 
     def _set_task(self, row: int, name: str) -> None:
         """Begin an episode of a task."""

@@ -29,7 +29,7 @@ from envs.events import unpack_window
 from envs.kinematics import DIAGONAL
 from envs.scene import Scene
 from envs.scene.planning import LATTICE_M, SIDE_PRICE, cost_to_go
-from envs.vehicles.planning import plan_body
+from envs.vehicles.planning import Planner
 
 if TYPE_CHECKING:
     from models.policy import Policy
@@ -275,8 +275,8 @@ class OracleAgent:
 def _planned(env: CorridorEnv) -> Callable[[], int]:
     """Return what chooses the planned action of an episode, where the action takes effect."""
     if env.dynamics.move is not None:
-        body = plan_body(env.scene, env.config, env.dynamics)
-        return lambda: int(body.of_actions(env.state_of_action()).argmin())
+        planner = Planner()
+        return lambda: int(planner.costs(env).argmin())
     step_m = env.config.speed_mps / env.config.control_hz
     plan = plan_path(env.scene, env.camera_pose()[0], env.config.vehicle_radius_m, env.config.camera_height_m)
     return lambda: follow(plan, MOVES * step_m, *env.place_of_action())

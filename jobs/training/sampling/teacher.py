@@ -8,7 +8,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 from envs.scene import Scene
 from envs.scene.planning import CostToGo, cost_to_go
-from envs.vehicles.planning import BodyPlan, plan_body
+from envs.vehicles.planning import Planner
 from jobs.training.sampling.env_runner import PlainEnvRunner, Step
 from jobs.training.sampling.snapshots import Snapshot
 
@@ -23,7 +23,8 @@ class TeacherEnvRunner(PlainEnvRunner):
     """As `PlainEnvRunner`, with a plan of each environment's scene."""
 
     def __init__(self, **settings: Any) -> None:
-        self._plans: dict[int, tuple[Scene, CostToGo | BodyPlan]] = {}  # of each environment's scene
+        self._plans: dict[int, tuple[Scene, CostToGo]] = {}  # of each environment's scene
+        self._planners: dict[int, Planner] = {}  # of each environment whose vehicle has a body
         super().__init__(**settings)
 
     def costs(self) -> np.ndarray:
@@ -33,14 +34,12 @@ class TeacherEnvRunner(PlainEnvRunner):
 
     def _costs(self, row: int, sight_m: float) -> np.ndarray:
         env = self.env.unwrapped.envs[row]
+        if env.dynamics.move is not None:
+            return self._planners.setdefault(row, Planner()).costs(env)
         scene, plan = self._plans.get(row, (None, None))
         if plan is None or scene is not env.scene:
-            vehicle = env.config.vehicle_radius_m, env.config.camera_height_m
-            body = env.dynamics.move is not None
-            plan = plan_body(env.scene, env.config, env.dynamics) if body else cost_to_go(env.scene, *vehicle)
+            plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
             self._plans[row] = env.scene, plan
-        if isinstance(plan, BodyPlan):
-            return plan.of_actions(env.state_of_action())
         x_m, y_m = env.place_of_action()
         return plan.of_actions(x_m, y_m, sight_m)
 

@@ -1,0 +1,73 @@
+"""A wrapper that shows what a vehicle measures of itself, velocity and last command, beside the events."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from envs.corridor import CorridorEnv, Info
+
+STREAM = 0x57A7E  # of the noise, in the entropy of its seed
+Observation = dict[str, Any]
+
+
+class StateObservation(gymnasium.Wrapper):
+    """Shows a Dict: "events", the observation of the wrapped environment, and "state".
+
+    The state is float32 (2 + C,): velocity to the right and ahead [m/s], with noise, and the C numbers of the
+    command that was decided last, 0 at the start. Of a Discrete it is the action's number, -1 at the start.
+    """
+
+    def __init__(self, env: gymnasium.Env, velocity_noise_mps: float = 0.0) -> None:
+        """Wrap a `CorridorEnv`.
+
+        Args:
+            env: The environment.
+            velocity_noise_mps: Standard deviation of the noise on either velocity [m/s].
+
+        Raises:
+            ValueError: The noise is negative or not finite.
+        """
+        super().__init__(env)
+        if not 0.0 <= velocity_noise_mps < np.inf:
+            raise ValueError(f"velocity_noise_mps must be finite and >= 0; got {velocity_noise_mps!r}.")
+        self._noise_mps = velocity_noise_mps
+        self._last: np.ndarray = self._no_command()
+        state = spaces.Box(-np.inf, np.inf, (2 + self._last.size,), np.float32)
+        self.observation_space = spaces.Dict({"events": env.observation_space, "state": state})
+
+    @property
+    def corridor(self) -> CorridorEnv:
+        """The wrapped environment."""
+        corridor = self.env.unwrapped
+        assert isinstance(corridor, CorridorEnv)  # noqa: S101  for the type checker
+        return corridor
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, Info]:
+        """Start an episode; the noise depends on the episode alone."""
+        events, info = self.env.reset(seed=seed, options=options)
+        own_seed, number = self.corridor.series
+        self._rng = np.random.default_rng([own_seed or 0, number, STREAM])
+        self._last = self._no_command()
+        return self._shown(events), info
+
+    def step(self, action: Any) -> tuple[Observation, Any, bool, bool, Any]:
+        """Simulate one control step."""
+        events, reward, terminated, truncated, info = self.env.step(action)
+        self._last = np.atleast_1d(np.asarray(action, np.float32))
+        return self._shown(events), reward, terminated, truncated, info
+
+    def _no_command(self) -> np.ndarray:
+        space = self.env.action_space
+        return (
+            -np.ones(1, np.float32)
+            if isinstance(space, spaces.Discrete)
+            else np.zeros(space.shape, np.float32)
+        )
+
+    def _shown(self, events: Any) -> Observation:
+        velocity = np.array(self.corridor.velocity_mps) + self._noise_mps * self._rng.standard_normal(2)
+        return {"events": events, "state": np.concatenate([velocity, self._last]).astype(np.float32)}
