@@ -92,6 +92,33 @@ def test_every_encoder_is_met_by_every_seed_of_ppo_once(monkeypatch):
     assert sorted(trained) == [(encoder, seed) for encoder in range(5) for seed in range(5)]
 
 
+def test_variants_whose_encoders_learn_from_the_same_settings_share_them_seed_by_seed(monkeypatch):
+    config = parse(compose("+exp=pooling"))
+    monkeypatch.setattr(trainings, "train_variant", lambda config, name, seed, first: (name, seed, first))
+    found = trainings.train_variants(config)
+    for (name, seed), (_, _, first) in found.items():
+        way, rank = name.split("_", 1)
+        assert (first is None) == (way == "taught")
+        assert first is None or first[:2] == (f"taught_{rank}", seed)
+        assert trainings.shares_encoder(config, name) == (way == "ppo")
+        settings = variant_config(config, name, seed)
+        owner = variant_config(config, f"taught_{rank}", seed)
+        assert (settings.pretrain, settings.collect, settings.env) == (
+            owner.pretrain,
+            owner.collect,
+            owner.env,
+        )
+        assert settings.model.evae(64, 64) == owner.model.evae(64, 64)
+
+
+def test_variants_without_an_encoder_share_none():
+    config = parse(
+        compose("+exp=taught", "+study.variants.again={model:{name:event_image,stack:3},algo.lr:3e-4}")
+    )
+    assert trainings.encoder_owner(config, "again") == "event_image"
+    assert not trainings.shares_encoder(config, "again")
+
+
 def test_cameras_are_compared_at_each_rate_with_nothing_else_changed():
     config = parse(compose("+exp=camera_rates"))
     seen = {}
