@@ -358,11 +358,11 @@ class CorridorVectorEnv(VectorEnv):
         spaces_seen = {repr(env.observation_space) for env in self.envs}
         if len(spaces_seen) > 1:
             raise ValueError(f"configs must have one observation space; got {sorted(spaces_seen)}.")
-        self._mode, self._max_steps = AutoresetMode(autoreset_mode), max_episode_steps
+        self.autoreset_mode, self._max_steps = AutoresetMode(autoreset_mode), max_episode_steps
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be >= 1 or None; got {max_episode_steps}.")
         render_fps = self.envs[0].metadata["render_fps"]
-        self.metadata = {**self.metadata, "render_fps": render_fps, "autoreset_mode": self._mode}
+        self.metadata = {**self.metadata, "render_fps": render_fps, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = self.envs[0].observation_space
         self.single_action_space = self.envs[0].action_space
         if any(env.action_space != self.single_action_space for env in self.envs):
@@ -416,9 +416,9 @@ class CorridorVectorEnv(VectorEnv):
             self.envs[row].begin(None, None)
         observations, rewards, terminated, truncated, infos = self._results(np.arange(self.num_envs))
         ended = terminated | truncated
-        if self._mode is AutoresetMode.SAME_STEP and ended.any():
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             observations, infos = self._reset_now(ended, observations, infos)
-        self._over = ended & (self._mode is AutoresetMode.NEXT_STEP)
+        self._over = ended & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
         return observations, rewards, terminated, truncated, infos
 
     def _reset_now(self, ended: np.ndarray, last: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
@@ -468,7 +468,7 @@ class CorridorVectorEnv(VectorEnv):
         """Return what copies and pickles need, see `CorridorEnv`."""
         states = [env.__getstate__() for env in self.envs]
         arguments = {"render_mode": self.render_mode, "draw": states[0]["arguments"]["draw"]}
-        arguments |= {"autoreset_mode": self._mode, "max_episode_steps": self._max_steps}
+        arguments |= {"autoreset_mode": self.autoreset_mode, "max_episode_steps": self._max_steps}
         configs = [state["arguments"]["config"] for state in states]
         attributes = {name: getattr(self, name) for name in ("action_space", "observation_space", "spec")}
         return {

@@ -82,7 +82,7 @@ def test_autoreset_does_as_gymnasium_around_single_environments(mode):
     sync = gymnasium.vector.SyncVectorEnv(
         [lambda: gymnasium.make(NAME, max_episode_steps=4, **SMALL)] * 2, autoreset_mode=mode
     )
-    assert ours.metadata["autoreset_mode"] is mode
+    assert ours.metadata["autoreset_mode"] is ours.unwrapped.autoreset_mode is mode  # TorchRL reads both
     masked = mode is AutoresetMode.DISABLED
     for mine, theirs in zip(ran(ours, masked), ran(sync, masked), strict=True):
         assert np.array_equal(mine, theirs)
@@ -115,3 +115,12 @@ def test_torchrl_makes_it_by_name():
     libs = pytest.importorskip("torchrl.envs")
     env = libs.GymEnv(NAME, time_limit_s=0.1, **SMALL)
     assert env.rollout(5).shape[0] == 5
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])  # the two that it takes
+def test_torchrl_wraps_the_vector_environment(mode):
+    libs = pytest.importorskip("torchrl.envs")
+    envs = gymnasium.make_vec(NAME, 3, autoreset_mode=mode, max_episode_steps=4, **SMALL)
+    steps = libs.GymWrapper(envs).rollout(9, break_when_any_done=False)
+    assert steps.shape == (3, 9)
+    assert int(steps["next", "done"].sum()) == 6

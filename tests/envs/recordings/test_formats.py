@@ -10,6 +10,7 @@ import pytest
 from envs.events import EVENT
 from envs.recordings import Recording, read_events, read_recording, write_events, write_recording
 from envs.recordings.hdf5 import milliseconds_to_index
+from tests.support.event_files import some_events
 
 
 @pytest.fixture
@@ -150,6 +151,23 @@ def test_a_tool_for_the_dsec_layout_reads_what_is_written(recording, tmp_path):
         assert np.array_equal(file["events/p"][:] == 1, recording.events["p"] == 1)
         first = file["ms_to_idx"][3]
         assert file["events/t"][first] >= 3000 > file["events/t"][first - 1]
+
+
+@pytest.mark.parametrize("window_us", [400, 3_700, 50_000])
+def test_the_index_of_milliseconds_finds_the_events_of_any_window_as_dsec_searches_it(window_us, tmp_path):
+    """DSEC's EventSlicer: the index at the whole milliseconds around a window, then a search between."""
+    events = some_events(1, 30_000, 640, 480, 2_000_000)
+    events["t"] += 5_000_123
+    write_events(tmp_path / "a.h5", events, 640, 480)
+    with h5py.File(tmp_path / "a.h5") as file:
+        index, offset = file["ms_to_idx"][:].astype(np.int64), int(file["t_offset"][()])
+        t_us, x = file["events/t"][:], file["events/x"][:]
+    for start_us in np.random.default_rng(0).integers(0, 1_900_000, 50).tolist():
+        first, last = index[start_us // 1000], index[-(-(start_us + window_us) // 1000)]
+        near = slice(first, last)
+        inside = (t_us[near] >= start_us) & (t_us[near] < start_us + window_us)
+        wanted = (events["t"] >= offset + start_us) & (events["t"] < offset + start_us + window_us)
+        assert x[near][inside].tolist() == events["x"][wanted].tolist()
 
 
 def test_a_recording_is_an_event_file_too_and_says_its_sensor(recording, tmp_path):
