@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def do(task: str, folder: Path, format: str) -> Callable[[], object]:
     from envs.recordings.video import video_steps
 
     path, name = folder / format, "txt" if format == "csv" else format
-    size = {"width": WIDTH, "height": HEIGHT} if format == "csv" else {}
+    size: dict[str, Any] = {"width": WIDTH, "height": HEIGHT} if format == "csv" else {}
     events = some() if task.startswith("write") else np.empty(0, EVENT)
 
     def in_parts() -> None:
