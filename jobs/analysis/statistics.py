@@ -31,11 +31,29 @@ class Difference(NamedTuple):
     """A value that may be 0, its 95 % interval, and the two-sided p of the test that it is 0.
 
     Interval and p are None where a single episode leaves nothing to compare.
+
+    Attributes:
+        error: Standard error; None where interval and p are.
+        freedom: Its degrees of freedom.
     """
 
     value: float
     interval: Interval | None
     p: float | None
+    error: float | None = None
+    freedom: float | None = None
+
+    def p_of_gain(self, margin: float) -> float | None:
+        """Return the one-sided p of the test that the value is `margin` or more; small: a gain is excluded."""
+        if self.error is None:
+            return None
+        if self.error == 0.0:
+            return float(self.value >= margin)
+        return float(scipy.stats.t.sf((margin - self.value) / self.error, self.freedom))
+
+    def p_of_loss(self, margin: float) -> float | None:
+        """Return the one-sided p of the test that the value is `-margin` or less; small: a loss is excluded."""
+        return self._replace(value=-self.value).p_of_gain(margin)
 
 
 def wilson_interval(successes: int, trials: int) -> Interval:
@@ -208,11 +226,10 @@ def _tested(value: float, parts: Sequence[tuple[float, int]], least: float, most
         return Difference(value, None, None)
     error, freedom = _error(parts, least, most)
     if error == 0.0:
-        return Difference(value, (value, value), float(value == 0.0))
+        return Difference(value, (value, value), float(value == 0.0), error, freedom)
     half = float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
-    return Difference(
-        value, (value - half, value + half), float(2 * scipy.stats.t.sf(abs(value) / error, freedom))
-    )
+    p = float(2 * scipy.stats.t.sf(abs(value) / error, freedom))
+    return Difference(value, (value - half, value + half), p, error, freedom)
 
 
 def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple[float, float]:

@@ -1,10 +1,13 @@
 """Tests of a family: the difference of each, its p value after the correction, and the verdict.
 
-One rule for all families. A verdict is certain if p is below 0.05 after the correction. Otherwise the
-interval of the single test decides: within the smallest difference that matters on both sides, or below it.
+One rule for all families. A difference is certain if p is below 0.05 after the correction. Otherwise the
+interval of the single test decides: it may exclude a gain of the smallest difference that matters, a loss of it,
+or both. Whether such an exclusion is certain in its family, too, is said apart (`Finding.excluded`).
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +42,8 @@ class Finding(NamedTuple):
         verdict: A word of the family, `UNDECIDED` or `NOT_TESTED`.
         needed: Trainings of each side that would show a difference that matters, if it is undecided; None:
             no number would in these corridors, or it was not asked.
+        excluded: Word of the family -> whether it is certain among all of its tests; of what the interval of
+            the test alone excludes.
     """
 
     contrast: Contrast
@@ -46,6 +51,7 @@ class Finding(NamedTuple):
     adjusted_p: float | None
     verdict: str
     needed: int | None = None
+    excluded: Mapping[str, bool] = MappingProxyType({})
 
 
 def judge(family: Family, results: Results, learned: Learned | None = None) -> list[Finding]:
@@ -60,13 +66,10 @@ def judge(family: Family, results: Results, learned: Learned | None = None) -> l
     found = [_difference(one, *pair) for one, pair in zip(family.contrasts, sides, strict=True)]
     places = [place for place, one in enumerate(found) if one is not None and one.p is not None]
     adjusted = dict(zip(places, adjust(family.adjust, [found[place].p for place in places]), strict=True))  # type: ignore[union-attr, misc]
+    excluded = exclusions(family, found)
     findings = []
     for place, (one, difference) in enumerate(zip(family.contrasts, found, strict=True)):
-        p, margin, needed = (
-            adjusted.get(place),
-            family.margin.get(one.measure, family.margin["success"]),
-            None,
-        )
+        p, margin, needed = adjusted.get(place), margin_of(family, one), None
         verdict = verdict_of(difference, p, margin, family.words)
         ours, theirs = sides[place]
         if (
@@ -77,8 +80,41 @@ def judge(family: Family, results: Results, learned: Learned | None = None) -> l
             and theirs is not None
         ):
             needed = trainings_needed(ours, theirs, margin, len(places), bounds_of(one, ours, theirs))
-        findings.append(Finding(one, difference, p, verdict, needed))
+        findings.append(Finding(one, difference, p, verdict, needed, excluded[place]))
     return findings
+
+
+def margin_of(family: Family, contrast: Contrast) -> float:
+    """Return the smallest difference that matters, in the unit of a test."""
+    return family.margin.get(contrast.measure, family.margin["success"])
+
+
+def exclusions(family: Family, found: Sequence[Difference | None]) -> list[dict[str, bool]]:
+    """Return what the interval of each test excludes, and whether that is certain in the family.
+
+    Gains and losses are a family each: one-sided tests, corrected as the family's own.
+
+    Returns:
+        For each test the word of the family -> whether it is certain, see `Finding.excluded`.
+    """
+    excluded: list[dict[str, bool]] = [{} for _ in found]
+    for name in ("no_gain", "no_loss"):
+        tested = [
+            (place, one, margin_of(family, contrast))
+            for place, (one, contrast) in enumerate(zip(found, family.contrasts, strict=True))
+            if name in family.words and one is not None and one.interval is not None
+        ]
+        alone = [_p_within(one, margin, name) for _, one, margin in tested]
+        for (place, one, margin), p in zip(tested, adjust(family.adjust, alone), strict=True):
+            low, high = one.interval or (-math.inf, math.inf)
+            if high < margin if name == "no_gain" else low > -margin:
+                excluded[place][family.words[name]] = p < 1 - CONFIDENCE
+    return excluded
+
+
+def _p_within(one: Difference, margin: float, name: str) -> float:
+    p = one.p_of_gain(margin) if name == "no_gain" else one.p_of_loss(margin)
+    return 1.0 if p is None else p
 
 
 def adjust(correction: str, p_values: Sequence[float]) -> list[float]:
@@ -103,7 +139,8 @@ def verdict_of(
         return words.get("above" if difference.value > 0 else "below", UNDECIDED)
     if -margin < low and high < margin and "within" in words:
         return words["within"]
-    return words["no_gain"] if high < margin and "no_gain" in words else UNDECIDED
+    beyond = {"no_gain": high < margin, "no_loss": low > -margin}
+    return ", ".join(words[name] for name, out in beyond.items() if out and name in words) or UNDECIDED
 
 
 def compared_values(

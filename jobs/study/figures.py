@@ -27,7 +27,7 @@ from jobs.study.summaries import Summary
 from jobs.study.tables import scale_of
 from jobs.study.words import TITLES, condition_text
 
-COLOURS = {"above": GREEN, "below": RED, "within": BLUE, "no_gain": AMBER}  # of verdicts
+COLOURS = {"above": GREEN, "below": RED, "within": BLUE, "no_gain": AMBER, "no_loss": INK}  # of verdicts
 
 
 class Drawn(NamedTuple):
@@ -98,7 +98,9 @@ def forest(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     sizes = [sum(scale_of(one.contrast) == unit for one in tested) for unit in units]
     figure = Figure(figsize=(9.6, 1.2 + 0.42 * sum(sizes)), layout="constrained")
     panels = figure.subplots(len(units), 1, squeeze=False, height_ratios=sizes)[:, 0]
-    colours = {word: COLOURS[name] for name, word in family.words.items()}
+    words = family.words
+    colours = {word: COLOURS[name] for name, word in words.items()}
+    colours[f"{words.get('no_gain')}, {words.get('no_loss')}"] = COLOURS["within"]
     for panel, unit in zip(panels, units, strict=True):
         scale, own = unit[0], [one for one in tested if scale_of(one.contrast) == unit]
         margin = scale * family.margin[own[0].contrast.measure if unit[2] == "m" else "success"]

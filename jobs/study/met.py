@@ -25,9 +25,10 @@ def met(
 ) -> bool:
     """Whether a training's episodes could have what distinguishes a cell of a sweep from the nominal one.
 
-    A number counts as met between the smallest and the largest that a condition may draw, a word if it may
-    draw that. All that distinguishes the cell must be met in one condition; a cell in which nothing changes,
-    or whose scene is a mesh, is not.
+    One rule for all tables. A word counts as met if a condition may draw it. A number does between the smallest
+    and the largest that any of the training's episodes may have, among them those of conditions that leave it as
+    it is: where some have 0 and some 0.3, 0.2 is met. One condition must draw all that distinguishes the cell; a
+    cell in which nothing changes, or whose scene is a mesh, is not met.
 
     Args:
         conditions: Of the training, as `TrainConfig`.
@@ -41,10 +42,13 @@ def met(
     changed = {key: value for key, value in here.items() if before.get(key) != value}
     if any(key.startswith(LAYOUT) for key in changed):  # another world, of which nothing may be new
         changed |= {key: value for key, value in here.items() if key.startswith(LAYOUT)}
+    every = [_drawn_settings(condition, trained) for condition in conditions]
     return bool(changed) and any(
-        all(_may_be(drawn.get(key, []), value) for key, value in changed.items())
-        for drawn in (_drawn_settings(condition, trained) for condition in conditions)
-    )
+        all(_may_be(drawn.get(key, []), value)
+            or (key in condition and _lies_between([one for own in every for one in own.get(key, [])], value))
+            for key, value in changed.items())
+        for condition, drawn in zip(conditions, every, strict=True)
+    )  # fmt: skip
 
 
 def settings_of(env: EnvConfig) -> dict[str, object]:
@@ -85,7 +89,14 @@ def _ends(value: Any) -> list[Any]:
 
 
 def _may_be(drawn: Sequence[Any], value: object) -> bool:
-    numbers = [one for one in drawn if isinstance(one, int | float) and not isinstance(one, bool)]
-    if isinstance(value, int | float) and not isinstance(value, bool) and numbers:
-        return min(numbers) <= value <= max(numbers)
-    return value in drawn
+    return value in drawn or _lies_between(drawn, value)
+
+
+def _lies_between(drawn: Sequence[Any], value: object) -> bool:
+    """Whether a number lies between the ends of the numbers among `drawn`; False for what is no number."""
+    numbers = [one for one in drawn if _is_number(one)]
+    return _is_number(value) and bool(numbers) and min(numbers) <= value <= max(numbers)  # type: ignore[operator]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -44,7 +44,7 @@ class Study(NamedTuple):
         summaries: Of its groups.
         families: Name -> a family and its findings.
         doses: Event errors of its conditions, if they were measured.
-        beside: Study -> `tables.key_of` a test -> its verdict there.
+        beside: What a family names beside itself -> `tables.key_of` a test -> what was found there.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Study(NamedTuple):
     summaries: list[Summary]
     families: Mapping[str, tuple[Family, list[Finding]]]
     doses: list[Dose]
-    beside: Mapping[str, Mapping[tuple[str, ...], str]]
+    beside: Mapping[tuple[str, str], Mapping[tuple[str, ...], str]]
 
 
 def judge_all(said: Mapping[str, Any], results: Results) -> dict[str, tuple[Family, list[Finding]]]:
@@ -78,9 +78,9 @@ def compute(
         data: Where other published studies are; None: none is shown beside.
     """
     families = judge_all(said, results)
-    named = {other for family, _ in families.values() for other in family.beside.values()}
-    there = [other for other in named if data and (data / f"{other}_about.json").is_file()]
-    beside = {other: _verdicts(data, other) for other in there if data}
+    named = {(other, name) for name, (family, _) in families.items() for other in family.beside.values()}
+    beside = {(other, name): found for other, name in named
+              if data and (found := _beside(data, *_place_beside(other, name))) is not None}  # fmt: skip
     every = bool(said.get("doses"))  # a plan that was written before names all of its conditions
     return Study(
         name, said, results, changes_of(results, every), summaries_of(results), families, doses, beside
@@ -94,10 +94,24 @@ def published(data: Path, name: str, spec: str) -> Study:
     return compute(name, said, read_published(data, name), read_doses(data / f"{name}_doses.csv"), data)
 
 
+def _place_beside(said: str, name: str) -> tuple[str, str]:
+    """Return study and family of STUDY or STUDY:FAMILY; `name` is the family that names it."""
+    study, _, family = said.partition(":")
+    return study, family or name
+
+
 @functools.cache
-def _verdicts(data: Path, name: str) -> dict[tuple[str, ...], str]:
-    found = judge_all(read_study(name), read_published(data, name))
-    return {tables.key_of(family, one.contrast): one.verdict for family, own in found.values() for one in own}
+def _beside(data: Path, name: str, family: str) -> dict[tuple[str, ...], str] | None:
+    """Return what a family of a published study found; None if the study is not there."""
+    if not (data / f"{name}_about.json").is_file():
+        return None
+    own, findings = _judged(data, name)[family]
+    return {tables.key_of(own, one.contrast): tables.beside_text(one) for one in findings}
+
+
+@functools.cache
+def _judged(data: Path, name: str) -> dict[str, tuple[Family, list[Finding]]]:
+    return judge_all(read_study(name), read_published(data, name))
 
 
 def figures(study: Study) -> dict[str, Figure]:
@@ -152,7 +166,11 @@ def new_page(name: str) -> str:
 
 def _results(study: Study, _: str) -> str:
     blocks = [_summary(study, ""), *(_figure(study, name) for name in _figures(study))]
-    blocks += [_family(study, name, heading=True) for name in study.families]
+    columns = {_place_beside(other, name) for name, (family, _) in study.families.items()
+               for other in family.beside.values()}  # fmt: skip
+    blocks += [
+        _family(study, name, heading=True) for name in study.families if (study.name, name) not in columns
+    ]
     if study.said.get("spread"):
         blocks.append(f"### By {study.said['spread']['rows']} and by {study.said['spread']['columns']}\n\n"
                       f"{_spread(study, '')}")  # fmt: skip
@@ -183,7 +201,7 @@ def _figure(study: Study, name: str) -> str:
 
 def _family(study: Study, name: str, heading: bool = False) -> str:
     family, findings = study.families[name]
-    beside = {head: study.beside.get(other, {}) for head, other in family.beside.items()}
+    beside = {head: study.beside.get((other, name), {}) for head, other in family.beside.items()}
     blocks = [f"### {family.title}"] if heading else []
     if len(findings) == 1 and findings[0].contrast.theirs is not None:
         (one,) = findings
@@ -193,7 +211,10 @@ def _family(study: Study, name: str, heading: bool = False) -> str:
             "Means with 95 % intervals over trainings and corridors, each alone. The first line is the test."
         )
     elif name != "lead":
-        blocks += [tables.family_note(family, findings), tables.family_table(family, findings, beside)]
+        notes = [study.families[own][0].note for own in dict.fromkeys(
+            _place_beside(other, name)[1] for other in family.beside.values()) if own in study.families and own != name]  # fmt: skip
+        blocks.append(" ".join((tables.family_note(family, findings), *notes)))
+        blocks.append(tables.family_table(family, findings, beside))
     else:
         blocks.append(tables.family_table(family, findings, {}))
     return "\n\n".join(block.strip("\n") for block in blocks)
@@ -238,8 +259,16 @@ def _changes(study: Study, _: str) -> str:
     return f"{note}\n\n{tables.change_table(study.changes, study.doses)}"
 
 
-def _losses(study: Study, _: str) -> str:
+def _losses(study: Study, which: str) -> str:
+    """Return what breaks each group; of `certain` only what is certain for other trainings."""
     tests = len(replicated(study.changes))
+    if which == "certain":
+        note = (
+            f"Change of success [points] with 95 % intervals over trainings: the losses that are certain for other "
+            f"trainings, among all {tests} changes (Benjamini and Hochberg). In brackets: trainings that certainly "
+            f"lose by themselves."
+        )
+        return f"{note}\n\n{tables.certain_losses_table(study.results, study.changes)}"
     note = (
         f'"2 of 3": so many of these trainings certainly lose, by McNemar\'s exact test over the corridors; '
         f"all such tests are one family (Benjamini and Hochberg). The interval is over trainings; **bold**: "

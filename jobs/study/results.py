@@ -79,6 +79,16 @@ class Results:
             for one in self._compared
         }
 
+    @cached_property
+    def different(self) -> list[Condition]:
+        """Return every simulation once, the one with nothing changed among them: the first of equal ones."""
+        return [at for at in self.conditions if self.same_as.get(at, at) == at]
+
+    def is_baseline(self, at: Condition, group: str | None = None) -> bool:
+        """Whether a condition is the same simulation as the one that a group is compared with there."""
+        usual = self.baselines(group).get(at, at)
+        return self.same_as.get(at, at) == self.same_as.get(usual, usual)
+
     @property
     def met(self) -> set[tuple[Condition, str]]:
         """Return the conditions that lie within what a group was trained on, with the group."""

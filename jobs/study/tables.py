@@ -7,13 +7,13 @@ from typing import cast
 
 import numpy as np
 
-from jobs.analysis.statistics import Difference, crossed_mean
+from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_mean
 from jobs.analysis.tables import estimate_text, markdown_table, percent_text, write_csv
 from jobs.study.changes import Change, replicated
 from jobs.study.contrasts import UNDECIDED, Finding, Row, by_condition
 from jobs.study.doses import Dose
 from jobs.study.results import RATE, Condition, Results, place, text_of
-from jobs.study.spec import LEARNED, Contrast, Family, changed_conditions
+from jobs.study.spec import LEARNED, Contrast, Family
 from jobs.study.spread import Factors
 from jobs.study.summaries import MET, Summary
 from jobs.study.words import condition_text
@@ -58,7 +58,7 @@ def family_table(
     Args:
         family: The family.
         findings: Of its tests.
-        beside: Heading -> `key_of` a test -> its verdict in another study.
+        beside: Heading -> `key_of` a test -> what another family found.
     """
     names = list(dict.fromkeys(one.contrast.name for one in findings))
     groups = list(dict.fromkeys(one.contrast.ours.group for one in findings))
@@ -83,12 +83,24 @@ def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]
         "Test": [one.contrast.name for one in findings],
         "Source": [one.contrast.source for one in findings],
         "Against": ["" if _alone(one.contrast) else f"`{one.contrast.theirs.group}`" for one in findings],  # type: ignore[union-attr]
-        "Finding": [one.verdict for one in findings] if tested else [],
+        "Finding": [finding_text(one) for one in findings] if tested else [],
         "Difference": [value_text(one) for one in findings],
         f"p ({CORRECTIONS.get(family.adjust)})": [_p_text(one) for one in findings] if tested else [],
         "Trainings needed": [_needed_text(one) for one in findings] if family.power else [],
     }
     return {name: texts for name, texts in found.items() if any(texts)}
+
+
+def finding_text(one: Finding) -> str:
+    """Return the verdict of a test; bold: what is certain in its family."""
+    if one.excluded and one.verdict == ", ".join(one.excluded):
+        return ", ".join(f"**{word}**" if certain else word for word, certain in one.excluded.items())
+    return f"**{one.verdict}**" if one.adjusted_p is not None and one.adjusted_p < 1 - CONFIDENCE else one.verdict
+
+
+def beside_text(one: Finding) -> str:
+    """Return the verdict of a test of another family with its difference."""
+    return f"{finding_text(one)}: {value_text(one)}"
 
 
 def _alone(contrast: Contrast) -> bool:
@@ -99,8 +111,7 @@ def _alone(contrast: Contrast) -> bool:
 def _cell(family: Family, one: Finding) -> str:
     if family.adjust == "none":
         return value_text(one)
-    verdict = one.verdict if one.verdict == UNDECIDED else f"**{one.verdict}**"
-    return f"{verdict}: {value_text(one)}, p = {_p_text(one)}"
+    return f"{finding_text(one)}: {value_text(one)}, p = {_p_text(one)}"
 
 
 def _p_text(one: Finding) -> str:
@@ -122,11 +133,25 @@ def key_of(family: Family, contrast: Contrast) -> tuple[str, ...]:
 def counted(findings: Sequence[Finding]) -> str:
     """Return how many findings have each verdict, the most frequent first."""
     verdicts = Counter(one.verdict for one in findings)
-    plural = {"does not hold": "do not hold"}
-    return ", ".join(
-        f"{count} {plural.get(verdict, verdict) if count > 1 else verdict}"
-        for verdict, count in verdicts.most_common()
-    )
+    return "; ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+
+
+def _excluded_text(family: Family, findings: Sequence[Finding]) -> str:
+    """Return how many tests exclude a gain, and how many a loss; "" if the family does not ask."""
+    said = []
+    for name, what in (("no_gain", "gain"), ("no_loss", "loss")):
+        word = family.words.get(name)
+        own = [one.excluded[word] for one in findings if word in one.excluded]
+        if word is not None:
+            said.append(f"{len(own)} exclude a {what} of {limit_text(family, findings)}, {sum(own)} of them for certain")
+    return f" {'; '.join(said).capitalize()}." if said else ""
+
+
+def limit_text(family: Family, findings: Sequence[Finding]) -> str:
+    """Return the smallest differences that matter, in each unit of the tests."""
+    measures = {one.contrast.measure for one in findings}
+    margins = [f"{100 * family.margin['success']:g} points"] if measures & {"success", *LEARNED} else []
+    return " or ".join(margins + ([f"{family.margin['distance_m']:g} m"] if "distance_m" in measures else []))
 
 
 def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
@@ -143,7 +168,8 @@ def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
         if one.verdict in certain
     ]
     listed = f" Certain: {'; '.join(named)}." if 0 < len(named) <= 6 else "" if named else " None is certain."
-    return f"{family.title}, {len(findings)} tests: {counted(findings)}.{listed}"
+    asked = _excluded_text(family, findings)
+    return f"{family.title}, {len(findings)} tests{'.' if asked else f': {counted(findings)}.'}{asked}{listed}"
 
 
 def _test_text(contrast: Contrast) -> str:
@@ -157,18 +183,17 @@ def family_note(family: Family, findings: Sequence[Finding]) -> str:
         return family.note or "Means with 95 % intervals over trainings and corridors, each alone."
     words = family.words
     sure = " and ".join(dict.fromkeys(f"*{words[name]}*" for name in ("above", "below") if name in words))
-    measures = {one.contrast.measure for one in findings}
-    margins = [f"{100 * family.margin['success']:g} points"] if measures & {"success", *LEARNED} else []
-    margins += [f"{family.margin['distance_m']:g} m"] if "distance_m" in measures else []
-    limit = " or ".join(margins)
+    limit = limit_text(family, findings)
+    excluding = " and ".join(f"*{words[name]}*" for name in ("no_gain", "no_loss") if name in words)
     said = [
         family.note,
         f"{sure}: certain among these {len(findings)} tests (p < 0.05 after {CORRECTIONS[family.adjust]}).",
         f"*{words['within']}*: the interval of this test alone lies within {limit} on both sides."
         if "within" in words
         else "",
-        f"*{words['no_gain']}*: the interval of this test alone excludes a gain of {limit}."
-        if "no_gain" in words
+        f"{excluding}: the interval of this test alone excludes a gain or a loss of {limit}; **bold**: for "
+        f"certain among all of these tests ({CORRECTIONS[family.adjust]}, one-sided)."
+        if excluding
         else "",
         "*Trainings needed*: of each group, to show such a difference in four of five studies; *corridors*: "
         "no number would, more corridors are needed."
@@ -180,9 +205,7 @@ def family_note(family: Family, findings: Sequence[Finding]) -> str:
 
 def lead_sentence(results: Results, findings: Sequence[Finding]) -> str:
     """Return which group succeeds most over all conditions, its worst one, and how sure its lead is."""
-    at = [
-        one for one in changed_conditions(results) if all((one, g) in results.cells for g in results.trained)
-    ]
+    at = [one for one in results.different if all((one, g) in results.cells for g in results.trained)]
     if not at:
         return ""
     rates = {group: np.stack([results.values(one, group) for one in at]) for group in results.trained}
@@ -196,7 +219,7 @@ def lead_sentence(results: Results, findings: Sequence[Finding]) -> str:
     lead = f"certain over {', '.join(behind)}" if behind else "certain over none"
     return (
         f"`{best}` succeeds most: {100 * usual:.0f} % with nothing changed, {100 * each.mean():.0f} % as the "
-        f"mean of {len(at)} changed conditions, {100 * each.min():.0f} % in its worst, "
+        f"mean of all {len(at)} conditions, {100 * each.min():.0f} % in its worst, "
         f"{condition_text(at[int(each.argmin())])}. Its lead is {lead} (Holm over {len(findings)} pairs)."
     )
 
@@ -244,6 +267,20 @@ def losses_table(results: Results, changes: Sequence[Change]) -> str:
                           _drop_text(worst) if worst.loses else "-", "; ".join(texts) or "none"))  # fmt: skip
     head = ("Group (trainings)", "Nothing changed [%]", "Largest drop of the mean", "Certain losses")
     return markdown_table(head, lines, len(head))
+
+
+def certain_losses_table(results: Results, changes: Sequence[Change]) -> str:
+    """Return for each group the losses that are certain for other trainings, the largest first."""
+    lines = []
+    for group in results.trained:
+        own = sorted((one for one in changes if one.group == group), key=lambda one: one.difference.value)
+        lost = [
+            f"{_drop_text(one)}, {estimate_text(one.difference, 100, '+.0f')} ({one.broken.sum()})"
+            for one in own
+            if one.certain and one.loses
+        ]
+        lines.append((f"`{group}` ({len(results.groups[group])})", "; ".join(lost) or "none"))
+    return markdown_table(("Group (trainings)", "Certain losses"), lines, 2)
 
 
 def _drop_text(change: Change) -> str:

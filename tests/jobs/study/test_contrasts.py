@@ -8,8 +8,8 @@ from jobs.study.spec import Contrast, Family, Side
 from tests.support.episodes import flights
 
 NOMINAL, A, B = ("nominal", "poles"), ("world", "a"), ("world", "b")
-WORDS = {"above": "holds", "below": "reversed", "within": "equivalent", "no_gain": "does not hold"}
-GAIN = {"success": 0.1, "distance_m": 10.0}
+WORDS = {"above": "holds", "below": "reversed", "no_gain": "no gain", "no_loss": "no loss"}
+GAIN = {"success": 0.1, "distance_m": 5.0}
 
 
 def family(*contrasts, words=WORDS, **changes):
@@ -43,10 +43,11 @@ def judged(contrast, table, **changes):
     [
         (0.3, (0.2, 0.4), 0.001, "holds"),
         (-0.3, (-0.4, -0.2), 0.001, "reversed"),
-        (0.3, (0.01, 0.6), 0.2, "undecided"),  # certain alone, not within its family
-        (0.01, (-0.05, 0.08), 0.7, "equivalent"),
-        (0.01, (-0.05, 0.1), 0.7, "undecided"),  # at the margin nothing is excluded
-        (-0.2, (-0.45, 0.05), 0.1, "does not hold"),
+        (0.3, (0.01, 0.6), 0.2, "no loss"),  # certain alone, not within its family
+        (0.01, (-0.05, 0.08), 0.7, "no gain, no loss"),
+        (0.01, (-0.05, 0.1), 0.7, "no loss"),  # at the margin nothing is excluded
+        (-0.2, (-0.45, 0.05), 0.1, "no gain"),
+        (0.2, (-0.05, 0.45), 0.1, "no loss"),
         (0.0, (-0.3, 0.3), 1.0, "undecided"),
         (0.2, None, None, "undecided"),
     ],
@@ -54,6 +55,9 @@ def judged(contrast, table, **changes):
 def test_certainty_comes_before_the_interval_of_the_single_test(value, interval, p, verdict):
     assert verdict_of(Difference(value, interval, p), p, 0.1, WORDS) == verdict
     assert verdict_of(None, None, 0.1, WORDS) == "not tested"
+    turned = Difference(-value, interval and (-interval[1], -interval[0]), p)
+    mirrored = {"holds": "reversed", "reversed": "holds", "no gain": "no loss", "no loss": "no gain"}
+    assert verdict_of(turned, p, 0.1, WORDS) == mirrored.get(verdict, verdict)
     only = {"above": "certain", "below": "certain"}
     assert verdict_of(Difference(value, interval, p), p, 0.1, only) in ("certain", "undecided")
 
@@ -120,7 +124,23 @@ def test_distances_that_agree_at_the_goal_are_equivalent_only_after_enough_episo
         return judged(better(measure="distance_m"), table).verdict
 
     assert verdict(2) == "undecided"
-    assert verdict(10) == "equivalent"
+    assert verdict(10) == "no gain, no loss"
+
+
+def test_an_exclusion_is_certain_only_if_it_is_so_among_all_tests_of_the_family():
+    """The one-sided p of an exclusion is that of the interval's end, and Holm's in its family."""
+    rates = {"learned": {"a": np.linspace(0.48, 0.53, 6), "b": np.linspace(0.47, 0.55, 6)}}
+    alone = judge(family(learnt("a", "b")), results({}), rates)[0]
+    low, high = alone.difference.interval
+    assert alone.difference.p_of_gain(high) == pytest.approx(0.025)
+    assert alone.difference.p_of_loss(-low) == pytest.approx(0.025)
+    assert alone.difference.p_of_gain(0.0) == pytest.approx(1 - alone.difference.p_of_loss(0.0))
+    close = {"success": 1.02 * high}
+    one = judge(family(learnt("a", "b"), margin=close), results({}), rates)[0]
+    many = judge(family(*[learnt("a", "b")] * 18, margin=close), results({}), rates)
+    assert one.excluded["no gain"]
+    assert [found.excluded["no gain"] for found in many] == [False] * 18
+    assert {found.verdict for found in many} == {one.verdict}
 
 
 def learnt(*groups):

@@ -7,7 +7,15 @@ from envs.config import EnvConfig
 from jobs.config.conditions import WEIGHT, axis_points
 from jobs.config.config import parse
 from jobs.config.env_keys import env_with
+from jobs.rollout.policies import find_study_policies
+from jobs.rollout.tasks import text_of
+from jobs.run.files import read_json
+from jobs.run.folder import locate_run
+from jobs.run.provenance import REPOSITORY
+from jobs.study.doses import read_doses
 from jobs.study.met import met
+from jobs.study.plan import plan_study
+from jobs.study.results import read_published
 from tests.support.configs import compose
 
 NOMINAL = EnvConfig(scene="poles_eval")
@@ -33,6 +41,11 @@ def was_met(conditions, changes):
         ([{"env.scene": "texture_change"}], {"env.scene": "texture_change"}, True),
         ([{"env.layout.shape": ["box", "cone"]}], {"env.scene": "shape_change"}, False),
         ([{"camera.memory": "frame"}], {"camera.memory": "frame"}, True),
+        ([{}, {"faults.sparsity": 0.3}], {"faults.sparsity": 0.2}, True),
+        ([{}, {"faults.sparsity": 0.3}], {"faults.sparsity": 0.4}, False),
+        ([{"faults.sparsity": 0.3}], {"faults.sparsity": 0.2}, False),  # no episode has less
+        ([{"env.control_hz": 60}, {"env.control_hz": 300}], {"env.control_hz": 100}, True),
+        ([{"env.control_hz": 60}, {"env.control_hz": 300}], {"env.control_hz": 45}, False),
     ],
 )
 def test_a_cell_is_met_where_one_condition_may_draw_all_that_distinguishes_it(conditions, changes, expected):
@@ -66,6 +79,20 @@ def test_what_a_sweep_tests_as_unseen_never_occurs_in_the_training_that_holds():
                 swept -= {value_of(nominal, key), "poles"}
                 drawn = itertools.chain(*(drawn_of(condition, key) for condition in conditions))
                 assert not swept & set(drawn), key
+
+
+def test_the_published_tables_mark_what_the_shipped_policies_drew():
+    """In the sweep for every group; the study of doses marks false events by the same rule."""
+    facts = read_json(REPOSITORY / "docs" / "data" / "robustness_about.json")
+    named = f"study.policies=[{','.join(facts['groups'])}]"
+    config = parse(compose("+exp=robustness", named, f"study.trials={facts['trials']}"))
+    plan = plan_study(config, find_study_policies(config, locate_run(config)))
+    assert sorted([at[0], text_of(at[1]), group] for at, group in plan.met) == facts["met"]
+    assert ["background_activity", "0.05", "bytestream_robust"] in facts["met"]
+    doses = read_doses(REPOSITORY / "docs" / "data" / "dose_response_doses.csv")
+    dosed = read_published(REPOSITORY / "docs" / "data", "dose_response").met
+    false = [one for one in doses if one.condition[0] == "invented"]
+    assert {(one.condition, group) for one in false for group in one.met_by} == dosed
 
 
 def value_of(env, key):

@@ -14,8 +14,8 @@ from jobs.study.changes import changes_of
 from jobs.study.contrasts import by_condition, judge
 from jobs.study.figures import contact_ends, pair_differences, worst_conditions
 from jobs.study.page import judge_all
-from jobs.study.results import read_published, text_of
-from jobs.study.spec import read_study
+from jobs.study.results import read_published, text_of, values_of
+from jobs.study.spec import GAIN, read_study
 from jobs.study.spread import crossed_tables, factors
 from jobs.study.summaries import summaries_of
 from jobs.study.tables import write_changes, write_estimates
@@ -107,6 +107,30 @@ def test_every_claim_of_the_paper(name):
                 one.contrast.name + one.contrast.ours.group.replace("bytestream_paper", "bytestream")
             ]
             assert same([[*place(row.condition), numbers(row.difference)] for row in rows], claimed)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_condition_of_a_test_is_its_own_baseline(name):
+    """Its change is 0, and an average with it is too small."""
+    for family, found in findings(name).items():
+        for one in found:
+            for side in filter(None, (one.contrast.ours, one.contrast.theirs)):
+                pairs = zip(side.at, side.less, strict=True) if len(side.at) == len(side.less) else ()
+                first = results(name).same_as
+                same = [at for at, less in pairs if first.get(at, at) == first.get(less, less)]
+                assert not same, (family, one.contrast.name, same)
+
+
+@pytest.mark.parametrize("name", ["ppo_claims", "taught_claims"])
+def test_ten_points_of_success_are_five_metres(name):
+    """Over all trainings and conditions; so one margin means the same in both units."""
+    success, metres = [], []
+    for (_, _), own in results(name).cells.items():
+        success += list(values_of(own, "success").mean(axis=1))
+        metres += list(values_of(own, "distance_m").mean(axis=1))
+    slope = np.polyfit(success, metres, 1)[0]
+    assert 10 * GAIN["success"] * slope / 10 == pytest.approx(GAIN["distance_m"], rel=0.15)
+    assert np.corrcoef(success, metres)[0, 1] > 0.9
 
 
 def test_the_cameras_at_each_rate():

@@ -67,6 +67,38 @@ def test_baselines_are_those_of_each_condition():
     assert mean.ours.less == (("hz", 45.0), ("hz", 400.0))
 
 
+def test_a_condition_that_is_its_own_baseline_averages_no_zero_into_a_change():
+    places = [("hz", "45"), ("hz", "400"), ("late", "50")]
+    facts = {**FACTS, "compared": [
+        {"condition": list(at), "baseline": ["hz", "400"], "same_as": list(at)} for at in places
+    ]}  # fmt: skip
+    said = {"contrasts": [{"ours": "a_45", "theirs": "b_45", "at": {"hz": "all"}, "less": "baseline"}]}
+    (family,) = families_of({"families": {"one": said}}, Results(facts, {}))
+    (one,) = family.contrasts
+    assert (one.ours.at, one.ours.less) == ((("hz", 45.0),), (("hz", 400.0),))
+    assert one.theirs.at == one.ours.at
+
+
+def test_all_conditions_are_every_simulation_once_and_the_unchanged_one_too():
+    places = [("nominal", "poles"), ("hz", "45"), ("hz", "400"), ("late", "50")]
+    facts = {**FACTS, "compared": [
+        {"condition": list(at), "baseline": list(places[0]), "same_as": list(places[0] if at[0] == "late" else at)}
+        for at in places
+    ]}  # fmt: skip
+    study = {"families": {"one": {"contrasts": [{"ours": "a_45"}], "pairs": {"at": "all"}}}}
+    (family,) = families_of(study, Results(facts, {}))
+    assert family.contrasts[0].ours.at == (("nominal", "poles"), ("hz", 45.0), ("hz", 400.0))
+
+
+def test_the_other_account_is_absolute_and_charges_no_recorded_steps():
+    change = {"name": "rates", "ours": "a_45", "at": {"hz": [45]}, "less": "baseline"}
+    learns = {"name": "learns", "ours": "a_45", "theirs": "b_45", "measure": "learned"}
+    neither = {"name": "better", "ours": "a_45", "at": {"hz": [45]}}
+    one, other = contrasts({"account": "other", "contrasts": [change, learns, neither]})
+    assert (one.name, one.ours.at, one.ours.less) == ("rates", (("hz", 45.0),), ())
+    assert (other.name, other.measure) == ("learns", "learned_uncharged")
+
+
 def test_a_shared_family_keeps_its_names_for_groups_that_are_called_otherwise():
     said = {"as": {"b_45": "a_400"}, "contrasts": [{"ours": "b_45", "theirs": "a_45"}]}
     (family,) = families(said)
@@ -83,9 +115,10 @@ REFUSED = {
     ),
     "a wrong word": ({"words": {"better": "yes"}, "contrasts": []}, r"got \['words.better'\]"),
     "a wrong file": ("moon", "must name a file of conf/claims, got 'moon'"),
+    "a wrong account": ({"account": "fair", "contrasts": []}, "account: must be one of"),
     "no family": (3, "must be a family or a file of conf/claims, got 3"),
     "no side": ({"contrasts": [{"theirs": "a_45"}]}, "a test has `ours`"),
-    "wrong conditions": ({"contrasts": [{"ours": "a_45", "at": "some"}]}, "must be all, changed, nominal"),
+    "wrong conditions": ({"contrasts": [{"ours": "a_45", "at": "some"}]}, "must be all, nominal"),
     "a wrong loop": ({"for": {"group": "every"}, "contrasts": [{"ours": "a_45"}]}, "must name a list"),
 }
 
