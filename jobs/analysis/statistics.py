@@ -44,7 +44,7 @@ class Difference(NamedTuple):
     freedom: float | None = None
 
     def p_of_gain(self, margin: float) -> float | None:
-        """Return the one-sided p of the test that the value is `margin` or more; small: a gain is excluded."""
+        """Return the one-sided p of the test that the value is `margin` or more; small excludes a gain."""
         if self.error is None:
             return None
         if self.error == 0.0:
@@ -52,7 +52,7 @@ class Difference(NamedTuple):
         return float(scipy.stats.t.sf((margin - self.value) / self.error, self.freedom))
 
     def p_of_loss(self, margin: float) -> float | None:
-        """Return the one-sided p of the test that the value is `-margin` or less; small: a loss is excluded."""
+        """Return the one-sided p of the test that the value is `-margin` or less; small excludes a loss."""
         return self._replace(value=-self.value).p_of_gain(margin)
 
 

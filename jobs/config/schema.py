@@ -104,6 +104,7 @@ class TrainConfig:
         value_warmup: Environment steps in which, after `init`, only the value network learns.
         conditions: Settings of the simulation that are replaced together, as a sweep replaces
             them; each episode draws one (`jobs.config.conditions`). [{}] changes nothing.
+        candidates: How many seeds are trained; the policy is the best of them under drawn faults.
     """
 
     env_steps: Count
@@ -111,6 +112,7 @@ class TrainConfig:
     init: str | None = None
     value_warmup: Annotated[int, Field(ge=0)] = 20_000
     conditions: Conditions = dataclasses.field(default_factory=lambda: [{}])
+    candidates: Count = 1
 
 
 @dataclass(frozen=True, config=STRICT)

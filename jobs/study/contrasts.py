@@ -1,8 +1,8 @@
 """Tests of a family: the difference of each, its p value after the correction, and the verdict.
 
 One rule for all families. A difference is certain if p is below 0.05 after the correction. Otherwise the
-interval of the single test decides: it may exclude a gain of the smallest difference that matters, a loss of it,
-or both. Whether such an exclusion is certain in its family, too, is said apart (`Finding.excluded`).
+interval of the single test decides: it may exclude a gain of the smallest difference that matters, a loss of
+it, or both. Whether such an exclusion is certain in its family, too, is said apart (`Finding.excluded`).
 """
 
 import math

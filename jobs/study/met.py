@@ -25,10 +25,10 @@ def met(
 ) -> bool:
     """Whether a training's episodes could have what distinguishes a cell of a sweep from the nominal one.
 
-    One rule for all tables. A word counts as met if a condition may draw it. A number does between the smallest
-    and the largest that any of the training's episodes may have, among them those of conditions that leave it as
-    it is: where some have 0 and some 0.3, 0.2 is met. One condition must draw all that distinguishes the cell; a
-    cell in which nothing changes, or whose scene is a mesh, is not met.
+    One rule for all tables. A word counts as met if a condition may draw it. A number does between the
+    smallest and the largest that any of the training's episodes may have, among them those of conditions that
+    leave it as it is: where some have 0 and some 0.3, 0.2 is met. One condition must draw all that
+    distinguishes the cell; a cell in which nothing changes, or whose scene is a mesh, is not met.
 
     Args:
         conditions: Of the training, as `TrainConfig`.

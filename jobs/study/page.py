@@ -211,8 +211,8 @@ def _family(study: Study, name: str, heading: bool = False) -> str:
             "Means with 95 % intervals over trainings and corridors, each alone. The first line is the test."
         )
     elif name != "lead":
-        notes = [study.families[own][0].note for own in dict.fromkeys(
-            _place_beside(other, name)[1] for other in family.beside.values()) if own in study.families and own != name]  # fmt: skip
+        named = dict.fromkeys(_place_beside(other, name)[1] for other in family.beside.values())
+        notes = [study.families[own][0].note for own in named if own in study.families and own != name]
         blocks.append(" ".join((tables.family_note(family, findings), *notes)))
         blocks.append(tables.family_table(family, findings, beside))
     else:
@@ -264,9 +264,9 @@ def _losses(study: Study, which: str) -> str:
     tests = len(replicated(study.changes))
     if which == "certain":
         note = (
-            f"Change of success [points] with 95 % intervals over trainings: the losses that are certain for other "
-            f"trainings, among all {tests} changes (Benjamini and Hochberg). In brackets: trainings that certainly "
-            f"lose by themselves."
+            f"Change of success [points] with 95 % intervals over trainings: the losses that are certain for "
+            f"other trainings, among all {tests} changes (Benjamini and Hochberg). In brackets: trainings "
+            f"that certainly lose by themselves."
         )
         return f"{note}\n\n{tables.certain_losses_table(study.results, study.changes)}"
     note = (

@@ -19,8 +19,8 @@ from jobs.run.provenance import REPOSITORY
 from jobs.study.results import Condition, Results, value_of
 
 CONF = REPOSITORY / "conf"
-# The smallest difference that matters, unless a family says other. In metres it is what 10 points of success are:
-# over the trainings of ppo_claims and taught_claims a point goes with 0.55 and 0.50 m.
+# The smallest difference that matters, unless a family says other. In metres it is what 10 points of success
+# are: over the trainings of ppo_claims and taught_claims a point goes with 0.55 and 0.50 m.
 GAIN = {"success": 0.1, "distance_m": 5.0}
 LEARNED = (
     "learned",
@@ -82,8 +82,8 @@ class Family(NamedTuple):
         margin: Measure -> the smallest difference that matters.
         words: Of `WORDS` -> how the family calls that verdict.
         power: Whether undecided tests say how many trainings would decide them.
-        beside: Heading -> study whose findings on the same tests are shown, in its family of the same name; or
-            STUDY:FAMILY.
+        beside: Heading -> study whose findings on the same tests are shown, in its family of the same name;
+            or STUDY:FAMILY.
         note: What a reader must know of the table.
         alias: Group of this study -> the name that the tests have for it.
     """
@@ -159,7 +159,9 @@ def _family(
         rule = f"has the keys {FAMILY} and adjust holm, bh or none"
         raise ConfigError(f"study.families.{name}: {rule}, got {wrong or adjust!r}")
     if said.get("account", "planned") not in ACCOUNTS:
-        raise ConfigError(f"study.families.{name}.account: must be one of {ACCOUNTS}, got {said['account']!r}")
+        raise ConfigError(
+            f"study.families.{name}.account: must be one of {ACCOUNTS}, got {said['account']!r}"
+        )
     alias = {there: here for here, there in said.get("as", {}).items()}
     known = {alias.get(group, group): own for group, own in tags.items() if group not in said.get("as", {})}
     first = {"first": results.trained[0]} if results.trained else {}

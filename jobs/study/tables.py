@@ -95,7 +95,11 @@ def finding_text(one: Finding) -> str:
     """Return the verdict of a test; bold: what is certain in its family."""
     if one.excluded and one.verdict == ", ".join(one.excluded):
         return ", ".join(f"**{word}**" if certain else word for word, certain in one.excluded.items())
-    return f"**{one.verdict}**" if one.adjusted_p is not None and one.adjusted_p < 1 - CONFIDENCE else one.verdict
+    return (
+        f"**{one.verdict}**"
+        if one.adjusted_p is not None and one.adjusted_p < 1 - CONFIDENCE
+        else one.verdict
+    )
 
 
 def beside_text(one: Finding) -> str:
@@ -140,10 +144,10 @@ def _excluded_text(family: Family, findings: Sequence[Finding]) -> str:
     """Return how many tests exclude a gain, and how many a loss; "" if the family does not ask."""
     said = []
     for name, what in (("no_gain", "gain"), ("no_loss", "loss")):
-        word = family.words.get(name)
-        own = [one.excluded[word] for one in findings if word in one.excluded]
-        if word is not None:
-            said.append(f"{len(own)} exclude a {what} of {limit_text(family, findings)}, {sum(own)} of them for certain")
+        if name in family.words:
+            own = [one.excluded[family.words[name]] for one in findings if family.words[name] in one.excluded]
+            limit = limit_text(family, findings)
+            said.append(f"{len(own)} exclude a {what} of {limit}, {sum(own)} of them for certain")
     return f" {'; '.join(said).capitalize()}." if said else ""
 
 
@@ -169,7 +173,9 @@ def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
     ]
     listed = f" Certain: {'; '.join(named)}." if 0 < len(named) <= 6 else "" if named else " None is certain."
     asked = _excluded_text(family, findings)
-    return f"{family.title}, {len(findings)} tests{'.' if asked else f': {counted(findings)}.'}{asked}{listed}"
+    return (
+        f"{family.title}, {len(findings)} tests{'.' if asked else f': {counted(findings)}.'}{asked}{listed}"
+    )
 
 
 def _test_text(contrast: Contrast) -> str:

@@ -11,6 +11,7 @@ raise the same again.
 import contextlib
 import math
 import re
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -34,6 +35,7 @@ from jobs.run.trial_errors import low_memory, newest_error
 from jobs.run.tune_state import keep_state, mend_state
 from jobs.tracking.tracker import open_tracker
 from jobs.training.algorithms import Algorithm, algorithm_of
+from jobs.training.candidates import best_of, candidate_run, candidate_seeds, show, take, validate
 from jobs.training.inputs import check_cpus, check_inputs, prepare_inputs
 from jobs.training.policy import policy_about, policy_spec
 from jobs.training.ppo.algorithm import NOTICE
@@ -122,6 +124,30 @@ def run(config: Config) -> dict[str, float]:
 
 
 def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
+    """Train as `train_one` does; of several `train.candidates` the best becomes the run's policy.
+
+    Candidates share the run's encoder. Each has a folder in the run folder, where a stopped one continues.
+    """
+    if finished(folder, "train") is not None:
+        return folder.policy
+    if config.train.candidates == 1:
+        return train_one(config, folder, encoder_path, on_result)
+    runs = {seed: candidate_run(folder, seed) for seed in candidate_seeds(config)}
+    for seed, own in runs.items():
+        console.print(f"Candidate with seed {seed}, one of {len(runs)}", markup=False)
+        if folder.init.is_dir():
+            shutil.copytree(folder.init, own.init, dirs_exist_ok=True)
+        train_one(own.config, own, encoder_path, lambda _steps, _metrics: None)
+    rates = validate(config, folder, {seed: own.policy for seed, own in runs.items()})
+    best = best_of(rates)
+    show(rates, best)
+    for row in take(folder, runs[best], rates):
+        on_result(int(row["env_steps"]), {name: value for name, value in row.items() if name != "env_steps"})
+    finish(folder, "train", finished(runs[best], "train") or {})
+    return folder.policy
+
+
+def train_one(config: Config, folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
     """Train until `train.env_steps`, from the newest checkpoint if there is one; export the policy.
 
     Args:
