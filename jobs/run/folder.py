@@ -179,7 +179,8 @@ def finish(run: Run, stage: str, results: Results) -> Results:
         ValueError: If a result is NaN or infinite.
     """
     keep_what_was_made()
-    write_json(run.path / "stages" / f"{stage}.json", {"figures": results, **provenance()})
+    made = {**provenance(), "device": run.config.cluster.device}
+    write_json(run.path / "stages" / f"{stage}.json", {"figures": results, **made})
     return results
 
 

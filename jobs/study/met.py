@@ -95,7 +95,7 @@ def _may_be(drawn: Sequence[Any], value: object) -> bool:
 def _lies_between(drawn: Sequence[Any], value: object) -> bool:
     """Whether a number lies between the ends of the numbers among `drawn`; False for what is no number."""
     numbers = [one for one in drawn if _is_number(one)]
-    return _is_number(value) and bool(numbers) and min(numbers) <= value <= max(numbers)  # type: ignore[operator]
+    return _is_number(value) and bool(numbers) and min(numbers) <= value <= max(numbers)
 
 
 def _is_number(value: object) -> bool:

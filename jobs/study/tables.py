@@ -31,7 +31,7 @@ CHANGES = (
     *("p", "certain", "broken"),
 )
 TESTS = (
-    *("family", "Group", "test", "against", "condition", "verdict"),
+    *("family", "Group", "test", "against", "condition", "verdict", "certain_in_family"),
     *("difference", "difference_low", "difference_high", "unit", "p_adjusted", "trainings_needed"),
 )
 WORST = 3  # conditions that break most are named, and what ties with them
@@ -448,7 +448,7 @@ def write_tests(
         if len(findings) == 1 and findings[0].contrast.theirs is not None:
             (one,) = findings
             scale, form, unit = scale_of(one.contrast)
-            rows += [(name, *_sides(one.contrast), condition_text(row.condition), "",
+            rows += [(name, *_sides(one.contrast), condition_text(row.condition), "", "",
                       *_numbers(row.difference.value * scale, _scaled(row.difference.interval, scale), form),
                       unit, "", "") for row in by_condition(one.contrast, results)]  # fmt: skip
     write_csv(file, TESTS, rows)
@@ -461,7 +461,17 @@ def _test_cells(family: Family, one: Finding) -> tuple[str, ...]:
     tested = family.adjust != "none"
     p = _p_text(one) if tested else ""
     needed = _needed_text(one) if family.power else ""
-    return (*_sides(one.contrast), "", one.verdict if tested else "", *value, unit, p, needed)
+    certain = ", ".join(word for word in one.verdict.split(", ") if f"**{word}**" in finding_text(one))
+    return (
+        *_sides(one.contrast),
+        "",
+        one.verdict if tested else "",
+        certain if tested else "",
+        *value,
+        unit,
+        p,
+        needed,
+    )
 
 
 def _sides(contrast: Contrast) -> tuple[str, str, str]:

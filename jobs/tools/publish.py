@@ -32,6 +32,7 @@ from models.policy.policy import save_lean_policy
 
 PLOT = REPOSITORY / "docs" / "images" / "learning.png"
 MAX_POINTS = 50  # of a curve
+STAGES = ("collect", "pretrain", "train")
 
 
 @dataclass(frozen=True)
@@ -94,11 +95,19 @@ def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
             "exp": group,
             "run": path.name,
             "commit": read_json(marker)["commit"],
+            "made_by": made_by(path),
             "config_hash": settings_hash(config),
             **{name: config[name] for name in ("train", "pretrain", "collect")},
         }
         found[group, seed] = Training(path, group, seed, about)
     return [found[key] for key in sorted(found)]
+
+
+def made_by(run: Path) -> dict[str, dict[str, object]]:
+    """Return stage -> commit and device of each stage of a run: its encoder may be older than its policy."""
+    markers = {stage: run / "stages" / f"{stage}.json" for stage in STAGES}
+    found = {stage: read_json(marker) for stage, marker in markers.items() if marker.is_file()}
+    return {stage: {"commit": own["commit"], "device": own.get("device")} for stage, own in found.items()}
 
 
 def publish(training: Training, folder: Path) -> Path:
