@@ -264,9 +264,8 @@ def _losses(study: Study, which: str) -> str:
     tests = len(replicated(study.changes))
     if which == "certain":
         note = (
-            f"Change of success [points] with 95 % intervals over trainings: the losses that are certain for "
-            f"other trainings, among all {tests} changes (Benjamini and Hochberg). In brackets: trainings "
-            f"that certainly lose by themselves."
+            f"Losses that are certain for other trainings among all {tests} changes (Benjamini and Hochberg), with "
+            f"95 % intervals [points]. In brackets: trainings that certainly lose by themselves."
         )
         return f"{note}\n\n{tables.certain_losses_table(study.results, study.changes)}"
     note = (

@@ -197,12 +197,11 @@ def family_note(family: Family, findings: Sequence[Finding]) -> str:
         f"*{words['within']}*: the interval of this test alone lies within {limit} on both sides."
         if "within" in words
         else "",
-        f"{excluding}: the interval of this test alone excludes a gain or a loss of {limit}; **bold**: for "
-        f"certain among all of these tests ({CORRECTIONS[family.adjust]}, one-sided)."
+        f"{excluding}: the interval of this test alone excludes one of {limit}; **bold**: certain among all."
         if excluding
         else "",
-        "*Trainings needed*: of each group, to show such a difference in four of five studies; *corridors*: "
-        "no number would, more corridors are needed."
+        "*Trainings needed*: of each group, to find such a difference with a power of 80 %; *corridors*: more of "
+        "these."
         if family.power
         else "",
     ]

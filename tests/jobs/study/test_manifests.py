@@ -1,4 +1,4 @@
-"""A published policy can be made again from what is said of it: the named commit has the code that it needs."""
+"""A published policy can be made again from what is said of it: its commit has the code that it needs."""
 
 import csv
 import fnmatch

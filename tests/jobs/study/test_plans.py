@@ -1,4 +1,4 @@
-"""A plan is the text of the commit that planned its study, before it was evaluated; changes stand below it."""
+"""A plan is the text of the commit that planned its study, before its evaluation; changes stand below it."""
 
 import re
 import subprocess

@@ -133,3 +133,16 @@ def test_the_job_writes_policies_curves_and_their_plot(tmp_path, monkeypatch):
     versions = client.search_model_versions("name = 'evade-bytestream'")
     assert sorted(version.tags["seed"] for version in versions) == ["0", "1"]
     assert {version.tags["commit"] for version in versions} == {"abc"}
+
+
+def test_a_published_policy_says_which_commit_and_device_made_each_stage(tmp_path):
+    """An encoder may come from an older commit and from a GPU, of which the last stage says nothing."""
+    path = finish_training(tmp_path, "run")
+    older = {"figures": {}, "commit": "older", "device": "cuda"}
+    (path / "stages" / "pretrain.json").write_text(json.dumps(older))
+    (training,) = newest_trainings(tmp_path / "runs", "smoke")
+    manifest = load_policy(publish(training, tmp_path / "published")).manifest
+    assert manifest["made_by"] == {
+        "pretrain": {"commit": "older", "device": "cuda"},
+        "train": {"commit": "abc", "device": None},
+    }
