@@ -264,8 +264,8 @@ def _losses(study: Study, which: str) -> str:
     tests = len(replicated(study.changes))
     if which == "certain":
         note = (
-            f"Losses that are certain for other trainings among all {tests} changes (Benjamini and Hochberg), with "
-            f"95 % intervals [points]. In brackets: trainings that certainly lose by themselves."
+            f"Losses that are certain for other trainings, of all {tests} changes (Benjamini and Hochberg), "
+            f"with 95 % intervals [points]. In brackets: trainings that certainly lose by themselves."
         )
         return f"{note}\n\n{tables.certain_losses_table(study.results, study.changes)}"
     note = (

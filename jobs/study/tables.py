@@ -197,11 +197,11 @@ def family_note(family: Family, findings: Sequence[Finding]) -> str:
         f"*{words['within']}*: the interval of this test alone lies within {limit} on both sides."
         if "within" in words
         else "",
-        f"{excluding}: the interval of this test alone excludes one of {limit}; **bold**: certain among all."
+        f"{excluding}: the test's own interval excludes one of {limit}; **bold**: certain among all."
         if excluding
         else "",
-        "*Trainings needed*: of each group, to find such a difference with a power of 80 %; *corridors*: more of "
-        "these."
+        "*Trainings needed*: of each group, to find such a difference with a power of 80 %; *corridors*: "
+        "more of these."
         if family.power
         else "",
     ]
