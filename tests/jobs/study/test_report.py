@@ -53,7 +53,7 @@ def test_a_study_is_published_with_its_data_figures_and_page_and_the_plan_stays(
     assert "\nnominal,poles_eval,bytestream,3,60,0.8000," in estimates
     assert "\n\n\n" not in text
     assert str(tmp_path) not in text
-    names = {f"results_{name}.png" for name in ("axes", "survival", "map", "claims")}
+    names = {f"results_{name}.png" for name in ("axes", "survival", "map")}
     assert {path.name for path in (docs / "images").iterdir()} == names
     assert filled_pages(docs) == {"plan.md": text}  # from the data alone
     page.published.cache_clear()
