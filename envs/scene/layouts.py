@@ -184,7 +184,7 @@ class SphereLayout:
         width_m, wall_height_m: The lane and its walls, at which a flight ends [m]. The challenge's box has no
             visible walls, so these are low.
         spawn_half_m: A start is at x uniform in +- this [m].
-        moving: Whether bodies move too.
+        moving: Whether the spheres of `dynamic_obstacles.yaml` beside the file move in it too.
         passable: Whether a way to the goal line must lead from every start.
     """
 
@@ -206,7 +206,6 @@ class SphereLayout:
             )
             > 0,
             "spawn_half_m must be < half of width_m": 2 * self.spawn_half_m < self.width_m,
-            "moving must be false: spheres that move are not simulated yet": not self.moving,
         }
         refuse_unless(rules, "layout", self)
 

@@ -36,7 +36,7 @@ from envs.scene.layouts import (
 )
 from envs.scene.mesh_file import is_mesh_path, read_mesh
 from envs.scene.moving import MovingBody, Throws, bodies_at
-from envs.scene.spheres import is_sphere_path, sphere_obstacles
+from envs.scene.spheres import is_sphere_path, moving_spheres, sphere_obstacles
 from envs.scene.textures import Texture
 
 # The sun stands behind the start and to the right, so that the sides of a pole differ.
@@ -276,6 +276,7 @@ def _spheres(name: str, layout: SphereLayout, rng: np.random.Generator) -> Scene
         width_m=float(layout.width_m),
         wall_height_m=float(layout.wall_height_m),
         spawn_range_m=(-float(layout.spawn_half_m), float(layout.spawn_half_m)),
+        moving=moving_spheres(layout),
     )
 
 

@@ -14,16 +14,18 @@ import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from envs.scene.layouts import SphereLayout
+from envs.scene.moving import MovingBody
 from envs.scene.obstacles import ELLIPSOID, OBSTACLE
 
 REMOVED_M = 1000.0
 COLUMNS = ("prefab", "x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz")
 ALBEDO = 0.25  # that of poles
+STRAIGHT_M = 1e-9  # by which a place may leave the line between its neighbours
 MAX_SPHERES = 100_000
 # Of the challenge's final generator: spheres per square metre of ground, from x to x [m], 20 m wide.
 REGIONS = ((0.11, 0.0, 60.0), (0.21, 0.0, 60.0), (0.21, 40.0, 60.0))
@@ -104,6 +106,59 @@ def _sphere(path: str, number: int, row: Sequence[str]) -> tuple[float, ...] | N
         raise ValueError(f"{where}: {rule}; got {scales}")
     radius = 0.5 * scales[0]
     return (ELLIPSOID, -y, x, z, radius, radius, radius, ALBEDO)
+
+
+def moving_spheres(layout: SphereLayout) -> tuple[MovingBody, ...]:
+    """Return the spheres that move, of `dynamic_obstacles.yaml` beside the layout's file.
+
+    Each has a scale and the name of a file in `csvtrajs`, whose rows behind a heading are t, x, y, z and the
+    rotation, every 20 ms. A sphere rests when its file ends, unless it loops.
+
+    Raises:
+        ValueError: A file is missing, or breaks a rule.
+    """
+    beside = Path(layout.file).with_name("dynamic_obstacles.yaml")
+    if not layout.moving:
+        return ()
+    if not layout.file or not beside.is_file():
+        raise ValueError(f"layout moving: must be false without {beside.name} beside the file of a scene")
+    return read_moving(str(beside), (beside.stat().st_mtime_ns, beside.stat().st_size))
+
+
+@functools.lru_cache(maxsize=4)
+def read_moving(path: str, stamp: tuple[int, int]) -> tuple[MovingBody, ...]:
+    """Return the moving spheres of a file; `stamp` changes with the file.
+
+    Raises:
+        ValueError: A file is missing, or breaks a rule.
+    """
+    import yaml
+
+    try:
+        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return tuple(
+            _moving(path, str(name), said)
+            for name, said in values.items()
+            if isinstance(said, dict) and "csvtraj" in said
+        )
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, OSError) as error:
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"scene {path!r} cannot be read: {text}") from None
+
+
+def _moving(path: str, name: str, said: dict[str, Any]) -> MovingBody:
+    """Return one moving sphere."""
+    file = Path(path).with_name("csvtrajs") / f"{Path(str(said['csvtraj'])).name}.csv"
+    rows = np.loadtxt(file, delimiter=",", ndmin=2, comments="#", usecols=(0, 1, 2, 3))
+    scales = [float(scale) for scale in said["scale"]]
+    if not min(scales) > 0.0 or max(scales) - min(scales) > 1e-6 * max(scales):
+        raise ValueError(f"scene {path!r}, {name}: scale must be equal in all directions and above 0")
+    radius, places = 0.5 * scales[0], np.stack([-rows[:, 2], rows[:, 1], rows[:, 3]], axis=1)
+    bends = np.ones(len(rows), bool)  # of a path at constant velocity both ends suffice
+    bends[1:-1] = np.abs(np.diff(places, 2, axis=0)).max(axis=1, initial=0.0) > STRAIGHT_M
+    x, y, z = places[0]
+    body = np.array((ELLIPSOID, x, y, z, radius, radius, radius, ALBEDO), OBSTACLE)
+    return MovingBody(body[()], rows[bends, 0], places[bends], bool(said.get("loop", False)))
 
 
 def drawn_spheres(layout: SphereLayout, rng: np.random.Generator) -> np.ndarray:

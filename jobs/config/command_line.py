@@ -47,10 +47,11 @@ def _placed(words: Sequence[str], name: str, jobs: Mapping[str, object]) -> list
 
 
 def _quoted(word: str) -> str:
-    """Return a word as a value in Hydra's grammar."""
+    """Return a word as a value in Hydra's grammar, in which a backslash escapes before a quote alone."""
     if re.fullmatch(r"[\w./:@-]+", word):
         return word
-    return "'" + word.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    inner = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), word)
+    return f"'{inner}'"
 
 
 def given_keys(words: Sequence[str]) -> set[str]:

@@ -55,7 +55,7 @@ def run(config: Config) -> dict[str, float]:
     )
     left_out = moving_beside(Path(own.file))
     if left_out:
-        said = f"{left_out} spheres of dynamic_obstacles.yaml move; they are left out"
+        said = f"{left_out} spheres of dynamic_obstacles.yaml move; +env.layout.moving=true flies among them"
         console.print(said, markup=False)
     return {"passable": float(sum(row[3] == "yes" for row in rows)), "overlaps": float(found.overlaps)}
 

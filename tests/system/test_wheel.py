@@ -69,9 +69,12 @@ def test_it_holds_the_packages_and_the_policies_and_nothing_else(wheel):
         (metadata,) = (archive.read(name).decode() for name in names if name.endswith("/METADATA"))
     tops = {name.partition("/")[0] for name in names}
     rooms = "core", "envs", "models", "jobs"
-    assert {top for top in tops if not top.endswith(".dist-info")} == {*rooms}
+    assert {top for top in tops if not top.endswith((".dist-info", ".data"))} == {*rooms}
     tracked = subprocess.check_output(["git", "ls-files", *rooms], cwd=ROOT, text=True)
     assert set(tracked.splitlines()) <= set(names)
+    command = subprocess.check_output(["git", "ls-files", "conf", "platform/launch.py"], cwd=ROOT, text=True)
+    installed = {name.partition("/data/share/evade/")[2] for name in names}
+    assert set(command.splitlines()) <= installed
     needed = re.findall(r"^Requires-Dist: ([\w-]+)(?!.*extra ==).*$", metadata, re.MULTILINE)
     assert {"numpy", "numba", "torch", "gymnasium"} <= set(needed)
     assert set(needed).isdisjoint(ABSENT)

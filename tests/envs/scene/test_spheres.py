@@ -10,7 +10,7 @@ from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from envs.scene import make_scene
 from envs.scene.layouts import SphereLayout
-from envs.scene.spheres import REGIONS, about, drawn_spheres, read_spheres
+from envs.scene.spheres import REGIONS, about, drawn_spheres, read_moving, read_spheres
 
 FOREIGN = Path(os.environ.get("EVADE_DATA", "../shared/data"), "dodgedrone")
 NO_FOREIGN = f"foreign worlds are not in {FOREIGN}: set EVADE_DATA"
@@ -54,7 +54,7 @@ def test_a_row_that_cannot_be_drawn_is_refused_by_its_line(tmp_path, text, rule)
 def test_a_file_that_is_not_there_and_spheres_that_move_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no such file"):
         make_scene("nowhere.csv", np.random.default_rng(0))
-    with pytest.raises(ValueError, match="moving must be false"):
+    with pytest.raises(ValueError, match="moving: must be false without dynamic"):
         make_scene(written(tmp_path, ROW), np.random.default_rng(0), moving=True)
 
 
@@ -121,6 +121,41 @@ def test_an_episode_in_a_file_s_world_ends_at_its_goal(tmp_path):
     assert env.scene.spawn_range_m == (0.0, 0.0)
 
 
+def moving_world(tmp_path, rows, loop="false", scale="1.0"):
+    (tmp_path / "csvtrajs").mkdir(exist_ok=True)
+    text = "\n".join(", ".join(map(str, (*row, 1, 0, 0, 0))) for row in rows)
+    (tmp_path / "csvtrajs" / "one.csv").write_text(f"# header\n{text}\n")
+    said = f"Object1:\n  csvtraj: one\n  loop: {loop}\n  prefab: rpg_box01\n  scale: [1.0, 1.0, {scale}]\n"
+    file = tmp_path / "dynamic_obstacles.yaml"
+    file.write_text(f"N: 1\n{said}")
+    return str(file)
+
+
+def test_a_recorded_path_is_followed_and_a_straight_one_needs_its_ends_alone(tmp_path):
+    times = np.arange(0.0, 2.001, 0.02)
+    rng = np.random.default_rng(0)
+    for wild in (0.0, 1.0):
+        x = 10.0 + 0.5 * times + wild * rng.uniform(-1, 1, times.size).cumsum()
+        rows = np.stack([times, x, 3.0 - times, np.full(times.size, 2.5)], axis=1)
+        (body,) = read_moving(moving_world(tmp_path, rows), (int(wild), 0))
+        assert len(body.t_s) == (times.size if wild else 2)
+        assert body.body["rx"] == 0.5
+        for t, x_m, y_m, z_m in rows[::7]:
+            assert np.abs(body.place(t) - (-y_m, x_m, z_m)).max() < 1e-9
+        assert np.array_equal(body.place(9.0), body.place(2.0))
+
+
+def test_a_moving_world_that_cannot_be_read_is_refused(tmp_path):
+    file = moving_world(tmp_path, [(0, 1, 2, 3), (1, 2, 2, 3)], scale="2.0")
+    with pytest.raises(ValueError, match="Object1: scale must be equal"):
+        read_moving(file, (0, 0))
+    (tmp_path / "csvtrajs" / "one.csv").unlink()
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_moving(moving_world(tmp_path, [(0, 1, 2, 3)]).replace("dynamic", "no"), (1, 1))
+    with pytest.raises(ValueError, match="moving"):
+        make_scene("spheres", np.random.default_rng(0), moving=True)
+
+
 @pytest.mark.skipif(not FOREIGN.is_dir(), reason=NO_FOREIGN)
 def test_the_official_world_and_the_planners_layouts_are_read_and_have_ways_through():
     file = FOREIGN / "official" / "static_obstacles.csv"
@@ -129,6 +164,7 @@ def test_the_official_world_and_the_planners_layouts_are_read_and_have_ways_thro
     assert scene.passable(0.3, 5.0)
     assert scene.passable(0.0, 4.0)
     assert not scene.passable(0.3, 2.0)
+    assert len(read_moving(str(file.with_name("dynamic_obstacles.yaml")), (0, 0))) == 132
     easy = sorted((FOREIGN / "dess").glob("*/*/static_obstacles.csv"))
     assert len(easy) == 18
     for one in easy:

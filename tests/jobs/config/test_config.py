@@ -178,6 +178,14 @@ def test_a_job_is_called_by_its_name_and_by_the_names_that_it_had(words, meant):
     assert hydra_words(words) == meant
 
 
+WORDS = ("my_policy.py:policy", "a b.onnx", "it's, [here].csv", r"C:\a b", r"back\'slash", "end\\", "rgb-s1")
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_a_word_reaches_its_setting_as_it_was_typed(word):
+    assert compose("demo", word)["demo"]["policy"] == word
+
+
 @pytest.mark.parametrize("budget", ["smoke", "paper"])
 @pytest.mark.parametrize("exp", OF_EACH_LENGTH.values(), ids=OF_EACH_LENGTH)
 def test_every_length_has_a_file_of_every_budget_or_takes_the_budgets_own(exp, budget):
