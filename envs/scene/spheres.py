@@ -117,9 +117,9 @@ def moving_spheres(layout: SphereLayout) -> tuple[MovingBody, ...]:
     Raises:
         ValueError: A file is missing, or breaks a rule.
     """
-    beside = Path(layout.file).with_name("dynamic_obstacles.yaml")
     if not layout.moving:
         return ()
+    beside = Path(layout.file or "world").with_name("dynamic_obstacles.yaml")
     if not layout.file or not beside.is_file():
         raise ValueError(f"layout moving: must be false without {beside.name} beside the file of a scene")
     return read_moving(str(beside), (beside.stat().st_mtime_ns, beside.stat().st_size))
