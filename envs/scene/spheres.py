@@ -157,8 +157,8 @@ def _moving(path: str, name: str, said: dict[str, Any]) -> MovingBody:
     bends = np.ones(len(rows), bool)  # of a path at constant velocity both ends suffice
     bends[1:-1] = np.abs(np.diff(places, 2, axis=0)).max(axis=1, initial=0.0) > STRAIGHT_M
     x, y, z = places[0]
-    body = np.array((ELLIPSOID, x, y, z, radius, radius, radius, ALBEDO), OBSTACLE)
-    return MovingBody(body[()], rows[bends, 0], places[bends], bool(said.get("loop", False)))
+    body = np.array([(ELLIPSOID, x, y, z, radius, radius, radius, ALBEDO)], OBSTACLE)
+    return MovingBody(body[0], rows[bends, 0], places[bends], bool(said.get("loop", False)))
 
 
 def drawn_spheres(layout: SphereLayout, rng: np.random.Generator) -> np.ndarray:
