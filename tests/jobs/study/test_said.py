@@ -3,6 +3,7 @@
 import csv
 import re
 
+import numpy as np
 import pytest
 
 from jobs.run.provenance import REPOSITORY
@@ -61,6 +62,16 @@ def test_what_breaks_ten_seeds_is_what_the_data_say():
     own = [certain for (study, *_), (_, certain) in changes.items() if study == "ppo_claims"]
     found = re.search(r"With ten seeds by PPO (\d+) of (\d+) are", text)
     assert [int(one) for one in found.groups()] == [sum(own), len(own)]
+
+
+def test_what_nominal_success_tells_is_what_the_data_say():
+    found, told = read_published(REPOSITORY / "docs" / "data", "ppo_claims"), []
+    for group in ("bytestream", "bytestream_xy"):
+        nominal = found.values(found.nominal, group).mean(axis=1)
+        others = [found.values(at, group).mean(axis=1) for at in found.different if at != found.nominal]
+        told.append(f"{np.corrcoef(nominal, np.mean(others, axis=0))[0, 1]:.2f} (`{group}`)")
+        assert len(others) == 15
+    assert " and ".join(told) in " ".join((REPOSITORY / "docs" / "statistics.md").read_text().split())
 
 
 def test_a_page_about_trainings_that_have_been_replaced_says_so():
