@@ -11,15 +11,16 @@ import pytest
 
 from envs.config import EnvConfig, hashed_settings
 from jobs.bench import bench, bench_table, bench_verify
-from jobs.bench.evaluated import joined
+from jobs.bench.evaluated import cost_of, joined
 from jobs.bench.protocol import CLEAN, PROTOCOL, read_protocol, tasks_of
-from jobs.bench.result import RefusedResultError, read_result
+from jobs.bench.result import Cost, RefusedResultError, read_result
 from jobs.bench.score import failure_counts, score
 from jobs.config.config import ConfigError, parse
 from jobs.rollout.agents import make_agent
 from jobs.rollout.episodes import EPISODE, roll_out
 from jobs.rollout.policies import read_foreign, read_policy
 from jobs.rollout.store import PartResult
+from models.policy import PRETRAINED
 from tests.support.configs import compose
 from tests.support.fake_executor import FakeExecutor
 
@@ -48,6 +49,8 @@ def protocol(monkeypatch):
     known = dataclasses.replace(whole, reference={**whole.reference, "failures": counts})
     for module in (bench, bench_verify, bench_table):
         monkeypatch.setattr(module, "read_protocol", lambda: known)
+    cost = Cost(bytes=None, operations_per_event=None, ms_per_decision=0.25)
+    monkeypatch.setattr(bench, "cost_of", lambda *_: cost)  # which flies an episode
     return known
 
 
@@ -307,6 +310,15 @@ def test_a_function_acts_in_its_own_episode_alone(tmp_path):
     assert len(set(together["x_m"])) == 3
 
 
+def test_a_policy_costs_its_files_and_two_operations_a_feature_and_event():
+    policy = read_policy(str(PRETRAINED / "bytestream-s0"))
+    cost = cost_of(policy, "stochastic", SHORT)
+    assert cost.bytes == sum(file.stat().st_size for file in (PRETRAINED / "bytestream-s0").iterdir())
+    assert cost.operations_per_event == 2 * 256
+    assert cost.ms_per_decision > 0.0
+    assert cost_of(read_policy("straight"), "stochastic", SHORT).bytes is None
+
+
 @pytest.mark.parametrize("name", ["missing.onnx", "json:dumps_nothing", "no_such_module_at_all:policy"])
 def test_a_policy_from_elsewhere_that_is_not_there_is_refused(name):
     with pytest.raises(ConfigError, match=r"policy|plugins"):
@@ -316,7 +328,7 @@ def test_a_policy_from_elsewhere_that_is_not_there_is_refused(name):
 def test_an_onnx_file_of_a_policy_flies_as_the_policy_does(tmp_path):
     pytest.importorskip("onnxruntime", reason="needs the extra onnx")
     pytest.importorskip("onnxscript", reason="needs the extra onnx")
-    from models.policy import PRETRAINED, load_policy
+    from models.policy import load_policy
     from models.policy.onnx import export_onnx
 
     folder = PRETRAINED / "event_columns-s0"
