@@ -239,17 +239,17 @@ class CorridorEnv(gymnasium.Env):
 
     @property
     def seen_events(self) -> np.ndarray:
-        """The events that pass the neighbour filter (`EnvConfig.filter_support`)."""
+        """Return the events that pass the neighbour filter (`EnvConfig.filter_support`)."""
         return self._vehicles.seen_of(self._row)
 
     @property
     def true_events(self) -> np.ndarray:
-        """The events before the faults of the sensor."""
+        """Return the events before the faults of the sensor."""
         return self._vehicles.true_of(self._row)
 
     @property
     def luminance(self) -> np.ndarray:
-        """The last render, float32 (H, W), which the next step may change; 0 with observation "none"."""
+        """Return the last render, float32 (H, W); the next step may change it; 0 with observation "none"."""
         return self._sensor.luminance
 
     def camera_pose(self) -> tuple[float, float, float, float]:
@@ -286,7 +286,7 @@ class CorridorEnv(gymnasium.Env):
 
     @property
     def moving(self) -> tuple[MovingBody, ...]:
-        """The bodies that move, on the paths that they are on now; a throw gives a ball a new one."""
+        """Return the moving bodies on their current paths; a throw gives a ball a new path."""
         return self._vehicles.moving(self._row)
 
     def state_of_action(self) -> np.ndarray:

@@ -39,7 +39,7 @@ class StateObservation(gymnasium.Wrapper):
 
     @property
     def corridor(self) -> CorridorEnv:
-        """The wrapped environment."""
+        """Return the wrapped environment."""
         corridor = self.env.unwrapped
         assert isinstance(corridor, CorridorEnv)  # noqa: S101  for the type checker
         return corridor

@@ -7,7 +7,6 @@ import subprocess  # noqa: E402
 import sys  # noqa: E402
 from pathlib import Path  # noqa: E402
 
-import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 from tests.support.costs import Costs  # noqa: E402
@@ -39,12 +38,3 @@ def pytest_configure(config):
     """Measure the quick tests; a worker leaves their list to the process that started it."""
     most_units = None if hasattr(config, "workerinput") else config.getoption("--most-units")
     config.pluginmanager.register(Costs(most_units), "costs")
-
-
-def pytest_collection_modifyitems(items):
-    """Expect the failures of `known_failures.txt`: tests whose code moved and that nobody has mended yet."""
-    lines = (ROOT / "tests" / "known_failures.txt").read_text().split("\n")
-    known = {line for line in lines if line and not line.startswith("#")}
-    for item in items:
-        if item.nodeid.partition("[")[0] in known:
-            item.add_marker(pytest.mark.xfail(reason="listed in tests/known_failures.txt"))

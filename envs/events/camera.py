@@ -111,7 +111,7 @@ class EventCamera:
 
     @property
     def pixels(self) -> np.ndarray:
-        """The flat pixel y * W + x of each pixel of the memory, int64 (H * W,)."""
+        """Return the flat pixel y * W + x of each pixel of the memory, int64 (H * W,)."""
         return np.arange(self.config.width * self.config.height)
 
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
@@ -135,7 +135,7 @@ class EventCamera:
         self.t_us, self.dropped = t_us, 0
 
     def step(self, luminance: np.ndarray, t_us: int) -> np.ndarray:
-        """Events between the last frame and this one (appendix E.1).
+        """Return the events between the last frame and this one (appendix E.1).
 
         Times are interpolated linearly in the response and rounded to whole microseconds.
 
@@ -153,7 +153,7 @@ class EventCamera:
         return self.steps(_stacked(luminance), (t_us,))
 
     def steps(self, frames: np.ndarray, times_us: Sequence[int]) -> np.ndarray:
-        """Events of several frames, one after the other, in one call.
+        """Return the events of several successive frames in one call.
 
         Args:
             frames: float32 (K, H, W), K >= 1, each as `step` takes it.
@@ -191,7 +191,7 @@ class EventCamera:
         return events
 
     def _encoded(self, flat: np.ndarray) -> np.ndarray:
-        """The frames (K, N) as an 8-bit front end hands them on."""
+        """Return the frames (K, N) after an 8-bit front end."""
         assert self._tables is not None  # noqa: S101  for the type checker
         encoded = np.empty_like(flat)
         bad = int(encode(flat.ravel(), *self._tables, encoded.ravel()))
@@ -200,7 +200,7 @@ class EventCamera:
         return encoded
 
     def _filtered(self, seen: np.ndarray, times_us: np.ndarray) -> np.ndarray:
-        """The frames (K, N) as the photoreceptors' bandwidth hands them on."""
+        """Return the frames (K, N) after the bandwidth of the photoreceptors."""
         bad = int(crossings.first_invalid(seen.ravel()))
         if bad >= 0:
             raise self._invalid(seen, bad)
@@ -210,25 +210,25 @@ class EventCamera:
         return filtered
 
     def _checked(self, frames: np.ndarray, count: int) -> np.ndarray:
-        """The frames as a contiguous (K, N) array."""
+        """Return the frames as a contiguous (K, N) array."""
         if getattr(frames, "dtype", None) != LUMINANCE or frames.shape != (count, *self._shape) or not count:
             dtype, shape = getattr(frames, "dtype", type(frames)), getattr(frames, "shape", ())[1:]
             raise ValueError(f"luminance must be float32 {self._shape}; got {dtype} of shape {shape}.")
         return frames.reshape(count, -1)
 
     def _invalid(self, flat: np.ndarray, pixel: int) -> ValueError:
-        """The error for a value that is not a luminance."""
+        """Return the error for a value that is not a luminance."""
         y, x = divmod(pixel % flat.shape[1], self.config.width)
         return ValueError(f"luminance must be finite and >= 0; pixel x={x}, y={y} is {flat.flat[pixel]!s}.")
 
 
 def _stacked(luminance: np.ndarray) -> np.ndarray:
-    """One frame as a stack of one; what is no array stays as it is, to be refused."""
+    """Return one frame as a stack of one; what is no array stays unchanged, and is refused later."""
     return luminance[None] if isinstance(luminance, np.ndarray) else luminance
 
 
 def checked_time(t_us: int) -> int:
-    """A time as an int. Raises ValueError unless it is a whole number within +-2**52 [us]."""
+    """Return a time as an int. Raises ValueError unless it is a whole number within +-2**52 [us]."""
     try:
         t_us = operator.index(t_us)
     except TypeError:

@@ -181,7 +181,7 @@ def make_room():
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def named(model, memory):
-    """The model and the memory, with names."""
+    """Return the model and the memory, with names."""
     rule, curve, limits = model
     lights, levels, ends, is_banded = memory
     thresholds = Thresholds(limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
@@ -251,7 +251,7 @@ def set_quiet_bands(pixels, levels, model, memory, room):
 
 @inlined
 def _bound(value, inwards):
-    """A bound of the quiet band as float32, never further out than `value` and never invalid."""
+    """Return a bound of the quiet band as float32, never further out than `value` and never invalid."""
     return np.float32(min(max(value * inwards, 0.0), MAX_LUMINANCE))
 
 
@@ -270,7 +270,7 @@ def _set_level_lights(pixels, levels, curve, memory, room):
 
 @numba.njit(cache=True, error_model="numpy")
 def steps(frames, times_us, width, limit, model, memory, scratch):
-    """Events of several frames, one after the other; nothing changes if a value is no luminance.
+    """Compute the events of several successive frames; nothing changes if a value is no luminance.
 
     Args:
         frames: float32 (K, N).
@@ -308,7 +308,7 @@ def steps(frames, times_us, width, limit, model, memory, scratch):
 
 @numba.njit(cache=True, error_model="numpy")
 def _step(luminance, span, width, limit, model, memory, scratch):
-    """One frame: (first invalid pixel or -1, events lost, events)."""
+    """Compute one frame: (first invalid pixel or -1, events lost, events)."""
     flags, outside = scratch
     found = scan(luminance, 0, model, memory, flags, outside)
     counts, times = np.empty((2, found), np.int64), np.empty((2, found))

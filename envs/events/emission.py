@@ -69,7 +69,7 @@ def limit_events(trains, span, limit):
 
 @numba.njit(cache=True, error_model="numpy")
 def _count_until(trains, t, interval):
-    """Events up to and including time `t`."""
+    """Count the events up to and including time `t`."""
     total = 0
     for j in range(trains.sent.size):
         total += _train_until(trains, j, t, interval)
@@ -78,7 +78,7 @@ def _count_until(trains, t, interval):
 
 @numba.njit(cache=True, error_model="numpy")
 def _train_until(trains, j, t, interval):
-    """Events of train `j` up to and including time `t`."""
+    """Count the events of train `j` up to and including time `t`."""
     low, high = 0, trains.sent[j]
     while low < high:
         middle = (low + high) // 2
@@ -139,7 +139,7 @@ def sorted_events(times, places, span):
 
 @numba.njit(cache=True, error_model="numpy")
 def _emitted(trains, interval, width, total):
-    """Times [us after the last frame] and places (y << 13 | x << 1 | is ON) of all events, by pixel."""
+    """Return times [us since the last frame] and places (y << 13 | x << 1 | ON) of all events, by pixel."""
     times, places = np.empty(total, np.int64), np.empty(total, np.uint32)
     event, y = 0, 0
     for j in range(trains.pixels.size):
@@ -156,7 +156,7 @@ def _emitted(trains, interval, width, total):
 
 @numba.njit(cache=True, error_model="numpy")
 def _digits(interval, total):
-    """Passes and bits per pass of the sort: few events do not pay for a large table."""
+    """Choose passes and bits per pass of the sort: few events do not pay for a large table."""
     needed = 1
     while interval >> needed > 0:
         needed += 1
@@ -169,7 +169,7 @@ def _digits(interval, total):
 
 @numba.njit(cache=True, error_model="numpy")
 def _starts(times, shift, mask, largest):
-    """Where the events of each digit, at most `largest`, start in the order of that digit."""
+    """Return where the events of each digit, at most `largest`, start in the order of that digit."""
     starts = np.zeros(largest + 2, np.int64)
     for t in times:
         starts[((t >> shift) & mask) + 1] += 1
@@ -180,7 +180,7 @@ def _starts(times, shift, mask, largest):
 
 @numba.njit(cache=True, error_model="numpy")
 def _moved(times, places, shift, mask):
-    """Times and places in the order of one digit, ties as they were."""
+    """Return times and places in the order of one digit; ties keep their order."""
     start = _starts(times, shift, mask, mask)
     moved_times, moved_places = np.empty_like(times), np.empty_like(places)
     for i in range(times.size):

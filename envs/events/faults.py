@@ -144,13 +144,13 @@ class RealSensor:
 
     @property
     def pixel_noise(self) -> PixelState:
-        """The noise of the pixels; of none if they have none."""
+        """Return the state of the pixel noise; `NO_NOISE` if the pixels have none."""
         return self._noise.state if self._noise is not None else NO_NOISE
 
     def events(
         self, events: np.ndarray, t0_us: int, t1_us: int, fired: np.ndarray | None = None
     ) -> np.ndarray:
-        """What leaves the sensor in (t0_us, t1_us], of what the light's changes fired in it.
+        """Return the events that leave the sensor in (t0_us, t1_us], given those that the light fired.
 
         The camera has seen the light of t1_us. `fired` is what `pixel_noise.fire` found of `pixel_noise` for
         this interval, if that was called. As `apply_faults`, which also says what is raised.
@@ -180,7 +180,7 @@ class RealSensor:
         return events
 
     def _sent(self, events: np.ndarray, t1_us: int) -> np.ndarray:
-        """What the readout sends until a time [us]."""
+        """Return the events that the readout sends until a time [us]."""
         assert self._readout is not None  # noqa: S101  for the type checker
         sent, self.lost = self._readout.send(events, t1_us)
         return sent
@@ -320,7 +320,7 @@ def _expected(
 
 
 def _at_any_time(where: np.ndarray, span_us: Span, rng: np.random.Generator) -> Noise:
-    """Events at these flat pixels, times and polarities uniform."""
+    """Draw events at these flat pixels with uniform times and polarities."""
     times = rng.integers(*span_us, where.size) + 1
     return times, where, 2 * rng.integers(0, 2, where.size) - 1
 

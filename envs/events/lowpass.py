@@ -60,7 +60,7 @@ def low_pass(num_pixels: int) -> LowPass:
 
 
 def column_filter(config: CameraConfig) -> ColumnFilter:
-    """The bandwidth of a camera, before a first image."""
+    """Return the bandwidth of a camera, before a first image."""
     size = config.width * config.height if config.cutoff_hz > 0.0 else 0
     room = np.zeros((4, config.height)), np.zeros(config.height, np.int64)
     return ColumnFilter(
@@ -124,7 +124,7 @@ def filter_frames(
 
 @inlined
 def _followed(filtered: float, slope: tuple, decay: float) -> float:
-    """What is behind the filter after a response that is linear in time.
+    """Return the filter's output after a response that is linear in time.
 
     Args:
         filtered: What was behind it.

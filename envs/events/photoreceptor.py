@@ -37,7 +37,7 @@ class Curve(NamedTuple):
 
 
 def response_curve(response: str, luminance_floor: float) -> Curve:
-    """The response curve of a camera's settings.
+    """Return the response curve of a camera's settings.
 
     With a = luminance_floor and L the luminance: "log" is log(L + a). "lin_log" is log(L)
     from a upwards and log(a) + (L - a) / a below it; value and slope are continuous at a.
@@ -141,7 +141,7 @@ def light_of(curve, levels, exponents):
 
 
 def encoding_tables(encoding: str) -> tuple[np.ndarray, np.ndarray]:
-    """Where an 8-bit encoding changes its code, float32 (255,), and what each code means, float32 (256,).
+    """Return where an 8-bit encoding changes its code, float32 (255,), and the value of each, float32 (256,).
 
     "linear8" rounds the luminance to the nearest multiple of 1/255; "gamma8" rounds its power
     1/2.2 so, and decodes it again. Light above 1 has code 255.

@@ -47,7 +47,7 @@ SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black 
 FIRED = 1024  # events, for which there is room at first
 PER_SIGMA = 64  # entries of the table of waiting rates
 MOST_SIGMAS, FEWEST_SIGMAS = 12.0, 0.5  # of a threshold
-SLICE = 1 / 32  # of a threshold, the most that a level leaks before the waiting times are taken anew
+SLICE = 1 / 32  # of a threshold, the most that a level leaks before the waiting times are taken again
 SAME_LIGHT = 5e-4  # relative; a change of the light that the waiting times need not follow
 
 
@@ -141,7 +141,7 @@ def mean_rate(sigmas: float) -> float:
 
 @lru_cache(maxsize=16)
 def threshold_in_sigmas(events_per_tau: float) -> float:
-    """How many sigmas a threshold is, for so many shot noise events per tau.
+    """Compute how many sigmas a threshold is, for so many shot noise events per tau.
 
     Raises:
         ValueError: If noise of that bandwidth cannot cross thresholds as often.
@@ -210,7 +210,7 @@ def _scratch(size: int) -> tuple:
 
 
 def no_noise() -> PixelState:
-    """The state of a camera whose pixels have no noise."""
+    """Return the state of a camera whose pixels have no noise."""
     rows = np.zeros((0, 9)), np.zeros((2, 0), np.float32), np.zeros(0), np.zeros(0, np.int64)
     return PixelState(rows, Process(0.0, 1.0, np.zeros(2), 0.0, 1.0), np.random.default_rng(0), _scratch(0))
 
@@ -266,7 +266,7 @@ class PixelNoise:
         move_levels(self._model, self._memory, -rng.random(size) * alive)
 
     def events(self, t0_us: int, t1_us: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What the noise fires in (t0_us, t1_us], after the events of the light, which is that of t1_us.
+        """Return the noise events of (t0_us, t1_us], after those of the light, which is the light of t1_us.
 
         Returns:
             Times [us], flat pixels y * W + x and polarities, int64 each.
@@ -279,7 +279,7 @@ class PixelNoise:
         return rows[:, 8].copy(), kept_us.copy()
 
     def of_image(self, fired: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `events`, of what `fire` returns."""
+        """Convert the output of `fire` to the output of `events`."""
         return fired[0], self._numbers[fired[1]], fired[2]
 
 
@@ -301,7 +301,7 @@ def move_levels(model, memory, shares):
 
 @numba.njit(cache=True, error_model="numpy")
 def fire(t0_us, t1_us, model, memory, state):
-    """Events of the noise in (t0_us, t1_us], after those of the light, which is that of t1_us.
+    """Fire the noise of (t0_us, t1_us], after the events of the light, which is the light of t1_us.
 
     Args:
         t0_us: When the interval begins [us].
@@ -345,7 +345,7 @@ def fire(t0_us, t1_us, model, memory, state):
 
 @numba.njit(cache=True, error_model="numpy")
 def _with_more_room(fired):
-    """The same events, in twice the room."""
+    """Copy the events into twice the room."""
     larger = np.empty((3, 2 * fired.shape[1]), np.int64)
     larger[:, : fired.shape[1]] = fired
     return larger

@@ -126,12 +126,12 @@ class ColumnCamera:
 
     @property
     def pixels(self) -> np.ndarray:
-        """The flat pixel y * W + x of each pixel of the memory, int64 (W * H,)."""
+        """Return the flat pixel y * W + x of each pixel of the memory, int64 (W * H,)."""
         return np.arange(self._shape[0] * self._shape[1]).reshape(self._shape).T.ravel()
 
     @property
     def last_frame(self) -> np.ndarray:
-        """The last frame, float32 (H, W), as it was seen before any filter; not a copy."""
+        """Return the last frame, float32 (H, W), as it was seen before any filter; not a copy."""
         limited = self.bandwidth.seen.size > 0
         frame: np.ndarray = self.bandwidth.pixels.light if limited else self.state[1][0][0]
         return frame.reshape(self._shape[::-1]).T
@@ -335,7 +335,7 @@ def _straighten(ramps, order, levels):
 
 @numba.njit(cache=True, error_model="numpy")
 def _row_after_row(ramps, kept, height):
-    """The ramps' places, int64 (kept,), by rows of the image; those of a row as they come."""
+    """Return the places of the ramps, int64 (N,), by rows of the image; within a row in their given order."""
     starts, order = np.zeros(height + 1, np.int64), np.empty(kept, np.int64)
     for j in range(kept):
         starts[ramps.pixels[j] - ramps.columns[j] * height + 1] += 1

@@ -27,7 +27,7 @@ class Readout:
         self._free_us, self._row = float(t_us), 0
 
     def send(self, events: np.ndarray, t1_us: int) -> tuple[np.ndarray, int]:
-        """What leaves the sensor until a time; the rest waits for the next call.
+        """Return the events that leave the sensor until a time; the others wait for the next call.
 
         Args:
             events: Events of the pixels since the last call, sorted by t, at most `t1_us`.

@@ -12,7 +12,7 @@ MAX_WINDOW_US = 2**31 - 1
 
 
 def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int) -> np.ndarray:
-    """Events of one window as an integer array of fixed size.
+    """Pack the events of one window into an integer array of fixed size.
 
     Row 0 is [count, dropped, window_us, 0]; rows 1 to count are [t - start_us, x, y, p], in
     time order; the rest is 0. Beyond the capacity the newest are kept, the others counted.
@@ -73,7 +73,7 @@ def pack_windows(
 
 
 def unpack_window(window: np.ndarray) -> tuple[np.ndarray, int]:
-    """Events of a packed window, with t counted from its start, and the window's length [us].
+    """Return the events of a packed window, with t counted from its start, and the window's length [us].
 
     Args:
         window: int32 (capacity + 1, 4), as `pack_window` makes it.

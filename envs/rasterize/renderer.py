@@ -55,7 +55,7 @@ class PyrenderRenderer:
         samples: int = 2,
         cull_m: float = math.inf,
     ) -> None:
-        """Renderer of `width` x `height` pixels and `fov_deg` across.
+        """Create a renderer of `width` x `height` pixels and `fov_deg` across.
 
         Args:
             scene: What to draw.

@@ -21,7 +21,7 @@ from envs.scene.textures import TILE_PERIODS, noise_waves
 WAVES = len(noise_waves(0)[0])  # a multiple of four, by which they are summed
 PARTS = 64  # of a pixel of the ground, at most: beyond, waves cancel
 LONGEST = 1e6  # [tiles]
-MAX_TABLE = 2**22  # numbers in a table of the ground; larger images average each pixel anew
+MAX_TABLE = 2**22  # numbers in a table of the ground; larger images average each pixel again
 
 REAL = np.float32
 PI, ONE, TWO, HALF = REAL(math.pi), REAL(1.0), REAL(2.0), REAL(0.5)

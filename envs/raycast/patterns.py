@@ -143,7 +143,7 @@ def _level_row(canvas: Canvas, look: Record, rows: Rows, height: float, u: float
 def _level_part(
     canvas: Canvas, look: Record, drop: float, low: float, high: float, u: float, wide: float
 ) -> float:
-    """The same between two rows below the horizon, in parts of equal rows where much is seen between them."""
+    """Average between two rows below the horizon, in parts of equal rows where much is visible."""
     frame = canvas.frame
     along_s, along_q = u * frame.cos - frame.sin, u * frame.sin + frame.cos
     long = abs(drop / low - drop / high) * look.frequency
@@ -257,7 +257,7 @@ def _swing(frame: Record, look: Record, s: float, along: float) -> float:
 
 @kernel
 def _swing_around(frame: Record, body: Record, strip: Record, s: float, along: float) -> float:
-    """The same around a pole, lit as the gap is, and cut at the pattern's edges as far as there are few."""
+    """Average around a pole, lit as the gap is, and cut at the pattern's edges if there are few."""
     look, left, right = frame.body_texture, strip.gap_slopes.left, strip.gap_slopes.right
     ahead = 2.0 * look.frequency
     begun = (s - 0.5 * along - look.speed_s * frame.time) * ahead
@@ -348,7 +348,7 @@ def _texture_wall(canvas: Canvas, layer: Layer, u: float, whole: float) -> None:
 def _part(
     frame: Record, row: int, shown: tuple[float, float, float], u: float, whole: float
 ) -> tuple[Rows, float, float]:
-    """What shows of a row, as a rectangle of its area around its middle: its rows, middle slope, and width.
+    """Return the visible part of a row as a rectangle of its area: rows, slope of the middle, width.
 
     `shown` is the share of the row, and its moments down and across.
     """
@@ -381,7 +381,7 @@ def _wall(frame: Record, side: float, u: float, wide: float) -> Upright:
 
 @kernel
 def _along_face(frame: Record, body: Record, strip: Record) -> Upright:
-    """The face of a box that the gap shows: s is the world's y (x) where it looks along x (y)."""
+    """Return the coordinate along the visible face of a box: y (x) if the face looks along x (y)."""
     cos, sin, left, right = frame.cos, frame.sin, strip.gap_slopes.left, strip.gap_slopes.right
     along_x, along_y = strip.slope * cos - sin, strip.slope * sin + cos
     near_x, near_y, _ = box_slab(body, along_x, along_y)

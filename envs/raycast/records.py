@@ -14,7 +14,7 @@ Record: TypeAlias = np.record
 
 
 def _record(fields: Sequence[tuple[str, str | np.dtype]]) -> np.dtype:
-    """A record whose fields are attributes, in a kernel as in Python (NUMBA_DISABLE_JIT=1)."""
+    """Return a record whose fields are attributes, in a kernel as in Python (NUMBA_DISABLE_JIT=1)."""
     return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 

@@ -72,7 +72,7 @@ class Picture(NamedTuple):
 
 
 def decoded_video(path: Path) -> Iterator[Picture]:
-    """The pictures of a video file, in turn.
+    """Yield the pictures of a video file, in order.
 
     Raises:
         ValueError: It is no video, is damaged, has a frame without time, or above 2**26 pixels.
@@ -82,7 +82,7 @@ def decoded_video(path: Path) -> Iterator[Picture]:
 
 
 def decoded_images(paths: Sequence[Path]) -> Iterator[Picture]:
-    """The pictures of image files, in turn; their times are those of 25 pictures a second.
+    """Yield the pictures of image files, in order; their times are those of 25 pictures a second.
 
     Raises:
         ValueError: One is no image of the kind that its suffix names, is damaged, or above 2**26 pixels, or
@@ -95,7 +95,7 @@ def decoded_images(paths: Sequence[Path]) -> Iterator[Picture]:
 
 
 def _decoded_links(paths: Sequence[Path], suffix: str) -> Iterator[Picture]:
-    """The pictures, by links with numbers for names, which ffmpeg reads one after the other as one stream."""
+    """Yield the pictures through numbered links, which ffmpeg reads as one stream."""
     with tempfile.TemporaryDirectory() as folder:
         for number, path in enumerate(paths):
             (Path(folder) / f"{number}{suffix}").symlink_to(path.resolve())
@@ -109,7 +109,7 @@ def _decoded_links(paths: Sequence[Path], suffix: str) -> Iterator[Picture]:
 
 
 def _decoded(path: Path, options: list[str], folder: str | None) -> Iterator[Picture]:
-    """What ffmpeg decodes in a folder, as it writes pictures to one pipe and a line for each to another."""
+    """Yield what ffmpeg decodes in a folder: pictures come by one pipe, a line for each by another."""
     # fmt: off
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-nostats", "-hide_banner", "-threads", "1", "-xerror",
@@ -172,7 +172,7 @@ def _paired(path: Path, pictures: IO[bytes], lines: queue.SimpleQueue) -> Iterat
 
 
 def _next_line(path: Path, lines: queue.SimpleQueue) -> str | None:
-    """The next thing that ffmpeg says."""
+    """Return the next line that ffmpeg prints."""
     try:
         line: str | None = lines.get(timeout=FRAME_TIMEOUT_S)
     except queue.Empty:
@@ -181,14 +181,14 @@ def _next_line(path: Path, lines: queue.SimpleQueue) -> str | None:
 
 
 def _time_us(path: Path, ticks: str, second: Fraction | None) -> int:
-    """A presentation time in whole microseconds."""
+    """Return a presentation time in whole microseconds."""
     if second is None or not re.fullmatch(r"-?\d+", ticks):
         raise ValueError(f"{path}: a frame has no time; encode it again at a constant frame rate")
     return round(int(ticks) * second * 1_000_000)
 
 
 def _picture(path: Path, pictures: IO[bytes], name: str, width: str, height: str) -> np.ndarray:
-    """The next picture, as `Picture.values`."""
+    """Return the next picture, as `Picture.values`."""
     layout, shape = LAYOUTS[name], (int(height), int(width))
     size = shape[0] * shape[1] * len(layout.channels) * layout.dtype.itemsize
     raw = pictures.read(size)

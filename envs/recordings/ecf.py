@@ -39,7 +39,7 @@ def decode_ecf(raw: np.ndarray, events: np.ndarray) -> bool:
 
 @numba.njit(cache=True, error_model="numpy")
 def _number(raw: np.ndarray, place: int, size: int) -> int:
-    """A little-endian number of so many bytes."""
+    """Return a little-endian number of so many bytes."""
     value = np.int64(0)
     for i in range(size):
         value |= np.int64(raw[place + i]) << 8 * i
@@ -48,7 +48,7 @@ def _number(raw: np.ndarray, place: int, size: int) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def _length(raw: np.ndarray, place: int, count: int, longest: int) -> tuple[int, int]:
-    """How many events a word is for, in two bytes after it if they are many; and what place comes next."""
+    """Read how many events a word stands for, in two more bytes if they are many, and the next place."""
     if count < longest:
         return count, place
     if place + 2 > raw.size:

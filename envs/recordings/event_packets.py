@@ -1,7 +1,7 @@
 """Decode the packets of event_camera_msgs, by the descriptions in event_camera_codecs (Apache 2.0).
 
 The encodings of Prophesee's cameras are streams of words: what a packet does not say the one before it did.
-libcaer's and mono are rows of 8 bytes; libcaer_cmp is words of 16 bits, and begins anew with each packet.
+libcaer's and mono are rows of 8 bytes; libcaer_cmp is words of 16 bits, and starts again with each packet.
 """
 
 import numba

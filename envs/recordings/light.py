@@ -16,12 +16,12 @@ FLOOR_LEVELS = 10  # grey levels below which a linear scale is too coarse for re
 
 
 def usual_transfer(dtype: np.dtype) -> Transfer:
-    """How values become light where nobody says: whole numbers are sRGB, floating point is linear."""
+    """Choose the transfer function where none is stated: whole numbers are sRGB, floating point is linear."""
     return "linear" if dtype.kind == "f" else "srgb"
 
 
 def usual_floor(dtype: np.dtype, transfer: Transfer) -> float:
-    """The luminance floor that is right for pictures of a dtype (docs/camera.md).
+    """Return the luminance floor that is right for pictures of a dtype (docs/camera.md).
 
     A linear scale of whole numbers shows nothing of relative changes below some grey levels, so the floor
     is ten of them: 10/255 for 8 bits. All other pictures get `LUMINANCE_FLOOR`, and none gets less.

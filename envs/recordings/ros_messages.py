@@ -66,7 +66,7 @@ class Values:
 
     @property
     def place(self) -> int:
-        """The place of the next byte."""
+        """Return the place of the next byte."""
         return self._place
 
 

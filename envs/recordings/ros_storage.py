@@ -49,7 +49,7 @@ def open_bags(request: Request) -> list[Bag]:
     _library(request)
     try:
         return [_whole(path)]
-    except Exception:  # the library's errors have no common base, and salvage judges anew
+    except Exception:  # the library's errors have no common base, and salvage judges again
         files = [path] if path.is_file() else sorted(one for one in path.iterdir() if one.suffix in STORAGE)
     if not files:
         raise request.refusal(

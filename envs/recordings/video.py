@@ -68,7 +68,7 @@ def video_to_events(  # noqa: PLR0913 - each is a choice of its own
     max_events: int = MAX_EVENTS,
     max_bytes: int = MAX_BYTES,
 ) -> EventFile:
-    """All events of a video or of a folder of images at once; `video_steps` gives them frame by frame.
+    """Return all events of a video or of a folder of images; `video_steps` yields them frame by frame.
 
     Args:
         path: The video file, or the folder.
@@ -125,7 +125,7 @@ def video_steps(
     rng: np.random.Generator | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Iterator[VideoStep]:
-    """Events of a video or of a folder of images from frame to frame, in the memory of one frame.
+    """Yield the events of a video or of a folder of images from frame to frame, in the memory of one frame.
 
     A folder has an `images.txt` with a line "time [s] name" for each image, or needs `fps`. Values of 8 and
     16 bits and floating point are read as they are.
@@ -221,7 +221,7 @@ class Eye:
             self._real = RealSensor(config, self._faults, state, self._rng, t_us, labels=True)
 
     def step(self, light: np.ndarray, t_us: int) -> VideoStep:
-        """What it fires until the next frame."""
+        """Return the events until the next frame."""
         config, last_us, seen = self._camera.config, self._camera.t_us, self._average(light)
         assert last_us is not None  # noqa: S101  for the type checker
         parts, dropped = [], 0
@@ -237,7 +237,7 @@ class Eye:
         return VideoStep(t_us, events, is_noise, dropped, config.width, config.height, self._loss.share)
 
     def _between(self, light: np.ndarray, last_us: int, t_us: int) -> Iterator[tuple[int, np.ndarray]]:
-        """Times [us] and pictures, on the camera's pixels, between the last frame and this one."""
+        """Yield times [us] and pictures, on the camera's pixels, between the last frame and this one."""
         if self._by_flow:
             floor = self._camera.config.luminance_floor
             for share, picture in frames_between(self._last, light, floor or LUMINANCE_FLOOR, t_us - last_us):
@@ -256,7 +256,7 @@ class Eye:
 
 
 def _frames(path: Path, fps: float | None, max_bytes: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Times [us] and values of the frames of a file or a folder."""
+    """Yield times [us] and values of the frames of a file or a folder."""
     if path.is_dir():
         paths, times_us = find_images(path, fps, max_bytes)
         for t_us, picture in zip(times_us, decoded_images(paths), strict=True):

@@ -178,7 +178,7 @@ class SphereLayout:
     """A world of spheres, of a file or drawn as the DodgeDrone challenge draws them (`envs.scene.spheres`).
 
     Attributes:
-        file: Path of a CSV file; "": drawn anew for each episode.
+        file: Path of a CSV file; "": drawn again for each episode.
         density: Times as many spheres as the challenge's generator draws, without a file.
         length_m: The goal line [m].
         width_m, wall_height_m: The lane and its walls, at which a flight ends [m]. The challenge's box has no

@@ -142,7 +142,7 @@ class Sensor:
 
     @property
     def lost(self) -> int:
-        """Events of the last step that the readout lost."""
+        """Return how many events of the last step the readout lost."""
         return self._real.lost
 
     def view(self) -> View:

@@ -52,7 +52,7 @@ class Bodies:
 
     @property
     def velocities(self) -> np.ndarray:
-        """The velocities of all vehicles, (2, B) [m/s]; 0 of kinematic ones."""
+        """Return the velocities of all vehicles, (2, B) [m/s]; 0 for kinematic vehicles."""
         return self._state[:, 2:4].T
 
     def move(self, actions: np.ndarray, active: np.ndarray) -> None:

@@ -82,7 +82,7 @@ class PointMass:
 
     @property
     def wind(self) -> tuple[float, float]:
-        """The wind, x and y [m/s]."""
+        """Return the wind, x and y [m/s]."""
         return self.wind_x_mps, self.wind_y_mps
 
 
@@ -228,7 +228,7 @@ def _relax_axis(state, axis, a, rate, seconds):
 
 @numba.njit(cache=True, error_model="numpy")
 def _integrals(rate, seconds):
-    """The first and the second integral of exp(-rate t) over some seconds."""
+    """Return the first and the second integral of exp(-rate t) over some seconds."""
     x = rate * seconds
     if x < 1e-3:  # where the difference below would cancel
         first = seconds * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x / 24.0)))

@@ -182,7 +182,7 @@ def _draw_choice(picture: Image.Image, box: Box, moment: Moment) -> None:
 
 
 def _draw_choices(picture: Image.Image, box: Box, moment: Moment) -> None:
-    """The probability of each of many actions, from the left to the right command, as bars upwards."""
+    """Draw the probability of each of many actions as bars upwards, from the left to the right command."""
     draw, (left, top, width, height) = ImageDraw.Draw(picture), box
     bottom, pitch = top + height - LINE, width / moment.probabilities.size
     for action, share in enumerate(moment.probabilities.tolist()):

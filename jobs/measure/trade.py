@@ -5,7 +5,7 @@ Expect: by estimate an hour on two idle cores. In the run folder under `trade/`,
 MLflow, tables, a plot, and the page that says what to choose, which `+exp=report` puts into docs/.
 All trainings of `trade.policies` are evaluated in the same corridors of each scene under every setting. A
 stopped job continues when the same command is given again: no episode is evaluated twice; costs and errors
-are measured anew.
+are measured again.
 """
 
 import dataclasses

@@ -74,7 +74,7 @@ def read_policy(agent: str) -> EvaluatedPolicy:
         raise ConfigError(f"policy: {error}") from None
     missing = [name for name in ("name", "seed", "sensor") if name not in manifest]
     if missing:
-        raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it anew")
+        raise ConfigError(f"policy: the manifest of {agent!r} lacks {missing}; train it again")
     changed = changed_plugins(manifest.get("plugins") or {})
     if changed:
         said = f"{', '.join(changed)} changed since the training of {agent}; its results may differ from then"

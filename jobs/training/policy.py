@@ -63,7 +63,7 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
         _, about = load_encoder(path)
     except EncoderFileError as error:
         marker = Path(path).parent.parent / "stages" / "pretrain.json"
-        raise RunError(f"{error}; delete {marker}, and the same command makes the encoder anew") from None
+        raise RunError(f"{error}; delete {marker}, and the same command makes the encoder again") from None
     differ = differences(about["sensor"], sensor_settings(config.env))
     if differ:
         remedy = "use its settings, or pretrain an encoder for these"

@@ -187,7 +187,7 @@ def check_data(folder: Run) -> None:
     if reason not in (None, UNSEALED):  # older versions did not seal them
         marker = folder.path / "stages" / "collect.json"
         raise RunError(
-            f"{folder.data}: damaged ({reason}); delete {marker}, and the same command collects anew"
+            f"{folder.data}: damaged ({reason}); delete {marker}, and the same command collects again"
         )
 
 

@@ -212,7 +212,7 @@ def export_policy(
     encoder = module.encoder if isinstance(module, PolicyModule) else None
     trained_on = {} if encoder is None else encoder.state_dict()
     if not all(torch.equal(value, frozen[name]) for name, value in trained_on.items()):
-        raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train anew")
+        raise TrainingError(f"{encoder_path}: not the encoder that {checkpoint} was trained on; train again")
     about = {**policy_about(config), "figures": figures}
     networks = algorithm_of(config).networks(module, spec)
     save_policy(target, networks, spec, about, evae, of_encoder.get("figures"))

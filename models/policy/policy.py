@@ -239,7 +239,7 @@ class Policy:
         state = np.where(first[:, None], np.float32(0.0), self._state)
         logits, self._state = self._run(self._stacks, state)
         if not np.isfinite(logits).all():
-            raise ValueError("the policy's logits must be finite, got NaN or infinity; train it anew")
+            raise ValueError("the policy's logits must be finite, got NaN or infinity; train it again")
         return logits
 
     def _choose(self, logits: np.ndarray) -> np.ndarray:
@@ -380,7 +380,7 @@ def read_policy_manifest(file: Path) -> dict[str, Any]:
 def _read_manifest(file: Path) -> tuple[PolicyManifest, PolicySpec]:
     manifest: Any = read_policy_manifest(file)
     if (found := manifest.get("format")) != FORMAT:
-        raise PolicyFileError(f"{file}: format {found!r}, this version reads {FORMAT}; train it anew")
+        raise PolicyFileError(f"{file}: format {found!r}, this version reads {FORMAT}; train it again")
     missing = [key for key in REQUIRED if key not in manifest]
     if missing:
         raise PolicyFileError(f"{file}: the manifest lacks {missing}; export the policy again")

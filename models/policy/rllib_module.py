@@ -120,7 +120,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
 
     def set_state(self, state: Any) -> None:
-        """Load weights; the table is built anew only if they change the encoder."""
+        """Load weights; the table is built again only if they change the encoder."""
         if self.encoder is None:
             super().set_state(state)
             return

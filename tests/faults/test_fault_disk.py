@@ -308,7 +308,7 @@ def test_a_kept_file_that_is_damaged_is_refused_by_name_with_a_remedy(name, tmp_
         else:
             assert type(error).__module__.split(".")[0] in ("jobs", "models")
             assert str(file.parent) in str(error)
-            assert re.search("delete|copy|again|anew", str(error)), error
+            assert re.search("delete|copy|again", str(error)), error
     outcome(f"damaged: {name}", "refused with the file and the remedy", "nothing else")
 
 

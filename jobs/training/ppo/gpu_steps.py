@@ -96,7 +96,7 @@ class GpuSteps:
             orders: int64 (epochs, N), the order of the rows in each epoch.
             minibatch_size: Rows of a step; the last of an epoch may have fewer.
             grad_clip: Largest norm of a gradient.
-            variant: What the loss depends on beside its arguments: another one is recorded anew.
+            variant: What the loss depends on beside its arguments: another one is recorded again.
 
         Returns:
             Means over the minibatches of the last epoch: parts of the loss, the loss itself (`TOTAL`), and

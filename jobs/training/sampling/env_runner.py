@@ -183,7 +183,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         """Continue from the snapshot of another process; the weights come by `set_state`.
 
         Returns:
-            Why the episodes begin anew instead, in a few words; empty if they go on.
+            Why the episodes start again instead, in a few words; empty if they go on.
 
         Raises:
             RolloutError: The process could not be built.
@@ -261,7 +261,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return done + going_on
 
     def _reset_all(self) -> None:
-        """Start every episode anew; unfinished ones are dropped."""
+        """Start every episode again; unfinished ones are dropped."""
         seed = self._seed if self._needs_initial_reset else None
         observations, infos = self.env.unwrapped.reset(seed=seed)
         first, space = np.ones(self.env.num_envs, bool), self.module.observation_space

@@ -29,7 +29,7 @@ class Rounds:
 
     Attributes:
         snapshots: Where each env runner stood after the last round, or stands before the first.
-        problems: Why episodes had to begin anew, in a few words each.
+        problems: Why episodes had to start again, in a few words each.
     """
 
     def __init__(self, group: EnvRunnerGroup) -> None:

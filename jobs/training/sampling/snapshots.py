@@ -72,7 +72,7 @@ def read_snapshots(checkpoint: Path) -> dict[str, Snapshot] | None:
         return None
     about = read_json(folder / ABOUT)
     if about.get("layout") != LAYOUT:
-        remedy = "continue with the version that wrote it, or delete the run's train/ to train anew"
+        remedy = "continue with the version that wrote it, or delete the run's train/ to train again"
         raise RunError(f"{folder}: layout must be {LAYOUT}, got {about.get('layout')!r}; {remedy}")
     return {name: _read(folder / name) for name in about["processes"]}
 

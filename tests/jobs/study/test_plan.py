@@ -216,7 +216,7 @@ def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
     ))  # fmt: skip
     assert refusal(one, two).startswith("study.policies: two policies are a with training seed 0, got ")
     (tmp_path / "one" / MANIFEST).write_text("{}")
-    assert "lacks ['name', 'seed', 'sensor']; train it anew" in refusal(one)
+    assert "lacks ['name', 'seed', 'sensor']; train it again" in refusal(one)
 
 
 @pytest.mark.parametrize(

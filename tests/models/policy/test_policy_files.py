@@ -88,7 +88,7 @@ def first_format(folder):
         (link_networks, r"networks\.safetensors: cannot be read: a link, which could name any file; copy"),
         (pipe_networks, r"networks\.safetensors: cannot be read: no regular file"),
         (cut_manifest, r"policy\.json: not a JSON file"),
-        (first_format, r"policy\.json: format 1, this version reads 2; train it anew$"),
+        (first_format, r"policy\.json: format 1, this version reads 2; train it again$"),
         (change_manifest(format=3), r"format 3, this version reads 2"),
         (forget("name"), r"the manifest lacks \['name'\]"),
         (change_manifest(name="snn"), r"name must be one of bytestream, .*, got 'snn'"),
