@@ -21,7 +21,7 @@ from jobs.study.contrasts import Finding
 from jobs.study.dose_figure import dose_figure
 from jobs.study.doses import Dose
 from jobs.study.results import Condition, Results, text_of
-from jobs.study.spec import Family, tags_of
+from jobs.study.spec import Family, Section, tags_of
 from jobs.study.spread import crossed_tables, factors
 from jobs.study.summaries import Summary
 from jobs.study.tables import scale_of
@@ -42,7 +42,7 @@ class Drawn(NamedTuple):
         doses: Event errors of its conditions, if they were measured.
     """
 
-    study: Mapping[str, Any]
+    study: Section
     results: Results
     changes: Sequence[Change]
     summaries: Sequence[Summary]
@@ -50,7 +50,7 @@ class Drawn(NamedTuple):
     doses: Sequence[Dose]
 
 
-def change_map(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def change_map(drawn: Drawn, said: Section) -> Figure:
     """Draw success [%] of conditions x groups, coloured by its change; the first row is the baseline."""
     changes = drawn.changes
     columns = [group for group in drawn.results.groups if any(change.group == group for change in changes)]
@@ -91,7 +91,7 @@ def _write_cell(panel: Axes, success: np.ndarray, points: float, row: int, colum
         panel.text(column, row, text, ha="center", va="center", color=colour, fontsize=9, weight=weight)
 
 
-def forest(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def forest(drawn: Drawn, said: Section) -> Figure:
     """Draw each test of a family with its interval, a panel for each unit, coloured by the verdict."""
     family, tested = drawn.families[said["family"]][0], tested_of(drawn, said)
     units = list(dict.fromkeys(scale_of(one.contrast) for one in tested))
@@ -120,7 +120,7 @@ def forest(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def tested_of(drawn: Drawn, said: Mapping[str, Any]) -> list[Finding]:
+def tested_of(drawn: Drawn, said: Section) -> list[Finding]:
     """Return the findings of a figure's family that have an interval; single trainings have none."""
     findings = drawn.families[said["family"]][1]
     return [one for one in findings if one.difference and one.difference.interval]
@@ -158,7 +158,7 @@ def worst_conditions(results: Results, changes: Sequence[Change]) -> dict[str, C
     return found
 
 
-def survival(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def survival(drawn: Drawn, said: Section) -> Figure:
     """Draw the share of episodes still going over distance, unchanged and in the worst condition."""
     results, worst = drawn.results, worst_conditions(drawn.results, drawn.changes)
     length_m = _scene(results).length_m
@@ -194,7 +194,7 @@ def numeric_axes(results: Results) -> list[str]:
     ]
 
 
-def axes_map(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def axes_map(drawn: Drawn, said: Section) -> Figure:
     """Draw success along the axes of numbers: the groups of `said` with intervals, all others in grey."""
     axes = {axis: [one for one in drawn.summaries if one.condition[0] == axis]
             for axis in numeric_axes(drawn.results)}  # fmt: skip
@@ -231,7 +231,7 @@ def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object],
     panel.plot(x + place, y, color=colour, marker=marker, ms=5, lw=1.6, zorder=3, label=name)
 
 
-def contacts(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def contacts(drawn: Drawn, said: Section) -> Figure:
     """Draw where episodes end in contact, seen from above."""
     scene = _scene(drawn.results)
     return contact_map(contact_ends(drawn.results), scene.length_m, scene.width_m / 2)
@@ -259,7 +259,7 @@ def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def doses(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def doses(drawn: Drawn, said: Section) -> Figure:
     """Draw the change of success against event error; axes that end with `dashed` as dashed lines."""
     errors = {one.condition: one.measured for one in drawn.doses}
     met = {(one.condition, group) for one in drawn.doses for group in one.met_by}
@@ -272,7 +272,7 @@ def doses(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     return dose_figure([one for one in drawn.changes if one.condition in errors], errors, met, behind)
 
 
-def lines(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def lines(drawn: Drawn, said: Section) -> Figure:
     """Draw success along axes: a panel for each value of a tag, a line for each value of another and axis."""
     results, tags = drawn.results, tags_of(drawn.study, drawn.results)
     panels_of = sorted({tags[group][said["panels"]] for group in results.trained})
@@ -319,7 +319,7 @@ def _label_rates(panel: Axes, results: Results, axis: str, trained_at: float) ->
     tidy(panel)
 
 
-def dots(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def dots(drawn: Drawn, said: Section) -> Figure:
     """Draw both groups of a test under each condition, a small marker for each training."""
     results, (one, *_) = drawn.results, drawn.families[said["family"]][1]
     at, groups = one.contrast.ours.at, [one.contrast.theirs.group, one.contrast.ours.group]  # type: ignore[union-attr]
@@ -342,7 +342,7 @@ def dots(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def spread(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def spread(drawn: Drawn, said: Section) -> Figure:
     """Draw the mean success of every training as a map, and by what it differs under each condition."""
     tables, names = crossed_tables(drawn.study, drawn.results), drawn.study["spread"]
     mean = 100 * np.mean(list(tables.values()), axis=0)
@@ -378,7 +378,7 @@ def _draw_numbers(panel: Axes, values: np.ndarray, low: float = 0.0, high: float
         )
 
 
-def variants(drawn: Drawn, said: Mapping[str, Any]) -> Figure:
+def variants(drawn: Drawn, said: Section) -> Figure:
     """Draw success by variant and condition as a map, and the tests of a family with a dot for each pair."""
     results, (_, findings) = drawn.results, drawn.families[said["family"]]
     groups, found = results.trained, {one.contrast.ours.group: one for one in findings}
@@ -414,7 +414,7 @@ def pair_differences(results: Results, one: Finding) -> np.ndarray:
     return difference
 
 
-KINDS: dict[str, Callable[[Drawn, Mapping[str, Any]], Figure]] = {
+KINDS: dict[str, Callable[[Drawn, Section], Figure]] = {
     "map": change_map,
     "forest": forest,
     "survival": survival,
@@ -427,7 +427,7 @@ KINDS: dict[str, Callable[[Drawn, Mapping[str, Any]], Figure]] = {
     "variants": variants,
 }
 # What a kind cannot be drawn without, of the kinds for which data may lack it.
-NEEDED: dict[str, Callable[[Drawn, Mapping[str, Any]], object]] = {
+NEEDED: dict[str, Callable[[Drawn, Section], object]] = {
     "map": lambda drawn, said: drawn.changes,
     "forest": tested_of,
     "axes": lambda drawn, said: numeric_axes(drawn.results),

@@ -19,6 +19,7 @@ from jobs.run.provenance import REPOSITORY
 from jobs.study.results import Condition, Results, value_of
 
 CONF = REPOSITORY / "conf"
+Section = Mapping[str, Any]  # of a study's file, which is data: no class names its keys
 # The smallest difference that matters, unless a family says other. In metres it is what 10 points of success
 # are: over the trainings of ppo_claims and taught_claims a point goes with 0.55 and 0.50 m.
 GAIN = {"success": 0.1, "distance_m": 5.0}
@@ -107,7 +108,7 @@ def read_study(name: str, conf: Path = CONF) -> dict[str, Any]:
     return dict((found or {}).get("study") or {})
 
 
-def families_of(study: Mapping[str, Any], results: Results, conf: Path = CONF) -> list[Family]:
+def families_of(study: Section, results: Results, conf: Path = CONF) -> list[Family]:
     """Return the families of a study whose sides its results have.
 
     Args:
@@ -126,7 +127,7 @@ def families_of(study: Mapping[str, Any], results: Results, conf: Path = CONF) -
     ]
 
 
-def tags_of(study: Mapping[str, Any], results: Results) -> dict[str, dict[str, Any]]:
+def tags_of(study: Section, results: Results) -> dict[str, dict[str, Any]]:
     """Return group -> its tags, of which its name is one."""
     variants = study.get("variants") or {}
     return {
@@ -148,9 +149,7 @@ def _shared(name: str, said: object, conf: Path) -> dict[str, Any]:
     return own
 
 
-def _family(
-    name: str, said: Mapping[str, Any], tags: Mapping[str, Mapping[str, Any]], results: Results
-) -> Family:
+def _family(name: str, said: Section, tags: Mapping[str, Section], results: Results) -> Family:
     wrong = [key for key in said if key not in FAMILY] + [
         f"words.{key}" for key in said.get("words", {}) if key not in WORDS
     ]
@@ -179,9 +178,7 @@ def _family(
     )  # fmt: skip
 
 
-def _expand(
-    block: Mapping[str, Any], values: Mapping[str, Any], results: Results
-) -> Iterator[dict[str, Any]]:
+def _expand(block: Section, values: Section, results: Results) -> Iterator[dict[str, Any]]:
     """Yield the tests of a block, one for each combination of the values in its `for`."""
     loops = {key: _loop(value, values, results) for key, value in (block.get("for") or {}).items()}
     for chosen in itertools.product(*loops.values()):
@@ -193,7 +190,7 @@ def _expand(
             yield {key: _filled(value, here) for key, value in block.items() if key != "for"}
 
 
-def other_account(said: Mapping[str, Any]) -> dict[str, Any] | None:
+def other_account(said: Section) -> dict[str, Any] | None:
     """Return a test by its other account; None if it has no other.
 
     A change from the baseline becomes success or distance as they are. Speed of learning no longer counts the
@@ -204,7 +201,7 @@ def other_account(said: Mapping[str, Any]) -> dict[str, Any] | None:
     return {**said, "measure": LEARNED[1]} if said.get("measure") == LEARNED[0] else None
 
 
-def _loop(value: object, values: Mapping[str, Any], results: Results) -> Sequence[Any]:
+def _loop(value: object, values: Section, results: Results) -> Sequence[Any]:
     """Return the values of a loop: a list, the trained groups, or those after the first."""
     if value == "groups":
         return results.trained
@@ -216,7 +213,7 @@ def _loop(value: object, values: Mapping[str, Any], results: Results) -> Sequenc
     return filled
 
 
-def _filled(value: Any, values: Mapping[str, Any]) -> Any:
+def _filled(value: Any, values: Section) -> Any:
     """Return a part of a file with each `<name>` replaced by its value."""
     if isinstance(value, Mapping):
         return {_filled(key, values): _filled(one, values) for key, one in value.items()}
@@ -229,8 +226,8 @@ def _filled(value: Any, values: Mapping[str, Any]) -> Any:
 
 def _contrast(
     family: str,
-    said: Mapping[str, Any],
-    tags: Mapping[str, Mapping[str, Any]],
+    said: Section,
+    tags: Mapping[str, Section],
     alias: Mapping[str, str],
     results: Results,
 ) -> Contrast | None:
@@ -250,9 +247,9 @@ def _contrast(
 
 
 def _side(
-    said: Mapping[str, Any],
+    said: Section,
     key: str,
-    tags: Mapping[str, Mapping[str, Any]],
+    tags: Mapping[str, Section],
     alias: Mapping[str, str],
     results: Results,
 ) -> Side | None:
@@ -298,7 +295,7 @@ def _conditions(said: object, group: str, results: Results) -> tuple[Condition, 
     return tuple(at for at in asked if at in every)
 
 
-def _all_pairs(said: Mapping[str, Any], results: Results) -> list[Contrast]:
+def _all_pairs(said: Section, results: Results) -> list[Contrast]:
     """Return a test for each pair of groups of several trainings, over the same conditions."""
     every = _conditions(said.get("at", "all"), "", results)
     groups = [group for group in results.trained if any((at, group) in results.cells for at in every)]
