@@ -57,9 +57,7 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     own, protocol, action = config.own, read_protocol(), config.evaluate.action
     policy, kind = find_benchmarked("bench.policy", own.policy, config)
     policy = policy if own.name is None else dataclasses.replace(policy, group=own.name)
-    unknown = [name for name in own.met if name not in protocol.parts[own.part]]
-    if unknown:
-        raise ConfigError(f"bench.met: must be of {list(protocol.parts[own.part])}, got {unknown}")
+    _check_met(own, protocol)
     tasks = tasks_of(protocol, own.part, policy, action)
     place = open_run(config).path / "bench"
     store = EpisodeStore(place)
@@ -94,6 +92,14 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     )
     console.print(f"Result: {write_result(place, result, text)}, and the CSV file beside it", markup=False)
     return {"mce": scores.mce, "clean": scores.clean, "worst": scores.worst}
+
+
+def _check_met(own: Settings, protocol: Protocol) -> None:
+    """Raise ConfigError for a corruption that the protocol does not have."""
+    names = list(protocol.parts[own.part])
+    unknown = [name for name in own.met if name not in names]
+    if unknown:
+        raise ConfigError(f"bench.met: must be of {names}, got {unknown}")
 
 
 def show(scores: Scores, protocol: Protocol) -> None:

@@ -17,19 +17,18 @@ from envs.config import EnvConfig
 from jobs.config.conditions import axis_points
 from jobs.config.config import ConfigError
 from jobs.config.env_keys import env_with
-from jobs.config.registry import CONF
 from jobs.rollout.policies import EvaluatedPolicy, with_own_parts
 from jobs.rollout.tasks import EvaluationTask, make_task
 from jobs.study.plan import was_met
 
-PROTOCOL = CONF / "protocols" / "eventpolicy_c_v1.yaml"
+PROTOCOL = Path(__file__).with_name("eventpolicy_c_v1.yaml")
 CLEAN = "clean"
 Cell = tuple[str, int]  # corruption and severity
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What `conf/protocols` says.
+    """What the file of a protocol says.
 
     Attributes:
         name, version: Of the benchmark.
