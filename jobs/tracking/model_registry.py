@@ -137,7 +137,7 @@ def signature(manifest: Mapping[str, Any]) -> "ModelSignature":
     logits = [ColSpec("float", name) for name in action_names(manifest)]
     given = Schema([ColSpec("long", "step"), ColSpec("long", "action"), *logits])
     if find_kind(manifest["name"]).observation == "luminance":
-        shape = (-1, manifest["height"], manifest["width"])
+        shape = (-1, manifest["height"], manifest["width"], 1)
         return ModelSignature(Schema([TensorSpec(np.dtype(np.float32), shape)]), given)
     window_us = round(1e6 / manifest["sensor"]["control_hz"])
     return ModelSignature(

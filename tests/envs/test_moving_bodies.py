@@ -137,6 +137,7 @@ def test_a_thrown_ball_hits_who_flies_straight_on():
         assert 1e-6 * info["t_us"] == pytest.approx(due_s, abs=0.021)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     "layout", [{"throw_every_s": 1.0, "throw_min_mps": 4.0}, {"num_moving": 60, "width_m": 50.0}]
 )

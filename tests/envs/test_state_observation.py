@@ -11,7 +11,7 @@ from envs.config import CameraConfig
 from envs.corridor import CorridorEnv
 from envs.state_observation import StateObservation
 
-WORLD = {"camera": CameraConfig(width=16, height=16), "observation": "event_image", "time_limit_s": 0.1}
+WORLD = {"camera": CameraConfig(width=36, height=36), "observation": "event_image", "time_limit_s": 0.1}
 BODY = {"vehicle": "point_mass", "speed_mps": 10.0, "control_hz": 100.0}
 
 

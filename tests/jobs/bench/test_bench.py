@@ -297,7 +297,7 @@ def test_a_function_acts_in_its_own_episode_alone(tmp_path):
         "def policy(seed):\n"
         "    seen = []\n"
         "    def act(image):\n"
-        "        assert image.shape == (64, 64)\n"
+        "        assert image.shape == (64, 64, 1)\n"
         "        seen.append(image)\n"
         "        return (seed + len(seen)) % 3\n"
         "    return act\n"

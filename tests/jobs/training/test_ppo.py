@@ -92,8 +92,9 @@ def plain_feature(name, observation, encoder):
         rows[:kept] = np.stack([np.where(events["p"] > 0, 1, 2), times, events["x"], events["y"]], axis=1)
         return rows
     if name == "rgb":
-        return np.floor(255 * np.minimum(observation.astype(float), 1) ** (1 / 2.2) + 0.5)
-    return observation
+        grey = observation[..., 0].astype(float)
+        return np.floor(255 * np.minimum(grey, 1) ** (1 / 2.2) + 0.5)
+    return observation[..., 0] if name == "event_image" else observation
 
 
 class Recorder:

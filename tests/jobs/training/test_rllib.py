@@ -32,6 +32,7 @@ def cluster(tmp_path_factory):
     ray.shutdown()
 
 
+@pytest.mark.system
 def test_a_users_dqn_trains_reports_and_is_exported_as_a_policy_that_acts_greedily(tmp_path):
     config = make_config(*SMALL)
     algorithm = algorithm_of(config)
