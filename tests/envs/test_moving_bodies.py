@@ -139,7 +139,11 @@ def test_a_thrown_ball_hits_who_flies_straight_on():
 
 @pytest.mark.system
 @pytest.mark.parametrize(
-    "layout", [{"throw_every_s": 1.0, "throw_min_mps": 4.0}, {"num_moving": 60, "width_m": 50.0}]
+    "layout",
+    [
+        {"throw_every_s": 1.0, "throw_min_mps": 4.0},
+        pytest.param({"num_moving": 60, "width_m": 50.0}, marks=pytest.mark.slow),
+    ],
 )
 def test_a_planner_that_knows_dodges(layout):
     def choose(env):
