@@ -52,6 +52,7 @@ def test_it_is_a_file_of_thirty_lines():
     assert len([line for line in PLUGIN.splitlines() if line.strip()]) <= 30
 
 
+@pytest.mark.slow
 def test_its_policy_trains_in_its_world_and_without_an_event_vae_at_once(trained):
     (run,) = (trained / "runs").glob("halves-*")
     assert {path.stem for path in (run / "stages").iterdir()} == {"train", "evaluate"}
@@ -63,6 +64,7 @@ def test_its_policy_trains_in_its_world_and_without_an_event_vae_at_once(trained
         load_policy(run / "policy")
 
 
+@pytest.mark.slow
 def test_its_policy_scene_and_fault_are_swept_and_reported(trained):
     said = evade(trained, *SWEEP)
     for point in (r"spot\s+│ 0\.9", r"world\s+│ forest"):
@@ -71,6 +73,7 @@ def test_its_policy_scene_and_fault_are_swept_and_reported(trained):
     assert "halves" in (trained / "docs" / "robustness.md").read_text()
 
 
+@pytest.mark.slow
 def test_without_it_a_job_says_which_plug_in_is_missing(trained):
     (policy,) = (trained / "runs").glob("halves-*/policy")
     words = ("+exp=demo", f"demo.policy={policy}")
