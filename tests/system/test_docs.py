@@ -60,7 +60,11 @@ def commands() -> list[str]:
         found |= dict.fromkeys(f"{MADE[target]} {words}" for target, words in ARGS.findall(text))
     # tests/system/test_plugins.py gives those with a plug-in; a reader's calibration makes the camera `mine`, and
     # a reader has the world.
-    own = [words for words in found if "plugins=" not in words and not words.startswith("scene") and "world.csv" not in words]
+    own = [
+        words
+        for words in found
+        if "plugins=" not in words and not words.startswith("scene") and "world.csv" not in words
+    ]
     return [words.replace("camera=mine ", "camera=dvs128 ") for words in own]
 
 
