@@ -58,8 +58,8 @@ def commands() -> list[str]:
         text = re.sub(r"^Made on .*$", "", page.read_text(), flags=re.MULTILINE).replace("\\\n", " ")
         found |= dict.fromkeys((match[1] or match[2]).strip() for match in LAUNCHED.finditer(text))
         found |= dict.fromkeys(f"{MADE[target]} {words}" for target, words in ARGS.findall(text))
-    # tests/system/test_plugins.py gives those with a plug-in; a reader's calibration makes the camera `mine`, and
-    # a reader has the world.
+    # tests/system/test_plugins.py gives those with a plug-in; a reader calibrates the camera `mine`, and has
+    # the world.
     own = [
         words
         for words in found
