@@ -31,6 +31,7 @@ def test_a_spread_is_students_interval_of_the_mean():
 
 
 @pytest.mark.system
+@pytest.mark.slow
 def test_it_leaves_a_table_and_pictures(tmp_path, monkeypatch):
     monkeypatch.setattr(codings, "CODING_CONTEXT", 16)
     monkeypatch.setattr(codings, "CONTEXTS", (16, 32))

@@ -55,6 +55,7 @@ with simulated(nodes=2, cores=1):
 STRANGER = "import sys; from ray._raylet import GcsClient; GcsClient(address=sys.argv[1])"
 
 
+@pytest.mark.slow
 def test_the_simulated_cluster_of_a_bench_listens_on_loopback_alone_and_asks_for_a_token(tmp_path):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
     command = [sys.executable, "-c", SIMULATED, str(tmp_path)]

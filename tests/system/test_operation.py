@@ -67,7 +67,7 @@ def test_a_training_runs_in_a_folder_of_any_name_with_packages_of_its_own_and_su
     assert len(run.data.metrics) > 3
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
 def test_a_signal_ends_a_training_as_ctrl_c_does(tmp_path, number):
     training = evade(tmp_path, *TRAINING, "train.env_steps=60000")
     while training.poll() is None:

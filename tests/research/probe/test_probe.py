@@ -43,6 +43,7 @@ def make_row(name="signed, latent 8", place=(8, "signed"), share=0.5):
 
 
 @pytest.mark.system
+@pytest.mark.slow
 def test_the_job_leaves_a_table_and_a_figure_and_trains_nothing_twice(tmp_path, monkeypatch):
     config = small_probe(tmp_path, latents=[4], targets=["occupancy", "signed", "aged", "counts"])
     metrics = probe.run(config)
