@@ -435,28 +435,25 @@ NEEDED: dict[str, Callable[[Drawn, Section], object]] = {
 }
 CAPTIONS = {
     "map": "Success [%] of each group under each condition. Colour: the change against the baseline "
-    "of the condition, by the same runs in the same corridors. First row: the baseline. Bold: "
-    "significant for other runs. Empty: the change cannot affect that policy.",
+    "of the condition. First row: the baseline. Bold: significant for other runs. Empty: the change cannot "
+    "affect that policy.",
     "forest": "Difference of each test. A line is a test: the dot is the difference, the line its 95 % "
     "interval, of this test alone. Within the grey band a difference is too small to matter.",
-    "survival": "Share of episodes that have not ended before a distance [%]; a thin line for each "
-    "training, a thick one for all. Blue: nothing changed. Red: the condition in which the "
-    "group succeeds least, named above.",
+    "survival": "Share of episodes that have not ended before a distance [%]. Thin: one training. Thick: "
+    "all. Blue: nothing changed. Red: the condition in which the group succeeds least, named above.",
     "axes": "Success along every axis of numbers. Markers: means of the named groups with 95 % intervals, "
-    "set aside of each other. Grey: the other groups. Values stand at equal distances.",
+    "shifted sideways. Grey: the other groups. Values stand at equal distances.",
     "contacts": "Where episodes end in contact, all corridors laid over each other: large dots with "
     "nothing changed, small ones under all changes in the same scene.",
-    "doses": "Change of success against the measured event error, with 95 % intervals that are not "
-    "adjusted. Kinds stand a little aside of their errors. Hollow: a training of the group "
-    "met as much of that kind.",
-    "lines": "Success against control rate. A marker is one training, set a little aside of its value;"
-    " a line is the mean. Dotted: the value at which they were trained.",
+    "doses": "Change of success against the measured event error. The 95 % intervals are not adjusted; "
+    "markers are shifted sideways. Hollow: a training of the group met as much of that kind.",
+    "lines": "Success against control rate. A marker is one training, shifted sideways; a line is the "
+    "mean. Dotted: the value at which they were trained.",
     "dots": "Success of every training under each condition. A small marker is one training, a stroke"
     " the mean of its group.",
     "spread": "Mean success of every training, and by what success differs. Left: a cell is one "
-    "training, its mean success under all conditions. Right: the standard deviations of the "
-    "table.",
+    "training. Right: the standard deviations of the table.",
     "variants": "Success of each variant, and the difference of the means. Left: success [%], mean of the"
-    " trainings. Right: difference of the mean over the conditions; a dot for each pair of "
-    "trainings of one seed, a tick for their mean, a bar for its 95 % interval.",
+    " trainings. Right: a dot for each pair of trainings of one seed, a tick for their mean, a bar for its "
+    "95 % interval.",
 }

@@ -201,7 +201,6 @@ def _figure(study: Study, name: str) -> str:
 
 def _family(study: Study, name: str, heading: bool = False) -> str:
     family, findings = study.families[name]
-    beside = {head: study.beside.get((other, name), {}) for head, other in family.beside.items()}
     blocks = [f"### {family.title}"] if heading else []
     if len(findings) == 1 and findings[0].contrast.theirs is not None:
         (one,) = findings
@@ -214,10 +213,17 @@ def _family(study: Study, name: str, heading: bool = False) -> str:
         named = dict.fromkeys(_place_beside(other, name)[1] for other in family.beside.values())
         notes = [study.families[own][0].note for own in named if own in study.families and own != name]
         blocks.append(" ".join((tables.family_note(family, findings), *notes)))
-        blocks.append(tables.family_table(family, findings, beside))
+        blocks.append(_tests(study, name))
     else:
         blocks.append(tables.family_table(family, findings, {}))
     return "\n\n".join(block.strip("\n") for block in blocks)
+
+
+def _tests(study: Study, name: str) -> str:
+    """Return the tests of a family without how they are to be read, which the page says once."""
+    family, findings = study.families[name]
+    beside = {head: study.beside.get((other, name), {}) for head, other in family.beside.items()}
+    return tables.family_table(family, findings, beside)
 
 
 def _crossed(study: Study) -> tuple[Any, Any, tuple[str, str], np.ndarray]:
@@ -264,8 +270,8 @@ def _losses(study: Study, which: str) -> str:
     tests = len(replicated(study.changes))
     if which == "certain":
         note = (
-            f"Losses that are certain for other trainings, of all {tests} changes (Benjamini and Hochberg), "
-            f"with 95 % intervals [points]. In brackets: trainings that certainly lose by themselves."
+            f"Certain for other trainings, among all {tests} changes (Benjamini and Hochberg) [points]; in "
+            "brackets, how many trainings certainly lose by themselves."
         )
         return f"{note}\n\n{tables.certain_losses_table(study.results, study.changes)}"
     note = (
@@ -303,7 +309,7 @@ def _provenance(study: Study, _: str) -> str:
     commits = ", ".join(commit[:7] for commit in facts["evaluated_at"])
     files = {
         "episodes": "episodes.csv.gz", "runs": "trainings.csv", "estimates": "estimates.csv",
-        "changes": "changes.csv", "tests": "tests.csv", "groups and event errors": "about.json",
+        "changes": "changes.csv", "tests": "tests.csv", "event errors": "about.json",
     }  # fmt: skip
     links = ", ".join(f"[{what}](data/{name}_{file})" for what, file in files.items())
     return (
@@ -317,6 +323,7 @@ PARTS: dict[str, Callable[[Study, str], str]] = {
     "summary": _summary,
     "figure": _figure,
     "family": _family,
+    "tests": _tests,
     "spread": _spread,
     "success": _success,
     "changes": _changes,

@@ -55,6 +55,8 @@ def family_table(
 ) -> str:
     """Return the tests of a family as a Markdown table: a line each, or a line for each group.
 
+    Groups that all pass the same tests, each alone or against one other group, have a line each.
+
     Args:
         family: The family.
         findings: Of its tests.
@@ -62,23 +64,48 @@ def family_table(
     """
     names = list(dict.fromkeys(one.contrast.name for one in findings))
     groups = list(dict.fromkeys(one.contrast.ours.group for one in findings))
-    if len(names) > 1 and not beside and all(_alone(one.contrast) for one in findings):
+    against = {"" if _alone(one.contrast) else one.contrast.theirs.group for one in findings}  # type: ignore[union-attr]
+    if (
+        len(names) > 1
+        and not beside
+        and len(against) == 1
+        and not any(one.contrast.source for one in findings)
+    ):
+        (theirs,) = against
         cells = {(one.contrast.ours.group, one.contrast.name): _cell(family, one) for one in findings}
         lines = [(f"`{group}`", *(cells.get((group, name), "-") for name in names)) for group in groups]
-        return markdown_table(("Group", *names), lines, len(names) + 1)
-    columns = _columns(family, findings)
-    head = (*columns, *beside)
-    lines = [
-        (*cells, *(own.get(key_of(family, one.contrast), "-") for own in beside.values()))
-        for one, *cells in zip(findings, *columns.values(), strict=True)
-    ]
-    return markdown_table(head, lines, 4)
+        head = f"Group, against `{theirs}`" if theirs else "Group"
+        return markdown_table((head, *names), lines, len(names) + 1)
+    columns = _columns_beside(family, findings, beside) if beside else _columns(family, findings)
+    found = {name: texts for name, texts in columns.items() if any(texts)}
+    return markdown_table(tuple(found), list(zip(*found.values(), strict=True)), len(found) if beside else 4)
+
+
+def _columns_beside(
+    family: Family, findings: Sequence[Finding], beside: Mapping[str, Mapping[tuple[str, ...], str]]
+) -> dict[str, list[str]]:
+    """Return heading -> a text for each test: what was found, and what other families found of the same."""
+    against = ["" if _alone(one.contrast) else one.contrast.theirs.group for one in findings]  # type: ignore[union-attr]
+    usual = Counter(against).most_common(1)[0][0]
+    return {
+        "Group": [f"`{one.contrast.ours.group}`" for one in findings],
+        f"Test, against `{usual}`": [
+            one.contrast.name + (f" (against `{theirs}`)" if theirs != usual else "")
+            for one, theirs in zip(findings, against, strict=True)
+        ],
+        "Source": [one.contrast.source for one in findings],
+        "Finding": [beside_text(one) for one in findings],
+        **{
+            head: [own.get(key_of(family, one.contrast), "-") for one in findings]
+            for head, own in beside.items()
+        },
+    }
 
 
 def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]]:
-    """Return heading -> a text for each test; headings of which a family has nothing are left out."""
+    """Return heading -> a text for each test; none of a heading of which a family has nothing."""
     tested = family.adjust != "none"
-    found = {
+    return {
         "Group": [f"`{one.contrast.ours.group}`" for one in findings],
         "Test": [one.contrast.name for one in findings],
         "Source": [one.contrast.source for one in findings],
@@ -88,7 +115,6 @@ def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]
         f"p ({CORRECTIONS.get(family.adjust)})": [_p_text(one) for one in findings] if tested else [],
         "Trainings needed": [_needed_text(one) for one in findings] if family.power else [],
     }
-    return {name: texts for name, texts in found.items() if any(texts)}
 
 
 def finding_text(one: Finding) -> str:
