@@ -2,10 +2,12 @@
 
 import csv
 import gzip
+import json
 import re
 import tomllib
 
 import imageio_ffmpeg
+import pytest
 
 from docs.draw_films import FAILURES, FILMS
 from docs.tables import DATA, ROOT
@@ -38,10 +40,30 @@ def test_the_demo_of_the_first_page_is_four_times_slower_than_the_flight():
     assert abs(about["duration"] - 4 * int(steps.replace(",", "")) * 0.005) < 0.5
 
 
-def test_the_slow_failure_lasts_as_its_title_says():
-    """102 steps of 40 ms, twice slower than real time."""
-    about = next(imageio_ffmpeg.read_frames(str(ROOT / "docs" / "films" / "fails_dense_25hz.mp4")))
-    assert abs(about["duration"] - 2 * 102 * 0.04) < 0.5
+@pytest.mark.parametrize(
+    ("name", "slower", "steps", "step_s"),
+    [
+        ("fails_dense_25hz", 2, 102, 0.04),
+        ("fails_dense", 4, 467, 0.005),
+        ("fails_late", 4, 786, 0.005),
+        ("crash", 4, 144, 0.005),
+    ],
+)
+def test_a_failure_lasts_as_its_title_says_and_its_last_frame_stays(name, slower, steps, step_s):
+    about = next(imageio_ffmpeg.read_frames(str(ROOT / "docs" / "films" / f"{name}.mp4")))
+    assert 0.15 < about["duration"] - slower * steps * step_s < 0.5
+
+
+def test_the_pages_count_the_episodes_of_the_replay_page():
+    text = (ROOT / "docs" / "replay.html").read_text()
+    data, _ = json.JSONDecoder().raw_decode(text[text.index('{"choices"') :])
+    names, page = data["choices"]["policy"], " ".join((ROOT / "docs" / "watch.md").read_text().split())
+    goals = [sum(one["ends"] == "goal" for one in data["episodes"] if one["policy"] == place)
+             for place in range(len(names))]  # fmt: skip
+    own = len(data["episodes"]) // len(names)
+    assert f"holds {len(data['episodes'])} recorded episodes of `{names[0]}` and `{names[1]}`" in page
+    assert f"`{names[0]}` reaches the goal in {goals[0]} of its {own} episodes, `{names[1]}` in all" in page
+    assert goals[1] == own
 
 
 def test_the_pages_count_the_episodes_that_the_file_has():
