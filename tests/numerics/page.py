@@ -20,19 +20,12 @@ TESTS = "tests/numerics/test_extremes.py"
 HEADINGS = ("Part", "Extreme", "Defined result", "Worst error", "Accepted")
 TEXT = """# Numbers at the ends of their ranges
 
-The table lists {count} extreme inputs. Each has one defined result. The worst error is measured against
-float64 or a closed form, and a test fails if an error exceeds the accepted bound (`{tests}`).
-A value outside its range raises an error that states the rule and the value; past that check no number is
-NaN or infinite.
-
-The event error is measured on a few short flights. Finer textures reach [0.07](simulator.md) at a
-tolerance of 0.05. [Results](results.md#event-errors) lists the event error of each condition of
-the sweep.
+Each of {count} extreme inputs has one defined result. The worst error is measured against float64 or a closed
+form, and a test fails if it exceeds the accepted bound (`{tests}`). A value outside its range
+raises an error that states the rule and the value.
 
 {table}
-"None" means exact: not one event, bit or accepted value too many. The docstrings of the modules state the
-rules. `numba` kernels that decide an event use no fast-math, clocks and sums have 64 bits, and luminance is
-float32.
+"None" means exact: not one event, bit or accepted value too many.
 
 Measured on {date} at commit {commit}; `python -m tests.numerics.page` (`make numerics`) measures again.
 """

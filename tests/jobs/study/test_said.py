@@ -64,6 +64,16 @@ def test_what_breaks_ten_seeds_is_what_the_data_say():
     assert [int(one) for one in found.groups()] == [sum(own), len(own)]
 
 
+def test_what_breaks_taught_policies_is_what_the_data_say():
+    text = " ".join((REPOSITORY / "docs" / "results.md").read_text().split())
+    with (REPOSITORY / "docs" / "data" / "taught_claims_changes.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["certain"] == "1"]
+    lost = [-round(100 * float(row["difference"])) for row in rows]
+    found = re.search(r"By imitation in plain worlds .* cost most, by (\d+) to (\d+) points", text)
+    assert [int(one) for one in found.groups()] == [min(lost), max(lost)]
+    assert {row["Axis"] for row in rows} == {"world", "background_activity", "control_hz", "control_hz_dense"}
+
+
 def test_what_nominal_success_tells_is_what_the_data_say():
     found, told = read_published(REPOSITORY / "docs" / "data", "ppo_claims"), []
     for group in ("bytestream", "bytestream_xy"):
