@@ -44,6 +44,7 @@ def processes_of(folder: Path) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_a_training_runs_in_a_folder_of_any_name_with_packages_of_its_own_and_survives_a_deletion(tmp_path):
     folder = tmp_path / "job%2Fmain a?b#c"
     for name in ("envs", "models", "jobs", "core"):

@@ -95,7 +95,7 @@ def assert_same(mine, other):
     [
         *(pytest.param(name, 0, marks=pytest.mark.slow if name in ALIKE else ()) for name in TRAINED),
         pytest.param("finetuned", 1, marks=pytest.mark.slow),
-        ("bytestream", 2),
+        pytest.param("bytestream", 2, marks=pytest.mark.slow),
         pytest.param("imitation", 2, marks=pytest.mark.slow),
         ("begun", 0),
         pytest.param("privileged", 2, marks=pytest.mark.slow),

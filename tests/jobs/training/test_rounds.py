@@ -160,7 +160,10 @@ def silent_for_too_long(taking, manager):
 FAULTS = {lost_in_its_work: 1, lost_twice: 1, started_again_unnoticed: 1, silent_for_too_long: 0, None: 0}
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(fault, marks=pytest.mark.slow if fault is silent_for_too_long else ()) for fault in FAULTS],
+)
 def test_a_round_has_the_same_bytes_whatever_becomes_of_a_process(make, fault):
     told = []
     for disturb in (None, fault):
