@@ -266,3 +266,31 @@ def test_the_preset_is_a_crazyflie_of_its_sources():
     assert limit == pytest.approx(gravity * math.tan(math.radians(20)), rel=5e-3)
     rotors = 4 * math.sqrt(mass * gravity / (4 * 2.3e-8))
     assert drag == pytest.approx(1.02506e-6 * rotors / mass, rel=5e-3)
+
+
+@pytest.mark.parametrize("wind_mps", [0.0, 1.0])
+def test_a_quadrotor_of_rotorpy_settles_where_the_point_mass_does(wind_mps):
+    """RotorPy 3.0's Crazyflie has an attitude and motors; its velocity controller gets our time constant."""
+    vehicles = pytest.importorskip("rotorpy.vehicles.multirotor", reason="needs: pip install rotorpy")
+    from rotorpy.vehicles.crazyflie_params import quad_params
+
+    ours = make_dynamics(EnvConfig(vehicle="crazyflie", speed_mps=3.0, body={"wind_x_mps": wind_mps}))
+    tau_s = 0.219  # of `make_crazyflie`
+    hover = math.sqrt(quad_params["mass"] * 9.81 / 4 / quad_params["k_eta"])
+    start = {name: np.zeros(3) for name in ("x", "v", "w")} | {
+        "q": np.array([0.0, 0.0, 0.0, 1.0]),
+        "wind": np.array([wind_mps, 0.0, 0.0]),
+        "rotor_speeds": np.full(4, hover),
+    }
+    quadrotor = vehicles.Multirotor(
+        quad_params | {"k_v": 1.0 / tau_s}, start, control_abstraction="cmd_vel", enable_ground=False
+    )
+    theirs, state = start, np.zeros(6)
+    for asked in np.array([(0.5, 0.0), (0.5, 0.3), (-0.2, 0.3), (0.0, 0.0)]):
+        for _ in range(200):
+            theirs = quadrotor.step(theirs, {"cmd_v": np.append(asked, 0.0)}, 0.01)
+            theirs["wind"] = start["wind"]
+            move(state, asked / ours.top_speed_mps, ours.wind, ours.parameters, 0.01)
+            assert np.hypot(*(theirs["x"][:2] - state[:2])) < 0.08  # the attitude comes late
+        np.testing.assert_allclose(theirs["v"][:2], state[2:4], atol=0.005)
+        np.testing.assert_allclose(theirs["x"][:2], state[:2], atol=0.02)
