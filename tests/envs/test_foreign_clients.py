@@ -194,3 +194,33 @@ def test_rllib_hands_the_class_its_env_config():
     assert (env.config.observation, env.config.scene) == ("event_image", "gates")
     with pytest.raises(ValueError, match="no_such_field"):
         CorridorEnv(EnvContext({"no_such_field": 1}, worker_index=1))
+
+
+@pytest.mark.slow
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("name", "sizes"),
+    [
+        ("PPO", {"train_batch_size_per_learner": 32, "minibatch_size": 16, "num_epochs": 1}),
+        ("SAC", {"train_batch_size_per_learner": 32, "num_steps_sampled_before_learning_starts": 16}),
+    ],
+)
+def test_rllib_trains_a_body_by_continuous_commands_as_a_user_configures_it(name, sizes):
+    import ray
+    from gymnasium.wrappers import DtypeObservation
+    from ray.tune.registry import get_trainable_cls, register_env
+
+    # RLlib's convolutions take floating-point numbers alone.
+    register_env("floats", lambda given: DtypeObservation(CorridorEnv(given), np.float32))
+    settings = {"vehicle": "point_mass", "observation": "event_image", "time_limit_s": 0.1, "speed_mps": 10.0}
+    config = get_trainable_cls(name).get_default_config().environment("floats", env_config=settings)
+    ray.init(num_cpus=1, include_dashboard=False)
+    try:
+        algorithm = config.env_runners(num_env_runners=0).training(**sizes).build_algo()
+        result = algorithm.train()
+        algorithm.stop()
+    finally:
+        ray.shutdown()
+    assert result["num_env_steps_sampled_lifetime"] > 0
+    learned = result["learners"]["default_policy"].values()
+    assert np.isfinite([value for value in learned if isinstance(value, float)]).all()
