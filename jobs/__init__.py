@@ -24,3 +24,9 @@ def main() -> int:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.main()
+
+
+def demo() -> int:
+    """Run the command `demo`, which is `evade demo`."""
+    sys.argv[:1] = [str(Path(sys.argv[0]).with_name("evade")), "demo"]
+    return main()

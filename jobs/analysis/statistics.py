@@ -5,11 +5,12 @@ two random factors. scipy computes what it can; it has no interval of a mean ove
 none of a difference of paired rates. `python -m research.coverage` prints how often the intervals hold.
 """
 
+import importlib
 from collections.abc import Sequence
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # `scipy.stats` loads when it is first used, which takes half a second
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -18,6 +19,11 @@ MOST_TRAININGS = 10_000  # beyond which no study is planned
 CERTAIN = 30.0  # standard errors beyond which power is 1, and scipy's noncentral t has no digits
 
 Interval = tuple[float, float]
+
+
+def _stats() -> ModuleType:
+    """Import scipy.stats, which takes half a second, and which a demo from the wheel does without."""
+    return importlib.import_module("scipy.stats")
 
 
 class Estimate(NamedTuple):
@@ -49,7 +55,7 @@ class Difference(NamedTuple):
             return None
         if self.error == 0.0:
             return float(self.value >= margin)
-        return float(scipy.stats.t.sf((margin - self.value) / self.error, self.freedom))
+        return float(_stats().t.sf((margin - self.value) / self.error, self.freedom))
 
     def p_of_loss(self, margin: float) -> float | None:
         """Return the one-sided p of the test that the value is `-margin` or less; small excludes a loss."""
@@ -64,7 +70,7 @@ def wilson_interval(successes: int, trials: int) -> Interval:
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"need 0 <= successes <= trials and a trial, got {successes} of {trials}")
-    interval = scipy.stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    interval = _stats().binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
     return float(interval.low), float(interval.high)
 
 
@@ -83,7 +89,7 @@ def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval
         raise ValueError(f"values must be a list of finite numbers, got {values!r}; leave out what failed")
     if values.size == 1:
         return None
-    found = scipy.stats.bootstrap([values], np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE,
+    found = _stats().bootstrap([values], np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE,
                       method="percentile", rng=rng)  # fmt: skip
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
@@ -227,8 +233,8 @@ def _tested(value: float, parts: Sequence[tuple[float, int]], least: float, most
     error, freedom = _error(parts, least, most)
     if error == 0.0:
         return Difference(value, (value, value), float(value == 0.0), error, freedom)
-    half = float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
-    p = float(2 * scipy.stats.t.sf(abs(value) / error, freedom))
+    half = float(_stats().t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+    p = float(2 * _stats().t.sf(abs(value) / error, freedom))
     return Difference(value, (value - half, value + half), p, error, freedom)
 
 
@@ -254,7 +260,7 @@ def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple
 def exact_pair_p(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Two-sided p of two policies' successes bool (n,) in the same corridors (McNemar's exact test)."""
     won, lost = int((ours > theirs).sum()), int((ours < theirs).sum())
-    return float(scipy.stats.binomtest(won, won + lost).pvalue) if won + lost else 1.0
+    return float(_stats().binomtest(won, won + lost).pvalue) if won + lost else 1.0
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -296,8 +302,8 @@ def trainings_needed(
         error, freedom = _error(parts, least, 2 * (count - 1))
         if error == 0.0:
             return 1.0
-        limit = scipy.stats.t.isf((1 - CONFIDENCE) / family / 2, freedom)
-        return float(scipy.stats.nct.sf(limit, freedom, min(gain / error, CERTAIN)))
+        limit = _stats().t.isf((1 - CONFIDENCE) / family / 2, freedom)
+        return float(_stats().nct.sf(limit, freedom, min(gain / error, CERTAIN)))
 
     low, high = 1, 2
     while power(high) < POWER:
@@ -363,7 +369,7 @@ def expected_half_width(ours: Spread, theirs: Spread, apart: float, trainings: i
         for one in (ours, theirs)
     ]
     error, freedom = _error([*parts, (apart**2 / corridors, corridors - 1)], 0.0, 2 * (trainings - 1))
-    return float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+    return float(_stats().t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
 
 
 class CrossedSpread(NamedTuple):
@@ -407,7 +413,7 @@ def _factor(values: np.ndarray, rest: float) -> tuple[float, float | None]:
     between = columns * float(values.mean(axis=1).var(ddof=1))
     spread = float(np.sqrt(max(between - rest, 0.0) / columns))
     if rest > 0:
-        return spread, float(scipy.stats.f.sf(between / rest, rows - 1, (rows - 1) * (columns - 1)))
+        return spread, float(_stats().f.sf(between / rest, rows - 1, (rows - 1) * (columns - 1)))
     return spread, 0.0 if between > 0 else None
 
 
@@ -423,7 +429,7 @@ def half_width(values: np.ndarray) -> np.ndarray:
     count = len(values)
     if count < 2:
         raise ValueError(f"an interval over trainings needs two of them, got {count}")
-    return scipy.stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) * scipy.stats.sem(values, axis=0)
+    return _stats().t.ppf((1 + CONFIDENCE) / 2, count - 1) * _stats().sem(values, axis=0)
 
 
 def _checked(values: np.ndarray, name: str) -> np.ndarray:

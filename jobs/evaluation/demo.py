@@ -26,6 +26,7 @@ from jobs.rollout.agents import PolicyAgent
 from jobs.rollout.episodes import outcome_of
 from jobs.rollout.policies import EvaluatedPolicy, find_one_policy, own_sensor_differences, with_own_parts
 from jobs.rollout.recorded import RecordedEpisode, record_episode
+from jobs.run.compile import compile_kernels
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console
 from models.policy import load_policy
@@ -76,6 +77,7 @@ def run(config: Config) -> np.void:
         ConfigError: If there is no such policy.
     """
     policy, env, agent = find_shown(config)
+    compile_kernels()
     name = f"{policy.group}-s{policy.training}"
     differ = own_sensor_differences(policy, env)
     if differ:

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 
@@ -11,27 +12,12 @@ import pytest
 
 pytestmark = pytest.mark.system
 ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("core", "envs", "models", "jobs")
 EXAMPLE = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
-# Raised before a meta path finder is asked, as if the package were not installed.
-ABSENT = (
-    "ray",
-    "mlflow",
-    "hydra",
-    "omegaconf",
-    "optuna",
-    "pyrender",
-    "OpenGL",
-    "scipy",
-    "matplotlib",
-    "yaml",
-)
-WITHOUT = f"""
-import importlib.machinery, sys
-find = importlib.machinery.PathFinder.find_spec
-def find_spec(name, path=None, target=None):
-    return None if name.partition(".")[0] in {ABSENT!r} else find(name, path, target)
-importlib.machinery.PathFinder.find_spec = find_spec
-"""
+# Of the extras: what `evade demo` does without, and what neither environment nor policies import.
+ABSENT = ("ray", "mlflow", "optuna", "pyrender", "OpenGL", "scipy", "matplotlib", "pandas")
+COMMANDS_ALONE = ("hydra", "omegaconf", "yaml", "rich")
+COMPILED = ("*.nbi", "*.nbc", "compiled_*")
 USES = """
 import numpy as np
 import envs
@@ -51,8 +37,32 @@ print(envs.__file__)
 """
 
 
+def without(*packages):
+    """Python as if these packages were not installed: they are not found where a module is looked for."""
+    return f"""
+import importlib.machinery
+find = importlib.machinery.PathFinder.find_spec
+def find_spec(name, path=None, target=None):
+    return None if name.partition(".")[0] in {packages!r} else find(name, path, target)
+importlib.machinery.PathFinder.find_spec = find_spec
+"""
+
+
+def compiled(folder):
+    """The compiled kernels of the rooms in a folder, and the files that say of which sources they are."""
+    files = (path for name in COMPILED for path in folder.glob(f"[a-z]*/**/__pycache__/{name}"))
+    return {path.relative_to(folder).as_posix() for path in files}
+
+
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
+def kernels():
+    """Those of this clone, the first of which are compiled."""
+    subprocess.run([sys.executable, "-m", "jobs.run.compile"], cwd=ROOT, check=True)
+    return {name for name in compiled(ROOT) if name.partition("/")[0] in ROOMS}
+
+
+@pytest.fixture(scope="module")
+def wheel(kernels, tmp_path_factory):
     """A wheel of this clone, built without a trace in it."""
     folder = tmp_path_factory.mktemp("wheel")
     (folder / "base.cfg").write_text(f"[build]\nbuild_base = {folder / 'build'}\n")
@@ -63,20 +73,21 @@ def wheel(tmp_path_factory):
     return path
 
 
-def test_it_holds_the_packages_and_the_policies_and_nothing_else(wheel):
+def test_it_holds_the_packages_the_policies_the_command_and_the_kernels_and_nothing_else(wheel, kernels):
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         (metadata,) = (archive.read(name).decode() for name in names if name.endswith("/METADATA"))
     tops = {name.partition("/")[0] for name in names}
-    rooms = "core", "envs", "models", "jobs"
-    assert {top for top in tops if not top.endswith((".dist-info", ".data"))} == {*rooms}
-    tracked = subprocess.check_output(["git", "ls-files", *rooms], cwd=ROOT, text=True)
+    assert "envs/__pycache__/compiled_" in "".join(sorted(kernels))
+    assert kernels <= set(names)
+    assert {top for top in tops if not top.endswith((".dist-info", ".data"))} == {*ROOMS}
+    tracked = subprocess.check_output(["git", "ls-files", *ROOMS], cwd=ROOT, text=True)
     assert set(tracked.splitlines()) <= set(names)
     command = subprocess.check_output(["git", "ls-files", "conf", "platform/launch.py"], cwd=ROOT, text=True)
     installed = {name.partition("/data/share/evade/")[2] for name in names}
     assert set(command.splitlines()) <= installed
     needed = re.findall(r"^Requires-Dist: ([\w-]+)(?!.*extra ==).*$", metadata, re.MULTILINE)
-    assert {"numpy", "numba", "torch", "gymnasium"} <= set(needed)
+    assert {"numpy", "numba", "torch", "gymnasium", "hydra-core", "rich"} <= set(needed)
     assert set(needed).isdisjoint(ABSENT)
 
 
@@ -85,7 +96,7 @@ def test_it_works_without_the_clone_and_without_what_only_jobs_need(wheel, tmp_p
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
-    code = WITHOUT + EXAMPLE + USES
+    code = without(*ABSENT, *COMMANDS_ALONE) + EXAMPLE + USES
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -93,3 +104,46 @@ def test_it_works_without_the_clone_and_without_what_only_jobs_need(wheel, tmp_p
     assert re.fullmatch(r"(True|False) \d+\.\d+", result)
     assert missing == "renderer='pyrender', which meshes need, is not installed: evade[meshes]"
     assert Path(place).is_relative_to(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_command_demo_of_a_new_environment_compiles_nothing_where_its_kernels_fit(wheel, tmp_path):
+    place = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", place], check=True)
+    python = place / "bin" / "python"
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        wheel,
+    ]
+    subprocess.run(pip, check=True)
+    site = Path(
+        subprocess.check_output([python, "-c", "import envs; print(envs.__path__[0])"], text=True)
+    ).parent
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    (site / "sitecustomize.py").write_text(without(*ABSENT))
+    before = compiled(site)
+    (tmp_path / "empty").mkdir()
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [place / "bin" / "demo"],
+        cwd=tmp_path / "empty",
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"bytestream_hold-s0 .*\byes\b", done.stdout)
+    assert "ompil" not in done.stdout
+    assert compiled(site) == before != set()
+    (film,) = (tmp_path / "empty" / "runs").glob("*/demo/*.mp4")
+    assert film.stat().st_size > 100_000
