@@ -14,14 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from jobs.analysis.tables import markdown_table
+from jobs.analysis.statistics import rate_estimate
+from jobs.analysis.tables import markdown_table, percent_text
 from jobs.study import tables
 from jobs.study.changes import Change, changes_of, content, replicated
 from jobs.study.contrasts import Finding, by_condition, judge
 from jobs.study.doses import Dose, read_doses
 from jobs.study.figures import CAPTIONS, KINDS, NEEDED, Drawn
 from jobs.study.learned import learned
-from jobs.study.results import Condition, Results, read_published, value_of
+from jobs.study.results import Condition, Results, read_published, value_of, values_of
 from jobs.study.spec import Family, families_of, read_study
 from jobs.study.spread import crossed_tables, factors
 from jobs.study.summaries import MET, Summary, success_lines, summaries_of
@@ -247,6 +248,23 @@ def _success(study: Study, _: str) -> str:
     return f"{note}\n\n{markdown_table(head, lines, 2)}"
 
 
+def _axes(study: Study, _: str) -> str:
+    results = study.results
+    lines = []
+    for axis in list(results.axes)[1:]:  # the first is the condition that changes nothing
+        conditions = [at for at in results.conditions if at[0] == axis]
+        pooled = {
+            group: np.hstack([values_of(results.trainings(at, group), "success") for at in conditions])
+            for group in results.groups
+        }
+        lines.append((axis, *(percent_text(rate_estimate(own)) for own in pooled.values())))
+    note = (
+        "Success [%] in all conditions of an axis together, with 95 % intervals over trainings; of a single "
+        "training over episodes."
+    )
+    return f"{note}\n\n{markdown_table(('Axis', *results.groups), lines, 1)}"
+
+
 def _is_repeated(results: Results, at: Condition) -> bool:
     """Whether a condition has the episodes of an earlier one that is the same simulation."""
     first = results.same_as[at]
@@ -326,6 +344,7 @@ PARTS: dict[str, Callable[[Study, str], str]] = {
     "tests": _tests,
     "spread": _spread,
     "success": _success,
+    "axes": _axes,
     "changes": _changes,
     "losses": _losses,
     "headline": _headline,

@@ -1,15 +1,19 @@
+import csv
 import dataclasses
 
 import numpy as np
 import pytest
 
 from jobs.analysis.tables import markdown_table
+from jobs.run.provenance import REPOSITORY
+from jobs.study.page import part, published
 from jobs.study.results import Results
 from jobs.study.summaries import axis_curves, columns_of, details_table, metrics_of, success_lines, summarise
 from jobs.tracking.store import check_metrics
 from tests.support.episodes import flights
 
 AT = ("sparsity", 0.2)
+DATA = REPOSITORY / "docs" / "data"
 
 
 def test_a_group_pools_its_trainings():
@@ -101,3 +105,18 @@ def test_a_curve_has_the_axis_as_whole_steps_and_says_their_unit(numbers, steps,
 
 def test_an_axis_too_fine_for_whole_steps_has_no_curve():
     assert axis_curves("a", [1e-5], []) == {}
+
+
+def test_an_axis_is_as_good_as_the_mean_of_its_conditions():
+    """Against the published table of trainings, which another function wrote."""
+    text = part(published(DATA, "robustness", "robustness"), "axes")
+    head, _, *lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    with (DATA / "robustness_trainings.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for axis, *cells in lines:
+        for group, cell in zip(head[1:], cells, strict=True):
+            rates = [
+                float(row["success_rate"]) for row in rows if (row["Axis"], row["Group"]) == (axis, group)
+            ]
+            assert rates
+            assert abs(float(cell.split()[0]) - 100 * np.mean(rates)) < 0.51
