@@ -1,3 +1,4 @@
+import fnmatch
 import json
 import os
 import re
@@ -150,6 +151,29 @@ def test_the_store_holds_settings_figures_and_pictures(flown):
     wanted = {"evae/reconstructions.png", "eval/trajectories.png", "eval/episode.mp4", "eval/table.md"}
     wanted |= {"eval/episodes.csv"}
     assert wanted <= files
+
+
+def listed_paths() -> list[str]:
+    """Return the paths of "The run folder" as patterns; a bare name is in the folder before."""
+    table = (ROOT / "docs" / "experiments.md").read_text().split("\n## The run folder\n")[1]
+    found = []
+    for line in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE):
+        folder = ""
+        for path in re.findall(r"`([^`]+)`", line):
+            folder = path.rpartition("/")[0] + "/" if "/" in path else folder
+            found.append((path if "/" in path else folder + path) + ("*" if path.endswith("/") else ""))
+    return found
+
+
+def test_the_page_lists_what_a_run_writes_and_the_run_wrote_what_it_lists(flown):
+    run, paths = flown[1], listed_paths()
+    written = [str(file.relative_to(run)) for file in sorted(run.rglob("*")) if file.is_file()]
+    unlisted = [file for file in written if not any(fnmatch.fnmatch(file, path) for path in paths)]
+    assert unlisted == []
+    stages = ("config.yaml", "tracking.json", "stages/", "data/", "encoder/", "train/", "policy/", "eval/")
+    own = [path for path in paths if path.startswith(stages)]
+    assert len(own) > 12
+    assert [path for path in own if not fnmatch.filter(written, path)] == []
 
 
 def test_the_policy_carries_the_very_encoder_that_was_pretrained(flown):
