@@ -65,12 +65,8 @@ def family_table(
     names = list(dict.fromkeys(one.contrast.name for one in findings))
     groups = list(dict.fromkeys(one.contrast.ours.group for one in findings))
     against = {"" if _alone(one.contrast) else one.contrast.theirs.group for one in findings}  # type: ignore[union-attr]
-    if (
-        len(names) > 1
-        and not beside
-        and len(against) == 1
-        and not any(one.contrast.source for one in findings)
-    ):
+    complete = len(findings) == len(groups) * len(names) and not any(one.contrast.source for one in findings)
+    if len(names) > 1 and not beside and (against == {""} or (len(against) == 1 and complete)):
         (theirs,) = against
         cells = {(one.contrast.ours.group, one.contrast.name): _cell(family, one) for one in findings}
         lines = [(f"`{group}`", *(cells.get((group, name), "-") for name in names)) for group in groups]
