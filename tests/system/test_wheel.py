@@ -125,7 +125,7 @@ def test_the_command_demo_of_a_new_environment_compiles_nothing_where_its_kernel
     ]
     subprocess.run(pip, check=True)
     site = Path(
-        subprocess.check_output([python, "-c", "import envs; print(envs.__path__[0])"], text=True)
+        subprocess.check_output([python, "-I", "-c", "import envs; print(envs.__path__[0])"], text=True)
     ).parent
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     (site / "sitecustomize.py").write_text(without(*ABSENT))
