@@ -334,10 +334,9 @@ def _step(luminance, span, width, limit, model, memory, scratch):
 def scan(luminance, begin, model, memory, flags, outside):
     """Write the pixels outside their quiet band, from pixel `begin` on, in their order; return how many.
 
-    The loops over pixels have no branch, so that they compile to wide instructions; the last looks
-    at eight flags at a time.
+    The loops over pixels have no branch, so that they compile to wide instructions.
     """
-    flag, found, words, end = flags.view(np.uint8), 0, (luminance.size + 7) // 8, begin + luminance.size
+    flag, end = flags.view(np.uint8), begin + luminance.size
     if memory.is_banded[0]:
         low, high = memory.quiet_low[begin:end], memory.quiet_high[begin:end]
         for i in range(luminance.size):
@@ -350,12 +349,28 @@ def scan(luminance, begin, model, memory, flags, outside):
             raised, reach = luminance[i] + shift, max(light[i], knee)
             quiet = (raised >= light[i] - down * reach) & (raised <= min(light[i] + up * reach, most))
             flag[i] = not (quiet & (luminance[i] >= np.float32(0.0)))
-    for i in range(luminance.size, 8 * words):
+    return write_flagged(flags, luminance.size, begin, outside)
+
+
+@inlined
+def write_flagged(flags, size, begin, places):
+    """Write `begin` + i for each i < `size` whose flag is set, in their order; return how many.
+
+    Eight flags are looked at together: most are not set.
+
+    Args:
+        flags: One a byte, uint64 (ceil(size / 8),) or more; changed from `size` on.
+        size: How many.
+        begin: Added to each.
+        places: Room for eight times as many words, int64.
+    """
+    flag, found, words = flags.view(np.uint8), 0, (size + 7) // 8
+    for i in range(size, 8 * words):
         flag[i] = False
     for word in range(words):
         if flags[word] != 0:
             for i in range(8 * word, 8 * word + 8):
-                outside[found] = begin + i
+                places[found] = begin + i
                 found += flag[i]
     return found
 

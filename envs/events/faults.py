@@ -4,6 +4,9 @@
 of one interval; `RealSensor` adds what acts on the pixels themselves, and what happens between them and the
 reader. What is off costs nothing and draws nothing.
 
+Where nothing but the pixels' noise, lost and false events is asked for, the compiled step of `envs.vehicles`
+applies all of it by `spoil`; the rest needs Python after each step.
+
 A plug-in adds a fault by `ADDED_FAULTS[name] = make`. At the start of an episode `make(amount, shape, rng)`
 is called, with the amount of `faults.added.NAME`, the image's (H, W) and the episode's random stream. It
 returns `apply(events, t0_us, t1_us)`, which is called after the faults of this file and before the readout,
@@ -12,7 +15,7 @@ with EVENT of the interval (t0_us, t1_us], and returns what they become: EVENT, 
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -22,13 +25,11 @@ from envs.events.camera import MAX_EVENTS_PER_FRAME
 from envs.events.disturbances import disturb
 from envs.events.emission import EVENT
 from envs.events.noise_labels import NoiseLabels
-from envs.events.pixel_noise import PixelNoise, PixelState, no_noise
+from envs.events.pixel_noise import PixelNoise, PixelState, fire, no_noise
 from envs.events.readout import Readout
 
-NO_NOISE = no_noise()
 LABELLED = np.dtype([*EVENT.descr, ("is_noise", "?")])
-Span = tuple[int, int]  # [us], without its begin
-Noise = tuple[np.ndarray, np.ndarray, np.ndarray]  # int64 each: times [us], flat pixels, polarities
+NO_BURSTS, NOTHING_FIRED = np.zeros((0, 2), np.int64), np.zeros((3, 0), np.int64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +45,61 @@ class PixelFaults:
     dead: np.ndarray
     live: np.ndarray
     hot: np.ndarray
+
+
+class Rates(NamedTuple):
+    """How many events are lost and added, as `FaultsConfig` has them; and whether any pixel may be dead."""
+
+    has_dead: bool
+    event_dropout: float
+    background_activity: float
+    background_activity_hz: float
+    hot_pixel_hz: float
+    burst_activity_hz: float
+
+
+class FaultState(NamedTuple):
+    """The faults of one camera, as compiled code takes them.
+
+    Attributes:
+        is_on: Whether there are any.
+        noise: Of its pixels, `PixelState`, whose random stream is that of all faults.
+        numbers: The flat pixel y * W + x of each pixel that has noise, int64.
+        dead, live, hot: As `PixelFaults` has them.
+        rates: `Rates`.
+        expected: float64 (1,), how many false events were to be expected in the last interval.
+    """
+
+    is_on: bool
+    noise: PixelState
+    numbers: np.ndarray
+    dead: np.ndarray
+    live: np.ndarray
+    hot: np.ndarray
+    rates: Rates
+    expected: np.ndarray
+
+
+def fault_state(
+    faults: FaultsConfig,
+    pixels: PixelFaults,
+    rng: np.random.Generator,
+    noise: PixelState | None = None,
+    numbers: np.ndarray | None = None,
+) -> FaultState:
+    """Return the faults of one camera for compiled code; `numbers` are those of the pixels of `noise`."""
+    rates = Rates(
+        faults.sparsity > 0.0 or faults.dead_block > 0.0,
+        float(faults.event_dropout),
+        float(faults.background_activity),
+        float(faults.background_activity_hz),
+        float(faults.hot_pixel_hz),
+        float(faults.burst_activity_hz),
+    )
+    state = no_noise(rng) if noise is None else noise
+    of_noise = np.empty(0, np.int64) if numbers is None else numbers
+    is_on = faults != FaultsConfig()
+    return FaultState(is_on, state, of_noise, pixels.dead, pixels.live, pixels.hot, rates, np.zeros(1))
 
 
 def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.random.Generator) -> PixelFaults:
@@ -68,6 +124,15 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
     return PixelFaults(dead, live, hot)
 
 
+def _no_faults() -> FaultState:
+    """Return the state of a camera without faults."""
+    rng, faults = np.random.default_rng(0), FaultsConfig()
+    return fault_state(faults, draw_pixel_faults((2, 2), faults, rng), rng)
+
+
+NO_FAULTS = _no_faults()
+
+
 class Bursts:
     """When bursts of false events begin and end: a Poisson process of beginnings, all of one length."""
 
@@ -77,21 +142,25 @@ class Bursts:
         self._rng, self._begun_us = rng, list[float]()
         self._next_us = t_us + rng.exponential(self._pause_us)
 
-    def until(self, t0_us: int, t1_us: int) -> list[Span]:
-        """Return the parts of (t0_us, t1_us] that each burst fills; spans may overlap, as bursts may."""
+    def until(self, t0_us: int, t1_us: int) -> np.ndarray:
+        """Return the parts (begin, end] of (t0_us, t1_us] that each burst fills, int64 (K, 2).
+
+        They may overlap, as bursts may.
+        """
         while self._next_us < t1_us:
             self._begun_us.append(self._next_us)
             self._next_us += self._rng.exponential(self._pause_us)
         ends = [(begun_us, begun_us + self._length_us) for begun_us in self._begun_us]
         self._begun_us = [begun_us for begun_us, end_us in ends if end_us > t1_us]
         spans = [(max(t0_us, round(begun)), min(t1_us, round(end))) for begun, end in ends]
-        return [span for span in spans if span[0] < span[1]]
+        return np.array([span for span in spans if span[0] < span[1]], np.int64).reshape(-1, 2)
 
 
 class RealSensor:
     """All that a real sensor adds to the events of one camera, from its first frame on.
 
     Attributes:
+        state: `FaultState`.
         lost: Events of the last interval that the readout lost.
         is_noise: bool (N,), which events of the last interval no change of the light fired; empty unless
             asked for. A displaced or flipped event is none; but all that a plug-in returns otherwise than it
@@ -126,6 +195,7 @@ class RealSensor:
         shape = camera.height, camera.width
         self._pixels = draw_pixel_faults(shape, faults, rng)
         self._noise = self._readout = self._noise_labels = None
+        alive = None
         if faults.shot_noise_hz > 0.0 or faults.leak_hz > 0.0:
             own, numbers = state
             rest = own[1][1]["first_level"].copy()  # before the noise moves the levels
@@ -133,6 +203,8 @@ class RealSensor:
             self._noise = PixelNoise(camera, faults, own, alive, t_us, rng)
             if labels:
                 self._noise_labels = NoiseLabels(own, numbers, rest)
+        noise = None if self._noise is None else self._noise.state
+        self.state = fault_state(faults, self._pixels, rng, noise, alive)
         bursts = faults.burst_hz > 0.0 and faults.burst_ms > 0.0 and faults.burst_activity_hz > 0.0
         self._bursts = Bursts(faults, t_us, rng) if bursts else None
         if has_readout(camera):
@@ -143,33 +215,32 @@ class RealSensor:
         }
 
     @property
-    def pixel_noise(self) -> PixelState:
-        """Return the state of the pixel noise; `NO_NOISE` if the pixels have none."""
-        return self._noise.state if self._noise is not None else NO_NOISE
+    def is_compiled(self) -> bool:
+        """Whether `spoil` applies all of it."""
+        disturbed = self._faults.displaced > 0.0 or self._faults.flipped > 0.0
+        later = self._bursts is not None or self._readout is not None or bool(self._added)
+        return not (disturbed or later or self._labels)
 
-    def events(
-        self, events: np.ndarray, t0_us: int, t1_us: int, fired: np.ndarray | None = None
-    ) -> np.ndarray:
+    def events(self, events: np.ndarray, t0_us: int, t1_us: int) -> np.ndarray:
         """Return the events that leave the sensor in (t0_us, t1_us], given those that the light fired.
 
-        The camera has seen the light of t1_us. `fired` is what `pixel_noise.fire` found of `pixel_noise` for
-        this interval, if that was called. As `apply_faults`, which also says what is raised.
+        The camera has seen the light of t1_us. As `apply_faults`, which also says what is raised.
         """
-        noise, labels = None, None
+        noise, labels, shape = NOTHING_FIRED, None, self._pixels.dead.shape
         kept = self._noise.kept() if self._noise_labels is not None and self._noise is not None else None
         if self._noise is not None:
-            noise = self._noise.events(t0_us, t1_us) if fired is None else self._noise.of_image(fired)
-        if self._noise_labels is not None and noise is not None and kept is not None:
-            pixels = events["y"].astype(np.int64) * self._pixels.dead.shape[1] + events["x"]
-            of_light, labels = self._noise_labels.of((pixels, events["p"]), noise[1:], t1_us, kept)
+            noise = self._noise.events(t0_us, t1_us)
+        if self._noise_labels is not None and kept is not None:
+            pixels, fired = events["y"].astype(np.int64) * shape[1] + events["x"], noise[1:]
+            told = self.state.numbers[fired[0]], fired[1]
+            of_light, labels = self._noise_labels.of((pixels, events["p"]), told, t1_us, kept)
             events = labelled(events, of_light)
-        drawn = self._pixels, self._rng
-        bursts = self._bursts.until(t0_us, t1_us) if self._bursts is not None else ()
+        bursts = self._bursts.until(t0_us, t1_us) if self._bursts is not None else NO_BURSTS
         span = t0_us, t1_us
-        events, is_noise = _with_faults(events, span, self._faults, *drawn, noise, labels, bursts)
+        events, is_noise = _with_faults(events, span, self._faults, self.state, noise, labels, bursts)
         for name, apply in self._added.items():
             before, events = events, apply(events, t0_us, t1_us)
-            _check_added(name, events, (t0_us, t1_us), self._pixels.dead.shape)
+            _check_added(name, events, (t0_us, t1_us), shape)
             if self._labels:
                 is_noise = ~np.isin(events, before[~is_noise])
         if not self._labels:
@@ -228,7 +299,6 @@ def apply_faults(
     faults: FaultsConfig,
     pixels: PixelFaults,
     rng: np.random.Generator,
-    noise: Noise | None = None,
 ) -> np.ndarray:
     """Lose true events and add false ones.
 
@@ -247,7 +317,6 @@ def apply_faults(
         faults: How much.
         pixels: Which pixels.
         rng: Source of the draws.
-        noise: What the noise of the pixels fired in the interval, if they have any.
 
     Returns:
         EVENT with t in (t0_us, t1_us], sorted by (t, y, x), true events first where all are equal.
@@ -255,74 +324,156 @@ def apply_faults(
     Raises:
         ValueError: The interval is empty, or more than 2**24 false events are to be expected.
     """
-    return _with_faults(events, (t0_us, t1_us), faults, pixels, rng, noise)[0]
+    return _with_faults(events, (t0_us, t1_us), faults, fault_state(faults, pixels, rng), NOTHING_FIRED)[0]
 
 
 def _with_faults(
     events: np.ndarray,
     span_us: tuple[int, int],
     faults: FaultsConfig,
-    pixels: PixelFaults,
-    rng: np.random.Generator,
-    noise: Noise | None,
+    state: FaultState,
+    fired: np.ndarray,
     labels: np.ndarray | None = None,
-    bursts: Sequence[Span] = (),
+    bursts: np.ndarray = NO_BURSTS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`apply_faults` and the false events of `bursts`, and which of the events are noise, bool (N,).
+    """`apply_faults`, the events of the pixels' noise and of bursts; and which are noise, bool (N,).
 
-    All that is added is noise, except where `labels` (bool, one for each event of `noise`) says otherwise; so
+    All that is added is noise, except where `labels` (bool, one for each event of `fired`) says otherwise; so
     are those events that come as LABELLED with that label.
     """
     t0_us, t1_us = span_us
     if t1_us <= t0_us:
         raise ValueError(f"faults need t1_us > t0_us; got {t0_us} and {t1_us}.")
-    if faults.sparsity > 0.0 or faults.dead_block > 0.0:
-        events = events[~pixels.dead[events["y"], events["x"]]]
-    if faults.event_dropout > 0.0:
-        events = events[rng.random(events.size) >= faults.event_dropout]
-    events = disturb(events, faults, pixels.dead.shape, rng)
-    kinds = _expected(events.size, span_us, faults, pixels, bursts)
-    expected = sum(mean for _, mean, _ in kinds)
-    if expected > MAX_EVENTS_PER_FRAME:
+    if state.rates.has_dead or state.rates.event_dropout > 0.0:
+        events = lose(events, state)
+    events = disturb(events, faults, state.dead.shape, state.noise.rng)
+    events, is_noise = unlabelled(events)
+    are_noise = np.ones(fired.shape[1], bool) if labels is None else labels
+    events, is_noise = add_false((events, is_noise), (fired, are_noise), span_us, bursts, state)
+    check_expected(state, span_us)
+    return events, is_noise
+
+
+def check_expected(state: FaultState, span_us: tuple[int, int]) -> None:
+    """Raise ValueError if more false events were to be expected in an interval than there may be."""
+    if state.expected[0] > MAX_EVENTS_PER_FRAME:
         raise ValueError(
             f"faults may add {MAX_EVENTS_PER_FRAME} events to an interval; these rates add about "
-            f"{expected:.3g} from {t0_us} to {t1_us} us. Lower the rates or shorten the interval."
+            f"{state.expected[0]:.3g} from {span_us[0]} to {span_us[1]} us. Lower the rates or shorten the "
+            "interval."
         )
-    drawn = [
-        (where[rng.integers(0, where.size, int(rng.poisson(mean)))], span) for where, mean, span in kinds
-    ]
-    false = [_at_any_time(where, span, rng) for where, span in drawn] + ([noise] if noise else [])
-    events, is_noise = unlabelled(events)
-    if not sum(part[0].size for part in false):
-        return events, is_noise
-    times, places, polarities = (np.concatenate(parts) for parts in zip(*false, strict=True))
-    are_noise = np.ones(times.size, bool)
-    if labels is not None:
-        are_noise[times.size - labels.size :] = labels
-    return _merged((events, is_noise), (times, places, polarities, are_noise), t0_us, pixels.dead.shape)
 
 
-def _expected(
-    num_events: int, span_us: Span, faults: FaultsConfig, pixels: PixelFaults, bursts: Sequence[Span]
-) -> list[tuple[np.ndarray, float, Span]]:
-    """Return pixels, mean number of events of all of them, and when, of each kind of noise that is on."""
-    kinds, seconds = [], (span_us[1] - span_us[0]) * 1e-6
-    background = faults.background_activity * num_events
-    background += faults.background_activity_hz * seconds * pixels.live.size
-    if background > 0.0 and pixels.live.size:
-        kinds.append((pixels.live, background, span_us))
-    if faults.hot_pixel_hz > 0.0 and pixels.hot.size:
-        kinds.append((pixels.hot, faults.hot_pixel_hz * seconds * pixels.hot.size, span_us))
-    for begin_us, end_us in bursts if pixels.live.size else ():
-        mean = faults.burst_activity_hz * (end_us - begin_us) * 1e-6 * pixels.live.size
-        kinds.append((pixels.live, mean, (begin_us, end_us)))
-    return kinds
+@numba.njit(cache=True, error_model="numpy")
+def spoil(
+    events: np.ndarray, span_us: tuple[int, int], model: tuple, memory: tuple, state: FaultState
+) -> np.ndarray:
+    """Apply the faults of a sensor of which `RealSensor.is_compiled` holds to the events of a step.
+
+    Args:
+        events: EVENT that the light fired, sorted by (t, y, x).
+        span_us: When the step began and ended [us].
+        model: Of the camera, as `EventCamera.state` has it.
+        memory: As there; it has seen the light of the end.
+        state: `FaultState`, changed in place.
+
+    Returns:
+        EVENT, sorted; wrong if `state.expected` is more than `MAX_EVENTS_PER_FRAME`.
+    """
+    rates, fired = state.rates, np.empty((3, 0), np.int64)
+    if state.numbers.size > 0:
+        fired = fire(span_us[0], span_us[1], model, memory, state.noise)
+    if rates.has_dead or rates.event_dropout > 0.0:
+        events = lose(events, state)
+    light, noise = (events, np.zeros(events.size, np.bool_)), (fired, np.ones(fired.shape[1], np.bool_))
+    return add_false(light, noise, span_us, NO_BURSTS, state)[0]
 
 
-def _at_any_time(where: np.ndarray, span_us: Span, rng: np.random.Generator) -> Noise:
-    """Draw events at these flat pixels with uniform times and polarities."""
-    times = rng.integers(*span_us, where.size) + 1
-    return times, where, 2 * rng.integers(0, 2, where.size) - 1
+@numba.njit(cache=True, error_model="numpy")
+def lose(events: np.ndarray, state: FaultState) -> np.ndarray:
+    """Return the events of live pixels, but each with probability event_dropout not."""
+    rates, rng, dead, count = state.rates, state.noise.rng, state.dead, 0
+    kept = np.empty_like(events)
+    for i in range(events.size):
+        if not (rates.has_dead and dead[events[i]["y"], events[i]["x"]]):
+            kept[count] = events[i]
+            count += rates.event_dropout == 0.0 or rng.random() >= rates.event_dropout
+    return kept[:count]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def add_false(
+    light: tuple[np.ndarray, np.ndarray],
+    noise: tuple[np.ndarray, np.ndarray],
+    span_us: tuple[int, int],
+    bursts: np.ndarray,
+    state: FaultState,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw background, hot pixels and bursts, and merge them and the pixels' noise with events.
+
+    Args:
+        light: EVENT (N,), sorted by (t, y, x), and which are noise, bool (N,).
+        noise: What `fire` returned, and which of it is noise.
+        span_us: When the interval begins and ends [us].
+        bursts: int64 (K, 2), when each burst begins and ends [us].
+        state: `FaultState`.
+
+    Returns:
+        EVENT and which of them are noise; without those that are drawn if too many are to be expected.
+    """
+    means, spans, are_hot = _kinds(light[0].size, span_us, bursts, state)
+    state.expected[0] = means.sum()
+    if state.expected[0] > MAX_EVENTS_PER_FRAME:
+        return light
+    (fired, are_noise), rng, total = noise, state.noise.rng, noise[1].size
+    parts = [np.empty(0, np.int64)]
+    for kind in range(means.size):
+        where = state.hot if are_hot[kind] else state.live
+        part = rng.integers(0, where.size, rng.poisson(means[kind]))
+        for j in range(part.size):
+            part[j] = where[part[j]]
+        parts.append(part)
+        total += part.size
+    if total == 0:
+        return light
+    false, labels, first = np.empty((3, total), np.int64), np.ones(total, np.bool_), 0
+    for kind in range(means.size):
+        part = parts[kind + 1]
+        end = first + part.size
+        false[0, first:end] = rng.integers(spans[kind, 0], spans[kind, 1], part.size) + 1
+        false[1, first:end] = part
+        false[2, first:end] = 2 * rng.integers(0, 2, part.size) - 1
+        first = end
+    for j in range(fired.shape[1]):
+        false[0, first + j], false[2, first + j] = fired[0, j], fired[2, j]
+        false[1, first + j], labels[first + j] = state.numbers[fired[1, j]], are_noise[j]
+    return _merged(light, (false[0], false[1], false[2], labels), span_us[0], state.dead.shape)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _kinds(
+    num_events: int, span_us: tuple[int, int], bursts: np.ndarray, state: FaultState
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return, of each kind of false events that is on, their mean number, when, and whether of hot pixels."""
+    rates, seconds = state.rates, (span_us[1] - span_us[0]) * 1e-6
+    most = 2 + len(bursts)
+    means, spans, are_hot = np.empty(most), np.empty((most, 2), np.int64), np.zeros(most, np.bool_)
+    spans[:2, 0], spans[:2, 1] = span_us
+    live, count = state.live.size, 0
+    background = rates.background_activity * num_events
+    background += rates.background_activity_hz * seconds * live
+    if background > 0.0 and live:
+        means[0] = background
+        count = 1
+    if rates.hot_pixel_hz > 0.0 and state.hot.size:
+        means[count], are_hot[count] = rates.hot_pixel_hz * seconds * state.hot.size, True
+        count += 1
+    for k in range(len(bursts) if live else 0):
+        begin_us, end_us = bursts[k, 0], bursts[k, 1]
+        means[count] = rates.burst_activity_hz * (end_us - begin_us) * 1e-6 * live
+        spans[count, 0], spans[count, 1] = begin_us, end_us
+        count += 1
+    return means[:count], spans[:count], are_hot[:count]
 
 
 @numba.njit(cache=True, error_model="numpy")

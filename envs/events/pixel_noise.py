@@ -38,6 +38,7 @@ from envs.events.crossings import (
     named,
     respond_at,
     set_quiet_bands,
+    write_flagged,
 )
 from envs.events.emission import Span
 from envs.events.refractory import never_be_quiet
@@ -194,7 +195,7 @@ class PixelState(NamedTuple):
         rows: Arrays of a `Noise`, as `_noise` takes them; of no pixels if there is no noise.
         process: `Process`.
         rng: Source of all draws.
-        scratch: Two rooms for blocks of pixels, and room for numbers of pixels, int64.
+        scratch: Two rooms for blocks of pixels, and flags and room as `crossings.scan` has.
     """
 
     rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -206,13 +207,14 @@ class PixelState(NamedTuple):
 @lru_cache(maxsize=4)
 def _scratch(size: int) -> tuple:
     """Scratch for `size` pixels, which all cameras of a process share: it stays in the cache."""
-    return make_room(), make_room(), np.empty(size, np.int64)
+    words = (size + 7) // 8
+    return make_room(), make_room(), np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)
 
 
-def no_noise() -> PixelState:
-    """Return the state of a camera whose pixels have no noise."""
+def no_noise(rng: np.random.Generator) -> PixelState:
+    """Return the state of a camera whose pixels have no noise; nothing is drawn."""
     rows = np.zeros((0, 9)), np.zeros((2, 0), np.float32), np.zeros(0), np.zeros(0, np.int64)
-    return PixelState(rows, Process(0.0, 1.0, np.zeros(2), 0.0, 1.0), np.random.default_rng(0), _scratch(0))
+    return PixelState(rows, Process(0.0, 1.0, np.zeros(2), 0.0, 1.0), rng, _scratch(0))
 
 
 class PixelNoise:
@@ -245,7 +247,6 @@ class PixelNoise:
             ValueError: If `shot_noise_hz` cannot be had with the bandwidth of the pixels.
         """
         self._model, self._memory, _ = state
-        self._numbers = numbers
         size, alive = numbers.size, numbers >= 0
         tau_s = 1.0 / (2.0 * math.pi * (camera.cutoff_hz or DEFAULT_BANDWIDTH_HZ))
         spread = alive * 10.0 ** (faults.noise_spread * rng.standard_normal(size))
@@ -265,22 +266,19 @@ class PixelNoise:
         self.state = PixelState((rows, seen, due_us, kept_us), process, rng, _scratch(size))
         move_levels(self._model, self._memory, -rng.random(size) * alive)
 
-    def events(self, t0_us: int, t1_us: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def events(self, t0_us: int, t1_us: int) -> np.ndarray:
         """Return the noise events of (t0_us, t1_us], after those of the light, which is the light of t1_us.
 
         Returns:
-            Times [us], flat pixels y * W + x and polarities, int64 each.
+            As `fire`.
         """
-        return self.of_image(fire(t0_us, t1_us, self._model, self._memory, self.state))
+        fired: np.ndarray = fire(t0_us, t1_us, self._model, self._memory, self.state)
+        return fired
 
     def kept(self) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of `Noise.kept` and `Noise.kept_us`."""
         rows, _, _, kept_us = self.state.rows
         return rows[:, 8].copy(), kept_us.copy()
-
-    def of_image(self, fired: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Convert the output of `fire` to the output of `events`."""
-        return fired[0], self._numbers[fired[1]], fired[2]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -315,14 +313,14 @@ def fire(t0_us, t1_us, model, memory, state):
     """
     (real, seen, due_us, kept_us), process, rng, scratch = state
     model, memory = named(model, memory)
-    noise, (room, spare, changed) = _noise(real, seen, due_us, kept_us), scratch
+    noise, (room, spare, flags, changed) = _noise(real, seen, due_us, kept_us), scratch
     parts = 1 + np.int64((t1_us - t0_us) / process.slice_us)  # cut finely enough for leakage
     noisy = Noisy(model, memory, noise, process)
     fired, count = np.empty((3, FIRED), np.int64), 0
     for part in range(parts):
         begin_us = t0_us + (t1_us - t0_us) * part // parts
         span = Span(begin_us, t0_us + (t1_us - t0_us) * (part + 1) // parts)
-        found = _find(span, memory, noise, changed)
+        found = _find(span, memory, noise, flags, changed)
         for first in range(0, found, BLOCK):
             pixels = changed[first : min(first + BLOCK, found)]
             _restore(pixels, t1_us, memory, noise)
@@ -361,15 +359,13 @@ def _noise(real, seen, due_us, kept_us):
 
 
 @kernel
-def _find(span, memory, noise, changed):
+def _find(span, memory, noise, flags, changed):
     """Write the pixels whose light or level has changed, or whose time has come; return how many."""
-    found, end_us = 0, np.float64(span.end_us)
-    for i in range(noise.leak.size):
+    flag, end_us, size = flags.view(np.uint8), np.float64(span.end_us), noise.due_us.size
+    for i in range(size):
         other = abs(memory.previous[i] - noise.light[i]) > SAME_LIGHT * noise.light[i]
-        other |= (memory.quiet_low[i] != noise.band[i]) | (noise.due_us[i] <= end_us)
-        changed[found] = i
-        found += other
-    return found
+        flag[i] = other | (memory.quiet_low[i] != noise.band[i]) | (noise.due_us[i] <= end_us)
+    return write_flagged(flags, size, 0, changed)
 
 
 @kernel

@@ -35,7 +35,7 @@ from envs.events.crossings import (
     set_quiet_bands,
 )
 from envs.events.emission import EVENT, MAX_EVENTS_PER_FRAME, sorted_events
-from envs.events.lowpass import ColumnFilter, column_filter, filter_columns, start_filter
+from envs.events.lowpass import ColumnFilter, column_filter, filter_columns, start_columns
 from envs.events.photoreceptor import Curve, light_of, natural_logarithm
 from envs.events.refractory import TOLERANCE
 
@@ -140,7 +140,7 @@ class ColumnCamera:
         """Remember a first frame, float32 (H, W), valid; it makes no events."""
         flat = luminance.T.ravel()
         if self.bandwidth.seen.size:
-            start_filter(flat, Curve(*self.state[0][1]), self.bandwidth.pixels)
+            start_columns(flat, Curve(*self.state[0][1]), self.bandwidth)
         remember(flat, *self.state[:2])
 
 
@@ -159,14 +159,15 @@ def look_at(image, first, last, t_us, watch, kept):
     Returns:
         First invalid pixel or -1, ramps in use, and events lost.
     """
-    flat, (flags, outside) = image.reshape(image.size), watch.scratch
+    flat, scratch = image.reshape(image.size), watch.scratch
+    flags, outside = scratch
     model, memory, ramps = watch.model, watch.memory, watch.ramps
     begin, end = first * image.shape[1], last * image.shape[1]
     if watch.bandwidth.seen.size > 0:
         bad = first_invalid(flat[begin:end])
         if bad >= 0:
             return begin + bad, kept, 0
-        filter_columns(flat, first, last, t_us, watch.seen_us, model.curve, watch.bandwidth)
+        filter_columns(flat, first, last, t_us, watch.seen_us, model.curve, watch.bandwidth, scratch)
         flat = watch.bandwidth.seen
     seen, past = flat[begin:end], memory.previous[begin:end]
     found = scan(seen, begin, model, memory, flags, outside)

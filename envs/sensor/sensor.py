@@ -8,11 +8,9 @@ import numpy as np
 from envs.checks import check_pose
 from envs.config import WITHOUT_EVENTS, EnvConfig, FaultsConfig
 from envs.events import EVENT, EventCamera, RealSensor
-from envs.events.faults import NO_NOISE as NO_PIXEL_NOISE
-from envs.events.faults import has_readout
+from envs.events.faults import NO_FAULTS, FaultState, check_expected, has_readout
 from envs.events.flicker import NO_FLICKER, brightness_at, draw_flicker, looks_needed
 from envs.events.lowpass import UNLIMITED
-from envs.events.pixel_noise import PixelState
 from envs.events.ramps import ColumnCamera
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
 from envs.kinematics import Outcome, Point
@@ -34,7 +32,7 @@ class Sensor:
     camera, with "none" a clock alone.
 
     A sensor that sees by looks is not stepped here: the compiled step of `envs.vehicles` takes its `view`,
-    together with the views of many other sensors, and `with_faults` completes the events.
+    together with the views of many other sensors, and its `faults`; `with_faults` applies what those lack.
 
     Attributes:
         events: EVENT array of the last step, faults included; empty where no camera is simulated.
@@ -158,18 +156,23 @@ class Sensor:
         scratch = scratch_for(*size, len(scene[0]))
         return View(*scene, model, memory, self._seen_us, bandwidth, shifts, self._flicker, scratch)
 
-    def pixel_noise(self) -> PixelState:
-        """Return the state from which the compiled step fires the noise of this sensor's pixels."""
-        return self._real.pixel_noise if self.sees_by_looks else NO_PIXEL_NOISE
+    def faults(self) -> FaultState:
+        """Return the faults that the compiled step applies to the events of this sensor."""
+        return self._real.state if self.sees_by_looks and self._real.is_compiled else NO_FAULTS
 
-    def with_faults(
-        self, events: np.ndarray, start_us: int, end_us: int, fired: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Apply this sensor's faults to the events of a step; `fired` is passed to `RealSensor.events`."""
+    @property
+    def needs_python(self) -> bool:
+        """Whether the compiled step leaves something to `step` or `with_faults`."""
+        return not self.sees_by_looks or (self.has_faults and not self._real.is_compiled)
+
+    def check_faults(self, start_us: int, end_us: int) -> None:
+        """Raise ValueError if the last step was to add more false events than may be."""
+        check_expected(self._real.state, (start_us, end_us))
+
+    def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
+        """Apply this sensor's faults to the events of a step."""
         self.true_events = events
-        if not self.has_faults:
-            return events
-        return self._real.events(events, start_us, end_us, fired)
+        return self._real.events(events, start_us, end_us) if self.has_faults else events
 
     def _render_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
         """Return the events of a way from whole images."""

@@ -1,7 +1,7 @@
 """One control step of many vehicles in one compiled call.
 
 It moves each vehicle, finds contact and goal, and simulates the camera of every sensor that sees
-by looks (`envs.sensor`), and the noise of its pixels. Other sensors, and all other faults, take
+by looks (`envs.sensor`), with its faults. Other sensors, and rarer faults (`RealSensor.is_compiled`), take
 their turn in Python afterwards. A kinematic vehicle is moved here; others come with the way of their step
 (`envs.vehicles.bodies`).
 """
@@ -13,13 +13,14 @@ import numpy as np
 from numba.typed import List
 
 from envs.events import EVENT
-from envs.events.pixel_noise import fire
+from envs.events.camera import MAX_EVENTS_PER_FRAME
+from envs.events.faults import spoil
 from envs.fidelity import parts_of
 from envs.kinematics import Lane, advance_among, clock_us, follow, planned_position
 from envs.raycast.silhouettes import Way
 from envs.sensor import joined, sense_way
 
-GOOD, BAD_REWARD = -1, -10
+GOOD, BAD_REWARD, TOO_MANY_FALSE = -1, -10, -11
 
 _FLOATS = (
     *("spawn_x_m", "spawn_y_m", "x_m", "y_m"),
@@ -37,7 +38,7 @@ _WHOLE = (
     *("start_us", "t_us"),  # when the last step began and ended
     "window_us",  # its length; before the first step, the length of that
     *("num_events", "dropped"),  # events of it, and those that the camera lost in it
-    "problem",  # `GOOD`, `BAD_REWARD`, or what `sense_way` says
+    "problem",  # `GOOD`, `BAD_REWARD`, `TOO_MANY_FALSE`, or what `sense_way` says
 )
 _FLAGS = ("by_looks", "success", "collision", "truncated", "over")
 VEHICLE = np.dtype(
@@ -50,7 +51,7 @@ VEHICLE = np.dtype(
 def corridor_list(corridor, count):
     """Return a list of `count` times the same corridor: sections that stand, those that move, and a `View`.
 
-    Or with the same `PixelState`.
+    Or with the same `FaultState`.
     """
     corridors = List()
     for _ in range(count):
@@ -65,47 +66,53 @@ def set_corridor(corridors, row, corridor):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def step_all(rows, corridors, noisy, actions, ways, active):
+def step_all(rows, corridors, faulty, actions, ways, active):
     """Simulate one control step of all active vehicles.
 
     Args:
         rows: (B,) VEHICLE, changed in place.
         corridors: A list of B, see `corridor_list`.
-        noisy: A list of B `PixelState`, of cameras that see by looks.
+        faulty: A list of B `FaultState`, of cameras that see by looks.
         actions: int64 (B,), of kinematic vehicles.
         ways: float64 (B, N, 2), the planned places of vehicles with bodies, `Bodies.ways`.
         active: bool (B,).
 
     Returns:
         EVENT of those that see by looks, vehicle after vehicle; int64 (B + 1,), where the events of each end;
-        and what the noise of their pixels fired, int64 (3, M) as `pixel_noise.fire` returns it, and its ends.
+        and both before faults, the same array where no vehicle has any.
     """
     found, ends = [np.empty(0, EVENT)], np.zeros(rows.size + 1, np.int64)
-    noise, noise_ends = [np.empty((3, 0), np.int64)], np.zeros(rows.size + 1, np.int64)
+    true, true_ends, spoilt = [np.empty(0, EVENT)], np.zeros(rows.size + 1, np.int64), False
     for row in range(rows.size):
-        ends[row + 1], noise_ends[row + 1] = ends[row], noise_ends[row]
+        ends[row + 1], true_ends[row + 1] = ends[row], true_ends[row]
         if active[row]:
             sections, moving, view = corridors[row]
             _move(rows[row], actions[row], (sections, moving), ways[row])
             if rows[row].by_looks and rows[row].problem == GOOD:
                 events = _look(rows[row], view, ways[row])
+                true.append(events)
+                true_ends[row + 1] += events.size
+                faults = faulty[row]
+                if faults.is_on and rows[row].problem == GOOD:  # while the camera's memory is in the cache
+                    span_us, spoilt = (rows[row].start_us, rows[row].t_us), True
+                    events = spoil(events, span_us, view.model, view.memory, faults)
+                    if faults.expected[0] > MAX_EVENTS_PER_FRAME:
+                        rows[row].problem = TOO_MANY_FALSE
                 found.append(events)
                 ends[row + 1] += events.size
-                pixels = noisy[row]
-                if pixels.rows[2].size > 0 and rows[row].problem == GOOD:  # while its memory is in the cache
-                    fired = fire(rows[row].start_us, rows[row].t_us, view.model, view.memory, pixels)
-                    noise.append(fired)
-                    noise_ends[row + 1] += fired.shape[1]
             rows[row].over |= rows[row].problem != GOOD
-    together, size = np.empty(ends[-1], EVENT), 0
-    for events in found:
+    together = _concatenated(found, ends[-1])
+    return together, ends, _concatenated(true, true_ends[-1]) if spoilt else together, true_ends
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _concatenated(parts, total):
+    """Concatenate EVENT arrays of so many events in all."""
+    together, size = np.empty(total, EVENT), 0
+    for events in parts:
         together[size : size + events.size] = events
         size += events.size
-    all_noise, size = np.empty((3, noise_ends[-1]), np.int64), 0
-    for fired in noise:
-        all_noise[:, size : size + fired.shape[1]] = fired
-        size += fired.shape[1]
-    return together, ends, all_noise, noise_ends
+    return together
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -8,7 +8,7 @@ import numpy as np
 from core.neighbour_filter import NEVER, filter_all
 from envs.config import EnvConfig
 from envs.events import EVENT
-from envs.events.pixel_noise import PixelState
+from envs.events.faults import FaultState
 from envs.kinematics import Outcome, Point, clock_us
 from envs.scene import Scene
 from envs.scene.moving import MovingBody, Throws, moving_sections
@@ -16,7 +16,16 @@ from envs.sensor import Sensor, check_sensed
 from envs.vehicles import task
 from envs.vehicles.bodies import Bodies
 from envs.vehicles.dynamics import Dynamics
-from envs.vehicles.step import BAD_REWARD, GOOD, VEHICLE, corridor_list, set_corridor, step_all, way_of
+from envs.vehicles.step import (
+    BAD_REWARD,
+    GOOD,
+    TOO_MANY_FALSE,
+    VEHICLE,
+    corridor_list,
+    set_corridor,
+    step_all,
+    way_of,
+)
 
 NOTHING = np.zeros((0, 7))  # sections of a scene in which nothing stands
 NOTHING.flags.writeable = False  # as the sections of a scene, so that numba sees one type
@@ -75,8 +84,8 @@ class Vehicles:
         self._sensors: list[Sensor | None] = [None] * count
         self._in_python: set[int] = set()
         self._corridors: Any = None
-        self._noise: Any = None  # of pixels
-        self._noise_of: list[PixelState | None] = [None] * count
+        self._faults: Any = None  # those that the compiled step applies
+        self._faults_of: list[FaultState | None] = [None] * count
         self._bodies = Bodies(count)
         self._straight = np.zeros(count, np.int64)  # actions of kinematic vehicles where there is none
         self._moving: dict[int, Moving] = {}  # of the rows in whose scenes something moves
@@ -115,18 +124,18 @@ class Vehicles:
         self._sensors[row] = sensor
         moving = self._start_moving(row, scene)
         corridor = scene.sections(config.camera_height_m), moving, sensor.view()
-        noise = sensor.pixel_noise()
+        faults = sensor.faults()
         if self._corridors is None:
             self._corridors = corridor_list(corridor, len(self.rows))
-            self._noise = corridor_list(noise, len(self.rows))
-            self._noise_of = [noise] * len(self.rows)
+            self._faults = corridor_list(faults, len(self.rows))
+            self._faults_of = [faults] * len(self.rows)
         set_corridor(self._corridors, row, corridor)
-        if noise is not self._noise_of[row]:  # numba takes milliseconds to find the type of a random stream
-            set_corridor(self._noise, row, noise)
-            self._noise_of[row] = noise
+        if faults is not self._faults_of[row]:  # numba takes milliseconds to find the type of a random stream
+            set_corridor(self._faults, row, faults)
+            self._faults_of[row] = faults
         self._set_filter(row, config)
         self._in_python.discard(row)
-        if not sensor.sees_by_looks or sensor.has_faults:
+        if sensor.needs_python:
             self._in_python.add(row)
         if len(self.rows) == 1:
             self.forget_events()
@@ -157,8 +166,8 @@ class Vehicles:
             self._bodies.move(taken, active)
             rows["vx_mps"], rows["vy_mps"] = self._bodies.velocities
             headings = taken if taken.ndim == 1 else self._straight
-        self.events, self.ends, noise, noise_ends = step_all(
-            rows, self._corridors, self._noise, headings, self._bodies.ways, active
+        self.events, self.ends, self._true, self._true_ends = step_all(
+            rows, self._corridors, self._faults, headings, self._bodies.ways, active
         )
         if self._judges:
             self._judge(active)
@@ -169,7 +178,7 @@ class Vehicles:
         if in_python:
             parts = [self.events_of(row) for row in range(len(rows))]
             for row in in_python:
-                parts[row] = self._sense(row, parts[row], noise[:, noise_ends[row] : noise_ends[row + 1]])
+                parts[row] = self._sense(row, parts[row])
             np.cumsum([part.size for part in parts], out=self.ends[1:])
             self.events = np.concatenate(parts)
         counts = np.diff(self.ends)[active]
@@ -195,9 +204,11 @@ class Vehicles:
     def true_of(self, row: int) -> np.ndarray:
         """Return the events of a vehicle before the faults of its sensor."""
         sensor = self._sensors[row]
-        if row not in self._in_python or sensor is None or not self.rows["t_us"][row]:
-            return self.events_of(row)
-        return sensor.true_events
+        if not self.rows["t_us"][row]:
+            return np.empty(0, EVENT)
+        if row in self._in_python and sensor is not None:
+            return sensor.true_events
+        return self._true[self._true_ends[row] : self._true_ends[row + 1]]
 
     def decided(self, row: int) -> np.ndarray:
         """Return the actions that a vehicle has decided and not yet taken, the next one first."""
@@ -217,6 +228,7 @@ class Vehicles:
         """Forget the events of the last step."""
         self.events, self.ends = np.empty(0, EVENT), np.zeros(len(self.rows) + 1, np.int64)
         self.seen, self.seen_ends = self.events, self.ends
+        self._true, self._true_ends = self.events, self.ends.copy()
 
     def _set_delay(self, row: int, steps: int, straight: Any) -> None:
         """Begin an episode with decisions to move straight ahead, as many as are under way."""
@@ -293,14 +305,14 @@ class Vehicles:
                 self._last_us[:, : before.shape[1], : before.shape[2]] = before
             self._last_us[row] = NEVER
 
-    def _sense(self, row: int, events: np.ndarray, fired: np.ndarray) -> np.ndarray:
+    def _sense(self, row: int, events: np.ndarray) -> np.ndarray:
         """Complete the events of a step that the compiled call does not simulate to the end."""
         vehicle, sensor = self.rows[row], self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
         start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])
         try:
             if vehicle["by_looks"]:
-                events = sensor.with_faults(events, start_us, t_us, fired)
+                events = sensor.with_faults(events, start_us, t_us)
                 vehicle["dropped"] += sensor.lost
                 return events
             end = float(vehicle["x_m"]), float(vehicle["y_m"])
@@ -322,6 +334,8 @@ class Vehicles:
             way = f"from {vehicle['start_x_m']}, {vehicle['start_y_m']} to {vehicle['x_m']}, {vehicle['y_m']}"
             raise StepError(row, f"the reward must be finite; got {vehicle['reward']} on the way {way}.")
         try:
+            if vehicle["problem"] == TOO_MANY_FALSE:
+                sensor.check_faults(int(vehicle["start_us"]), int(vehicle["t_us"]))
             check_sensed(int(vehicle["problem"]), way_of(vehicle), sensor.view().scratch.columns)
         except ValueError as error:
             raise StepError(row, str(error)) from error

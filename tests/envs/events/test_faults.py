@@ -228,6 +228,40 @@ def test_what_a_fault_of_a_plug_in_adds_is_noise_and_what_it_keeps_is_as_it_was(
     assert np.isin(events[is_noise & ~ends], before[was_noise]).all()
 
 
+def added_by_numpy(events, t0_us, t1_us, faults, pixels, rng):
+    """What `apply_faults` should return, by numpy alone, drawn in the same order."""
+    events = events[~pixels.dead[events["y"], events["x"]]]
+    events = events[rng.random(events.size) >= faults.event_dropout]
+    seconds = (t1_us - t0_us) * 1e-6
+    mean = faults.background_activity * events.size
+    mean += faults.background_activity_hz * seconds * pixels.live.size
+    kinds = [(pixels.live, mean), (pixels.hot, faults.hot_pixel_hz * seconds * pixels.hot.size)]
+    places = [where[rng.integers(0, where.size, rng.poisson(mean))] for where, mean in kinds]
+    false = np.empty(sum(map(len, places)), EVENT)
+    drawn = [(rng.integers(t0_us, t1_us, len(at)) + 1, 2 * rng.integers(0, 2, len(at)) - 1) for at in places]
+    false["t"], false["p"] = (np.concatenate(part) for part in zip(*drawn, strict=True))
+    false["y"], false["x"] = np.divmod(np.concatenate(places), SHAPE[1])
+    both = np.concatenate((events, false))
+    return both[np.lexsort((both["x"], both["y"], both["t"]))]
+
+
+@pytest.mark.parametrize(
+    "rate", [1.0, 30.0, 3000.0]
+)  # numpy draws small and large Poisson numbers in two ways
+def test_losses_and_false_events_are_drawn_as_numpy_draws_them(rate):
+    faults = FaultsConfig(
+        sparsity=0.2, event_dropout=0.3, background_activity=0.2, background_activity_hz=rate,
+        hot_pixel_share=0.05, hot_pixel_hz=20 * rate,
+    )  # fmt: skip
+    pixels = draw_pixel_faults(SHAPE, faults, np.random.default_rng(0))
+    streams = [np.random.default_rng(1) for _ in range(2)]
+    for seed in range(20):
+        told = some_events(50, seed=seed), 0, 5000, faults, pixels
+        found, expected = apply_faults(*told, streams[0]), added_by_numpy(*told, streams[1])
+        assert found.tobytes() == expected.tobytes()
+    assert streams[0].random() == streams[1].random()
+
+
 @pytest.mark.parametrize(("share", "sides"), [(0.25, (4, 6)), (0.1, (3, 4)), (1.0, SHAPE), (1e-4, (0, 0))])
 def test_a_dead_block_is_one_rectangle_of_the_image_s_proportions(share, sides):
     rng, tops = np.random.default_rng(0), set()

@@ -11,7 +11,7 @@ from envs.corridor import CorridorEnv
 from envs.event_error import event_error
 from envs.events import EventCamera
 from envs.events.lowpass import filter_frames, low_pass, start_filter
-from envs.events.photoreceptor import response_curve
+from envs.events.photoreceptor import Curve, exponential, light_of, respond, response_curve
 from envs.events.ramps import can_look, look_at
 from tests.support.looks import HEIGHT, WIDTH, Looker
 
@@ -143,6 +143,45 @@ def test_by_columns_resting_light_is_followed_as_in_whole_images_whenever_one_lo
     seen = looker.camera.bandwidth.pixels
     assert np.abs(seen.filtered.reshape(WIDTH, HEIGHT).T.ravel() - camera._low_pass.filtered).max() < 1e-4
     assert looker.camera.last_frame.tobytes() == last.tobytes()
+
+
+def followed_by_numpy(state, image, seconds, curve, rates):
+    """What all pixels have behind the filter, what they respond and see, `seconds` after half-way twice."""
+    filtered, before, past = state
+    room = np.empty(past.size, np.int64)
+    for light in (np.float32(0.5) * past + np.float32(0.5) * image, image):
+        after = np.empty(past.size)
+        respond(curve, light, after, room)
+        periods = rates[0] * seconds + rates[1] * seconds * (
+            0.5 * past.astype(float) + 0.5 * light.astype(float)
+        )
+        decay, lag = -periods, (after - before) / periods
+        exponential(decay, room)
+        filtered = after - lag + (filtered - before + lag) * decay
+        before, past = after, light
+    lights = filtered.copy()
+    light_of(curve, lights, room)
+    return (filtered, before, past), np.maximum(lights, 0.0).astype(np.float32)
+
+
+@pytest.mark.parametrize("fields", [{}, {"response": "lin_log", "luminance_floor": 0.3}])
+def test_by_columns_every_pixel_has_the_bits_that_the_equation_gives_it_also_those_left_alone(fields):
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0.05, 0.9, (HEIGHT, WIDTH)).astype(np.float32)
+    looker = Looker(image, cutoff_hz=300.0, **fields)
+    filter_, curve = looker.camera.bandwidth, Curve(*looker.camera.state[0][1])
+    state = tuple(part.copy() for part in filter_.pixels)
+    settled = []
+    for look in range(40):
+        changed = rng.random(image.shape) < (0.2 if look < 5 else 0.01)
+        image = np.where(changed, rng.uniform(0.05, 0.9, image.shape), image).astype(np.float32)
+        looker.look((image, 0, WIDTH, 5000 * (look + 1)))
+        state, seen = followed_by_numpy(state, image.T.ravel(), 2.5e-3, curve, filter_.rates)
+        assert [part.tobytes() for part in filter_.pixels] == [part.tobytes() for part in state]
+        assert filter_.seen.tobytes() == seen.tobytes()
+        settled.append((state[0] == state[1]).mean())
+    assert max(settled) > 0.5  # some are left alone
+    assert min(settled) < 0.9
 
 
 @pytest.mark.parametrize("grows", [False, True])

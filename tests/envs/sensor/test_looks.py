@@ -2,12 +2,13 @@ import itertools
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
 from envs.corridor import CorridorEnv
 from envs.event_error import event_error
 from envs.events import EventCamera
-from envs.events.pixel_noise import no_noise
+from envs.events.faults import NO_FAULTS
 from envs.kinematics import Outcome, clock_us
 from envs.raycast import RaycastRenderer
 from envs.raycast.columns import aim, paint_columns
@@ -199,17 +200,32 @@ def test_steps_of_a_few_microseconds(step_us):
         assert k * step_us < sensor.events["t"].min() <= sensor.events["t"].max() <= (k + 1) * step_us
 
 
+NOISE = {"shot_noise_hz": 5.0, "leak_hz": 0.1, "hot_pixel_share": 0.01, "hot_pixel_hz": 100.0}
+LOSSES = {"sparsity": 0.3, "event_dropout": 0.2, "background_activity": 0.1, "background_activity_hz": 3.0}
+
+
 @pytest.mark.parametrize("camera", [CameraConfig(), CameraConfig(cutoff_hz=30.0, threshold_mismatch=0.25)])
-def test_noise_of_pixels_is_the_same_fired_in_the_compiled_step_or_after_it(monkeypatch, camera):
-    config = EnvConfig(camera=camera, faults=FaultsConfig(shot_noise_hz=5.0, leak_hz=0.1, hot_pixel_hz=9.0))
+@pytest.mark.parametrize("faults", [NOISE, LOSSES, NOISE | LOSSES])
+def test_faults_are_the_same_applied_in_the_compiled_step_or_after_it(monkeypatch, camera, faults):
+    config = EnvConfig(camera=camera, faults=FaultsConfig(**faults))
 
     def events():
         env = CorridorEnv(config)
         env.reset(seed=1)
-        return [(env.step(k % 3), env.events.tobytes())[1] for k in range(8)]
+        return [(env.step(k % 3), env.events.tobytes(), env.true_events.tobytes())[1:] for k in range(8)]
 
-    together, after = events(), Sensor.with_faults
-    assert sum(map(len, together)) > 0
-    monkeypatch.setattr(Sensor, "pixel_noise", lambda _: no_noise())
-    monkeypatch.setattr(Sensor, "with_faults", lambda sensor, *step: after(sensor, *step[:3]))
+    together = events()
+    assert sum(len(seen) for seen, _ in together) > 0
+    assert all(seen != true for seen, true in together)
+    monkeypatch.setattr(Sensor, "faults", lambda _: NO_FAULTS)
+    monkeypatch.setattr(Sensor, "needs_python", True)
     assert events() == together
+
+
+def test_more_false_events_than_a_step_may_have_end_an_episode_of_the_compiled_step():
+    env = CorridorEnv(EnvConfig(control_hz=0.1, faults=FaultsConfig(background_activity_hz=1e6)))
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=r"step 1, seed 1: faults may add 16777216 .*Lower the rates"):
+        env.step(0)
+    with pytest.raises(ResetNeeded):
+        env.step(0)
