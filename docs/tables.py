@@ -129,11 +129,12 @@ def success_table() -> str:
 
 
 def bench_table() -> str:
-    """Return the leaderboard of part C of the benchmark, of the results in docs/data/bench."""
+    """Return leaderboard and heat map of part C of the benchmark, of the results in docs/data/bench."""
     folder = DATA / "bench"
     if not any(folder.glob("*.json")):
         return "No result yet."
-    return leaderboard(entries(folder, read_protocol())["C"])
+    drawn = "![Failures of each entry in each cell](data/bench/leaderboard_C.png)"
+    return f"{leaderboard(entries(folder, read_protocol())['C'])}\n{drawn}"
 
 
 TABLES: dict[str, dict[str, Callable[[], str]]] = {
