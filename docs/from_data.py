@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 from benchmarks.scaling_model import from_plain, plot_scaling
 from jobs.analysis.plots import plot_learning_curves
 from jobs.analysis.tables import write_csv
+from jobs.bench.bench_table import entries, heat_map
+from jobs.bench.protocol import read_protocol
 from jobs.measure.encoding_plots import plot_encoding_costs
 from jobs.measure.encodings import read_costs
 from jobs.measure.front_plots import plot_costs
@@ -81,6 +83,10 @@ def other_figures(data: Path) -> dict[str, Figure]:
         found["encoder_inference"] = plot_encoding_costs(read_costs(data / "encoder_costs.csv"))
     if (data / "scaling.json").is_file():
         found["scaling"] = plot_scaling(from_plain(read_json(data / "scaling.json")))
+    if any((data / "bench").glob("*.json")):
+        protocol = read_protocol()
+        board = entries(data / "bench", protocol)
+        found |= {f"bench_{part}": heat_map(own, protocol, part) for part, own in board.items()}
     curves = [curve for _, curve in sorted(read_curves(PRETRAINED).items())]
     found["learning"] = plot_learning_curves(by_reward(PRETRAINED, curves))
     return found

@@ -112,11 +112,22 @@ def changes_in_turn(changes: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def met_in_training(protocol: Protocol, part: str, policy: EvaluatedPolicy) -> list[str]:
-    """Return the corruptions of which a policy's training drew a severity; none of a foreign policy."""
+    """Return the corruptions of which a policy's training drew a severity; none of a foreign policy.
+
+    What is the same at all severities, as the scatter of a noise, does not tell them apart.
+    """
     base = with_own_parts(policy, protocol.env)
-    met = [
-        corruption
-        for (corruption, _), changes in protocol.cells(part).items()
-        if any(was_met(policy, base, env_with(base, turn)) for turn in changes_in_turn(changes))
-    ]
-    return list(dict.fromkeys(met))
+    return [name for name in protocol.parts[part] if _has_met(protocol, part, name, policy, base)]
+
+
+def _has_met(protocol: Protocol, part: str, name: str, policy: EvaluatedPolicy, base: EnvConfig) -> bool:
+    fixed = [key for key, values in protocol.parts[part][name].items() if len(values) == 1]
+    turns = [
+        turn
+        for (corruption, _), changes in protocol.cells(part).items() if corruption == name
+        for turn in changes_in_turn(changes)
+    ]  # fmt: skip
+    return any(
+        was_met(policy, env_with(base, {key: turn[key] for key in fixed}), env_with(base, turn))
+        for turn in turns
+    )

@@ -12,7 +12,7 @@ import pytest
 from envs.config import EnvConfig, hashed_settings
 from jobs.bench import bench, bench_table, bench_verify
 from jobs.bench.evaluated import cost_of, joined
-from jobs.bench.protocol import CLEAN, PROTOCOL, read_protocol, tasks_of
+from jobs.bench.protocol import CLEAN, PROTOCOL, met_in_training, read_protocol, tasks_of
 from jobs.bench.result import Cost, RefusedResultError, read_result
 from jobs.bench.score import failure_counts, score
 from jobs.config.config import ConfigError, parse
@@ -272,6 +272,12 @@ def test_the_leaderboard_has_the_best_first_and_refuses_what_is_forged(protocol,
         bench_table.entries(folder, protocol)
     with pytest.raises(RefusedResultError, match="holds no JSON file"):
         bench_table.entries(tmp_path, protocol)
+
+
+def test_a_corruption_is_met_where_training_drew_a_severity_of_it_whatever_all_severities_share(protocol):
+    policy = read_policy(str(PRETRAINED / "bytestream_hold-s0"))  # up to 7 Hz of noise, all pixels alike
+    assert met_in_training(protocol, "C", policy) == ["invented_events", "pixel_noise", "hot_pixels"]
+    assert met_in_training(protocol, "C", read_policy(str(PRETRAINED / "bytestream-s0"))) == []
 
 
 def test_a_corruption_that_does_not_exist_cannot_have_been_met(protocol, tmp_path):
