@@ -85,8 +85,7 @@ def other_figures(data: Path) -> dict[str, Figure]:
         found["scaling"] = plot_scaling(from_plain(read_json(data / "scaling.json")))
     if any((data / "bench").glob("*.json")):
         protocol = read_protocol()
-        board = entries(data / "bench", protocol)
-        found |= {f"bench_{part}": heat_map(own, protocol, part) for part, own in board.items()}
+        found["bench_C"] = heat_map(entries(data / "bench", protocol)["C"], protocol, "C")
     curves = [curve for _, curve in sorted(read_curves(PRETRAINED).items())]
     found["learning"] = plot_learning_curves(by_reward(PRETRAINED, curves))
     return found

@@ -129,12 +129,11 @@ def success_table() -> str:
 
 
 def bench_table() -> str:
-    """Return leaderboard and heat map of part C of the benchmark, of the results in docs/data/bench."""
+    """Return the leaderboard of part C of the benchmark, of the results in docs/data/bench."""
     folder = DATA / "bench"
     if not any(folder.glob("*.json")):
         return "No result yet."
-    drawn = "![Failures of each entry in each cell](data/bench/leaderboard_C.png)"
-    return f"{leaderboard(entries(folder, read_protocol())['C'])}\n{drawn}"
+    return leaderboard(entries(folder, read_protocol())["C"])
 
 
 TABLES: dict[str, dict[str, Callable[[], str]]] = {
