@@ -26,10 +26,10 @@ from jobs.run.files import write_atomic
 from jobs.run.progress import console
 
 HEAD = (
-    "policy", "trainings", "mCE [%]", "clean [%]", "worst cell [%]", "under", "met in training", "bytes",
-    "operations an event", "ms a decision", "how to get it",
+    "policy", "met in training", "trainings", "mCE [%]", "clean [%]", "worst cell [%]", "kB",
+    "operations an event", "ms a decision",
 )  # fmt: skip
-WORDS = 1
+WORDS = 2
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -107,18 +107,17 @@ def _row(entry: Entry) -> tuple[str, ...]:
     low, high = scores.interval or (np.nan, np.nan)
     several = len(entry.results)
     cost = first.cost
+    interval = f"{100 * scores.mce:.1f} [{100 * low:.1f}, {100 * high:.1f}]" + ("" if several > 1 else "*")
     return (
-        f"`{entry.name}`",
+        f"`{entry.name}`" + (f" ({first.source})" if first.source else ""),
+        ", ".join(name.replace("_", " ") for name in first.met) or "-",
         str(several),
-        f"{100 * scores.mce:.1f} [{100 * low:.1f}, {100 * high:.1f}]" + ("" if several > 1 else " *"),
+        interval.replace(" ", "\N{NO-BREAK SPACE}"),
         f"{100 * scores.clean:.0f}",
-        f"{100 * scores.worst:.0f}",
-        f"{scores.worst_cell[0]} {scores.worst_cell[1]}",
-        ", ".join(first.met) or "-",
-        "-" if cost.bytes is None else f"{cost.bytes:,}",
+        f"{100 * scores.worst:.0f}: {scores.worst_cell[0].replace('_', ' ')} {scores.worst_cell[1]}",
+        "-" if cost.bytes is None else f"{cost.bytes / 1e3:,.0f}",
         "-" if cost.operations_per_event is None else f"{cost.operations_per_event:,}",
         f"{cost.ms_per_decision:.2f}",
-        first.source or "-",
     )
 
 
