@@ -21,6 +21,7 @@ COMPILED = ("*.nbi", "*.nbc", "compiled_*")
 USES = """
 import numpy as np
 import envs
+from envs.corridor import CorridorEnv
 from envs.events import EventCamera
 from envs.recordings import read_events, write_events
 camera = EventCamera(8, 6)
@@ -108,42 +109,23 @@ def test_it_works_without_the_clone_and_without_what_only_jobs_need(wheel, tmp_p
 
 @pytest.mark.slow
 def test_the_command_demo_of_a_new_environment_compiles_nothing_where_its_kernels_fit(wheel, tmp_path):
-    place = tmp_path / "environment"
+    place, empty = tmp_path / "environment", tmp_path / "empty"
+    empty.mkdir()
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", place], check=True)
-    python = place / "bin" / "python"
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        python,
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        wheel,
-    ]
-    subprocess.run(pip, check=True)
-    site = Path(
-        subprocess.check_output([python, "-I", "-c", "import envs; print(envs.__path__[0])"], text=True)
-    ).parent
+    pip = [sys.executable, "-m", "pip", "--python", place / "bin" / "python", "install", "--quiet"]
+    subprocess.run([*pip, "--no-deps", "--no-index", wheel], cwd=empty, env=environment, check=True)
+    (site,) = place.glob("lib/python*/site-packages")
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     (site / "sitecustomize.py").write_text(without(*ABSENT))
     before = compiled(site)
-    (tmp_path / "empty").mkdir()
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    environment |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     done = subprocess.run(
-        [place / "bin" / "demo"],
-        cwd=tmp_path / "empty",
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        [place / "bin" / "demo"], cwd=empty, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     assert re.search(r"bytestream_hold-s0 .*\byes\b", done.stdout)
     assert "ompil" not in done.stdout
     assert compiled(site) == before != set()
-    (film,) = (tmp_path / "empty" / "runs").glob("*/demo/*.mp4")
+    (film,) = empty.glob("runs/*/demo/*.mp4")
     assert film.stat().st_size > 100_000
