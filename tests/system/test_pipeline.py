@@ -167,7 +167,8 @@ def listed_paths() -> list[str]:
 
 def test_the_page_lists_what_a_run_writes_and_the_run_wrote_what_it_lists(flown):
     run, paths = flown[1], listed_paths()
-    written = [str(file.relative_to(run)) for file in sorted(run.rglob("*")) if file.is_file()]
+    files = [file.relative_to(run) for file in sorted(run.rglob("*")) if file.is_file()]
+    written = [str(file) for file in files if not file.parts[0].startswith(".")]
     unlisted = [file for file in written if not any(fnmatch.fnmatch(file, path) for path in paths)]
     assert unlisted == []
     stages = ("config.yaml", "tracking.json", "stages/", "data/", "encoder/", "train/", "policy/", "eval/")
