@@ -34,7 +34,8 @@ class Settings:
     """Which policy is evaluated, by which part of the benchmark, and what its result says of it.
 
     Attributes:
-        policy: A policy folder, a name in models/pretrained, a baseline, FILE.onnx, or FILE.py:FUNCTION.
+        policy: A policy folder, a name in models/pretrained, a baseline, FILE.onnx, FILE.py:FUNCTION or
+            FOLDER:FUNCTION.
         part: "C" corrupts the sensor, "W" changes the world.
         name: In the leaderboard; None: the policy's own.
         source: How anyone gets the policy, such as a link.

@@ -1,6 +1,7 @@
 """Policies by name: the folder that a name stands for, what it says, and its sensor in training."""
 
 import hashlib
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -94,6 +95,9 @@ def read_policy(agent: str) -> EvaluatedPolicy:
 def read_foreign(name: str) -> EvaluatedPolicy:
     """Return a policy that was not trained here: an ONNX file, or a function "file.py:attribute".
 
+    In the place of a file there may be a package's folder, all of whose files go to the workers and into
+    the identity: weights, too.
+
     Raises:
         ConfigError: There is no such file, module or attribute, or it cannot be loaded.
     """
@@ -105,7 +109,7 @@ def read_foreign(name: str) -> EvaluatedPolicy:
         agent, identity = str(path), hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     else:
         load_plugins([place])
-        module = Path(place).stem if place.endswith(".py") else place
+        module = Path(place).resolve().stem if place.endswith(".py") or os.sep in place else place
         agent, identity = f"{module}:{attribute}", plugin_digests()[module]
     try:
         observation = make_agent(agent).observation

@@ -316,6 +316,21 @@ def test_a_function_acts_in_its_own_episode_alone(tmp_path):
     assert len(set(together["x_m"])) == 3
 
 
+def test_the_identity_of_a_function_in_a_folder_is_that_of_its_weights_too(tmp_path):
+    code = "from pathlib import Path\nACTION = int(Path(__file__).with_name('weights').read_text())\n"
+    seen = []
+    for action in (1, 2):
+        folder = tmp_path / str(action) / f"weighed_{action}"
+        folder.mkdir(parents=True)
+        (folder / "__init__.py").write_text(code + "def policy(seed):\n    return lambda image: ACTION\n")
+        (folder / "weights").write_text(str(action))
+        seen.append(read_foreign(f"{folder}:policy"))
+    first, second = (roll_out(make_agent(policy.agent), SHORT, (0,)) for policy in seen)
+    assert first["x_m"] < second["x_m"]
+    (folder / "weights").write_text("1")
+    assert len({*(policy.identity for policy in seen), read_foreign(f"{folder}:policy").identity}) == 3
+
+
 def test_a_policy_costs_its_files_and_two_operations_a_feature_and_event():
     policy = read_policy(str(PRETRAINED / "bytestream-s0"))
     cost = cost_of(policy, "stochastic", SHORT)
