@@ -116,7 +116,10 @@ def read_result(path: Path, protocol: Protocol) -> Submission:
     """
     try:
         result = Result(**read_json(path))
-    except (RunError, pydantic.ValidationError, TypeError) as error:
+    except RunError:
+        rule = "must be the file that `evade bench` wrote, unchanged"
+        raise RefusedResultError(f"{path}: {rule}; its checksum differs, or it is no JSON") from None
+    except (pydantic.ValidationError, TypeError) as error:
         raise RefusedResultError(f"{path}: {_first_line(error)}") from None
     except OSError as error:
         raise RefusedResultError(f"{path}: cannot be read ({error.strerror})") from None
