@@ -95,6 +95,7 @@ class EncoderModel(Model):
         hidden: Neurons of each dense layer.
         memory_ms: If any, it sees the newest latent instead, and means of all that decay with these
             time constants [ms] (`models.policy.memory`).
+        own_actions: Whether it also sees the action that it took last, remembered as a latent is.
     """
 
     has_encoder: ClassVar[bool] = True
@@ -111,6 +112,7 @@ class EncoderModel(Model):
     hidden: list[Size]
     memory_ms: TimesMs = dataclasses.field(default_factory=list)
     pool_rank: PoolRank = 1
+    own_actions: bool = False
 
     @pydantic.model_validator(mode="after")
     def _fits_its_kind(self) -> "EncoderModel":
@@ -123,6 +125,9 @@ class EncoderModel(Model):
             if self.memory_ms:
                 rule = "must be [] for encoder=finetuned, whose latents change while it learns"
                 raise ValueError(f"memory_ms {rule}, got {self.memory_ms}")
+            if self.own_actions:
+                rule = "must be false for encoder=finetuned, whose networks read events"
+                raise ValueError(f"own_actions {rule}, got True")
             if self.time_bins > MAX_ROW_TIME_BINS:
                 rule = f"must be at most {MAX_ROW_TIME_BINS} for encoder=finetuned"
                 raise ValueError(f"time_bins {rule}, got {self.time_bins}")
@@ -142,6 +147,7 @@ class DenseModel(Model):
     stack: Stack
     hidden: list[Size]
     memory_ms: TimesMs = dataclasses.field(default_factory=list)
+    own_actions: bool = False
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -243,7 +249,7 @@ KINDS = {
     ),
 }
 # Settings that older files lack, each with the value that does what was done before it existed.
-ADDED_MODEL_SETTINGS: dict[str, object] = {"memory_ms": [], "pool_rank": 1}
+ADDED_MODEL_SETTINGS: dict[str, object] = {"memory_ms": [], "pool_rank": 1, "own_actions": False}
 RENAMED = {
     "brp_full": "bytestream",
     "brp_xy": "bytestream_xy",
@@ -304,6 +310,11 @@ class PolicySpec:
     def memory_ms(self) -> list[float]:
         """Return the time constants of its memory [ms]; none if it reads a stack of features."""
         return list(getattr(self.model, "memory_ms", []))
+
+    @property
+    def own_actions(self) -> bool:
+        """Return whether it also sees the action that it took last."""
+        return bool(getattr(self.model, "own_actions", False))
 
     @property
     def depth(self) -> int:

@@ -160,7 +160,8 @@ class PolicyAgent:
         if not self.stochastic:
             return logits.argmax(axis=1)
         gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])
-        return (logits + gumbel).argmax(axis=1)
+        self.policy.taken = (logits + gumbel).argmax(axis=1)
+        return self.policy.taken.copy()
 
     def keep(self, places: np.ndarray) -> None:
         """Forget the other episodes."""
@@ -221,7 +222,11 @@ class OnnxAgent:
         if not self.stochastic:
             return logits.argmax(axis=1)
         gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])
-        return (logits + gumbel).argmax(axis=1)
+        actions = (logits + gumbel).argmax(axis=1)
+        for memory, action in zip(self._memory, actions, strict=True):
+            if "last_action" in memory:
+                memory["last_action"] = np.array(action)
+        return actions
 
     def keep(self, places: np.ndarray) -> None:
         """Forget the other episodes."""

@@ -3,29 +3,58 @@
 Kept features are an array (B, depth, ...), the newest last. A stack holds the last ones, whatever time lies
 between them. Decaying means, one for each time constant, say how long something has been so, whatever the
 rate of control: a feature holds until the next one, so that m <- f + (m - f) exp(-dt / tau).
+
+A policy with `own_actions` appends to each feature which action it took last, as a one among zeros. The
+decaying means then say what a vehicle with inertia or a delay is about to do, without a sensor for it.
 """
 
 import numpy as np
 
 from models.kinds import PolicySpec
-from models.policy.features import Windows, push_features
+from models.policy.features import Windows, feature_of, push_features
+
+
+def kept_shape(spec: PolicySpec) -> tuple[int, ...]:
+    """Return what is kept of an episode, which the networks read: (depth, *feature).
+
+    Raises:
+        ValueError: `own_actions` of a policy whose feature is not a vector of floats.
+    """
+    feature = feature_of(spec)
+    shape = feature.shape(spec)
+    if not spec.own_actions:
+        return spec.depth, *shape
+    if len(shape) != 1 or not np.issubdtype(feature.dtype, np.floating):
+        rule = f"must be false for {spec.model.name}, whose feature is no vector of floats"
+        raise ValueError(f"own_actions {rule}, got True")
+    return spec.depth, shape[0] + spec.num_actions
 
 
 def remember(
-    kept: np.ndarray, features: np.ndarray, first: np.ndarray, spec: PolicySpec, window_us: np.ndarray | int
+    kept: np.ndarray,
+    features: np.ndarray,
+    first: np.ndarray,
+    spec: PolicySpec,
+    window_us: np.ndarray | int,
+    taken: np.ndarray,
 ) -> np.ndarray:
     """Add the newest feature of each episode to what was kept; the first of an episode fills all of it.
 
     Args:
-        kept: (B, depth, ...).
+        kept: (B, depth, ...) of `kept_shape`.
         features: (B, ...) of the same type.
         first: bool (B,), True where the feature is the first of an episode.
         spec: The policy.
         window_us: How long each feature took, (B,) or one for all [us]; a stack does not ask.
+        taken: The action of each episode's last step, int (B,); only a policy with `own_actions` asks.
 
     Returns:
         (B, depth, ...), a new array.
     """
+    if spec.own_actions:
+        known = np.zeros((len(features), spec.num_actions), features.dtype)
+        known[np.arange(len(features)), taken] = ~first  # an episode begins without an action
+        features = np.concatenate([features, known], axis=1)
     if not spec.memory_ms:
         return push_features(kept, features, first)
     tau_us = np.float32(1e3) * np.array(spec.memory_ms, np.float32)

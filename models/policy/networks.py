@@ -24,7 +24,7 @@ from models.encoder.table import dense
 from models.kinds import PolicySpec
 from models.policy.dense_update import tanh
 from models.policy.event_set import OUTPUTS, EventSet, EventTables
-from models.policy.features import feature_of
+from models.policy.memory import kept_shape
 
 PARTS = ("trunk", "pi", "vf")
 # Of the last layer's weights; all other layers have sqrt(2) (stable-baselines' policies).
@@ -128,7 +128,7 @@ def assemble(spec: PolicySpec) -> nn.ModuleDict:
     Raises:
         ValueError: The row of the network says that it is compiled, but it has other layers than `mlp`.
     """
-    shape, network = (spec.depth, *feature_of(spec).shape(spec)), network_of(spec)
+    shape, network = kept_shape(spec), network_of(spec)
     parts = dict(zip(PARTS, network.build(shape, spec), strict=True))
     plain = isinstance(parts["trunk"], nn.Flatten) and is_mlp(parts["pi"]) and is_mlp(parts["vf"])
     if network.gradients == "compiled" and not plain:

@@ -6,6 +6,7 @@ For robots without Python. The graph is the whole policy, with the preprocessing
     window_us    int64 (), length of the window [us]        (policies that see events)
     luminance    float32 (H, W), linear                     (policies that see luminance)
     last_stack   (depth, ...), next_stack of the step before; for an episode's first step anything
+    last_action  int64 (), the action taken in the step before  (policies with own_actions; behind first)
     last_state   float32 (S,), next_state of the step before  (recurrent networks; behind first)
     first        bool (), whether this is an episode's first step
     last_us      int64 (H + 2, W + 2), next_us of the step before  (policies with a neighbour filter)
@@ -14,6 +15,7 @@ and gives::
 
     logits       float32 (actions,), unnormalised log-probabilities
     next_stack   as last_stack: float32, uint8 for pictures, int32 for sets of events
+    next_action  int64 (), the likeliest; give another one as last_action if it was taken
     next_state   as last_state
     next_us      as last_us: when each pixel fired last, since the end of this step [us]
     dropped      int64 (), events or pixels that were left out because `Policy` refuses them
@@ -75,6 +77,8 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
     names = {"input_names": [*seen, "last_stack", "first"], "output_names": ["logits", "next_stack"]}
     inputs = [*examples, stack, torch.tensor(True)]
     own = []
+    if graph.own_actions:
+        own.append(("action", torch.tensor(0)))
     if graph.state_size:
         own.append(("state", torch.zeros(graph.state_size)))
     if graph.filter is not None:
@@ -108,7 +112,8 @@ class PolicyGraph(nn.Module):
         self.tau_us = torch.tensor([1e3 * time_ms for time_ms in spec.memory_ms])
         self.filter = filter_of(policy.manifest.get("sensor", {}), spec.width, spec.height)
         self.sees_events = policy.feature.from_events is not None
-        self.state_size = network_of(spec).state(spec)
+        self.num_actions = spec.num_actions
+        self.state_size, self.own_actions = network_of(spec).state(spec), spec.own_actions
         commands = policy.commands
         self.commands = None if commands is None else torch.from_numpy(commands.astype(np.float32))
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
@@ -169,8 +174,12 @@ class PolicyGraph(nn.Module):
     def _step(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the logits, the next stack and, of a recurrent network, its next state."""
         *given, state = inputs if self.state_size else (*inputs, torch.zeros(0))
+        *given, action = given if self.own_actions else (*given, torch.tensor(0))
         *seen, stack, first = given
         feature = self.feature(self, *seen).to(self.dtype)
+        if self.own_actions:
+            known = (torch.arange(self.num_actions) == action) & ~first
+            feature = torch.cat([feature, known.to(self.dtype)])
         newest = feature[None]
         kept = newest + (stack[:-1] - newest) * self._rest(*seen) if len(self.tau_us) else stack[1:]
         pushed = torch.cat([kept, newest])
@@ -178,7 +187,8 @@ class PolicyGraph(nn.Module):
         if self.state_size:
             _, after = self.trunk(stack[None, None], torch.where(first, 0.0, state)[None])
             return self.pi(after)[0], stack, after[0]
-        return self.pi(self.read(stack[None]))[0], stack
+        logits = self.pi(self.read(stack[None]))[0]
+        return (logits, stack, logits.argmax()) if self.own_actions else (logits, stack)
 
     def _rest(self, events: Tensor, window_us: Tensor) -> Tensor:
         """Return share (K, 1) of each mean that outlives the step (`models.policy.memory`)."""

@@ -37,7 +37,7 @@ from models.kinds import PolicySpec, needed_plugins, read_spec
 from models.policy.event_filter import filter_of
 from models.policy.features import LATENT, Step, Windows, feature_of
 from models.policy.given import check_step, read_fields, read_observations
-from models.policy.memory import remember, windows_us
+from models.policy.memory import kept_shape, remember, windows_us
 from models.policy.networks import TWO_MLPS, assemble, network_of
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # the shipped policies, a folder each
@@ -88,6 +88,8 @@ class Policy:
         deterministic: True: the most likely action; False: one drawn from the distribution.
         commands: float64 (K, C), the command of each action of a vehicle with a body, as its Box takes it;
             None for the kinematic vehicle's three headings.
+        taken: int64 (B,), the action of each episode's last step, which a policy with `own_actions` sees: the
+            one that was chosen last, or the likeliest. Set it if another one was taken.
     """
 
     def __init__(
@@ -149,19 +151,20 @@ class Policy:
     @property
     def stack_shape(self) -> tuple[int, ...]:
         """Shape of what the networks read for one episode: (depth, *feature), the newest last."""
-        return self.spec.depth, *self.feature.shape(self.spec)
+        return kept_shape(self.spec)
 
     def reset(self, num_envs: int = 1) -> None:
         """Forget everything: the next observations are the first of `num_envs` episodes."""
         self._stacks: np.ndarray = np.zeros((num_envs, *self.stack_shape), self.feature.dtype)
         self._state = np.zeros((num_envs, self._network.state(self.spec)), np.float32)
         self._first = np.ones(num_envs, bool)
+        self.taken = np.zeros(num_envs, np.int64)
         self._filter = filter_of(self.manifest.get("sensor", {}), self.spec.width, self.spec.height)
 
     def keep(self, places: np.ndarray) -> None:
         """Keep only the episodes at these indices, int (n,); later batches must follow this order."""
-        parts = self._stacks, self._state, self._first
-        self._stacks, self._state, self._first = (part[places] for part in parts)
+        parts = self._stacks, self._state, self._first, self.taken
+        self._stacks, self._state, self._first, self.taken = (part[places] for part in parts)
 
     def __call__(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Choose an action for each episode.
@@ -234,21 +237,23 @@ class Policy:
                 "call reset(num_envs) first"
             )
         first = self._first if restarted is None else self._first | np.asarray(restarted, bool)
-        self._stacks = remember(self._stacks, features, first, self.spec, window_us)
+        self._stacks = remember(self._stacks, features, first, self.spec, window_us, self.taken)
         self._first = np.zeros(len(features), bool)
         state = np.where(first[:, None], np.float32(0.0), self._state)
         logits, self._state = self._run(self._stacks, state)
         if not np.isfinite(logits).all():
             raise ValueError("the policy's logits must be finite, got NaN or infinity; train it again")
+        self.taken = logits.argmax(axis=1)
         return logits
 
     def _choose(self, logits: np.ndarray) -> np.ndarray:
         if self.deterministic or self.rng is None:
-            return logits.argmax(axis=1)
+            return self.taken.copy()
         weights = np.exp(logits.astype(np.float64) - logits.max(axis=1, keepdims=True))
         cumulative = np.cumsum(weights, axis=1)
         drawn = self.rng.random((len(logits), 1)) * cumulative[:, -1:]
-        return (cumulative <= drawn).sum(axis=1)
+        self.taken = (cumulative <= drawn).sum(axis=1)
+        return self.taken.copy()
 
 
 def action_names(manifest: Mapping[str, Any]) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from models.encoder.frozen import Encoder, read_encoder_part, tabulate
 from models.encoder.weights import EncoderManifest
 from models.kinds import EvaeSettings, PolicySpec
 from models.policy.features import Windows, feature_of
-from models.policy.memory import remember, windows_us
+from models.policy.memory import kept_shape, remember, windows_us
 from models.policy.mirror import mirror
 from models.policy.networks import PARTS, build_networks, network_of, widened
 from models.policy.policy import load_networks
@@ -51,7 +51,7 @@ def stack_space(spec: PolicySpec) -> gym.spaces.Box:
     feature = feature_of(spec)
     whole = np.issubdtype(feature.dtype, np.integer)
     low, high = (np.iinfo(feature.dtype).min, np.iinfo(feature.dtype).max) if whole else (-np.inf, np.inf)
-    return gym.spaces.Box(low, high, (spec.depth, *feature.shape(spec)), feature.dtype)
+    return gym.spaces.Box(low, high, kept_shape(spec), feature.dtype)
 
 
 class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
@@ -109,15 +109,19 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     def _features(self, observations: Windows) -> np.ndarray:
         return feature_of(self.spec).from_observations(observations, self.spec, self._table)
 
-    def remember(self, kept: np.ndarray, observations: Windows, first: np.ndarray) -> np.ndarray:
+    def remember(
+        self, kept: np.ndarray, observations: Windows, first: np.ndarray, taken: np.ndarray
+    ) -> np.ndarray:
         """Return what the networks read after the newest observations (`models.policy.memory`)."""
         features = self.features(observations)
-        return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
+        return remember(kept, features, first, self.spec, windows_us(observations, self.spec), taken)
 
-    def remember_mirrored(self, kept: np.ndarray, observations: Windows, first: np.ndarray) -> np.ndarray:
-        """Return `remember` for the mirrored observations. Call it after `remember`."""
+    def remember_mirrored(
+        self, kept: np.ndarray, observations: Windows, first: np.ndarray, taken: np.ndarray
+    ) -> np.ndarray:
+        """Return `remember` for the mirrored observations and actions. Call it after `remember`."""
         features = self._features(mirror(observations, self.spec))
-        return remember(kept, features, first, self.spec, windows_us(observations, self.spec))
+        return remember(kept, features, first, self.spec, windows_us(observations, self.spec), taken)
 
     def set_state(self, state: Any) -> None:
         """Load weights; the table is built again only if they change the encoder."""

@@ -7,6 +7,7 @@ import torch
 
 from models.kinds import PolicySpec, TrialError
 from models.policy.features import feature_of
+from models.policy.memory import kept_shape
 from models.policy.networks import PARTS, build_networks, network_of
 
 EPISODES, EVENTS, WINDOW_US = 3, 200, 5_000
@@ -26,7 +27,7 @@ def try_policy(spec: PolicySpec) -> None:
     networks = build_networks(spec)
     if len(networks) != len(PARTS):
         raise TrialError(f"its network must be {len(PARTS)} parts {PARTS}, got {len(networks)}")
-    stacks = np.repeat(made[:, None], spec.depth, 1)
+    stacks = np.resize(made, (EPISODES, *kept_shape(spec)))
     state = np.zeros((EPISODES, network.state(spec)), np.float32)
     logits, after = network.run(networks["trunk"], networks["pi"])(stacks, state)
     _check("logits", logits, np.dtype(np.float32), (EPISODES, spec.num_actions))

@@ -293,7 +293,9 @@ def memories() -> float:
     for window_us in (1, 5_000, 10**12):
         kept = np.zeros((1, 3, 2), np.float32)
         for step in range(1000):
-            kept = remember(kept, rng.random((1, 2), np.float32), np.array([step == 0]), spec, window_us)
+            kept = remember(
+                kept, rng.random((1, 2), np.float32), np.array([step == 0]), spec, window_us, np.zeros(1, int)
+            )
             worst = max(worst, float(-kept.min()), float(kept.max() - 1.0))
     return worst
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS
+from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, mirror_images
 from jobs.training.sampling.snapshots import Snapshot
 from jobs.training.sampling.teacher import TeacherEnvRunner
 
@@ -35,11 +35,13 @@ class TaughtEnvRunner(TeacherEnvRunner):
             self._mirrored = snapshot.arrays[MIRRORED]
         return super()._replay(snapshot)
 
-    def _remember(self, observations: Any, first: np.ndarray) -> None:
-        super()._remember(observations, first)
-        if self._settings.get(MIRRORED):
+    def _remember(self, observations: Any, first: np.ndarray, taken: np.ndarray) -> None:
+        super()._remember(observations, first, taken)
+        if images := mirror_images(self._settings):
             before = np.zeros_like(self._stacks) if first.all() else self._mirrored
-            self._mirrored = self.module.remember_mirrored(before, observations, first)
+            self._mirrored = self.module.remember_mirrored(
+                before, observations, first, np.array(images)[taken]
+            )
 
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         actions, outputs = super()._decide(stacks)

@@ -1,15 +1,24 @@
 """The steps that imitation has sampled so far, each with the teacher's costs (DAgger's data set)."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from ray.rllib.core.columns import Columns
 from torch import Tensor
 
+from envs.kinematics import MIRRORED_ACTIONS
+
 SETTINGS = "imitation"  # key among the learner's settings: the fields of `ImitationConfig`, and env_steps
 COSTS = "costs"  # column of a step: cost of each action minus that of the cheapest, float32 (actions,)
 MIRRORED = "mirrored"  # column of a step: its observation with left and right exchanged
+
+
+def mirror_images(settings: Mapping[str, Any]) -> list[int]:
+    """Return the mirrored action of each action, from the learner's settings; none if nothing is mirrored."""
+    mirrored = settings.get(MIRRORED, False)  # True: of the kinematic vehicle; a list: of another one
+    return MIRRORED_ACTIONS if mirrored is True else list(mirrored or [])
 
 
 class LabelledSteps:

@@ -23,8 +23,7 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from envs.kinematics import MIRRORED_ACTIONS
-from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, LabelledSteps
+from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, LabelledSteps, mirror_images
 from jobs.training.ppo.learner import PlainPPOLearner, shared_threads
 
 # Fraction of the newest steps in which the student's likeliest action is the cheapest.
@@ -38,8 +37,7 @@ class ImitationLearner(PlainPPOLearner):
         """Build PPO's learner, an empty store of steps, and a copy of the initial weights."""
         super().build()
         self._settings: dict[str, Any] = self.config.learner_config_dict[SETTINGS]
-        mirrored = self._settings.get(MIRRORED, False)  # or the mirrored action of each, of other vehicles
-        self._mirrored: list[int] = MIRRORED_ACTIONS if mirrored is True else mirrored or []
+        self._mirrored = mirror_images(self._settings)
         self._steps = LabelledSteps(1e6 * self._settings["keep_mb"])
         self._first = copy.deepcopy(self.module[DEFAULT_MODULE_ID].unwrapped().state_dict())
 

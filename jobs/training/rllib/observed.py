@@ -13,7 +13,7 @@ from models.encoder.frozen import encoder_of
 from models.encoder.weights import load_encoder
 from models.kinds import PolicySpec
 from models.policy.features import feature_of
-from models.policy.memory import remember, windows_us
+from models.policy.memory import kept_shape, remember, windows_us
 
 
 class ObservedCorridor(gymnasium.Env):
@@ -34,7 +34,7 @@ class ObservedCorridor(gymnasium.Env):
         self._reward_scale: float = context["reward_scale"]
         file = context["encoder_file"]
         self._encoder = None if file is None else encoder_of(load_encoder(file)[0])
-        self._shape = (self._spec.depth, *feature_of(self._spec).shape(self._spec))
+        self._shape = kept_shape(self._spec)
         self.observation_space = spaces.Box(-np.inf, np.inf, (int(np.prod(self._shape)),), np.float32)
         self.action_space = self._env.action_space
         self._stack = np.zeros((1, *self._shape), np.float32)
@@ -42,21 +42,22 @@ class ObservedCorridor(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, Any]:
         """Start an episode, as `CorridorEnv.reset` does."""
         shown, info = self._env.reset(seed=seed, options=options)
-        return self._seen(shown, first=True), info
+        return self._seen(shown, taken=None), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Any]:
         """Simulate one control step, as `CorridorEnv.step` does."""
         shown, reward, terminated, truncated, info = self._env.step(action)
-        return self._seen(shown, first=False), self._reward_scale * reward, terminated, truncated, info
+        return self._seen(shown, taken=action), self._reward_scale * reward, terminated, truncated, info
 
     def close(self) -> None:
         """Free the renderer."""
         self._env.close()
 
-    def _seen(self, shown: np.ndarray, first: bool) -> np.ndarray:
+    def _seen(self, shown: np.ndarray, taken: Any) -> np.ndarray:
+        """Return what the networks read; `taken` is the action of the step, None at the start."""
         windows = shown[None]
         features = feature_of(self._spec).from_observations(windows, self._spec, self._encoder)
-        began = np.array([first])
+        began, last = np.array([taken is None]), np.array([taken or 0])
         duration_us = windows_us(windows, self._spec)
-        self._stack = remember(self._stack, features, began, self._spec, duration_us)
+        self._stack = remember(self._stack, features, began, self._spec, duration_us, last)
         return self._stack.reshape(-1)

@@ -211,7 +211,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         observations, self._over, self._infos = told
         self._stacks, none = arrays["stacks"], np.zeros((len(self._over), 0), np.float32)
         self._state = arrays.get(STATES, none)
-        if not np.array_equal(self.module.features(observations), self._stacks[:, -1]):
+        shown = self.module.features(observations)
+        if not np.array_equal(shown, self._stacks[:, -1, ..., : shown.shape[-1]]):  # without the own action
             return "the simulation shows something else than before"
         self._episodes = list(zip(snapshot.values["names"], actions, strict=True))
         return ""
@@ -267,7 +268,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         first, space = np.ones(self.env.num_envs, bool), self.module.observation_space
         self._stacks = np.zeros((len(first), *space.shape), space.dtype)
         self._state = np.zeros((len(first), self.module.state_size), np.float32)
-        self._remember(observations, first)
+        self._remember(observations, first, np.zeros(len(first), np.int64))
         self._infos, self._over = infos, ~first
         self._episodes = [_begun() for _ in first]
         self._needs_initial_reset = False
@@ -278,15 +279,21 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         actions, outputs = self._decide(stacks)
         observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
         self._state = np.where(over[:, None], np.float32(0.0), self._state)
-        self._remember(observations, over)
+        self._remember(observations, over, actions)
         self._over = terminated | truncated
         return Step(stacks, actions, outputs, rewards, terminated, truncated, infos, over)
 
-    def _remember(self, observations: Any, first: np.ndarray) -> None:
-        """Add what each environment shows to what the policy keeps; `first` (N,): its episode begins."""
+    def _remember(self, observations: Any, first: np.ndarray, taken: np.ndarray) -> None:
+        """Add what each environment shows to what the policy keeps.
+
+        Args:
+            observations: One for each environment.
+            first: bool (N,), True where an episode begins.
+            taken: int (N,), the actions of the step that ended with these observations.
+        """
         if self.module.encoder is not None:
             self.shown.add(observations)
-        self._stacks = self.module.remember(self._stacks, observations, first)
+        self._stacks = self.module.remember(self._stacks, observations, first, taken)
 
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -21,7 +21,7 @@ from jobs.evaluation.evaluate import (
     seed_to_film,
 )
 from jobs.evaluation.evaluate import run as run_evaluation
-from jobs.rollout.agents import PolicyAgent, make_agent
+from jobs.rollout.agents import OnnxAgent, PolicyAgent, make_agent
 from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.rollout.episodes import EPISODE, TrajectoryRecorder, roll_out
 from jobs.rollout.executors import evaluate_part, run_serially
@@ -31,10 +31,20 @@ from jobs.run.files import write_json
 from jobs.run.folder import finished, open_run
 from jobs.tracking.tracker import open_tracker
 from models.kinds import KINDS
-from models.policy import load_policy
+from models.policy import load_policy, save_policy
+from models.policy.memory import kept_shape
+from models.policy.networks import build_networks
 from tests.support.configs import small_config
 from tests.support.fake_executor import FakeExecutor
-from tests.support.policies import HELD_OUT, save_training, save_untrained
+from tests.support.policies import (
+    ABOUT,
+    HELD_OUT,
+    SIDE,
+    make_spec,
+    make_windows,
+    save_training,
+    save_untrained,
+)
 
 
 @pytest.fixture(scope="module")
@@ -283,6 +293,30 @@ def test_a_policy_acts_as_its_own_networks_say(policy):
         action = agent(window[None])
         np.testing.assert_array_equal(action, alone(window[None]))
         window = env.step(int(action[0]))[0]
+
+
+@pytest.mark.system
+def test_a_policy_and_its_file_remember_the_actions_that_were_drawn(tmp_path):
+    pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+    from models.policy.onnx import export_onnx
+
+    spec = make_spec("event_columns", memory_ms=[10.0, 100.0], own_actions=True)
+    networks = build_networks(spec, seed=3)
+    networks["pi"][0].weight.data.view(64, *kept_shape(spec))[:, :, -spec.num_actions :] *= 20.0
+    networks["pi"][-1].weight.data.mul_(100.0)
+    own = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
+    file = export_onnx(own, tmp_path / "policy.onnx")
+    agents = PolicyAgent(own, stochastic=True), OnnxAgent(str(file), stochastic=True)
+    for agent in agents:
+        agent.reset([CorridorEnv(HELD_OUT)] * 2, [0, 1])
+    rng, chosen = np.random.default_rng(0), []
+    for _ in range(40):
+        windows = make_windows(rng, 2, side=SIDE)
+        one, other = (agent(windows) for agent in agents)
+        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(own.taken, one)
+        chosen.append(agents[0].logits.argmax(axis=1) == one)
+    assert 0.1 < np.mean(chosen) < 0.9  # other actions were drawn than the likeliest
 
 
 def test_more_episodes_evaluate_only_the_new_corridors_and_another_policy_all_but_the_baselines(tmp_path):

@@ -120,6 +120,28 @@ def test_one_that_resumes_samples_as_the_one_that_went_on(name, tmp_path):
         runner.stop()
 
 
+def test_a_runner_keeps_the_actions_that_were_taken():
+    words = "model=event_columns", "model.own_actions=true", "algo.train_batch_size_per_learner=32"
+    runner = PlainEnvRunner(config=build_algorithm(make_config(*SHORT, *words)), worker_index=0)
+    episodes = [*runner.sample(num_timesteps=200), *runner.sample(num_timesteps=60)]
+    taken, begins = set(), 0
+    for episode in episodes:
+        observations, actions = np.asarray(episode.get_observations()), episode.get_actions()
+        shown = observations[:, -1, -3:]
+        np.testing.assert_array_equal(shown[1:], np.eye(3)[actions])
+        if not episode.t_started:
+            begins += 1
+            assert not shown[0].any()
+        taken |= set(actions.tolist())
+    assert taken == {0, 1, 2}
+    assert begins > 0
+    kept = runner.snapshot()
+    parts = [runner.take_part().episodes[0].get_observations()[-1].tobytes()]
+    assert runner.resume(kept) == ""
+    assert runner.take_part().episodes[0].get_observations()[-1].tobytes() == parts[0]
+    runner.stop()
+
+
 def test_one_that_resumes_before_its_first_round_begins_anew():
     words = "model=event_columns", "algo.train_batch_size_per_learner=32"
     runner = PlainEnvRunner(config=build_algorithm(make_config(*SHORT, *words)), worker_index=0)

@@ -146,10 +146,13 @@ def test_labels_are_learnt(learner, rolled_out):
     assert losses[-1] < 0.8 * losses[0]
 
 
-@pytest.mark.parametrize("name", kinds(TAUGHT, quick=("event_columns",)))
+@pytest.mark.parametrize("name", kinds([*TAUGHT, "own_actions"], quick=("event_columns", "own_actions")))
 def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(name, tmp_path, monkeypatch):
     """And nothing else is rolled out than without them; RLlib's own pieces are cut alike."""
-    own = ("model.encoder=finetuned",) if name == "finetuned" else (f"model={name}",)
+    own = {
+        "finetuned": ("model.encoder=finetuned",),
+        "own_actions": ("model=event_columns", "model.own_actions=true"),
+    }.get(name, (f"model={name}",))
     told = {}
     for mirrored in (False, True):
         config = make_config(
@@ -160,9 +163,9 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
         shown = []
         remember = type(runner)._remember
 
-        def watched(self, observations, first, shown=shown, remember=remember):
-            shown.append((copy.deepcopy(observations), first.copy()))
-            remember(self, observations, first)
+        def watched(self, observations, first, taken, shown=shown, remember=remember):
+            shown.append((copy.deepcopy(observations), first.copy(), np.array(MIRRORED_ACTIONS)[taken]))
+            remember(self, observations, first, taken)
 
         monkeypatch.setattr(runner, "_remember", watched.__get__(runner))
         torch.manual_seed(1)
@@ -175,8 +178,8 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
     seen = np.concatenate([episode.get_observations()[:-1] for episode in told[True]])
     kept, met = np.zeros((len(shown[0][1]), *seen.shape[1:]), seen.dtype), len(runner.shown.windows)
     expected = []
-    for observations, first in shown:
-        kept = runner.module.remember_mirrored(kept, observations, first)
+    for observations, first, taken in shown:
+        kept = runner.module.remember_mirrored(kept, observations, first, taken)
         expected.append(kept)
     assert len(runner.shown.windows) == met
     expected = {row.tobytes() for step in expected for row in step}

@@ -1,21 +1,22 @@
 import numpy as np
 import pytest
 
-from models.kinds import checked, read_model, read_spec
+from models.kinds import KINDS, checked, read_model, read_spec
 from models.policy import load_policy, save_policy
-from models.policy.memory import remember
+from models.policy.memory import kept_shape, remember
 from models.policy.networks import build_networks
 from tests.support.policies import ABOUT, SIDE, make_evae, make_spec, make_windows
 
 TAUS = [10.0, 30.0, 100.0]
 SPEC = make_spec("event_columns", memory_ms=TAUS)
+NONE = np.zeros(1, int)
 
 
 def kept_after(features, window_us):
     """What is kept of one episode's features (T, n)."""
     kept = np.zeros((1, SPEC.depth, features.shape[1]), np.float32)
     for step, feature in enumerate(features):
-        kept = remember(kept, feature[None], np.array([step == 0]), SPEC, window_us[step : step + 1])
+        kept = remember(kept, feature[None], np.array([step == 0]), SPEC, window_us[step : step + 1], NONE)
     return kept[0]
 
 
@@ -45,10 +46,10 @@ def test_an_episode_that_begins_forgets_and_its_neighbours_remember():
     rng = np.random.default_rng(2)
     kept, features = rng.normal(size=(3, 4, 5)).astype("f4"), rng.normal(size=(3, 5)).astype("f4")
     before, first = kept.copy(), np.array([False, True, False])
-    after = remember(kept, features, first, SPEC, 5000)
+    after = remember(kept, features, first, SPEC, 5000, np.zeros(3, int))
     np.testing.assert_array_equal(kept, before)
     np.testing.assert_array_equal(after[1], np.stack([features[1]] * 4))
-    alone = remember(kept[2:], features[2:], first[2:], SPEC, np.array([5000]))
+    alone = remember(kept[2:], features[2:], first[2:], SPEC, np.array([5000]), NONE)
     np.testing.assert_array_equal(after[2:], alone)
     assert after.dtype == np.float32
 
@@ -90,3 +91,62 @@ def test_latents_that_change_while_learning_have_no_memory_in_time():
         read_spec(values)
     with pytest.raises(ValueError, match=r"memory_ms\.0: .*greater than 0, got 0\.0"):
         checked(read_model, {"name": "event_columns", "stack": 3, "hidden": [8], "memory_ms": [0.0]})
+
+
+@pytest.mark.parametrize("memory_ms", [[], TAUS])
+def test_own_actions_are_remembered_as_features_are(memory_ms):
+    spec = make_spec("event_columns", memory_ms=memory_ms, own_actions=True)
+    plain = make_spec("event_columns", memory_ms=memory_ms)
+    assert kept_shape(spec) == (spec.depth, 2 * SIDE + 3)
+    rng, window_us = np.random.default_rng(4), 5000
+    features = rng.normal(size=(9, 2, 2 * SIDE)).astype("f4")
+    actions = rng.integers(0, 3, (9, 2))
+    kept, alone = (np.zeros((2, *kept_shape(one)), np.float32) for one in (spec, plain))
+    told = np.zeros((2, spec.depth, 3), np.float32)  # the actions alone, remembered as features
+    for step, feature in enumerate(features):
+        first = np.full(2, step == 0)
+        kept = remember(kept, feature, first, spec, window_us, actions[step])
+        alone = remember(alone, feature, first, plain, window_us, actions[step])
+        known = np.eye(3, dtype="f4")[actions[step]] * (step > 0)
+        told = remember(told, known, first, plain, window_us, actions[step])
+    np.testing.assert_array_equal(kept[..., : 2 * SIDE], alone)
+    np.testing.assert_array_equal(kept[..., 2 * SIDE :], told)
+
+
+def test_a_policy_sees_the_actions_that_were_taken_from_observations_and_from_events(tmp_path):
+    spec = make_spec("event_columns", memory_ms=TAUS, own_actions=True)
+    networks = build_networks(spec, seed=3)
+    networks["pi"][-1].weight.data.mul_(100.0)
+    policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
+    windows = make_windows(np.random.default_rng(0), 12, side=SIDE)
+
+    def logits(forced=None):
+        policy.reset()
+        shown = []
+        for window in windows:
+            shown.append(policy.logits(window[None])[0])
+            if forced is not None:
+                policy.taken = np.array([forced])
+        return np.array(shown)
+
+    own = logits()
+    policy.reset()
+    chosen = []
+    for window in windows:
+        count, _, window_us, _ = window[0]
+        t, x, y, p = window[1 : count + 1].T
+        chosen.append(policy.act({"t": t, "x": x, "y": y, "p": p}, 0, window_us))
+    assert chosen == own.argmax(axis=1).tolist()
+    forced = [logits(action) for action in range(3)]
+    for one in forced:
+        np.testing.assert_array_equal(one[0], own[0])  # nothing was taken before the first
+    assert all(np.abs(one[1:] - forced[0][1:]).max() > 0.0 for one in forced[1:])
+
+
+def test_networks_that_read_events_or_pictures_see_no_actions(monkeypatch):
+    with pytest.raises(ValueError, match="own_actions must be false for encoder=finetuned"):
+        read_spec(make_spec("finetuned").manifest() | {"own_actions": True})
+    pictured = KINDS["event_columns"]._replace(feature="models.policy.features:EVENT_IMAGE")
+    monkeypatch.setitem(KINDS, "pictured", pictured)
+    with pytest.raises(ValueError, match="own_actions must be false for pictured"):
+        kept_shape(make_spec("pictured", own_actions=True))

@@ -43,7 +43,9 @@ def fly_exported(file, shown, shape, dtype):
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     memory, first, logits = {"last_stack": np.full(shape, 7, dtype)}, np.array(True), []
     memory |= {
-        one.name: np.ones(one.shape, np.float32) for one in session.get_inputs() if "state" in one.name
+        one.name: np.ones(one.shape, np.float32 if "state" in one.name else np.int64)
+        for one in session.get_inputs()
+        if one.name in ("last_state", "last_action")
     }
     names = [one.name for one in session.get_outputs()]
     for inputs in shown:
@@ -55,11 +57,13 @@ def fly_exported(file, shown, shape, dtype):
     return np.array(logits)
 
 
-@pytest.fixture(scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet", "ranked", "memory"]))
+@pytest.fixture(
+    scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet", "ranked", "memory", "own_actions"])
+)
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
-    if name == "memory":
-        spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0])
+    if name in ("memory", "own_actions"):
+        spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0], own_actions=name == "own_actions")
         return save_policy(path, build_networks(spec, seed=3), spec, {**ABOUT, "commands": COMMANDS})
     changes = {
         "bytestream_xy": {"variant": "bytestream_xy"},
