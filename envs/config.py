@@ -304,7 +304,8 @@ class EnvConfig:
             before (`core.neighbour_filter`); 0: every event is.
         filter_tau_us: How long before, at most [us].
         split: Which corridors: those of one split never occur in another, whatever the seed.
-        renderer: "raycast", "pyrender", or "auto": the cheapest that can draw the scene.
+        renderer: "raycast", "pyrender", "spheres" (hundreds of spheres, approximated:
+            `envs.raycast.discs`), or "auto": "raycast" unless the scene has a mesh.
     """
 
     _plain = model_validator(mode="before")(PLAIN)
@@ -325,7 +326,7 @@ class EnvConfig:
     filter_support: Annotated[int, Field(ge=0, le=8)] = 0
     filter_tau_us: Annotated[int, Field(ge=0, le=10**9)] = 5_000
     split: Split = "train"
-    renderer: Literal["auto", "raycast", "pyrender"] = "auto"
+    renderer: Literal["auto", "raycast", "pyrender", "spheres"] = "auto"
     camera: CameraConfig = dataclasses.field(default_factory=lambda: with_floor(CameraConfig()))
     faults: FaultsConfig = dataclasses.field(default_factory=FaultsConfig)
     fidelity: FidelityConfig = dataclasses.field(default_factory=FidelityConfig)

@@ -9,17 +9,19 @@ import importlib
 import importlib.util
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numba
+import numpy as np
 
 from envs.config import EnvConfig
 from envs.events.ramps import can_look
 from envs.raycast import RaycastRenderer
 from envs.raycast.stretches import Shifts
-from envs.scene import CONE, ELLIPSOID, Scene
+from envs.scene import CONE, ELLIPSOID, OBSTACLE, Scene
 
-RENDERERS = ("auto", "raycast", "pyrender")
+RENDERERS = ("auto", "raycast", "pyrender", "spheres")
 
 CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the error
 RENDERS_TEXTURED = 1.3  # times those of a plain scene; at bodies only if their pattern has edges
@@ -34,6 +36,7 @@ FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
 # light and the arcs of cones and ellipsoids and the patterns of textures converge with them.
 SAMPLES = {"straight": 0.5, "textured": 1.5, "curved": 1.95, "curved noise": 2.9, "curved pattern": 10.0}
 MAX_SAMPLES = 16
+LOW_WALL_M = 0.1  # walls up to it stand for none
 PYRENDER_SAMPLES = ((0.3, 1), (0.15, 2), (0.0, 4))  # from which tolerance on how many do
 
 
@@ -42,7 +45,7 @@ class RenderPlan:
     """Rendering settings of one scene.
 
     Attributes:
-        renderer: "raycast" or "pyrender".
+        renderer: "raycast", "pyrender" or "spheres".
         samples: Its anti-aliasing.
         max_shifts_px: How far outlines may move between two looks at their columns.
         max_step_m: Longest way between two renders [m]; infinite: one render a control step.
@@ -71,7 +74,7 @@ def plan_renders(config: EnvConfig, scene: Scene) -> RenderPlan:
     asked = config.fidelity
     renderer = choose_renderer(config.renderer, scene)
     remembers = config.camera.memory == "reference"
-    by_looks = renderer == "raycast" and can_look(config.camera)
+    by_looks = renderer != "pyrender" and can_look(config.camera)
     step_m = asked.max_step_m or _max_step_m(config, scene, by_looks)
     return RenderPlan(
         renderer=renderer,
@@ -87,8 +90,8 @@ def choose_renderer(name: str, scene: Scene) -> str:
     """Return the renderer called `name`; "auto" is the cheapest that can draw `scene`.
 
     Raises:
-        ValueError: The name is not known, or the renderer cannot draw the scene: the ray caster no mesh, and
-            pyrender no bodies that move.
+        ValueError: The name is not known, or the renderer cannot draw the scene: the ray caster no mesh,
+            pyrender no bodies that move, and "spheres" nothing but plain spheres above plain ground.
     """
     if name not in RENDERERS:
         raise ValueError(f"renderer must be one of {RENDERERS}; got {name!r}.")
@@ -96,6 +99,9 @@ def choose_renderer(name: str, scene: Scene) -> str:
         raise ValueError("renderer='pyrender' cannot draw bodies that move; use 'auto'.")
     if name == "raycast" and scene.mesh is not None:
         raise ValueError(f"renderer='raycast' cannot draw the mesh of scene {scene.name!r}; use 'auto'.")
+    if name == "spheres" and not _only_spheres(scene):
+        rule = "draws plain spheres above plain ground, between walls that are too low to show"
+        raise ValueError(f"renderer='spheres' {rule}; scene {scene.name!r} has more: use 'auto'.")
     if name == "auto":
         return "raycast" if scene.mesh is None else "pyrender"
     return name
@@ -104,6 +110,8 @@ def choose_renderer(name: str, scene: Scene) -> str:
 def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov_deg: float) -> Any:
     """Make the renderer of a plan; RuntimeError if it is pyrender, and pyrender or OpenGL is missing."""
     make: Any = RaycastRenderer
+    if chosen.renderer == "spheres":
+        make = partial(RaycastRenderer, discs=True)
     if chosen.renderer == "pyrender":  # imported only where it is needed: it loads OpenGL
         if importlib.util.find_spec("pyrender") is None:
             raise RuntimeError("renderer='pyrender', which meshes need, is not installed: evade[meshes]")
@@ -205,6 +213,8 @@ def _samples(config: EnvConfig, scene: Scene, renderer: str) -> int:
     tolerance = config.fidelity.tolerance
     if renderer == "pyrender":
         return next(samples for least, samples in PYRENDER_SAMPLES if tolerance >= least)
+    if renderer == "spheres":
+        return 1
     kind = "straight" if _plain(scene) else "textured"
     if scene.kinds & {CONE, ELLIPSOID}:
         kind = "curved"
@@ -215,6 +225,13 @@ def _samples(config: EnvConfig, scene: Scene, renderer: str) -> int:
     if kind != "straight":
         samples *= share**-0.7
     return min(MAX_SAMPLES, math.ceil(samples))
+
+
+def _only_spheres(scene: Scene) -> bool:
+    """Whether `envs.raycast.discs` draws all that can be seen of a scene."""
+    bodies = np.concatenate([scene.obstacles, np.array([one.body for one in scene.movers], OBSTACLE)])
+    round_ = (bodies["kind"] == ELLIPSOID) & (bodies["rx"] == bodies["ry"]) & (bodies["ry"] == bodies["rz"])
+    return _plain(scene) and bool(round_.all()) and scene.wall_height_m <= LOW_WALL_M
 
 
 def _plain(scene: Scene) -> bool:

@@ -16,6 +16,7 @@ from envs.compiled import inlined, kernel
 from envs.raycast.bodies import MIN_DEPTH, corner, depths, drop_hidden, is_before, outline, see_bodies
 from envs.raycast.coverage import BLOCK, LAYERS, PADDING, cover_ground, ends, put, resolve
 from envs.raycast.curved import make_bends
+from envs.raycast.discs import paint_discs
 from envs.raycast.noise import make_mixing, turn_waves
 from envs.raycast.patterns import texture_cell, texture_column
 from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Bends, Canvas, Ends, Mixing, Noise, Record
@@ -136,6 +137,9 @@ def paint_columns(
     A column has the same bytes whichever columns are painted with it.
     """
     frame, half = room.frames[0], 0.5 * image.shape[1]
+    if frame.discs:
+        paint_discs(bodies, frame, image, (first, last), cull, room.seen, room.order, room.accumulators)
+        return
     low, high = (first - half) / frame.focal, (last - half) / frame.focal
     count = see_bodies(bodies, frame, low, high, cull, room.seen)
     count = drop_hidden(room.seen, count, frame)

@@ -44,6 +44,7 @@ FRAME = _record(
     [
         *_floats("horizon", "focal", "eye_x", "eye_y", "eye_z", "cos", "sin", "time"),
         ("samples", "i8"),  # strips per column of pixels
+        ("discs", "i8"),  # whether `envs.raycast.discs` draws it
         *_floats("sky", "floor"),  # luminance of the sky and of the plain ground
         ("tallest", "f8"),  # height that nothing rises above
         *_floats("wall_half", "wall_top", "wall_near", "wall_far", "wall_albedo"),  # at x = +-wall_half

@@ -104,6 +104,7 @@ class RaycastRenderer:
         fov_deg: float = 90.0,
         samples: int = 1,
         cull_m: float = math.inf,
+        discs: bool = False,
     ) -> None:
         """Make a renderer of `width` x `height` square pixels with a horizontal field of view of `fov_deg`.
 
@@ -115,6 +116,8 @@ class RaycastRenderer:
             samples: Strips into which each column of pixels is cut, besides the cuts at
                 silhouettes.
             cull_m: Bodies whose nearest point is farther than this are not drawn [m].
+            discs: Whether spheres are drawn pixel by pixel, in samples^2 parts of each, by
+                `envs.raycast.discs`.
 
         Raises:
             ValueError: If a size is not at least 1, fov_deg not in [1, 170], cull_m not
@@ -122,7 +125,7 @@ class RaycastRenderer:
         """
         check_image(width, height, fov_deg, samples, cull_m)
         self.width, self.height, self.fov_deg, self.samples = width, height, fov_deg, samples
-        self.cull_m = float(cull_m)
+        self.cull_m, self.discs = float(cull_m), discs
         self.set_scene(scene)
 
     def set_scene(self, scene: Scene) -> None:
@@ -131,6 +134,7 @@ class RaycastRenderer:
         self.bodies = _make_bodies(scene)
         focal = focal_length(self.width, self.fov_deg)
         self.frame, waves = _make_frame(scene, self.height, focal, self.samples)
+        self.frame["discs"] = self.discs
         self.noise, self._ground_texture = Noise(waves, NO_NOISE.ground, 0.0), scene.ground_texture
         self.room = make_workspace(len(self.bodies), self.height)
         self._moving = scene.movers

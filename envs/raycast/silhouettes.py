@@ -19,6 +19,7 @@ from envs.scene import BOX
 BESIDE = 2.0  # columns beside the image in which silhouettes are followed too
 MOVING = 0.2  # columns; a silhouette that moves farther is looked at once more, half-way
 MIN_MOVE = 1e-9  # columns
+NEARBY = 1e-6  # [m] more than any rounding of distances
 LOOKS_PER_COLUMN = 4  # at most, on average over the image; beyond it silhouettes cross unseen
 
 
@@ -127,6 +128,39 @@ def follow_bodies(
                 numbers[count] = i
                 count += 1
                 break
+    return count
+
+
+@kernel
+def find_near(bodies: np.ndarray, way: Way, focal: float, width: int, cull: float, near: np.ndarray) -> int:
+    """Collect the bodies that can be in view anywhere on a way; the others need not be asked at each look.
+
+    Args:
+        bodies: (N,) BODY.
+        way: The way.
+        focal: Of the camera [pixels].
+        width: Columns of the image.
+        cull: Bodies farther than this are not seen [m].
+        near: (N,) BODY, whose first elements become these bodies, in their order.
+
+    Returns:
+        How many there are.
+    """
+    limit, count = 0.5 * width / focal, 0
+    slack = math.sqrt(1.0 + limit * limit)
+    moved = math.hypot(way.end_x - way.start_x, way.end_y - way.start_y)
+    for i in range(len(bodies)):
+        body = bodies[i]
+        beside, forward = body.x - way.start_x, body.y - way.start_y
+        reach = (body.rx if body.kind != BOX else math.hypot(body.rx, body.ry)) + moved + NEARBY
+        if body.moves:
+            late = way.start_us * 1e-6 - body.since
+            beside, forward = beside + body.vx * late, forward + body.vy * late
+            reach += math.hypot(body.vx, body.vy) * way.moving_us * 1e-6
+        ahead = forward + reach > 0.0 and abs(beside) <= limit * forward + slack * reach
+        if ahead and beside * beside + forward * forward <= (cull + reach) ** 2:
+            near[count] = body
+            count += 1
     return count
 
 

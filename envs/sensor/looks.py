@@ -20,12 +20,13 @@ from envs.events.flicker import Flicker, brightness, looks_needed
 from envs.events.lowpass import ColumnFilter
 from envs.events.ramps import Ramps, Watch, events_of_ramps, look_at, make_ramps
 from envs.raycast.columns import Workspace, make_workspace, paint_columns
-from envs.raycast.records import Noise
+from envs.raycast.records import BODY, Noise
 from envs.raycast.silhouettes import (
     Looks,
     Stretch,
     aim_along,
     find_looks,
+    find_near,
     find_silhouettes,
     follow_bodies,
     make_looks,
@@ -41,6 +42,7 @@ class Scratch(NamedTuple):
 
     Attributes:
         room: `Workspace` for as many bodies as a scene has, or more.
+        near: BODY, as many: those that can be in view on a way.
         columns: float32 (W, H), what is painted, column after column.
         pixels: As `crossings.steps` takes its scratch.
         ramps: For `ROOM` times as many pixels as the image has.
@@ -50,6 +52,7 @@ class Scratch(NamedTuple):
     """
 
     room: Workspace
+    near: np.ndarray
     columns: np.ndarray
     pixels: tuple[np.ndarray, np.ndarray]
     ramps: Ramps
@@ -99,6 +102,7 @@ def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
     size, words = width * height, (width * height + 7) // 8
     return Scratch(
         room=make_workspace(num_bodies, height),
+        near=np.empty(num_bodies, BODY),
         columns=np.zeros((width, height), np.float32),
         pixels=(np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)),
         ramps=make_ramps(ROOM * size),
@@ -131,6 +135,8 @@ def sense_way(view, way, parts):
         view.seen_us[column] = max(view.seen_us[column], way.start_us)
     parts = min(max(parts, looks_needed(view.flicker, way.moving_us)), way.moving_us)
     count, stretches = _divide(view, way, parts)
+    frame, near = view.frame[0], scratch.near
+    near = near[: find_near(bodies, way, frame.focal, view.seen_us.size, view.cull_m, near)]
     before, after, followed = outlines.before[:count], outlines.after[:count], outlines.followed[:count]
     events, lost, columns, begun_us = np.empty(0, EVENT), 0, 0, way.start_us
     kept = np.int64(0)  # not 0, for which numba would compile everything below a second time
@@ -143,7 +149,7 @@ def sense_way(view, way, parts):
             find_silhouettes(bodies, followed, view.seen_us.size, scratch.room, after)
         stretch = Stretch(number, begin_us, end_us, followed, before, after)
         ends = number % stretches == 0
-        bad, kept, more, looked = _look_along(view, way, stretch, ends, watch, kept)
+        bad, kept, more, looked = _look_along(view, near, way, stretch, ends, watch, kept)
         if bad >= 0:
             return bad, 0, 0, np.empty(0, EVENT)
         lost, columns = lost + more, columns + looked
@@ -177,8 +183,10 @@ def _divide(view, way, parts):
 
 
 @kernel
-def _look_along(view, way, stretch, ends, watch, kept):
+def _look_along(view, near, way, stretch, ends, watch, kept):
     """Look at the columns that a stretch of a way asks for; at all columns if it `ends` a part of the way.
+
+    `near` are the bodies that can be in view.
 
     Returns:
         First invalid pixel or -1, ramps in use, events lost, columns looked at.
@@ -192,7 +200,7 @@ def _look_along(view, way, stretch, ends, watch, kept):
         if not needed and (full or _is_seen(view.seen_us, first, last, t_us)):
             continue
         aim_along(room.frames[0], way, t_us)
-        paint_columns(view.bodies, view.noise, painted.T, first, last, view.cull_m, room)
+        paint_columns(near, view.noise, painted.T, first, last, view.cull_m, room)
         if view.flicker.depth > 0.0:
             _dim(painted, first, last, brightness(view.flicker, t_us))
         bad, kept, more = look_at(painted, first, last, t_us, watch, kept)

@@ -1,19 +1,22 @@
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 from envs.raycast import RaycastRenderer
+from envs.raycast.bodies import see_bodies
 from envs.raycast.silhouettes import (
     Stretch,
     Way,
     aim_along,
     find_looks,
+    find_near,
     find_silhouettes,
     follow_bodies,
     make_looks,
 )
-from envs.scene import BOX, OBSTACLE, POLE, Scene, make_scene
+from envs.scene import BOX, OBSTACLE, POLE, Scene, at_velocity, make_scene
 
 WIDTH = 64
 WAY = Way(0.3, 20.0, 0.1, 20.3, 2.0, 1000, 40_000)
@@ -121,3 +124,26 @@ def test_bodies_in_view_at_one_end_of_a_way_alone_are_followed_to_the_side_that_
 def test_a_scene_without_bodies_takes_no_look():
     scene = make_scene("poles", np.random.default_rng(0), num_obstacles=0)
     assert looks_of(scene)[0].size == 0
+
+
+@pytest.mark.parametrize("cull_m", [15.0, math.inf])
+@pytest.mark.parametrize("name", ["spheres", "gates"])
+def test_what_is_in_view_anywhere_on_a_way_was_found_near_it(name, cull_m):
+    rng = np.random.default_rng(3)
+    scene = make_scene(name, rng)
+    moving = tuple(at_velocity(body, rng.uniform(-20.0, 20.0, 3)) for body in scene.obstacles[:30])
+    renderer = RaycastRenderer(dataclasses.replace(scene, moving=moving), WIDTH, 48)
+    renderer.move_bodies(moving, 0.0, 1.0)
+    bodies, seen, found = renderer.bodies, np.zeros_like(renderer.bodies), np.zeros_like(renderer.bodies)
+    focal, frame, few = renderer.frame[0].focal, renderer.room.frames, 0
+    frame[0] = renderer.frame[0]
+    for _ in range(10):
+        way = Way(*rng.uniform((-5.0, 0.0, -5.0, 0.0), (5.0, 30.0, 5.0, 30.0)), 2.0, 10_000, 300_000)
+        near = found["number"][: find_near(bodies, way, focal, WIDTH, cull_m, found)].copy()
+        assert (np.diff(near) > 0).all()
+        few += near.size < 0.8 * len(bodies)
+        for t_us in np.linspace(way.start_us, way.start_us + way.moving_us, 9):
+            aim_along(frame[0], way, t_us)
+            count = see_bodies(bodies, frame[0], -32.0 / focal, 32.0 / focal, cull_m, seen)
+            assert np.isin(seen["number"][:count], near).all()
+    assert few or name == "gates"

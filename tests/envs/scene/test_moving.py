@@ -27,6 +27,19 @@ def test_a_path_goes_through_its_places_and_repeats():
     assert (body["x"], body["y"], body["z"], body["rx"]) == (2.0, 0.0, 1.0, 0.1)
 
 
+def test_many_bodies_together_are_where_each_is_alone():
+    rng = np.random.default_rng(0)
+    moving = tuple(
+        MovingBody(BALL, np.cumsum(rng.uniform(0.01, 1.0, size)), rng.normal(size=(size, 3)), repeats)
+        for size in (1, 2, 3, 40)
+        for repeats in (False, True)
+    )
+    ends = [one.t_s[-1] for one in moving]
+    for t_s in (0.0, *ends, *rng.uniform(0.0, 60.0, 50)):
+        places = np.stack([bodies_at(moving, t_s)[axis] for axis in "xyz"], axis=1)
+        assert places.tobytes() == np.stack([one.place(t_s) for one in moving]).tobytes()
+
+
 @pytest.mark.parametrize(
     ("t_s", "places_m", "rule"),
     [
