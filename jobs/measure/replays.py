@@ -165,6 +165,7 @@ def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray 
             start = time.process_time()
             chosen.append(int(agent(observation[None])[0]))
             action = chosen[-1] if actions is None else int(actions[len(chosen) - 1])
+            agent.policy.taken = np.array([action])
             observation, _, terminated, truncated, _ = env.step(action)
             seconds += time.process_time() - start
             events.append(env.events)

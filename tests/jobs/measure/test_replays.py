@@ -40,8 +40,9 @@ def test_a_flight_repeats_itself_from_its_actions(policy):
 
 
 def test_given_actions_are_flown_whatever_the_agent_would_do(policy):
-    turns = np.array([1, 2] * 10)
-    found = replay(SHORT, agent_of(policy), 0, turns)
+    turns, agent = np.array([1, 2] * 10), agent_of(policy)
+    found = replay(SHORT, agent, 0, turns)
+    np.testing.assert_array_equal(agent.policy.taken, turns[-1:])  # what it remembers of its own actions
     env = CorridorEnv(SHORT)
     env.reset(seed=0)
     for action in turns:
