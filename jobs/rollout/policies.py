@@ -239,14 +239,17 @@ def load_trained(key: str, name: str, env: EnvConfig) -> tuple[Path, Policy]:
 def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
     """Return the simulation with the sensor settings of a manifest, named as `sensor_settings` names them.
 
-    A manifest that names no vehicle is that of a kinematic one.
+    A manifest that names no vehicle is that of a kinematic one. Another vehicle than the configured one has
+    time for as long a way at its own speed.
 
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is out of range.
     """
-    if sensor:
-        env = replace(env, **KINEMATIC)
-    return env_with(env, {SENSOR_KEYS.get(name, name): value for name, value in sensor.items()})
+    usual = replace(env, **KINEMATIC) if sensor else env
+    own = env_with(usual, {SENSOR_KEYS.get(name, name): value for name, value in sensor.items()})
+    if own.vehicle == env.vehicle:
+        return own
+    return replace(own, time_limit_s=env.time_limit_s * env.speed_mps / own.speed_mps)
 
 
 def with_own_parts(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:

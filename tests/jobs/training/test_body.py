@@ -58,7 +58,10 @@ def test_a_policy_brings_its_own_vehicle(config, folder):
     assert with_own_parts(policy, kinematic).body == {"primitives": 15}
     heavy = dataclasses.replace(config.env, body={"primitives": 15, "mass_ratio": 1.1})
     assert with_own_parts(policy, heavy) == heavy
-    assert with_sensor(kinematic, policy.sensor) == dataclasses.replace(
+    slow = with_sensor(kinematic, policy.sensor)
+    assert slow.time_limit_s * slow.speed_mps == kinematic.time_limit_s * kinematic.speed_mps
+    assert slow.speed_mps != kinematic.speed_mps
+    assert dataclasses.replace(slow, time_limit_s=config.env.time_limit_s) == dataclasses.replace(
         config.env, split=kinematic.split, observation=kinematic.observation
     )
     old = dataclasses.replace(policy, sensor={"control_hz": 100.0, "speed_mps": 10.0})
