@@ -38,6 +38,14 @@ FILMS = {  # name: the words of the demo
     "dense": ("env.scene=poles_dense",),
     "false_events": ("faults.background_activity=0.25",),
     "dead_pixels": ("faults.sparsity=0.5",),
+    "body": ("demo.policy=body_hold-s0", "vehicle=point_mass"),
+    "balls": (
+        "demo.policy=body_hold-s0",
+        "vehicle=point_mass",
+        "+env.layout.num_obstacles=20",
+        "+env.layout.throw_every_s=1.5",
+        "+env.layout.throw_min_mps=10.0",
+    ),
     "crash": ("demo.policy=bytestream-s1", "env.scene=texture_change", "fidelity.tolerance=0.2"),
 }
 FAILURES = {

@@ -65,6 +65,7 @@ POLICIES = {
     ("ppo_event_set", "event_set"): "`event_set`: PPO",
     ("ppo_claims", "event_image"): "`event_image`: PPO",
     ("ppo_paper", "bytestream_paper"): "`bytestream_paper`: the appendix read literally",
+    ("body_conditions", "body_hold"): "`body_hold`: imitation, a [point mass](docs/vehicles.md) at 10 m/s",
 }
 
 

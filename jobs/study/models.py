@@ -1,7 +1,7 @@
 """List the shipped policies: how each was trained, how large it is, how often it reaches the goal.
 
 Run: evade models
-Expect: two tables in seconds; docs/models.md has the same, written by python -m docs.tables.
+Expect: tables in seconds; docs/models.md has the same, written by python -m docs.tables.
 """
 
 import csv
@@ -39,7 +39,8 @@ INPUTS = {
     "rgb": "grey camera image",
 }
 TAUGHT = "taught_"  # begins the names of the policies of the study `taught`
-EPISODES = {"robustness": "", "taught": TAUGHT}  # file of a sweep -> what its groups' names begin with
+# File of a study -> what the names of its groups begin with.
+EPISODES = {"robustness": "", "taught": TAUGHT, "body_conditions": ""}
 LOAD = 'load_policy(PRETRAINED / "bytestream_hold-s0")'
 
 Condition = tuple[str, str]
@@ -84,10 +85,9 @@ class Group(NamedTuple):
 
 def run(_config: Config) -> None:
     """Print the tables of shipped policies."""
-    for study, prefix in EPISODES.items():
+    for study in EPISODES:
         rows = model_rows(study, PRETRAINED, DATA)
-        name = f"{prefix}*" if prefix else "PPO, and imitation under domain randomization"
-        show_table(f"Shipped policies: {name} (success in the sweep {study})", HEAD, rows, WORDS)
+        show_table(f"Shipped policies by their success in the study {study}", HEAD, rows, WORDS)
     console.print(f"from models.policy import PRETRAINED, load_policy; policy = {LOAD}", highlight=False)
 
 
