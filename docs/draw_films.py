@@ -31,6 +31,7 @@ from jobs.rollout.recorded import Moment, record_episode
 from models.policy import PRETRAINED, load_policy
 
 DOCS = Path(__file__).resolve().parent
+BODY = ("demo.policy=body_hold-s0", "env.speed_mps=10.0", "env.control_hz=100.0", "env.time_limit_s=20.0")
 FILMS = {  # name: the words of the demo
     "poles": (),
     "textures": ("env.scene=texture_change", "fidelity.tolerance=0.2"),
@@ -38,11 +39,10 @@ FILMS = {  # name: the words of the demo
     "dense": ("env.scene=poles_dense",),
     "false_events": ("faults.background_activity=0.25",),
     "dead_pixels": ("faults.sparsity=0.5",),
-    "body": ("demo.policy=body_hold-s0", "vehicle=point_mass"),
+    "body": BODY,
     "balls": (
-        "demo.policy=body_hold-s0",
-        "vehicle=point_mass",
-        "+env.layout.num_obstacles=20",
+        *BODY,
+        "+env.layout.num_obstacles=0",
         "+env.layout.throw_every_s=1.5",
         "+env.layout.throw_min_mps=10.0",
     ),

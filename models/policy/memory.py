@@ -11,16 +11,20 @@ decaying means then say what a vehicle with inertia or a delay is about to do, w
 import numpy as np
 
 from models.kinds import PolicySpec
-from models.policy.features import Windows, feature_of, push_features
+from models.policy.features import Feature, Windows, feature_of, push_features
 
 
-def kept_shape(spec: PolicySpec) -> tuple[int, ...]:
+def kept_shape(spec: PolicySpec, feature: Feature | None = None) -> tuple[int, ...]:
     """Return what is kept of an episode, which the networks read: (depth, *feature).
+
+    Args:
+        spec: The policy.
+        feature: What is kept of a step; None: what its row says, as in training.
 
     Raises:
         ValueError: `own_actions` of a policy whose feature is not a vector of floats.
     """
-    feature = feature_of(spec)
+    feature = feature or feature_of(spec)
     shape = feature.shape(spec)
     if not spec.own_actions:
         return spec.depth, *shape

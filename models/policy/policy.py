@@ -151,7 +151,7 @@ class Policy:
     @property
     def stack_shape(self) -> tuple[int, ...]:
         """Shape of what the networks read for one episode: (depth, *feature), the newest last."""
-        return kept_shape(self.spec)
+        return kept_shape(self.spec, self.feature)
 
     def reset(self, num_envs: int = 1) -> None:
         """Forget everything: the next observations are the first of `num_envs` episodes."""

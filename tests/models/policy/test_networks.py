@@ -144,7 +144,7 @@ def test_only_what_mlp_builds_may_be_compiled_and_all_else_is_run_by_torch(what,
     assert state.shape == (4, 0)
     monkeypatch.setattr("models.policy.networks.resolve", lambda name: row._replace(gradients="compiled"))
     monkeypatch.setattr(
-        "models.policy.networks.feature_of", lambda spec: SimpleNamespace(shape=lambda spec: (3,))
+        "models.policy.memory.feature_of", lambda spec: SimpleNamespace(shape=lambda spec: (3,))
     )
     with pytest.raises(ValueError, match="have compiled gradients"):
         assemble(MLP)
