@@ -22,7 +22,7 @@ from envs.raycast.columns import make_workspace, render_way
 from envs.raycast.noise import NO_NOISE, tabulate_ground, waves_of
 from envs.raycast.records import BODY, FRAME, Noise
 from envs.scene import CONE, ELLIPSOID, MovingBody, Scene, Texture
-from envs.scene.moving import bodies_at
+from envs.scene.paths import bodies_at
 from envs.scene.textures import PATTERNS, around
 
 

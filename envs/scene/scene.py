@@ -35,7 +35,8 @@ from envs.scene.layouts import (
     with_overrides,
 )
 from envs.scene.mesh_file import is_mesh_path, read_mesh
-from envs.scene.moving import MovingBody, Throws, bodies_at
+from envs.scene.moving import MovingBody, Throws
+from envs.scene.paths import bodies_at
 from envs.scene.spheres import is_sphere_path, moving_spheres, sphere_obstacles
 from envs.scene.textures import Texture
 

@@ -11,7 +11,8 @@ from envs.events import EVENT
 from envs.events.faults import FaultState
 from envs.kinematics import Outcome, Point, clock_us
 from envs.scene import Scene
-from envs.scene.moving import MovingBody, Throws, moving_sections
+from envs.scene.moving import MovingBody, Throws
+from envs.scene.paths import moving_sections
 from envs.sensor import Sensor, check_sensed
 from envs.vehicles import task
 from envs.vehicles.bodies import Bodies
@@ -39,7 +40,7 @@ class Moving:
     Attributes:
         bodies: On the paths that they are on now; the last one is the ball that is thrown, if any.
         throws: Of the episode.
-        sections: float64 (M, 9), filled by `envs.scene.moving.moving_sections`.
+        sections: float64 (M, 9), filled by `envs.scene.paths.moving_sections`.
         thrown: How many throws there have been.
     """
 

@@ -13,7 +13,8 @@ from envs.raycast import RaycastRenderer
 from envs.raycast.silhouettes import Way
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, at_velocity
 from envs.scene.collision import first_moving_contact
-from envs.scene.moving import MovingBody, moving_sections
+from envs.scene.moving import MovingBody
+from envs.scene.paths import moving_sections
 from envs.sensor import Sensor, sense_way
 from envs.vehicles.planning import Planner
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs.scene import ELLIPSOID, OBSTACLE, MovingBody, Scene, at_velocity
-from envs.scene.moving import bodies_at
+from envs.scene.paths import bodies_at
 
 BALL = np.array((ELLIPSOID, 1.0, 2.0, 3.0, 0.1, 0.1, 0.1, 0.5), OBSTACLE)[()]
 
