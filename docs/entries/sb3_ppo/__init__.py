@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gymnasium.spaces import Space
+from gymnasium.spaces import Box, Discrete, Space
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticCnnPolicy
@@ -60,13 +60,16 @@ def train() -> None:
         device="cpu",
     )
     model.learn(STEPS, log_interval=10)
-    model.policy.save(WEIGHTS)
+    torch.save(model.policy.state_dict(), WEIGHTS)
 
 
 @cache
 def trained() -> ActorCriticCnnPolicy:
     """Load the weights once in each process."""
-    return ActorCriticCnnPolicy.load(WEIGHTS, device="cpu")
+    images, actions = Box(0, 255, (STACK, 64, 64), np.uint8), Discrete(3)
+    loaded = ActorCriticCnnPolicy(images, actions, lambda _: 0.0, features_extractor_class=SmallCnn)
+    loaded.load_state_dict(torch.load(WEIGHTS, weights_only=True))
+    return loaded
 
 
 def policy(seed):
