@@ -32,6 +32,7 @@ Latent = Annotated[int, Field(ge=1, le=256)]
 TimeBins = Annotated[int, Field(ge=1, le=65536)]
 PoolRank = Annotated[int, Field(ge=1, le=8)]
 Stack = Annotated[int, Field(ge=1, le=32)]
+Bands = Annotated[int, Field(ge=1, le=64)]
 Size = Annotated[int, Field(ge=1, le=65536)]
 TimesMs = Annotated[list[Annotated[float, Field(gt=0, le=1e6)]], Field(max_length=16)]
 
@@ -151,6 +152,18 @@ class DenseModel(Model):
 
 
 @dataclass(frozen=True, config=STRICT)
+class ColumnsModel(DenseModel):
+    """A policy whose dense layers read event counts per image column; see `EncoderModel`.
+
+    Attributes:
+        bands: Horizontal bands of the image, each with counts of its own. One sees where something is;
+            several also see how high, which matters where bodies hang in the air.
+    """
+
+    bands: Bands = 1
+
+
+@dataclass(frozen=True, config=STRICT)
 class FixedModel(Model):
     """A policy whose network has fixed sizes and is trained end to end on a stack of features."""
 
@@ -213,7 +226,7 @@ KINDS = {
         observation="window",
         feature=f"{_FEATURES}:COLUMNS",
         network=f"{_NETWORKS}:TWO_MLPS",
-        settings=DenseModel,
+        settings=ColumnsModel,
         onnx=f"{_ONNX}:columns",
     ),
     "event_columns_gru": Kind(
@@ -249,7 +262,12 @@ KINDS = {
     ),
 }
 # Settings that older files lack, each with the value that does what was done before it existed.
-ADDED_MODEL_SETTINGS: dict[str, object] = {"memory_ms": [], "pool_rank": 1, "own_actions": False}
+ADDED_MODEL_SETTINGS: dict[str, object] = {
+    "memory_ms": [],
+    "pool_rank": 1,
+    "own_actions": False,
+    "bands": 1,
+}
 RENAMED = {
     "brp_full": "bytestream",
     "brp_xy": "bytestream_xy",
@@ -310,6 +328,11 @@ class PolicySpec:
     def memory_ms(self) -> list[float]:
         """Return the time constants of its memory [ms]; none if it reads a stack of features."""
         return list(getattr(self.model, "memory_ms", []))
+
+    @property
+    def bands(self) -> int:
+        """Return the bands of the image whose columns are counted apart."""
+        return int(getattr(self.model, "bands", 1))
 
     @property
     def own_actions(self) -> bool:

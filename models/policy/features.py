@@ -101,12 +101,18 @@ def push_features(stacks: np.ndarray, features: np.ndarray, first: np.ndarray) -
     return pushed
 
 
-def column_counts(batch: EventBatch) -> np.ndarray:
-    """Return log(1 + count) of the ON, then of the OFF events in each column, float32 (B, 2 * width)."""
+def column_counts(batch: EventBatch, bands: int = 1) -> np.ndarray:
+    """Return log(1 + count) of the ON, then of the OFF events in each column of each band of the image.
+
+    Returns:
+        float32 (B, 2 * bands * width); band b holds the rows y with y * bands // height = b, from the top.
+    """
     width, height, _ = batch.grid
-    place = (2 * batch.window + (batch.code < width * height)) * width + batch.code % width
-    counts = np.bincount(place, minlength=2 * width * len(batch))
-    return np.log1p(counts).astype(np.float32).reshape(len(batch), 2 * width)
+    place = 2 * batch.window + (batch.code < width * height)
+    if bands > 1:
+        place = place * bands + batch.code // width % height * bands // height
+    counts = np.bincount(place * width + batch.code % width, minlength=2 * bands * width * len(batch))
+    return np.log1p(counts).astype(np.float32).reshape(len(batch), 2 * bands * width)
 
 
 def event_picture(code: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -125,7 +131,7 @@ def _latents(batch: EventBatch, spec: PolicySpec, encoder: Encoder) -> np.ndarra
 
 
 def _columns(batch: EventBatch, spec: PolicySpec, encoder: None) -> np.ndarray:
-    return column_counts(batch)
+    return column_counts(batch, spec.bands)
 
 
 def _grid_of_encoder(spec: PolicySpec, encoder: Encoder) -> Grid:
@@ -164,7 +170,7 @@ def _grey_of_luminance(luminance: np.ndarray, spec: PolicySpec, encoder: None) -
 
 
 LATENT = of_windows(np.float32, lambda spec: (spec.evae.latent,), _latents, _grid_of_encoder)
-COLUMNS = of_windows(np.float32, lambda spec: (2 * spec.width,), _columns)
+COLUMNS = of_windows(np.float32, lambda spec: (2 * spec.bands * spec.width,), _columns)
 EVENT_SET = of_windows(
     np.int16,
     lambda spec: (EVENTS, 4),

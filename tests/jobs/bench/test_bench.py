@@ -331,6 +331,16 @@ def test_the_identity_of_a_function_in_a_folder_is_that_of_its_weights_too(tmp_p
     assert len({*(policy.identity for policy in seen), read_foreign(f"{folder}:policy").identity}) == 3
 
 
+@pytest.mark.system
+@pytest.mark.parametrize(
+    "folder", sorted((ROOT / "docs" / "entries").glob("[a-z]*/")), ids=lambda folder: folder.name
+)
+def test_an_entry_decides_in_a_process_that_did_not_train_it(folder):
+    pytest.importorskip("stable_baselines3", reason="needs the extra dev")
+    episodes = roll_out(make_agent(read_foreign(f"{folder}:policy").agent), SHORT, (0,))
+    assert episodes["x_m"] > 0.0
+
+
 def test_a_policy_costs_its_files_and_two_operations_a_feature_and_event():
     policy = read_policy(str(PRETRAINED / "bytestream-s0"))
     cost = cost_of(policy, "stochastic", SHORT)

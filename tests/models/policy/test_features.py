@@ -8,15 +8,15 @@ from core.places import resolve
 from envs.config import CameraConfig, EnvConfig, Observation
 from envs.corridor import CorridorEnv
 from envs.events import EVENT, event_image, pack_window
-from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec, RecurrentModel
+from models.kinds import KINDS, ColumnsModel, FixedModel, PolicySpec, RecurrentModel
 from models.policy import Policy
 from models.policy.features import Feature, Step, feature_of, grey_picture, push_features
 from models.policy.networks import Network, build_networks
 
 WIDTH, HEIGHT, WINDOW_US = 6, 4, 5000
 SIZES = (WIDTH, HEIGHT, 3)
-OWN = {DenseModel: {"hidden": [8]}, RecurrentModel: {"units": 8}}  # settings beside name and stack
-COLUMNS = PolicySpec(DenseModel("event_columns", 3, [8]), *SIZES)
+OWN = {ColumnsModel: {"hidden": [8]}, RecurrentModel: {"units": 8}}  # settings beside name and stack
+COLUMNS = PolicySpec(ColumnsModel("event_columns", 3, [8]), *SIZES)
 PICTURE = PolicySpec(FixedModel("event_image", 3), *SIZES)
 
 
@@ -47,6 +47,21 @@ def test_columns_count_every_event_once_in_its_column_and_polarity(seed, count):
     counted = np.expm1(columns(events).astype(float))
     np.testing.assert_allclose(counted.reshape(2, WIDTH), expected, atol=1e-4)
     assert counted.sum() == pytest.approx(count, abs=1e-3)
+
+
+@given(seeds, counts, strategies.integers(1, HEIGHT))
+def test_bands_split_the_columns_by_height(seed, count, bands):
+    events = make_events(np.random.default_rng(seed), count)
+    spec = PolicySpec(ColumnsModel("event_columns", 3, [8], bands=bands), *SIZES)
+    made = feature_of(spec).from_observations(pack_window(events, 0, WINDOW_US, 200)[None], spec, None)
+    assert made.shape == (1, *feature_of(spec).shape(spec))
+    expected = np.zeros((2, bands, WIDTH))
+    for event in events:
+        expected[0 if event["p"] > 0 else 1, int(event["y"] * bands / HEIGHT), event["x"]] += 1
+    counted = np.expm1(made[0].astype(float)).reshape(2, bands, WIDTH)
+    np.testing.assert_allclose(counted, expected, atol=1e-4)
+    whole = np.expm1(columns(events).astype(float)).reshape(2, WIDTH)
+    np.testing.assert_allclose(counted.sum(axis=1), whole, atol=1e-3)
 
 
 @given(seeds, counts)

@@ -3,14 +3,15 @@ import pytest
 from hypothesis import given, strategies
 
 from envs.events import event_image, pack_window, unpack_window
-from models.kinds import KINDS, DenseModel, FixedModel, PolicySpec
+from models.kinds import KINDS, ColumnsModel, FixedModel, PolicySpec
 from models.policy.features import feature_of
 from models.policy.mirror import mirror
 from tests.support.encoders import WINDOW_US, make_events
 
 WIDTH, HEIGHT = 6, 4
 SIZES = (WIDTH, HEIGHT, 3)
-COLUMNS = PolicySpec(DenseModel("event_columns", 3, [8]), *SIZES)
+COLUMNS = PolicySpec(ColumnsModel("event_columns", 3, [8]), *SIZES)
+BANDS = PolicySpec(ColumnsModel("event_columns", 3, [8], bands=2), *SIZES)
 
 batches = strategies.tuples(strategies.integers(0, 2**32 - 1), strategies.lists(strategies.integers(0, 60)))
 
@@ -38,12 +39,11 @@ def test_mirrored_windows_hold_the_events_of_the_mirrored_picture(batch, padded)
         np.testing.assert_array_equal(window, twice)
 
 
-def test_the_features_of_a_mirrored_window_are_mirrored():
+@pytest.mark.parametrize("spec", [COLUMNS, BANDS], ids=["columns", "bands"])
+def test_the_features_of_a_mirrored_window_are_mirrored(spec):
     window = pack_window(make_events(40, width=WIDTH, height=HEIGHT), 0, WINDOW_US, 40)[None]
-    feature = feature_of(COLUMNS).from_observations
-    one, other = (
-        feature(shown, COLUMNS, None).reshape(2, WIDTH) for shown in (window, mirror(window, COLUMNS))
-    )
+    feature = feature_of(spec).from_observations
+    one, other = (feature(shown, spec, None).reshape(-1, WIDTH) for shown in (window, mirror(window, spec)))
     assert not np.array_equal(one, other)
     np.testing.assert_array_equal(one[:, ::-1], other)
 

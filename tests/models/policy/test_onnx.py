@@ -58,12 +58,14 @@ def fly_exported(file, shown, shape, dtype):
 
 
 @pytest.fixture(
-    scope="module", params=kinds([*TRAINED, "bytestream_xy", "eventnet", "ranked", "memory", "own_actions"])
+    scope="module",
+    params=kinds([*TRAINED, "bytestream_xy", "eventnet", "ranked", "memory", "own_actions", "bands"]),
 )
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
-    if name in ("memory", "own_actions"):
-        spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0], own_actions=name == "own_actions")
+    if name in ("memory", "own_actions", "bands"):
+        own = {"own_actions": name == "own_actions", "bands": 3 if name == "bands" else 1}
+        spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0], **own)
         return save_policy(path, build_networks(spec, seed=3), spec, {**ABOUT, "commands": COMMANDS})
     changes = {
         "bytestream_xy": {"variant": "bytestream_xy"},
