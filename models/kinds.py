@@ -11,6 +11,7 @@ The ranges of all settings stand here; configurations, encoder files and policy 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, cast
 
@@ -32,7 +33,7 @@ Latent = Annotated[int, Field(ge=1, le=256)]
 TimeBins = Annotated[int, Field(ge=1, le=65536)]
 PoolRank = Annotated[int, Field(ge=1, le=8)]
 Stack = Annotated[int, Field(ge=1, le=32)]
-Bands = Annotated[int, Field(ge=1, le=64)]
+Rows = Annotated[list[Annotated[int, Field(ge=0, le=4096)]], Field(max_length=65)]
 Size = Annotated[int, Field(ge=1, le=65536)]
 TimesMs = Annotated[list[Annotated[float, Field(gt=0, le=1e6)]], Field(max_length=16)]
 
@@ -156,11 +157,18 @@ class ColumnsModel(DenseModel):
     """A policy whose dense layers read event counts per image column; see `EncoderModel`.
 
     Attributes:
-        bands: Horizontal bands of the image, each with counts of its own. One sees where something is;
-            several also see how high, which matters where bodies hang in the air.
+        bands: Rows at which horizontal bands of the image begin and, the last, end; each band has counts of
+            its own, and rows outside are not seen. None: the whole image is one band. Several bands see how
+            high something is, which matters where bodies hang in the air.
     """
 
-    bands: Bands = 1
+    bands: Rows = dataclasses.field(default_factory=list)
+
+    @pydantic.model_validator(mode="after")
+    def _rises(self) -> "ColumnsModel":
+        if len(self.bands) == 1 or any(a >= b for a, b in itertools.pairwise(self.bands)):
+            raise ValueError(f"bands must be [] or two and more rising rows, got {self.bands}")
+        return self
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -266,7 +274,7 @@ ADDED_MODEL_SETTINGS: dict[str, object] = {
     "memory_ms": [],
     "pool_rank": 1,
     "own_actions": False,
-    "bands": 1,
+    "bands": [],
 }
 RENAMED = {
     "brp_full": "bytestream",
@@ -330,9 +338,9 @@ class PolicySpec:
         return list(getattr(self.model, "memory_ms", []))
 
     @property
-    def bands(self) -> int:
-        """Return the bands of the image whose columns are counted apart."""
-        return int(getattr(self.model, "bands", 1))
+    def bands(self) -> list[int]:
+        """Return the rows at which the bands of its columns begin, and the end of the last."""
+        return list(getattr(self.model, "bands", [])) or [0, self.height]
 
     @property
     def own_actions(self) -> bool:

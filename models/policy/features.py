@@ -101,18 +101,25 @@ def push_features(stacks: np.ndarray, features: np.ndarray, first: np.ndarray) -
     return pushed
 
 
-def column_counts(batch: EventBatch, bands: int = 1) -> np.ndarray:
+def column_counts(batch: EventBatch, bands: Sequence[int] = ()) -> np.ndarray:
     """Return log(1 + count) of the ON, then of the OFF events in each column of each band of the image.
 
+    Args:
+        batch: B windows.
+        bands: As of `models.kinds.ColumnsModel`; events in other rows are not counted.
+
     Returns:
-        float32 (B, 2 * bands * width); band b holds the rows y with y * bands // height = b, from the top.
+        float32 (B, 2 * bands * width).
     """
     width, height, _ = batch.grid
-    place = 2 * batch.window + (batch.code < width * height)
-    if bands > 1:
-        place = place * bands + batch.code // width % height * bands // height
-    counts = np.bincount(place * width + batch.code % width, minlength=2 * bands * width * len(batch))
-    return np.log1p(counts).astype(np.float32).reshape(len(batch), 2 * bands * width)
+    edges = bands or (0, height)
+    count, below = len(edges) - 1, batch.code < width * height
+    band = np.searchsorted(edges, np.arange(height), side="right") - 1  # of each row; -1 or `count`: of none
+    band = band[batch.code // width % height]
+    place = ((2 * batch.window + below) * count + band) * width + batch.code % width
+    place = place[(band >= 0) & (band < count)]
+    counts = np.bincount(place, minlength=2 * count * width * len(batch))
+    return np.log1p(counts).astype(np.float32).reshape(len(batch), 2 * count * width)
 
 
 def event_picture(code: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -170,7 +177,7 @@ def _grey_of_luminance(luminance: np.ndarray, spec: PolicySpec, encoder: None) -
 
 
 LATENT = of_windows(np.float32, lambda spec: (spec.evae.latent,), _latents, _grid_of_encoder)
-COLUMNS = of_windows(np.float32, lambda spec: (2 * spec.bands * spec.width,), _columns)
+COLUMNS = of_windows(np.float32, lambda spec: (2 * (len(spec.bands) - 1) * spec.width,), _columns)
 EVENT_SET = of_windows(
     np.int16,
     lambda spec: (EVENTS, 4),

@@ -108,7 +108,7 @@ class PolicyGraph(nn.Module):
         self.shape = policy.stack_shape
         kept = torch.from_numpy(np.empty(0, policy.feature.dtype)).dtype
         self.dtype = torch.int32 if kept == torch.int16 else kept  # of which onnxruntime knows more
-        self.size, self.bands = (spec.height, spec.width), spec.bands
+        self.size, self.bands = (spec.height, spec.width), torch.tensor(spec.bands)
         self.tau_us = torch.tensor([1e3 * time_ms for time_ms in spec.memory_ms])
         self.filter = filter_of(policy.manifest.get("sensor", {}), spec.width, spec.height)
         self.sees_events = policy.feature.from_events is not None
@@ -266,11 +266,11 @@ def _bins(t: Tensor, window_us: Tensor, time_bins: int) -> Tensor:
 def columns(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
     """Return log(1 + count) of ON, then of OFF events in each column of each band."""
     _, x, y, p = events.unbind(1)
-    height, width = policy.size
-    bands = policy.bands
-    place = x + width * (bands * (p < 0) + torch.div(y * bands, height, rounding_mode="floor"))
-    counts = torch.zeros(2 * bands * width).scatter_add(0, place, torch.ones_like(place, dtype=torch.float32))
-    return torch.log1p(counts)
+    width, count = policy.size[1], len(policy.bands) - 1
+    band = (y[:, None] >= policy.bands).sum(1) - 1
+    place = x + width * (count * (p < 0) + band.clamp(0, count - 1))
+    seen = ((band >= 0) & (band < count)).float()
+    return torch.log1p(torch.zeros(2 * count * width).scatter_add(0, place, seen))
 
 
 def event_image(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:

@@ -1,3 +1,4 @@
+import itertools
 from typing import get_args
 
 import numpy as np
@@ -8,7 +9,7 @@ from core.places import resolve
 from envs.config import CameraConfig, EnvConfig, Observation
 from envs.corridor import CorridorEnv
 from envs.events import EVENT, event_image, pack_window
-from models.kinds import KINDS, ColumnsModel, FixedModel, PolicySpec, RecurrentModel
+from models.kinds import KINDS, ColumnsModel, FixedModel, PolicySpec, RecurrentModel, read_model
 from models.policy import Policy
 from models.policy.features import Feature, Step, feature_of, grey_picture, push_features
 from models.policy.networks import Network, build_networks
@@ -49,19 +50,25 @@ def test_columns_count_every_event_once_in_its_column_and_polarity(seed, count):
     assert counted.sum() == pytest.approx(count, abs=1e-3)
 
 
-@given(seeds, counts, strategies.integers(1, HEIGHT))
-def test_bands_split_the_columns_by_height(seed, count, bands):
+edges = strategies.lists(strategies.integers(0, HEIGHT + 1), min_size=2, unique=True).map(sorted)
+
+
+@given(seeds, counts, edges)
+def test_bands_count_the_columns_of_their_rows(seed, count, bands):
     events = make_events(np.random.default_rng(seed), count)
     spec = PolicySpec(ColumnsModel("event_columns", 3, [8], bands=bands), *SIZES)
     made = feature_of(spec).from_observations(pack_window(events, 0, WINDOW_US, 200)[None], spec, None)
     assert made.shape == (1, *feature_of(spec).shape(spec))
-    expected = np.zeros((2, bands, WIDTH))
-    for event in events:
-        expected[0 if event["p"] > 0 else 1, int(event["y"] * bands / HEIGHT), event["x"]] += 1
-    counted = np.expm1(made[0].astype(float)).reshape(2, bands, WIDTH)
-    np.testing.assert_allclose(counted, expected, atol=1e-4)
-    whole = np.expm1(columns(events).astype(float)).reshape(2, WIDTH)
-    np.testing.assert_allclose(counted.sum(axis=1), whole, atol=1e-3)
+    for band, (begin, end) in enumerate(itertools.pairwise(bands)):
+        inside = events[(events["y"] >= begin) & (events["y"] < end)]
+        own = made[0].reshape(2, len(bands) - 1, WIDTH)[:, band]
+        np.testing.assert_array_equal(own.ravel(), columns(inside))
+
+
+@pytest.mark.parametrize("bands", [[3], [3, 3], [4, 2], [-1, 3]])
+def test_bands_that_do_not_rise_are_refused(bands):
+    with pytest.raises(ValueError, match="bands"):
+        read_model(name="event_columns", stack=3, hidden=[8], bands=bands)
 
 
 @given(seeds, counts)

@@ -64,7 +64,7 @@ def fly_exported(file, shown, shape, dtype):
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
     if name in ("memory", "own_actions", "bands"):
-        own = {"own_actions": name == "own_actions", "bands": 3 if name == "bands" else 1}
+        own = {"own_actions": name == "own_actions", "bands": [2, 5, SIDE - 3] if name == "bands" else []}
         spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0], **own)
         return save_policy(path, build_networks(spec, seed=3), spec, {**ABOUT, "commands": COMMANDS})
     changes = {
