@@ -11,7 +11,7 @@ from envs.config import sensor_settings
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.errors import differences
 from jobs.run.files import read_json_lines
-from jobs.run.folder import Run, finished, locate_run, open_run
+from jobs.run.folder import Run, finished, group_name, locate_run, open_run
 from jobs.run.progress import console
 from jobs.study.learned import published_place
 from jobs.training import train
@@ -57,9 +57,13 @@ def published_policies(config: Config) -> dict[Training, Path]:
         place = published_place(said, name)
         if place is None:
             raise ConfigError("study.published: must name published policies where train is false, got null")
-        folder = place.with_name(f"{place.name}-s{seed}")
+        training = variant_config(config, name, seed)
+        # `evade publish` puts the length of some trainings into their names.
+        length = group_name(as_dict(training)).removeprefix(training.exp)
+        folders = [place.with_name(f"{place.name}{end}-s{seed}") for end in (length, "")]
+        folder = next(filter(Path.is_dir, folders), folders[-1])
         found[name, seed] = folder
-        differ = _stated_otherwise(folder, variant_config(config, name, seed))
+        differ = _stated_otherwise(folder, training)
         wrong += [f"{folder.name} {differ}"] if differ else []
     if wrong:
         rule = f"must hold every training as +exp={config.exp} makes it"

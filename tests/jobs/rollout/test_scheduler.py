@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,15 @@ def test_each_simulation_is_measured_once_whatever_is_evaluated_in_it(tmp_path, 
     assert len(executor.measured) == len({task.simulation for task in tasks}) == 2
     more = planned(sweep_config(tmp_path, trials=3), "straight", "oracle", "random").tasks
     assert not any(part.measures_accuracy for part in plan_parts(more, store, True))
+
+
+def test_of_spheres_no_accuracy_is_measured(tmp_path, store):
+    config = sweep_config(tmp_path)
+    for renderer in ("raycast", "spheres"):
+        env = dataclasses.replace(config.env, scene="spheres", layout={"passable": False}, renderer=renderer)
+        parts = plan_parts(planned(dataclasses.replace(config, env=env), "oracle").tasks, store, True)
+        assert {part.task.env.renderer for part in parts} == {renderer}
+        assert any(part.measures_accuracy for part in parts) == (renderer == "raycast")
 
 
 def test_what_raises_or_dies_stops_no_other_and_is_evaluated_by_the_next_run(tmp_path, store, executor):
