@@ -8,7 +8,6 @@ more), and the mean width.
 """
 
 from collections.abc import Iterator
-from functools import cache
 
 import numpy as np
 
@@ -72,14 +71,6 @@ def change_coverage(trainings: int, corridors: int, mean: float, spread: float) 
         low, high = crossed_mean(once - again, (-1.0, 1.0)).interval or (0.0, 0.0)
         held += low <= 0.0 <= high
     return held / STUDIES
-
-
-@cache
-def coverage_text(trainings: int, corridors: int) -> str:
-    """How often the intervals of such a study hold the true rate, at a mean logit of 1.5, in words."""
-    shares = [coverage(trainings, corridors, 1.5, spread)[0] for spread in SPREADS]
-    named = [f"{100 * share:.0f} % at {spread:g}" for share, spread in zip(shares, SPREADS, strict=True)]
-    return ", ".join(named)
 
 
 def main() -> None:

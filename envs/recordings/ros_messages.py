@@ -8,7 +8,6 @@ import numpy as np
 # An event of ROS 1: x, y, seconds, nanoseconds, polarity, without gaps.
 EVENT_1 = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 EVENT_2_BYTES = 16  # from one event of CDR to the next
-MAX_LENGTH = 1 << 31
 
 
 class Values:
