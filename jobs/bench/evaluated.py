@@ -1,6 +1,7 @@
 """Evaluate a policy in the cells of a protocol, or in some of their corridors."""
 
 import dataclasses
+import sys
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -94,13 +95,20 @@ def cost_of(policy: EvaluatedPolicy, action: str, env: EnvConfig) -> Cost:
     with torch_threads(1):
         agent = Timed(make_agent(policy.agent, action))
         roll_out(agent, dataclasses.replace(env, split="train"), (0,))
-    path = Path(policy.agent)
+    path = _place(policy.agent)
     files = [path] if path.is_file() else [file for file in path.glob("*") if file.is_file()]
     return Cost(
         bytes=sum(file.stat().st_size for file in files) if path.exists() else None,
         operations_per_event=_operations(agent),
         ms_per_decision=round(1e3 * float(np.median(agent.seconds)), 4),
     )
+
+
+def _place(agent: str) -> Path:
+    """Return the file or folder of an agent: of a function, that of its imported module."""
+    module = sys.modules.get(agent.rpartition(":")[0])
+    path = Path(agent if module is None or module.__file__ is None else module.__file__)
+    return path.parent if path.name == "__init__.py" else path
 
 
 def _operations(agent: Timed) -> int | None:

@@ -18,6 +18,7 @@ def test_the_policies_that_are_timed_have_the_default_sizes_and_choose_from_any_
         assert np.isfinite(logits).all()
 
 
+@pytest.mark.slow
 def test_a_timed_policy_can_be_exported_and_opened(tmp_path):
     session = load(export_onnx(random_policy("event_columns"), tmp_path / "policy.onnx"))
     assert {value.name for value in session.get_inputs()} >= {"events", "window_us", "last_stack"}

@@ -325,6 +325,8 @@ def test_the_identity_of_a_function_in_a_folder_is_that_of_its_weights_too(tmp_p
         (folder / "__init__.py").write_text(code + "def policy(seed):\n    return lambda image: ACTION\n")
         (folder / "weights").write_text(str(action))
         seen.append(read_foreign(f"{folder}:policy"))
+    sizes = [file.stat().st_size for file in folder.iterdir() if file.is_file()]
+    assert cost_of(seen[1], "stochastic", SHORT).bytes == sum(sizes)
     first, second = (roll_out(make_agent(policy.agent), SHORT, (0,)) for policy in seen)
     assert first["x_m"] < second["x_m"]
     (folder / "weights").write_text("1")

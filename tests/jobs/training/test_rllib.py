@@ -63,6 +63,7 @@ def built_context(training):
     return training.config.env_config
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_ppo_is_opened_by_rllibs_own_command(tmp_path):
     config = make_config(*COLUMNS, "algo.train_batch_size_per_learner=64", "algo.num_envs_per_env_runner=2")
     training = algorithm_of(config).trainable(config)(config=build_algorithm(config))
