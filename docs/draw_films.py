@@ -31,7 +31,7 @@ from jobs.rollout.recorded import Moment, record_episode
 from models.policy import PRETRAINED, load_policy
 
 DOCS = Path(__file__).resolve().parent
-BODY = ("demo.policy=body_hold-s0", "env.speed_mps=10.0", "env.control_hz=100.0", "env.time_limit_s=20.0")
+BODY = ("demo.policy=body_hold-s0",)
 FILMS = {  # name: the words of the demo
     "poles": (),
     "textures": ("env.scene=texture_change", "fidelity.tolerance=0.2"),

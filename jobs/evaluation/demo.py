@@ -66,8 +66,25 @@ def find_shown(config: Config) -> Shown:
         ConfigError: There is no such policy.
     """
     policy = find_one_policy("demo.policy", config.own.policy, config, locate_run(config))
-    env = with_own_parts(policy, dataclasses.replace(config.env, split="eval"))
+    asked = dataclasses.replace(config.env, split="eval")
+    env = with_own_parts(policy, asked)
+    if env.vehicle != asked.vehicle:
+        env = at_own_pace(policy, env)
     return Shown(policy, env, PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic"))
+
+
+def at_own_pace(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
+    """Return the simulation at the speed and rate of a policy's training, where none is asked for.
+
+    None is asked for where they are the defaults. There is time for as long a way as before.
+    """
+    usual = {name: getattr(env, name) == getattr(EnvConfig, name) for name in ("speed_mps", "control_hz")}
+    own = {name: policy.sensor[name] for name, is_default in usual.items() if is_default}
+    time_limit_s = env.time_limit_s * env.speed_mps / own.get("speed_mps", env.speed_mps)
+    if own:
+        said = f"{own.get('speed_mps', env.speed_mps):g} m/s, {own.get('control_hz', env.control_hz):g} Hz"
+        console.print(f"As in training: {said}; vehicle={env.vehicle} keeps what is configured", markup=False)
+    return dataclasses.replace(env, **own, time_limit_s=time_limit_s)
 
 
 def run(config: Config) -> np.void:

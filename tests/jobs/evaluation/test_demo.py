@@ -55,6 +55,22 @@ def test_the_printed_line_is_the_evaluations_own_row_and_the_film_has_a_frame_fo
     assert (len(frames), about["fps"]) == (row["steps"], 50.0)
 
 
+@pytest.mark.parametrize(
+    ("words", "speed_mps", "control_hz", "time_limit_s"),
+    [
+        ((), 10.0, 100.0, 20.0),
+        (("env.speed_mps=15.0",), 15.0, 100.0, 10.0),
+        (("vehicle=point_mass", "env.speed_mps=20.0"), 20.0, 100.0, 20.0),
+    ],
+)
+def test_another_vehicle_has_the_pace_of_its_training_unless_one_is_asked_for(
+    tmp_path, words, speed_mps, control_hz, time_limit_s
+):
+    _, env, _ = demo.find_shown(demo_config(tmp_path, "demo.policy=body_hold-s0", *words))
+    assert env.vehicle == "point_mass"
+    assert (env.speed_mps, env.control_hz, env.time_limit_s) == (speed_mps, control_hz, time_limit_s)
+
+
 def test_the_film_shows_the_way_that_was_taken_and_how_it_ended(tmp_path):
     env = dataclasses.replace(HELD_OUT, time_limit_s=0.1)
     folder = save_training(tmp_path / "policy", "a", 0, HELD_OUT, "bytestream")
