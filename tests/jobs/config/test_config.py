@@ -36,6 +36,7 @@ JOBS = {
     "ablation": "study",
     "hold": "study",
     "body_speed": "study",
+    "body_kinds": "study",
     "body_conditions": "study",
     "dodge": "study",
     "renderer": "study",
