@@ -50,7 +50,6 @@ FILMS = {  # name: the words of the demo
 }
 FAILURES = {
     "fails_dense_25hz": ("env.scene=poles_dense", "env.control_hz=25"),
-    "fails_dense": ("env.scene=poles_dense",),
     "fails_late": ("env.action_delay_ms=100",),
 }
 CORRUPTIONS, SEVERITY, SHOWN_S, SHOWN_FPS = "corruptions", 5, 0.8, 10.0

@@ -273,7 +273,10 @@ LATER_FAULTS = (
     *("burst_hz", "burst_ms", "burst_activity_hz"),
 )
 # Of the environment, with the values that do what was done before they existed.
-LATER_ENV_SETTINGS: dict[str, object] = {"vehicle": "kinematic", "body": {}, "task": "corridor"}
+LATER_ENV_SETTINGS: dict[str, object] = {
+    **{"vehicle": "kinematic", "body": {}, "task": "corridor"},
+    "velocity_noise_mps": 0.0,
+}
 SECTIONS: dict[str, Any] = {"camera": CameraConfig, "faults": FaultsConfig, "fidelity": FidelityConfig}
 
 
@@ -293,6 +296,8 @@ class EnvConfig:
         task: A row of `TASKS`: reward and end of an episode (`envs.vehicles.task`).
         action_delay_ms: An action is taken in the first control step that begins so long after its choice
             [ms]; until then the vehicle follows earlier choices, at first straight ahead.
+        velocity_noise_mps: Standard deviation of either component of the velocity that the vehicle
+            measures (`CorridorEnv.measured_velocity_mps`) [m/s].
         vehicle_radius_m: The vehicle is a disc of this radius [m].
         camera_height_m: Height of the camera above the ground [m].
         time_limit_s: Flight time after which the episode is truncated [s].
@@ -318,6 +323,7 @@ class EnvConfig:
     body: dict[str, Value] = dataclasses.field(default_factory=dict)
     task: Annotated[str, _row_of(TASKS)] = "corridor"
     action_delay_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    velocity_noise_mps: Annotated[float, Field(ge=0, le=1000)] = 0.0
     vehicle_radius_m: Annotated[float, Field(ge=0, le=10)] = 0.3
     camera_height_m: Annotated[float, Field(ge=0, le=1000)] = 2.0
     time_limit_s: Positive = 10.0
@@ -375,6 +381,7 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
         config,
         observation=cast(Observation, observation),
         window_capacity=EnvConfig.window_capacity,
+        velocity_noise_mps=EnvConfig.velocity_noise_mps,
         filter_support=EnvConfig.filter_support,
         filter_tau_us=EnvConfig.filter_tau_us,
         camera=CameraConfig(**lens),

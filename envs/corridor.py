@@ -30,6 +30,7 @@ from envs.sensor import Sensor
 from envs.vehicles import StepError, Vehicles
 from envs.vehicles.dynamics import make_dynamics, number_type, planned_config, wrong_actions
 
+VELOCITY_STREAM = 0x57A7E  # of the noise of measured velocity, in the entropy of its seed
 Draw = Callable[[EnvConfig, np.random.Generator], EnvConfig]  # the settings of an episode, drawn
 
 
@@ -266,6 +267,19 @@ class CorridorEnv(gymnasium.Env):
         per_s = 1e6 / vehicle["window_us"]
         moved = vehicle["x_m"] - vehicle["start_x_m"], vehicle["y_m"] - vehicle["start_y_m"]
         return float(moved[0] * per_s), float(moved[1] * per_s)
+
+    @property
+    def measured_velocity_mps(self) -> np.ndarray:
+        """Velocity with the noise of `EnvConfig.velocity_noise_mps`, float64 (2,) [m/s].
+
+        The noise depends on the episode and the step alone.
+        """
+        velocity, noise_mps = np.array(self.velocity_mps), self.config.velocity_noise_mps
+        if noise_mps:
+            (seed, number), step = self.series, int(self._vehicles.rows["steps"][self._row])
+            rng = np.random.default_rng([seed or 0, number, VELOCITY_STREAM, step])
+            velocity += noise_mps * rng.standard_normal(2)
+        return velocity
 
     def place_of_action(self) -> tuple[float, float]:
         """Return where the next decision takes effect if nothing is in the way: x, y [m].

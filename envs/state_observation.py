@@ -8,31 +8,20 @@ from gymnasium import spaces
 
 from envs.corridor import CorridorEnv, Info
 
-STREAM = 0x57A7E  # of the noise, in the entropy of its seed
 Observation = dict[str, Any]
 
 
 class StateObservation(gymnasium.Wrapper):
     """Shows a Dict: "events", the observation of the wrapped environment, and "state".
 
-    The state is float32 (2 + C,): velocity to the right and ahead [m/s], with noise, and the C numbers of the
-    command that was decided last, 0 at the start. Of a Discrete it is the action's number, -1 at the start.
+    The state is float32 (2 + C,): measured velocity to the right and ahead [m/s], whose noise is
+    `EnvConfig.velocity_noise_mps`, and the C numbers of the command that was decided last, 0 at the start.
+    Of a Discrete it is the action's number, -1 at the start.
     """
 
-    def __init__(self, env: gymnasium.Env, velocity_noise_mps: float = 0.0) -> None:
-        """Wrap a `CorridorEnv`.
-
-        Args:
-            env: The environment.
-            velocity_noise_mps: Standard deviation of the noise on either velocity [m/s].
-
-        Raises:
-            ValueError: The noise is negative or not finite.
-        """
+    def __init__(self, env: gymnasium.Env) -> None:
+        """Wrap a `CorridorEnv`."""
         super().__init__(env)
-        if not 0.0 <= velocity_noise_mps < np.inf:
-            raise ValueError(f"velocity_noise_mps must be finite and >= 0; got {velocity_noise_mps!r}.")
-        self._noise_mps = velocity_noise_mps
         self._last: np.ndarray = self._no_command()
         state = spaces.Box(-np.inf, np.inf, (2 + self._last.size,), np.float32)
         self.observation_space = spaces.Dict({"events": env.observation_space, "state": state})
@@ -47,10 +36,8 @@ class StateObservation(gymnasium.Wrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
-        """Start an episode; the noise depends on the episode alone."""
+        """Start an episode."""
         events, info = self.env.reset(seed=seed, options=options)
-        own_seed, number = self.corridor.series
-        self._rng = np.random.default_rng([own_seed or 0, number, STREAM])
         self._last = self._no_command()
         return self._shown(events), info
 
@@ -69,5 +56,5 @@ class StateObservation(gymnasium.Wrapper):
         )
 
     def _shown(self, events: Any) -> Observation:
-        velocity = np.array(self.corridor.velocity_mps) + self._noise_mps * self._rng.standard_normal(2)
-        return {"events": events, "state": np.concatenate([velocity, self._last]).astype(np.float32)}
+        state = np.concatenate([self.corridor.measured_velocity_mps, self._last])
+        return {"events": events, "state": state.astype(np.float32)}

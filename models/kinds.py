@@ -98,6 +98,7 @@ class EncoderModel(Model):
         memory_ms: If any, it sees the newest latent instead, and means of all that decay with these
             time constants [ms] (`models.policy.memory`).
         own_actions: Whether it also sees the action that it took last, remembered as a latent is.
+        own_velocity: Whether it also sees the velocity that the vehicle measures.
     """
 
     has_encoder: ClassVar[bool] = True
@@ -115,6 +116,7 @@ class EncoderModel(Model):
     memory_ms: TimesMs = dataclasses.field(default_factory=list)
     pool_rank: PoolRank = 1
     own_actions: bool = False
+    own_velocity: bool = False
 
     @pydantic.model_validator(mode="after")
     def _fits_its_kind(self) -> "EncoderModel":
@@ -127,9 +129,10 @@ class EncoderModel(Model):
             if self.memory_ms:
                 rule = "must be [] for encoder=finetuned, whose latents change while it learns"
                 raise ValueError(f"memory_ms {rule}, got {self.memory_ms}")
-            if self.own_actions:
-                rule = "must be false for encoder=finetuned, whose networks read events"
-                raise ValueError(f"own_actions {rule}, got True")
+            for name in ("own_actions", "own_velocity"):
+                if getattr(self, name):
+                    rule = "must be false for encoder=finetuned, whose networks read events"
+                    raise ValueError(f"{name} {rule}, got True")
             if self.time_bins > MAX_ROW_TIME_BINS:
                 rule = f"must be at most {MAX_ROW_TIME_BINS} for encoder=finetuned"
                 raise ValueError(f"time_bins {rule}, got {self.time_bins}")
@@ -150,6 +153,7 @@ class DenseModel(Model):
     hidden: list[Size]
     memory_ms: TimesMs = dataclasses.field(default_factory=list)
     own_actions: bool = False
+    own_velocity: bool = False
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -274,6 +278,7 @@ ADDED_MODEL_SETTINGS: dict[str, object] = {
     "memory_ms": [],
     "pool_rank": 1,
     "own_actions": False,
+    "own_velocity": False,
     "bands": [],
 }
 RENAMED = {
@@ -346,6 +351,16 @@ class PolicySpec:
     def own_actions(self) -> bool:
         """Return whether it also sees the action that it took last."""
         return bool(getattr(self.model, "own_actions", False))
+
+    @property
+    def own_velocity(self) -> bool:
+        """Return whether it also sees the velocity that the vehicle measures."""
+        return bool(getattr(self.model, "own_velocity", False))
+
+    @property
+    def own_size(self) -> int:
+        """Return how many numbers about its vehicle are appended to each feature."""
+        return self.num_actions * self.own_actions + 2 * self.own_velocity
 
     @property
     def depth(self) -> int:

@@ -152,10 +152,12 @@ class PolicyAgent:
         if own != theirs:
             raise ValueError(f"the policy chooses among {own} actions, and the vehicle has {theirs}")
         self.policy.reset(len(envs))
-        self._streams = episode_streams(seeds)
+        self._envs, self._streams = list(envs), episode_streams(seeds)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return actions (B,); draws come from each episode's own stream."""
+        if self.policy.spec.own_velocity:
+            self.policy.velocity_mps = np.array([env.measured_velocity_mps for env in self._envs])
         self.logits = logits = self.policy.logits(observations).astype(np.float64)
         if not self.stochastic:
             return logits.argmax(axis=1)
@@ -166,7 +168,7 @@ class PolicyAgent:
     def keep(self, places: np.ndarray) -> None:
         """Forget the other episodes."""
         self.policy.keep(places)
-        self._streams = [self._streams[k] for k in places]
+        self._envs, self._streams = ([kept[k] for k in places] for kept in (self._envs, self._streams))
 
 
 class FunctionAgent:
@@ -210,7 +212,7 @@ class OnnxAgent:
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
         """Begin an episode for each seed."""
-        self._streams = episode_streams(seeds)
+        self._envs, self._streams = list(envs), episode_streams(seeds)
         memory = {name: _empty(one) for name, one in self._inputs.items() if name.startswith("last_")}
         self._memory: list[dict[str, np.ndarray]] = [dict(memory) for _ in seeds]
         self._first = True
@@ -230,12 +232,17 @@ class OnnxAgent:
 
     def keep(self, places: np.ndarray) -> None:
         """Forget the other episodes."""
-        self._streams = [self._streams[k] for k in places]
-        self._memory = [self._memory[k] for k in places]
+        kept = self._envs, self._streams, self._memory
+        self._envs, self._streams, self._memory = ([one[k] for k in places] for one in kept)
 
     def _logits(self, k: int, observation: np.ndarray) -> np.ndarray:
         """Return the logits of an episode's next step, and remember what the file asks for."""
-        results = self._session.run(None, self._seen(observation) | self._memory[k])
+        velocity = (
+            {"velocity_mps": self._envs[k].measured_velocity_mps.astype(np.float32)}
+            if "velocity_mps" in self._inputs
+            else {}
+        )
+        results = self._session.run(None, self._seen(observation) | velocity | self._memory[k])
         named = dict(zip(self._outputs, results, strict=True))
         self._memory[k] = {name: named["next_" + name.removeprefix("last_")] for name in self._memory[k]}
         return np.asarray(results[0]).reshape(-1)

@@ -25,7 +25,10 @@ ENCODER_FILES = (
     "stages/pretrain.json",
 )
 # Settings that change nothing an encoder learns from: variants that differ in these alone share encoders.
-SAME_ENCODER = ("train.", "algo.", "model.memory_ms", "model.own_actions", "model.stack", "model.hidden")
+SAME_ENCODER = (
+    *("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden"),
+    *("model.own_actions", "model.own_velocity"),
+)
 INIT = "train.init"
 STATED = ("algo", "train", "collect", "pretrain")  # sections that a manifest states, beside the model's
 # Keys of a variant that are no settings of its experiment.

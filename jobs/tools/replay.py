@@ -67,12 +67,16 @@ def run(config: Config) -> list[Choice]:
     """Replay `replay.recording` to `replay.policy`; return what it chose.
 
     Raises:
-        ConfigError: There is no such policy, or it sees no events; or the recording is refused.
+        ConfigError: There is no such policy, or it sees no events, or more than events; or the recording is
+            refused.
     """
     found = find_one_policy("replay.policy", config.own.policy, config, locate_run(config))
     policy = load_policy(found.agent)
     if policy.feature.from_events is None:
         raise ConfigError(f"replay.policy: must see events, got {config.own.policy!r}")
+    if policy.spec.own_velocity:
+        rule = "must not read the vehicle's velocity (model.own_velocity), which a recording lacks"
+        raise ConfigError(f"replay.policy: {rule}, got {config.own.policy!r}")
     env = EnvConfig(**policy.env_fields)
     try:
         recorded, fitted = read_whole(config.own.recording, env, config.recording)

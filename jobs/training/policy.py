@@ -26,6 +26,7 @@ def policy_spec(config: Config) -> PolicySpec:
 def policy_about(config: Config) -> dict[str, object]:
     """Return what a policy's manifest records of its environment and training, beside its `policy_spec`."""
     sensor, commands = sensor_settings(config.env), make_dynamics(config.env).commands
+    own = {name: getattr(config.env, name) for name in ("action_delay_ms", "velocity_noise_mps")}
     return {
         "exp": config.exp,
         "observation": KINDS[config.model.name].observation,
@@ -34,7 +35,7 @@ def policy_about(config: Config) -> dict[str, object]:
         "sensor_hash": settings_hash(sensor),
         "world": {name: getattr(config.env, name) for name in ("scene", "layout")}
         | {"faults": dataclasses.asdict(config.env.faults)}
-        | ({"action_delay_ms": config.env.action_delay_ms} if config.env.action_delay_ms > 0 else {}),
+        | {name: value for name, value in own.items() if value > 0},
         "conditions": config.train.conditions,
         "seed": config.seed,
         "algo": dataclasses.asdict(config.algo),

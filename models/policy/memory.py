@@ -6,12 +6,15 @@ rate of control: a feature holds until the next one, so that m <- f + (m - f) ex
 
 A policy with `own_actions` appends to each feature which action it took last, as a one among zeros. The
 decaying means then say what a vehicle with inertia or a delay is about to do, without a sensor for it.
+One with `own_velocity` appends the velocity that the vehicle measures.
 """
 
 import numpy as np
 
 from models.kinds import PolicySpec
 from models.policy.features import Feature, Windows, feature_of, push_features
+
+VELOCITY_UNIT_MPS = 10.0  # what a network reads as 1, so that velocities are about as large as other features
 
 
 def kept_shape(spec: PolicySpec, feature: Feature | None = None) -> tuple[int, ...]:
@@ -22,16 +25,17 @@ def kept_shape(spec: PolicySpec, feature: Feature | None = None) -> tuple[int, .
         feature: What is kept of a step; None: what its row says, as in training.
 
     Raises:
-        ValueError: `own_actions` of a policy whose feature is not a vector of floats.
+        ValueError: `own_actions` or `own_velocity` of a policy whose feature is not a vector of floats.
     """
     feature = feature or feature_of(spec)
     shape = feature.shape(spec)
-    if not spec.own_actions:
+    if not spec.own_size:
         return spec.depth, *shape
     if len(shape) != 1 or not np.issubdtype(feature.dtype, np.floating):
+        name = "own_actions" if spec.own_actions else "own_velocity"
         rule = f"must be false for {spec.model.name}, whose feature is no vector of floats"
-        raise ValueError(f"own_actions {rule}, got True")
-    return spec.depth, shape[0] + spec.num_actions
+        raise ValueError(f"{name} {rule}, got True")
+    return spec.depth, shape[0] + spec.own_size
 
 
 def remember(
@@ -41,6 +45,7 @@ def remember(
     spec: PolicySpec,
     window_us: np.ndarray | int,
     taken: np.ndarray,
+    velocity_mps: np.ndarray | None = None,
 ) -> np.ndarray:
     """Add the newest feature of each episode to what was kept; the first of an episode fills all of it.
 
@@ -51,14 +56,25 @@ def remember(
         spec: The policy.
         window_us: How long each feature took, (B,) or one for all [us]; a stack does not ask.
         taken: The action of each episode's last step, int (B,); only a policy with `own_actions` asks.
+        velocity_mps: What each vehicle measures now, to the right and ahead, (B, 2) [m/s]; only a policy with
+            `own_velocity` asks.
 
     Returns:
         (B, depth, ...), a new array.
+
+    Raises:
+        ValueError: A velocity is asked for, and is missing or not finite.
     """
     if spec.own_actions:
         known = np.zeros((len(features), spec.num_actions), features.dtype)
         known[np.arange(len(features)), taken] = ~first  # an episode begins without an action
         features = np.concatenate([features, known], axis=1)
+    if spec.own_velocity:
+        if velocity_mps is None or not np.isfinite(velocity_mps).all():
+            rule = "this policy reads the vehicle's velocity: set policy.velocity_mps (B, 2) before each step"
+            raise ValueError(f"{rule}, got {velocity_mps}")
+        own = np.asarray(velocity_mps, features.dtype) / features.dtype.type(VELOCITY_UNIT_MPS)
+        features = np.concatenate([features, own], axis=1)
     if not spec.memory_ms:
         return push_features(kept, features, first)
     tau_us = np.float32(1e3) * np.array(spec.memory_ms, np.float32)

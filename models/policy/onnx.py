@@ -6,6 +6,7 @@ For robots without Python. The graph is the whole policy, with the preprocessing
     window_us    int64 (), length of the window [us]        (policies that see events)
     luminance    float32 (H, W), linear                     (policies that see luminance)
     last_stack   (depth, ...), next_stack of the step before; for an episode's first step anything
+    velocity_mps float32 (2,), as the vehicle measures it  (policies with own_velocity; behind first)
     last_action  int64 (), the action taken in the step before  (policies with own_actions; behind first)
     last_state   float32 (S,), next_state of the step before  (recurrent networks; behind first)
     first        bool (), whether this is an episode's first step
@@ -45,6 +46,7 @@ from models.encoder.event_images import OFF_SHARE, PictureEncoder
 from models.kinds import KINDS
 from models.policy.event_filter import EventFilter, filter_of
 from models.policy.event_set import EVENTS, TIMES, EventSet
+from models.policy.memory import VELOCITY_UNIT_MPS
 from models.policy.networks import network_of
 from models.policy.policy import Policy
 
@@ -76,6 +78,9 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
     stack = torch.zeros(graph.shape, dtype=graph.dtype)
     names = {"input_names": [*seen, "last_stack", "first"], "output_names": ["logits", "next_stack"]}
     inputs = [*examples, stack, torch.tensor(True)]
+    if graph.own_velocity:
+        names["input_names"].append("velocity_mps")
+        inputs.append(torch.zeros(2))
     own = []
     if graph.own_actions:
         own.append(("action", torch.tensor(0)))
@@ -113,7 +118,8 @@ class PolicyGraph(nn.Module):
         self.filter = filter_of(policy.manifest.get("sensor", {}), spec.width, spec.height)
         self.sees_events = policy.feature.from_events is not None
         self.num_actions = spec.num_actions
-        self.state_size, self.own_actions = network_of(spec).state(spec), spec.own_actions
+        self.state_size = network_of(spec).state(spec)
+        self.own_actions, self.own_velocity = spec.own_actions, spec.own_velocity
         commands = policy.commands
         self.commands = None if commands is None else torch.from_numpy(commands.astype(np.float32))
         self.trunk, self.pi = policy.networks["trunk"], policy.networks["pi"]
@@ -175,11 +181,14 @@ class PolicyGraph(nn.Module):
         """Return the logits, the next stack and, of a recurrent network, its next state."""
         *given, state = inputs if self.state_size else (*inputs, torch.zeros(0))
         *given, action = given if self.own_actions else (*given, torch.tensor(0))
+        *given, velocity_mps = given if self.own_velocity else (*given, torch.zeros(2))
         *seen, stack, first = given
         feature = self.feature(self, *seen).to(self.dtype)
         if self.own_actions:
             known = (torch.arange(self.num_actions) == action) & ~first
             feature = torch.cat([feature, known.to(self.dtype)])
+        if self.own_velocity:
+            feature = torch.cat([feature, velocity_mps / VELOCITY_UNIT_MPS])
         newest = feature[None]
         kept = newest + (stack[:-1] - newest) * self._rest(*seen) if len(self.tau_us) else stack[1:]
         pushed = torch.cat([kept, newest])

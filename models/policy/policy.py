@@ -90,6 +90,8 @@ class Policy:
             None for the kinematic vehicle's three headings.
         taken: int64 (B,), the action of each episode's last step, which a policy with `own_actions` sees: the
             one that was chosen last, or the likeliest. Set it if another one was taken.
+        velocity_mps: float (B, 2), what each vehicle measures, to the right and ahead [m/s]; set it before
+            each step of a policy with `own_velocity`.
     """
 
     def __init__(
@@ -159,12 +161,14 @@ class Policy:
         self._state = np.zeros((num_envs, self._network.state(self.spec)), np.float32)
         self._first = np.ones(num_envs, bool)
         self.taken = np.zeros(num_envs, np.int64)
+        self.velocity_mps = np.full((num_envs, 2), np.nan)
         self._filter = filter_of(self.manifest.get("sensor", {}), self.spec.width, self.spec.height)
 
     def keep(self, places: np.ndarray) -> None:
         """Keep only the episodes at these indices, int (n,); later batches must follow this order."""
-        parts = self._stacks, self._state, self._first, self.taken
-        self._stacks, self._state, self._first, self.taken = (part[places] for part in parts)
+        parts = self._stacks, self._state, self._first, self.taken, self.velocity_mps
+        kept = (part[places] for part in parts)
+        self._stacks, self._state, self._first, self.taken, self.velocity_mps = kept
 
     def __call__(self, observations: Windows, restarted: np.ndarray | None = None) -> np.ndarray:
         """Choose an action for each episode.
@@ -237,7 +241,8 @@ class Policy:
                 "call reset(num_envs) first"
             )
         first = self._first if restarted is None else self._first | np.asarray(restarted, bool)
-        self._stacks = remember(self._stacks, features, first, self.spec, window_us, self.taken)
+        own = self.taken, self.velocity_mps
+        self._stacks = remember(self._stacks, features, first, self.spec, window_us, *own)
         self._first = np.zeros(len(features), bool)
         state = np.where(first[:, None], np.float32(0.0), self._state)
         logits, self._state = self._run(self._stacks, state)

@@ -110,18 +110,35 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return feature_of(self.spec).from_observations(observations, self.spec, self._table)
 
     def remember(
-        self, kept: np.ndarray, observations: Windows, first: np.ndarray, taken: np.ndarray
+        self,
+        kept: np.ndarray,
+        observations: Windows,
+        first: np.ndarray,
+        taken: np.ndarray,
+        velocity_mps: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return what the networks read after the newest observations (`models.policy.memory`)."""
-        features = self.features(observations)
-        return remember(kept, features, first, self.spec, windows_us(observations, self.spec), taken)
+        return self._remember(kept, self.features(observations), observations, first, taken, velocity_mps)
 
     def remember_mirrored(
-        self, kept: np.ndarray, observations: Windows, first: np.ndarray, taken: np.ndarray
+        self,
+        kept: np.ndarray,
+        observations: Windows,
+        first: np.ndarray,
+        taken: np.ndarray,
+        velocity_mps: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return `remember` for the mirrored observations and actions. Call it after `remember`."""
+        """Return `remember` for the mirrored observations. Call it after `remember`.
+
+        Actions and velocities are mirrored already.
+        """
         features = self._features(mirror(observations, self.spec))
-        return remember(kept, features, first, self.spec, windows_us(observations, self.spec), taken)
+        return self._remember(kept, features, observations, first, taken, velocity_mps)
+
+    def _remember(
+        self, kept: np.ndarray, features: np.ndarray, observations: Windows, first: np.ndarray, *own: Any
+    ) -> np.ndarray:
+        return remember(kept, features, first, self.spec, windows_us(observations, self.spec), *own)
 
     def set_state(self, state: Any) -> None:
         """Load weights; the table is built again only if they change the encoder."""

@@ -45,7 +45,6 @@ def test_the_demo_of_the_first_page_is_four_times_slower_than_the_flight():
     ("name", "slower", "steps", "step_s"),
     [
         ("fails_dense_25hz", 2, 102, 0.04),
-        ("fails_dense", 4, 467, 0.005),
         ("fails_late", 4, 786, 0.005),
         ("crash", 4, 144, 0.005),
     ],

@@ -9,6 +9,8 @@ from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, mi
 from jobs.training.sampling.snapshots import Snapshot
 from jobs.training.sampling.teacher import TeacherEnvRunner
 
+MIRROR = np.array([-1.0, 1.0])  # of a velocity to the right and ahead
+
 
 class TaughtEnvRunner(TeacherEnvRunner):
     """A `PlainEnvRunner` whose steps carry the teacher's costs, and its mirror image if asked for."""
@@ -39,8 +41,10 @@ class TaughtEnvRunner(TeacherEnvRunner):
         super()._remember(observations, first, taken)
         if images := mirror_images(self._settings):
             before = np.zeros_like(self._stacks) if first.all() else self._mirrored
+            velocity = self.velocities_mps()
             self._mirrored = self.module.remember_mirrored(
-                before, observations, first, np.array(images)[taken]
+                *(before, observations, first, np.array(images)[taken]),
+                None if velocity is None else velocity * MIRROR,
             )
 
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -58,6 +58,6 @@ class ObservedCorridor(gymnasium.Env):
         windows = shown[None]
         features = feature_of(self._spec).from_observations(windows, self._spec, self._encoder)
         began, last = np.array([taken is None]), np.array([taken or 0])
-        duration_us = windows_us(windows, self._spec)
-        self._stack = remember(self._stack, features, began, self._spec, duration_us, last)
+        duration_us, velocity = windows_us(windows, self._spec), self._env.measured_velocity_mps[None]
+        self._stack = remember(self._stack, features, began, self._spec, duration_us, last, velocity)
         return self._stack.reshape(-1)

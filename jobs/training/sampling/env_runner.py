@@ -283,6 +283,12 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self._over = terminated | truncated
         return Step(stacks, actions, outputs, rewards, terminated, truncated, infos, over)
 
+    def velocities_mps(self) -> np.ndarray | None:
+        """Return what each vehicle measures now, (N, 2) [m/s]; None for a policy that does not ask."""
+        if not self.module.spec.own_velocity:
+            return None
+        return np.array([env.measured_velocity_mps for env in self.env.unwrapped.envs])
+
     def _remember(self, observations: Any, first: np.ndarray, taken: np.ndarray) -> None:
         """Add what each environment shows to what the policy keeps.
 
@@ -293,7 +299,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         """
         if self.module.encoder is not None:
             self.shown.add(observations)
-        self._stacks = self.module.remember(self._stacks, observations, first, taken)
+        self._stacks = self.module.remember(self._stacks, observations, first, taken, self.velocities_mps())
 
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -296,23 +296,28 @@ def test_a_policy_acts_as_its_own_networks_say(policy):
 
 
 @pytest.mark.system
-def test_a_policy_and_its_file_remember_the_actions_that_were_drawn(tmp_path):
+def test_a_policy_and_its_file_see_the_same_actions_and_velocity(tmp_path):
     pytest.importorskip("onnxruntime", reason="needs the extra onnx")
     from models.policy.onnx import export_onnx
 
-    spec = make_spec("event_columns", memory_ms=[10.0, 100.0], own_actions=True)
+    spec = make_spec("event_columns", memory_ms=[10.0, 100.0], own_actions=True, own_velocity=True)
     networks = build_networks(spec, seed=3)
-    networks["pi"][0].weight.data.view(64, *kept_shape(spec))[:, :, -spec.num_actions :] *= 20.0
+    networks["pi"][0].weight.data.view(64, *kept_shape(spec))[:, :, -spec.own_size :] *= 20.0
     networks["pi"][-1].weight.data.mul_(100.0)
     own = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
     file = export_onnx(own, tmp_path / "policy.onnx")
     agents = PolicyAgent(own, stochastic=True), OnnxAgent(str(file), stochastic=True)
+    envs = [CorridorEnv(HELD_OUT, velocity_noise_mps=1.0) for _ in range(2)]
+    for seed, env in enumerate(envs):
+        env.reset(seed=seed)
     for agent in agents:
-        agent.reset([CorridorEnv(HELD_OUT)] * 2, [0, 1])
+        agent.reset(envs, [0, 1])
     rng, chosen = np.random.default_rng(0), []
     for _ in range(40):
         windows = make_windows(rng, 2, side=SIDE)
         one, other = (agent(windows) for agent in agents)
+        for env, action in zip(envs, one, strict=True):
+            env.step(action)
         np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(own.taken, one)
         chosen.append(agents[0].logits.argmax(axis=1) == one)

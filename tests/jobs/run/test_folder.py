@@ -199,6 +199,7 @@ def test_the_stored_groups_are_those_of_the_command_line_so_that_older_folders_k
     ]  # fmt: skip
     assert set(stored["env"]) == {
         "scene", "layout", "control_hz", "speed_mps", "vehicle", "body", "task", "action_delay_ms",
+        "velocity_noise_mps",
         "vehicle_radius_m", "camera_height_m", "time_limit_s", "window_capacity",
         "filter_support", "filter_tau_us",
     }  # fmt: skip

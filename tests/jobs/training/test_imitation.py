@@ -146,12 +146,12 @@ def test_labels_are_learnt(learner, rolled_out):
     assert losses[-1] < 0.8 * losses[0]
 
 
-@pytest.mark.parametrize("name", kinds([*TAUGHT, "own_actions"], quick=("event_columns", "own_actions")))
+@pytest.mark.parametrize("name", kinds([*TAUGHT, "own"], quick=("event_columns", "own")))
 def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(name, tmp_path, monkeypatch):
     """And nothing else is rolled out than without them; RLlib's own pieces are cut alike."""
     own = {
         "finetuned": ("model.encoder=finetuned",),
-        "own_actions": ("model=event_columns", "model.own_actions=true"),
+        "own": ("model=event_columns", "model.own_actions=true", "model.own_velocity=true"),
     }.get(name, (f"model={name}",))
     told = {}
     for mirrored in (False, True):
@@ -164,7 +164,9 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
         remember = type(runner)._remember
 
         def watched(self, observations, first, taken, shown=shown, remember=remember):
-            shown.append((copy.deepcopy(observations), first.copy(), np.array(MIRRORED_ACTIONS)[taken]))
+            own = [np.array(MIRRORED_ACTIONS)[taken]]
+            own += [] if name != "own" else [self.velocities_mps() * [-1.0, 1.0]]
+            shown.append((copy.deepcopy(observations), first.copy(), *own))
             remember(self, observations, first, taken)
 
         monkeypatch.setattr(runner, "_remember", watched.__get__(runner))
@@ -178,8 +180,8 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
     seen = np.concatenate([episode.get_observations()[:-1] for episode in told[True]])
     kept, met = np.zeros((len(shown[0][1]), *seen.shape[1:]), seen.dtype), len(runner.shown.windows)
     expected = []
-    for observations, first, taken in shown:
-        kept = runner.module.remember_mirrored(kept, observations, first, taken)
+    for observations, first, *own in shown:
+        kept = runner.module.remember_mirrored(kept, observations, first, *own)
         expected.append(kept)
     assert len(runner.shown.windows) == met
     expected = {row.tobytes() for step in expected for row in step}

@@ -143,10 +143,43 @@ def test_a_policy_sees_the_actions_that_were_taken_from_observations_and_from_ev
     assert all(np.abs(one[1:] - forced[0][1:]).max() > 0.0 for one in forced[1:])
 
 
-def test_networks_that_read_events_or_pictures_see_no_actions(monkeypatch):
-    with pytest.raises(ValueError, match="own_actions must be false for encoder=finetuned"):
-        read_spec(make_spec("finetuned").manifest() | {"own_actions": True})
+def test_velocity_is_remembered_in_units_of_ten_metres_a_second_behind_the_actions():
+    spec = make_spec("event_columns", memory_ms=TAUS, own_actions=True, own_velocity=True)
+    assert kept_shape(spec) == (spec.depth, 2 * SIDE + 3 + 2)
+    features, first = np.zeros((2, 2 * SIDE), np.float32), np.ones(2, bool)
+    kept, taken = np.zeros((2, *kept_shape(spec)), np.float32), np.zeros(2, int)
+    velocity = np.array([[3.0, 10.0], [-3.0, 20.0]])
+    kept = remember(kept, features, first, spec, 5000, taken, velocity)
+    np.testing.assert_allclose(kept[:, :, -2:], (velocity / 10.0)[:, None].repeat(spec.depth, 1), rtol=1e-6)
+    kept = remember(kept, features, ~first, spec, 5000, taken, 0.0 * velocity)
+    shares = np.append(np.exp(-5.0 / np.array(TAUS)), 0.0)  # of the mean that outlives the step
+    np.testing.assert_allclose(kept[0, :, -1], shares, rtol=1e-6)
+    for missing in (None, np.full((2, 2), np.nan)):
+        with pytest.raises(ValueError, match=r"set policy\.velocity_mps \(B, 2\) before each step"):
+            remember(kept, features, first, spec, 5000, taken, missing)
+
+
+def test_a_policy_reads_the_velocity_that_it_is_told(tmp_path):
+    spec = make_spec("event_columns", own_velocity=True)
+    networks = build_networks(spec, seed=3)
+    networks["pi"][-1].weight.data.mul_(100.0)
+    policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
+    window = make_windows(np.random.default_rng(0), 1, side=SIDE)
+    with pytest.raises(ValueError, match="reads the vehicle's velocity"):
+        policy.logits(window)
+    shown = []
+    for ahead_mps in (10.0, 20.0):
+        policy.reset()
+        policy.velocity_mps = np.array([[0.0, ahead_mps]])
+        shown.append(policy.logits(window))
+    assert np.abs(shown[0] - shown[1]).max() > 0.0
+
+
+@pytest.mark.parametrize("name", ["own_actions", "own_velocity"])
+def test_networks_that_read_events_or_pictures_see_nothing_of_the_vehicle(name, monkeypatch):
+    with pytest.raises(ValueError, match=f"{name} must be false for encoder=finetuned"):
+        read_spec(make_spec("finetuned").manifest() | {name: True})
     pictured = KINDS["event_columns"]._replace(feature="models.policy.features:EVENT_IMAGE")
     monkeypatch.setitem(KINDS, "pictured", pictured)
-    with pytest.raises(ValueError, match="own_actions must be false for pictured"):
-        kept_shape(make_spec("pictured", own_actions=True))
+    with pytest.raises(ValueError, match=f"{name} must be false for pictured"):
+        kept_shape(make_spec("pictured", **{name: True}))

@@ -17,6 +17,7 @@ from tests.support.policies import ABOUT, SIDE, TRAINED, kinds, make_networks, m
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
 COMMANDS = [[-0.25, 1.0], [0.0, 1.0], [0.25, 1.0]]
+VELOCITY = np.array([-3.0, 12.0], np.float32)
 EDGES = [(1, 0, 0, 1), (5000, SIDE - 1, SIDE - 1, -1), (4999, SIDE - 1, 0, 1), (5000, 0, SIDE - 1, -1)]
 
 
@@ -47,9 +48,10 @@ def fly_exported(file, shown, shape, dtype):
         for one in session.get_inputs()
         if one.name in ("last_state", "last_action")
     }
+    told = {"velocity_mps": VELOCITY} if "velocity_mps" in {one.name for one in session.get_inputs()} else {}
     names = [one.name for one in session.get_outputs()]
     for inputs in shown:
-        out = dict(zip(names, session.run(None, {**inputs, **memory, "first": first}), strict=True))
+        out = dict(zip(names, session.run(None, {**inputs, **told, **memory, "first": first}), strict=True))
         memory, first = {name: out[name.replace("last", "next")] for name in memory}, np.array(False)
         assert out["dropped"] == 0
         assert "command" not in out or out["command"].tolist() == COMMANDS[out["logits"].argmax()]
@@ -59,12 +61,13 @@ def fly_exported(file, shown, shape, dtype):
 
 @pytest.fixture(
     scope="module",
-    params=kinds([*TRAINED, "bytestream_xy", "eventnet", "ranked", "memory", "own_actions", "bands"]),
+    params=kinds([*TRAINED, "bytestream_xy", "eventnet", "ranked", "memory", "own", "bands"]),
 )
 def folder(request, tmp_path_factory):
     path, name = tmp_path_factory.mktemp("policy") / "policy", request.param
-    if name in ("memory", "own_actions", "bands"):
-        own = {"own_actions": name == "own_actions", "bands": [2, 5, SIDE - 3] if name == "bands" else []}
+    if name in ("memory", "own", "bands"):
+        own = {"own_actions": name == "own", "own_velocity": name == "own"}
+        own["bands"] = [2, 5, SIDE - 3] if name == "bands" else []
         spec = make_spec("event_columns", memory_ms=[10.0, 30.0, 300.0], **own)
         return save_policy(path, build_networks(spec, seed=3), spec, {**ABOUT, "commands": COMMANDS})
     changes = {
@@ -88,7 +91,7 @@ def test_the_file_gives_the_logits_of_the_policy_on_every_step_of_an_episode(fol
     file = export_onnx(policy, tmp_path / "policy.onnx")
     given = [one.name for one in onnxruntime.InferenceSession(str(file)).get_outputs()]
     assert ("command" in given) == (policy.commands is not None)
-    feature = policy.feature
+    feature, policy.velocity_mps = policy.feature, VELOCITY[None]
     if feature.from_events is None:
         rng = np.random.default_rng(0)
         pictures = rng.uniform(-0.2, 1.4, (6, SIDE, SIDE)).astype(np.float32)
