@@ -43,6 +43,8 @@ ONNX_NUMBERS: Mapping[str, Any] = {
     **{"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(uint8)": np.uint8},
 }
 
+Act = Callable[[Any], Any]  # an episode's observation -> its action
+
 
 class Agent(Protocol):
     """Chooses an action for each episode of a batch.
@@ -76,11 +78,11 @@ def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[s
             encoder reads single events; empty: those of the policy.
     """
     if name in BASELINES:
-        return BASELINES[name]()
+        return EpisodeAgent(BASELINES[name])
     if name.endswith(ONNX):
         return OnnxAgent(name, action == "stochastic")
     if ":" in name:
-        return FunctionAgent(resolve(name))
+        return function_agent(resolve(name))
     # Imported here, because the baselines need no network.
     from models.encoder.table import EncoderTable
     from models.encoder.weights import load_encoder
@@ -93,39 +95,45 @@ def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[s
     return PolicyAgent(policy, action == "stochastic")
 
 
-class StraightAgent:
-    """Always flies straight ahead."""
+class EpisodeAgent:
+    """Chooses in each episode by itself; episodes side by side do not know of each other."""
 
-    observation: Observation = "none"
-
-    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Look up the action of the vehicle, one for all episodes."""
-        self._straight = envs[0].dynamics.straight
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return the same action for each episode, (B,)."""
-        return np.stack([self._straight] * len(observations))
-
-    def keep(self, places: np.ndarray) -> None:
-        """Do nothing: it has no memory."""
-
-
-class RandomAgent:
-    """Takes each action with the same probability, drawn from the episode's own stream."""
-
-    observation: Observation = "none"
+    def __init__(self, begin: Callable[[CorridorEnv, int], Act], observation: Observation = "none") -> None:
+        """Take what begins an episode of an environment with a seed, and what it sees."""
+        self._begin, self.observation = begin, observation
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Open one stream per episode, so that no episode depends on its neighbours."""
-        self._streams, self._count = episode_streams(seeds), num_actions(envs[0])
+        """Begin an episode for each seed."""
+        self._acts = [self._begin(env, int(seed)) for env, seed in zip(envs, seeds, strict=True)]
 
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return actions (B,)."""
-        return np.array([stream.integers(self._count) for stream in self._streams])
+    def __call__(self, observations: Any) -> np.ndarray:
+        """Return the action of each episode, (B,)."""
+        return np.array([act(one) for act, one in zip(self._acts, observations, strict=True)])
 
     def keep(self, places: np.ndarray) -> None:
-        """Forget the streams of the others."""
-        self._streams = [self._streams[k] for k in places]
+        """Forget the other episodes."""
+        self._acts = [self._acts[k] for k in places]
+
+
+def fly_straight(env: CorridorEnv, seed: int) -> Act:
+    """Fly straight ahead at every step."""
+    return lambda observation: env.dynamics.straight
+
+
+def fly_at_random(env: CorridorEnv, seed: int) -> Act:
+    """Take each action with the same probability, drawn from the episode's own stream."""
+    (stream,), count = episode_streams([seed]), num_actions(env)
+    return lambda observation: stream.integers(count)
+
+
+def fly_as_planned(env: CorridorEnv, seed: int) -> Act:
+    """Plan with the true geometry, for where the action takes effect; with a body by the cheapest command."""
+    if env.dynamics.move is not None:
+        planner = Planner()
+        return lambda observation: int(planner.costs(env).argmin())
+    step_m = env.config.speed_mps / env.config.control_hz
+    plan = plan_path(env.scene, env.camera_pose()[0], env.config.vehicle_radius_m, env.config.camera_height_m)
+    return lambda observation: follow(plan, MOVES * step_m, *env.place_of_action())
 
 
 class PolicyAgent:
@@ -171,29 +179,17 @@ class PolicyAgent:
         self._envs, self._streams = ([kept[k] for k in places] for kept in (self._envs, self._streams))
 
 
-class FunctionAgent:
-    """A Python function for each episode; episodes side by side do not know of each other."""
+def function_agent(function: Callable[[int], Act]) -> EpisodeAgent:
+    """Return the agent of a Python function, as the top of this file describes it."""
 
-    def __init__(self, begin: Callable[[int], Callable[[Any], Any]]) -> None:
-        """Take what begins an episode."""
-        self._begin = begin
-        self.observation: Observation = getattr(begin, "observation", "event_image")
+    def begin(env: CorridorEnv, seed: int) -> Act:
+        act = function(seed)
+        return lambda observation: int(np.asarray(act(observation)).item())
 
-    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Begin an episode for each seed."""
-        self._acts = [self._begin(int(seed)) for seed in seeds]
-
-    def __call__(self, observations: Any) -> np.ndarray:
-        """Return actions (B,)."""
-        chosen = [act(observation) for act, observation in zip(self._acts, observations, strict=True)]
-        return np.array([int(np.asarray(action).item()) for action in chosen])
-
-    def keep(self, places: np.ndarray) -> None:
-        """Forget the other episodes."""
-        self._acts = [self._acts[k] for k in places]
+    return EpisodeAgent(begin, getattr(function, "observation", "event_image"))
 
 
-class OnnxAgent:
+class OnnxAgent(EpisodeAgent):
     """An ONNX file, run by one thread of onnxruntime, one episode at a time."""
 
     def __init__(self, path: str, stochastic: bool) -> None:
@@ -208,90 +204,51 @@ class OnnxAgent:
         self._own = "first" in self._inputs  # written by models.policy.onnx
         self.stochastic = stochastic
         sees = ("luminance" if "luminance" in self._inputs else "window") if self._own else "event_image"
-        self.observation: Observation = sees  # type: ignore[assignment]
+        super().__init__(self._episode, cast(Observation, sees))
 
-    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Begin an episode for each seed."""
-        self._envs, self._streams = list(envs), episode_streams(seeds)
+    def _episode(self, env: CorridorEnv, seed: int) -> Act:
+        """Begin an episode, which remembers what the file asks for."""
+        (stream,) = episode_streams([seed])
+        first = True
         memory = {name: _empty(one) for name, one in self._inputs.items() if name.startswith("last_")}
-        self._memory: list[dict[str, np.ndarray]] = [dict(memory) for _ in seeds]
-        self._first = True
+        reads_velocity = "velocity_mps" in self._inputs
 
-    def __call__(self, observations: Any) -> np.ndarray:
-        """Return actions (B,)."""
-        logits = np.array([self._logits(k, one) for k, one in enumerate(observations)], np.float64)
-        self._first = False
-        if not self.stochastic:
-            return logits.argmax(axis=1)
-        gumbel = np.array([stream.gumbel(size=logits.shape[1]) for stream in self._streams])
-        actions = (logits + gumbel).argmax(axis=1)
-        for memory, action in zip(self._memory, actions, strict=True):
+        def act(observation: np.ndarray) -> int:
+            nonlocal first, memory
+            given = self._seen(observation, first)
+            if reads_velocity:
+                given["velocity_mps"] = env.measured_velocity_mps.astype(np.float32)
+            results = self._session.run(None, given | memory)
+            named = dict(zip(self._outputs, results, strict=True))
+            memory = {name: named["next_" + name.removeprefix("last_")] for name in memory}
+            first = False
+            logits = np.asarray(results[0], np.float64).reshape(-1)
+            if not self.stochastic:
+                return int(logits.argmax())
+            action = int((logits + stream.gumbel(size=logits.size)).argmax())
             if "last_action" in memory:
                 memory["last_action"] = np.array(action)
-        return actions
+            return action
 
-    def keep(self, places: np.ndarray) -> None:
-        """Forget the other episodes."""
-        kept = self._envs, self._streams, self._memory
-        self._envs, self._streams, self._memory = ([one[k] for k in places] for one in kept)
+        return act
 
-    def _logits(self, k: int, observation: np.ndarray) -> np.ndarray:
-        """Return the logits of an episode's next step, and remember what the file asks for."""
-        velocity = (
-            {"velocity_mps": self._envs[k].measured_velocity_mps.astype(np.float32)}
-            if "velocity_mps" in self._inputs
-            else {}
-        )
-        results = self._session.run(None, self._seen(observation) | velocity | self._memory[k])
-        named = dict(zip(self._outputs, results, strict=True))
-        self._memory[k] = {name: named["next_" + name.removeprefix("last_")] for name in self._memory[k]}
-        return np.asarray(results[0]).reshape(-1)
-
-    def _seen(self, observation: np.ndarray) -> dict[str, Any]:
+    def _seen(self, observation: np.ndarray, first: bool) -> dict[str, Any]:
         """Return an observation as the file takes it."""
         if not self._own:
             ((name, one),) = self._inputs.items()
             shape = [size if isinstance(size, int) else 1 for size in one.shape]
             return {name: observation.astype(ONNX_NUMBERS[one.type]).reshape(shape)}
-        first = {"first": np.array(self._first)}
+        begins = {"first": np.array(first)}
         if self.observation == "luminance":
-            return {"luminance": observation, **first}
+            return {"luminance": observation, **begins}
         events, window_us = unpack_window(observation)
         rows = np.stack([events[name].astype(np.int64) for name in ("t", "x", "y", "p")], axis=1)
-        return {"events": rows, "window_us": np.array(window_us), **first}
+        return {"events": rows, "window_us": np.array(window_us), **begins}
 
 
 def _empty(one: Any) -> np.ndarray:
     """Return zeros of an input's shape and type."""
     return np.zeros([size if isinstance(size, int) else 1 for size in one.shape], ONNX_NUMBERS[one.type])
-
-
-class OracleAgent:
-    """Plans with the true geometry; of a vehicle with a body it takes the cheapest command."""
-
-    observation: Observation = "none"
-
-    def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Plan each episode."""
-        self._choices = [_planned(env) for env in envs]
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return the planned action of each episode, (B,)."""
-        return np.array([choose() for choose in self._choices])
-
-    def keep(self, places: np.ndarray) -> None:
-        """Forget the other plans."""
-        self._choices = [self._choices[k] for k in places]
-
-
-def _planned(env: CorridorEnv) -> Callable[[], int]:
-    """Return what chooses the planned action of an episode, where the action takes effect."""
-    if env.dynamics.move is not None:
-        planner = Planner()
-        return lambda: int(planner.costs(env).argmin())
-    step_m = env.config.speed_mps / env.config.control_hz
-    plan = plan_path(env.scene, env.camera_pose()[0], env.config.vehicle_radius_m, env.config.camera_height_m)
-    return lambda: follow(plan, MOVES * step_m, *env.place_of_action())
 
 
 def num_actions(env: CorridorEnv) -> int:
@@ -339,8 +296,9 @@ def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float =
     return start_x_m + (np.array(path) - start) * LATTICE_M
 
 
-BASELINES: dict[str, type[StraightAgent | RandomAgent | OracleAgent]] = {
-    "straight": StraightAgent,
-    "random": RandomAgent,
-    "oracle": OracleAgent,
+# Name -> what begins an episode.
+BASELINES: dict[str, Callable[[CorridorEnv, int], Act]] = {
+    "straight": fly_straight,
+    "random": fly_at_random,
+    "oracle": fly_as_planned,
 }

@@ -7,7 +7,7 @@ import pytest
 
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
-from jobs.rollout.agents import BASELINES, PolicyAgent
+from jobs.rollout.agents import BASELINES, PolicyAgent, make_agent
 from jobs.rollout.episodes import roll_out
 from jobs.rollout.policies import read_policy, with_own_parts, with_sensor
 from jobs.training.algorithms import build_algorithm
@@ -80,8 +80,8 @@ def test_wrong_commands_are_refused(folder, tmp_path, config, commands):
 
 def test_agents_fly_a_body_and_refuse_another_number_of_actions(config, folder):
     seeds = [0, 1]
-    for agent in (BASELINES["straight"](), BASELINES["random"](), BASELINES["oracle"]()):
-        episodes = roll_out(agent, config.env, seeds)
+    for name in BASELINES:
+        episodes = roll_out(make_agent(name), config.env, seeds)
         assert episodes["truncated"].all()
         assert (episodes["distance_m"] > 0.9).all()
     assert roll_out(PolicyAgent(load_policy(folder)), config.env, seeds)["steps"].tolist() == [10, 10]
