@@ -18,11 +18,9 @@ from jobs.analysis.plots import plot_learning_curves
 from jobs.analysis.tables import write_csv
 from jobs.bench.bench_table import entries, heat_map
 from jobs.bench.protocol import read_protocol
-from jobs.measure.encoding_plots import plot_encoding_costs
 from jobs.measure.encodings import read_costs
-from jobs.measure.front_plots import plot_costs
 from jobs.measure.measured import Measured
-from jobs.measure.trade_page import draw_settings
+from jobs.measure.plots import draw_settings, plot_costs, plot_encoding_costs
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json, write_atomic
 from jobs.study.page import Study, figures, marked

@@ -25,7 +25,6 @@ from jobs.analysis.statistics import half_width
 from jobs.analysis.tables import publish_plot, publish_table, write_csv
 from jobs.config.config import Config
 from jobs.config.schema import Count
-from jobs.measure.encoding_plots import plot_encoding_costs
 from jobs.measure.encodings import (
     COST_FIELDS,
     Encoding,
@@ -35,6 +34,7 @@ from jobs.measure.encodings import (
     explained,
     measure_encodings,
 )
+from jobs.measure.plots import plot_encoding_costs
 from jobs.measure.trade_encoder import DENSE_EVENTS, HEADINGS, MAX_EVENTS, control_steps, cost_cells, draw
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.progress import progress

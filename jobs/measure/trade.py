@@ -27,6 +27,7 @@ from jobs.analysis.tables import publish_plot, publish_table, write_csv
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count, Name
 from jobs.measure.encodings import CAPS, TIME_BINS
+from jobs.measure.plots import draw_settings
 from jobs.measure.replays import Measured, measure_settings
 from jobs.measure.trade_encoder import EVENT_ENCODERS
 from jobs.measure.trade_page import (
@@ -37,7 +38,6 @@ from jobs.measure.trade_page import (
     Outcome,
     TradedSetting,
     TradeFacts,
-    draw_settings,
     headings,
     setting_values,
     trade_lines,

@@ -17,7 +17,6 @@ from envs.recordings import Recording, read_recording
 from jobs.analysis.tables import publish_plot, publish_table, short, write_csv
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count
-from jobs.measure.encoding_plots import plot_encoding_costs
 from jobs.measure.encodings import (
     COST_FIELDS,
     cost_values,
@@ -25,6 +24,7 @@ from jobs.measure.encodings import (
     measure_encodings,
 )
 from jobs.measure.measured import Measured, columns
+from jobs.measure.plots import plot_encoding_costs
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker

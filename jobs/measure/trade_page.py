@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from jobs.analysis.statistics import Difference, Estimate, holm
 from jobs.analysis.tables import estimate_metrics, estimate_text, markdown_table, percent_text, short
 from jobs.measure.measured import name_of
-from jobs.measure.trade_plot import TradePoint, plot_trade
 from jobs.run.provenance import Provenance
 from jobs.run.templates import render
 
@@ -172,34 +170,6 @@ def by_scene(rows: Sequence[TradedSetting]) -> list[list[TradedSetting]]:
     """Return the rows of each scene."""
     scenes = dict.fromkeys(row.scene for row in rows)
     return [[row for row in rows if row.scene == scene] for scene in scenes]
-
-
-def draw_settings(settings: Sequence[Mapping[str, str]]) -> Figure:
-    """Draw what settings cost and give, from their published values (`setting_values`)."""
-    points = [
-        TradePoint(
-            scene=one["scene"],
-            name=_label(one["knob"], one["setting"]),
-            speed=(float(one["speed"]), float(one["speed_low"]), float(one["speed_high"])),
-            error=100 * float(one["event_error"] or "nan"),
-            difference=(_points(one, ""), _points(one, "_low"), _points(one, "_high")),
-            front=one["front"] == "yes",
-        )
-        for one in settings
-        if one["policies"] == ALL
-    ]
-    return plot_trade(points, 100 * MARGIN)
-
-
-def _label(knob: str, setting: str) -> str:
-    """Return a setting in words: what is varied stands before a bare value."""
-    return (
-        f"{knob} {setting}" if setting and " " not in setting and knob in ENCODER_KNOBS else setting or knob
-    )
-
-
-def _points(setting: Mapping[str, str], end: str) -> float:
-    return 100 * float(setting[f"difference{end}"])
 
 
 def headings(groups: Sequence[str]) -> tuple[str, ...]:

@@ -24,8 +24,8 @@ from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import env_with
 from jobs.config.config import Config
 from jobs.config.schema import Count, Name
-from jobs.measure.front_plots import plot_costs, plot_memory_modes
 from jobs.measure.measured import Measured, columns, pareto
+from jobs.measure.plots import plot_costs, plot_memory_modes
 from jobs.measure.timing import interleaved
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.progress import console, progress

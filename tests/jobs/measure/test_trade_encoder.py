@@ -10,7 +10,6 @@ from jobs.analysis.tables import write_csv
 from jobs.config.config import ConfigError
 from jobs.measure import encodings as encoder_costs
 from jobs.measure import trade_encoder
-from jobs.measure.encoding_plots import plot_encoding_costs
 from jobs.measure.encodings import (
     COST_FIELDS,
     UNCHANGED,
@@ -27,6 +26,7 @@ from jobs.measure.encodings import (
     repeats,
 )
 from jobs.measure.measured import Measured, columns
+from jobs.measure.plots import plot_encoding_costs
 from jobs.measure.trade_encoder import MAX_EVENTS, cost_cells
 from jobs.run.folder import locate_run
 from jobs.run.provenance import REPOSITORY

@@ -2,6 +2,7 @@ import pytest
 from matplotlib.collections import PathCollection
 
 from jobs.analysis.statistics import Difference, Estimate
+from jobs.measure.plots import draw_settings
 from jobs.measure.trade_page import (
     ALL,
     SETTING_FIELDS,
@@ -9,7 +10,6 @@ from jobs.measure.trade_page import (
     TradedSetting,
     advise,
     choices,
-    draw_settings,
     headings,
     on_front,
     setting_values,
