@@ -23,7 +23,8 @@ from jobs.measure.measured import Measured
 from jobs.measure.plots import draw_settings, plot_costs, plot_encoding_costs
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json, write_atomic
-from jobs.study.page import Study, figures, marked
+from jobs.study.computed import Study
+from jobs.study.page import figures, marked
 from jobs.study.report import filled_pages, study_of, write_figures, write_values
 from jobs.tools.curves import PublishedTraining, by_reward, published_trainings, read_curves
 

@@ -10,7 +10,9 @@ from matplotlib.lines import Line2D
 from jobs.analysis.colours import INK, MUTED
 from jobs.analysis.plots import panel_grid, tidy
 from jobs.study.changes import Change
+from jobs.study.computed import Study
 from jobs.study.results import Condition
+from jobs.study.spec import Section
 
 # Colour and marker of each kind: Okabe and Ito's, which the colour-blind tell apart too.
 KINDS = {
@@ -22,28 +24,29 @@ DODGE = 0.09  # between kinds at the same dose, in roots of per cent
 TICKS = (0, 1, 5, 10, 20, 40)  # event error [%]
 
 
-def dose_figure(
-    changes: Sequence[Change],
-    errors: Mapping[Condition, float],
-    met: Collection[tuple[Condition, str]] = (),
-    dashed: Sequence[Change] = (),
-) -> Figure:
+def dose_figure(study: Study, said: Section) -> Figure:
     """Draw a panel for each group: change of success [points] with its interval, a line for each kind.
 
-    Args:
-        changes: What is drawn.
-        errors: Condition -> event error that was measured.
-        met: Condition and group of what trainings met; their markers are hollow.
-        dashed: Changes under the same conditions behind a filter, drawn as dashed lines.
+    Markers of what trainings met are hollow. Axes that end with `dashed` are the same conditions behind a
+    filter, drawn as dashed lines without intervals.
     """
+    errors = {one.condition: one.measured for one in study.doses}
+    met = {(one.condition, group) for one in study.doses for group in one.met_by}
+    ending = said.get("dashed", "")
+    changes = [one for one in study.changes if one.condition in errors]
+    dashed = [
+        one._replace(condition=(one.condition[0].removesuffix(ending), one.condition[1]))
+        for one in study.changes
+        if ending and one.condition[0].endswith(ending)
+    ]
     groups = list(dict.fromkeys(change.group for change in changes))
     kinds = list(dict.fromkeys(kind for kind, _ in errors))
     figure, panels = panel_grid(len(groups), 4, (3.1, 2.7), (0.4, 0.9), sharex=True, sharey=True)
     for panel, group in zip(panels, groups, strict=True):
         for place, kind in enumerate(kinds):
             aside = DODGE * (place - (len(kinds) - 1) / 2)
-            _draw_kind(panel, _own(changes, group, kind), errors, met, aside)
-            _draw_dashed(panel, _own(dashed, group, kind), errors, aside)
+            _draw_kind(panel, _own(changes, group, kind), errors, aside, met)
+            _draw_kind(panel, _own(dashed, group, kind), errors, aside)
         panel.axhline(0, color=MUTED, lw=0.8, zorder=1)
         count = max(len(one.success) for one in changes if one.group == group)
         plural = "s" if count > 1 else ""
@@ -77,31 +80,26 @@ def _draw_kind(
     panel: Axes,
     changes: Sequence[Change],
     errors: Mapping[Condition, float],
-    met: Collection[tuple[Condition, str]],
     aside: float,
+    met: Collection[tuple[Condition, str]] | None = None,
 ) -> None:
-    """Draw the line of one kind through no error and no change, its intervals, and a marker for each dose."""
+    """Draw the line of one kind through no error and no change, its intervals, and a marker for each dose.
+
+    Markers of what is `met` are hollow; None: all are, and the line is dashed, without intervals.
+    """
     if not changes:
         return
     ordered = sorted(changes, key=lambda one: errors[one.condition])
     colour, marker = _look(ordered[0].condition[0])
     x = np.sqrt([100 * errors[one.condition] for one in ordered]) + aside
     y = [100 * one.difference.value for one in ordered]
+    if met is None:
+        panel.plot([0.0, *x], [0.0, *y], "--", color=colour, lw=1.1, zorder=3)
+        panel.plot(x, y, marker, color=colour, ms=3.5, mfc="white", zorder=5)
+        return
     panel.plot([0.0, *x], [0.0, *y], color=colour, lw=1.6, zorder=3)
     for place, value, one in zip(x, y, ordered, strict=True):
         ends = [100 * end for end in one.difference.interval or ()]
         panel.plot([place] * len(ends), ends, color=colour, lw=1.0, alpha=0.55, zorder=2)
         hollow = (one.condition, one.group) in met
         panel.plot(place, value, marker, color=colour, ms=5, mfc="white" if hollow else colour, zorder=4)
-
-
-def _draw_dashed(
-    panel: Axes, changes: Sequence[Change], errors: Mapping[Condition, float], aside: float
-) -> None:
-    """Draw the dashed line of one kind, without intervals."""
-    ordered = sorted(changes, key=lambda one: errors[one.condition])
-    for colour, marker in (_look(kind) for kind in dict.fromkeys(one.condition[0] for one in ordered)):
-        x = np.sqrt([100 * errors[one.condition] for one in ordered]) + aside
-        y = [100 * one.difference.value for one in ordered]
-        panel.plot([0.0, *x], [0.0, *y], "--", color=colour, lw=1.1, zorder=3)
-        panel.plot(x, y, marker, color=colour, ms=3.5, mfc="white", zorder=5)

@@ -2,7 +2,7 @@
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,12 +16,11 @@ from jobs.analysis.statistics import Difference
 from jobs.config.conditions import NOMINAL, axis_numbers
 from jobs.rollout.agents import BASELINES
 from jobs.study.changes import Change, content
-from jobs.study.contact_map import contact_map
+from jobs.study.computed import Study
 from jobs.study.contrasts import Finding
 from jobs.study.dose_figure import dose_figure
-from jobs.study.doses import Dose
 from jobs.study.results import Condition, Results, text_of
-from jobs.study.spec import Family, Section, tags_of
+from jobs.study.spec import Section, tags_of
 from jobs.study.spread import crossed_tables, factors
 from jobs.study.summaries import Summary
 from jobs.study.tables import scale_of
@@ -30,31 +29,11 @@ from jobs.study.words import TITLES, condition_text
 COLOURS = {"above": GREEN, "below": RED, "within": BLUE, "no_gain": AMBER, "no_loss": INK}  # of verdicts
 
 
-class Drawn(NamedTuple):
-    """All that a figure may show.
-
-    Attributes:
-        study: Section `study` of the study's file.
-        results: What was evaluated.
-        changes: Of its conditions.
-        summaries: Of its groups.
-        families: Name -> a family and its findings.
-        doses: Event errors of its conditions, if they were measured.
-    """
-
-    study: Section
-    results: Results
-    changes: Sequence[Change]
-    summaries: Sequence[Summary]
-    families: Mapping[str, tuple[Family, Sequence[Finding]]]
-    doses: Sequence[Dose]
-
-
-def change_map(drawn: Drawn, said: Section) -> Figure:
+def change_map(study: Study, said: Section) -> Figure:
     """Draw success [%] of conditions x groups, coloured by its change; the first row is the baseline."""
-    changes = drawn.changes
-    columns = [group for group in drawn.results.groups if any(change.group == group for change in changes)]
-    rows = [at for at in drawn.results.conditions if any(change.condition == at for change in changes)]
+    changes = study.changes
+    columns = [group for group in study.results.groups if any(change.group == group for change in changes)]
+    rows = [at for at in study.results.conditions if any(change.condition == at for change in changes)]
     first = [change.baseline for change in changes if change.baseline[0] == NOMINAL][:1]
     rows = [*first, *rows]
     figure = Figure(figsize=(2.6 + 0.85 * len(columns), 1.6 + 0.27 * len(rows)), layout="constrained")
@@ -91,9 +70,9 @@ def _write_cell(panel: Axes, success: np.ndarray, points: float, row: int, colum
         panel.text(column, row, text, ha="center", va="center", color=colour, fontsize=9, weight=weight)
 
 
-def forest(drawn: Drawn, said: Section) -> Figure:
+def forest(study: Study, said: Section) -> Figure:
     """Draw each test of a family with its interval, a panel for each unit, coloured by the verdict."""
-    family, tested = drawn.families[said["family"]][0], tested_of(drawn, said)
+    family, tested = study.families[said["family"]][0], tested_of(study, said)
     units = list(dict.fromkeys(scale_of(one.contrast) for one in tested))
     sizes = [sum(scale_of(one.contrast) == unit for one in tested) for unit in units]
     figure = Figure(figsize=(9.6, 1.2 + 0.42 * sum(sizes)), layout="constrained")
@@ -120,9 +99,9 @@ def forest(drawn: Drawn, said: Section) -> Figure:
     return figure
 
 
-def tested_of(drawn: Drawn, said: Section) -> list[Finding]:
+def tested_of(study: Study, said: Section) -> list[Finding]:
     """Return the findings of a figure's family that have an interval; single trainings have none."""
-    findings = drawn.families[said["family"]][1]
+    findings = study.families[said["family"]][1]
     return [one for one in findings if one.difference and one.difference.interval]
 
 
@@ -158,9 +137,9 @@ def worst_conditions(results: Results, changes: Sequence[Change]) -> dict[str, C
     return found
 
 
-def survival(drawn: Drawn, said: Section) -> Figure:
+def survival(study: Study, said: Section) -> Figure:
     """Draw the share of episodes still going over distance, unchanged and in the worst condition."""
-    results, worst = drawn.results, worst_conditions(drawn.results, drawn.changes)
+    results, worst = study.results, worst_conditions(study.results, study.changes)
     length_m = _scene(results).length_m
     figure, panels = panel_grid(max(len(worst), 1), 4, (2.9, 2.2), (0.4, 0.5), sharex=True, sharey=True)
     for panel, (group, at) in zip(panels, worst.items(), strict=bool(worst)):
@@ -194,12 +173,12 @@ def numeric_axes(results: Results) -> list[str]:
     ]
 
 
-def axes_map(drawn: Drawn, said: Section) -> Figure:
+def axes_map(study: Study, said: Section) -> Figure:
     """Draw success along the axes of numbers: the groups of `said` with intervals, all others in grey."""
-    axes = {axis: [one for one in drawn.summaries if one.condition[0] == axis]
-            for axis in numeric_axes(drawn.results)}  # fmt: skip
+    axes = {axis: [one for one in study.summaries if one.condition[0] == axis]
+            for axis in numeric_axes(study.results)}  # fmt: skip
     there = {one.group for own in axes.values() for one in own}
-    groups = [group for group in drawn.results.groups if group in there and group not in BASELINES]
+    groups = [group for group in study.results.groups if group in there and group not in BASELINES]
     front = [group for group in said.get("groups") or groups if group in there] or groups
     figure, panels = panel_grid(len(axes), 3, (3.3, 2.5), (0.4, 0.6), sharey=True)
     for panel, (axis, found) in zip(panels, axes.items(), strict=True):
@@ -231,10 +210,46 @@ def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object],
     panel.plot(x + place, y, color=colour, marker=marker, ms=5, lw=1.6, zorder=3, label=name)
 
 
-def contacts(drawn: Drawn, said: Section) -> Figure:
+def contacts(study: Study, said: Section) -> Figure:
     """Draw where episodes end in contact, seen from above."""
-    scene = _scene(drawn.results)
-    return contact_map(contact_ends(drawn.results), scene.length_m, scene.width_m / 2)
+    scene = _scene(study.results)
+    return contact_map(contact_ends(study.results), scene.length_m, scene.width_m / 2)
+
+
+def contact_map(
+    ends: Mapping[str, tuple[np.ndarray, np.ndarray]], length_m: float, half_width_m: float
+) -> Figure:
+    """Draw where episodes of each group ended in contact.
+
+    Args:
+        ends: Group -> EPISODE without any change, and EPISODE under all changes in the same scene.
+        length_m: Where the goal line is [m].
+        half_width_m: Where the walls are [m].
+    """
+    figure, panels = panel_grid(len(ends), 2, (6.6, 2.3), (0.0, 0.7), sharex=True, sharey=True)
+    for panel, (group, (unchanged, changed)) in zip(panels, ends.items(), strict=True):
+        _draw_contacts(panel, group, unchanged, changed)
+        panel.hlines([-half_width_m, half_width_m], 0, length_m, color=INK, lw=1.5)
+        panel.vlines(length_m, -half_width_m, half_width_m, color=MUTED, lw=1.2, ls=":")
+        panel.set(xlim=(-2, length_m + 2), ylim=(half_width_m + 1.5, -half_width_m - 1.5))
+    figure.supxlabel(
+        "y, along the corridor [m]; large dots: nothing changed, small dots: with changes in the same scene",
+        fontsize=8,
+    )
+    figure.supylabel("x, to the right [m]", fontsize=8)
+    return figure
+
+
+def _draw_contacts(panel: Axes, group: str, unchanged: np.ndarray, changed: np.ndarray) -> None:
+    """Draw the contacts of one group as dots, large where nothing was changed."""
+    colour, usual, others = style_of(group)[0], *(rows[rows["collision"]] for rows in (unchanged, changed))
+    panel.scatter(usual["distance_m"], usual["x_m"], s=26, alpha=0.95, color=colour, edgecolors="white",
+                  lw=0.5, zorder=3)  # fmt: skip
+    panel.scatter(others["distance_m"], others["x_m"], s=7, alpha=0.25, color=colour, lw=0, zorder=2)
+    counts = f"unchanged {len(usual)} of {len(unchanged)}, changed {len(others)} of {len(changed)}"
+    panel.set_title(f"{group}: contacts {counts}", loc="left", fontsize=9, color=INK)
+    panel.spines[:].set_visible(False)
+    panel.tick_params(labelsize=8, labelbottom=True, labelleft=True)
 
 
 def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -259,22 +274,9 @@ def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def doses(drawn: Drawn, said: Section) -> Figure:
-    """Draw the change of success against event error; axes that end with `dashed` as dashed lines."""
-    errors = {one.condition: one.measured for one in drawn.doses}
-    met = {(one.condition, group) for one in drawn.doses for group in one.met_by}
-    ending = said.get("dashed", "")
-    behind = [
-        one._replace(condition=(one.condition[0].removesuffix(ending), one.condition[1]))
-        for one in drawn.changes
-        if ending and one.condition[0].endswith(ending)
-    ]
-    return dose_figure([one for one in drawn.changes if one.condition in errors], errors, met, behind)
-
-
-def lines(drawn: Drawn, said: Section) -> Figure:
+def lines(study: Study, said: Section) -> Figure:
     """Draw success along axes: a panel for each value of a tag, a line for each value of another and axis."""
-    results, tags = drawn.results, tags_of(drawn.study, drawn.results)
+    results, tags = study.results, tags_of(study.said, study.results)
     panels_of = sorted({tags[group][said["panels"]] for group in results.trained})
     figure = Figure(figsize=(3.4 * len(panels_of), 3.4), layout="constrained")
     panels = figure.subplots(1, len(panels_of), sharey=True, squeeze=False)[0]
@@ -319,9 +321,9 @@ def _label_rates(panel: Axes, results: Results, axis: str, trained_at: float) ->
     tidy(panel)
 
 
-def dots(drawn: Drawn, said: Section) -> Figure:
+def dots(study: Study, said: Section) -> Figure:
     """Draw both groups of a test under each condition, a small marker for each training."""
-    results, (one, *_) = drawn.results, drawn.families[said["family"]][1]
+    results, (one, *_) = study.results, study.families[said["family"]][1]
     at, groups = one.contrast.ours.at, [one.contrast.theirs.group, one.contrast.ours.group]  # type: ignore[union-attr]
     names = ["mean of these", *map(condition_text, at)]
     figure = Figure(figsize=(6.4, 1.0 + 0.34 * len(names)), layout="constrained")
@@ -342,9 +344,9 @@ def dots(drawn: Drawn, said: Section) -> Figure:
     return figure
 
 
-def spread(drawn: Drawn, said: Section) -> Figure:
+def spread(study: Study, said: Section) -> Figure:
     """Draw the mean success of every training as a map, and by what it differs under each condition."""
-    tables, names = crossed_tables(drawn.study, drawn.results), drawn.study["spread"]
+    tables, names = crossed_tables(study.said, study.results), study.said["spread"]
     mean = 100 * np.mean(list(tables.values()), axis=0)
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
@@ -378,9 +380,9 @@ def _draw_numbers(panel: Axes, values: np.ndarray, low: float = 0.0, high: float
         )
 
 
-def variants(drawn: Drawn, said: Section) -> Figure:
+def variants(study: Study, said: Section) -> Figure:
     """Draw success by variant and condition as a map, and the tests of a family with a dot for each pair."""
-    results, (_, findings) = drawn.results, drawn.families[said["family"]]
+    results, (_, findings) = study.results, study.families[said["family"]]
     groups, found = results.trained, {one.contrast.ours.group: one for one in findings}
     values = np.array(
         [[100 * results.values(at, group).mean() for at in results.conditions] for group in groups]
@@ -414,24 +416,24 @@ def pair_differences(results: Results, one: Finding) -> np.ndarray:
     return difference
 
 
-KINDS: dict[str, Callable[[Drawn, Section], Figure]] = {
+KINDS: dict[str, Callable[[Study, Section], Figure]] = {
     "map": change_map,
     "forest": forest,
     "survival": survival,
     "axes": axes_map,
     "contacts": contacts,
-    "doses": doses,
+    "doses": dose_figure,
     "lines": lines,
     "dots": dots,
     "spread": spread,
     "variants": variants,
 }
 # What a kind cannot be drawn without, of the kinds for which data may lack it.
-NEEDED: dict[str, Callable[[Drawn, Section], object]] = {
-    "map": lambda drawn, said: drawn.changes,
+NEEDED: dict[str, Callable[[Study, Section], object]] = {
+    "map": lambda study, said: study.changes,
     "forest": tested_of,
-    "axes": lambda drawn, said: numeric_axes(drawn.results),
-    "dots": lambda drawn, said: drawn.families[said["family"]][1],
+    "axes": lambda study, said: numeric_axes(study.results),
+    "dots": lambda study, said: study.families[said["family"]][1],
 }
 CAPTIONS = {
     "map": "Success [%] of each group under each condition. Colour: the change against the baseline "

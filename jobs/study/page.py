@@ -5,11 +5,9 @@ ends it; what is between them is replaced. `results` is the usual choice of all 
 made them. NAME:DATA takes the file of one study and the data of another.
 """
 
-import functools
 import re
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,15 +15,13 @@ from matplotlib.figure import Figure
 from jobs.analysis.statistics import rate_estimate
 from jobs.analysis.tables import markdown_table, percent_text
 from jobs.study import tables
-from jobs.study.changes import Change, changes_of, content, replicated
-from jobs.study.contrasts import Finding, by_condition, judge
-from jobs.study.doses import Dose, read_doses
-from jobs.study.figures import CAPTIONS, KINDS, NEEDED, Drawn
-from jobs.study.learned import learned
-from jobs.study.results import Condition, Results, read_published, value_of, values_of
-from jobs.study.spec import Family, families_of, read_study
+from jobs.study.changes import content, replicated
+from jobs.study.computed import Study, place_beside
+from jobs.study.contrasts import by_condition
+from jobs.study.figures import CAPTIONS, KINDS, NEEDED
+from jobs.study.results import Condition, Results, value_of, values_of
 from jobs.study.spread import crossed_tables, factors
-from jobs.study.summaries import MET, Summary, success_lines, summaries_of
+from jobs.study.summaries import MET, success_lines
 from jobs.study.words import condition_text
 
 MARK = re.compile(r"(<!-- study ([\w:]+) ([\w:]+) -->\n).*?(<!-- end of study -->\n)", re.DOTALL)
@@ -34,104 +30,17 @@ EMPTY = "<!-- study {name} {part} -->\n<!-- end of study -->\n"
 FOUND_MET = f"{MET} The condition lies within what the group was trained on."
 
 
-class Study(NamedTuple):
-    """A study and all that is computed of its results.
-
-    Attributes:
-        name: Of its data.
-        said: Section `study` of its file.
-        results: What was evaluated.
-        changes: Of its conditions.
-        summaries: Of its groups.
-        families: Name -> a family and its findings.
-        doses: Event errors of its conditions, if they were measured.
-        beside: What a family names beside itself -> `tables.key_of` a test -> what was found there.
-    """
-
-    name: str
-    said: Mapping[str, Any]
-    results: Results
-    changes: list[Change]
-    summaries: list[Summary]
-    families: Mapping[str, tuple[Family, list[Finding]]]
-    doses: list[Dose]
-    beside: Mapping[tuple[str, str], Mapping[tuple[str, ...], str]]
-
-
-def judge_all(said: Mapping[str, Any], results: Results) -> dict[str, tuple[Family, list[Finding]]]:
-    """Return name -> each family of a study and its findings."""
-    rates = learned(said, results.groups)
-    found = {family.name: (family, judge(family, results, rates)) for family in families_of(said, results)}
-    return {name: (family, [one for one in own if one.difference is not None])
-            for name, (family, own) in found.items()}  # fmt: skip
-
-
-def compute(
-    name: str, said: Mapping[str, Any], results: Results, doses: list[Dose], data: Path | None
-) -> Study:
-    """Compute all that the pages of a study show.
-
-    Args:
-        name: Of its data.
-        said: Section `study` of its file.
-        results: What was evaluated.
-        doses: Event errors of its conditions, if they were measured.
-        data: Where other published studies are; None: none is shown beside.
-    """
-    families = judge_all(said, results)
-    named = {(other, name) for name, (family, _) in families.items() for other in family.beside.values()}
-    beside = {(other, name): found for other, name in named
-              if data and (found := _beside(data, *_place_beside(other, name))) is not None}  # fmt: skip
-    every = bool(said.get("doses"))  # a plan that was written before names all of its conditions
-    return Study(
-        name, said, results, changes_of(results, every), summaries_of(results), families, doses, beside
-    )
-
-
-@functools.cache
-def published(data: Path, name: str, spec: str) -> Study:
-    """Compute a published study by the file of `spec`."""
-    said = read_study(spec)
-    return compute(name, said, read_published(data, name), read_doses(data / f"{name}_doses.csv"), data)
-
-
-def _place_beside(said: str, name: str) -> tuple[str, str]:
-    """Return study and family of STUDY or STUDY:FAMILY; `name` is the family that names it."""
-    study, _, family = said.partition(":")
-    return study, family or name
-
-
-@functools.cache
-def _beside(data: Path, name: str, family: str) -> dict[tuple[str, ...], str] | None:
-    """Return what a family of a published study found; None if the study is not there."""
-    if not (data / f"{name}_about.json").is_file():
-        return None
-    own, findings = _judged(data, name)[family]
-    return {tables.key_of(own, one.contrast): tables.beside_text(one) for one in findings}
-
-
-@functools.cache
-def _judged(data: Path, name: str) -> dict[str, tuple[Family, list[Finding]]]:
-    return judge_all(read_study(name), read_published(data, name))
-
-
 def figures(study: Study) -> dict[str, Figure]:
     """Return name -> each figure of a study that its data suffice for."""
-    drawn = _drawn(study)
-    return {name: KINDS[said["kind"]](drawn, said) for name, said in _figures(study).items()}
+    return {name: KINDS[said["kind"]](study, said) for name, said in _figures(study).items()}
 
 
 def _figures(study: Study) -> dict[str, Mapping[str, Any]]:
-    drawn, asked = _drawn(study), dict(study.said.get("figures") or {})
     return {
         name: said
-        for name, said in asked.items()
-        if said["kind"] not in NEEDED or NEEDED[said["kind"]](drawn, said)
+        for name, said in (study.said.get("figures") or {}).items()
+        if said["kind"] not in NEEDED or NEEDED[said["kind"]](study, said)
     }
-
-
-def _drawn(study: Study) -> Drawn:
-    return Drawn(study.said, study.results, study.changes, study.summaries, study.families, study.doses)
 
 
 def part(study: Study, name: str) -> str:
@@ -167,7 +76,7 @@ def new_page(name: str) -> str:
 
 def _results(study: Study, _: str) -> str:
     blocks = [_summary(study, ""), *(_figure(study, name) for name in _figures(study))]
-    columns = {_place_beside(other, name) for name, (family, _) in study.families.items()
+    columns = {place_beside(other, name) for name, (family, _) in study.families.items()
                for other in family.beside.values()}  # fmt: skip
     blocks += [
         _family(study, name, heading=True) for name in study.families if (study.name, name) not in columns
@@ -211,7 +120,7 @@ def _family(study: Study, name: str, heading: bool = False) -> str:
             "Means with 95 % intervals over trainings and corridors, each alone. The first line is the test."
         )
     elif name != "lead":
-        named = dict.fromkeys(_place_beside(other, name)[1] for other in family.beside.values())
+        named = dict.fromkeys(place_beside(other, name)[1] for other in family.beside.values())
         notes = [study.families[own][0].note for own in named if own in study.families and own != name]
         blocks.append(" ".join((tables.family_note(family, findings), *notes)))
         blocks.append(_tests(study, name))

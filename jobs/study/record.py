@@ -25,7 +25,8 @@ from jobs.run.folder import Run
 from jobs.run.progress import console
 from jobs.run.provenance import command, git_commit, provenance, today
 from jobs.study.axis_figure import axis_figure
-from jobs.study.page import FOUND_MET, Study, compute, figures, part
+from jobs.study.computed import Study, compute
+from jobs.study.page import FOUND_MET, figures, part
 from jobs.study.plan import Plan
 from jobs.study.results import Condition, Results
 from jobs.study.summaries import (

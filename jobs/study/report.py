@@ -20,8 +20,9 @@ from jobs.analysis.tables import save_plot
 from jobs.config.config import Config, ConfigError
 from jobs.run.files import RunError, read_json, write_atomic
 from jobs.run.progress import console
+from jobs.study.computed import Study, compute, published
 from jobs.study.doses import measure_doses, read_doses, write_doses
-from jobs.study.page import Study, compute, figures, fill, marked, new_page, part, published
+from jobs.study.page import figures, fill, marked, new_page, part
 from jobs.study.results import FOLDERS, check_whole, publish, read_results
 from jobs.study.spec import read_study
 from jobs.study.tables import write_changes, write_estimates, write_tests

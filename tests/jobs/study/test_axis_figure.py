@@ -7,7 +7,7 @@ from jobs.config.conditions import NOMINAL
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.policies import PRETRAINED
 from jobs.study.axis_figure import axis_figure
-from jobs.study.contact_map import contact_map
+from jobs.study.figures import contact_map
 from jobs.study.plan import axes_of
 from jobs.study.spec import read_study
 from jobs.study.summaries import summarise

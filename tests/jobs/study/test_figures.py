@@ -4,16 +4,16 @@ import pytest
 from jobs.analysis.statistics import Difference
 from jobs.run.provenance import REPOSITORY
 from jobs.study.changes import Change, changes_of
+from jobs.study.computed import Study, compute, published
 from jobs.study.figures import (
     KINDS,
-    Drawn,
     change_map,
     contact_ends,
     numeric_axes,
     still_going,
     worst_conditions,
 )
-from jobs.study.page import compute, figures, published
+from jobs.study.page import figures
 from jobs.study.results import Results, read_cells
 from jobs.study.spec import read_study
 from tests.support.episodes import flights
@@ -69,7 +69,7 @@ def test_the_map_says_each_success_once_below_the_baseline(swept):
         Change(at, NOMINAL, "bytestream", success, before, Difference(-0.5, None, None), False, success < 0)
         for at in (FEW, MANY)
     ]
-    panel = change_map(Drawn({}, Results(ABOUT, swept), changes, [], {}, []), {}).axes[0]
+    panel = change_map(Study("", {}, Results(ABOUT, swept), changes, [], {}, [], {}), {}).axes[0]
     assert panel.get_yticklabels()[0].get_text() == "nothing changed"
     assert [(text.get_position(), text.get_text()) for text in panel.texts] == [
         ((0, 0), "75"), ((0, 1), "25"), ((0, 2), "25"),
@@ -91,9 +91,8 @@ def test_axes_of_numbers_are_those_along_which_one_number_changes(swept):
 )
 def test_published_figures_are_drawn_from_their_data(name, kind):
     study = published(DATA, name, name)
-    drawn = Drawn(study.said, study.results, study.changes, study.summaries, study.families, study.doses)
     (said,) = [one for one in study.said["figures"].values() if one["kind"] == kind]
-    figure = KINDS[kind](drawn, said)
+    figure = KINDS[kind](study, said)
     marks = sum(len(panel.lines) + len(panel.texts) for panel in figure.axes)
     assert marks >= len(study.results.trained)
 

@@ -11,9 +11,9 @@ import pytest
 from docs.from_data import UNMARKED, filled_pages, studies
 from jobs.run.provenance import REPOSITORY
 from jobs.study.changes import changes_of
+from jobs.study.computed import judge_all
 from jobs.study.contrasts import by_condition, judge
 from jobs.study.figures import contact_ends, pair_differences, worst_conditions
-from jobs.study.page import judge_all
 from jobs.study.results import read_published, text_of, values_of
 from jobs.study.spec import GAIN, read_study
 from jobs.study.spread import crossed_tables, factors

@@ -11,7 +11,7 @@ from PIL import Image
 from jobs.config.config import ConfigError
 from jobs.rollout.table import LABELS
 from jobs.run.files import write_json
-from jobs.study import page, report
+from jobs.study import computed, report
 from jobs.study.page import fill, marked, new_page
 from jobs.study.report import filled_pages, newest_studies, write_study, write_trade
 from tests.support.configs import small_config
@@ -56,7 +56,7 @@ def test_a_study_is_published_with_its_data_figures_and_page_and_the_plan_stays(
     names = {f"results_{name}.png" for name in ("axes", "survival", "map")}
     assert {path.name for path in (docs / "images").iterdir()} == names
     assert filled_pages(docs) == {"plan.md": text}  # from the data alone
-    page.published.cache_clear()
+    computed.published.cache_clear()
 
 
 def test_every_episode_and_training_is_there_to_be_analysed_again(sweep, tmp_path):

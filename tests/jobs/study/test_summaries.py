@@ -6,7 +6,8 @@ import pytest
 
 from jobs.analysis.tables import markdown_table
 from jobs.run.provenance import REPOSITORY
-from jobs.study.page import part, published
+from jobs.study.computed import published
+from jobs.study.page import part
 from jobs.study.results import Results
 from jobs.study.summaries import axis_curves, columns_of, details_table, metrics_of, success_lines, summarise
 from jobs.tracking.store import check_metrics
