@@ -71,6 +71,11 @@ class Contrast(NamedTuple):
     measure: str
     paired: bool
 
+    @property
+    def against(self) -> str:
+        """Return the group of the other side; "" for a test about one group."""
+        return "" if self.theirs is None or self.theirs.group == self.ours.group else self.theirs.group
+
 
 class Family(NamedTuple):
     """Tests that are corrected together.

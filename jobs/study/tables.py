@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from jobs.analysis.statistics import CONFIDENCE, Difference, crossed_mean
+from jobs.analysis.statistics import CONFIDENCE, Difference, Estimate, crossed_mean
 from jobs.analysis.tables import estimate_text, markdown_table, percent_text, write_csv
 from jobs.study.changes import Change, replicated
 from jobs.study.contrasts import UNDECIDED, Finding, Row, by_condition
@@ -64,7 +64,7 @@ def family_table(
     """
     names = list(dict.fromkeys(one.contrast.name for one in findings))
     groups = list(dict.fromkeys(one.contrast.ours.group for one in findings))
-    against = {"" if _alone(one.contrast) else one.contrast.theirs.group for one in findings}  # type: ignore[union-attr]
+    against = {one.contrast.against for one in findings}
     complete = len(findings) == len(groups) * len(names) and not any(one.contrast.source for one in findings)
     if len(names) > 1 and not beside and (against == {""} or (len(against) == 1 and complete)):
         (theirs,) = against
@@ -81,14 +81,10 @@ def _columns_beside(
     family: Family, findings: Sequence[Finding], beside: Mapping[str, Mapping[tuple[str, ...], str]]
 ) -> dict[str, list[str]]:
     """Return heading -> a text for each test: what was found, and what other families found of the same."""
-    against = ["" if _alone(one.contrast) else one.contrast.theirs.group for one in findings]  # type: ignore[union-attr]
-    usual = Counter(against).most_common(1)[0][0]
+    usual = Counter(one.contrast.against for one in findings).most_common(1)[0][0]
     return {
         "Group": [f"`{one.contrast.ours.group}`" for one in findings],
-        f"Test, against `{usual}`": [
-            one.contrast.name + (f" (against `{theirs}`)" if theirs != usual else "")
-            for one, theirs in zip(findings, against, strict=True)
-        ],
+        f"Test, against `{usual}`": [_test_text(one.contrast, usual) for one in findings],
         "Source": [one.contrast.source for one in findings],
         "Finding": [beside_text(one) for one in findings],
         **{
@@ -105,7 +101,7 @@ def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]
         "Group": [f"`{one.contrast.ours.group}`" for one in findings],
         "Test": [one.contrast.name for one in findings],
         "Source": [one.contrast.source for one in findings],
-        "Against": ["" if _alone(one.contrast) else f"`{one.contrast.theirs.group}`" for one in findings],  # type: ignore[union-attr]
+        "Against": [one.contrast.against and f"`{one.contrast.against}`" for one in findings],
         "Finding": [finding_text(one) for one in findings] if tested else [],
         "Difference": [value_text(one) for one in findings],
         f"p ({CORRECTIONS.get(family.adjust)})": [_p_text(one) for one in findings] if tested else [],
@@ -115,13 +111,14 @@ def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]
 
 def finding_text(one: Finding) -> str:
     """Return the verdict of a test; bold: what is certain in its family."""
+    return ", ".join(f"**{word}**" if certain else word for word, certain in _certainty(one).items())
+
+
+def _certainty(one: Finding) -> Mapping[str, bool]:
+    """Return the words of a verdict, and whether each is certain in the family."""
     if one.excluded and one.verdict == ", ".join(one.excluded):
-        return ", ".join(f"**{word}**" if certain else word for word, certain in one.excluded.items())
-    return (
-        f"**{one.verdict}**"
-        if one.adjusted_p is not None and one.adjusted_p < 1 - CONFIDENCE
-        else one.verdict
-    )
+        return one.excluded
+    return {one.verdict: one.adjusted_p is not None and one.adjusted_p < 1 - CONFIDENCE}
 
 
 def beside_text(one: Finding) -> str:
@@ -129,15 +126,8 @@ def beside_text(one: Finding) -> str:
     return f"{finding_text(one)}: {value_text(one)}"
 
 
-def _alone(contrast: Contrast) -> bool:
-    """Whether a test is about one group."""
-    return contrast.theirs is None or contrast.theirs.group == contrast.ours.group
-
-
 def _cell(family: Family, one: Finding) -> str:
-    if family.adjust == "none":
-        return value_text(one)
-    return f"{finding_text(one)}: {value_text(one)}, p = {_p_text(one)}"
+    return value_text(one) if family.adjust == "none" else f"{beside_text(one)}, p = {_p_text(one)}"
 
 
 def _p_text(one: Finding) -> str:
@@ -189,7 +179,7 @@ def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
         return f"{family.title}: {value_text(one)}, p = {_p_text(one)}, {one.verdict}."
     certain = [family.words[name] for name in ("above", "below") if name in family.words]
     named = [
-        f"{one.verdict}: {_test_text(one.contrast)}, {value_text(one)}"
+        f"{one.verdict}: `{one.contrast.ours.group}` {_test_text(one.contrast)}, {value_text(one)}"
         for one in findings
         if one.verdict in certain
     ]
@@ -200,9 +190,9 @@ def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
     )
 
 
-def _test_text(contrast: Contrast) -> str:
-    against = "" if _alone(contrast) else f" (against `{contrast.theirs.group}`)"  # type: ignore[union-attr]
-    return f"`{contrast.ours.group}` {contrast.name}{against}"
+def _test_text(contrast: Contrast, usual: str = "") -> str:
+    """Return the name of a test, and the other side unless that is the usual one."""
+    return contrast.name + ("" if contrast.against == usual else f" (against `{contrast.against}`)")
 
 
 def family_note(family: Family, findings: Sequence[Finding]) -> str:
@@ -239,9 +229,9 @@ def lead_sentence(results: Results, findings: Sequence[Finding]) -> str:
     best = max(rates, key=lambda group: float(rates[group].mean()))
     each, usual = rates[best].mean(axis=(1, 2)), results.values(results.nominal, best).mean()
     behind = [
-        f"`{({one.contrast.ours.group, one.contrast.theirs.group} - {best}).pop()}`"  # type: ignore[union-attr]
+        f"`{(pair - {best}).pop()}`"
         for one in findings
-        if one.verdict == "certain" and best in (one.contrast.ours.group, one.contrast.theirs.group)  # type: ignore[union-attr]
+        if one.verdict == "certain" and best in (pair := {one.contrast.ours.group, one.contrast.against})
     ]
     lead = f"certain over {', '.join(behind)}" if behind else "certain over none"
     return (
@@ -431,8 +421,8 @@ def write_estimates(file: Path, found: Sequence[Summary]) -> None:
     rows = [
         (
             *(one.condition[0], text_of(one.condition[1]), one.group, len(one.trainings), one.episodes),
-            *_numbers(one.success.value, one.success.interval, ".4f"),
-            *_numbers(one.distance_m.value, one.distance_m.interval, ".2f"),
+            *_numbers(one.success, ".4f"),
+            *_numbers(one.distance_m, ".2f"),
             *(f"{one.events_per_step:.1f}", one.dropped),
         )
         for one in found
@@ -447,7 +437,7 @@ def write_changes(file: Path, changes: Sequence[Change]) -> None:
             *(one.condition[0], text_of(one.condition[1]), one.group),
             *(one.baseline[0], text_of(one.baseline[1]), len(one.success)),
             *(f"{one.success.mean():.4f}", f"{one.before.mean():.4f}"),
-            *_numbers(one.difference.value, one.difference.interval, ".4f"),
+            *_numbers(one.difference, ".4f"),
             *(
                 "" if one.difference.p is None else f"{one.difference.p:.3g}",
                 int(one.certain),
@@ -470,40 +460,25 @@ def write_tests(
             (one,) = findings
             scale, form, unit = scale_of(one.contrast)
             rows += [(name, *_sides(one.contrast), condition_text(row.condition), "", "",
-                      *_numbers(row.difference.value * scale, _scaled(row.difference.interval, scale), form),
-                      unit, "", "") for row in by_condition(one.contrast, results)]  # fmt: skip
+                      *_numbers(row.difference, form, scale), unit, "", "")
+                     for row in by_condition(one.contrast, results)]  # fmt: skip
     write_csv(file, TESTS, rows)
 
 
 def _test_cells(family: Family, one: Finding) -> tuple[str, ...]:
     scale, form, unit = scale_of(one.contrast)
-    difference = cast(Difference, one.difference)  # findings without one are left out
-    value = _numbers(difference.value * scale, _scaled(difference.interval, scale), form)
-    tested = family.adjust != "none"
-    p = _p_text(one) if tested else ""
+    value = _numbers(cast(Difference, one.difference), form, scale)  # findings without one are left out
+    certain = ", ".join(word for word, is_certain in _certainty(one).items() if is_certain)
+    verdict, p = ((one.verdict, certain), _p_text(one)) if family.adjust != "none" else (("", ""), "")
     needed = _needed_text(one) if family.power else ""
-    certain = ", ".join(word for word in one.verdict.split(", ") if f"**{word}**" in finding_text(one))
-    return (
-        *_sides(one.contrast),
-        "",
-        one.verdict if tested else "",
-        certain if tested else "",
-        *value,
-        unit,
-        p,
-        needed,
-    )
+    return (*_sides(one.contrast), "", *verdict, *value, unit, p, needed)
 
 
 def _sides(contrast: Contrast) -> tuple[str, str, str]:
-    return contrast.ours.group, contrast.name, "" if _alone(contrast) else contrast.theirs.group  # type: ignore[union-attr]
+    return contrast.ours.group, contrast.name, contrast.against
 
 
-def _scaled(interval: tuple[float, float] | None, scale: float) -> tuple[float, float] | None:
-    return None if interval is None else (scale * interval[0], scale * interval[1])
-
-
-def _numbers(value: float, interval: tuple[float, float] | None, form: str) -> tuple[str, str, str]:
+def _numbers(one: Estimate | Difference, form: str, scale: float = 1) -> tuple[str, str, str]:
     """Return a value and the ends of its interval as text."""
-    low, high = ("", "") if interval is None else (format(end, form) for end in interval)
-    return format(value, form), low, high
+    low, high = (format(scale * end, form) for end in one.interval) if one.interval else ("", "")
+    return format(scale * one.value, form), low, high
