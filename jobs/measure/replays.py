@@ -113,13 +113,12 @@ def _compare(own: Replay, reference: Replay, env: EnvConfig, agent: PolicyAgent)
 
 
 def _mean(found: Sequence[_Comparison], exact: np.ndarray) -> Measured:
-    weights = [one.events for one in found]
-    errors = [one.event_error for one in found]
+    steps_us, errors, events, latents, others = zip(*found, strict=True)
     return Measured(
-        steps_us=tuple(one.step_us for one in found),
-        event_error=float(np.average(errors, weights=weights)) if sum(weights) else 0.0,
-        latent_error=latent_error(np.concatenate([one.latents for one in found]), exact),
-        other_action=float(np.concatenate([one.others for one in found]).mean()),
+        steps_us=steps_us,
+        event_error=float(np.average(errors, weights=events)) if sum(events) else 0.0,
+        latent_error=latent_error(np.concatenate(latents), exact),
+        other_action=float(np.concatenate(others).mean()),
     )
 
 

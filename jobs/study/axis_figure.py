@@ -26,25 +26,19 @@ def axis_figure(axis: str, points: Mapping[Value, Mapping[str, object]], found: 
     """
     by_text = {text_of(value): changes for value, changes in points.items()}
     moving, numbers = moving_settings(by_text), axis_numbers(by_text) is not None
-    places, groups = (
-        {value: place for place, value in enumerate(points)},
-        list(dict.fromkeys(one.group for one in found)),
-    )
+    places, groups = list(points), list(dict.fromkeys(one.group for one in found))
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     panels = figure.subplots(1, 2)
     for rank, group in enumerate(groups):
         own = [one for one in found if one.group == group]
-        x = np.array([places[one.condition[1]] for one in own]) + WIDTH * ((rank + 0.5) / len(groups) - 0.5)
+        aside = WIDTH * ((rank + 0.5) / len(groups) - 0.5)
+        x = np.array([places.index(one.condition[1]) for one in own]) + aside
         colour, marker = style_of(group)
-        ends = [
-            (100 * one.success.value, *(100 * end for end in one.success.interval or (0.0, 1.0)))
-            for one in own
-        ]
-        metres = [
-            (one.distance_m.value, *(one.distance_m.interval or (one.distance_m.value,) * 2)) for one in own
-        ]
-        for panel, rows in zip(panels, (ends, metres), strict=True):
-            value, low, high = np.array(rows).T
+        success = np.array([(one.success.value, *(one.success.interval or (0.0, 1.0))) for one in own])
+        metres = [one.distance_m for one in own]
+        distance = np.array([(one.value, *(one.interval or (one.value, one.value))) for one in metres])
+        for panel, rows in zip(panels, (100 * success, distance), strict=True):
+            value, low, high = rows.T
             panel.vlines(x, low, high, color=colour, alpha=0.5, lw=1.2)
             panel.plot(x, value, color=colour, marker=marker, ms=6, lw=1.4 if numbers else 0, label=group)
     for panel in panels:

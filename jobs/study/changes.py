@@ -120,10 +120,8 @@ def _change(
     alone = np.array(
         [exact_pair_p(ours > 0, theirs > 0) for ours, theirs in zip(success, before, strict=True)]
     )
-    difference, rates = (
-        crossed_mean(success - before, (-1.0, 1.0)),
-        (success.mean(axis=1), before.mean(axis=1)),
-    )
+    difference = crossed_mean(success - before, (-1.0, 1.0))
+    rates = success.mean(axis=1), before.mean(axis=1)
     return Change(at, baseline, group, *rates, difference, False, np.zeros(len(success), bool)), alone
 
 

@@ -7,6 +7,7 @@ it, or both. Whether such an exclusion is certain in its family, too, is said ap
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -72,13 +73,8 @@ def judge(family: Family, results: Results, learned: Learned | None = None) -> l
         p, margin, needed = adjusted.get(place), margin_of(family, one), None
         verdict = verdict_of(difference, p, margin, family.words)
         ours, theirs = sides[place]
-        if (
-            family.power
-            and verdict == UNDECIDED
-            and p is not None
-            and ours is not None
-            and theirs is not None
-        ):
+        is_asked = family.power and verdict == UNDECIDED and p is not None
+        if is_asked and ours is not None and theirs is not None:
             needed = trainings_needed(ours, theirs, margin, len(places), bounds_of(one, ours, theirs))
         findings.append(Finding(one, difference, p, verdict, needed, excluded[place]))
     return findings
@@ -179,17 +175,12 @@ def _evaluated(ours: Side, theirs: Side | None, results: Results) -> tuple[Side,
     """Leave out the conditions under which a side was not evaluated, if both have the same out of both."""
 
     def there(side: Side) -> list[bool]:
-        found = [bool(results.trainings(at, side.group)) for at in side.at]
-        if len(side.less) != len(side.at):
-            return found
-        return [one and bool(results.trainings(at, side.group))
-                for one, at in zip(found, side.less, strict=True)]  # fmt: skip
+        places = zip(side.at, side.less, strict=True) if _is_matched(side) else zip(side.at)
+        return [all(results.trainings(at, side.group) for at in place) for place in places]
 
     def only(side: Side, kept: Sequence[bool]) -> Side:
-        at = tuple(one for one, keep in zip(side.at, kept, strict=True) if keep)
-        if len(side.less) != len(side.at):
-            return side._replace(at=at)
-        return side._replace(at=at, less=tuple(one for one, k in zip(side.less, kept, strict=True) if k))
+        at, less = tuple(compress(side.at, kept)), tuple(compress(side.less, kept))
+        return side._replace(at=at, less=less if _is_matched(side) else side.less)
 
     if theirs is None:
         return only(ours, there(ours)), None
@@ -197,6 +188,11 @@ def _evaluated(ours: Side, theirs: Side | None, results: Results) -> tuple[Side,
     if ours.at == theirs.at:
         kept = ([one and other for one, other in zip(*kept, strict=True)],) * 2
     return only(ours, kept[0]), only(theirs, kept[1])
+
+
+def _is_matched(side: Side) -> bool:
+    """Whether one condition is subtracted from each."""
+    return len(side.less) == len(side.at)
 
 
 def _seeds(side: Side, results: Results) -> list[int | None]:

@@ -15,6 +15,7 @@ from jobs.analysis.plots import panel_grid, style_of, tidy
 from jobs.analysis.statistics import Difference
 from jobs.config.conditions import NOMINAL, axis_numbers
 from jobs.rollout.agents import BASELINES
+from jobs.rollout.episodes import EPISODE
 from jobs.study.changes import Change, content
 from jobs.study.computed import Study
 from jobs.study.contrasts import Finding
@@ -260,7 +261,7 @@ def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     usual = results.facts["scene"]
     here = [at for at in results.conditions if results.axes[at[0]][at[1]].get("env.scene", usual) == usual]
     here.sort(key=lambda at: at[0] != NOMINAL)
-    found = {}
+    found, none = {}, np.empty(0, EPISODE)
     for group in results.groups:
         first: dict[bytes, Condition] = {}
         for at in here:
@@ -268,8 +269,6 @@ def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         parts: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
         for at in first.values():
             parts[at[0] != NOMINAL].extend(results.trainings(at, group).values())
-        empty = next(iter(results.cells.values()))
-        none = next(iter(empty.values()))[:0]
         found[group] = np.concatenate([none, *parts[0]]), np.concatenate([none, *parts[1]])
     return found
 

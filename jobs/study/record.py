@@ -125,8 +125,8 @@ def record(
     write_child_runs(tracker, "condition", [condition_run(found, one) for one in study.summaries])
     track_groups(tracker, study)
     track_totals(tracker, found, study)
-    sums = {"episodes_sha256": sha256(place / "episodes.csv")}
-    write_json(place / "about.json", {**facts, **sums})  # the last: it says that the rest is there
+    facts["episodes_sha256"] = sha256(place / "episodes.csv")
+    write_json(place / "about.json", facts)  # the last: it says that the rest is there
     return {one.name: one.success.value for one in study.summaries}
 
 
@@ -175,9 +175,7 @@ def _compared(plan: Plan, at: Condition) -> dict[str, Any]:
 
 def _exactness(found: Evaluated) -> list[dict[str, Any]]:
     """Return how exact each condition was simulated: asked and achieved, as far as it was measured."""
-    first: dict[Condition, EvaluationTask] = {}
-    for task in found.plan.tasks:
-        first.setdefault(task.condition, task)
+    first = {task.condition: task for task in reversed(found.plan.tasks)}
     return [
         {"condition": _place(at), "asked": task.env.fidelity.tolerance, **asdict(accuracy)}
         for at, task in ((at, first[at]) for at in found.plan.conditions)
@@ -201,10 +199,9 @@ def write_plots(place: Path, study: Study) -> list[Path]:
 
 def film_crashes(place: Path, found: Evaluated) -> list[Path]:
     """Film contacts of each group's first training where nothing is changed; baselines have none."""
-    first: dict[str, EvaluationTask] = {}
-    for task in found.plan.tasks:
-        if task.condition[0] == NOMINAL and task.key in found.results and task.policy.training is not None:
-            first.setdefault(task.policy.group, task)
+    unchanged = [task for task in found.plan.tasks if task.condition[0] == NOMINAL]
+    flown = [task for task in unchanged if task.key in found.results and task.policy.training is not None]
+    first = {task.policy.group: task for task in reversed(flown)}
     paths = []
     for group, task in sorted(first.items()):
         for seed in typical_crashes(found.results[task.key].episodes):
@@ -249,8 +246,7 @@ def write_tables(
         for _, findings in study.families.values():
             for one in findings:
                 console.print(f"{one.contrast.name}: {value_text(one)} {one.verdict}", markup=False)
-        texts = {"study.md": part(study, "results") + "\n"}
-        write_all(place, tracker, texts)
+        write_all(place, tracker, {"study.md": part(study, "results") + "\n"})
     details = details_table(study.summaries, str(results.facts["reference"]))
     write_all(place, tracker, {"table.md": text, "details.md": details})
     tracker.table("sweep/results", columns_of(study.summaries))

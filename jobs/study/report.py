@@ -107,16 +107,10 @@ def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
         shown = [docs / f"{name}.md"]
         pages[shown[0]] = new_page(name)
     for page in shown:
-        write_atomic(page, fill(pages[page], lambda at, what: _part(study, at, what, data)))
+        write_atomic(
+            page, fill(pages[page], lambda at, what: part(study if at == name else study_of(data, at), what))
+        )
     return shown[0]
-
-
-def _part(study: Study, mark: str, what: str, data: Path) -> str:
-    """Return a part of a page: of this study, or of another that is published."""
-    if mark == study.name:
-        return part(study, what)
-    spec, _, own = mark.partition(":")
-    return part(published(data, own or spec, spec), what)
 
 
 def filled_pages(docs: Path) -> dict[str, str]:
@@ -168,12 +162,10 @@ def copy_plot(picture: Path, target: Path) -> None:
 
 def _copied(config: Config) -> Iterable[Path]:
     """Copy the newest trade and the newest replay page; yield what was written."""
-    trade = _newest([file for one in _runs(config) if (file := one / "trade" / "about.json").is_file()])
-    if trade is not None:
-        yield write_trade(trade.parent, DOCS)
-    replay = _newest([file for one in _runs(config) if (file := one / "replay" / "about.json").is_file()])
-    if replay is not None:
-        yield write_replay(replay.parent, DOCS)
+    for name, write in (("trade", write_trade), ("replay", write_replay)):
+        newest = _newest([file for one in _runs(config) if (file := one / name / "about.json").is_file()])
+        if newest is not None:
+            yield write(newest.parent, DOCS)
 
 
 def write_trade(trade: Path, docs: Path) -> Path:
