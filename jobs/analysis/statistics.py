@@ -138,9 +138,7 @@ def crossed_mean(values: np.ndarray, bounds: Interval | None = None) -> Differen
         ValueError: If there is no value, or one is NaN or infinite.
     """
     values = _checked(values, "values")
-    trainings, corridors = (size - 1 for size in values.shape)
-    parts = [(_by_trainings(values), trainings), (_by_corridors([values]), corridors)]
-    return _within(_tested(values.mean(), parts, _least(values, bounds), trainings or corridors), bounds)
+    return _within(_crossed([values], _least(values, bounds)), bounds)
 
 
 def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | None = None) -> Difference:
@@ -160,14 +158,9 @@ def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | 
     ours, theirs = _checked(ours, "ours"), _checked(theirs, "theirs")
     if ours.shape[1] != theirs.shape[1]:
         raise ValueError(f"both must be of the same corridors, got {ours.shape[1]} and {theirs.shape[1]}")
-    parts = [(_by_corridors([ours, -theirs]), ours.shape[1] - 1)]
-    most = ours.shape[1] - 1
-    if min(len(ours), len(theirs)) > 1:
-        parts += [(_by_trainings(side), len(side) - 1) for side in (ours, theirs)]
-        most = len(ours) + len(theirs) - 2
     least = _least(ours, bounds) + _least(theirs, bounds)
     span = None if bounds is None else (bounds[0] - bounds[1], bounds[1] - bounds[0])
-    return _within(_tested(ours.mean() - theirs.mean(), parts, least, most), span)
+    return _within(_crossed([ours, -theirs], least), span)
 
 
 def _within(found: Difference, bounds: Interval | None) -> Difference:
@@ -218,16 +211,21 @@ def _least(values: np.ndarray, bounds: Interval | None, size: int | None = None)
     return (count * chance + sum((end - mean) ** 2 for end in bounds)) / (count + 2) ** 2
 
 
-def _tested(value: float, parts: Sequence[tuple[float, int]], least: float, most: int) -> Difference:
-    """Student's interval and two-sided test of a value; None where there are no degrees of freedom.
+def _crossed(sides: Sequence[np.ndarray], least: float) -> Difference:
+    """Student's interval and two-sided test of the sum of the sides' means, crossed with their corridors.
+
+    Where a side has one training, the degrees of freedom are those of the corridors; None without any.
 
     Args:
-        value: What is tested.
-        parts: As for `_error`, as `least` and `most`.
-        least: As there.
-        most: As there.
+        sides: Each of shape (trainings, corridors).
+        least: As for `_error`.
     """
-    value = float(value)
+    value = float(sum(side.mean() for side in sides))
+    most = corridors = sides[0].shape[1] - 1
+    parts = [(_by_corridors(sides), corridors)]
+    if min(map(len, sides)) > 1:
+        parts += [(_by_trainings(side), len(side) - 1) for side in sides]
+        most = sum(freedom for _, freedom in parts[1:])
     if most < 1:
         return Difference(value, None, None)
     error, freedom = _error(parts, least, most)
