@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from pydantic.dataclasses import dataclass
@@ -45,22 +44,12 @@ class Settings:
     policy: Name
 
 
-class Shown(NamedTuple):
-    """Who is shown, and in what.
-
-    Attributes:
-        policy: It.
-        env: The held-out corridors, with the filter and the vehicle of the policy's training.
-        agent: It acts by its likeliest or its drawn actions, as `evaluate.action` says.
-    """
-
-    policy: EvaluatedPolicy
-    env: EnvConfig
-    agent: PolicyAgent
-
-
-def find_shown(config: Config) -> Shown:
+def find_shown(config: Config) -> tuple[EvaluatedPolicy, EnvConfig, PolicyAgent]:
     """Find the policy and the environment that `config` asks for.
+
+    Returns:
+        The policy; the held-out corridors, with the filter and the vehicle of its training; and its agent,
+        which acts by its likeliest or its drawn actions, as `evaluate.action` says.
 
     Raises:
         ConfigError: There is no such policy.
@@ -70,7 +59,7 @@ def find_shown(config: Config) -> Shown:
     env = with_own_parts(policy, asked)
     if env.vehicle != asked.vehicle:
         env = at_own_pace(policy, env)
-    return Shown(policy, env, PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic"))
+    return policy, env, PolicyAgent(load_policy(policy.agent), config.evaluate.action == "stochastic")
 
 
 def at_own_pace(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jobs.analysis.statistics import Difference, Estimate, holm
+from jobs.analysis.statistics import Difference, Estimate, Interval, holm
 from jobs.analysis.tables import estimate_metrics, estimate_text, markdown_table, percent_text, short
 from jobs.measure.measured import name_of
 from jobs.run.provenance import Provenance
@@ -131,20 +131,16 @@ def on_front(rows: Sequence[TradedSetting]) -> list[bool]:
         and not any(
             other.known_error is not None
             and other.known_error <= row.event_error
-            and _low(other.speed) > _high(row.speed)
+            and _ends(other.speed)[0] > _ends(row.speed)[1]
             for other in rows
         )
         for row in rows
     ]
 
 
-def _low(speed: Estimate) -> float:
-    """Lower end of a speed's interval; of a single timing nothing is known."""
-    return 0.0 if speed.interval is None else speed.interval[0]
-
-
-def _high(speed: Estimate) -> float:
-    return float("inf") if speed.interval is None else speed.interval[1]
+def _ends(speed: Estimate) -> Interval:
+    """Return the interval of a speed; of a single timing nothing is known."""
+    return speed.interval or (0.0, float("inf"))
 
 
 def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
@@ -155,7 +151,7 @@ def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
         for group, outcome in row.outcomes.items():
             numbers = (
                 outcome.trainings, outcome.episodes, row.steps_per_s,
-                row.speed.value, _low(row.speed), _high(row.speed),
+                row.speed.value, *_ends(row.speed),
                 row.known_error, row.latent_error, outcome.other_action,
                 outcome.success.value, *(outcome.success.interval or (0.0, 1.0)),
                 outcome.difference.value, *(outcome.difference.interval or (-1.0, 1.0)),
@@ -251,7 +247,7 @@ class Choice(NamedTuple):
     @property
     def is_faster(self) -> bool:
         """Beyond doubt, in each scene."""
-        return all(_low(row.speed) > 1.0 for row in self.rows)
+        return all(_ends(row.speed)[0] > 1.0 for row in self.rows)
 
 
 def choices(rows: Sequence[TradedSetting]) -> list[Choice]:
@@ -333,14 +329,8 @@ def trade_page(about: TradeFacts, rows: Sequence[TradedSetting]) -> str:
 
 def advice_table(advice: Advice, every: Sequence[Choice]) -> str:
     """Return a row for the default, each setting that the advice names, and the most exact one."""
-    named = [
-        advice.fastest,
-        advice.encoder,
-        advice.coarsest,
-        *advice.cameras,
-        *advice.worse,
-        *advice.undecided,
-    ]
+    best = [advice.fastest, advice.encoder, advice.coarsest]
+    named = [*best, *advice.cameras, *advice.worse, *advice.undecided]
     shown = [one for one in every if one in named or one in (every[0], every[-1])]
     scenes = [row.scene for row in every[0].rows]
     columns = ("speed", "events that differ [%]", "success [points]")

@@ -166,9 +166,8 @@ def find_policies(
     if name in BASELINES:
         return [read_policy(name)]
     path = named_policy(name) or named_policy(str(pretrained / name))
-    if path is not None:
-        return [read_policy(str(path))]
-    trainings = [path for path in published if re.fullmatch(re.escape(name) + r"-s\d+", path.name)]
+    group = [path for path in published if re.fullmatch(re.escape(name) + r"-s\d+", path.name)]
+    trainings = group if path is None else [path]
     if not trainings:
         places = "a name or a group in models/pretrained, a policy folder or a run folder"
         raise ConfigError(
