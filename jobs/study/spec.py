@@ -167,13 +167,16 @@ def _family(name: str, said: Section, tags: Mapping[str, Section], results: Resu
             f"study.families.{name}.account: must be one of {ACCOUNTS}, got {said['account']!r}"
         )
     alias = {there: here for here, there in said.get("as", {}).items()}
-    known = {alias.get(group, group): own for group, own in tags.items() if group not in said.get("as", {})}
+    known = {
+        group: {**own, "group": alias.get(group, group)}
+        for group, own in tags.items()
+        if group not in said.get("as", {})
+    }
     first = {"first": results.trained[0]} if results.trained else {}
     expanded = _expand(said, first, results) if "contrasts" in said else ()
     if said.get("account", "planned") == "other":
         expanded = filter(None, map(other_account, expanded))
-    contrasts = [_contrast(name, one, known, {there: here for here, there in alias.items()}, results)
-                 for one in expanded]  # fmt: skip
+    contrasts = [_contrast(name, one, known, results) for one in expanded]
     if "pairs" in said:
         contrasts += _all_pairs(said["pairs"], results)
     return Family(
@@ -229,20 +232,14 @@ def _filled(value: Any, values: Section) -> Any:
     return values[value[1:-1]] if value[1:-1] in values else PLACE.sub(lambda at: str(values[at[1]]), value)
 
 
-def _contrast(
-    family: str,
-    said: Section,
-    tags: Mapping[str, Section],
-    alias: Mapping[str, str],
-    results: Results,
-) -> Contrast | None:
+def _contrast(family: str, said: Section, tags: Mapping[str, Section], results: Results) -> Contrast | None:
     """Return a test; None where the study lacks one of its groups."""
     wrong = [key for key in said if key not in KEYS]
     if wrong or "ours" not in said:
         raise ConfigError(
             f"study.families.{family}: a test has `ours` and some of {KEYS}, got {dict(said)!r}"
         )
-    sides = [_side(said, key, tags, alias, results) for key in ("ours", "theirs") if key in said]
+    sides = [_side(said, key, tags, results) for key in ("ours", "theirs") if key in said]
     if None in sides:
         return None
     ours, *theirs = [side for side in sides if side is not None]
@@ -251,25 +248,17 @@ def _contrast(
                     said.get("measure", "success"), PAIRED[pair])  # fmt: skip
 
 
-def _side(
-    said: Section,
-    key: str,
-    tags: Mapping[str, Section],
-    alias: Mapping[str, str],
-    results: Results,
-) -> Side | None:
+def _side(said: Section, key: str, tags: Mapping[str, Section], results: Results) -> Side | None:
     side = said[key] if isinstance(said[key], Mapping) else {"group": said[key]}
     wanted = {name: value for name, value in side.items() if name not in ("at", "less")}
     found = [
-        group
-        for group, own in tags.items()
-        if all((group if name == "group" else own.get(name)) == value for name, value in wanted.items())
+        group for group, own in tags.items() if all(own.get(name) == value for name, value in wanted.items())
     ]
     if len(found) > 1:
         raise ConfigError(f"study.families: a side must select one group, {wanted} selects {found}")
     if not found:
         return None
-    group = alias.get(found[0], found[0])
+    (group,) = found
     at = _conditions(side.get("at", said.get("at", "all")), group, results)
     less = side.get("less", said.get("less"))
     if less == "baseline":  # a condition that is its own baseline changes nothing
