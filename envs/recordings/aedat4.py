@@ -36,6 +36,7 @@ EDGES = {
     5: (1, -1),
 }  # of a type: channel (1 is the generator), edge
 BROKEN = (struct.error, ElementTree.ParseError, UnicodeDecodeError, OSError, ValueError)
+DAMAGED = "is damaged or no AEDAT 4.0 file ({}); copy or record it again"
 
 
 class Stream(NamedTuple):
@@ -94,32 +95,22 @@ def read_layout(request: Request) -> Layout:
         ValueError: The header is damaged.
     """
     size = request.path.stat().st_size
-    try:
-        with request.path.open("rb") as file:
-            file.seek(len(MAGIC_4))
-            (length,) = struct.unpack("<I", file.read(4))
-            start = len(MAGIC_4) + 4 + length
-            if not 0 < length <= min(MAX_HEADER_BYTES, size - len(MAGIC_4) - 4):
-                raise ValueError(f"its header declares {length} bytes")
-            head = root(file.read(length))
-            codec, end = CODECS.get(int(head.scalar(0, "i", 0))), int(head.scalar(1, "q", -1))
-            streams = list(_streams(head))
-            if end == -1 or end >= size:  # without a table of packets, or cut off before it
-                return Layout(codec, streams, start, size, end == -1)
-            if end < start:
-                raise ValueError(f"its table of packets should be at byte {end} of {size}")
-            file.seek(end)
-            _unpacked(file.read(), codec, PACKET_TABLE)
-    except BROKEN as error:
-        raise _damaged(request, error) from None
+    with request.refusing(BROKEN, DAMAGED), request.path.open("rb") as file:
+        file.seek(len(MAGIC_4))
+        (length,) = struct.unpack("<I", file.read(4))
+        start = len(MAGIC_4) + 4 + length
+        if not 0 < length <= min(MAX_HEADER_BYTES, size - len(MAGIC_4) - 4):
+            raise ValueError(f"its header declares {length} bytes")
+        head = root(file.read(length))
+        codec, end = CODECS.get(int(head.scalar(0, "i", 0))), int(head.scalar(1, "q", -1))
+        streams = list(_streams(head))
+        if end == -1 or end >= size:  # without a table of packets, or cut off before it
+            return Layout(codec, streams, start, size, end == -1)
+        if end < start:
+            raise ValueError(f"its table of packets should be at byte {end} of {size}")
+        file.seek(end)
+        _unpacked(file.read(), codec, PACKET_TABLE)
     return Layout(codec, streams, start, end, True)
-
-
-def _damaged(request: Request, error: Exception) -> ValueError:
-    """Return the refusal for an error in the walk."""
-    if str(error).startswith(str(request.path)):
-        return ValueError(str(error))
-    return request.refusal(f"is damaged or no AEDAT 4.0 file ({error}); copy or record it again")
 
 
 def choose(request: Request, streams: list[Stream], kind: bytes, tally: Tally) -> Stream:
@@ -158,12 +149,9 @@ def packets(
     Raises:
         ValueError: A packet is damaged, and is not the last.
     """
-    try:
-        with request.path.open("rb") as file:
-            file.seek(layout.start)
-            yield from _walk(file, layout, tally, kinds)
-    except BROKEN as error:
-        raise _damaged(request, error) from None
+    with request.refusing(BROKEN, DAMAGED), request.path.open("rb") as file:
+        file.seek(layout.start)
+        yield from _walk(file, layout, tally, kinds)
 
 
 def _walk(
@@ -241,23 +229,19 @@ def _unpacked(body: bytes, codec: str | None, kind: bytes) -> bytes:
 
 def _events(request: Request, buffer: bytes) -> np.ndarray:
     """Return the events of one flatbuffer `EventPacket`, copied, so that the rest of the packet is freed."""
-    try:
+    with request.refusing(BROKEN, DAMAGED):
         start, count = root(buffer).vector(0, PACKED_EVENT.itemsize)
-    except BROKEN as error:
-        raise _damaged(request, error) from None
     return np.frombuffer(buffer, PACKED_EVENT, count, start).copy()
 
 
 def _triggers(request: Request, buffer: bytes) -> np.ndarray:
     """Return the external triggers of one flatbuffer `TriggerPacket`."""
-    try:
+    with request.refusing(BROKEN, DAMAGED):
         rows = [
             (int(row.scalar(0, "q", 0)), *EDGES[int(row.scalar(1, "b", 0))])
             for row in root(buffer).tables(0)
             if int(row.scalar(1, "b", 0)) in EDGES
         ]
-    except BROKEN as error:
-        raise _damaged(request, error) from None
     return np.array(rows, TRIGGER)
 
 

@@ -17,6 +17,7 @@ from envs.recordings.ros_storage import Topic, is_bag_folder, messages, open_bag
 # One sample: us, m/s^2, rad/s, on the axes of the sensor.
 IMU = np.dtype([("t", "<i8"), ("acceleration", "<f4", 3), ("rotation", "<f4", 3)])
 G = 9.80665  # m/s^2
+BROKEN_FRAME = (*aedat4.BROKEN, KeyError)
 CHANNELS = {0: 1, 16: 3, 24: 4}  # of OpenCV's types, as DV stores frames
 ENCODINGS = {"mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3)}
 IMAGE, INERTIAL = "sensor_msgs/Image", "sensor_msgs/Imu"
@@ -106,7 +107,7 @@ def _packets4(request: Request, kind: bytes) -> Iterator[bytes]:
 def _frames4(request: Request) -> Iterator[Frame]:
     """Yield the frames of an AEDAT 4 file."""
     for buffer in _packets4(request, b"FRME"):
-        try:
+        with request.refusing(BROKEN_FRAME, "has a damaged frame ({}); copy or record it again"):
             table = root(buffer)
             t_us, begin_us, end_us = (int(table.scalar(number, "q", 0)) for number in (0, 3, 4))
             channels = CHANNELS[int(table.scalar(5, "b", 0))]
@@ -114,8 +115,6 @@ def _frames4(request: Request) -> Iterator[Frame]:
             start, count = table.vector(10, 1)
             if count != width * height * channels or not count:
                 raise ValueError(f"a frame of {width}x{height} has {count} bytes")
-        except (*aedat4.BROKEN, KeyError) as error:
-            raise request.refusal(f"has a damaged frame ({error}); copy or record it again") from None
         values = np.frombuffer(buffer, np.uint8, count, start).reshape(height, width, channels)
         is_exposed = 0 < begin_us <= end_us
         yield Frame(
@@ -128,13 +127,11 @@ def _frames4(request: Request) -> Iterator[Frame]:
 def _imu4(request: Request) -> Iterator[tuple[Any, ...]]:
     """Yield the inertial samples of an AEDAT 4 file, which are in g and degrees a second."""
     for buffer in _packets4(request, b"IMUS"):
-        try:
+        with request.refusing(aedat4.BROKEN, "has damaged samples ({}); copy or record it again"):
             for row in root(buffer).tables(0):
                 t_us = int(row.scalar(0, "q", 0))
                 values = np.array([row.scalar(number, "f", 0.0) for number in range(2, 8)])
                 yield t_us, values[:3] * G, np.deg2rad(values[3:])
-        except aedat4.BROKEN as error:
-            raise request.refusal(f"has damaged samples ({error}); copy or record it again") from None
 
 
 def _frames3(request: Request) -> Iterator[Frame]:
@@ -211,21 +208,17 @@ def _imu_ros(request: Request) -> Iterator[tuple[Any, ...]]:
 
 def _frames_hdf5(request: Request) -> Iterator[Frame]:
     """Yield the images of an HDF5 file in the layout of MVSEC."""
-    try:
-        with opened(request.path) as file:
-            group = request.group or next((name for name in HDF5_IMAGES if f"{name}/image_raw" in file), "")
-            if not group:
-                raise NoFramesError(
-                    f"{request.path}: has no images at {' or '.join(HDF5_IMAGES)}/image_raw; give group"
-                )
-            check_plain(file, f"{group}/image_raw", 3)
-            check_plain(file, f"{group}/image_raw_ts", 1)
-            for t_s, values in zip(file[f"{group}/image_raw_ts"][:], file[f"{group}/image_raw"], strict=True):
-                yield Frame(round(1e6 * float(t_s)), 0, np.asarray(values))
-    except NoFramesError:
-        raise
-    except ERRORS as error:
-        raise request.refusal(f"has no readable images ({error}); give group, or another file") from None
+    rule = "has no readable images ({}); give group, or another file"
+    with request.refusing(ERRORS, rule), opened(request.path) as file:
+        group = request.group or next((name for name in HDF5_IMAGES if f"{name}/image_raw" in file), "")
+        if not group:
+            raise NoFramesError(
+                f"{request.path}: has no images at {' or '.join(HDF5_IMAGES)}/image_raw; give group"
+            )
+        check_plain(file, f"{group}/image_raw", 3)
+        check_plain(file, f"{group}/image_raw_ts", 1)
+        for t_s, values in zip(file[f"{group}/image_raw_ts"][:], file[f"{group}/image_raw"], strict=True):
+            yield Frame(round(1e6 * float(t_s)), 0, np.asarray(values))
 
 
 FRAMES = {"aedat3": _frames3, "aedat4": _frames4, "hdf5": _frames_hdf5, "ros": _frames_ros}

@@ -6,6 +6,7 @@ What the file contains beside good events is counted in a `Tally`. An error is o
 names the file, the rule and the remedy.
 """
 
+import contextlib
 import dataclasses
 import stat
 from collections import Counter
@@ -151,6 +152,24 @@ class Request:
         """Return the error for a file that breaks a rule."""
         return ValueError(f"{self.path}: {rule}")
 
+    @contextlib.contextmanager
+    def refusing(self, errors: tuple[type[Exception], ...], rule: str) -> Iterator[None]:
+        """Turn errors of libraries into the refusal of the file; one that is a refusal already goes on.
+
+        Args:
+            errors: The types of the errors.
+            rule: The rule that the file breaks, with `{}` where the error says what is wrong.
+
+        Raises:
+            ValueError: There was such an error.
+        """
+        try:
+            yield
+        except errors as error:
+            if isinstance(error, ValueError) and str(error).startswith(str(self.path)):
+                raise
+            raise self.refusal(rule.format(error)) from None
+
     def check_count(self, count: int) -> int:
         """Return the number of events, if it may be read.
 
@@ -251,17 +270,6 @@ def check_declared(path: Path, name: str, declared_bytes: int) -> None:
         raise ValueError(
             f"{name} declares {declared_bytes} bytes in a file of {size}; copy or record it again"
         )
-
-
-def check_options(path: Path, format: str, given: dict[str, object], known: tuple[str, ...]) -> None:
-    """Refuse an option that has no effect on a format.
-
-    Raises:
-        ValueError: An option that is not None is not among `known`.
-    """
-    for name, value in given.items():
-        if value is not None and name not in known:
-            raise ValueError(f"{path}: {name}={value!r} has no effect on {format} files; leave {name} out")
 
 
 def whole_entries(request: Request, tally: Tally, size: int, entry: int) -> int:

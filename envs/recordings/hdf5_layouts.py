@@ -28,6 +28,7 @@ from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
 from envs.recordings.npz import table_order
 
 NOISE = "events/is_noise"  # labels, where there are any
+UNREADABLE = "is no readable HDF5 event file ({}); copy or write it again"
 FIRST_ROWS = 1 << 16
 
 
@@ -87,31 +88,21 @@ def read_hdf5(request: Request) -> Opened:
         ValueError: It has no layout that is known, is truncated, links to other files, or declares more
             than `max_events`.
     """
-    try:
-        with opened(request.path) as file:
-            if "CD" in file and request.group is None:
-                request = request.sized(*_said_size(file, "CD"))
-                return Opened("hdf5", request, (tally := Tally()), _metavision(request, tally))
-            found, others = find(request, file)
-            count = len(file[found.paths[0]])
-            request.check_declared(count)
-            for path in dict.fromkeys(found.paths):
-                if found.fields[0] is None and declared_length(file, path, max(count, 1 << 62)) != count:
-                    raise ValueError(f"{path} and {found.paths[0]} differ in length")
-            request = _sized(request, file, found)
-    except ERRORS as error:
-        raise _refused(request, error) from None
+    with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
+        if "CD" in file and request.group is None:
+            request = request.sized(*_said_size(file, "CD"))
+            return Opened("hdf5", request, (tally := Tally()), _metavision(request, tally))
+        found, others = find(request, file)
+        count = len(file[found.paths[0]])
+        request.check_declared(count)
+        for path in dict.fromkeys(found.paths):
+            if found.fields[0] is None and declared_length(file, path, max(count, 1 << 62)) != count:
+                raise ValueError(f"{path} and {found.paths[0]} differ in length")
+        request = _sized(request, file, found)
     tally = Tally()
     if others:
         tally.notes.append(f"events of {found.group} are read; group= chooses another of {', '.join(others)}")
     return Opened("hdf5", request, tally, _parts(request, tally, found, count))
-
-
-def _refused(request: Request, error: Exception) -> ValueError:
-    """Return the refusal for an error of the library."""
-    if str(error).startswith(str(request.path)):
-        return ValueError(str(error))
-    return request.refusal(f"is no readable HDF5 event file ({error}); copy or write it again")
 
 
 def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
@@ -246,34 +237,28 @@ def _first_rows(file: h5py.File, path: str) -> np.ndarray:
 
 def _metavision(request: Request, tally: Tally) -> Iterator[Part]:
     """Yield the events of a file in Metavision's layout."""
-    try:
-        with opened(request.path) as file:
-            yield from metavision_parts(request, tally, file)
-    except ERRORS as error:
-        raise _refused(request, error) from None
+    with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
+        yield from metavision_parts(request, tally, file)
 
 
 def _parts(request: Request, tally: Tally, found: Found, count: int) -> Iterator[Part]:
     """Yield the events where they were found."""
-    try:
-        with opened(request.path) as file:
-            for path in dict.fromkeys(found.paths):
-                check_plain(file, path, 2 if isinstance(found.fields[0], int) else 1)
-            offset = _offset(file, found)
-            has_labels = found.group == "events" and file.get(NOISE, getlink=True) is not None
-            if has_labels and declared_length(file, NOISE, max(count, 1 << 62)) != count:
-                raise ValueError("it must have one is_noise of 0 or 1 for each event")
-            for first in range(0, count, request.part_events):
-                rows = slice(first, min(count, first + request.part_events))
-                if is_cut(file):
-                    reads = [partial(read_rows, file[path]) for path in dict.fromkeys(found.paths)]
-                    rows = until_cut(tally, rows, *reads)
-                labels = _labels(file, rows) if has_labels else None
-                yield _part(request, tally, file, found, rows, offset, labels)
-                if tally.damage[CUT_PACKETS]:
-                    return
-    except ERRORS as error:
-        raise _refused(request, error) from None
+    with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
+        for path in dict.fromkeys(found.paths):
+            check_plain(file, path, 2 if isinstance(found.fields[0], int) else 1)
+        offset = _offset(file, found)
+        has_labels = found.group == "events" and file.get(NOISE, getlink=True) is not None
+        if has_labels and declared_length(file, NOISE, max(count, 1 << 62)) != count:
+            raise ValueError("it must have one is_noise of 0 or 1 for each event")
+        for first in range(0, count, request.part_events):
+            rows = slice(first, min(count, first + request.part_events))
+            if is_cut(file):
+                reads = [partial(read_rows, file[path]) for path in dict.fromkeys(found.paths)]
+                rows = until_cut(tally, rows, *reads)
+            labels = _labels(file, rows) if has_labels else None
+            yield _part(request, tally, file, found, rows, offset, labels)
+            if tally.damage[CUT_PACKETS]:
+                return
 
 
 def _part(

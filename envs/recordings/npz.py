@@ -4,6 +4,7 @@ Arrays are found by their names. Nothing is unpickled, and nothing is unpacked b
 to be sound. Columns are read side by side, in parts.
 """
 
+import contextlib
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ MAX_HEADER_BYTES = 1 << 16
 NOISE = "is_noise"  # an array that labels each event, if there is one
 ROWS = 4  # columns of a table
 BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
+UNREADABLE = "is no readable array file ({}); copy or save it again"
 # Sizes of the data sets whose files do not say them, by the name of their array.
 SIZES = {"event_data": (640, 480)}  # N-ImageNet
 SECONDS = ("events_t",)  # names of times in seconds: EVIMO 2
@@ -68,19 +70,20 @@ def read_npz(request: Request) -> Opened:
     if not any(name.endswith(".npy") for name in members) and len(texts) == 1:
         opened = read_text(request, members[texts[0]])
     else:
-        try:
-            arrays = {
-                name.removesuffix(".npy"): _header(request, name.removesuffix(".npy"), open_bytes)
-                for name, open_bytes in members.items()
-                if name.endswith(".npy")
-            }
-            opened = _opened(request, "npz", arrays)
-        except BROKEN as error:
-            if is_cut and str(error).startswith(str(request.path)):
+        with request.refusing(BROKEN, UNREADABLE):
+            try:
+                arrays = {
+                    name.removesuffix(".npy"): _header(request, name.removesuffix(".npy"), open_bytes)
+                    for name, open_bytes in members.items()
+                    if name.endswith(".npy")
+                }
+                opened = _opened(request, "npz", arrays)
+            except BROKEN as error:
+                if not (is_cut and str(error).startswith(str(request.path))):
+                    raise
                 raise request.refusal(
                     f"was cut off before the end of its columns ({', '.join(members)}); copy it again"
                 ) from None
-            raise _broken(request, error) from None
     opened.tally.damage.update({CUT_TABLE: 1} if is_cut else {})
     return opened
 
@@ -91,30 +94,22 @@ def read_npy(request: Request) -> Opened:
     Raises:
         ValueError: As `read_npz`.
     """
-    try:
+    with request.refusing(BROKEN, UNREADABLE):
         array = _header(request, "rows", lambda: request.path.open("rb"))
         return _opened(request, "npy", {"rows": array})
-    except BROKEN as error:
-        raise _broken(request, error) from None
-
-
-def _broken(request: Request, error: Exception) -> ValueError:
-    """Return the refusal for an error of a library."""
-    if str(error).startswith(str(request.path)):
-        return ValueError(str(error))
-    return request.refusal(f"is no readable array file ({error}); copy or save it again")
 
 
 def _members(request: Request) -> tuple[dict[str, Callable[[], IO[bytes]]], bool]:
     """Return functions that open the members of a zip file, and whether it was cut off."""
-    try:
-        archive = zipfile.ZipFile(request.path)
-        return {name: _opener(archive, name) for name in archive.namelist()}, False
-    except BROKEN as error:
-        found = cut_members(request.path)
-        if not found:
-            raise _broken(request, error) from None
-        return found, True
+    with request.refusing(BROKEN, UNREADABLE):
+        try:
+            archive = zipfile.ZipFile(request.path)
+            return {name: _opener(archive, name) for name in archive.namelist()}, False
+        except BROKEN:
+            found = cut_members(request.path)
+            if not found:
+                raise
+            return found, True
 
 
 def _opener(archive: zipfile.ZipFile, name: str) -> Callable[[], IO[bytes]]:
@@ -299,8 +294,8 @@ def _parts(
 ) -> Iterator[Part]:
     """Yield the events; the arrays are read side by side."""
     used = used if noise is None else [*used, noise]
-    files = [array.open() for array in used]
-    try:
+    with request.refusing(BROKEN, UNREADABLE), contextlib.ExitStack() as stack:
+        files = [stack.enter_context(array.open()) for array in used]
         for file, array in zip(files, used, strict=True):
             _shape(request, file, array.name)
         for first in range(0, count, request.part_events):
@@ -310,11 +305,6 @@ def _parts(
         for file, array in zip(files, used, strict=True):
             if file.read(1):
                 raise request.refusal(f"array {array.name} contains more than it declares; save it again")
-    except BROKEN as error:
-        raise _broken(request, error) from None
-    finally:
-        for file in files:
-            file.close()
 
 
 def _side_by_side(

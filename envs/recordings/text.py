@@ -1,5 +1,6 @@
 """Read text and CSV files of events, one event a line."""
 
+import contextlib
 import io
 import re
 import warnings
@@ -136,24 +137,15 @@ def _is_whole(line: str, table: Table, columns: list[int]) -> bool:
         return not line.strip()
 
 
-class _refusing:
+@contextlib.contextmanager
+def _refusing(request: Request) -> Iterator[None]:
     """Turn errors of numpy and of the decoder into a refusal of the file."""
-
-    def __init__(self, request: Request) -> None:
-        self._request = request
-
-    def __enter__(self) -> None:
-        """Do nothing."""
-
-    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
-        """Raise the refusal."""
-        if isinstance(error, UnicodeDecodeError):
-            raise self._request.refusal(
+    with request.refusing((ValueError,), "has a line that is no row of numbers ({}); repair or remove it"):
+        try:
+            yield
+        except UnicodeDecodeError as error:
+            raise request.refusal(
                 f"is not UTF-8 text ({error.reason} at byte {error.start}); give the format"
-            ) from None
-        if isinstance(error, ValueError) and not str(error).startswith(str(self._request.path)):
-            raise self._request.refusal(
-                f"has a line that is no row of numbers ({error}); repair or remove it"
             ) from None
 
 
