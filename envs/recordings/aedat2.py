@@ -5,15 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from envs.recordings.clocks import unwrap
-from envs.recordings.event_file import (
-    TRIGGER,
-    Opened,
-    Part,
-    Request,
-    Tally,
-    assemble,
-    whole_entries,
-)
+from envs.recordings.event_file import TRIGGER, Opened, Part, Request, assemble, whole_entries
 from envs.recordings.mapped import mapped_parts
 
 MAGIC_2 = b"#!AER-DAT2"
@@ -38,15 +30,14 @@ def read_aedat2(request: Request) -> Opened:
         ValueError: An unknown camera.
     """
     start, chip = _header(request)
-    tally = Tally()
-    count = whole_entries(request, tally, request.path.stat().st_size - start, ENTRY.itemsize)
+    count = whole_entries(request, request.path.stat().st_size - start, ENTRY.itemsize)
     request.check_declared(count)
     width, height, is_davis = _camera(request, chip, start, count)
     request = request.sized(width, height)
-    return Opened("aedat2", request, tally, _parts(request, tally, start, count, is_davis))
+    return Opened("aedat2", request, _parts(request, start, count, is_davis))
 
 
-def _parts(request: Request, tally: Tally, start: int, count: int, is_davis: bool) -> Iterator[Part]:
+def _parts(request: Request, start: int, count: int, is_davis: bool) -> Iterator[Part]:
     """Yield the events of entries of 8 bytes."""
     last_us, width, height = -1, request.width or 0, request.height or 0
     for body in mapped_parts(request, start, ENTRY, count):
@@ -56,14 +47,14 @@ def _parts(request: Request, tally: Tally, start: int, count: int, is_davis: boo
         external = address & DAVIS_SPECIAL == 0x400 if is_davis else ~is_event
         triggers = np.zeros(np.count_nonzero(external), TRIGGER)
         triggers["t"] = t_us[external]
-        tally.skipped += int(np.count_nonzero(~is_event))
+        request.tally.skipped += int(np.count_nonzero(~is_event))
         address, t_us = address[is_event], t_us[is_event]
         if is_davis:
             x, y, p = address >> 12 & 1023, address >> 22 & 511, address >> 11 & 1
         else:
             x, y, p = address >> 1 & 127, address >> 8 & 127, 1 - (address & 1)
         x, y = (width - 1 - x.astype(np.int64)) & 0xFFFF, (height - 1 - y.astype(np.int64)) & 0xFFFF
-        yield Part(assemble(request, tally, t_us, x, y, p)[0], None, triggers)
+        yield assemble(request, t_us, x, y, p, triggers=triggers)
 
 
 def _header(request: Request) -> tuple[int, str]:

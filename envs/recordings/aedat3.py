@@ -5,20 +5,11 @@ From the format's description (inivation.github.io, "AEDAT file formats") and li
 
 import struct
 from collections.abc import Iterator
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import (
-    CUT,
-    CUT_PACKETS,
-    TRIGGER,
-    Opened,
-    Part,
-    Request,
-    Tally,
-    assemble,
-)
+from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Opened, Part, Request, assemble
 
 MAGIC_3 = b"#!AER-DAT3"
 MAX_HEADER_BYTES = 1 << 20
@@ -55,18 +46,18 @@ def read_aedat3(request: Request) -> Opened:
     Raises:
         ValueError: The header has no end, the format is not RAW, or there is no such source.
     """
-    header, tally = read_header(request), Tally()
+    header = read_header(request)
     sources = sorted(header.sources)
     if request.stream is not None and request.stream not in sources:
         raise request.refusal(f"has no source {request.stream}; give stream as one of {header.sources}")
     if len(sources) > 1 and request.stream is None:
-        tally.notes.append(f"source {sources[0]} is read of {header.sources}; stream= chooses")
+        request.tally.notes.append(f"source {sources[0]} is read of {header.sources}; stream= chooses")
     source = request.stream if request.stream is not None else next(iter(sources), None)
     name = header.sources.get(source, "").upper() if source is not None else ""
     size = next(((w, h) for known, w, h in SIZES if name.startswith(known)), (None, None))
     if None not in size:
         request = request.sized(*size)
-    return Opened("aedat3", request, tally, _parts(request, tally, header, source))
+    return Opened("aedat3", request, _parts(request, header, source))
 
 
 def read_header(request: Request) -> Header:
@@ -100,13 +91,13 @@ def read_header(request: Request) -> Header:
     return Header(start, sources, from_below)
 
 
-def packets(request: Request, header: Header, tally: Tally) -> Iterator[tuple[int, int, int, bytes]]:
+def packets(request: Request, header: Header) -> Iterator[tuple[int, int, int, bytes]]:
     """Yield type, source, turns of the clock [2**31 us] and body of each packet."""
     with request.path.open("rb") as file:
         file.seek(header.start)
         while head := file.read(PACKET.size):
             if len(head) < PACKET.size:
-                tally.damage[CUT] += len(head)
+                request.tally.damage[CUT] += len(head)
                 return
             kind, source, size, _, turns, _, number, _ = PACKET.unpack(head)
             if min(size, number, turns, kind) < 0 or size * number > MAX_PACKET_BYTES:
@@ -114,54 +105,44 @@ def packets(request: Request, header: Header, tally: Tally) -> Iterator[tuple[in
                     f"is damaged: a packet at byte {file.tell() - PACKET.size} declares {number} events of "
                     f"{size} bytes; copy or record it again"
                 )
-            yield from _body(file, tally, kind, source, turns, size, number)
+            body = file.read(size * number)
+            if len(body) < size * number:  # cut off: its whole events are read
+                request.tally.damage[CUT_PACKETS] += 1
+                body = body[: len(body) // size * size]
+            yield kind, source, turns, body
 
 
-def _body(
-    file: IO[bytes], tally: Tally, kind: int, source: int, turns: int, size: int, number: int
-) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yield a packet, or its whole events if it was cut off."""
-    body = file.read(size * number)
-    if len(body) < size * number:
-        tally.damage[CUT_PACKETS] += 1
-        body = body[: len(body) // size * size]
-    yield kind, source, turns, body
-
-
-def _parts(request: Request, tally: Tally, header: Header, source: int | None) -> Iterator[Part]:
+def _parts(request: Request, header: Header, source: int | None) -> Iterator[Part]:
     """Yield the events and triggers of one source."""
     some, triggers, count = [], [np.empty(0, TRIGGER)], 0
-    for kind, number, turns, body in packets(request, header, tally):
+    for kind, number, turns, body in packets(request, header):
         if source is not None and number != source:
             continue
         if kind not in (POLARITY, SPECIAL) or len(body) % WORD.itemsize:
-            tally.skipped += 1
+            request.tally.skipped += 1
             continue
         words = np.frombuffer(body, WORD)
         words = words[words["data"] & 1 == 1]
         t_us = words["t"].astype(np.int64) + (turns << 31)
         if kind == SPECIAL:
             triggers.append(_triggers(words["data"] >> 1 & 127, t_us))
-            tally.skipped += len(words)
+            request.tally.skipped += len(words)
             continue
         some.append(np.stack((words["data"].astype(np.int64), t_us)))
         count += len(words)
         if count >= request.part_events:
-            yield _part(request, tally, header, some, triggers)
+            yield _part(request, header, some, triggers)
             some, triggers, count = [], [np.empty(0, TRIGGER)], 0
-    yield _part(request, tally, header, some, triggers)
+    yield _part(request, header, some, triggers)
 
 
-def _part(
-    request: Request, tally: Tally, header: Header, some: list[np.ndarray], triggers: list[np.ndarray]
-) -> Part:
+def _part(request: Request, header: Header, some: list[np.ndarray], triggers: list[np.ndarray]) -> Part:
     """Return the words of some packets as one part."""
     data, t_us = np.concatenate([np.empty((2, 0), np.int64), *some], axis=1)
     y = data >> 2 & 0x7FFF
     if header.from_below:
         y = ((request.height or 1) - 1 - y) & 0xFFFF
-    events, _ = assemble(request, tally, t_us, data >> 17 & 0x7FFF, y, data >> 1 & 1)
-    return Part(events, None, np.concatenate(triggers))
+    return assemble(request, t_us, data >> 17 & 0x7FFF, y, data >> 1 & 1, triggers=np.concatenate(triggers))
 
 
 def _triggers(kinds: np.ndarray, t_us: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Opened, Part, Request, Tally, assemble
+from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Opened, Part, Request, assemble
 from envs.recordings.flatbuffer import Table, root
 
 MAGIC_4 = b"#!AER-DAT4.0\r\n"
@@ -80,12 +80,12 @@ def read_aedat4(request: Request) -> Opened:
     Raises:
         ValueError: A damaged header or packet, no stream of events, or a packet of more than 256 MiB.
     """
-    layout, tally = read_layout(request), Tally()
-    chosen = choose(request, layout.streams, EVENT_PACKET, tally)
+    layout = read_layout(request)
+    chosen = choose(request, layout.streams, EVENT_PACKET)
     if not layout.is_whole:
-        tally.damage[CUT_PACKETS] += 1
+        request.tally.damage[CUT_PACKETS] += 1
     request = request.sized(chosen.width, chosen.height)
-    return Opened("aedat4", request, tally, _parts(request, tally, layout, chosen))
+    return Opened("aedat4", request, _parts(request, layout, chosen))
 
 
 def read_layout(request: Request) -> Layout:
@@ -113,7 +113,7 @@ def read_layout(request: Request) -> Layout:
     return Layout(codec, streams, start, end, True)
 
 
-def choose(request: Request, streams: list[Stream], kind: bytes, tally: Tally) -> Stream:
+def choose(request: Request, streams: list[Stream], kind: bytes) -> Stream:
     """Return the stream of a kind that the caller names, else the first; a note names the others.
 
     Raises:
@@ -129,21 +129,18 @@ def choose(request: Request, streams: list[Stream], kind: bytes, tally: Tally) -
             f"its streams are {listing or 'none'}: give stream as one of that kind"
         )
     if len(found) > 1:
-        tally.notes.append(
+        request.tally.notes.append(
             f"stream {found[0].number} is read, and there are {len(found)}: {listing}; stream= chooses"
         )
     return found[0]
 
 
-def packets(
-    request: Request, layout: Layout, tally: Tally, kinds: dict[int, bytes]
-) -> Iterator[tuple[int, bytes]]:
+def packets(request: Request, layout: Layout, kinds: dict[int, bytes]) -> Iterator[tuple[int, bytes]]:
     """Yield stream numbers and flatbuffers of some streams.
 
     Args:
         request: The file.
         layout: Of its header.
-        tally: Counts what was cut off.
         kinds: Identifiers of the wanted streams, by number.
 
     Raises:
@@ -151,17 +148,17 @@ def packets(
     """
     with request.refusing(BROKEN, DAMAGED), request.path.open("rb") as file:
         file.seek(layout.start)
-        yield from _walk(file, layout, tally, kinds)
+        yield from _walk(request, file, layout, kinds)
 
 
 def _walk(
-    file: IO[bytes], layout: Layout, tally: Tally, kinds: dict[int, bytes]
+    request: Request, file: IO[bytes], layout: Layout, kinds: dict[int, bytes]
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the packets from where the file is."""
     place = layout.start
     while place < layout.end:
         if layout.end - place < 8:
-            tally.damage[CUT] += layout.end - place
+            request.tally.damage[CUT] += layout.end - place
             return
         number, size = struct.unpack("<ii", file.read(8))
         place += 8
@@ -172,7 +169,7 @@ def _walk(
                 raise ValueError(
                     f"the packet at byte {place - 8} declares {size} bytes and {layout.end - place} follow"
                 )
-            tally.damage.setdefault(CUT_PACKETS, 1)
+            request.tally.damage.setdefault(CUT_PACKETS, 1)
             return
         place += size
         if number in kinds:
@@ -181,31 +178,29 @@ def _walk(
             file.seek(place)
 
 
-def _parts(request: Request, tally: Tally, layout: Layout, chosen: Stream) -> Iterator[Part]:
+def _parts(request: Request, layout: Layout, chosen: Stream) -> Iterator[Part]:
     """Yield the events of a stream, with the triggers of all streams."""
     kinds = {stream.number: stream.kind for stream in layout.streams if stream.kind == TRIGGER_PACKET}
     kinds[chosen.number] = EVENT_PACKET
     some, triggers, count = [], [np.empty(0, TRIGGER)], 0
-    for number, buffer in packets(request, layout, tally, kinds):
+    for number, buffer in packets(request, layout, kinds):
         if number != chosen.number:
             triggers.append(_triggers(request, buffer))
-            tally.skipped += len(triggers[-1])
+            request.tally.skipped += len(triggers[-1])
             continue
         some.append(_events(request, buffer))
         count += len(some[-1])
         if count >= request.part_events:
-            yield _part(request, tally, some, triggers)
+            yield _part(request, some, triggers)
             some, triggers, count = [], [np.empty(0, TRIGGER)], 0
-    yield _part(request, tally, some, triggers)
+    yield _part(request, some, triggers)
 
 
-def _part(request: Request, tally: Tally, some: list[np.ndarray], triggers: list[np.ndarray]) -> Part:
+def _part(request: Request, some: list[np.ndarray], triggers: list[np.ndarray]) -> Part:
     """Return packets as one part."""
     packed = np.concatenate([np.empty(0, PACKED_EVENT), *some])
     on = (packed["on"] != 0).view(np.int8)
-    return Part(
-        assemble(request, tally, packed["t"], packed["x"], packed["y"], on)[0], None, np.concatenate(triggers)
-    )
+    return assemble(request, packed["t"], packed["x"], packed["y"], on, triggers=np.concatenate(triggers))
 
 
 def _unpacked(body: bytes, codec: str | None, kind: bytes) -> bytes:

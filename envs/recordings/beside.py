@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from envs.recordings import aedat3, aedat4
-from envs.recordings.event_file import MAX_BYTES, Request, Tally, check_file
+from envs.recordings.event_file import MAX_BYTES, Request, check_file
 from envs.recordings.flatbuffer import root
 from envs.recordings.formats import recognised
 from envs.recordings.hdf5_checks import ERRORS, check_plain, opened
@@ -99,8 +99,8 @@ def _packets4(request: Request, kind: bytes) -> Iterator[bytes]:
     layout = aedat4.read_layout(request)
     if not any(stream.kind == kind for stream in layout.streams):
         raise NoFramesError(f"{request.path}: has no stream of kind {kind.decode()}; give another file")
-    stream = aedat4.choose(request, layout.streams, kind, Tally())
-    for _, buffer in aedat4.packets(request, layout, Tally(), {stream.number: kind}):
+    stream = aedat4.choose(request, layout.streams, kind)
+    for _, buffer in aedat4.packets(request, layout, {stream.number: kind}):
         yield buffer
 
 
@@ -137,7 +137,7 @@ def _imu4(request: Request) -> Iterator[tuple[Any, ...]]:
 def _frames3(request: Request) -> Iterator[Frame]:
     """Yield the frames of an AEDAT 3 file, whose pixels have 16 bits."""
     header = aedat3.read_header(request)
-    for kind, _, turns, body in aedat3.packets(request, header, Tally()):
+    for kind, _, turns, body in aedat3.packets(request, header):
         if kind != aedat3.FRAME or len(body) < 36:
             continue
         info, _, _, begin, end, width, height, _, _ = np.frombuffer(body, "<i4", 9).tolist()
@@ -154,7 +154,7 @@ def _frames3(request: Request) -> Iterator[Frame]:
 def _imu3(request: Request) -> Iterator[tuple[Any, ...]]:
     """Yield the inertial samples of an AEDAT 3 file, which are in g and degrees a second."""
     row = np.dtype([("info", "<u4"), ("t", "<i4"), ("values", "<f4", 7)])
-    for kind, _, turns, body in aedat3.packets(request, aedat3.read_header(request), Tally()):
+    for kind, _, turns, body in aedat3.packets(request, aedat3.read_header(request)):
         if kind == aedat3.IMU6 and len(body) % row.itemsize == 0:
             for one in np.frombuffer(body, row):
                 if one["info"] & 1:

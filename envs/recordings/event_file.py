@@ -28,6 +28,7 @@ SMALL_BYTES = 1 << 26  # any file may unpack to as many
 PART_EVENTS = 1 << 22  # 55 MB
 
 TRIGGER = np.dtype([("t", "<i8"), ("channel", "<i2"), ("p", "i1")])  # us; +1 rising, -1 falling, 0 pulse
+NO_TRIGGERS = np.empty(0, TRIGGER)
 
 # Damage: why something is left out. Each is a count of `EventFile.damage`.
 OUTSIDE = "events outside the sensor"
@@ -74,7 +75,7 @@ class Part(NamedTuple):
 
     events: np.ndarray
     is_noise: np.ndarray | None = None
-    triggers: np.ndarray = np.empty(0, TRIGGER)
+    triggers: np.ndarray = NO_TRIGGERS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +133,7 @@ class Request:
         max_events: Most events that are read.
         part_events: Most events of a part, about.
         strict: Whether damage is refused.
+        tally: Counts of what is found; they grow while parts are read.
     """
 
     path: Path
@@ -147,6 +149,7 @@ class Request:
     max_events: int = MAX_EVENTS
     part_events: int = PART_EVENTS
     strict: bool = False
+    tally: Tally = dataclasses.field(default_factory=Tally)
 
     def refusal(self, rule: str) -> ValueError:
         """Return the error for a file that breaks a rule."""
@@ -219,13 +222,11 @@ class Opened:
     Attributes:
         format: Name of the format.
         request: The request, with the sensor's size from the file filled in.
-        tally: Counts that grow while parts are read.
         parts: The events in the order of the file, once.
     """
 
     format: str
     request: Request
-    tally: Tally
     parts: Iterator[Part]
 
 
@@ -272,20 +273,19 @@ def check_declared(path: Path, name: str, declared_bytes: int) -> None:
         )
 
 
-def whole_entries(request: Request, tally: Tally, size: int, entry: int) -> int:
+def whole_entries(request: Request, size: int, entry: int) -> int:
     """Return how many entries of `entry` bytes are whole in `size` bytes; count the bytes after them."""
     if size % entry:
-        tally.damage[CUT] += size % entry
+        request.tally.damage[CUT] += size % entry
     return size // entry
 
 
-def polarity(request: Request, values: np.ndarray, codes: set[int]) -> np.ndarray:
-    """Return polarities in {-1, +1}, int8, from either of the two codes in use.
+def polarity(request: Request, values: np.ndarray) -> np.ndarray:
+    """Return polarities in {-1, +1}, int8, from either of the two codes in use, of which a file has one.
 
     Args:
-        request: The file.
+        request: The file, whose tally tells the codes of OFF that were seen before.
         values: Numbers or booleans.
-        codes: Codes of OFF that were seen before; those of `values` are added.
 
     Raises:
         ValueError: The values are neither all in {0, 1} nor all in {-1, +1}.
@@ -297,26 +297,38 @@ def polarity(request: Request, values: np.ndarray, codes: set[int]) -> np.ndarra
         worst = values[~good][0]
         raise request.refusal(f"polarity must be coded as 0 and 1 or as -1 and 1, got {worst}; recode it")
     is_off = values <= 0
-    codes |= {int(code) for code in np.unique(values[is_off])}
-    if len(codes) > 1:
+    request.tally.codes.update(int(code) for code in np.unique(values[is_off]))
+    if len(request.tally.codes) > 1:
         raise request.refusal("polarity is coded as -1, 0 and 1 at once; recode it as 0 and 1")
     return np.where(is_off, np.int8(-1), np.int8(1))
 
 
 def assemble(
-    request: Request, tally: Tally, t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return an EVENT array from four columns of numbers of any type; t is already in microseconds.
+    request: Request,
+    t_us: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    p: np.ndarray,
+    is_noise: np.ndarray | None = None,
+    triggers: np.ndarray = NO_TRIGGERS,
+) -> Part:
+    """Return a part from columns of numbers of any type; t is already in microseconds.
 
     A row that is no event (a time that is not finite or outside [0, 2**52), a coordinate outside
     [0, 65536)) is left out and counted, unless more than a tenth of the rows are none.
 
-    Returns:
-        EVENT array, and bool (N,), which rows it has.
+    Args:
+        request: The file.
+        t_us: Times (N,) [us].
+        x: Columns of the sensor [px].
+        y: Its rows [px].
+        p: Polarities, in either code.
+        is_noise: Labels, 0 or 1; None: there are none.
+        triggers: TRIGGER array of the part.
 
     Raises:
-        ValueError: Too many rows are no event, a coordinate is fractional, or a polarity is not coded
-            in one of the two ways.
+        ValueError: Too many rows are no event, a coordinate is fractional, a polarity is not coded in one
+            of the two ways, or a label is neither 0 nor 1.
     """
     columns, good = {"t": t_us, "x": x, "y": y}, np.ones(len(t_us), bool)
     for name, limit in (("t", T_LIMIT_US), ("x", 65536), ("y", 65536)):
@@ -330,7 +342,7 @@ def assemble(
         good &= fits
         columns[name] = values
     if not good.all():
-        tally.damage[ROWS] += int(np.count_nonzero(~good))
+        request.tally.damage[ROWS] += int(np.count_nonzero(~good))
         columns = {name: values[good] for name, values in columns.items()}
     events = np.empty(np.count_nonzero(good), EVENT)
     for name, values in columns.items():
@@ -339,8 +351,15 @@ def assemble(
                 f"{name} must be whole pixels, event {int(np.argmax(values % 1 > 0))} is not; round them"
             )
         events[name] = np.rint(values) if values.dtype.kind == "f" else values
-    events["p"] = polarity(request, p if good.all() else p[good], tally.codes)
-    return events, good
+    events["p"] = polarity(request, p if good.all() else p[good])
+    return Part(events, None if is_noise is None else _labels(request, is_noise)[good], triggers)
+
+
+def _labels(request: Request, is_noise: np.ndarray) -> np.ndarray:
+    """Return labels as booleans."""
+    if not np.isin(is_noise, (0, 1)).all():
+        raise request.refusal("must have one is_noise of 0 or 1 for each event; repair or remove it")
+    return is_noise.astype(bool)
 
 
 def _refuse_column(request: Request, name: str, values: np.ndarray, fits: np.ndarray, limit: int) -> None:

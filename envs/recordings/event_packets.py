@@ -21,8 +21,8 @@ TIME_HIGH, TIME_LOW, ADDRESS_X, ADDRESS_Y, BASE_Y, VECTOR_8 = range(6)  # types 
 class PacketDecoder:
     """Collects packets, and decodes them together."""
 
-    def __init__(self, request: Request, tally: Tally) -> None:
-        self._request, self._tally = request, tally
+    def __init__(self, request: Request) -> None:
+        self._request = request
         self._words: dict[str, list[bytes]] = {}
         self._rows: list[np.ndarray] = [np.empty((4, 0), np.int64)]
         self._states: dict[str, np.ndarray] = {}
@@ -36,7 +36,7 @@ class PacketDecoder:
         if packet.encoding in WORDS:
             self._words.setdefault(packet.encoding, []).append(packet.body)
         elif packet.encoding in ROWS:
-            self._rows.append(ROWS[packet.encoding](packet, self._tally))
+            self._rows.append(ROWS[packet.encoding](packet, self._request.tally))
         else:
             known = ", ".join((*WORDS, *ROWS))
             raise self._request.refusal(
@@ -51,14 +51,14 @@ class PacketDecoder:
             dtype = np.dtype(WORDS[encoding])
             raw = b"".join(body[: len(body) // dtype.itemsize * dtype.itemsize] for body in bodies)
             words = np.frombuffer(raw, dtype)
-            parts = list(evt_parts(self._request, self._tally, encoding, words, states=self._states))
+            parts = list(evt_parts(self._request, encoding, words, states=self._states))
             return Part(
                 np.concatenate([np.empty(0, EVENT), *(part.events for part in parts)]),
                 None,
                 np.concatenate([np.empty(0, TRIGGER), *(part.triggers for part in parts)]),
             )
         rows, self._rows = np.concatenate(self._rows, axis=1), [np.empty((4, 0), np.int64)]
-        return Part(assemble(self._request, self._tally, *rows)[0])
+        return assemble(self._request, *rows)
 
 
 def _libcaer(packet: EventPacket, tally: Tally) -> np.ndarray:

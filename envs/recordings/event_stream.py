@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from envs.events import EVENT
-from envs.recordings.event_file import CUT, Opened, Part, Request, Tally
+from envs.recordings.event_file import CUT, Opened, Part, Request
 from envs.recordings.mapped import Mapped
 
 MAGIC_ES = b"Event Stream"
@@ -36,11 +36,11 @@ def read_es(request: Request) -> Opened:
             f"is of version {major} and type {kind}; types 1 (DVS) and 2 (ATIS) of version 2 are read: "
             "write it again as one of them"
         )
-    request, tally = request.sized(*np.frombuffer(head[16:], "<u2").tolist()), Tally()
-    return Opened("es", request, tally, _parts(request, tally, kind == ATIS))
+    request = request.sized(*np.frombuffer(head[16:], "<u2").tolist())
+    return Opened("es", request, _parts(request, kind == ATIS))
 
 
-def _parts(request: Request, tally: Tally, is_atis: bool) -> Iterator[Part]:
+def _parts(request: Request, is_atis: bool) -> Iterator[Part]:
     """Yield the events of a file after its header."""
     size = request.path.stat().st_size - HEADER_BYTES
     if not size:
@@ -50,13 +50,13 @@ def _parts(request: Request, tally: Tally, is_atis: bool) -> Iterator[Part]:
         events = np.empty(min(request.part_events, size // EVENT_BYTES + 1), EVENT)
         before = int(state[EXPOSURES])
         n = decode_es(mapped.values, is_atis, request.height or 0, state, events)
-        tally.skipped += int(state[EXPOSURES]) - before
+        request.tally.skipped += int(state[EXPOSURES]) - before
         yield Part(events[:n])
         mapped.forget(int(state[PLACE]))
         if n < len(events):
             break
     if state[PLACE] < size:
-        tally.damage[CUT] += size - int(state[PLACE])
+        request.tally.damage[CUT] += size - int(state[PLACE])
 
 
 @numba.njit(cache=True, error_model="numpy")

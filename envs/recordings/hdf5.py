@@ -18,7 +18,7 @@ import numpy as np
 
 from core.files import replaced
 from envs.events import EVENT
-from envs.recordings.event_file import Request, Tally, assemble, check_file, check_order
+from envs.recordings.event_file import Request, assemble, check_file, check_order
 from envs.recordings.hdf5_checks import ERRORS, attribute, check_own, check_plain, declared_length, opened
 
 MAX_EVENTS = 2_000_000_000
@@ -137,8 +137,7 @@ def _events(request: Request, file: h5py.File) -> np.ndarray:
         raise ValueError("events/t are no whole microseconds")
     t = t.astype(np.int64, copy=False)
     t += offset
-    tally = Tally()
-    rows, _ = assemble(request, tally, t, x, y, p)
-    if tally.damage:
-        raise ValueError(f"it has {dict(tally.damage)}")
+    rows = assemble(request, t, x, y, p).events
+    if request.tally.damage:
+        raise ValueError(f"it has {dict(request.tally.damage)}")
     return rows

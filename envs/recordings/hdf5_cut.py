@@ -11,7 +11,7 @@ from pathlib import Path
 
 import h5py
 
-from envs.recordings.event_file import CUT_PACKETS, Tally
+from envs.recordings.event_file import CUT_PACKETS, Request
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 END_AT = {0: 40, 1: 44, 2: 28, 3: 28}  # byte of the declared length, by the version of the first block
@@ -80,11 +80,11 @@ def declared_length(path: Path) -> int:
     return length if length < 1 << 63 else 0
 
 
-def until_cut(tally: Tally, rows: slice, *reads: Callable[[slice], object]) -> slice:
+def until_cut(request: Request, rows: slice, *reads: Callable[[slice], object]) -> slice:
     """Return the rows of a file that was cut off, up to the first that is missing, which is counted.
 
     Args:
-        tally: Where it is counted.
+        request: The file, in whose tally it is counted.
         rows: Rows to be read.
         reads: Each reads some rows of a data set.
     """
@@ -97,7 +97,7 @@ def until_cut(tally: Tally, rows: slice, *reads: Callable[[slice], object]) -> s
 
     if are_whole(rows):
         return rows
-    tally.damage[CUT_PACKETS] += 1
+    request.tally.damage[CUT_PACKETS] += 1
     first, stop = rows.start, rows.stop
     while stop > first:
         middle = (first + stop + 1) // 2

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from envs.recordings.event_file import CUT_PACKETS, Opened, Part, Request, Tally, assemble
+from envs.recordings.event_file import CUT_PACKETS, Opened, Part, Request, assemble
 from envs.recordings.hdf5_checks import (
     ERRORS,
     attribute,
@@ -91,7 +91,7 @@ def read_hdf5(request: Request) -> Opened:
     with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
         if "CD" in file and request.group is None:
             request = request.sized(*_said_size(file, "CD"))
-            return Opened("hdf5", request, (tally := Tally()), _metavision(request, tally))
+            return Opened("hdf5", request, _metavision(request))
         found, others = find(request, file)
         count = len(file[found.paths[0]])
         request.check_declared(count)
@@ -99,10 +99,11 @@ def read_hdf5(request: Request) -> Opened:
             if found.fields[0] is None and declared_length(file, path, max(count, 1 << 62)) != count:
                 raise ValueError(f"{path} and {found.paths[0]} differ in length")
         request = _sized(request, file, found)
-    tally = Tally()
     if others:
-        tally.notes.append(f"events of {found.group} are read; group= chooses another of {', '.join(others)}")
-    return Opened("hdf5", request, tally, _parts(request, tally, found, count))
+        request.tally.notes.append(
+            f"events of {found.group} are read; group= chooses another of {', '.join(others)}"
+        )
+    return Opened("hdf5", request, _parts(request, found, count))
 
 
 def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
@@ -235,13 +236,13 @@ def _first_rows(file: h5py.File, path: str) -> np.ndarray:
     return np.asarray(file[path][:FIRST_ROWS])
 
 
-def _metavision(request: Request, tally: Tally) -> Iterator[Part]:
+def _metavision(request: Request) -> Iterator[Part]:
     """Yield the events of a file in Metavision's layout."""
     with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
-        yield from metavision_parts(request, tally, file)
+        yield from metavision_parts(request, file)
 
 
-def _parts(request: Request, tally: Tally, found: Found, count: int) -> Iterator[Part]:
+def _parts(request: Request, found: Found, count: int) -> Iterator[Part]:
     """Yield the events where they were found."""
     with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
         for path in dict.fromkeys(found.paths):
@@ -254,16 +255,15 @@ def _parts(request: Request, tally: Tally, found: Found, count: int) -> Iterator
             rows = slice(first, min(count, first + request.part_events))
             if is_cut(file):
                 reads = [partial(read_rows, file[path]) for path in dict.fromkeys(found.paths)]
-                rows = until_cut(tally, rows, *reads)
-            labels = _labels(file, rows) if has_labels else None
-            yield _part(request, tally, file, found, rows, offset, labels)
-            if tally.damage[CUT_PACKETS]:
+                rows = until_cut(request, rows, *reads)
+            labels = np.asarray(file[NOISE][rows]) if has_labels else None
+            yield _part(request, file, found, rows, offset, labels)
+            if request.tally.damage[CUT_PACKETS]:
                 return
 
 
 def _part(
     request: Request,
-    tally: Tally,
     file: h5py.File,
     found: Found,
     rows: slice,
@@ -285,16 +285,7 @@ def _part(
     if t_us.dtype.kind in "iu" and len(t_us) and not 0 <= int(t_us.max()) + abs(offset) < 1 << 62:
         raise ValueError(f"{found.paths[0]} are not below 2**62 with their offset; shift them")
     t_us = t_us.astype(np.int64, copy=False) + offset if t_us.dtype.kind in "iu" else t_us + offset
-    events, good = assemble(request, tally, t_us, x, y, p)
-    return Part(events, None if labels is None else labels[good])
-
-
-def _labels(file: h5py.File, rows: slice) -> np.ndarray:
-    """Return labels of some events."""
-    labels = np.asarray(file[NOISE][rows])
-    if not np.isin(labels, (0, 1)).all():
-        raise ValueError("it must have one is_noise of 0 or 1 for each event")
-    return labels.astype(bool)
+    return assemble(request, t_us, x, y, p, labels)
 
 
 def _offset(file: h5py.File, found: Found) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 
 from envs.events import EVENT
 from envs.recordings.ecf import FILTER_ECF, MAX_CHUNK_EVENTS, decode_ecf
-from envs.recordings.event_file import CUT_PACKETS, TRIGGER, Part, Request, Tally, assemble, check_declared
+from envs.recordings.event_file import CUT_PACKETS, TRIGGER, Part, Request, assemble, check_declared
 from envs.recordings.hdf5_checks import check_chunks, check_own, filters, read_rows
 from envs.recordings.hdf5_cut import ERRORS as CUT_ERRORS
 from envs.recordings.hdf5_cut import is_cut, until_cut
@@ -16,7 +16,7 @@ from envs.recordings.hdf5_cut import is_cut, until_cut
 EVENTS, TRIGGERS = "CD/events", "EXT_TRIGGER/events"
 
 
-def metavision_parts(request: Request, tally: Tally, file: h5py.File) -> Iterator[Part]:
+def metavision_parts(request: Request, file: h5py.File) -> Iterator[Part]:
     """Yield the events of an open file, chunk by chunk, with its triggers first.
 
     Raises:
@@ -26,16 +26,16 @@ def metavision_parts(request: Request, tally: Tally, file: h5py.File) -> Iterato
     request.check_declared(len(data))
     check_declared(request.path, EVENTS, data.nbytes)
     triggers = _triggers(request, file)
-    tally.skipped += len(triggers)
+    request.tally.skipped += len(triggers)
     if FILTER_ECF not in filters(data):
         check_chunks(data, EVENTS)
         for first in range(0, len(data), request.part_events):
             rows = slice(first, min(len(data), first + request.part_events))
             if is_cut(file):
-                rows = until_cut(tally, rows, partial(read_rows, data))
-            yield Part(_assembled(request, tally, data[rows]), None, triggers)
+                rows = until_cut(request, rows, partial(read_rows, data))
+            yield _assembled(request, data[rows])._replace(triggers=triggers)
             triggers = triggers[:0]
-            if tally.damage[CUT_PACKETS]:
+            if request.tally.damage[CUT_PACKETS]:
                 return
         return
     if filters(data) != [FILTER_ECF] or data.chunks[0] > MAX_CHUNK_EVENTS:
@@ -43,10 +43,10 @@ def metavision_parts(request: Request, tally: Tally, file: h5py.File) -> Iterato
     chunks = max(1, request.part_events // data.chunks[0])
     for first in range(0, len(data), chunks * data.chunks[0]):
         places = range(first, min(len(data), first + chunks * data.chunks[0]), data.chunks[0])
-        some = [np.empty(0, EVENT), *_chunks(request, tally, file, places)]
+        some = [np.empty(0, EVENT), *_chunks(request, file, places)]
         yield Part(np.concatenate(some), None, triggers)
         triggers = triggers[:0]
-        if tally.damage[CUT_PACKETS]:
+        if request.tally.damage[CUT_PACKETS]:
             return
 
 
@@ -65,9 +65,9 @@ def _rows(file: h5py.File, name: str, fields: str | tuple[str, ...]) -> h5py.Dat
     return data
 
 
-def _assembled(request: Request, tally: Tally, rows: np.ndarray) -> np.ndarray:
+def _assembled(request: Request, rows: np.ndarray) -> Part:
     """Return rows as events."""
-    return assemble(request, tally, rows["t"], rows["x"], rows["y"], rows["p"])[0]
+    return assemble(request, rows["t"], rows["x"], rows["y"], rows["p"])
 
 
 def _triggers(request: Request, file: h5py.File) -> np.ndarray:
@@ -85,19 +85,19 @@ def _triggers(request: Request, file: h5py.File) -> np.ndarray:
     return triggers
 
 
-def _chunks(request: Request, tally: Tally, file: h5py.File, places: range) -> Iterator[np.ndarray]:
+def _chunks(request: Request, file: h5py.File, places: range) -> Iterator[np.ndarray]:
     """Yield the events of some chunks, up to the first that is missing in a file that was cut off."""
     for place in places:
         try:
-            yield _chunk(request, tally, file[EVENTS], place)
+            yield _chunk(request, file[EVENTS], place)
         except CUT_ERRORS:
             if not is_cut(file):
                 raise
-            tally.damage[CUT_PACKETS] += 1
+            request.tally.damage[CUT_PACKETS] += 1
             return
 
 
-def _chunk(request: Request, tally: Tally, data: h5py.Dataset, first: int) -> np.ndarray:
+def _chunk(request: Request, data: h5py.Dataset, first: int) -> np.ndarray:
     """Return the events of one chunk; its filter, which trusts its input, is not run."""
     stored = data.id.get_chunk_info_by_coord((first,)).size
     if stored > request.path.stat().st_size:
@@ -105,7 +105,7 @@ def _chunk(request: Request, tally: Tally, data: h5py.Dataset, first: int) -> np
     unpacked, raw = data.id.read_direct_chunk((first,))
     events = np.empty(min(data.chunks[0], len(data) - first), EVENT)
     if unpacked:  # a writer without the filter
-        return _assembled(request, tally, np.frombuffer(raw, data.dtype, len(events)))
+        return _assembled(request, np.frombuffer(raw, data.dtype, len(events))).events
     if not decode_ecf(np.frombuffer(raw, np.uint8), events):
         raise ValueError(f"the chunk at event {first} is damaged")
     return events

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from envs.recordings.clocks import unwrap
-from envs.recordings.event_file import Opened, Part, Request, Tally, assemble, whole_entries
+from envs.recordings.event_file import Opened, Part, Request, assemble, whole_entries
 from envs.recordings.mapped import mapped_parts
 
 NMNIST_SIZE = (34, 34)
@@ -18,15 +18,14 @@ def read_nmnist(request: Request) -> Opened:
     Row 240 marks an overflow of the camera's own counter: it is no event, and moves what
     follows by 8,192 us, as the data set's reader has it. The 23-bit clock of 8.4 s is unwrapped.
     """
-    tally = Tally()
-    count = whole_entries(request, tally, request.path.stat().st_size, 5)
+    count = whole_entries(request, request.path.stat().st_size, 5)
     request.check_declared(count)
     if request.width is None and request.height is None:
         request = request.sized(*NMNIST_SIZE)
-    return Opened("nmnist", request, tally, _parts(request, tally, count))
+    return Opened("nmnist", request, _parts(request, count))
 
 
-def _parts(request: Request, tally: Tally, count: int) -> Iterator[Part]:
+def _parts(request: Request, count: int) -> Iterator[Part]:
     """Yield the events of entries of 5 bytes."""
     last_us, turns = -1, 0
     for raw in mapped_parts(request, 0, np.dtype("V5"), count):
@@ -36,6 +35,6 @@ def _parts(request: Request, tally: Tally, count: int) -> Iterator[Part]:
         counted = unwrap(counter, 23, last_us)
         t_us = counted + OVERFLOW_US * (turns + np.cumsum(overflows))
         last_us, turns = int(counted[-1]), turns + int(np.count_nonzero(overflows))
-        tally.skipped += int(np.count_nonzero(overflows))
+        request.tally.skipped += int(np.count_nonzero(overflows))
         kept = body[~overflows]
-        yield Part(assemble(request, tally, t_us[~overflows], kept[:, 0], kept[:, 1], kept[:, 2] >> 7)[0])
+        yield assemble(request, t_us[~overflows], kept[:, 0], kept[:, 1], kept[:, 2] >> 7)

@@ -12,7 +12,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import CUT, CUT_TABLE, Opened, Part, Request, Tally, assemble
+from envs.recordings.event_file import CUT, CUT_TABLE, Opened, Part, Request, assemble
 from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
 from envs.recordings.npz_cut import cut_members
 from envs.recordings.text import read_text
@@ -84,7 +84,7 @@ def read_npz(request: Request) -> Opened:
                 raise request.refusal(
                     f"was cut off before the end of its columns ({', '.join(members)}); copy it again"
                 ) from None
-    opened.tally.damage.update({CUT_TABLE: 1} if is_cut else {})
+    request.tally.damage.update({CUT_TABLE: 1} if is_cut else {})
     return opened
 
 
@@ -163,8 +163,7 @@ def _opened(request: Request, format: str, arrays: dict[str, Array]) -> Opened:
         )
     if columns[0].array in SECONDS and not request.time_unit:
         unit = "s"
-    tally = Tally()
-    return Opened(format, request, tally, _parts(request, tally, used, columns, unit, noise, count))
+    return Opened(format, request, _parts(request, used, columns, unit, noise, count))
 
 
 def _columns(request: Request, arrays: dict[str, Array]) -> list[Column]:
@@ -285,7 +284,6 @@ def _first_rows(request: Request, array: Array) -> np.ndarray:
 
 def _parts(
     request: Request,
-    tally: Tally,
     used: list[Array],
     columns: list[Column],
     unit: str | None,
@@ -300,21 +298,21 @@ def _parts(
             _shape(request, file, array.name)
         for first in range(0, count, request.part_events):
             size = min(request.part_events, count - first)
-            some = _side_by_side(request, tally, files, used, size)
-            yield _part(request, tally, some, columns, unit, noise)
+            some = _side_by_side(request, files, used, size)
+            yield _part(request, some, columns, unit, noise)
         for file, array in zip(files, used, strict=True):
             if file.read(1):
                 raise request.refusal(f"array {array.name} contains more than it declares; save it again")
 
 
 def _side_by_side(
-    request: Request, tally: Tally, files: list[IO[bytes]], used: list[Array], size: int
+    request: Request, files: list[IO[bytes]], used: list[Array], size: int
 ) -> dict[str, np.ndarray]:
     """Return the next rows of all arrays by their names; all end where the first ends."""
     read = [_next(request, file, array, size) for file, array in zip(files, used, strict=True)]
     whole = min(map(len, read))
     if whole < size:
-        tally.damage[CUT] += sum((size - whole) * values.itemsize for values in read)
+        request.tally.damage[CUT] += sum((size - whole) * values.itemsize for values in read)
     return {array.name: values[:whole] for array, values in zip(used, read, strict=True)}
 
 
@@ -331,7 +329,6 @@ def _next(request: Request, file: IO[bytes], array: Array, size: int) -> np.ndar
 
 def _part(
     request: Request,
-    tally: Tally,
     some: dict[str, np.ndarray],
     columns: list[Column],
     unit: str | None,
@@ -347,13 +344,7 @@ def _part(
         for array, field in columns
     )
     t_us = microseconds(request, t, unit, usual_unit(t))
-    events, good = assemble(request, tally, t_us, x, y, p)
-    if noise is None:
-        return Part(events)
-    labels = some[noise.name]
-    if not np.isin(labels, (0, 1)).all():
-        raise request.refusal("must have one is_noise of 0 or 1 for each event; repair or remove it")
-    return Part(events, labels.astype(bool)[good])
+    return assemble(request, t_us, x, y, p, None if noise is None else some[noise.name])
 
 
 def _sized(request: Request, arrays: dict[str, Array], used: list[Array]) -> Request:

@@ -65,18 +65,18 @@ def in_order(opened: Opened, hold: int | None) -> Iterator[Part]:
         ValueError: More than a tenth of the events are outside the sensor, the clock goes back often, or
             the request is strict and the file is damaged.
     """
-    request, tally, clock, held = opened.request, opened.tally, Clock(), Part(np.empty(0, EVENT))
+    request, clock, held = opened.request, Clock(), Part(np.empty(0, EVENT))
     for part in opened.parts if hold is not None else (joined(opened.parts, request),):
-        good, is_old = _taken(part, request, tally, clock)
-        merged = _merged(Part(held.events[:0]) if is_old else held, good, tally, clock)
-        check_strict(request, tally)
+        good, is_old = _taken(part, request, clock)
+        merged = _merged(Part(held.events[:0]) if is_old else held, good, request, clock)
+        check_strict(request)
         cut = len(merged.events)
         if hold is not None and cut:
             recent = int(np.searchsorted(merged.events["t"], merged.events["t"][-1] - FAR_US))
             cut = max(recent, cut - hold)
         held = _cut(merged, slice(cut, None))._replace(triggers=Part(held.events).triggers)
         yield _delivered(_cut(merged, slice(0, cut)), clock)
-    check_strict(request, tally)
+    check_strict(request)
     if len(held.events):
         yield _delivered(held, clock)
 
@@ -99,15 +99,16 @@ def joined(parts: Iterator[Part], request: Request) -> Part:
     )
 
 
-def check_strict(request: Request, tally: Tally) -> None:
+def check_strict(request: Request) -> None:
     """Refuse a damaged file if the request is strict.
 
     Raises:
         ValueError: The tally counts damage.
     """
-    if request.strict and (tally.damage or tally.strays):
+    if request.strict and (request.tally.damage or request.tally.strays):
         raise request.refusal(
-            f"is damaged ({'; '.join(damage_lines(tally))}); read it without strict, which leaves this out"
+            f"is damaged ({'; '.join(damage_lines(request.tally))}); "
+            "read it without strict, which leaves this out"
         )
 
 
@@ -168,7 +169,7 @@ def count_late(events: np.ndarray, newest: int) -> tuple[int, int]:
     return late, newest
 
 
-def _taken(part: Part, request: Request, tally: Tally, clock: Clock) -> tuple[Part, bool]:
+def _taken(part: Part, request: Request, clock: Clock) -> tuple[Part, bool]:
     """Return the good events of a part, and whether all events before them are of an older clock."""
     events = part.events
     marks, breaks = np.empty(len(events), np.uint8), np.empty(len(events), np.int64)
@@ -176,12 +177,12 @@ def _taken(part: Part, request: Request, tally: Tally, clock: Clock) -> tuple[Pa
     newest = clock.newest_us - clock.shift_us if clock.newest_us >= 0 else -1
     outside, torn, count = walk(events, *size, newest, marks, breaks)
     clock.seen += len(events)
-    _count_outside(request, tally, clock, events, outside)
+    _count_outside(request, clock, events, outside)
     if torn:
-        tally.damage[TORN] += torn
+        request.tally.damage[TORN] += torn
     is_old = False
     if count:
-        events, is_old = _without_jumps(request, events, marks, breaks[:count].copy(), tally, clock)
+        events, is_old = _without_jumps(request, events, marks, breaks[:count].copy(), clock)
     elif clock.shift_us:
         events = events.copy()
         events["t"] += clock.shift_us
@@ -192,26 +193,25 @@ def _taken(part: Part, request: Request, tally: Tally, clock: Clock) -> tuple[Pa
     else:
         part = part._replace(events=events)
     late, clock.newest_us = count_late(part.events, -1 if is_old else clock.newest_us)
-    tally.late += late
+    request.tally.late += late
     clock.taken += len(part.events)
     return part, is_old
 
 
-def _count_outside(request: Request, tally: Tally, clock: Clock, events: np.ndarray, outside: int) -> None:
+def _count_outside(request: Request, clock: Clock, events: np.ndarray, outside: int) -> None:
     """Count events outside the sensor, and refuse the file if they are many."""
     if not outside:
         return
-    tally.damage[OUTSIDE] += outside
-    if tally.damage[OUTSIDE] > max(1, clock.seen // 10) or tally.damage[OUTSIDE] == clock.seen:
+    beyond = request.tally.damage[OUTSIDE] = request.tally.damage[OUTSIDE] + outside
+    if beyond > max(1, clock.seen // 10) or beyond == clock.seen:
         raise request.refusal(
-            f"has events up to x={events['x'].max()}, y={events['y'].max()}, {tally.damage[OUTSIDE]:,} of "
-            f"{clock.seen:,} outside the sensor of {request.width}x{request.height}; give the right width "
-            "and height"
+            f"has events up to x={events['x'].max()}, y={events['y'].max()}, {beyond:,} of {clock.seen:,} "
+            f"outside the sensor of {request.width}x{request.height}; give the right width and height"
         )
 
 
 def _without_jumps(
-    request: Request, events: np.ndarray, marks: np.ndarray, breaks: np.ndarray, tally: Tally, clock: Clock
+    request: Request, events: np.ndarray, marks: np.ndarray, breaks: np.ndarray, clock: Clock
 ) -> tuple[np.ndarray, bool]:
     """Decide what each long step of the time is: a gap, stray times, an older clock or a reset.
 
@@ -230,24 +230,24 @@ def _without_jumps(
         is_back = now >= 0 and shown < now - FAR_US
         is_gap = now >= 0 and shown > now + FAR_US
         if size <= FEW_STRAYS and follows and (is_back or (is_gap and later < first)):
-            tally.damage[STRAY_TIMES] += size
+            request.tally.damage[STRAY_TIMES] += size
             marks[run][marks[run] == GOOD] = IS_LEFT_OUT
             continue
         if is_back and _is_old(marks[:a], clock, size):
-            tally.damage[OLD_CLOCK] += clock.taken + int(np.count_nonzero(marks[:a] == GOOD))
+            request.tally.damage[OLD_CLOCK] += clock.taken + int(np.count_nonzero(marks[:a] == GOOD))
             marks[:a] = np.where(marks[:a] == GOOD, IS_LEFT_OUT, marks[:a])
             clock.taken, clock.shift_us, is_old = 0, 0, True
-            tally.gaps.clear()
+            request.tally.gaps.clear()
         elif is_back:
-            tally.damage[RESETS] += 1
+            request.tally.damage[RESETS] += 1
             clock.shift_us += now + 1 - shown
-            if tally.damage[RESETS] > MOST_RESETS:
+            if request.tally.damage[RESETS] > MOST_RESETS:
                 raise request.refusal(
                     f"goes back in time more than {MOST_RESETS} times by more than a second; check format, "
                     "columns and time_unit, or sort its events"
                 )
         elif is_gap:
-            tally.gaps.append((now, shown))
+            request.tally.gaps.append((now, shown))
         events["t"][run] += clock.shift_us
         now = int(events["t"][run][marks[run] == GOOD].max())
     return events, is_old
@@ -259,7 +259,7 @@ def _is_old(marks: np.ndarray, clock: Clock, size: int) -> bool:
     return clock.delivered_us < 0 and before <= min(FEW_OLD, size // 10)
 
 
-def _merged(held: Part, part: Part, tally: Tally, clock: Clock) -> Part:
+def _merged(held: Part, part: Part, request: Request, clock: Clock) -> Part:
     """Return the events that were held back and those of a part, sorted; ties keep their order."""
     if len(held.events):
         labels = None
@@ -271,7 +271,7 @@ def _merged(held: Part, part: Part, tally: Tally, clock: Clock) -> Part:
         part = _cut(part, np.argsort(t_us, kind="stable"))
     if len(t_us) and part.events["t"][0] < clock.delivered_us:
         first = int(np.searchsorted(part.events["t"], clock.delivered_us))
-        tally.damage[TOO_LATE] += first
+        request.tally.damage[TOO_LATE] += first
         part = _cut(part, slice(first, None))
     return part
 

@@ -9,16 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from envs.events import EVENT
-from envs.recordings.event_file import (
-    OUTSIDE,
-    RESERVED,
-    TRIGGER,
-    Opened,
-    Part,
-    Request,
-    Tally,
-    whole_entries,
-)
+from envs.recordings.event_file import OUTSIDE, RESERVED, TRIGGER, Opened, Part, Request, whole_entries
 from envs.recordings.evt_decoders import State, decode_dat, decode_evt2, decode_evt3, new_state
 from envs.recordings.mapped import Mapped, mapped_parts
 
@@ -49,10 +40,9 @@ def read_dat(request: Request) -> Opened:
             "give the DAT file of brightness changes (CD)"
         )
     request = request.sized(_number(fields.get("Width")), _number(fields.get("Height")))
-    tally = Tally()
-    count = whole_entries(request, tally, request.path.stat().st_size - start - 2, DAT_WORD.itemsize)
+    count = whole_entries(request, request.path.stat().st_size - start - 2, DAT_WORD.itemsize)
     request.check_declared(count)
-    return Opened("dat", request, tally, _dat_parts(request, start + 2, count))
+    return Opened("dat", request, _dat_parts(request, start + 2, count))
 
 
 def _dat_parts(request: Request, start: int, count: int) -> Iterator[Part]:
@@ -83,16 +73,15 @@ def read_evt(request: Request, format: str | None = None) -> Opened:
     endianness = options.get("endianness", "little")
     if endianness not in ("little", "legacy"):
         raise request.refusal(f"has {endianness}-endian words; little-endian ones are read: write it again")
-    tally, word = Tally(), np.dtype({"evt3": "<u2", "evt2": "<u4", "evt21": "<u8"}[encoding])
-    count = whole_entries(request, tally, request.path.stat().st_size - start, word.itemsize)
+    word = np.dtype({"evt3": "<u2", "evt2": "<u4", "evt21": "<u8"}[encoding])
+    count = whole_entries(request, request.path.stat().st_size - start, word.itemsize)
     mapped = Mapped(request, start, word, count)
-    parts = evt_parts(request, tally, encoding, mapped.values, endianness, mapped.forget)
-    return Opened(encoding, request, tally, parts)
+    parts = evt_parts(request, encoding, mapped.values, endianness, mapped.forget)
+    return Opened(encoding, request, parts)
 
 
 def evt_parts(
     request: Request,
-    tally: Tally,
     encoding: str,
     words: np.ndarray,
     endianness: str = "little",
@@ -103,7 +92,6 @@ def evt_parts(
 
     Args:
         request: The file.
-        tally: Counts that grow.
         encoding: "evt2", "evt21" or "evt3".
         words: uint16, uint32 or uint64.
         endianness: "legacy": the lower half of a word of EVT 2.1 comes second.
@@ -119,7 +107,7 @@ def evt_parts(
         events = np.empty(min(request.part_events, usual) + 32, EVENT)
         triggers = np.empty(min(MAX_TRIGGERS, len(words)), TRIGGER)
         n, k = decode(encoding, words, state, events, triggers, endianness)
-        _count(request, tally, state, before, n)
+        _count(request, state, before, n)
         yield Part(events[:n] if n > len(events) // 2 else events[:n].copy(), None, triggers[:k].copy())
         forget(int(state[State.WORD]))
 
@@ -142,7 +130,7 @@ def decode(
     return decode_evt2(pairs[:, upper], pairs[:, 1 - upper], state, events, triggers)
 
 
-def _count(request: Request, tally: Tally, state: np.ndarray, before: np.ndarray, events: int) -> None:
+def _count(request: Request, state: np.ndarray, before: np.ndarray, events: int) -> None:
     """Add to the tally what a decoder counted since `before`, and refuse words of another encoding.
 
     Raises:
@@ -150,11 +138,11 @@ def _count(request: Request, tally: Tally, state: np.ndarray, before: np.ndarray
             events lie beyond its last column than within it.
     """
     new = state - before
-    tally.skipped += int(new[State.SKIPPED])
-    tally.strays += int(new[State.STRAYS])
+    request.tally.skipped += int(new[State.SKIPPED])
+    request.tally.strays += int(new[State.STRAYS])
     for place, name in ((State.RESERVED, RESERVED), (State.BEYOND, OUTSIDE)):
         if new[place]:
-            tally.damage[name] += int(new[place])
+            request.tally.damage[name] += int(new[place])
     before[:] = state
     if new[State.RESERVED] > max(FEW_RESERVED, new[State.WORD] // 8):
         raise request.refusal(

@@ -1,5 +1,6 @@
 """Read events of any format: a whole file, a range of its times, or part by part."""
 
+import copy
 import dataclasses
 import itertools
 import warnings
@@ -151,12 +152,7 @@ def _parts(opened: Opened, tally: Tally) -> Iterator[EventFile]:
     empty = None
     for part in _within(ordered, opened.request) if opened.request.is_range else ordered:
         file = _file(opened, part, tally)
-        tally = dataclasses.replace(
-            opened.tally,
-            damage=opened.tally.damage.copy(),
-            gaps=opened.tally.gaps.copy(),
-            notes=opened.tally.notes.copy(),
-        )
+        tally = copy.deepcopy(opened.request.tally)
         tell(opened.request.path, file)
         if len(file.events) or len(file.triggers):
             yield file
@@ -213,12 +209,7 @@ def _within(parts: Iterator[Part], request: Request) -> Iterator[Part]:
 
 def _file(opened: Opened, part: Part, before: Tally) -> EventFile:
     """Return a part with the counts since another tally."""
-    tally, request = opened.tally, opened.request
-    damage = {
-        name: count - before.damage[name]
-        for name, count in tally.damage.items()
-        if count > before.damage[name]
-    }
+    request, tally = opened.request, opened.request.tally
     return EventFile(
         part.events,
         request.width,
@@ -229,7 +220,7 @@ def _file(opened: Opened, part: Part, before: Tally) -> EventFile:
         strays=tally.strays - before.strays,
         is_noise=part.is_noise,
         triggers=part.triggers,
-        damage=damage,
+        damage=dict(tally.damage - before.damage),
         gaps=tuple(tally.gaps[len(before.gaps) :]),
         notes=tuple(tally.notes[len(before.notes) :]),
     )

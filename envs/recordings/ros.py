@@ -9,16 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import (
-    CUT,
-    CUT_PACKETS,
-    TRIGGER,
-    Opened,
-    Part,
-    Request,
-    Tally,
-    assemble,
-)
+from envs.recordings.event_file import CUT, CUT_PACKETS, Opened, Part, Request, assemble
 from envs.recordings.event_packets import PacketDecoder
 from envs.recordings.ros_messages import EventPacket, Values, event_array, event_packet
 from envs.recordings.ros_storage import Bag, Message, Topic, messages, open_bags
@@ -44,20 +35,20 @@ def read_ros(request: Request) -> Opened:
     Raises:
         ValueError: The library rosbags is missing, or there is no such topic; the message lists them.
     """
-    bags, tally = open_bags(request), Tally()
+    bags = open_bags(request)
     topics = list(dict.fromkeys(topic for bag in bags for topic in bag.topics))
     for bag in bags:
         if not bag.is_whole:
-            tally.damage[CUT_PACKETS] += 1
+            request.tally.damage[CUT_PACKETS] += 1
     if not topics and not all(bag.is_whole for bag in bags):  # cut off before its first record
-        tally.damage[CUT] += sum(bag.path.stat().st_size for bag in bags)
-        return Opened("ros", request, tally, iter(()))
-    topic = _chosen(request, topics, tally)
+        request.tally.damage[CUT] += sum(bag.path.stat().st_size for bag in bags)
+        return Opened("ros", request, iter(()))
+    topic = _chosen(request, topics)
     size = _size(bags, topic.name)
-    return Opened("ros", request.sized(*size), tally, _parts(request, tally, bags, topic))
+    return Opened("ros", request.sized(*size), _parts(request, bags, topic))
 
 
-def _chosen(request: Request, topics: list[Topic], tally: Tally) -> Topic:
+def _chosen(request: Request, topics: list[Topic]) -> Topic:
     """Return the topic that is read."""
     found = [topic for topic in topics if topic.kind in (*ARRAYS, *PACKETS)]
     if request.topic is not None:
@@ -72,7 +63,7 @@ def _chosen(request: Request, topics: list[Topic], tally: Tally) -> Topic:
     found = sorted(found, key=lambda topic: -topic.number)
     if len(found) > 1:
         names = ", ".join(topic.name for topic in found)
-        tally.notes.append(f"topic {found[0].name} is read of {names}; topic= chooses")
+        request.tally.notes.append(f"topic {found[0].name} is read of {names}; topic= chooses")
     return found[0]
 
 
@@ -89,36 +80,36 @@ def _size(bags: list[Bag], topic: str) -> Size:
     return Size(None, None)
 
 
-def _parts(request: Request, tally: Tally, bags: list[Bag], topic: Topic) -> Iterator[Part]:
+def _parts(request: Request, bags: list[Bag], topic: Topic) -> Iterator[Part]:
     """Yield the events of a topic."""
-    packets, arrays, size = PacketDecoder(request, tally), [], 0
+    packets, arrays, size = PacketDecoder(request), [], 0
     for bag in bags:
         for message in messages(bag, {topic.name}):
-            decoded = _decoded(message, bag, tally)
+            decoded = _decoded(request, message, bag)
             if isinstance(decoded, EventPacket):
                 packets.add(decoded)
             elif decoded is not None:
                 arrays.append(decoded)
             size += len(message.raw) // MIN_BYTES
             if size >= request.part_events:
-                yield _part(request, tally, packets, arrays)
+                yield _part(request, packets, arrays)
                 arrays, size = [], 0
-    yield _part(request, tally, packets, arrays)
+    yield _part(request, packets, arrays)
 
 
-def _decoded(message: Message, bag: Bag, tally: Tally) -> EventPacket | np.ndarray | None:
+def _decoded(request: Request, message: Message, bag: Bag) -> EventPacket | np.ndarray | None:
     """Return the events of one message, or None if it is damaged."""
     try:
         values = Values(message.raw, bag.is_ros1)
         return event_array(values).columns if message.kind in ARRAYS else event_packet(values)
     except (struct.error, ValueError):
-        tally.damage[CUT_PACKETS] += 1
+        request.tally.damage[CUT_PACKETS] += 1
         return None
 
 
-def _part(request: Request, tally: Tally, packets: PacketDecoder, arrays: list[np.ndarray]) -> Part:
+def _part(request: Request, packets: PacketDecoder, arrays: list[np.ndarray]) -> Part:
     """Return the events of some messages."""
     if arrays:
         t_us, x, y, p = np.concatenate(arrays, axis=1)
-        return Part(assemble(request, tally, t_us, x, y, p)[0], None, np.empty(0, TRIGGER))
+        return assemble(request, t_us, x, y, p)
     return packets.taken()

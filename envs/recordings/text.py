@@ -10,7 +10,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import CUT_LINE, Opened, Part, Request, Tally, assemble
+from envs.recordings.event_file import CUT_LINE, Opened, Part, Request, assemble
 from envs.recordings.names import COLUMNS, microseconds, roles
 
 E2VID = {"columns": "t x y p", "usual_unit": "s"}  # after a first line with the sensor's size
@@ -75,14 +75,13 @@ def read_text(request: Request, open_bytes: Callable[[], IO[bytes]] | None = Non
             "give columns=('t', 'x', 'y', 'p') in the order of the file and time_unit"
         )
     unit = table.facts.get("time_unit", told)
-    request, tally = request.sized(*size), Tally()
+    request = request.sized(*size)
     microseconds(request, np.zeros(1), unit, table.facts.get("usual_unit"))  # refuses a missing unit now
-    return Opened("txt", request, tally, _parts(request, tally, open_bytes, table, places, unit))
+    return Opened("txt", request, _parts(request, open_bytes, table, places, unit))
 
 
 def _parts(
     request: Request,
-    tally: Tally,
     open_bytes: Callable[[], IO[bytes]],
     table: Table,
     places: dict[str, int],
@@ -96,7 +95,7 @@ def _parts(
         lines = io.TextIOWrapper(raw, "utf-8-sig")
         for _ in islice(lines, table.skip):
             pass
-        whole = _whole_lines(lines, tally, table, columns)
+        whole = _whole_lines(request, lines, table, columns)
         for line in whole:  # of each part the first; the others never lie in memory together
             part = chain([line], islice(whole, min(request.part_events, PART_LINES) - 1))
             t, x, y, p, *nanoseconds = _numbers(part, table, columns).T
@@ -104,16 +103,16 @@ def _parts(
                 t_us = np.rint(t * 1e6 + nanoseconds[0] * 1e-3)
             else:
                 t_us = microseconds(request, t, unit, table.facts.get("usual_unit"))
-            yield Part(assemble(request, tally, t_us, x, y, p)[0])
+            yield assemble(request, t_us, x, y, p)
 
 
-def _whole_lines(lines: IO[str], tally: Tally, table: Table, columns: list[int]) -> Iterator[str]:
+def _whole_lines(request: Request, lines: IO[str], table: Table, columns: list[int]) -> Iterator[str]:
     """Yield the lines of a file; a last one that was cut off is counted."""
     for line in lines:
         if line.endswith("\n") or _is_whole(line, table, columns):
             yield line
         else:
-            tally.damage[CUT_LINE] += 1
+            request.tally.damage[CUT_LINE] += 1
 
 
 def _numbers(lines: Iterable[str], table: Table, columns: list[int]) -> np.ndarray:

@@ -138,7 +138,7 @@ def ordered(t_us: np.ndarray, part: int, hold: int | None) -> tuple[np.ndarray, 
     events = some_events(0, len(t_us), 640, 480, 1)
     events["t"], tally = t_us, Tally()
     some = (Part(events[first : first + part]) for first in range(0, len(events), part))
-    parts = list(in_order(Opened("x", Request(Path("a")), tally, some), hold))
+    parts = list(in_order(Opened("x", Request(Path("a"), tally=tally), some), hold))
     return np.concatenate([np.empty(0, EVENT), *(one.events for one in parts)]), tally
 
 
