@@ -162,13 +162,13 @@ def _imu3(request: Request) -> Iterator[tuple[Any, ...]]:
                     yield int(one["t"]) + (turns << 31), values[:3] * G, np.deg2rad(values[3:6])
 
 
-def _messages(request: Request, kind: str) -> Iterator[tuple[Values, bool]]:
+def _messages(request: Request, kind: str) -> Iterator[Values]:
     """Yield the messages of a type of a bag."""
     for bag in open_bags(request):
         found = [topic for topic in bag.topics if topic.kind == kind]
         name = _one(request, found, bag.topics, kind) if found or request.topic else None
         for message in messages(bag, {name} if name else set()):
-            yield Values(message.raw, bag.is_ros1), bag.is_ros1
+            yield Values(message.raw, bag.is_ros1)
 
 
 def _one(request: Request, found: list[Topic], topics: list[Topic], kind: str) -> str:
@@ -182,7 +182,7 @@ def _one(request: Request, found: list[Topic], topics: list[Topic], kind: str) -
 
 def _frames_ros(request: Request) -> Iterator[Frame]:
     """Yield the images of a bag."""
-    for values, _ in _messages(request, IMAGE):
+    for values in _messages(request, IMAGE):
         t_us = values.header()
         height, width, encoding = values.number("I"), values.number("I"), values.text()
         is_big, step, raw = values.number("B"), values.number("I"), values.bytes()
@@ -200,7 +200,7 @@ def _frames_ros(request: Request) -> Iterator[Frame]:
 
 def _imu_ros(request: Request) -> Iterator[tuple[Any, ...]]:
     """Yield the inertial samples of a bag."""
-    for values, _ in _messages(request, INERTIAL):
+    for values in _messages(request, INERTIAL):
         t_us = values.header()
         numbers = [values.real("d") for _ in range(37)]  # orientation, rotation, acceleration; covariances
         yield t_us, np.array(numbers[25:28]), np.array(numbers[13:16])

@@ -18,22 +18,21 @@ class Values:
 
     def __init__(self, raw: bytes, is_ros1: bool) -> None:
         """Begin with the first value; the four bytes before a message of CDR say its byte order."""
-        self._is_ros1, self._place = is_ros1, 0 if is_ros1 else 4
-        self.raw, self._origin = raw, self._place
+        self.raw, self.is_ros1, self.place = raw, is_ros1, 0 if is_ros1 else 4
         self._order = "<" if is_ros1 or raw[1:2] in (b"\1", b"\3") else ">"
-        self.is_ros1 = is_ros1
+
+    def real(self, code: str) -> float:
+        """Return the next number by its code for `struct`; only in CDR there is a gap before it."""
+        size = struct.calcsize("<" + code)
+        if not self.is_ros1:
+            self.place += (4 - self.place) % size
+        (value,) = struct.unpack_from(self._order + code, self.raw, self.place)
+        self.place += size
+        return value  # type: ignore[no-any-return]
 
     def number(self, code: str) -> int:
-        """Return the next number by its code for `struct`."""
-        self.align(struct.calcsize("<" + code))
-        (value,) = struct.unpack_from(self._order + code, self.raw, self._place)
-        self._place += struct.calcsize("<" + code)
-        return int(value)
-
-    def align(self, size: int) -> None:
-        """Pass over the gap before a value of a size, which only CDR has."""
-        if not self._is_ros1:
-            self._place += -(self._place - self._origin) % size
+        """Return the next whole number by its code for `struct`."""
+        return int(self.real(code))
 
     def text(self) -> str:
         """Return the next text."""
@@ -42,31 +41,18 @@ class Values:
     def bytes(self) -> bytes:
         """Return the next list of bytes."""
         size = self.number("I")
-        if size > len(self.raw) - self._place:
+        if size > len(self.raw) - self.place:
             raise ValueError(f"a list of {size} bytes is not whole")
-        self._place += size
-        return self.raw[self._place - size : self._place]
-
-    def real(self, code: str) -> float:
-        """Return the next number of floating point by its code for `struct`."""
-        size = struct.calcsize("<" + code)
-        self.align(size)
-        (value,) = struct.unpack_from(self._order + code, self.raw, self._place)
-        self._place += size
-        return float(value)
+        self.place += size
+        return self.raw[self.place - size : self.place]
 
     def header(self) -> int:
         """Return the time [us] of a header: a number (ROS 1), a time and the name of a frame."""
-        if self._is_ros1:
+        if self.is_ros1:
             self.number("I")
         seconds, nanoseconds = self.number("I"), self.number("I")
         self.text()
         return seconds * 1_000_000 + (nanoseconds + 500) // 1000
-
-    @property
-    def place(self) -> int:
-        """Return the place of the next byte."""
-        return self._place
 
 
 class EventArray(NamedTuple):
@@ -120,8 +106,7 @@ def event_packet(values: Values) -> EventPacket:
 
 def _rows_1(values: Values, count: int) -> np.ndarray:
     """Return the columns of events of ROS 1."""
-    rows = np.frombuffer(values.raw, EVENT_1, count, values.place)
-    return _columns(rows["s"], rows["ns"], rows["x"], rows["y"], rows["p"])
+    return _columns(np.frombuffer(values.raw, EVENT_1, count, values.place))
 
 
 def _rows_2(values: Values, count: int) -> np.ndarray:
@@ -140,11 +125,10 @@ def _rows_2(values: Values, count: int) -> np.ndarray:
     padded[:4] = body[:4]  # x and y of the first
     late = np.dtype({"names": ["x", "y", "s", "ns", "p"], "formats": ["<u2", "<u2", "<u4", "<u4", "u1"],
                      "offsets": [0, 2, 6, 10, 14], "itemsize": EVENT_2_BYTES})  # fmt: skip
-    rows = np.frombuffer(padded.tobytes(), late, count)
-    return _columns(rows["s"], rows["ns"], rows["x"], rows["y"], rows["p"])
+    return _columns(np.frombuffer(padded.tobytes(), late, count))
 
 
-def _columns(s: np.ndarray, ns: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> np.ndarray:
+def _columns(rows: np.ndarray) -> np.ndarray:
     """Return t [us], x, y and p, int64 (4, N)."""
-    t_us = s.astype(np.int64) * 1_000_000 + (ns.astype(np.int64) + 500) // 1000
-    return np.stack((t_us, x.astype(np.int64), y.astype(np.int64), p.astype(np.int64)))
+    seconds, nanoseconds, *others = (rows[name].astype(np.int64) for name in ("s", "ns", "x", "y", "p"))
+    return np.stack((seconds * 1_000_000 + (nanoseconds + 500) // 1000, *others))

@@ -6,7 +6,7 @@ whole is read; the walk ends where the file does. It needs lz4 and zstd, which c
 
 import bz2
 import contextlib
-import os
+import io
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
@@ -72,47 +72,43 @@ def _walk(path: Path) -> Iterator[Topic | Message]:
         yield from walk(path)
 
 
-def _present(file: BinaryIO, size: int) -> bytes:
-    """Return the next bytes, as many as there are: memory for a damaged size would be taken before."""
-    return file.read(min(size, os.fstat(file.fileno()).st_size))
-
-
 def _walk_bag(path: Path) -> Iterator[Topic | Message]:
     """Walk through a bag of ROS 1."""
     known: dict[bytes, Topic] = {}
     with path.open("rb") as file:
         file.readline()
-        while (header := _fields(lambda size: _present(file, size))) is not None:
-            (size,) = struct.unpack("<I", file.read(4))
-            if size > MAX_RECORD:
-                return
-            data = _present(file, size)
-            if header.get(b"op") == b"\x05":
-                yield from _walk_chunk(_unpacked(data, header[b"compression"].decode()), known)
-            else:
-                yield from _bag_record(header, data, size, known)
+        for header, data, is_whole in _bag_records(file, path.stat().st_size):
+            if header.get(b"op") == b"\x05":  # a chunk, which may have been cut off
+                chunk = _unpacked(data, header[b"compression"].decode())
+                for fields, record, is_there in _bag_records(io.BytesIO(chunk), len(chunk)):
+                    if is_there:
+                        yield from _bag_record(fields, record, known)
+            elif is_whole:
+                yield from _bag_record(header, data, known)
 
 
-def _walk_chunk(chunk: bytes, known: dict[bytes, Topic]) -> Iterator[Topic | Message]:
-    """Walk through the records of a chunk, which may have been cut off."""
-    place = 0
+def _bag_records(file: BinaryIO, most: int) -> Iterator[tuple[dict[bytes, bytes], bytes, bool]]:
+    """Yield header and data of each record, and whether these are whole.
 
-    def read(size: int) -> bytes:
-        nonlocal place
-        place += size
-        return chunk[place - size : place]
-
-    while place < len(chunk) and (header := _fields(read)) is not None:
-        (size,) = struct.unpack("<I", read(4))
-        yield from _bag_record(header, read(size), size, known)
+    At most `most` bytes are read at once: memory for a damaged size would be taken before.
+    """
+    while len(size := file.read(4)) == 4:
+        (length,) = struct.unpack("<I", size)
+        head = file.read(min(length, most))
+        if length > MAX_RECORD or len(head) < length:
+            return
+        fields = _split(head)
+        (length,) = struct.unpack("<I", file.read(4))
+        if length > MAX_RECORD:
+            return
+        data = file.read(min(length, most))
+        yield fields, data, len(data) == length
 
 
 def _bag_record(
-    header: dict[bytes, bytes], data: bytes, size: int, known: dict[bytes, Topic]
+    header: dict[bytes, bytes], data: bytes, known: dict[bytes, Topic]
 ) -> Iterator[Topic | Message]:
-    """Yield what a record of a connection or a message says, if it is whole."""
-    if len(data) < size:
-        return
+    """Yield what a record of a connection or a message says."""
     if header.get(b"op") == b"\x07":
         facts = _split(data)
         known[header[b"conn"]] = Topic(header[b"topic"].decode(), facts[b"type"].decode(), -1)
@@ -120,16 +116,6 @@ def _bag_record(
     if header.get(b"op") == b"\x02" and header[b"conn"] in known:
         topic = known[header[b"conn"]]
         yield Message(topic.name, topic.kind, data)
-
-
-def _fields(read: Callable[[int], bytes]) -> dict[bytes, bytes] | None:
-    """Return the header of the next record, or None at the end."""
-    size = read(4)
-    if len(size) < 4:
-        return None
-    (length,) = struct.unpack("<I", size)
-    head = read(length) if length <= MAX_RECORD else b""
-    return _split(head) if len(head) == length else None
 
 
 def _split(head: bytes) -> dict[bytes, bytes]:
@@ -149,29 +135,27 @@ def _walk_mcap(path: Path) -> Iterator[Topic | Message]:
     kinds: dict[int, str] = {0: ""}
     with path.open("rb") as file:
         file.seek(8)
-        while len(head := file.read(9)) == 9:
-            code, size = struct.unpack("<BQ", head)
-            if size > MAX_RECORD or code == 0:
+        for code, data, is_whole in _mcap_records(file, path.stat().st_size):
+            if code == 0:
                 return
-            data = _present(file, size)
-            if code == 6:  # a chunk
-                for name, record in _mcap_chunk(data):
-                    yield from _mcap_record(name, record, known, kinds)
-            elif len(data) == size:
+            if code == 6:  # a chunk, which may have been cut off
+                compression, place = _text(data, 28)
+                chunk = _unpacked(data[place + 8 :], compression)
+                for name, record, is_there in _mcap_records(io.BytesIO(chunk), len(chunk)):
+                    if is_there:
+                        yield from _mcap_record(name, record, known, kinds)
+            elif is_whole:
                 yield from _mcap_record(code, data, known, kinds)
 
 
-def _mcap_chunk(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield the whole records of a chunk."""
-    compression, place = _text(data, 28)
-    chunk = _unpacked(data[place + 8 :], compression)
-    place = 0
-    while place + 9 <= len(chunk):
-        code, size = struct.unpack_from("<BQ", chunk, place)
-        if place + 9 + size > len(chunk):
+def _mcap_records(file: BinaryIO, most: int) -> Iterator[tuple[int, bytes, bool]]:
+    """Yield code and data of each record, and whether these are whole; at most `most` bytes at once."""
+    while len(head := file.read(9)) == 9:
+        code, size = struct.unpack("<BQ", head)
+        if size > MAX_RECORD:
             return
-        yield code, chunk[place + 9 : place + 9 + size]
-        place += 9 + size
+        data = file.read(min(size, most))
+        yield code, data, len(data) == size
 
 
 def _mcap_record(
