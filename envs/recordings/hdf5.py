@@ -19,7 +19,7 @@ import numpy as np
 from core.files import replaced
 from envs.events import EVENT
 from envs.recordings.event_file import Request, assemble, check_file, check_order
-from envs.recordings.hdf5_checks import ERRORS, attribute, check_own, check_plain, declared_length, opened
+from envs.recordings.hdf5_checks import ERRORS, attribute, check_own, declared_length, opened, time_offset
 
 MAX_EVENTS = 2_000_000_000
 MAX_INDEX = 200_000_000
@@ -127,12 +127,7 @@ def _events(request: Request, file: h5py.File) -> np.ndarray:
             raise ValueError(f"events/{name} and events/t differ in length")
         columns.append(file[f"events/{name}"][:])
     t, x, y, p = columns
-    offset = 0
-    if file.get("t_offset", getlink=True) is not None:
-        check_plain(file, "t_offset", 0)
-        offset = int(file["t_offset"][()])
-        if offset != file["t_offset"][()]:
-            raise ValueError("t_offset is no whole number of microseconds")
+    offset = time_offset(file)
     if t.dtype.kind not in "iu" or (len(t) and not 0 <= int(t.max()) + abs(offset) < 1 << 62):
         raise ValueError("events/t are no whole microseconds")
     t = t.astype(np.int64, copy=False)

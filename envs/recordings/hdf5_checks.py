@@ -1,13 +1,18 @@
-"""Look into HDF5 files that may be damaged or hostile, with every size checked before memory is taken.
+"""Look into HDF5 files that may be damaged, hostile or cut off; sizes are checked before memory is taken.
 
 The library crashes on some damaged files, follows links to other files, and reads texts that lead in a
 circle for ever. What could do so is refused here before the library sees it.
+
+It refuses a file that is shorter than its first block declares, as a full disk or a copy that stopped leaves
+it. Here such a file has the declared length, and what is missing cannot be read, so that the rows before the
+first missing chunk are whole.
 """
 
 import contextlib
+import io
 import mmap
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +20,7 @@ import h5py
 import hdf5plugin  # noqa: F401  registers the filters
 import numpy as np
 
-from envs.recordings.event_file import check_declared
-from envs.recordings.hdf5_cut import is_cut, open_hdf5
+from envs.recordings.event_file import CUT_PACKETS, Request, check_declared
 
 MAX_CHUNK_BYTES = 1 << 28
 # Filters that event files use: deflate, shuffle, fletcher32, lzf, blosc, blosc2. Others (nbit,
@@ -27,6 +31,11 @@ FLETCHER32, CHECKSUM_BYTES = 3, 4
 SIMPLE = (h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeStringID)  # types of attributes
 HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
 ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)  # of the library
+MAGIC = b"\x89HDF\r\n\x1a\n"
+END_AT = {0: 40, 1: 44, 2: 28, 3: 28}  # byte of the declared length, by the version of the first block
+SIZE_AT = {0: 13, 1: 13, 2: 9, 3: 9}  # byte of the number of bytes of an address, which is 8
+HEAD_BYTES, ADDRESS_BYTES = 64, 8
+CUT_ERRORS = (OSError, RuntimeError)  # of reading what is missing
 MAX_NODES, MAX_DEPTH = 10_000, 5  # of a listing
 
 
@@ -34,8 +43,68 @@ MAX_NODES, MAX_DEPTH = 10_000, 5  # of a listing
 def opened(path: Path) -> Iterator[h5py.File]:
     """Open a file whose heaps do not lead in a circle."""
     check_heaps(path)
-    with open_hdf5(path) as file:
+    with _open(path) as file:
         yield file
+
+
+class CutFile(io.RawIOBase):
+    """A file with its declared length; reading beyond its end is an error."""
+
+    def __init__(self, path: Path, length: int) -> None:
+        """Open the file for reading."""
+        self._path, self._file, self._length = path, path.open("rb", buffering=0), length
+        self._end, self._place = path.stat().st_size, 0
+
+    def __repr__(self) -> str:
+        """Return the path, which HDF5 takes for the file's name."""
+        return str(self._path)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Move to a byte."""
+        self._place = offset + {0: 0, 1: self._place, 2: self._length}[whence]
+        return self._place
+
+    def tell(self) -> int:
+        """Return the byte that is next."""
+        return self._place
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read bytes that are there."""
+        if self._place + len(buffer) > self._end:
+            raise OSError(f"the file was cut off at byte {self._end}")
+        self._file.seek(self._place)
+        count = self._file.readinto(buffer) or 0
+        self._place += count
+        return count
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        super().close()
+
+
+def _open(path: Path) -> h5py.File:
+    """Open a file for reading, also if it was cut off."""
+    length = _declared_bytes(path)
+    if length <= path.stat().st_size:
+        return h5py.File(path, "r")
+    return h5py.File(CutFile(path, length), "r")
+
+
+def is_cut(file: h5py.File) -> bool:
+    """Whether an open file was cut off."""
+    return bool(file.driver == "fileobj")
+
+
+def _declared_bytes(path: Path) -> int:
+    """Return the length that the first block of a file declares [bytes]; 0 if it is of an unknown kind."""
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    version = head[len(MAGIC)] if len(head) == HEAD_BYTES and head.startswith(MAGIC) else -1
+    if version not in END_AT or head[SIZE_AT[version]] != ADDRESS_BYTES:
+        return 0
+    length: int = struct.unpack_from("<Q", head, END_AT[version])[0]
+    return length if length < 1 << 63 else 0
 
 
 def attribute(file: h5py.File, name: str) -> Any:
@@ -94,6 +163,21 @@ def declared_length(file: h5py.File, name: str, most: int) -> int:
     return length
 
 
+def time_offset(file: h5py.File) -> int:
+    """Return the time of t = 0 [us], which files of the DSEC layout say; 0 if this one does not.
+
+    Raises:
+        ValueError: It is no whole number.
+    """
+    if file.get("t_offset", getlink=True) is None:
+        return 0
+    check_plain(file, "t_offset", 0)
+    offset = int(file["t_offset"][()])
+    if offset != file["t_offset"][()]:
+        raise ValueError("t_offset is no whole number of microseconds")
+    return offset
+
+
 def check_plain(file: h5py.File, name: str, ndim: int) -> None:
     """Refuse links, virtual and external data, other types than numbers, and huge chunks."""
     parts = name.split("/")
@@ -127,7 +211,7 @@ def check_chunks(data: h5py.Dataset, name: str) -> None:
             raise ValueError(f"{name} describes its packing wrongly")
     if FLETCHER32 in codes[:-1]:  # what decompression leaves may be too short for it
         raise ValueError(f"{name} has its checksum within its compression; write it again without fletcher32")
-    # Of a file that was cut off the list of chunks may be missing: `read_rows` looks at each chunk.
+    # Of a file that was cut off the list of chunks may be missing: `_read_rows` looks at each chunk.
     if FLETCHER32 in codes and not is_cut(data.file) and data.id.chunk_iter(_too_short):
         raise ValueError(f"{name} has a chunk without its checksum")
 
@@ -137,7 +221,43 @@ def _too_short(chunk: Any) -> bool | None:
     return chunk.size < CHECKSUM_BYTES or None
 
 
-def read_rows(data: h5py.Dataset, rows: slice) -> np.ndarray:
+def row_parts(request: Request, sets: Sequence[h5py.Dataset]) -> Iterator[slice]:
+    """Yield the rows of data sets of one length, part by part, up to the first that was cut off, if one was.
+
+    Args:
+        request: The file, in whose tally the cut is counted.
+        sets: The data sets.
+    """
+    for first in range(0, len(sets[0]), request.part_events):
+        rows = slice(first, min(len(sets[0]), first + request.part_events))
+        yield _until_cut(request, rows, sets) if is_cut(sets[0].file) else rows
+        if request.tally.damage[CUT_PACKETS]:
+            return
+
+
+def _until_cut(request: Request, rows: slice, sets: Sequence[h5py.Dataset]) -> slice:
+    """Return the rows up to the first that is missing, which is counted."""
+
+    def are_whole(some: slice) -> bool:
+        try:
+            return all(_read_rows(data, some) is not None for data in sets)
+        except CUT_ERRORS:
+            return False
+
+    if are_whole(rows):
+        return rows
+    request.tally.damage[CUT_PACKETS] += 1
+    first, stop = rows.start, rows.stop
+    while stop > first:
+        middle = (first + stop + 1) // 2
+        if are_whole(slice(first, middle)):
+            first = middle
+        else:
+            stop = middle - 1
+    return slice(rows.start, first)
+
+
+def _read_rows(data: h5py.Dataset, rows: slice) -> np.ndarray:
     """Return rows of a data set of a file that was cut off, after a look at its chunks."""
     if FLETCHER32 in filters(data):
         columns = range(0, data.shape[1], data.chunks[1]) if data.ndim > 1 else [None]

@@ -3,26 +3,26 @@
 import json
 import re
 from collections.abc import Iterator
-from functools import partial
 from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
-from envs.recordings.event_file import CUT_PACKETS, Opened, Part, Request, assemble
+from envs.recordings.event_file import Opened, Part, Request, assemble
 from envs.recordings.hdf5_checks import (
+    CUT_ERRORS,
     ERRORS,
     attribute,
     check_plain,
     data_sets,
     declared_length,
+    is_cut,
     listing,
     numbers,
     opened,
-    read_rows,
+    row_parts,
+    time_offset,
 )
-from envs.recordings.hdf5_cut import ERRORS as CUT_ERRORS
-from envs.recordings.hdf5_cut import is_cut, until_cut
 from envs.recordings.metavision_hdf5 import metavision_parts
 from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
 from envs.recordings.npz import table_order
@@ -247,19 +247,13 @@ def _parts(request: Request, found: Found, count: int) -> Iterator[Part]:
     with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
         for path in dict.fromkeys(found.paths):
             check_plain(file, path, 2 if isinstance(found.fields[0], int) else 1)
-        offset = _offset(file, found)
+        offset = time_offset(file) if found.group == "events" else 0
         has_labels = found.group == "events" and file.get(NOISE, getlink=True) is not None
         if has_labels and declared_length(file, NOISE, max(count, 1 << 62)) != count:
             raise ValueError("it must have one is_noise of 0 or 1 for each event")
-        for first in range(0, count, request.part_events):
-            rows = slice(first, min(count, first + request.part_events))
-            if is_cut(file):
-                reads = [partial(read_rows, file[path]) for path in dict.fromkeys(found.paths)]
-                rows = until_cut(request, rows, *reads)
+        for rows in row_parts(request, [file[path] for path in dict.fromkeys(found.paths)]):
             labels = np.asarray(file[NOISE][rows]) if has_labels else None
             yield _part(request, file, found, rows, offset, labels)
-            if request.tally.damage[CUT_PACKETS]:
-                return
 
 
 def _part(
@@ -286,17 +280,6 @@ def _part(
         raise ValueError(f"{found.paths[0]} are not below 2**62 with their offset; shift them")
     t_us = t_us.astype(np.int64, copy=False) + offset if t_us.dtype.kind in "iu" else t_us + offset
     return assemble(request, t_us, x, y, p, labels)
-
-
-def _offset(file: h5py.File, found: Found) -> int:
-    """Return the time of t = 0 [us], which files of the DSEC layout say."""
-    if found.group != "events" or file.get("t_offset", getlink=True) is None:
-        return 0
-    check_plain(file, "t_offset", 0)
-    offset = int(file["t_offset"][()])
-    if offset != file["t_offset"][()]:
-        raise ValueError("t_offset is no whole number of microseconds")
-    return offset
 
 
 def _sized(request: Request, file: h5py.File, found: Found) -> Request:

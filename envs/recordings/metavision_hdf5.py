@@ -1,7 +1,6 @@
 """Read the events of HDF5 files in Metavision's layout (`/CD/events`), with its ECF packing."""
 
 from collections.abc import Iterator
-from functools import partial
 
 import h5py
 import numpy as np
@@ -9,9 +8,7 @@ import numpy as np
 from envs.events import EVENT
 from envs.recordings.ecf import FILTER_ECF, MAX_CHUNK_EVENTS, decode_ecf
 from envs.recordings.event_file import CUT_PACKETS, TRIGGER, Part, Request, assemble, check_declared
-from envs.recordings.hdf5_checks import check_chunks, check_own, filters, read_rows
-from envs.recordings.hdf5_cut import ERRORS as CUT_ERRORS
-from envs.recordings.hdf5_cut import is_cut, until_cut
+from envs.recordings.hdf5_checks import CUT_ERRORS, check_chunks, check_own, filters, is_cut, row_parts
 
 EVENTS, TRIGGERS = "CD/events", "EXT_TRIGGER/events"
 
@@ -29,14 +26,9 @@ def metavision_parts(request: Request, file: h5py.File) -> Iterator[Part]:
     request.tally.skipped += len(triggers)
     if FILTER_ECF not in filters(data):
         check_chunks(data, EVENTS)
-        for first in range(0, len(data), request.part_events):
-            rows = slice(first, min(len(data), first + request.part_events))
-            if is_cut(file):
-                rows = until_cut(request, rows, partial(read_rows, data))
+        for rows in row_parts(request, [data]):
             yield _assembled(request, data[rows])._replace(triggers=triggers)
             triggers = triggers[:0]
-            if request.tally.damage[CUT_PACKETS]:
-                return
         return
     if filters(data) != [FILTER_ECF] or data.chunks[0] > MAX_CHUNK_EVENTS:
         raise ValueError(f"{EVENTS} has another filter beside Metavision's, or larger chunks")
