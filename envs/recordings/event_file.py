@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import stat
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,6 +76,24 @@ class Part(NamedTuple):
     events: np.ndarray
     is_noise: np.ndarray | None = None
     triggers: np.ndarray = NO_TRIGGERS
+
+    def rows(self, which: slice | np.ndarray) -> "Part":
+        """Return some of the events, with all triggers."""
+        labels = None if self.is_noise is None else self.is_noise[which]
+        return self._replace(events=self.events[which], is_noise=labels)
+
+
+def concatenated(parts: Iterable[Part]) -> Part:
+    """Return parts as one, without a copy if there is only one."""
+    some = list(parts)
+    if len(some) == 1:
+        return some[0]
+    labels = [part.is_noise for part in some if part.is_noise is not None]
+    return Part(
+        np.concatenate([np.empty(0, EVENT), *(part.events for part in some)]),
+        np.concatenate(labels) if labels else None,
+        np.concatenate([NO_TRIGGERS, *(part.triggers for part in some)]),
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,7 @@ libcaer's and mono are rows of 8 bytes; libcaer_cmp is words of 16 bits, and sta
 import numba
 import numpy as np
 
-from envs.events import EVENT
-from envs.recordings.event_file import CUT, RESERVED, TRIGGER, Part, Request, Tally, assemble
+from envs.recordings.event_file import CUT, RESERVED, Part, Request, Tally, assemble, concatenated
 from envs.recordings.prophesee import evt_parts
 from envs.recordings.ros_messages import EventPacket
 
@@ -51,12 +50,7 @@ class PacketDecoder:
             dtype = np.dtype(WORDS[encoding])
             raw = b"".join(body[: len(body) // dtype.itemsize * dtype.itemsize] for body in bodies)
             words = np.frombuffer(raw, dtype)
-            parts = list(evt_parts(self._request, encoding, words, states=self._states))
-            return Part(
-                np.concatenate([np.empty(0, EVENT), *(part.events for part in parts)]),
-                None,
-                np.concatenate([np.empty(0, TRIGGER), *(part.triggers for part in parts)]),
-            )
+            return concatenated(evt_parts(self._request, encoding, words, states=self._states))
         rows, self._rows = np.concatenate(self._rows, axis=1), [np.empty((4, 0), np.int64)]
         return assemble(self._request, *rows)
 

@@ -24,7 +24,7 @@ from envs.recordings.hdf5_checks import (
     time_offset,
 )
 from envs.recordings.metavision_hdf5 import metavision_parts
-from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
+from envs.recordings.names import COLUMNS, column_of, microseconds, roles, usual_unit
 from envs.recordings.npz import table_order
 
 NOISE = "events/is_noise"  # labels, where there are any
@@ -265,11 +265,9 @@ def _part(
     labels: np.ndarray | None,
 ) -> Part:
     """Return some rows as events."""
-    if found.fields[0] is None:
-        t, x, y, p = (file[path][rows] for path in found.paths)
-    else:
-        block = file[found.paths[0]][rows]
-        t, x, y, p = (block[field] if isinstance(field, str) else block[:, field] for field in found.fields)
+    blocks = {path: file[path][rows] for path in dict.fromkeys(found.paths)}
+    columns = zip(found.paths, found.fields, strict=True)
+    t, x, y, p = (column_of(blocks[path], field) for path, field in columns)
     usual = usual_unit(t)
     if t.dtype.kind == "f" and found.layout and found.layout.time_unit:
         usual = found.layout.time_unit

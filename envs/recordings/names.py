@@ -41,6 +41,13 @@ def roles(request: Request, names: Iterable[str]) -> tuple[dict[str, int], str |
     return places, told
 
 
+def column_of(rows: np.ndarray, field: str | int | None) -> np.ndarray:
+    """Return a column of rows by its name or number; None: the rows are one column."""
+    if field is None:
+        return rows
+    return rows[field] if isinstance(field, str) else rows[:, field]
+
+
 def microseconds(request: Request, t: np.ndarray, said: str | None, usual: str | None = None) -> np.ndarray:
     """Return times in microseconds by the unit that the file says, else the caller, else the format.
 

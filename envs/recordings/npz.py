@@ -13,7 +13,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from envs.recordings.event_file import CUT, CUT_TABLE, Opened, Part, Request, assemble
-from envs.recordings.names import COLUMNS, microseconds, roles, usual_unit
+from envs.recordings.names import COLUMNS, column_of, microseconds, roles, usual_unit
 from envs.recordings.npz_cut import cut_members
 from envs.recordings.text import read_text
 
@@ -144,11 +144,10 @@ def _shape(request: Request, file: IO[bytes], name: str) -> tuple[tuple[int, ...
 def _opened(request: Request, format: str, arrays: dict[str, Array]) -> Opened:
     """Find the columns of the events and the facts beside them."""
     columns = _columns(request, arrays)
+    if NOISE in arrays:
+        columns.append(Column(NOISE, None))
     used = [arrays[name] for name in dict.fromkeys(column.array for column in columns)]
-    noise = arrays.get(NOISE) if format == "npz" else None
-    lengths = {
-        array.name: array.shape[0] if array.shape else 0 for array in (*used, *([noise] if noise else ()))
-    }
+    lengths = {array.name: array.shape[0] if array.shape else 0 for array in used}
     if len(set(lengths.values())) > 1:
         raise request.refusal(
             f"has arrays of different lengths ({lengths}); save one entry per event in each"
@@ -163,7 +162,7 @@ def _opened(request: Request, format: str, arrays: dict[str, Array]) -> Opened:
         )
     if columns[0].array in SECONDS and not request.time_unit:
         unit = "s"
-    return Opened(format, request, _parts(request, used, columns, unit, noise, count))
+    return Opened(format, request, _parts(request, used, columns, unit, count))
 
 
 def _columns(request: Request, arrays: dict[str, Array]) -> list[Column]:
@@ -283,15 +282,9 @@ def _first_rows(request: Request, array: Array) -> np.ndarray:
 
 
 def _parts(
-    request: Request,
-    used: list[Array],
-    columns: list[Column],
-    unit: str | None,
-    noise: Array | None,
-    count: int,
+    request: Request, used: list[Array], columns: list[Column], unit: str | None, count: int
 ) -> Iterator[Part]:
     """Yield the events; the arrays are read side by side."""
-    used = used if noise is None else [*used, noise]
     with request.refusing(BROKEN, UNREADABLE), contextlib.ExitStack() as stack:
         files = [stack.enter_context(array.open()) for array in used]
         for file, array in zip(files, used, strict=True):
@@ -299,7 +292,9 @@ def _parts(
         for first in range(0, count, request.part_events):
             size = min(request.part_events, count - first)
             some = _side_by_side(request, files, used, size)
-            yield _part(request, some, columns, unit, noise)
+            t, x, y, p, *labels = (column_of(some[array], field) for array, field in columns)
+            t_us = microseconds(request, t, unit, usual_unit(t))
+            yield assemble(request, t_us, x, y, p, *labels)
         for file, array in zip(files, used, strict=True):
             if file.read(1):
                 raise request.refusal(f"array {array.name} contains more than it declares; save it again")
@@ -325,26 +320,6 @@ def _next(request: Request, file: IO[bytes], array: Array, size: int) -> np.ndar
     got = len(raw) // (row * array.dtype.itemsize)
     values = np.frombuffer(raw, array.dtype, got * row)
     return values.reshape(got, *array.shape[1:])
-
-
-def _part(
-    request: Request,
-    some: dict[str, np.ndarray],
-    columns: list[Column],
-    unit: str | None,
-    noise: Array | None,
-) -> Part:
-    """Return the events of some rows of the arrays."""
-    t, x, y, p = (
-        some[array]
-        if field is None
-        else some[array][field]
-        if isinstance(field, str)
-        else some[array][:, field]
-        for array, field in columns
-    )
-    t_us = microseconds(request, t, unit, usual_unit(t))
-    return assemble(request, t_us, x, y, p, None if noise is None else some[noise.name])
 
 
 def _sized(request: Request, arrays: dict[str, Array], used: list[Array]) -> Request:

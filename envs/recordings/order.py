@@ -13,6 +13,7 @@ import numpy as np
 
 from envs.events import EVENT
 from envs.recordings.event_file import (
+    NO_TRIGGERS,
     OLD_CLOCK,
     OUTSIDE,
     RESETS,
@@ -23,6 +24,7 @@ from envs.recordings.event_file import (
     Part,
     Request,
     Tally,
+    concatenated,
 )
 
 FAR_US = 1_000_000  # a longer step is a gap, or a clock that was set
@@ -74,8 +76,8 @@ def in_order(opened: Opened, hold: int | None) -> Iterator[Part]:
         if hold is not None and cut:
             recent = int(np.searchsorted(merged.events["t"], merged.events["t"][-1] - FAR_US))
             cut = max(recent, cut - hold)
-        held = _cut(merged, slice(cut, None))._replace(triggers=Part(held.events).triggers)
-        yield _delivered(_cut(merged, slice(0, cut)), clock)
+        held = merged.rows(slice(cut, None))._replace(triggers=NO_TRIGGERS)
+        yield _delivered(merged.rows(slice(0, cut)), clock)
     check_strict(request)
     if len(held.events):
         yield _delivered(held, clock)
@@ -87,16 +89,12 @@ def joined(parts: Iterator[Part], request: Request) -> Part:
     Raises:
         ValueError: They have more than `max_events` events.
     """
-    some, count = [Part(np.empty(0, EVENT))], 0
+    some: list[Part] = []
+    count = 0
     for part in parts:
         some.append(part)
         count = request.check_count(count + len(part.events))
-    labels = [part.is_noise for part in some if part.is_noise is not None]
-    return Part(
-        np.concatenate([part.events for part in some]) if len(some) != 2 else some[1].events,
-        np.concatenate(labels) if labels else None,
-        np.concatenate([part.triggers for part in some]),
-    )
+    return concatenated(some)
 
 
 def check_strict(request: Request) -> None:
@@ -186,12 +184,9 @@ def _taken(part: Part, request: Request, clock: Clock) -> tuple[Part, bool]:
     elif clock.shift_us:
         events = events.copy()
         events["t"] += clock.shift_us
+    part = part._replace(events=events)
     if marks.any():
-        good = marks == GOOD
-        labels = part.is_noise if part.is_noise is None else part.is_noise[good]
-        part = Part(events[good], labels, part.triggers)
-    else:
-        part = part._replace(events=events)
+        part = part.rows(marks == GOOD)
     late, clock.newest_us = count_late(part.events, -1 if is_old else clock.newest_us)
     request.tally.late += late
     clock.taken += len(part.events)
@@ -262,24 +257,15 @@ def _is_old(marks: np.ndarray, clock: Clock, size: int) -> bool:
 def _merged(held: Part, part: Part, request: Request, clock: Clock) -> Part:
     """Return the events that were held back and those of a part, sorted; ties keep their order."""
     if len(held.events):
-        labels = None
-        if held.is_noise is not None and part.is_noise is not None:
-            labels = np.concatenate((held.is_noise, part.is_noise))
-        part = Part(np.concatenate((held.events, part.events)), labels, part.triggers)
+        part = concatenated((held, part))
     t_us = part.events["t"]
     if len(t_us) and (t_us[1:] < t_us[:-1]).any():
-        part = _cut(part, np.argsort(t_us, kind="stable"))
+        part = part.rows(np.argsort(t_us, kind="stable"))
     if len(t_us) and part.events["t"][0] < clock.delivered_us:
         first = int(np.searchsorted(part.events["t"], clock.delivered_us))
         request.tally.damage[TOO_LATE] += first
-        part = _cut(part, slice(first, None))
+        part = part.rows(slice(first, None))
     return part
-
-
-def _cut(part: Part, which: slice | np.ndarray) -> Part:
-    """Return some events of a part."""
-    labels = part.is_noise if part.is_noise is None else part.is_noise[which]
-    return part._replace(events=part.events[which], is_noise=labels)
 
 
 def _delivered(part: Part, clock: Clock) -> Part:

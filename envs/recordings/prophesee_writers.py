@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -15,30 +16,24 @@ LIMITS = {"dat": (32, 14), "evt2": (34, 11), "evt3": (24, 11)}
 MAX_WORDS = 1 << 26  # of a part: a gap of 76 hours in EVT 3.0
 
 
-@contextlib.contextmanager
-def dat_writer(path: Path, width: int, height: int) -> Iterator[Append]:
+def dat_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
     """Yield a function that adds events to a DAT file.
 
     Raises:
         ValueError: The format's clock or address cannot represent them.
     """
     lines = f"% Data file containing CD events\n% Version 2\n% Width {width}\n% Height {height}\n"
-    with _writer(path, width, height, "dat", lines.encode() + bytes((0x0C, 8)), _dat_words) as append:
-        yield append
+    return _writer(path, width, height, "dat", lines.encode() + bytes((0x0C, 8)), _dat_words)
 
 
-@contextlib.contextmanager
-def evt2_writer(path: Path, width: int, height: int) -> Iterator[Append]:
+def evt2_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
     """Yield a function that adds events to a RAW file of EVT 2.0; raises as `dat_writer`."""
-    with _writer(path, width, height, "evt2", _evt_header("2.0", width, height), _Evt2()) as append:
-        yield append
+    return _writer(path, width, height, "evt2", _evt_header("2.0", width, height), _Evt2())
 
 
-@contextlib.contextmanager
-def evt3_writer(path: Path, width: int, height: int) -> Iterator[Append]:
+def evt3_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
     """Yield a function that adds events to a RAW file of EVT 3.0; raises as `dat_writer`."""
-    with _writer(path, width, height, "evt3", _evt_header("3.0", width, height), _Evt3(path)) as append:
-        yield append
+    return _writer(path, width, height, "evt3", _evt_header("3.0", width, height), _Evt3(path))
 
 
 @contextlib.contextmanager

@@ -77,7 +77,7 @@ def read_events(  # noqa: PLR0913  each is something else that a file may not sa
         ValueError: The file is no regular file, of no known format, too large, damaged beyond what is
             tolerated, or breaks a rule of its format; the message names the file, the rule and the remedy.
     """
-    opened, tally = _opened(locals())
+    opened = _opened(locals())
     request = opened.request
     try:
         if request.is_range:
@@ -89,7 +89,7 @@ def read_events(  # noqa: PLR0913  each is something else that a file may not sa
         raise ValueError(
             f"{path}: does not fit into memory; read a part by start_us and end_us, or lower max_events"
         ) from None
-    file = _file(opened, part, tally)
+    file = _file(opened, part, Tally())
     tell(request.path, file)
     return file
 
@@ -141,13 +141,12 @@ def read_parts(  # noqa: PLR0913  as above
     """
     if part_events < 1:
         raise ValueError(f"part_events must be at least 1, got {part_events}")
-    opened, tally = _opened(locals() | {"max_events": 1 << 62})
-    return _parts(opened, tally)
+    return _parts(_opened(locals() | {"max_events": 1 << 62}))
 
 
-def _parts(opened: Opened, tally: Tally) -> Iterator[EventFile]:
+def _parts(opened: Opened) -> Iterator[EventFile]:
     """Yield parts as files."""
-    is_first = True
+    is_first, tally = True, Tally()
     ordered = in_order(opened, opened.request.part_events)
     empty = None
     for part in _within(ordered, opened.request) if opened.request.is_range else ordered:
@@ -163,8 +162,8 @@ def _parts(opened: Opened, tally: Tally) -> Iterator[EventFile]:
         yield empty or _file(opened, Part(np.empty(0, EVENT)), tally)
 
 
-def _opened(arguments: dict[str, Any]) -> tuple[Opened, Tally]:
-    """Open the file that the arguments of `read_events` describe, with an empty tally beside it."""
+def _opened(arguments: dict[str, Any]) -> Opened:
+    """Open the file that the arguments of `read_events` describe."""
     path, format = Path(arguments["path"]), arguments["format"]
     if is_bag_folder(path):
         size, kind = sum(one.stat().st_size for one in path.iterdir() if one.is_file()), format or "ros"
@@ -188,7 +187,7 @@ def _opened(arguments: dict[str, Any]) -> tuple[Opened, Tally]:
     )
     read = TABLE[kind].read
     assert read is not None  # noqa: S101  for the type checker
-    return read(request), Tally()
+    return read(request)
 
 
 def _within(parts: Iterator[Part], request: Request) -> Iterator[Part]:
@@ -201,8 +200,8 @@ def _within(parts: Iterator[Part], request: Request) -> Iterator[Part]:
         inside = np.ones(len(triggers), bool)
         inside &= triggers["t"] >= start if start is not None else True
         inside &= triggers["t"] < end if end is not None else True
-        labels = part.is_noise if part.is_noise is None else part.is_noise[first:last]
-        yield Part(part.events[first:last].copy(), labels, triggers[inside])
+        some = part.rows(slice(first, last))
+        yield Part(some.events.copy(), some.is_noise, triggers[inside])
         if last < len(t_us):
             return
 
