@@ -5,26 +5,18 @@ Messages are decoded from their bytes: an object for each event would take a hun
 
 import struct
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
 from envs.recordings.event_file import CUT, CUT_PACKETS, Opened, Part, Request, assemble
 from envs.recordings.event_packets import PacketDecoder
-from envs.recordings.ros_messages import EventPacket, Values, event_array, event_packet
+from envs.recordings.ros_messages import EventArray, EventPacket, Values, event_array, event_packet
 from envs.recordings.ros_storage import Bag, Message, Topic, messages, open_bags
 
 # Types of messages with events, and with arrays of packed bytes.
 ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
 PACKETS = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
 MIN_BYTES = 2  # of an event, about
-
-
-class Size(NamedTuple):
-    """The sensor's size as the first message says it."""
-
-    width: int | None
-    height: int | None
 
 
 def read_ros(request: Request) -> Opened:
@@ -67,17 +59,14 @@ def _chosen(request: Request, topics: list[Topic]) -> Topic:
     return found[0]
 
 
-def _size(bags: list[Bag], topic: str) -> Size:
-    """Return the sensor's size by the first message."""
+def _size(bags: list[Bag], topic: str) -> tuple[int | None, int | None]:
+    """Return the sensor's width and height by the first whole message."""
     for bag in bags:
         for message in messages(bag, {topic}):
-            try:
-                values = Values(message.raw, bag.is_ros1)
-                decoded = event_array(values) if message.kind in ARRAYS else event_packet(values)
-            except (struct.error, ValueError):
-                continue
-            return Size(decoded.width or None, decoded.height or None)
-    return Size(None, None)
+            decoded = _decoded(message, bag)
+            if decoded is not None:
+                return decoded.width or None, decoded.height or None
+    return None, None
 
 
 def _parts(request: Request, bags: list[Bag], topic: Topic) -> Iterator[Part]:
@@ -85,11 +74,13 @@ def _parts(request: Request, bags: list[Bag], topic: Topic) -> Iterator[Part]:
     packets, arrays, size = PacketDecoder(request), [], 0
     for bag in bags:
         for message in messages(bag, {topic.name}):
-            decoded = _decoded(request, message, bag)
+            decoded = _decoded(message, bag)
             if isinstance(decoded, EventPacket):
                 packets.add(decoded)
             elif decoded is not None:
-                arrays.append(decoded)
+                arrays.append(decoded.columns)
+            else:
+                request.tally.damage[CUT_PACKETS] += 1
             size += len(message.raw) // MIN_BYTES
             if size >= request.part_events:
                 yield _part(request, packets, arrays)
@@ -97,13 +88,12 @@ def _parts(request: Request, bags: list[Bag], topic: Topic) -> Iterator[Part]:
     yield _part(request, packets, arrays)
 
 
-def _decoded(request: Request, message: Message, bag: Bag) -> EventPacket | np.ndarray | None:
-    """Return the events of one message, or None if it is damaged."""
+def _decoded(message: Message, bag: Bag) -> EventArray | EventPacket | None:
+    """Return what a message says, or None if it is damaged."""
     try:
         values = Values(message.raw, bag.is_ros1)
-        return event_array(values).columns if message.kind in ARRAYS else event_packet(values)
+        return event_array(values) if message.kind in ARRAYS else event_packet(values)
     except (struct.error, ValueError):
-        request.tally.damage[CUT_PACKETS] += 1
         return None
 
 

@@ -26,9 +26,9 @@ class Values:
         size = struct.calcsize("<" + code)
         if not self.is_ros1:
             self.place += (4 - self.place) % size
-        (value,) = struct.unpack_from(self._order + code, self.raw, self.place)
+        value: float = struct.unpack_from(self._order + code, self.raw, self.place)[0]
         self.place += size
-        return value  # type: ignore[no-any-return]
+        return value
 
     def number(self, code: str) -> int:
         """Return the next whole number by its code for `struct`."""
