@@ -9,16 +9,16 @@ touch but not overlap; one may float above another. A body that cannot be compos
 A plug-in adds a row: `SHAPES["arch"] = Shape(BOX, compose_arches)`.
 """
 
+from envs.scene.obstacles import BOX, CONE, ELLIPSOID, POLE
 from envs.scene.shapes.gate import GATES
 from envs.scene.shapes.shape import Shape
-from envs.scene.shapes.single import BOXES, CONES, ELLIPSOIDS, POLES
 from envs.scene.shapes.tree import TREES
 
 SHAPES: dict[str, Shape] = {
-    "pole": POLES,
-    "box": BOXES,
-    "cone": CONES,
-    "ellipsoid": ELLIPSOIDS,
+    "pole": Shape(POLE),
+    "box": Shape(BOX, half_y_m=lambda radius_m: radius_m),
+    "cone": Shape(CONE),
+    "ellipsoid": Shape(ELLIPSOID),
     "gate": GATES,
     "tree": TREES,
 }
