@@ -28,13 +28,8 @@ PACKED_EVENT = np.dtype(
         "itemsize": 16,
     }
 )
-EDGES = {
-    1: (0, 1),
-    2: (0, -1),
-    3: (0, 0),
-    4: (1, 1),
-    5: (1, -1),
-}  # of a type: channel (1 is the generator), edge
+# Channel (1 is the generator) and edge of a type.
+EDGES = {1: (0, 1), 2: (0, -1), 3: (0, 0), 4: (1, 1), 5: (1, -1)}
 BROKEN = (struct.error, ElementTree.ParseError, UnicodeDecodeError, OSError, ValueError)
 DAMAGED = "is damaged or no AEDAT 4.0 file ({}); copy or record it again"
 

@@ -38,14 +38,10 @@ DESCRIPTION = """<dv version="2.0">
 """
 # A row of the table of packets: a flatbuffer's table with five fields.
 PACKET = np.dtype(
-    [
-        (name, code)
-        for name, code in zip(
-            ("fields", "pad", "place", "stream", "size", "count", "first_us", "last_us"),
-            ("<i4", "<i4", "<i8", "<i4", "<i4", "<i8", "<i8", "<i8"),
-            strict=True,
-        )
-    ]
+    {
+        "names": ["fields", "pad", "place", "stream", "size", "count", "first_us", "last_us"],
+        "formats": ["<i4", "<i4", "<i8", "<i4", "<i4", "<i8", "<i8", "<i8"],
+    }
 )
 
 

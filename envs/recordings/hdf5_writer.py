@@ -28,8 +28,7 @@ def hdf5_writer(path: Path, width: int, height: int, is_labelled: bool) -> Itera
         ValueError: They last longer than an index of milliseconds can tell.
     """
     types = TYPES | ({NOISE: "u1"} if is_labelled else {})
-    with replaced(path) as part, part.open("w+b", buffering=0) as raw:
-        target = Forgiving(raw)
+    with replaced(path) as part, Forgiving(part, "w+") as target:
         with h5py.File(target, "w") as file:
             for name, kind in types.items():
                 file.create_dataset(name, (0,), kind, maxshape=(None,), chunks=(CHUNK,), **PACKING)
@@ -41,52 +40,34 @@ def hdf5_writer(path: Path, width: int, height: int, is_labelled: bool) -> Itera
         target.check()
 
 
-class Forgiving(io.RawIOBase):
+class Forgiving(io.FileIO):
     """A file whose errors are told later: HDF5 crashes the process if a write fails, as on a full disk."""
 
-    def __init__(self, file: io.FileIO) -> None:
-        """Wrap a file that is open for reading and writing."""
-        self._file, self._error = file, None  # type: tuple[io.FileIO, OSError | None]
+    error: OSError | None = None
 
     def check(self) -> None:
         """Raise the first error, if there was one."""
-        if self._error is not None:
-            raise self._error
-
-    def _tried(self, action: str, *arguments: object) -> object:
-        """Do something with the file, unless an error has happened."""
-        try:
-            return None if self._error else getattr(self._file, action)(*arguments)
-        except OSError as error:
-            self._error = error
-            return None
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """Move to a byte."""
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        """Return the byte that is next."""
-        return self._file.tell()
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Read bytes that were written."""
-        return self._file.readinto(buffer)
+        if self.error is not None:
+            raise self.error
 
     def write(self, data: memoryview) -> int:  # type: ignore[override]
         """Write all bytes."""
         rest = memoryview(data).cast("B")
-        while len(rest) and self._error is None:
-            rest = rest[int(self._tried("write", rest) or len(rest)) :]  # type: ignore[call-overload]
+        try:
+            while len(rest) and self.error is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
         return len(data)
 
     def truncate(self, size: int | None = None) -> int:
         """Set the size of the file."""
-        self._tried("truncate", size)
+        try:
+            if self.error is None:
+                super().truncate(size)
+        except OSError as error:
+            self.error = error
         return size or 0
-
-    def flush(self) -> None:
-        """Do nothing: the file has no buffer."""
 
 
 class Adding:
