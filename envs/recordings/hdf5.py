@@ -5,10 +5,8 @@ milliseconds; `index` and the attribute `about` are added.
 """
 
 import bisect
-import contextlib
 import dataclasses
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +55,37 @@ def write_recording(path: Path, recording: Recording) -> None:
     if events.dtype != EVENT:
         raise ValueError(f"events must have the dtype EVENT {EVENT}, got {events.dtype}")
     check_order(events)
-    with _written(path, events) as file:
+    offset = int(events["t"][0]) if len(events) else 0
+    t_us = events["t"] - offset
+    check_span(path, t_us)
+    # Made in memory, where it takes its packed size: HDF5 crashes the process on a full disk.
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        columns = {"t": t_us, "x": events["x"], "y": events["y"], "p": (events["p"] > 0).astype(np.uint8)}
+        for name, values in columns.items():
+            file.create_dataset(f"events/{name}", data=values, **PACKING)
+        file["t_offset"] = np.int64(offset)
+        file["ms_to_idx"] = milliseconds_to_index(t_us)
         index = file.create_group("index")
         for name, values in recording.index.items():
             index.create_dataset(name, data=values, **PACKING)
         file.attrs["about"] = json.dumps(recording.about, allow_nan=False)
+        file.flush()
+        image = file.id.get_file_image()
+    with replaced(path) as part:
+        part.write_bytes(image)
+
+
+def check_span(path: Path, t_us: np.ndarray) -> None:
+    """Refuse times [us] since the first event that an index of milliseconds cannot tell.
+
+    Raises:
+        ValueError: The last of them is too long after the first event.
+    """
+    if len(t_us) and t_us[-1] >= 1000 * MAX_INDEX:
+        raise ValueError(
+            f"{path}: the hdf5 layout has an index entry for each millisecond and this is {t_us[-1]} us; "
+            f"write parts of at most {1000 * MAX_INDEX} us, or choose npz"
+        )
 
 
 def read_recording(path: Path) -> Recording:
@@ -90,32 +114,6 @@ def milliseconds_to_index(t_us: np.ndarray) -> np.ndarray:
     """Return the first event at or after each whole millisecond, as DSEC has it: t[i[ms]] >= ms * 1000."""
     last_ms = int(t_us[-1]) // 1000 if len(t_us) else 0
     return np.searchsorted(t_us, np.arange(last_ms + 1, dtype=np.int64) * 1000).astype(np.uint64)
-
-
-@contextlib.contextmanager
-def _written(path: Path, events: np.ndarray) -> Iterator[h5py.File]:
-    """Yield a new file that has the events already and takes its name when all is written.
-
-    It is made in memory, where it takes its packed size: HDF5 crashes the process on a full disk.
-    """
-    offset = int(events["t"][0]) if len(events) else 0
-    t_us = events["t"] - offset
-    if len(events) and t_us[-1] >= 1000 * MAX_INDEX:
-        raise ValueError(
-            f"{path}: the hdf5 layout has an index entry for each millisecond and this is {t_us[-1]} us; "
-            f"write parts of at most {1000 * MAX_INDEX} us, or choose npz"
-        )
-    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
-        columns = {"t": t_us, "x": events["x"], "y": events["y"], "p": (events["p"] > 0).astype(np.uint8)}
-        for name, values in columns.items():
-            file.create_dataset(f"events/{name}", data=values, **PACKING)
-        file["t_offset"] = np.int64(offset)
-        file["ms_to_idx"] = milliseconds_to_index(t_us)
-        yield file
-        file.flush()
-        image = file.id.get_file_image()
-    with replaced(path) as part:
-        part.write_bytes(image)
 
 
 def _events(request: Request, file: h5py.File) -> np.ndarray:

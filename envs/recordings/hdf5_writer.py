@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from core.files import replaced
-from envs.recordings.hdf5 import MAX_INDEX
+from envs.recordings.hdf5 import check_span
 from envs.recordings.hdf5_layouts import NOISE
 from envs.recordings.writing import Append
 
@@ -94,11 +94,7 @@ class Adding:
             self._offset_us = int(events["t"][0])
             self._file["t_offset"][()] = self._offset_us
         t_us = events["t"] - self._offset_us
-        if t_us[-1] >= 1000 * MAX_INDEX:
-            raise ValueError(
-                f"{self._path}: the hdf5 layout has an index entry for each millisecond and this is "
-                f"{t_us[-1]} us; write parts of at most {1000 * MAX_INDEX} us, or choose npz"
-            )
+        check_span(self._path, t_us)
         columns = {"t": t_us, "x": events["x"], "y": events["y"], "p": events["p"] > 0}
         for name, values in columns.items():
             self._extend(f"events/{name}", values)
