@@ -8,6 +8,7 @@ import contextlib
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -104,17 +105,12 @@ def _members(request: Request) -> tuple[dict[str, Callable[[], IO[bytes]]], bool
     with request.refusing(BROKEN, UNREADABLE):
         try:
             archive = zipfile.ZipFile(request.path)
-            return {name: _opener(archive, name) for name in archive.namelist()}, False
+            return {name: partial(archive.open, name) for name in archive.namelist()}, False
         except BROKEN:
             found = cut_members(request.path)
             if not found:
                 raise
             return found, True
-
-
-def _opener(archive: zipfile.ZipFile, name: str) -> Callable[[], IO[bytes]]:
-    """Return a function that opens one member."""
-    return lambda: archive.open(name)
 
 
 def _header(request: Request, name: str, open_bytes: Callable[[], IO[bytes]]) -> Array:

@@ -5,6 +5,7 @@ Both begin with lines `% name value`, and the names tell them apart. From the pu
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
@@ -101,33 +102,32 @@ def evt_parts(
     states = {} if states is None else states
     state = states.setdefault(encoding, new_state())
     state[State.WORD], before = 0, state.copy()
+    decode = decoder(encoding, words, endianness)
     # About as many as such words usually encode; denser ones take several arrays.
     usual = len(words) * {"evt2": 2, "evt21": 4, "evt3": 1}[encoding] // 2
     while state[State.WORD] < len(words):
         events = np.empty(min(request.part_events, usual) + 32, EVENT)
         triggers = np.empty(min(MAX_TRIGGERS, len(words)), TRIGGER)
-        n, k = decode(encoding, words, state, events, triggers, endianness)
+        n, k = decode(state, events, triggers)
         _count(request, state, before, n)
         yield Part(events[:n] if n > len(events) // 2 else events[:n].copy(), None, triggers[:k].copy())
         forget(int(state[State.WORD]))
 
 
-def decode(
-    encoding: str,
-    words: np.ndarray,
-    state: np.ndarray,
-    events: np.ndarray,
-    triggers: np.ndarray,
-    endianness: str = "little",
-) -> tuple[int, int]:
-    """Fill events and triggers from words of an encoding; return how many there are of each."""
+def decoder(
+    encoding: str, words: np.ndarray, endianness: str
+) -> Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[int, int]]:
+    """Return a function of state, events and triggers that fills the last two from words of an encoding.
+
+    It returns how many there are of each, as the functions of `evt_decoders`.
+    """
     if encoding == "evt3":
-        return decode_evt3(words, state, events, triggers)
+        return partial(decode_evt3, words)
     if encoding == "evt2":
-        return decode_evt2(words, np.empty(0, "<u4"), state, events, triggers)
+        return partial(decode_evt2, words, np.empty(0, "<u4"))
     pairs = words.view("<u4").reshape(-1, 2)
     upper = 0 if endianness == "legacy" else 1  # IMX636 sends the upper half first
-    return decode_evt2(pairs[:, upper], pairs[:, 1 - upper], state, events, triggers)
+    return partial(decode_evt2, pairs[:, upper], pairs[:, 1 - upper])
 
 
 def _count(request: Request, state: np.ndarray, before: np.ndarray, events: int) -> None:

@@ -4,6 +4,7 @@ Whole bags are read with the library rosbags (the extra `ros`). It reads no bag 
 crashed recorder leaves it; such a bag is walked record by record (`ros_salvage`).
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,7 +66,7 @@ def _whole_or_cut(path: Path) -> Bag:
     try:
         return _whole(path)
     except Exception:  # as above
-        return Bag(path, ros_salvage.topics(path), False, _magic(path).startswith(MAGIC_BAG))
+        return Bag(path, ros_salvage.topics(path), False, _is_ros1(path))
 
 
 def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
@@ -83,12 +84,11 @@ def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
 def _whole(path: Path) -> Bag:
     """Return a bag as the library opens it."""
     with _reader(path) as reader:
-        counts: dict[tuple[str, str], int] = {}
+        counts = Counter[tuple[str, str]]()
         for one in reader.connections:
-            key = one.topic, _kind(one.msgtype)
-            counts[key] = counts.get(key, 0) + one.msgcount
+            counts[one.topic, _kind(one.msgtype)] += one.msgcount
     topics = [Topic(name, kind, count) for (name, kind), count in counts.items()]
-    return Bag(path, topics, True, path.is_file() and _magic(path).startswith(MAGIC_BAG))
+    return Bag(path, topics, True, _is_ros1(path))
 
 
 def _reader(path: Path) -> Any:
@@ -96,9 +96,12 @@ def _reader(path: Path) -> Any:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
-    if path.is_file() and _magic(path).startswith(MAGIC_BAG):
-        return Reader1(path)
-    return Reader2(path)
+    return Reader1(path) if _is_ros1(path) else Reader2(path)
+
+
+def _is_ros1(path: Path) -> bool:
+    """Whether a path is a bag of ROS 1."""
+    return path.is_file() and _magic(path).startswith(MAGIC_BAG)
 
 
 def _magic(path: Path) -> bytes:

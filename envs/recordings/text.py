@@ -180,7 +180,8 @@ def _table(lines: IO[str]) -> Table:
             continue
         is_header = any(WORD.match(word) and not NUMBERS.fullmatch(word) for word in words)
         row = next(lines, "") if is_header else text
-        return Table(facts, words if is_header else [], number + is_header, separator, _has_words(row))
+        has_words = re.search("true|false", row, re.IGNORECASE) is not None
+        return Table(facts, words if is_header else [], number + is_header, separator, has_words)
     return Table(facts, [], number + 1, None, False)
 
 
@@ -196,8 +197,3 @@ def _facts(text: str) -> dict[str, str]:
     if name.lower() in ("columns", "time_unit", "width", "height"):
         return {name.lower(): value.replace(",", " ").strip()}
     return {}
-
-
-def _has_words(line: str) -> bool:
-    """Whether truth values are written as words."""
-    return re.search("true|false", line, re.IGNORECASE) is not None

@@ -311,10 +311,8 @@ def draw_moving(layout: Layout, rng: np.random.Generator, height_m: float) -> tu
         return ()
     count, half = int(layout.num_moving), 0.5 * layout.width_m - layout.moving_radius_m
     start, y = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (count, 2)).T
-    speeds, sides = (
-        rng.uniform(layout.moving_min_mps, layout.moving_max_mps, count),
-        rng.choice([-1.0, 1.0], count),
-    )
+    speeds = rng.uniform(layout.moving_min_mps, layout.moving_max_mps, count)
+    sides = rng.choice([-1.0, 1.0], count)
     albedo = rng.uniform(layout.albedo_min, layout.albedo_max, count)
     found = []
     for k in range(count):

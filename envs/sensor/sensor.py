@@ -64,12 +64,11 @@ class Sensor:
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
         """Start in a new scene at `place` (x, y) [m], without events; `rng` draws the faults."""
         camera = self._config.camera
+        self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
         if self._config.observation == "none":
             self.luminance = np.zeros((camera.height, camera.width), np.float32)
-            self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
             return
         self._set_renderer(scene)
-        self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
         self._flicker = NO_FLICKER if self._pictures_alone else draw_flicker(self._config.faults, rng)
         self.luminance = self._picture(place, t_us)
         if not self._pictures_alone:
