@@ -6,7 +6,7 @@ file that was cut off is read up to there.
 
 import struct
 from collections.abc import Iterator
-from typing import IO, NamedTuple
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -141,36 +141,25 @@ def packets(request: Request, layout: Layout, kinds: dict[int, bytes]) -> Iterat
     Raises:
         ValueError: A packet is damaged, and is not the last.
     """
-    with request.refusing(BROKEN, DAMAGED), request.path.open("rb") as file:
-        file.seek(layout.start)
-        yield from _walk(request, file, layout, kinds)
-
-
-def _walk(
-    request: Request, file: IO[bytes], layout: Layout, kinds: dict[int, bytes]
-) -> Iterator[tuple[int, bytes]]:
-    """Yield the packets from where the file is."""
     place = layout.start
-    while place < layout.end:
-        if layout.end - place < 8:
-            request.tally.damage[CUT] += layout.end - place
-            return
-        number, size = struct.unpack("<ii", file.read(8))
-        place += 8
-        if size < 0:
-            raise ValueError(f"the packet at byte {place - 8} declares {size} bytes")
-        if size > layout.end - place:
-            if layout.is_whole and layout.end < file.seek(0, 2):
-                raise ValueError(
-                    f"the packet at byte {place - 8} declares {size} bytes and {layout.end - place} follow"
-                )
-            request.tally.damage.setdefault(CUT_PACKETS, 1)
-            return
-        place += size
-        if number in kinds:
-            yield number, _unpacked(file.read(size), layout.codec, kinds[number])
-        else:
+    with request.refusing(BROKEN, DAMAGED), request.path.open("rb") as file:
+        while place < layout.end:
+            if layout.end - place < 8:
+                request.tally.damage[CUT] += layout.end - place
+                return
             file.seek(place)
+            number, size = struct.unpack("<ii", file.read(8))
+            left = layout.end - place - 8
+            if size < 0:
+                raise ValueError(f"the packet at byte {place} declares {size} bytes")
+            if size > left:
+                if layout.is_whole and layout.end < file.seek(0, 2):
+                    raise ValueError(f"the packet at byte {place} declares {size} bytes and {left} follow")
+                request.tally.damage.setdefault(CUT_PACKETS, 1)
+                return
+            if number in kinds:
+                yield number, _unpacked(file.read(size), layout.codec, kinds[number])
+            place += 8 + size
 
 
 def _parts(request: Request, layout: Layout, chosen: Stream) -> Iterator[Part]:

@@ -257,12 +257,7 @@ def _parts(request: Request, found: Found, count: int) -> Iterator[Part]:
 
 
 def _part(
-    request: Request,
-    file: h5py.File,
-    found: Found,
-    rows: slice,
-    offset: int,
-    labels: np.ndarray | None,
+    request: Request, file: h5py.File, found: Found, rows: slice, offset: int, labels: np.ndarray | None
 ) -> Part:
     """Return some rows as events."""
     blocks = {path: file[path][rows] for path in dict.fromkeys(found.paths)}

@@ -6,7 +6,7 @@ sensor, of an older clock, or with a time far from all others is left out and co
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numba
 import numpy as np
@@ -23,7 +23,6 @@ from envs.recordings.event_file import (
     Opened,
     Part,
     Request,
-    Tally,
     concatenated,
 )
 
@@ -105,15 +104,15 @@ def check_strict(request: Request) -> None:
     """
     if request.strict and (request.tally.damage or request.tally.strays):
         raise request.refusal(
-            f"is damaged ({'; '.join(damage_lines(request.tally))}); "
+            f"is damaged ({'; '.join(damage_lines(request.tally.damage, request.tally.strays))}); "
             "read it without strict, which leaves this out"
         )
 
 
-def damage_lines(tally: Tally) -> list[str]:
+def damage_lines(damage: Mapping[str, int], strays: int) -> list[str]:
     """Return a line for each kind of damage with its count."""
-    lines = [f"{count:,} {name}" for name, count in tally.damage.items()]
-    return lines + ([f"{tally.strays:,} stray times of the stream"] if tally.strays else [])
+    lines = [f"{count:,} {name}" for name, count in damage.items()]
+    return lines + ([f"{strays:,} stray times of the stream"] if strays else [])
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -228,7 +228,7 @@ def _file(opened: Opened, part: Part, before: Tally) -> EventFile:
 def tell(path: Path, file: EventFile) -> None:
     """Warn once of what a reader left out, chose, or found missing."""
     lines = list(file.notes)
-    lost = damage_lines(Tally(strays=file.strays, damage=file.damage))  # type: ignore[arg-type]
+    lost = damage_lines(file.damage, file.strays)
     if lost:
         lines.append(f"left out or moved: {'; '.join(lost)}. strict=True refuses such a file")
     if file.gaps:

@@ -21,14 +21,7 @@ from envs.recordings.event_file import MAX_BYTES, MAX_EVENTS, EventFile, check_f
 from envs.recordings.frame_rate import FrameLoss
 from envs.recordings.image_folder import LISTS, check_fps, even_time_us, find_images
 from envs.recordings.in_between import frames_between, open_cv
-from envs.recordings.light import (
-    TRANSFERS,
-    Transfer,
-    area_average,
-    luminance,
-    usual_floor,
-    usual_transfer,
-)
+from envs.recordings.light import TRANSFERS, Transfer, area_average, luminance, usual_floor, usual_transfer
 
 MUCH_LOST = 0.05  # of the events, from which on a warning is given
 
@@ -102,16 +95,9 @@ def video_to_events(  # noqa: PLR0913 - each is a choice of its own
                 "frame by frame from video_steps and write them with event_writer"
             )
         dropped += step.dropped
-    events = np.concatenate(parts)
-    return EventFile(
-        events,
-        step.width,
-        step.height,
-        "video",
-        dropped=dropped,
-        is_noise=np.concatenate(noise),
-        missed=step.missed,
-    )
+    events, is_noise = np.concatenate(parts), np.concatenate(noise)
+    size = step.width, step.height
+    return EventFile(events, *size, "video", dropped=dropped, is_noise=is_noise, missed=step.missed)
 
 
 def video_steps(
