@@ -77,8 +77,8 @@ class Found(NamedTuple):
 
     group: str
     paths: tuple[str, ...]
-    fields: tuple[str | int | None, ...]
-    layout: Layout | None
+    fields: tuple[str | int | None, ...] = (None,) * 4
+    layout: Layout | None = None
 
 
 def read_hdf5(request: Request) -> Opened:
@@ -115,11 +115,11 @@ def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
     sets = data_sets(file)
     if request.group is not None or request.columns is not None:
         return _named(request, file, sets), []
-    found = [one for layout in LAYOUTS if (one := _matched(request, file, sets, layout))]
+    matches = ((layout, _matched(request, file, sets, layout)) for layout in LAYOUTS)
+    found = [match._replace(layout=layout) for layout, match in matches if match]
     if not found:
-        groups = {path.rpartition("/")[0] for path in sets}
-        layouts = [Layout("", group) for group in sorted(groups)]
-        found = [one for layout in layouts if (one := _by_roles(request, sets, layout.group))]
+        groups = sorted({path.rpartition("/")[0] for path in sets})
+        found = [one for group in groups if (one := _by_roles(request, sets, group))]
     if not found:
         for name in ("events/t", "events"):  # says what is wrong with data sets that should be there
             if name.split("/")[0] in file and not sets:
@@ -140,14 +140,13 @@ def _matched(
     if layout.group in sets:
         data = sets[layout.group]
         if data.dtype.names:
-            return _fields(request, layout.group, data, None, layout)
+            return _fields(request, layout.group, data, None)
         if data.ndim == 2 and data.shape[1] == len(COLUMNS):
-            return _table(layout.group, layout.columns, layout)
+            return _table(layout.group, layout.columns)
         return None
     paths = tuple(_join(layout.group, name) for name in layout.columns)
-    if all(_has(file, path) for path in paths) and len(set(paths)) == len(COLUMNS):
-        return Found(layout.group, paths, (None,) * 4, layout)
-    return None
+    is_there = all(_has(file, path) for path in paths) and len(set(paths)) == len(COLUMNS)
+    return Found(layout.group, paths) if is_there else None
 
 
 def _has(file: h5py.File, path: str) -> bool:
@@ -171,17 +170,17 @@ def _named(request: Request, file: h5py.File, sets: dict[str, h5py.Dataset]) -> 
     if group in sets:
         data = sets[group]
         if data.dtype.names:
-            found = _fields(request, group, data, request.columns, None)
+            found = _fields(request, group, data, request.columns)
         else:
             columns = request.columns or table_order(request, group, _first_rows(file, group))
-            found = _table(group, columns, None)
+            found = _table(group, columns)
     elif request.columns is not None:
         paths = tuple(_join(group, name) for name in request.columns)
         missing = [path for path in paths if path not in sets]
         if missing and request.group is None:
             paths = tuple(_join("events", name) for name in request.columns)
             missing = missing if any(path not in sets for path in paths) else []
-        found = None if missing or len(paths) != len(COLUMNS) else Found(group, paths, (None,) * 4, None)
+        found = None if missing or len(paths) != len(COLUMNS) else Found(group, paths)
     else:
         found = _by_roles(request, sets, group)
     if found is None:
@@ -194,20 +193,14 @@ def _named(request: Request, file: h5py.File, sets: dict[str, h5py.Dataset]) -> 
 
 def _by_roles(request: Request, sets: dict[str, h5py.Dataset], group: str) -> Found | None:
     """Return the events of a group by the names of its data sets, whatever their spelling."""
-    prefix = f"{group}/" if group else ""
-    names = [
-        path[len(prefix) :] for path in sets if path.startswith(prefix) and "/" not in path[len(prefix) :]
-    ]
-    one = [name for name in names if sets[prefix + name].ndim == 1]
-    places, _ = roles(request, [name.removeprefix("events_") for name in one])
+    paths = [path for path, data in sets.items() if path.rpartition("/")[0] == group and data.ndim == 1]
+    places, _ = roles(request, [path.rpartition("/")[2].removeprefix("events_") for path in paths])
     if not set(COLUMNS) <= places.keys():
         return None
-    return Found(group, tuple(prefix + one[places[name]] for name in COLUMNS), (None,) * 4, None)
+    return Found(group, tuple(paths[places[name]] for name in COLUMNS))
 
 
-def _fields(
-    request: Request, path: str, data: h5py.Dataset, columns: tuple[str, ...] | None, layout: Layout | None
-) -> Found | None:
+def _fields(request: Request, path: str, data: h5py.Dataset, columns: tuple[str, ...] | None) -> Found | None:
     """Return the events of a data set of rows with named fields."""
     names = data.dtype.names or ()
     if columns is None:
@@ -215,14 +208,14 @@ def _fields(
         columns = tuple(names[places[name]] if name in places else "" for name in COLUMNS)
     if not set(columns) <= set(names) or len(columns) != len(COLUMNS):
         return None
-    return Found(path, (path,) * 4, columns, layout)
+    return Found(path, (path,) * 4, columns)
 
 
-def _table(path: str, columns: tuple[str, ...], layout: Layout | None) -> Found | None:
+def _table(path: str, columns: tuple[str, ...]) -> Found | None:
     """Return the events of a data set of rows without names."""
     if not set(COLUMNS) <= set(columns):
         return None
-    return Found(path, (path,) * 4, tuple(columns.index(name) for name in COLUMNS), layout)
+    return Found(path, (path,) * 4, tuple(columns.index(name) for name in COLUMNS))
 
 
 def _join(group: str, name: str) -> str:
@@ -245,13 +238,14 @@ def _metavision(request: Request) -> Iterator[Part]:
 def _parts(request: Request, found: Found, count: int) -> Iterator[Part]:
     """Yield the events where they were found."""
     with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
-        for path in dict.fromkeys(found.paths):
+        paths = list(dict.fromkeys(found.paths))
+        for path in paths:
             check_plain(file, path, 2 if isinstance(found.fields[0], int) else 1)
         offset = time_offset(file) if found.group == "events" else 0
         has_labels = found.group == "events" and file.get(NOISE, getlink=True) is not None
         if has_labels and declared_length(file, NOISE, max(count, 1 << 62)) != count:
             raise ValueError("it must have one is_noise of 0 or 1 for each event")
-        for rows in row_parts(request, [file[path] for path in dict.fromkeys(found.paths)]):
+        for rows in row_parts(request, [file[path] for path in paths]):
             labels = np.asarray(file[NOISE][rows]) if has_labels else None
             yield _part(request, file, found, rows, offset, labels)
 
