@@ -30,8 +30,7 @@ def read_aedat2(request: Request) -> Opened:
         ValueError: An unknown camera.
     """
     start, chip = _header(request)
-    count = whole_entries(request, request.path.stat().st_size - start, ENTRY.itemsize)
-    request.check_declared(count)
+    count = request.check_declared(whole_entries(request, start, ENTRY.itemsize))
     width, height, is_davis = _camera(request, chip, start, count)
     request = request.sized(width, height)
     return Opened("aedat2", request, _parts(request, start, count, is_davis))

@@ -291,8 +291,9 @@ def check_declared(path: Path, name: str, declared_bytes: int) -> None:
         )
 
 
-def whole_entries(request: Request, size: int, entry: int) -> int:
-    """Return how many entries of `entry` bytes are whole in `size` bytes; count the bytes after them."""
+def whole_entries(request: Request, start: int, entry: int) -> int:
+    """Return how many entries of `entry` bytes a file has from `start` on; count the bytes after the last."""
+    size = request.path.stat().st_size - start
     if size % entry:
         request.tally.damage[CUT] += size % entry
     return size // entry

@@ -93,8 +93,7 @@ def read_hdf5(request: Request) -> Opened:
             request = request.sized(*_said_size(file, "CD"))
             return Opened("hdf5", request, _metavision(request))
         found, others = find(request, file)
-        count = len(file[found.paths[0]])
-        request.check_declared(count)
+        count = request.check_declared(len(file[found.paths[0]]))
         for path in dict.fromkeys(found.paths):
             if found.fields[0] is None and declared_length(file, path, max(count, 1 << 62)) != count:
                 raise ValueError(f"{path} and {found.paths[0]} differ in length")

@@ -18,8 +18,7 @@ def read_nmnist(request: Request) -> Opened:
     Row 240 marks an overflow of the camera's own counter: it is no event, and moves what
     follows by 8,192 us, as the data set's reader has it. The 23-bit clock of 8.4 s is unwrapped.
     """
-    count = whole_entries(request, request.path.stat().st_size, 5)
-    request.check_declared(count)
+    count = request.check_declared(whole_entries(request, 0, 5))
     if request.width is None and request.height is None:
         request = request.sized(*NMNIST_SIZE)
     return Opened("nmnist", request, _parts(request, count))

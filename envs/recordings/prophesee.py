@@ -41,8 +41,7 @@ def read_dat(request: Request) -> Opened:
             "give the DAT file of brightness changes (CD)"
         )
     request = request.sized(_number(fields.get("Width")), _number(fields.get("Height")))
-    count = whole_entries(request, request.path.stat().st_size - start - 2, DAT_WORD.itemsize)
-    request.check_declared(count)
+    count = request.check_declared(whole_entries(request, start + 2, DAT_WORD.itemsize))
     return Opened("dat", request, _dat_parts(request, start + 2, count))
 
 
@@ -75,7 +74,7 @@ def read_evt(request: Request, format: str | None = None) -> Opened:
     if endianness not in ("little", "legacy"):
         raise request.refusal(f"has {endianness}-endian words; little-endian ones are read: write it again")
     word = np.dtype({"evt3": "<u2", "evt2": "<u4", "evt21": "<u8"}[encoding])
-    count = whole_entries(request, request.path.stat().st_size - start, word.itemsize)
+    count = whole_entries(request, start, word.itemsize)
     mapped = Mapped(request, start, word, count)
     parts = evt_parts(request, encoding, mapped.values, endianness, mapped.forget)
     return Opened(encoding, request, parts)
