@@ -1,4 +1,4 @@
-"""Shapes of obstacles: one file each, and one row in `SHAPES`.
+"""Shapes of obstacles: one row each in `SHAPES`, and a file if it is composed of several bodies.
 
 A new shape is a file with a function that composes it from poles, cones, ellipsoids and boxes (`tree.py` is
 the shortest), a row below, and a test. Renderers, collisions, passability and the planner know these four
