@@ -1,22 +1,26 @@
 """The cheapest way to the goal line from anywhere in a corridor, by dynamic programming on a lattice.
 
 A vehicle that knows the geometry moves on a lattice of `LATTICE_M` by steps ahead or 45 degrees to a side.
-Each place has a price, which falls with its clearance. Geometry is the scene's, which stands still
-while an episode lasts: bodies, gates as their posts, and of a mesh the surfaces that the vehicle's
-height cuts; textures that move move nothing.
+Each place has a price, which falls with its clearance. Geometry is the scene's: bodies, gates as their posts,
+and of a mesh the surfaces that the vehicle's height cuts; textures that move move nothing. What moves is
+priced where it is when the vehicle comes there.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 
 from envs.scene.collision import MARGIN
+from envs.scene.moving import MovingBody
+from envs.scene.obstacles import OBSTACLE, body_sections
 from envs.scene.scene import Scene
 
 LATTICE_M = 0.25
 CLEARANCE_SCALE_M = 0.4  # the price of a place falls by e with each such distance from contact
+FELT_M = 6 * CLEARANCE_SCALE_M  # beyond this distance from contact an obstacle adds nothing
 BLOCKED = 1e3
 SIDE_PRICE = 0.01  # of a lattice step to the side: of two free paths, the straighter
 
@@ -51,6 +55,15 @@ class CostToGo:
             return _of_actions(self.costs, column, row)
         return _of_actions_in_sight(self.prices, column, row, max(1, round(ahead)))
 
+    def among(
+        self, moving: Sequence[MovingBody], now: tuple[float, float], vehicle: tuple[float, float, float]
+    ) -> "CostToGo":
+        """Return the plan among what moves; arguments as `prices_among`."""
+        if not moving:
+            return self
+        prices = prices_among(moving, self.prices, self.first_x_m, now, vehicle)
+        return CostToGo(_costs(prices), prices, self.first_x_m)
+
 
 def cost_to_go(scene: Scene, radius_m: float, height_m: float = 2.0, through_x_m: float = 0.0) -> CostToGo:
     """Plan for a vehicle of `radius_m` at `height_m` [m]; a column of the lattice is at `through_x_m` [m].
@@ -78,10 +91,41 @@ def lattice_prices(
     x_m = through_x_m + np.arange(-left, right + 1) * LATTICE_M
     y_m = np.arange(math.ceil(scene.length_m / LATTICE_M) + 1) * LATTICE_M
     clearance = np.broadcast_to(half - np.abs(x_m), (len(y_m), len(x_m))).copy()
-    # Beyond six scales an obstacle adds nothing to the price.
-    _approach(clearance, scene.sections(height_m), x_m, y_m, radius_m, 6 * CLEARANCE_SCALE_M)
+    _approach(clearance, scene.sections(height_m), x_m, y_m, radius_m, FELT_M)
     price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
     return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price), float(x_m[0])
+
+
+def prices_among(
+    moving: Sequence[MovingBody],
+    prices: np.ndarray,
+    first_x_m: float,
+    now: tuple[float, float],
+    vehicle: tuple[float, float, float],
+) -> np.ndarray:
+    """Return the prices of `lattice_prices` where bodies move as well.
+
+    Args:
+        moving: Each row is priced as it is when the vehicle comes there, straight ahead.
+        prices: Of what stands still.
+        first_x_m: Where column 0 is [m].
+        now: The time [s], and where the vehicle is, y [m].
+        vehicle: Its radius [m], height [m] and speed [m/s].
+    """
+    radius_m, height_m, speed_mps = vehicle
+    y_m, x_m = (LATTICE_M * np.arange(size) for size in prices.shape)
+    times_s, prices = np.maximum(now[0], now[0] + (y_m - now[1]) / speed_mps), prices.copy()
+    for one in moving:
+        bodies = np.array([one.body] * len(times_s), OBSTACLE)
+        bodies["x"], bodies["y"], bodies["z"] = one.places(times_s).T
+        reach_m = max(float(one.body["rx"]), float(one.body["ry"])) + radius_m + FELT_M
+        there = (np.abs(bodies["z"] - height_m) <= bodies["rz"]) & (np.abs(bodies["y"] - y_m) <= reach_m)
+        x, y, _, _, hx, hy, r = body_sections(bodies[there], height_m).T[:, :, None]
+        across = np.maximum(np.abs(y_m[there][:, None] - y) - hy, 0.0)
+        clearance = np.hypot(np.maximum(np.abs(first_x_m + x_m - x) - hx, 0.0), across) - r - radius_m
+        price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
+        prices[there] = np.maximum(prices[there], np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price))
+    return prices
 
 
 @numba.njit(cache=True, error_model="numpy")

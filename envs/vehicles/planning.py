@@ -18,8 +18,7 @@ import numpy as np
 
 from envs.config import EnvConfig
 from envs.scene.moving import MovingBody
-from envs.scene.obstacles import OBSTACLE, body_sections
-from envs.scene.planning import BLOCKED, CLEARANCE_SCALE_M, LATTICE_M, SIDE_PRICE, lattice_prices
+from envs.scene.planning import LATTICE_M, SIDE_PRICE, CostToGo, cost_to_go, lattice_prices, prices_among
 from envs.scene.scene import Scene
 from envs.vehicles.dynamics import WAY_S, Dynamics
 
@@ -60,7 +59,8 @@ class BodyPlan:
 class Planner:
     """The plans of one environment (`envs.corridor.CorridorEnv`), made again when they no longer hold.
 
-    A plan holds while the scene is the same, and what moves in it keeps to its path.
+    A plan holds while the scene is the same, and what moves in it keeps to its path. Among bodies that move,
+    a kinematic vehicle plans at every step, since its way to a side takes longer than that straight ahead.
     """
 
     def __init__(self) -> None:
@@ -68,14 +68,33 @@ class Planner:
         self._scene: Scene | None = None
         self._moving: tuple[MovingBody, ...] = ()
         self._plan: BodyPlan
+        self._headings: CostToGo
 
-    def costs(self, env: Any) -> np.ndarray:
-        """Return the cost of each action where it takes effect, float64 (K,)."""
-        if env.scene is not self._scene or env.moving != self._moving:
-            now = 1e-6 * env.info()["t_us"], env.camera_pose()[1]
-            self._plan = plan_body(env.scene, env.config, env.dynamics, env.moving, now)
+    def costs(self, env: Any, sight_m: float = math.inf) -> np.ndarray:
+        """Return the cost of each action where it takes effect, float64 (K,).
+
+        Args:
+            env: The environment, in an episode.
+            sight_m: Ways of a kinematic vehicle end so far ahead; infinite: at the goal line [m].
+        """
+        config, same = env.config, env.scene is self._scene
+        if env.dynamics.move is None:
+            if not same:
+                self._headings = cost_to_go(env.scene, config.vehicle_radius_m, config.camera_height_m)
+                self._scene = env.scene
+            vehicle = config.vehicle_radius_m, config.camera_height_m, config.speed_mps
+            plan = self._headings.among(env.moving, _now(env), vehicle)
+            x_m, y_m = env.place_of_action()
+            return plan.of_actions(x_m, y_m, sight_m)
+        if not same or env.moving != self._moving:
+            self._plan = plan_body(env.scene, config, env.dynamics, env.moving, _now(env))
             self._scene, self._moving = env.scene, env.moving
         return self._plan.of_actions(env.state_of_action())
+
+
+def _now(env: Any) -> tuple[float, float]:
+    """Return the time [s], and where the vehicle is, y [m]."""
+    return 1e-6 * env.info()["t_us"], env.camera_pose()[1]
 
 
 def plan_body(
@@ -102,36 +121,14 @@ def plan_body(
         raise ValueError(f"{rule}; got vehicle {config.vehicle!r} with {dynamics.action_space}")
     speed_mps, acceleration_mps2 = dynamics.sideways
     prices, first_x_m = lattice_prices(scene, 0.0, config.vehicle_radius_m, config.camera_height_m)
-    if moving:
-        y_m = LATTICE_M * np.arange(len(prices))
-        x_m = first_x_m + LATTICE_M * np.arange(prices.shape[1])
-        times_s = np.maximum(now[0], now[0] + (y_m - now[1]) / config.speed_mps)
-        for one in moving:
-            vehicle = config.vehicle_radius_m, config.camera_height_m
-            prices = np.maximum(prices, _moving_prices(one, (x_m, y_m), times_s, vehicle))
+    vehicle = config.vehicle_radius_m, config.camera_height_m, config.speed_mps
+    prices = prices_among(moving, prices, first_x_m, now, vehicle)
     stride = max(1, round(ROW_S * config.speed_mps / LATTICE_M))
     row_s = stride * LATTICE_M / config.speed_mps
     step_mps = min(acceleration_mps2 * row_s, speed_mps)
     half = int(speed_mps / step_mps + 1e-9)
     costs = _costs(prices, stride, row_s, step_mps, half)
     return BodyPlan(costs, prices, first_x_m, stride * LATTICE_M, step_mps, dynamics)
-
-
-def _moving_prices(
-    one: MovingBody, lattice: tuple[np.ndarray, np.ndarray], times_s: np.ndarray, vehicle: tuple[float, float]
-) -> np.ndarray:
-    """Return the price of each place of a lattice x (C,), y (R,) [m] at each row's time, (R, C)."""
-    (x_m, y_m), (radius_m, height_m) = lattice, vehicle
-    bodies = np.array([one.body] * len(times_s), OBSTACLE)
-    bodies["x"], bodies["y"], bodies["z"] = one.places(times_s).T
-    there = np.abs(bodies["z"] - height_m) <= bodies["rz"]
-    prices = np.zeros((len(y_m), len(x_m)))
-    x, y, _, _, hx, hy, r = body_sections(bodies[there], height_m).T[:, :, None]
-    across = np.maximum(np.abs(y_m[there][:, None] - y) - hy, 0.0)
-    clearance = np.hypot(np.maximum(np.abs(x_m - x) - hx, 0.0), across) - r - radius_m
-    price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
-    prices[there] = np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price)
-    return prices
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -128,7 +128,7 @@ def fly_at_random(env: CorridorEnv, seed: int) -> Act:
 
 def fly_as_planned(env: CorridorEnv, seed: int) -> Act:
     """Plan with the true geometry, for where the action takes effect; with a body by the cheapest command."""
-    if env.dynamics.move is not None:
+    if env.dynamics.move is not None or env.moving:
         planner = Planner()
         return lambda observation: int(planner.costs(env).argmin())
     step_m = env.config.speed_mps / env.config.control_hz

@@ -1,13 +1,12 @@
 """Env runners beside which a planner stands that knows the geometry, and says what each place costs."""
 
 import math
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
-from envs.scene import Scene
-from envs.scene.planning import CostToGo, cost_to_go
 from envs.vehicles.planning import Planner
 from jobs.training.sampling.env_runner import PlainEnvRunner, Step
 from jobs.training.sampling.snapshots import Snapshot
@@ -23,25 +22,14 @@ class TeacherEnvRunner(PlainEnvRunner):
     """As `PlainEnvRunner`, with a plan of each environment's scene."""
 
     def __init__(self, **settings: Any) -> None:
-        self._plans: dict[int, tuple[Scene, CostToGo]] = {}  # of each environment's scene
-        self._planners: dict[int, Planner] = {}  # of each environment whose vehicle has a body
+        self._planners: dict[int, Planner] = defaultdict(Planner)  # of each environment
         super().__init__(**settings)
 
     def costs(self) -> np.ndarray:
         """Return the cost of each action where it takes effect, float64 (N, actions)."""
         sight_m = self.config.learner_config_dict.get(SIGHT_M, math.inf)
-        return np.stack([self._costs(row, sight_m) for row in range(self.env.num_envs)])
-
-    def _costs(self, row: int, sight_m: float) -> np.ndarray:
-        env = self.env.unwrapped.envs[row]
-        if env.dynamics.move is not None:
-            return self._planners.setdefault(row, Planner()).costs(env)
-        scene, plan = self._plans.get(row, (None, None))
-        if plan is None or scene is not env.scene:
-            plan = cost_to_go(env.scene, env.config.vehicle_radius_m, env.config.camera_height_m)
-            self._plans[row] = env.scene, plan
-        x_m, y_m = env.place_of_action()
-        return plan.of_actions(x_m, y_m, sight_m)
+        envs = self.env.unwrapped.envs
+        return np.stack([self._planners[row].costs(env, sight_m) for row, env in enumerate(envs)])
 
 
 class PricedEnvRunner(TeacherEnvRunner):

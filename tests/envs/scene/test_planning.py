@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from envs.config import EnvConfig
 from envs.kinematics import Lane, advance, planned_position
-from envs.scene import make_scene
+from envs.scene import ELLIPSOID, OBSTACLE, Scene, at_velocity, make_scene
 from envs.scene.planning import BLOCKED, LATTICE_M, SIDE_PRICE, CostToGo, _costs, cost_to_go
 
 RADIUS_M, HEIGHT_M = 0.3, 2.0
@@ -120,6 +120,22 @@ def test_the_cheapest_actions_come_through(name, random_share, least):
 def test_five_metres_of_sight_suffice_among_dense_poles(control_hz):
     flights = [flown(drawn("poles_dense", k), k, 0.0, sight_m=5.0, control_hz=control_hz) for k in range(40)]
     assert all(flights)
+
+
+def test_a_row_is_priced_as_it_is_when_the_vehicle_comes_there():
+    ball = np.array((ELLIPSOID, -4.0, 20.0, HEIGHT_M, 0.5, 0.5, 0.5, 0.5), OBSTACLE)[()]
+    crossing, standing = at_velocity(ball, (4.0, 0.0, 0.0)), at_velocity(ball, (0.0, 0.0, 0.0))
+    plan = cost_to_go(Scene("empty", np.empty(0, OBSTACLE)), RADIUS_M, HEIGHT_M)
+    now, vehicle = (0.0, 0.0), (RADIUS_M, HEIGHT_M, 10.0)  # there after 2 s, when the ball is at x = 4 m
+    row, columns = round(20.0 / LATTICE_M), {x: round((x - plan.first_x_m) / LATTICE_M) for x in (-4, 0, 4)}
+    for moving, blocked in ((crossing, 4), (standing, -4)):
+        prices = plan.among([moving], now, vehicle).prices[row]
+        assert {x for x, column in columns.items() if prices[column] == BLOCKED} == {blocked}
+    again = plan.among([crossing], (1.0, 10.0), vehicle)
+    np.testing.assert_array_equal(again.costs, plan.among([crossing], now, vehicle).costs)
+    assert plan.among([], now, vehicle) is plan
+    higher = plan.among([crossing], now, (RADIUS_M, HEIGHT_M + 0.6, 10.0))
+    np.testing.assert_array_equal(higher.costs, plan.costs)
 
 
 def test_a_mesh_blocks_where_its_surfaces_are(tmp_path):

@@ -106,6 +106,15 @@ def test_the_oracle_also_comes_through_at_the_slowest_control():
     assert roll_out(make_agent("oracle"), slow, range(10), num_envs=10)["success"].mean() >= 0.9
 
 
+@pytest.mark.parametrize("layout", [{"num_obstacles": 0, "num_moving": 40}, {"throw_every_s": 1.0}])
+def test_the_oracle_of_a_kinematic_vehicle_passes_bodies_that_move(layout):
+    among = dataclasses.replace(HELD_OUT, layout=layout, speed_mps=10.0, time_limit_s=20.0)
+    success = [roll_out(make_agent(name), among, range(10), num_envs=10)["success"].mean()
+               for name in ("oracle", "straight")]  # fmt: skip
+    assert success[0] >= 0.9
+    assert success[1] <= 0.3
+
+
 def test_the_oracle_foresees_what_it_has_decided():
     late = dataclasses.replace(HELD_OUT, action_delay_ms=250.0)
     assert roll_out(make_agent("oracle"), late, range(10), num_envs=10)["success"].mean() >= 0.9
