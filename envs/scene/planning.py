@@ -116,15 +116,21 @@ def prices_among(
     y_m, x_m = (LATTICE_M * np.arange(size) for size in prices.shape)
     times_s, prices = np.maximum(now[0], now[0] + (y_m - now[1]) / speed_mps), prices.copy()
     for one in moving:
-        bodies = np.array([one.body] * len(times_s), OBSTACLE)
-        bodies["x"], bodies["y"], bodies["z"] = one.places(times_s).T
         reach_m = max(float(one.body["rx"]), float(one.body["ry"])) + radius_m + FELT_M
-        there = (np.abs(bodies["z"] - height_m) <= bodies["rz"]) & (np.abs(bodies["y"] - y_m) <= reach_m)
+        ends_m = one.places_m[:, 1].min() - reach_m, one.places_m[:, 1].max() + reach_m
+        rows = slice(*np.searchsorted(y_m, ends_m))  # others it never comes near
+        bodies = np.array([one.body] * len(y_m[rows]), OBSTACLE)
+        bodies["x"], bodies["y"], bodies["z"] = one.places(times_s[rows]).T
+        there = (np.abs(bodies["z"] - height_m) <= bodies["rz"]) & (
+            np.abs(bodies["y"] - y_m[rows]) <= reach_m
+        )
         x, y, _, _, hx, hy, r = body_sections(bodies[there], height_m).T[:, :, None]
-        across = np.maximum(np.abs(y_m[there][:, None] - y) - hy, 0.0)
+        across = np.maximum(np.abs(y_m[rows][there][:, None] - y) - hy, 0.0)
         clearance = np.hypot(np.maximum(np.abs(first_x_m + x_m - x) - hx, 0.0), across) - r - radius_m
-        price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
-        prices[there] = np.maximum(prices[there], np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price))
+        price = np.where(
+            clearance <= 0.5 * LATTICE_M, BLOCKED, np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
+        )
+        prices[rows][there] = np.maximum(prices[rows][there], price)
     return prices
 
 
