@@ -3,7 +3,6 @@ from pathlib import Path
 
 from research import coverage
 from research.coverage import SPREADS, change_coverage, true_rate
-from research.stopping import EFFECTS, MEAN
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "statistics.md").read_text()
@@ -19,9 +18,6 @@ def test_the_page_says_the_true_rates_at_each_spread():
     assert f"the true rates are {', '.join(first)} and {last} %" in PAGE
     mean_3 = f"a true rate of {percent(3, 0)} % where seeds agree, and of {percent(3, 3)} % at a spread of 3"
     assert mean_3 in PAGE
-    ours, theirs = ([percent(MEAN - effect, spread) for spread in (0, 2)] for effect in EFFECTS)
-    said = f"true rates of {ours[0]} and {theirs[0]} % where seeds agree, and of {ours[1]} and {theirs[1]} %"
-    assert said in PAGE.replace("\n", " ")
 
 
 def test_the_page_says_what_looking_early_costs_as_its_rows_do():
@@ -30,7 +26,7 @@ def test_the_page_says_what_looking_early_costs_as_its_rows_do():
     losses = [1 - int(shared) / int(once) for once, shared in rows]
     assert len(losses) == 4
     assert 0.32 < min(losses) < max(losses) < 0.45
-    assert "costs a third to four in ten of the decisions" in PAGE
+    assert "cost a third to four in ten of the decisions" in " ".join(PAGE.split())
 
 
 def test_intervals_of_a_change_hold_zero_where_nothing_changes(monkeypatch):

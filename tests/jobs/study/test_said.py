@@ -3,7 +3,6 @@
 import csv
 import re
 
-import numpy as np
 import pytest
 
 from jobs.run.provenance import REPOSITORY
@@ -72,18 +71,3 @@ def test_what_breaks_taught_policies_is_what_the_data_say():
     found = re.search(r"By imitation in plain worlds .* cost most, by (\d+) to (\d+) points", text)
     assert [int(one) for one in found.groups()] == [min(lost), max(lost)]
     assert {row["Axis"] for row in rows} == {"world", "background_activity", "control_hz", "control_hz_dense"}
-
-
-def test_what_nominal_success_tells_is_what_the_data_say():
-    found, told = read_published(REPOSITORY / "docs" / "data", "ppo_claims"), []
-    for group in ("bytestream", "bytestream_xy"):
-        nominal = found.values(found.nominal, group).mean(axis=1)
-        others = [found.values(at, group).mean(axis=1) for at in found.different if at != found.nominal]
-        told.append(f"{np.corrcoef(nominal, np.mean(others, axis=0))[0, 1]:.2f} (`{group}`)")
-        assert len(others) == 15
-    assert " and ".join(told) in " ".join((REPOSITORY / "docs" / "statistics.md").read_text().split())
-
-
-def test_a_page_about_trainings_that_have_been_replaced_says_so():
-    text = (REPOSITORY / "docs" / "dose_response_taught.md").read_text()
-    assert "stands for trainings shipped at commit 2991870" in text
