@@ -30,7 +30,7 @@ from jobs.rollout.policies import find_one_policy
 from jobs.run.files import write_atomic
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console
-from jobs.tools.calibrate.estimate import Footage, simulate
+from jobs.tools.calibrate.footage import Footage, simulate
 from jobs.tools.calibrate.sources import read_frames, read_greys, read_source
 from jobs.training.real_recordings import cropped
 from models.encoder.evae import EventVAE

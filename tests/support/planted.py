@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from envs.config import CameraConfig, FaultsConfig
-from jobs.tools.calibrate.estimate import Footage, simulate, still_footage
+from jobs.tools.calibrate.footage import Footage, simulate, still_footage
 
 HZ, SECONDS = 100, 10.0
 

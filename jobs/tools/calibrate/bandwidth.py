@@ -6,11 +6,13 @@ lets a pixel fire early, on average by the same part of a threshold in all rises
 off.
 """
 
+import dataclasses
+
 import numpy as np
 
 from envs.config import CameraConfig
 from envs.events.lowpass import filter_rates
-from jobs.tools.calibrate.footage import Trains, light_behind, of_columns, with_bandwidth
+from jobs.tools.calibrate.footage import Trains, light_behind, of_columns
 from jobs.tools.calibrate.found import TAILS, Found, missing, resampled, with_interval
 from jobs.tools.calibrate.thresholds import equations, staircase
 
@@ -62,7 +64,7 @@ def bandwidth(
     trains, luminance = of_columns(trains, chosen), np.ascontiguousarray(luminance[:, chosen])
 
     def tried(cutoffs: np.ndarray) -> np.ndarray:
-        cameras = [with_bandwidth(camera, cutoff_hz) for cutoff_hz in cutoffs.tolist()]
+        cameras = [dataclasses.replace(camera, cutoff_hz=cutoff_hz) for cutoff_hz in cutoffs.tolist()]
         return np.stack([misfit(trains, luminance, times_us, one, refractory_us) for one in cameras])
 
     cutoffs = np.geomspace(LOWEST_HZ, HIGHEST_HZ, COARSE)
@@ -86,7 +88,7 @@ def bandwidth(
 
 def time_constant_s(cutoff_hz: float, luminance: np.ndarray, camera: CameraConfig) -> float:
     """Time constant of the filter under the median of luminances, white = 1 [s]."""
-    black, white = filter_rates(with_bandwidth(camera, cutoff_hz))
+    black, white = filter_rates(dataclasses.replace(camera, cutoff_hz=cutoff_hz))
     return 1.0 / (black + white * float(np.median(luminance)))
 
 

@@ -29,14 +29,8 @@ from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
 from jobs.run.recordings import refused
 from jobs.tools.calibrate.camera_file import camera_text, unit
-from jobs.tools.calibrate.estimate import (
-    Calibration,
-    Footage,
-    estimate,
-    settings,
-    simulate,
-    still_footage,
-)
+from jobs.tools.calibrate.estimate import Calibration, estimate, settings
+from jobs.tools.calibrate.footage import Footage, simulate, still_footage
 from jobs.tools.calibrate.found import Found
 from jobs.tools.calibrate.likeness import INTERVALS_MS, Likeness, likeness
 from jobs.tools.calibrate.sources import frames_beside, read_frames, read_source

@@ -16,15 +16,9 @@ FEWEST, MOVED = 20, 1.4  # deaf intervals, and thresholds that the light moves i
 AGREE = 2.5  # most that what deaf intervals say and the shortest one may differ by, as a factor
 
 
-def intervals_us(trains: Trains) -> np.ndarray:
-    """Return all intervals between successive events of a pixel, ascending, float64 (M,) [us]."""
-    same = np.diff(trains.pixel) == 0
-    return np.sort(np.diff(trains.t_us)[same].astype(np.float64))
-
-
 def shortest_us(trains: Trains) -> float:
     """Return the shortest interval with four others within a tenth of it [us]; infinite if there is none."""
-    intervals = intervals_us(trains)
+    intervals = np.sort(np.diff(trains.t_us)[np.diff(trains.pixel) == 0].astype(np.float64))
     far = np.searchsorted(intervals, (1.0 + NEAR) * intervals, side="right")
     credible = intervals[far - np.arange(intervals.size) >= FEWEST_NEAR]
     return float(credible[0]) if credible.size else np.inf

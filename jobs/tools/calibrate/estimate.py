@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from envs.config import CameraConfig, FaultsConfig
-from envs.events import EventCamera, RealSensor
 from jobs.tools.calibrate.bandwidth import bandwidth
 from jobs.tools.calibrate.dead_time import refractory_period
 from jobs.tools.calibrate.footage import (
+    Footage,
     Light,
     Trains,
     light_behind,
     luminance_of,
     of_pixels,
+    simulate,
     trains_of,
-    with_bandwidth,
 )
 from jobs.tools.calibrate.found import Found, at_most, missing
 from jobs.tools.calibrate.hot_pixels import hot_pixels, hot_settings, unexplained
@@ -43,28 +43,6 @@ BY_LIGHT = (ON, OFF, MISMATCH, CUTOFF, DEAD)
 NEEDS_LIGHT = "a still scene does not tell it; give frames of a moving one with `calibrate.frames`"
 
 
-class Footage(NamedTuple):
-    """Frames of a sensor.
-
-    Attributes:
-        luminance: float32 (K, H, W), white = 1.
-        times_us: int64 (K,), ascending [us].
-    """
-
-    luminance: np.ndarray
-    times_us: np.ndarray
-
-    @property
-    def flat(self) -> np.ndarray:
-        """Return the luminance as float32 (K, H * W)."""
-        return self.luminance.reshape(len(self.luminance), -1)
-
-    @property
-    def is_still(self) -> bool:
-        """Whether nothing changes."""
-        return bool((self.luminance == self.luminance[0]).all())
-
-
 class Calibration(NamedTuple):
     """What a recording says of its sensor.
 
@@ -75,20 +53,6 @@ class Calibration(NamedTuple):
 
     found: dict[str, Found]
     hot: np.ndarray
-
-
-def still_footage(shape: tuple[int, int], luminance: float, span_us: tuple[int, int]) -> Footage:
-    """Return the frames of a uniform scene that never changes."""
-    return Footage(np.full((2, *shape), luminance, np.float32), np.array(span_us, np.int64))
-
-
-def simulate(footage: Footage, camera: CameraConfig, faults: FaultsConfig, seed: int) -> np.ndarray:
-    """Events, EVENT, that the simulated sensor makes of frames of its size."""
-    eye, times = EventCamera(camera), footage.times_us.tolist()
-    eye.reset(footage.luminance[0], times[0])
-    sensor = RealSensor(camera, faults, (eye.state, eye.pixels), np.random.default_rng(seed), times[0])
-    steps = zip(footage.luminance[1:], times[:-1], times[1:], strict=True)
-    return np.concatenate([sensor.events(eye.step(frame, end), begin, end) for frame, begin, end in steps])
 
 
 def estimate(events: np.ndarray, footage: Footage, camera: CameraConfig, seed: int = 0) -> Calibration:
@@ -115,10 +79,8 @@ def estimate(events: np.ndarray, footage: Footage, camera: CameraConfig, seed: i
         refuse_motion(events, (begin, end), shape)
     camera = dataclasses.replace(camera, height=shape[0], width=shape[1])
     trains, rng = trains_of(events, shape[1]), np.random.default_rng(seed)
-    rough = _rough(trains, footage, camera, rng)
-    beyond = unexplained(
-        trains, light_behind(footage.flat, footage.times_us, with_bandwidth(camera, 0.0)), rough
-    )
+    light = light_behind(footage.flat, footage.times_us, dataclasses.replace(camera, cutoff_hz=0.0))
+    beyond = unexplained(trains, light, _rough(trains, footage, light, camera, rng))
     hot = hot_pixels(beyond)
     found = dict(zip((HOT_SHARE, HOT_HZ), hot_settings(beyond, hot, 1e-6 * (end - begin), rng), strict=True))
     sound = of_pixels(trains, ~hot)
@@ -153,7 +115,7 @@ def by_light(
     dead_us = 0.0
     for _ in range(PASSES):
         cutoff = bandwidth(trains, flat, times_us, camera, dead_us, rng)
-        light = light_behind(flat, times_us, with_bandwidth(camera, cutoff.value or 0.0))
+        light = light_behind(flat, times_us, dataclasses.replace(camera, cutoff_hz=cutoff.value or 0.0))
         table = equations(trains, light, dead_us)
         on, off = thresholds(table, rng)
         if on.value is None or off.value is None:
@@ -181,13 +143,12 @@ def by_noise(trains: Trains, footage: Footage, camera: CameraConfig, sound: np.n
 
 
 def _rough(
-    trains: Trains, footage: Footage, camera: CameraConfig, rng: np.random.Generator
+    trains: Trains, footage: Footage, light: Light, camera: CameraConfig, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Thresholds before anything else is known."""
     usual = camera.contrast_threshold, camera.contrast_threshold_off or camera.contrast_threshold
     if footage.is_still:
         return usual
-    light: Light = light_behind(footage.flat, footage.times_us, with_bandwidth(camera, 0.0))
     on, off = thresholds(equations(trains, light, 0.0), rng)
     return (on.value, off.value) if on.value is not None and off.value is not None else usual
 

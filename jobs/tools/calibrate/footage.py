@@ -1,13 +1,35 @@
-"""What an event camera sent, pixel by pixel, and the response of its pixels to the light of its frames."""
+"""The frames of an event camera, what it sent, pixel by pixel, and the response of its pixels to light."""
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
-from envs.config import LUMINANCE_FLOOR, CameraConfig
+from envs.config import LUMINANCE_FLOOR, CameraConfig, FaultsConfig
+from envs.events import EventCamera, RealSensor
 from envs.events.lowpass import filter_frames, filter_rates, low_pass, start_filter
 from envs.events.photoreceptor import Curve, light_of, respond, response_curve
+
+
+class Footage(NamedTuple):
+    """Frames of a sensor.
+
+    Attributes:
+        luminance: float32 (K, H, W), white = 1.
+        times_us: int64 (K,), ascending [us].
+    """
+
+    luminance: np.ndarray
+    times_us: np.ndarray
+
+    @property
+    def flat(self) -> np.ndarray:
+        """Return the luminance as float32 (K, H * W)."""
+        return self.luminance.reshape(len(self.luminance), -1)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether nothing changes."""
+        return bool((self.luminance == self.luminance[0]).all())
 
 
 class Trains(NamedTuple):
@@ -38,6 +60,20 @@ class Light(NamedTuple):
     travel: np.ndarray
 
 
+def still_footage(shape: tuple[int, int], luminance: float, span_us: tuple[int, int]) -> Footage:
+    """Return the frames of a uniform scene that never changes."""
+    return Footage(np.full((2, *shape), luminance, np.float32), np.array(span_us, np.int64))
+
+
+def simulate(footage: Footage, camera: CameraConfig, faults: FaultsConfig, seed: int) -> np.ndarray:
+    """Events, EVENT, that the simulated sensor makes of frames of its size."""
+    eye, times = EventCamera(camera), footage.times_us.tolist()
+    eye.reset(footage.luminance[0], times[0])
+    sensor = RealSensor(camera, faults, (eye.state, eye.pixels), np.random.default_rng(seed), times[0])
+    steps = zip(footage.luminance[1:], times[:-1], times[1:], strict=True)
+    return np.concatenate([sensor.events(eye.step(frame, end), begin, end) for frame, begin, end in steps])
+
+
 def trains_of(events: np.ndarray, width: int) -> Trains:
     """EVENT (N,), sorted by t, of a sensor with so many columns, as trains."""
     pixel = events["y"].astype(np.int64) * width + events["x"]
@@ -63,7 +99,7 @@ def light_behind(luminance: np.ndarray, times_us: np.ndarray, camera: CameraConf
 
     A bandwidth of 0 leaves all.
     """
-    curve = Curve(*response_curve(camera.response, camera.luminance_floor or LUMINANCE_FLOOR))
+    curve = _curve(camera)
     if camera.cutoff_hz > 0.0:
         pixels = low_pass(luminance.shape[1])
         start_filter(np.ascontiguousarray(luminance[0]), curve, pixels)
@@ -85,17 +121,13 @@ def looked_up(values: np.ndarray, times_us: np.ndarray, pixel: np.ndarray, t_us:
     return values[late - 1, pixel] * (1.0 - share) + values[late, pixel] * share
 
 
-def with_bandwidth(camera: CameraConfig, cutoff_hz: float) -> CameraConfig:
-    """Return the camera with another bandwidth [Hz]; 0: unlimited."""
-    return dataclasses.replace(camera, cutoff_hz=cutoff_hz)
-
-
 def luminance_of(response: np.ndarray, camera: CameraConfig) -> np.ndarray:
     """Return the luminance, white = 1, of these responses; float64 (N,)."""
     levels = np.array(response, np.float64)
-    light_of(
-        Curve(*response_curve(camera.response, camera.luminance_floor or LUMINANCE_FLOOR)),
-        levels,
-        np.empty(levels.size, np.int64),
-    )
+    light_of(_curve(camera), levels, np.empty(levels.size, np.int64))
     return np.clip(levels, 0.0, None)
+
+
+def _curve(camera: CameraConfig) -> Curve:
+    """Return how a camera's pixels respond to light."""
+    return Curve(*response_curve(camera.response, camera.luminance_floor or LUMINANCE_FLOOR))

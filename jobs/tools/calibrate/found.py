@@ -30,6 +30,11 @@ def missing(reason: str) -> Found:
     return Found(None, reason=reason)
 
 
+def neither(reason: str) -> tuple[Found, Found]:
+    """Return two settings of which neither can be estimated."""
+    return missing(reason), missing(reason)
+
+
 def at_most(value: float) -> Found:
     """Return a setting that may be 0."""
     return missing(f"at most {value:.2g}")

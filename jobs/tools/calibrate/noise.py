@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.config import CameraConfig, FaultsConfig
-from envs.events import EventCamera, RealSensor
 from envs.events.pixel_noise import SHOT_NOISE_FALL
-from jobs.tools.calibrate.footage import Trains
-from jobs.tools.calibrate.found import Found, missing
+from jobs.tools.calibrate.footage import Footage, Trains, simulate, trains_of
+from jobs.tools.calibrate.found import Found, neither
 
 BURN_IN = 0.25  # of the time: levels are where noise takes them only after a while
 FEWEST_PIXELS = 16
@@ -24,7 +23,6 @@ SIMULATED_PIXELS = 5000
 ROUNDS, NUDGE = 3, 0.2
 LEAST_NUDGE_HZ = 0.01
 HIDDEN = 1e-3  # of the slopes' determinant
-HIDDEN_REASON = "leakage and shot noise look the same behind this refractory period"
 STEP_US = 250_000
 
 
@@ -63,19 +61,12 @@ def simulated_rates(
     """Compute the rates of simulated pixels; equal arguments give equal numbers."""
     side = math.isqrt(SIMULATED_PIXELS)
     camera = dataclasses.replace(camera, width=side, height=side)
-    eye, frame = EventCamera(camera), np.full((side, side), luminance, np.float32)
-    eye.reset(frame, span_us[0])
-    faults = FaultsConfig(leak_hz=leak_hz, shot_noise_hz=shot_hz)
-    sensor = RealSensor(camera, faults, (eye.state, eye.pixels), np.random.default_rng(0), span_us[0])
-    pixel, t_us, p = [], [], []
-    for begin in range(*span_us, STEP_US):
-        end = min(begin + STEP_US, span_us[1])
-        events = sensor.events(eye.step(frame, end), begin, end)
-        pixel.append(events["y"].astype(np.int64) * side + events["x"])
-        t_us.append(events["t"])
-        p.append(events["p"].astype(np.float64))
-    trains = Trains(*(np.concatenate(parts) for parts in (pixel, t_us, p)))
-    return still_rates(trains, np.ones(side * side, bool), span_us)
+    times_us = np.append(np.arange(*span_us, STEP_US), span_us[1])
+    frames = np.broadcast_to(np.float32(luminance), (len(times_us), side, side))
+    events = simulate(
+        Footage(frames, times_us), camera, FaultsConfig(leak_hz=leak_hz, shot_noise_hz=shot_hz), seed=0
+    )
+    return still_rates(trains_of(events, side), np.ones(side * side, bool), span_us)
 
 
 def noise_rates(
@@ -99,7 +90,7 @@ def noise_rates(
             [(simulated(values + nudge).mean - made.mean) / nudge.sum() for nudge in nudges], axis=1
         )
         if abs(np.linalg.det(slope)) < HIDDEN:
-            return missing(HIDDEN_REASON), missing(HIDDEN_REASON)
+            return neither("leakage and shot noise look the same behind this refractory period")
         step = np.linalg.solve(slope, seen.mean - made.mean)
         values = np.clip(values + step, 0.2 * values, 5.0 * values + LEAST_NUDGE_HZ)
     inverse = np.linalg.inv(slope)

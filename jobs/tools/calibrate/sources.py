@@ -13,7 +13,7 @@ from envs.recordings.event_file import EventFile
 from envs.recordings.light import light_of_grey, luminance
 from jobs.config.schema import RecordingConfig
 from jobs.run.recordings import read_recording
-from jobs.tools.calibrate.estimate import Footage
+from jobs.tools.calibrate.footage import Footage
 
 MAX_PIXELS = 1 << 28  # of all frames together: 1 GiB
 EIGHT_BITS = ("L", "LA", "P", "RGB", "RGBA")  # of Pillow's modes

@@ -13,7 +13,7 @@ import numpy as np
 
 from jobs.analysis.statistics import CONFIDENCE
 from jobs.tools.calibrate.footage import Light, Trains, looked_up
-from jobs.tools.calibrate.found import TAILS, Found, at_most, missing, resampled, with_interval
+from jobs.tools.calibrate.found import TAILS, Found, at_most, missing, neither, resampled, with_interval
 
 RUN = 16  # events of a pixel that are compared with each other
 FEWEST_EVENTS = 200  # in all runs of three or more
@@ -93,25 +93,23 @@ def thresholds(found: Equations, rng: np.random.Generator) -> tuple[Found, Found
     """ON and OFF threshold, of all pixels together; intervals over pixels."""
     matrix, right = found.matrix.sum(axis=0), found.right.sum(axis=0)
     if found.events.sum() < FEWEST_EVENTS:
-        reason = f"fewer than {FEWEST_EVENTS} events between the frames"
-        return missing(reason), missing(reason)
+        return neither(f"fewer than {FEWEST_EVENTS} events between the frames")
     if is_singular(matrix.sum(axis=0)):
-        reason = "frames that never change the light of a pixel by a threshold"
-        return missing(reason), missing(reason)
+        return neither("frames that never change the light of a pixel by a threshold")
     value = np.linalg.solve(matrix.sum(axis=0), right.sum(axis=0))
     weights = resampled(len(right), rng)
     drawn, sums = np.tensordot(weights, matrix, 1), weights @ right
     sound = ~is_singular(drawn)
     if sound.mean() < CONFIDENCE:
-        reason = "too few pixels whose light changes"
-        return missing(reason), missing(reason)
+        return neither("too few pixels whose light changes")
     drawn = np.linalg.solve(drawn[sound], sums[sound][..., None])[..., 0]
     on, off = (with_interval(value[k], drawn[:, k]) for k in range(2))
     # Frames of another scene tell nothing of the counts: the solution is anything, and its interval wide.
     width = np.max((on.high - on.low, off.high - off.low) / value)
     if not (np.min((on.low, off.low)) > 0.0 and max(value) <= HIGHEST and width < WIDEST):
-        reason = "frames and events do not fit each other: check the clock and `calibrate.frame_delay_us`"
-        return missing(reason), missing(reason)
+        return neither(
+            "frames and events do not fit each other: check the clock and `calibrate.frame_delay_us`"
+        )
     return on, off
 
 

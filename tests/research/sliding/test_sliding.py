@@ -5,7 +5,7 @@ from PIL import Image
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from envs.events import EVENT
 from envs.recordings import write_events
-from jobs.tools.calibrate.estimate import Footage
+from jobs.tools.calibrate.footage import Footage
 from research.probe.dataset import SECTORS, ProbeData
 from research.sliding.depth import Lens, distorted, inverse_depth, straightened
 from research.sliding.sliding import (

@@ -17,12 +17,17 @@ from jobs.tools.calibrate.estimate import (
     OFF,
     ON,
     SHOT,
-    Footage,
     corrected,
     estimate,
-    still_footage,
 )
-from jobs.tools.calibrate.footage import light_behind, looked_up, luminance_of, trains_of
+from jobs.tools.calibrate.footage import (
+    Footage,
+    light_behind,
+    looked_up,
+    luminance_of,
+    still_footage,
+    trains_of,
+)
 from jobs.tools.calibrate.found import Found, missing
 from jobs.tools.calibrate.hot_pixels import hot_pixels
 from jobs.tools.calibrate.thresholds import Equations, equations, mismatch, thresholds

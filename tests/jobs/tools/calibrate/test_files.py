@@ -16,7 +16,8 @@ from jobs.config.config import ConfigError, parse
 from jobs.config.schema import RecordingConfig
 from jobs.tools.calibrate import calibrate, sources
 from jobs.tools.calibrate.camera_file import camera_text
-from jobs.tools.calibrate.estimate import DEAD, LEAK, NAMES, OFF, ON, Calibration, Footage
+from jobs.tools.calibrate.estimate import DEAD, LEAK, NAMES, OFF, ON, Calibration
+from jobs.tools.calibrate.footage import Footage
 from jobs.tools.calibrate.found import Found, missing
 from jobs.tools.calibrate.likeness import likeness, net_images
 from jobs.tools.calibrate.sources import read_frames, read_source
