@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from core.files import naming
 from core.files import write_atomic as write_atomic  # for the jobs, with the rest of this file
 from envs.config import settings_hash
 
@@ -64,6 +65,15 @@ def without_checksum(values: Any) -> Any:
 def json_lines(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return rows as lines of JSON, each with its checksum; NaN and infinity are refused."""
     return "".join(json.dumps(with_checksum(row), allow_nan=False) + "\n" for row in rows)
+
+
+def append_json_lines(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Append `json_lines` to a file, made if it is missing; half a line that a kill left there is removed."""
+    with naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab") as lines:
+            lines.truncate(len(whole_lines(path)))
+            lines.write(json_lines(rows).encode())
 
 
 def read_json_lines(path: Path) -> list[Any]:

@@ -118,9 +118,6 @@ def _remove_new(path: Path) -> None:
     """Remove a run folder that holds its configuration and no results."""
     for file in [path / name for name in NEW_FILES]:
         file.unlink(missing_ok=True)
-    curves = path / "train" / "results.jsonl"
-    if curves.is_file() and not curves.stat().st_size:
-        curves.unlink()
     shutil.rmtree(path / ".ray", ignore_errors=True)
     for place in (path / "train", path, path.parent):  # folders that hold anything else stay
         with contextlib.suppress(OSError):

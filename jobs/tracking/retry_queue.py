@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
 
-from jobs.run.files import json_lines, read_json_lines, whole_lines, write_atomic
+from jobs.run.files import append_json_lines, json_lines, read_json_lines, write_atomic
 
 RETRY_AFTER_S = 30.0  # so that a store that does not answer does not hold up the work
 # How often MLflow's calls try a server that does not answer.
@@ -84,9 +84,7 @@ class RetryQueue:
         Returns:
             Why steps wait from now on; None if none wait, or if some waited before.
         """
-        with self.record.open("ab") as lines:
-            lines.truncate(len(whole_lines(self.record)))  # a kill can leave half a line
-            lines.write(json_lines([new]).encode())
+        append_json_lines(self.record, [new])
         waited = self.rows()
         rows = [*waited, new]
         if waited and time.monotonic() < self._retry_at_s:

@@ -22,12 +22,11 @@ import torch
 from ray import tune
 from ray.rllib.core.rl_module.rl_module import RLModule
 
-from core.files import naming
 from jobs.config.config import Config
 from jobs.config.plugins import with_culprit
 from jobs.rollout.diagnostics import DRIFT_METRICS
 from jobs.run.checkpoints import mend, seal
-from jobs.run.files import json_lines, read_json_lines, whole_lines
+from jobs.run.files import append_json_lines, read_json_lines
 from jobs.run.folder import Run, finish, finished, open_run
 from jobs.run.progress import console, progress
 from jobs.run.ray_cluster import fit, holds, start_ray, storage
@@ -66,10 +65,9 @@ LEARNER = ("learners", "default_policy")
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
-LISTENER = "train"
 RAISED = re.compile(r"^(?:\w+\.)*\w+(?:Error|Exception|Exit|Interrupt)\b.*$", re.MULTILINE)
 
-_LISTENERS: dict[str, Callable[[Mapping[str, object]], None]] = {}
+_listeners: list[Callable[[Mapping[str, Any]], None]] = []  # the last one hears the results
 
 
 class TrainingError(RuntimeError):
@@ -77,15 +75,11 @@ class TrainingError(RuntimeError):
 
 
 class Relay(tune.Callback):
-    """Hands results to the listener that this process has registered under a name.
+    """Hands results to the listener of this process, see `relayed_to`.
 
     Tune pickles its callbacks into the experiment's state, and neither a tracker nor a
-    progress bar can be pickled: the callback carries the name alone.
+    progress bar can be pickled: the callback carries nothing.
     """
-
-    def __init__(self, name: str) -> None:
-        """Remember the name."""
-        self.name = name
 
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
@@ -93,7 +87,7 @@ class Relay(tune.Callback):
         """Pass one result on, with the number of restarts before it, and show its notice."""
         if NOTICE in result:
             console.print(result[NOTICE], markup=False)
-        _LISTENERS[self.name]({**result, "trial_restarts": trial.num_failures})
+        _listeners[-1]({**result, "trial_restarts": trial.num_failures})
 
     def on_checkpoint(
         self, iteration: int, trials: list[Any], trial: Any, checkpoint: tune.Checkpoint, **info: Any
@@ -221,11 +215,7 @@ def export_policy(
 def _tuner(config: Config, folder: Run, built: Any) -> tune.Tuner:
     """Return the experiment in the run folder: the one that is there, else a new one."""
     path, trainable = storage(config.cluster, folder.train), algorithm_of(config).trainable(config)
-    said = mend_state(folder.train)
-    if said:
-        console.print(said, markup=False)
-    # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
-    if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
+    if can_continue(path, folder.train):
         stopped_at = restored(path, trainable, built).get_results()[0].checkpoint
         said = mend(Path(stopped_at.path)) if stopped_at and on_disk(stopped_at) else None
         if said:
@@ -234,19 +224,46 @@ def _tuner(config: Config, folder: Run, built: Any) -> tune.Tuner:
     return tune.Tuner(
         trainable,
         param_space=built,
-        run_config=tune.RunConfig(
-            name=folder.train.name,
-            storage_path=path.rpartition("/")[0],
-            stop={ENV_STEPS: config.train.env_steps},
-            verbose=0,
-            callbacks=[Relay(LISTENER)],
-            failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
-            checkpoint_config=tune.CheckpointConfig(
-                checkpoint_frequency=config.train.checkpoint_every,
-                num_to_keep=CHECKPOINTS_KEPT,
-                checkpoint_at_end=True,
-            ),
+        run_config=run_config(
+            path, config.train.checkpoint_every, at_end=True, stop={ENV_STEPS: config.train.env_steps}
         ),
+    )
+
+
+def can_continue(path: str, folder: Path) -> bool:
+    """Whether Tune can continue an experiment; its state is mended first, and what was done is printed.
+
+    Args:
+        path: Where the experiment is stored: a path or an address.
+        folder: Its folder on this machine.
+    """
+    said = mend_state(folder)
+    if said:
+        console.print(said, markup=False)
+    # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
+    return bool(tune.Tuner.can_restore(path)) and holds(path, "experiment_state-")
+
+
+def run_config(path: str, checkpoint_every: int, at_end: bool | None = None, **more: Any) -> tune.RunConfig:
+    """Return how Tune runs an experiment: stored at `path`, its results relayed, the newest checkpoints kept.
+
+    Args:
+        path: As `jobs.run.ray_cluster.storage` returns it.
+        checkpoint_every: Iterations from one checkpoint to the next.
+        at_end: Whether there is one at the end too; None: as Tune does.
+        **more: Of `tune.RunConfig`.
+    """
+    place, _, name = path.rpartition("/")
+    return tune.RunConfig(
+        name=name,
+        storage_path=place,
+        verbose=0,
+        callbacks=[Relay()],
+        failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
+        checkpoint_config=tune.CheckpointConfig(
+            checkpoint_frequency=checkpoint_every, num_to_keep=CHECKPOINTS_KEPT, checkpoint_at_end=at_end
+        ),
+        **more,
     )
 
 
@@ -264,12 +281,9 @@ def restored(path: str, trainable: type, built: Any) -> tune.Tuner:
 def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
     """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
     file = folder.train / "results.jsonl"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("ab") as content:
-        content.truncate(len(whole_lines(file)))  # a kill can leave half a line
     reported, last = reported_so_far(file)
     algorithm, total, since_s = algorithm_of(config), config.train.env_steps, time.monotonic()
-    with progress("Train the policy", total, "steps", done=reported) as advance, file.open("a") as lines:
+    with progress("Train the policy", total, "steps", done=reported) as advance:
 
         def listen(result: Mapping[str, object]) -> None:
             nonlocal reported, since_s
@@ -279,25 +293,23 @@ def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dic
             if env_steps <= reported:
                 return
             row = {name: value if math.isfinite(value) else None for name, value in last.items()}
-            with naming(file):
-                lines.write(json_lines([{"env_steps": env_steps, **row}]))
-                lines.flush()
+            append_json_lines(file, [{"env_steps": env_steps, **row}])
             on_result(env_steps, dict(last))
             advance(env_steps - reported, note=_note(last))
             reported = env_steps
 
-        with relayed_to(LISTENER, listen):
+        with relayed_to(listen):
             yield last
 
 
 @contextlib.contextmanager
-def relayed_to(name: str, listen: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
-    """Let a function hear each result that a `Relay` of this name gets."""
-    _LISTENERS[name] = listen
+def relayed_to(listen: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
+    """Let a function hear each result that a `Relay` gets."""
+    _listeners.append(listen)
     try:
         yield
     finally:
-        del _LISTENERS[name]
+        _listeners.pop()
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:

@@ -8,7 +8,6 @@ search.
 """
 
 import dataclasses
-import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,6 @@ from ray import tune
 from ray.tune.schedulers import ASHAScheduler
 from ray.tune.search.optuna import OptunaSearch
 
-from core.files import naming
 from envs.config import STRICT, settings_hash
 from jobs.analysis.colours import BLUE, GREYS, INK
 from jobs.analysis.plots import tidy
@@ -31,11 +29,10 @@ from jobs.analysis.tables import publish_plot, publish_table
 from jobs.config.conditions import Searched
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Count
-from jobs.run.files import json_lines, read_json_lines, whole_lines, write_atomic
+from jobs.run.files import append_json_lines, json_lines, read_json_lines, write_atomic
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console, progress
-from jobs.run.ray_cluster import fit, holds, start_ray, storage
-from jobs.run.tune_state import mend_state
+from jobs.run.ray_cluster import fit, start_ray, storage
 from jobs.tools.search.space import (
     encoder_facts,
     extremes,
@@ -49,10 +46,9 @@ from jobs.tools.search.trial import Files, SearchTrial
 from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.inputs import check_inputs, prepare_inputs
-from jobs.training.train import CHECKPOINTS_KEPT, MAX_FAILURES, Relay, TrainingError, relayed_to, stopped
+from jobs.training.train import TrainingError, can_continue, relayed_to, run_config, stopped
 from models.policy.policy import ENCODER_FILES, NETWORKS
 
-LISTENER = "tune"
 REDUCTION = 3  # of the trials that reach a step of ASHA, one in so many goes on
 METRIC = "distance_m"  # success is 0 for long, and would tell nothing early
 HEADINGS = ("trial", "settings", "steps", "distance [m]", "success [%]")
@@ -149,9 +145,7 @@ def search(
     if begun.trials and not file.is_file():
         console.print(f"Continues a finished search: {begun.trials} of {config.own.trials} trials are there.")
         write_atomic(file, json_lines(begun.rows))
-    if file.is_file():
-        os.truncate(file, len(whole_lines(file)))  # a kill can leave half a line
-    rows: list[Row] = read_json_lines(file) if file.is_file() else []
+    rows: list[Row] = read_json_lines(file)
     known, total = {(row["trial"], row["env_steps"]) for row in rows}, config.own.trials
     with progress("Tune", total, "trials", done=len({row["trial"] for row in rows})) as advance:
 
@@ -162,12 +156,11 @@ def search(
             new = row["trial"] not in {one["trial"] for one in rows}
             known.add((row["trial"], row["env_steps"]))
             rows.append(row)
-            with naming(file), file.open("a") as lines:
-                lines.write(json_lines([row]))
+            append_json_lines(file, [row])
             write_child_runs(tracker, "trial", [child_run(of_trial(rows, row["trial"]))])
             advance(int(new), note=f"{row['trial']}: {row['distance_m']:.1f} m at {row['env_steps']:,} steps")
 
-        with relayed_to(LISTENER, listen):
+        with relayed_to(listen):
             results = fit(_tuner(config, place, files, begun))
     if not rows and results.errors:
         raise TrainingError(stopped(results.errors[0]))
@@ -179,10 +172,7 @@ def _tuner(config: Config, place: Path, files: Files, begun: Earlier) -> tune.Tu
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     path, most = storage(config.cluster, place), config.train.env_steps
     trial = tune.with_resources(tune.with_parameters(SearchTrial, base=config, files=files), {"cpu": 1})
-    said = mend_state(place)
-    if said:
-        console.print(said, markup=False)
-    if tune.Tuner.can_restore(path) and holds(path, "experiment_state-"):
+    if can_continue(path, place):
         return tune.Tuner.restore(path, trial, resume_unfinished=True, resume_errored=True)
     scheduler = ASHAScheduler(
         time_attr="env_steps",
@@ -200,14 +190,7 @@ def _tuner(config: Config, place: Path, files: Files, begun: Earlier) -> tune.Tu
             search_alg=_optuna(config, begun),
             scheduler=scheduler,
         ),
-        run_config=tune.RunConfig(
-            name=place.name,
-            storage_path=path.rpartition("/")[0],
-            verbose=0,
-            callbacks=[Relay(LISTENER)],
-            failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
-            checkpoint_config=tune.CheckpointConfig(checkpoint_frequency=1, num_to_keep=CHECKPOINTS_KEPT),
-        ),
+        run_config=run_config(path, checkpoint_every=1),
     )
 
 

@@ -82,7 +82,7 @@ class Trial:
 
 
 def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_path, capsys):
-    relay = training.Relay("name")
+    relay = training.Relay()
     raised = str(RayTaskError("train", "ray::PPO.train()\n  File 'a'\nValueError: no", ValueError("no")))
     lost = str(ActorDiedError())
     within = str(
@@ -121,7 +121,7 @@ def test_half_a_line_left_by_a_kill_is_not_written_on_to(tmp_path):
     file.write_text('{"env_steps": 64, "train/entropy": 0.5}\n{"env_st')
     with training._listening(config, folder, lambda step, metrics: None) as last:
         assert last == {"train/entropy": 0.5}
-        training._LISTENERS[training.LISTENER]({**result(), "num_env_steps_sampled_lifetime": 128})
+        training._listeners[-1]({**result(), "num_env_steps_sampled_lifetime": 128})
     assert [json.loads(line)["env_steps"] for line in file.read_text().splitlines()] == [64, 128]
 
 
@@ -131,13 +131,13 @@ def test_a_step_is_reported_once_even_after_a_restart(tmp_path):
     for steps in ((64, 128), (128, 192)):
         with training._listening(config, folder, lambda step, metrics: seen.append(step)) as last:
             for step in steps:
-                training._LISTENERS[training.LISTENER]({**result(), "num_env_steps_sampled_lifetime": step})
+                training._listeners[-1]({**result(), "num_env_steps_sampled_lifetime": step})
     assert seen == [64, 128, 192]
     assert last["train/episode_return"] == 12.5
     lines = (folder.train / "results.jsonl").read_text().splitlines()
     assert [json.loads(line)["env_steps"] for line in lines] == seen
     assert json.loads(lines[0])["train/success_rate"] is None
-    assert training._LISTENERS == {}
+    assert training._listeners == []
 
 
 SCRIPT = """
