@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 from core.files import replaced
@@ -155,9 +154,9 @@ def show_table(
     """
     table = Table(title=title, caption=caption, title_justify="left")
     for place, name in enumerate(head):
-        table.add_column(escape(name), justify="left" if place < words else "right", overflow="fold")
+        table.add_column(name, justify="left" if place < words else "right", overflow="fold")
     for row in rows:
-        table.add_row(*map(escape, row))
+        table.add_row(*row)
     console.print(table, width=None if console.is_terminal else FILE_WIDTH, soft_wrap=False)
 
 

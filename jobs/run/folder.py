@@ -190,7 +190,7 @@ def latest_policies(runs_dir: str | Path) -> dict[str, Path]:
         try:
             found[read_json(path).get("name", "")] = path.parent
         except RunError:  # another run's: its own commands refuse it
-            console.print(f"Damaged, not considered: {path}", markup=False)
+            console.print(f"Damaged, not considered: {path}")
     return found
 
 

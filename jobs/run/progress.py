@@ -10,7 +10,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 PLAIN_LINE_EVERY_S = 10.0
 
-console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 140)
+# Text is shown as it stands: what a file or a person has named may have brackets.
+console = Console(markup=False, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 140)
 
 
 @contextlib.contextmanager

@@ -60,7 +60,7 @@ def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[Eve
         told = min(told, time.monotonic())
         if time.monotonic() - told > TELL_EVERY_S:
             told = time.monotonic()
-            console.print(f"{Path(path).name}: {count / 1e6:,.1f} million events read", markup=False)
+            console.print(f"{Path(path).name}: {count / 1e6:,.1f} million events read")
         yield part
 
 
@@ -88,4 +88,4 @@ def _print(said: list[warnings.WarningMessage]) -> None:
     """Print warnings as plain lines, with the keys of commands."""
     for warning in said:
         text = re.sub(r"\b(topic|group|stream)= chooses", r"recording.\1 chooses", str(warning.message))
-        console.print(text.replace("strict=True", "recording.strict=true"), markup=False)
+        console.print(text.replace("strict=True", "recording.strict=true"))

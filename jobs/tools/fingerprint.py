@@ -74,7 +74,7 @@ def run(config: Config) -> dict[str, str]:
     Raises:
         FingerprintError: A stage differs; the message names the first.
     """
-    console.print("\n".join(f"{name}: {value}" for name, value in machine().items()), markup=False)
+    console.print("\n".join(f"{name}: {value}" for name, value in machine().items()))
     found = {name: digest(arrays) for name, arrays in stages(config)}
     if not PUBLISHED.is_file():
         first = {"processors": [machine()["Processor"]], "versions": versions(), "stages": found}

@@ -65,7 +65,7 @@ def run(config: Config) -> dict[str, int]:
     for training in trainings:
         target = publish(training, PRETRAINED)
         size = sum(file.stat().st_size for file in target.iterdir())
-        console.print(f"{target.relative_to(REPOSITORY)}: {size / 1024:,.0f} KiB", markup=False)
+        console.print(f"{target.relative_to(REPOSITORY)}: {size / 1024:,.0f} KiB")
     published = read_curves(PRETRAINED)  # also of trainings elsewhere, or whose run folders are gone
     published |= {(training.group, training.seed): learning_curve(training) for training in trainings}
     curves = [published[key] for key in sorted(published)]

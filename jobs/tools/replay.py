@@ -85,7 +85,6 @@ def run(config: Config) -> list[Choice]:
     if fitted.gaps:
         console.print(
             f"{fitted.gaps:,} gaps, {fitted.closed_us / 1e6:,.1f} s together, are closed in all times.",
-            markup=False,
         )
     _tell_rate(recorded, trained_rate(policy))
     choices, name = choose(policy, recorded), f"{found.group}-s{found.training}"
@@ -101,16 +100,14 @@ def run(config: Config) -> list[Choice]:
         "p99",
     )
     show_table("A policy looks at a recording", headings, [line(recorded.name, name, choices)], words=2)
-    console.print(
-        "Latency from events to action [ms]; actions by the likeliest, in % of the steps.", markup=False
-    )
+    console.print("Latency from events to action [ms]; actions by the likeliest, in % of the steps.")
     folder = open_run(config).path / "replay"
     folder.mkdir(parents=True, exist_ok=True)
     write_atomic(folder / "choices.csv", table_text(choices, policy.action_names))
     shape = env.camera.height, env.camera.width
     title, names = f"{recorded.name}   {name}", policy.action_names
     path = write_film(folder / "replay.mp4", choices, shape, (title, names), env.control_hz)
-    console.print(f"Film: {path}", markup=False)
+    console.print(f"Film: {path}")
     return choices
 
 
@@ -151,7 +148,6 @@ def _tell_rate(recorded: Recorded, trained: float | None) -> None:
             f"The recording has {rate:.1f} events a control step, and the policy was trained with about "
             f"{trained:.0f}: it has not seen such input. Record with another contrast threshold or lens, or "
             "train a policy whose encoder knows such recordings (docs/encoder.md).",
-            markup=False,
         )
 
 

@@ -77,8 +77,8 @@ def run(config: Config) -> dict[str, int]:
             data = page_data(cells, record(config, cells, advance))
         path = write_page(folder, data)
         tracker.artifact(path, "replay")
-        console.print(f"Page: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
-        console.print(tracker.dashboard(), markup=False)
+        console.print(f"Page: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+        console.print(tracker.dashboard())
     return finish(folder, "replay_page", {"episodes": len(cells)})
 
 

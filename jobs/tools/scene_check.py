@@ -51,12 +51,11 @@ def run(config: Config) -> dict[str, float]:
     console.print(
         f"{found.spheres} spheres stand. {found.overlaps} pairs overlap: the camera draws the nearer "
         f"one whole; {found.in_ground} reach into the ground, and are drawn whole.",
-        markup=False,
     )
     left_out = moving_beside(Path(own.file))
     if left_out:
         said = f"{left_out} spheres of dynamic_obstacles.yaml move; +env.layout.moving=true flies among them"
-        console.print(said, markup=False)
+        console.print(said)
     return {"passable": float(sum(row[3] == "yes" for row in rows)), "overlaps": float(found.overlaps)}
 
 

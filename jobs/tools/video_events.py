@@ -79,9 +79,9 @@ def run(config: Config) -> Path:
     counts, said = write_steps(steps, output, kind, (camera.width, camera.height))
     show_table("The events of a video", HEADINGS, [line(Path(chosen.path).name, counts)])
     for warning in said:
-        console.print(warning, markup=False)
+        console.print(warning)
     unlabelled = "" if kind in LABELLED else f" ({kind} stores no labels of noise; npz and hdf5 do)"
-    console.print(f"Events: {output}{unlabelled}", markup=False)
+    console.print(f"Events: {output}{unlabelled}")
     return output
 
 
@@ -140,7 +140,6 @@ def write_steps(
                         console.print(
                             f"Frame {frames:,}, {step.t_us / SECOND_US:.2f} s: "
                             f"{counts.events / 1e6:,.1f} million events",
-                            markup=False,
                         )
         except ConfigError:
             raise

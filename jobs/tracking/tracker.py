@@ -128,9 +128,7 @@ class Tracker:
         with calling_with(NO_RETRIES):
             reason = self.retry_queue.deliver(row, self._send)
         if reason is not None:
-            console.print(
-                f"{self.uri} does not answer, results wait in {self.retry_queue.file}: {reason}", markup=False
-            )
+            console.print(f"{self.uri} does not answer, results wait in {self.retry_queue.file}: {reason}")
 
     def _send(self, row: LoggedStep) -> None:
         """Write the metrics of a step; writing the same row twice adds no points, as their times are equal.

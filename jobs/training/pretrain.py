@@ -160,7 +160,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
             if last or (iteration + 1) % settings.validate_every == 0:
                 before, latest = latest, held_out_figures(on_processor(evae), held_out)
                 if latest["collapsed"] > before.get("collapsed", 0.0):
-                    console.print(f"Iteration {iteration + 1}: {COLLAPSED}", markup=False)
+                    console.print(f"Iteration {iteration + 1}: {COLLAPSED}")
                 tracker.log(
                     iteration + 1, {f"evae/{name}": value for name, value in {**losses, **latest}.items()}
                 )
@@ -427,7 +427,7 @@ def restore(folder: Path, training: EvaeTraining) -> int:
     for path in checkpoints(folder):
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != path.stem.rpartition("-")[2]:
-            console.print(f"Checkpoint damaged, the one before it is taken: {path}", markup=False)
+            console.print(f"Checkpoint damaged, the one before it is taken: {path}")
             path.unlink()
             continue
         state = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")

@@ -86,7 +86,7 @@ class Relay(tune.Callback):
     ) -> None:
         """Pass one result on, with the number of restarts before it, and show its notice."""
         if NOTICE in result:
-            console.print(result[NOTICE], markup=False)
+            console.print(result[NOTICE])
         _listeners[-1]({**result, "trial_restarts": trial.num_failures})
 
     def on_checkpoint(
@@ -104,7 +104,7 @@ class Relay(tune.Callback):
         if raised and not raised[-1].startswith("ray.exceptions."):
             raise TrainingError(stopped(error))
         reason = last_line(error) if error else "its process could not be started"
-        console.print(f"Cut off, goes on from its last checkpoint: {reason}", markup=False)
+        console.print(f"Cut off, goes on from its last checkpoint: {reason}")
 
 
 def run(config: Config) -> dict[str, float]:
@@ -128,7 +128,7 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
         return train_one(config, folder, encoder_path, on_result)
     runs = {seed: candidate_run(folder, seed) for seed in candidate_seeds(config)}
     for seed, own in runs.items():
-        console.print(f"Candidate with seed {seed}, one of {len(runs)}", markup=False)
+        console.print(f"Candidate with seed {seed}, one of {len(runs)}")
         if folder.init.is_dir():
             shutil.copytree(folder.init, own.init, dirs_exist_ok=True)
         train_one(own.config, own, encoder_path, lambda _steps, _metrics: None)
@@ -219,7 +219,7 @@ def _tuner(config: Config, folder: Run, built: Any) -> tune.Tuner:
         stopped_at = restored(path, trainable, built).get_results()[0].checkpoint
         said = mend(Path(stopped_at.path)) if stopped_at and on_disk(stopped_at) else None
         if said:
-            console.print(said, markup=False)
+            console.print(said)
         return restored(path, trainable, built)
     return tune.Tuner(
         trainable,
@@ -239,7 +239,7 @@ def can_continue(path: str, folder: Path) -> bool:
     """
     said = mend_state(folder)
     if said:
-        console.print(said, markup=False)
+        console.print(said)
     # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
     return bool(tune.Tuner.can_restore(path)) and holds(path, "experiment_state-")
 

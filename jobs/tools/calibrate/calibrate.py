@@ -98,8 +98,8 @@ def run(config: Config) -> Calibration:
         _compare(config, calibration, footage, file.events, folder)
     if chosen.camera is not None:
         write_atomic(REPOSITORY / "conf" / "camera" / f"{chosen.camera}.yaml", text)
-        console.print(f"Take it with: camera={chosen.camera}", markup=False)
-    console.print(f"Written: {folder / 'camera.yaml'}", markup=False)
+        console.print(f"Take it with: camera={chosen.camera}")
+    console.print(f"Written: {folder / 'camera.yaml'}")
     return calibration
 
 
@@ -177,7 +177,7 @@ def _compare(
         "Recorded and simulated events", SIMULATED, [(name, *texts(row)) for name, row in rows.items()]
     )
     save_plot(folder / "likeness.png", plot_likeness(rows))
-    console.print(f"Drawn: {folder / 'likeness.png'}", markup=False)
+    console.print(f"Drawn: {folder / 'likeness.png'}")
 
 
 def texts(row: Likeness) -> tuple[str, ...]:

@@ -92,7 +92,7 @@ def run(config: Config) -> dict[str, float]:
         begun = earlier_trials(folder, config.own)
         rows = search(config, folder.path / name, files, tracker, begun)
         best = report(folder, name, rows, tracker)
-        console.print(tracker.dashboard(), markup=False)
+        console.print(tracker.dashboard())
     figures = {key: float(best[key]) for key in ("distance_m", "success_rate", "env_steps")}
     return finish(folder, name, figures)
 
@@ -260,7 +260,7 @@ def report(folder: Run, name: str, rows: Sequence[Row], tracker: Tracker) -> Row
     publish_plot(folder, tracker, f"{name}/curves", plot_curves(rows, order))
     best = order[0]
     tracker.log_once(best["env_steps"], {f"tune/{key}": best[key] for key in ("distance_m", "success_rate")})
-    console.print(f"Best: {words(best['settings'])}", markup=False)
+    console.print(f"Best: {words(best['settings'])}")
     return best
 
 
