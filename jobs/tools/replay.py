@@ -5,8 +5,6 @@ Expect: seconds. A line of numbers; `replay/choices.csv` and a film of the event
 folder. Nothing moves: the recording is what it is, whatever the policy chooses (docs/camera.md).
 """
 
-import csv
-import io
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,12 +14,11 @@ import numpy as np
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, EnvConfig
-from jobs.analysis.tables import show_table
+from jobs.analysis.tables import show_table, write_csv
 from jobs.analysis.video import coloured, frame, last_polarity, open_film
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Name
 from jobs.rollout.policies import find_one_policy
-from jobs.run.files import write_atomic
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console, progress
 from jobs.run.recordings import refused
@@ -102,8 +99,7 @@ def run(config: Config) -> list[Choice]:
     show_table("A policy looks at a recording", headings, [line(recorded.name, name, choices)], words=2)
     console.print("Latency from events to action [ms]; actions by the likeliest, in % of the steps.")
     folder = open_run(config).path / "replay"
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(folder / "choices.csv", table_text(choices, policy.action_names))
+    write_choices(folder / "choices.csv", choices, policy.action_names)
     shape = env.camera.height, env.camera.width
     title, names = f"{recorded.name}   {name}", policy.action_names
     path = write_film(folder / "replay.mp4", choices, shape, (title, names), env.control_hz)
@@ -161,14 +157,10 @@ def line(recording: str, policy: str, choices: list[Choice]) -> tuple[str, ...]:
     return recording, policy, str(len(choices)), f"{per_step:.0f}", *shares, *(f"{ms:.2f}" for ms in latency)
 
 
-def table_text(choices: list[Choice], names: Sequence[str]) -> str:
-    """CSV with a row for each control step: its end [us], its events, and the actions' probabilities."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("end_us", "events", *names))
-    for choice in choices:
-        writer.writerow((choice.end_us, choice.events.size, *(f"{p:.4f}" for p in choice.probabilities)))
-    return text.getvalue()
+def write_choices(file: Path, choices: list[Choice], names: Sequence[str]) -> None:
+    """Write a CSV file with a row for each control step: its end [us], events, and actions' probabilities."""
+    rows = [(one.end_us, one.events.size, *(f"{p:.4f}" for p in one.probabilities)) for one in choices]
+    write_csv(file, ("end_us", "events", *names), rows)
 
 
 def write_film(

@@ -20,7 +20,7 @@ from envs.config import LUMINANCE_FLOOR, STRICT, CameraConfig, FaultsConfig, wit
 from envs.recordings.event_file import EventFile
 from jobs.analysis.colours import AMBER, BLUE, GREEN, INK
 from jobs.analysis.plots import tidy
-from jobs.analysis.tables import save_plot, show_table
+from jobs.analysis.tables import save_plot, show_table, write_csv
 from jobs.config.config import Config
 from jobs.config.schema import Name
 from jobs.run.files import write_atomic
@@ -87,13 +87,10 @@ def run(config: Config) -> Calibration:
         f"The camera of {name}", HEADINGS, [line(*pair) for pair in calibration.found.items()], words=4
     )
     folder = open_run(config).path / "calibrate"
-    folder.mkdir(parents=True, exist_ok=True)
     text = camera_text(calibration, name, taken)
     write_atomic(folder / "camera.yaml", text)
     y, x = np.nonzero(calibration.hot)
-    write_atomic(
-        folder / "hot_pixels.csv", "x,y\n" + "".join(f"{a},{b}\n" for a, b in zip(x, y, strict=True))
-    )
+    write_csv(folder / "hot_pixels.csv", ("x", "y"), [*zip(x, y, strict=True)])
     if frames is not None and len(footage.times_us) > 2:
         _compare(config, calibration, footage, file.events, folder)
     if chosen.camera is not None:
