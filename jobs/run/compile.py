@@ -29,6 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from core import forget_stale_kernels
+from core.files import replaced
 from jobs.run.files import write_atomic
 from jobs.run.locks import locked
 from jobs.run.progress import console
@@ -95,14 +96,14 @@ def _archive(name: str) -> Path:
 
 def pack(archive: Path) -> None:
     """Archive the compiled kernels for other clones; do nothing if the archive cannot be written."""
-    part = archive.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):
-        archive.parent.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        with (
+            replaced(archive) as part,
+            zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
+        ):
             for room in ROOMS:
                 for path in sorted((REPOSITORY / room).rglob("__pycache__/*.nb[ci]")):
                     file.write(path, path.relative_to(REPOSITORY))
-        part.replace(archive)
         archives = sorted(archive.parent.glob("*.zip"), key=lambda path: path.stat().st_mtime)
         for old in archives[:-ARCHIVES]:
             old.unlink(missing_ok=True)

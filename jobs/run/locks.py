@@ -18,17 +18,14 @@ from jobs.run.progress import console
 def locked(file: Path, waiting: str = "") -> Iterator[None]:
     """Hold a lock file, which is made if it is missing; while another process holds it, say so and wait."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(file)
     try:
-        lock.acquire(blocking=False)
+        lock = FileLock(file).acquire(blocking=False)
     except Timeout:
         if waiting:
             console.print(waiting)
-        lock.acquire()
-    try:
+        lock = FileLock(file).acquire()
+    with lock:
         yield
-    finally:
-        lock.release()
 
 
 @contextlib.contextmanager

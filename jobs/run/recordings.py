@@ -1,5 +1,6 @@
 """Read event files as every command does: by the keys `recording.*`, and print what the reader tells."""
 
+import contextlib
 import dataclasses
 import math
 import re
@@ -27,11 +28,8 @@ def read_recording(path: str | Path, settings: RecordingConfig) -> EventFile:
     Raises:
         ValueError: As `envs.recordings.read_events`.
     """
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", UserWarning)
-        file = read_events(path, **options(path, settings))
-    _print(said)
-    return file
+    with _printing():
+        return read_events(path, **options(path, settings))
 
 
 def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[EventFile]:
@@ -45,10 +43,8 @@ def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[Eve
     most = given.pop("max_events")
     parts = read_parts(path, **given)
     while True:
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", UserWarning)
+        with _printing():
             part = next(parts, None)
-        _print(said)
         if part is None:
             return
         count += len(part.events)
@@ -84,8 +80,12 @@ def refused(key: str, path: str | Path, error: Exception) -> ConfigError:
     return ConfigError(f"{key}: {error}{f' (as {spelled})' if spelled else ''}")
 
 
-def _print(said: list[warnings.WarningMessage]) -> None:
-    """Print warnings as plain lines, with the keys of commands."""
+@contextlib.contextmanager
+def _printing() -> Iterator[None]:
+    """Print the warnings of a block as plain lines, with the keys of commands."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        yield
     for warning in said:
         text = re.sub(r"\b(topic|group|stream)= chooses", r"recording.\1 chooses", str(warning.message))
         console.print(text.replace("strict=True", "recording.strict=true"))
