@@ -152,7 +152,15 @@ def record(
         actions, draws = (np.random.SeedSequence([seed, len(tape.steps), stream]) for stream in (1, 2))
         agent = make_agent(str(by_policy), "stochastic") if by_policy else HoldingAgent(actions)
         env = CorridorEnv(config, observation=_shown_to(agent), draw=episode_draw(conditions))
-        _record_stint(tape, env, num_steps, agent, np.random.default_rng(draws), seed, advance)
+        agent_seeds, taken = np.random.default_rng(draws), 0
+        started = env.reset(seed=seed, options={"episode_number": POLICY_EPISODES if by_policy else 0})
+        while taken < num_steps:
+            agent.reset([env], [int(agent_seeds.integers(2**63))])
+            events, true_events, ends_us = run_episode(env, agent, started, num_steps - taken)
+            tape.add(events, true_events, ends_us)
+            taken += len(ends_us)
+            advance(len(ends_us))
+            started = env.reset()
         env.close()
     start, end, number = np.array(tape.steps, dtype=np.int64).T
     settings = sensor_settings(shares[0][0])
@@ -221,28 +229,6 @@ class _Tape:
             self.steps.append((self.clock_us + start, self.clock_us + end, self.episodes))
         self.episodes += 1
         self.clock_us += ends_us[-1] + GAP_US
-
-
-def _record_stint(
-    tape: _Tape,
-    env: CorridorEnv,
-    num_steps: int,
-    agent: Agent,
-    agent_seeds: np.random.Generator,
-    seed: int,
-    advance: Callable[[int], None],
-) -> None:
-    """Add episodes of one agent in one scene to the tape, `num_steps` control steps of them."""
-    first = 0 if isinstance(agent, HoldingAgent) else POLICY_EPISODES
-    started = env.reset(seed=seed, options={"episode_number": first})
-    taken = 0
-    while taken < num_steps:
-        agent.reset([env], [int(agent_seeds.integers(2**63))])
-        events, true_events, ends_us = run_episode(env, agent, started, num_steps - taken)
-        tape.add(events, true_events, ends_us)
-        taken += len(ends_us)
-        advance(len(ends_us))
-        started = env.reset()
 
 
 def _shown_to(agent: Agent) -> Observation:
