@@ -14,10 +14,9 @@ from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Fraction, Positive
+from jobs.config.schema import Count, NonNegative
 from models.kinds import checked
 
-Count = Annotated[int, Field(ge=1)]
-NonNegative = Annotated[float, Field(ge=0)]
 Runners = Annotated[int, Field(ge=0, le=10_000)]
 
 

@@ -5,6 +5,7 @@ in conf/ and in the files of a run they are groups of their own. Only this file 
 """
 
 import dataclasses
+import functools
 import typing
 from collections.abc import Mapping, Sequence
 
@@ -14,12 +15,7 @@ from jobs.config.errors import SET_BY_JOBS
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-BESIDE_ENV = (
-    "camera",
-    "faults",
-    "renderer",
-    "fidelity",
-)  # users write these fields without `env.`
+BESIDE_ENV = ("camera", "faults", "renderer", "fidelity")  # users write these fields without `env.`
 
 
 def fields_of(section: "type[DataclassInstance]") -> dict[str, type]:
@@ -43,9 +39,10 @@ def key_of(section: str, path: Sequence[int | str]) -> str:
 
 
 LAYOUT = "env.layout."  # begins the key of a layout's field, such as env.layout.ground_texture.pattern
-OPEN_FIELDS = {LAYOUT: "layout", "env.body.": "body"}  # the latter of a vehicle's, such as env.body.tau_s
+BODY = "env.body."  # begins the key of a vehicle's, such as env.body.tau_s
 ADDED_FAULT = "faults.added."  # begins the key of a plug-in's fault
-OPEN_KEYS = (*OPEN_FIELDS, ADDED_FAULT)
+OPEN_FIELDS = {LAYOUT: ("layout",), BODY: ("body",), ADDED_FAULT: ("faults", "added")}  # as in `ENV_KEYS`
+OPEN_KEYS = tuple(OPEN_FIELDS)
 
 
 def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
@@ -54,26 +51,20 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is not valid.
     """
-    fields: dict[str, typing.Any] = {}
-    groups: dict[str, dict[str, object]] = {}
+    values: dict[tuple[str, ...], typing.Any] = {}
     for key, value in changes.items():
-        start = next((one for one in OPEN_FIELDS if key.startswith(one)), None)
-        if start is not None:
-            field = OPEN_FIELDS[start]
-            values = typing.cast(dict[str, object], fields.get(field, getattr(env, field)))
-            fields[field] = _with_part(values, key.removeprefix(start).split("."), value)
+        start = next((one for one in OPEN_KEYS if key.startswith(one)), None)
+        if start is None:
+            values[ENV_KEYS.get(key, (key,))] = value  # an unknown key is for pydantic to reject
             continue
-        if key.startswith(ADDED_FAULT):
-            added = groups.setdefault("faults", {}).setdefault("added", dict(env.faults.added))
-            typing.cast(dict[str, object], added)[key.removeprefix(ADDED_FAULT)] = value
-            continue
-        path = ENV_KEYS.get(key, (key,))  # an unknown key is for pydantic to reject
-        if len(path) == 2:
-            groups.setdefault(path[0], {})[path[1]] = value
-        else:
-            fields[path[0]] = value
-    parts = {group: dataclasses.replace(getattr(env, group), **values) for group, values in groups.items()}
-    return dataclasses.replace(env, **fields, **parts)
+        path = OPEN_FIELDS[start]
+        whole = values.get(path, functools.reduce(getattr, path, env))
+        values[path] = _with_part(whole, key.removeprefix(start).split("."), value)
+    fields = {path[0]: value for path, value in values.items() if len(path) == 1}
+    for group in dict.fromkeys(path[0] for path in values if len(path) == 2):
+        own = {path[1]: value for path, value in values.items() if path[0] == group}
+        fields[group] = dataclasses.replace(getattr(env, group), **own)
+    return dataclasses.replace(env, **fields)
 
 
 def _with_part(values: Mapping[str, object], path: Sequence[str], value: object) -> dict[str, object]:
