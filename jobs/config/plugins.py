@@ -14,7 +14,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -244,8 +244,14 @@ def _files(module: ModuleType) -> list[Path]:
 
 def _digest(module: ModuleType) -> str:
     place = _place(module)
+    files = sorted(place.rglob("*")) if place.is_dir() else [place]
+    return digest_of([file for file in files if "__pycache__" not in file.parts], place.parent)
+
+
+def digest_of(files: Iterable[Path], root: Path) -> str:
+    """Return 12 digits of a SHA-256 of files, of their names in the folder `root` and their content."""
     digest = hashlib.sha256()
-    for file in sorted(place.rglob("*")) if place.is_dir() else [place]:
-        if file.is_file() and "__pycache__" not in file.parts:
-            digest.update(f"{file.relative_to(place.parent)}\0".encode() + file.read_bytes() + b"\0")
+    for file in files:
+        if file.is_file():
+            digest.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes() + b"\0")
     return digest.hexdigest()[:12]

@@ -1,12 +1,11 @@
 """Check that every machine of a cluster has the code and the packages of the driver."""
 
-import hashlib
 from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
 from jobs.config.config import ConfigError
-from jobs.config.plugins import plugin_digests
+from jobs.config.plugins import digest_of, plugin_digests
 from jobs.run.provenance import REPOSITORY
 
 ROOMS = ("core", "envs", "models", "jobs")
@@ -16,12 +15,9 @@ ANSWER_S = 600.0  # a busy machine starts a worker in minutes
 
 def fingerprint() -> dict[str, str]:
     """Return what decides this process's results: the code, as a SHA-256, and the packages' versions."""
-    digest = hashlib.sha256()
-    for room in ROOMS:
-        for file in sorted((REPOSITORY / room).rglob("*.py")):
-            digest.update(f"{file.relative_to(REPOSITORY)}\0".encode() + file.read_bytes() + b"\0")
+    files = [file for room in ROOMS for file in sorted((REPOSITORY / room).rglob("*.py"))]
     versions = {name: version(name) for name in PACKAGES}
-    return {"evade": digest.hexdigest()[:12], **versions, **plugin_digests()}
+    return {"evade": digest_of(files, REPOSITORY), **versions, **plugin_digests()}
 
 
 def check_machines() -> None:
