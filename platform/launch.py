@@ -28,13 +28,8 @@ from jobs.run.signals import end_on_signals, signal_of
 from jobs.run.undo import undo
 
 ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
-OPEN_GROUPS = (
-    "env.layout",
-    "env.body",
-    "faults.added",
-    "study.axes",
-    "search.space",
-)  # take entries that conf/ does not have
+# They take entries that conf/ does not have.
+OPEN_GROUPS = ("env.layout", "env.body", "faults.added", "study.axes", "search.space")
 UNWRITABLE = {  # what the operating system says: what to do
     errno.ENOSPC: "make room there",
     errno.EDQUOT: "make room there",

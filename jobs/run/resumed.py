@@ -8,9 +8,8 @@ from jobs.config.config import Config, ConfigError, as_dict
 from jobs.run.folder import reopen
 from jobs.run.identity import TRAINED_BY
 
-READS_STUDIES = (
-    "report"  # its `resume` names a study to publish, and its settings are compared with the study's
-)
+# Its `resume` names a study to publish, and its settings are compared with the study's.
+READS_STUDIES = "report"
 
 
 def check_resumed(config: Config, given: Collection[str]) -> None:

@@ -27,6 +27,7 @@ from models.policy import Policy, load_policy
 
 SHOWN_ACTIONS = 3  # columns of the table of numbers; the CSV file has the probabilities of more
 FILM_FPS, SLOWEST_FPS = 50.0, 5.0
+BARS = (245, 158, 11)  # their colour
 FAR = 5.0  # times the event rate of the training, or less than its reciprocal: a warning
 
 
@@ -181,11 +182,8 @@ def write_film(
             bars = np.zeros((*shape, 3), np.uint8)
             for place, action in enumerate(order):
                 height, width = round(choice.probabilities[action] * shape[0]), shape[1] // len(names)
-                bars[shape[0] - height :, place * width + (width > 2) : (place + 1) * width - (width > 2)] = (
-                    245,
-                    158,
-                    11,
-                )
+                gap = width > 2
+                bars[shape[0] - height :, place * width + gap : (place + 1) * width - gap] = BARS
             panels = [(title, panel), ("actions, from left to right", bars)]
             film.add(frame(panels, f"{choice.end_us / 1e6:.2f} s   {odds}"))
     return path

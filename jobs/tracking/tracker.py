@@ -20,7 +20,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -119,12 +119,7 @@ class Tracker:
         values = check_metrics(metrics)
         missing = sorted(name for name, value in values.items() if math.isnan(value))
         measured = {name: value for name, value in values.items() if name not in missing}
-        row: LoggedStep = {
-            "step": step,
-            "time_ms": now_ms(),
-            "metrics": measured,
-            "missing": missing,
-        }
+        row: LoggedStep = {"step": step, "time_ms": now_ms(), "metrics": measured, "missing": missing}
         with calling_with(NO_RETRIES):
             reason = self.retry_queue.deliver(row, self._send)
         if reason is not None:
@@ -362,7 +357,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
         try:
             near.client.update_run(run_id, status="RUNNING")
             near.client.log_batch(run_id, tags=[])
-            return replace(near, run_id=run_id)
+            return dataclasses.replace(near, run_id=run_id)
         except MlflowException as error:  # the run was deleted: begin a new one
             if error.error_code in UNAVAILABLE:
                 raise

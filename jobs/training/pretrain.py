@@ -47,9 +47,8 @@ Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
 HeldOut = dict[str, tuple[EventBatch, EventBatch]]  # windows by their length, and what is decoded from each
 
 ENCODER, CHECKPOINTS = "encoder.safetensors", "checkpoint-*.pt"
-THREADS = (
-    2  # on any machine, so that its cores change no byte; encoders of bytestreams have those of one thread
-)
+# On any machine, so that its cores change no byte; encoders of bytestreams have those of one thread.
+THREADS = 2
 CHECKPOINTS_KEPT = 2  # should the newest be damaged
 MIN_STEPS, MAX_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
@@ -373,9 +372,7 @@ def freeze(
     """Write the encoder file and a picture of its reconstructions; return its held-out figures."""
     figures = held_out_figures(evae, held_out)
     manifest = {
-        "sensor": about["sensor"],
-        "sensor_hash": about["sensor_hash"],
-        "scenes": about["scenes"],
+        **{name: about[name] for name in ("sensor", "sensor_hash", "scenes")},
         "iterations": config.pretrain.iterations,
         "figures": figures,
     }

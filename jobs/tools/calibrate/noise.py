@@ -49,9 +49,8 @@ def still_rates(trains: Trains, still: np.ndarray, span_us: tuple[int, int]) -> 
         ]
     )
     seconds = (span_us[1] - begin) * 1e-6
-    covariance = (np.cov(counts) + np.eye(2) / counts.shape[1]) / counts.shape[
-        1
-    ]  # that of one event at least
+    # That of one event at least.
+    covariance = (np.cov(counts) + np.eye(2) / counts.shape[1]) / counts.shape[1]
     return Rates(counts.mean(axis=1) / seconds, covariance / seconds**2)
 
 
