@@ -54,7 +54,7 @@ def train_short(
     config: Config, train: Recording, settings: EvaeSettings, seed: int, iterations: int, title: str
 ) -> EventVAE:
     """Train for some iterations as `jobs.training.pretrain` does, without its checkpoints."""
-    training = EvaeTraining.begin(settings, train, config.pretrain, (seed, 3))
+    training = EvaeTraining(settings, train, config.pretrain, (seed, 3))
     with progress(title, iterations, "iterations") as advance:
         for iteration in range(iterations):
             advance(1, note=f"loss {training.step(iteration)['loss']:.4f}")

@@ -126,7 +126,7 @@ def stages(config: Config) -> Iterator[tuple[str, Arrays]]:
         spec = policy_spec(dataclasses.replace(config, model=model))
         yield f"first weights: {name}", weights(build_networks(spec))
     for name, settings in ENCODERS.items():
-        training = EvaeTraining.begin(settings, recording, config.pretrain, (0, 2))
+        training = EvaeTraining(settings, recording, config.pretrain, (0, 2))
         yield f"first weights: encoder{name}", weights(training.evae)
         with torch_threads(THREADS):
             for iteration in range(ITERATIONS):

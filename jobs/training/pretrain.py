@@ -140,7 +140,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
         read_split(folder, split, settings.denoise) for split in SPLITS
     )
     seed, device = (config.seed, 2), config.cluster.device
-    training = EvaeTraining.begin(evae_settings(config), train, settings, seed, true, device)
+    training = EvaeTraining(evae_settings(config), train, settings, seed, true, device)
     evae, first = training.evae, restore(folder.encoder, training)
     begin = initial_state(folder)  # none where a checkpoint was restored; a damaged one is gone by now
     if begin is not None:
@@ -190,7 +190,6 @@ def check_data(folder: Run) -> None:
         )
 
 
-@dataclasses.dataclass(frozen=True)
 class EvaeTraining:
     """A training of an event VAE in progress; each step changes the model, the optimiser and the stream.
 
@@ -203,24 +202,16 @@ class EvaeTraining:
         rng: Draws the windows and the noise of the latent.
     """
 
-    evae: EventVAE
-    optimizer: torch.optim.Optimizer
-    recording: Recording
-    true: Recording | None
-    settings: PretrainConfig
-    rng: np.random.Generator
-
-    @classmethod
-    def begin(
-        cls,
+    def __init__(
+        self,
         model: EvaeSettings,
         recording: Recording,
         settings: PretrainConfig,
         seed: tuple[int, int],
         true: Recording | None = None,
         device: str = "cpu",
-    ) -> "EvaeTraining":
-        """Return a training from random weights; `seed`: the experiment's, and the number of the stream.
+    ) -> None:
+        """Begin from random weights; `seed`: the experiment's, and the number of the stream.
 
         On any `device`, as torch names it, it begins from the same weights and sees the same windows.
 
@@ -233,12 +224,12 @@ class EvaeTraining:
             )
             raise ConfigError(f"pretrain.windows: {rule}")
         torch.manual_seed(seed[0])
-        evae = EventVAE.of(model).to(device)
-        optimizer = torch.optim.Adam(
-            evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
+        self.evae = EventVAE.of(model).to(device)
+        self.optimizer = torch.optim.Adam(
+            self.evae.parameters(), lr=settings.lr, weight_decay=settings.weight_decay, fused=True
         )
-        rng = np.random.default_rng(np.random.SeedSequence(seed))
-        return cls(evae, optimizer, recording, true, settings, rng)
+        self.recording, self.true, self.settings = recording, true, settings
+        self.rng = np.random.default_rng(np.random.SeedSequence(seed))
 
     def step(self, iteration: int) -> dict[str, float]:
         """Take one update on a batch of sampled windows; return the losses of `train_step`."""

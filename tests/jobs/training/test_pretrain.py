@@ -108,7 +108,7 @@ def trained(recording, iterations, checkpoint=None, true=None):
     """A training after some iterations, interrupted and continued at `checkpoint` if given."""
     model = EventVAE(context=64, latent=32, target="occupancy").settings
     settings = dataclasses.replace(SETTINGS, batch_windows=8)
-    training = EvaeTraining.begin(model, recording, settings, (0, 0), true)
+    training = EvaeTraining(model, recording, settings, (0, 0), true)
     for iteration in range(0 if checkpoint is None else restore(checkpoint, training), iterations):
         training.step(iteration)
     return training

@@ -35,7 +35,7 @@ def recording():
 
 
 def begun(model, recording, device):
-    return EvaeTraining.begin(model, recording, SETTINGS, (0, 2), device=device)
+    return EvaeTraining(model, recording, SETTINGS, (0, 2), device=device)
 
 
 def taught(training, first, last):
@@ -98,7 +98,7 @@ def test_pretraining_is_where_the_configuration_says(tmp_path, monkeypatch):
         asked.append(told[-1])
         raise StopIteration
 
-    monkeypatch.setattr(pretrain.EvaeTraining, "begin", begin)
+    monkeypatch.setattr(pretrain, "EvaeTraining", begin)
     monkeypatch.setattr(pretrain, "check_data", lambda folder: None)
     monkeypatch.setattr(pretrain, "read_split", lambda *told: (None, None))
     for config in (on_gpu(tmp_path / "a"), small_config(tmp_path / "b")):
