@@ -191,11 +191,18 @@ def with_plugins(runtime_env: Mapping[str, Any]) -> dict[str, Any]:
 
 def load_in_worker() -> None:
     """Import the plug-ins of a Ray worker; `plugin_digests` reports those that cannot be imported."""
-    for name in filter(None, os.environ.get(VARIABLE, "").split(",")):
-        try:
-            _loaded[name] = importlib.import_module(name)
-        except Exception as error:
-            sys.stderr.write(f"plugins: {name}: {one_line(error)}\n")
+    for refusal in _load_shipped():
+        sys.stderr.write(f"{refusal}\n")
+
+
+def _load_shipped() -> Iterator[ConfigError]:
+    """Import the plug-ins of a Ray worker that it has not imported yet; yield why one cannot be."""
+    for name in os.environ.get(VARIABLE, "").split(","):
+        if name and name not in _loaded:
+            try:
+                _loaded[name] = importlib.import_module(name)
+            except Exception as error:
+                yield ConfigError(f"plugins: {name}: {one_line(error)}")
 
 
 def plugin_digests() -> dict[str, str]:
@@ -204,12 +211,8 @@ def plugin_digests() -> dict[str, str]:
     Raises:
         ConfigError: In a Ray worker, if one could not be imported.
     """
-    missing = [name for name in os.environ.get(VARIABLE, "").split(",") if name and name not in _loaded]
-    for name in missing:
-        try:
-            _loaded[name] = importlib.import_module(name)
-        except Exception as error:
-            raise ConfigError(f"plugins: {name}: {one_line(error)}") from error
+    for refusal in _load_shipped():
+        raise refusal
     return {name: _digest(module) for name, module in sorted(_loaded.items())}
 
 
