@@ -26,6 +26,7 @@ from jobs.run.libraries import hold
 from jobs.run.provenance import REPOSITORY as ROOT
 from jobs.run.signals import end_on_signals, signal_of
 from jobs.run.undo import undo
+from jobs.run.variables import variables_set
 
 ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
 # They take entries that conf/ does not have.
@@ -102,20 +103,17 @@ def compose(words: list[str]) -> dict[str, object] | None:
     def keep(config: Any) -> None:
         composed.append(OmegaConf.to_container(config, resolve=False))
 
-    given, verbose = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing and leaving
+    given = sys.argv
     sys.argv = [given[0], *words]
     try:
-        with contextlib.redirect_stdout(answer):
+        # Hydra then raises, instead of printing and leaving.
+        with variables_set({"HYDRA_FULL_ERROR": "1"}), contextlib.redirect_stdout(answer):
             hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(keep)()
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(explain(error, words)) from error
     finally:
         sys.argv = given
         print(redacted(with_jobs(answer.getvalue())), end="")
-        os.environ.pop("HYDRA_FULL_ERROR")
-        if verbose is not None:
-            os.environ["HYDRA_FULL_ERROR"] = verbose
     return composed[0] if composed else None
 
 

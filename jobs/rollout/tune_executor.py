@@ -7,7 +7,6 @@ get the policies from the driver, so that other machines need not see its folder
 import atexit
 import dataclasses
 import math
-import os
 import shutil
 import tempfile
 import time
@@ -25,6 +24,7 @@ from jobs.rollout.agents import BASELINES
 from jobs.rollout.executors import Part, Recorder, attempt, evaluate_part
 from jobs.run.ray_cluster import fit, session_folder, start_ray, storage
 from jobs.run.trial_errors import low_memory, newest_error
+from jobs.run.variables import variables_set
 from jobs.run.watchdog import ending_after
 
 MAX_FAILURES = 2
@@ -33,8 +33,8 @@ MAX_FAILURES = 2
 MAX_STEP_S, MAX_START_S = 0.1, 900.0
 UNKNOWN_END = "killed, often for lack of memory, or crashed"  # Ray cannot tell which
 # Stored episodes are what a stopped job continues from. Tune's own picture of all trials, written
-# at each result, would cost more than the episodes.
-SNAPSHOT_S, TUNE_SNAPSHOT_S = "TUNE_GLOBAL_CHECKPOINT_S", "3600"
+# at each result, would cost more than the episodes. A training of this process has another interval.
+SNAPSHOTS = {"TUNE_GLOBAL_CHECKPOINT_S": "3600"}  # [s]
 
 Files = Mapping[str, Mapping[str, bytes]]  # policy folder -> name -> content
 
@@ -51,17 +51,10 @@ def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterCon
     start_ray(cluster, folder.parent)
     trial = tune.with_parameters(run_trial, files=policy_files(parts))
     callback = TrialCallback(recorder)
-    before = os.environ.get(SNAPSHOT_S)
-    os.environ[SNAPSHOT_S] = TUNE_SNAPSHOT_S
-    try:
+    with variables_set(SNAPSHOTS):
         while parts:
             fit(_tuner(trial, parts, cluster, folder, callback))
             parts = callback.take_unfinished()
-    finally:  # a training of this process has another
-        if before is None:
-            del os.environ[SNAPSHOT_S]
-        else:
-            os.environ[SNAPSHOT_S] = before
 
 
 def _tuner(

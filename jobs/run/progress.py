@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 PLAIN_LINE_EVERY_S = 10.0
 
@@ -38,18 +38,18 @@ def progress(title: str, total: int, unit: str, done: int = 0) -> Iterator[Calla
         )
         with Progress(*columns, console=console) as bar:
             task = bar.add_task(title, total=total, completed=done, note="")
-            yield lambda count, note="": _advance_bar(bar, task, count, note)
+
+            def advance(count: int, note: str = "") -> None:
+                bar.advance(task, count)
+                if note:
+                    bar.update(task, note=note)
+
+            yield advance
     else:
         lines = _PlainLines(title, total, unit, done)
         lines.show("")
         yield lines.advance
         lines.show("", final=True)
-
-
-def _advance_bar(bar: Progress, task: TaskID, count: int, note: str) -> None:
-    bar.advance(task, count)
-    if note:
-        bar.update(task, note=note)
 
 
 class _PlainLines:

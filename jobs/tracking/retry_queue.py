@@ -1,9 +1,7 @@
 """Metrics that the tracking store has not taken yet: they wait in the run folder until it answers again."""
 
-import contextlib
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
@@ -11,7 +9,7 @@ from typing import TypedDict
 from jobs.run.files import append_json_lines, json_lines, read_json_lines, write_atomic
 
 RETRY_AFTER_S = 30.0  # so that a store that does not answer does not hold up the work
-# How often MLflow's calls try a server that does not answer.
+# How often MLflow's calls try a server that does not answer: variables that it reads at each call.
 MANY_RETRIES = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "6"}  # 0, 4, 8, 16, 32 and 64 s apart
 NO_RETRIES = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
 
@@ -27,20 +25,6 @@ class LoggedStep(TypedDict):
     time_ms: int
     metrics: dict[str, float]
     missing: list[str]
-
-
-@contextlib.contextmanager
-def calling_with(retries: Mapping[str, str]) -> Iterator[None]:
-    """Set `MANY_RETRIES` or `NO_RETRIES` for a block: MLflow reads these variables at each call."""
-    before = {name: os.environ.get(name) for name in retries}
-    os.environ.update(retries)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
 
 
 @dataclass

@@ -36,6 +36,7 @@ from jobs.run.locks import held_alone, locked, private_folder
 from jobs.run.progress import console
 from jobs.run.provenance import provenance
 from jobs.run.undo import undo_if_refused
+from jobs.run.variables import variables_set
 from jobs.tracking.clock import now_ms
 from jobs.tracking.pages import (
     NOTE,
@@ -57,7 +58,6 @@ from jobs.tracking.retry_queue import (
     LoggedStep,
     RetryQueue,
     StoreUnavailable,
-    calling_with,
 )
 from jobs.tracking.store import (
     check_metrics,
@@ -120,7 +120,7 @@ class Tracker:
         missing = sorted(name for name, value in values.items() if math.isnan(value))
         measured = {name: value for name, value in values.items() if name not in missing}
         row: LoggedStep = {"step": step, "time_ms": now_ms(), "metrics": measured, "missing": missing}
-        with calling_with(NO_RETRIES):
+        with variables_set(NO_RETRIES):
             reason = self.retry_queue.deliver(row, self._send)
         if reason is not None:
             console.print(f"{self.uri} does not answer, results wait in {self.retry_queue.file}: {reason}")
@@ -293,7 +293,7 @@ def _answering(uri: str, folder: Run) -> Iterator[None]:
     from sqlalchemy.exc import DBAPIError
 
     try:
-        with calling_with(MANY_RETRIES):
+        with variables_set(MANY_RETRIES):
             yield
     except (MlflowException, StoreUnavailable, DBAPIError) as error:
         reason = _reason(error)
@@ -336,7 +336,7 @@ def _ended(tracker: Tracker) -> Iterator[None]:
     except BaseException as error:
         status = "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
         # An error of the store must not hide why the block ended.
-        with contextlib.suppress(MlflowException), calling_with(NO_RETRIES):
+        with contextlib.suppress(MlflowException), variables_set(NO_RETRIES):
             _terminate(tracker, status)
         raise
 

@@ -1,7 +1,7 @@
 import pytest
 
-from jobs.tracking import retry_queue as retry_queue
-from jobs.tracking.retry_queue import RetryQueue, StoreUnavailable, calling_with
+from jobs.tracking import retry_queue
+from jobs.tracking.retry_queue import RetryQueue, StoreUnavailable
 
 
 class Store:
@@ -64,12 +64,3 @@ def test_another_error_than_absence_is_raised(tmp_path):
 
     with pytest.raises(ValueError, match="no such metric"):
         RetryQueue(tmp_path / "waiting.jsonl").deliver({"step": 1}, refuse)
-
-
-def test_settings_of_calls_are_put_back(monkeypatch):
-    monkeypatch.setenv("EVADE_A", "1")
-    monkeypatch.delenv("EVADE_B", raising=False)
-    with calling_with({"EVADE_A": "2", "EVADE_B": "3"}):
-        assert (retry_queue.os.environ["EVADE_A"], retry_queue.os.environ["EVADE_B"]) == ("2", "3")
-    assert retry_queue.os.environ["EVADE_A"] == "1"
-    assert "EVADE_B" not in retry_queue.os.environ
