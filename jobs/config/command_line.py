@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from jobs.config.flat import flat
 from jobs.config.registry import CONF, JOBS, Job
 
 RENAMED_JOBS = {"ship": "publish", "tune": "search"}  # old name -> new
@@ -83,15 +84,7 @@ def _leaves(file: Path) -> Iterator[str]:
 
     text = file.read_text(encoding="utf-8")
     package = "" if "@package _global_" in text else f"{file.parent.name}."
-
-    def of(values: Mapping[str, object], prefix: str) -> Iterator[str]:
-        for key, value in values.items():
-            if isinstance(value, Mapping) and value:
-                yield from of(value, f"{prefix}{key}.")
-            elif key != "defaults":
-                yield f"{prefix}{key}"
-
-    yield from of(yaml.safe_load(text) or {}, package)
+    yield from (f"{package}{key}" for key, _ in flat(yaml.safe_load(text) or {}) if key != "defaults")
 
 
 def once_per_value(words: Sequence[str]) -> str:

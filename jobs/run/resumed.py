@@ -1,10 +1,10 @@
 """Settings of a command line that a continued run does not take, because its own are stored in its folder."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
 from jobs.config.config import Config, ConfigError, as_dict
+from jobs.config.flat import flat
 from jobs.run.folder import reopen
 from jobs.run.identity import TRAINED_BY
 
@@ -25,7 +25,7 @@ def check_resumed(config: Config, given: Collection[str]) -> None:
     if config.resume is None or config.job == READS_STUDIES:
         return
     run = reopen(Path(config.resume), config)
-    asked, stored = dict(_flat(as_dict(config))), dict(_flat(as_dict(run.config)))
+    asked, stored = dict(flat(as_dict(config))), dict(flat(as_dict(run.config)))
     lines = []
     for key in dict.fromkeys([*asked, *stored]):
         named = any(key == one or key.startswith(f"{one}.") for one in given)
@@ -34,12 +34,3 @@ def check_resumed(config: Config, given: Collection[str]) -> None:
             lines.append(f"{key}: {rule}; leave it out, or leave out resume for a run of its own")
     if lines:
         raise ConfigError("\n".join(lines))
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yield each value behind its dotted key."""
-    for key, value in values.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value

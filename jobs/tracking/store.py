@@ -9,6 +9,7 @@ from urllib.parse import unquote
 
 from jobs.config.config import Config, ConfigError
 from jobs.config.errors import HIDDEN, redacted
+from jobs.config.flat import flat
 from jobs.run.provenance import REPOSITORY
 
 SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep", "tune")
@@ -113,16 +114,10 @@ def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
     return values
 
 
-def flatten(values: Mapping[str, object], prefix: str = "") -> dict[str, str]:
+def flatten(values: Mapping[str, object]) -> dict[str, str]:
     """Return nested settings as `outer.inner` -> text; a text that MLflow would cut is refused."""
-    flat: dict[str, str] = {}
-    for key, value in values.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping) and value:
-            flat.update(flatten(value, f"{name}."))
-            continue
-        text = str(value)
+    texts = {name: str(value) for name, value in flat(values)}
+    for name, text in texts.items():
         if len(text) > MAX_PARAM_CHARACTERS:
             raise ValueError(f"{name} must be at most {MAX_PARAM_CHARACTERS} characters, got {len(text)}")
-        flat[name] = text
-    return flat
+    return texts
