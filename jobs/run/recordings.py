@@ -71,6 +71,19 @@ def options(path: str | Path, settings: RecordingConfig) -> dict[str, Any]:
     return given
 
 
+@contextlib.contextmanager
+def refusing(key: str, path: str | Path) -> Iterator[None]:
+    """Read a file for a command in a block.
+
+    Raises:
+        ConfigError: The file is refused, as `refused` says.
+    """
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise refused(key, path, error) from error
+
+
 def refused(key: str, path: str | Path, error: Exception) -> ConfigError:
     """Return the error of a command for a file that is refused, with the keys that its remedy names."""
     if not str(error).startswith(str(path)):

@@ -21,7 +21,7 @@ from jobs.config.schema import Name
 from jobs.rollout.policies import find_one_policy
 from jobs.run.folder import locate_run, open_run
 from jobs.run.progress import console, progress
-from jobs.run.recordings import refused
+from jobs.run.recordings import refusing
 from jobs.training.real_recordings import Recorded, read_whole
 from models.policy import Policy, load_policy
 
@@ -76,10 +76,8 @@ def run(config: Config) -> list[Choice]:
         rule = "must not read the vehicle's velocity (model.own_velocity), which a recording lacks"
         raise ConfigError(f"replay.policy: {rule}, got {config.own.policy!r}")
     env = EnvConfig(**policy.env_fields)
-    try:
+    with refusing("replay.recording", config.own.recording):
         recorded, fitted = read_whole(config.own.recording, env, config.recording)
-    except (ValueError, OSError) as error:
-        raise refused("replay.recording", config.own.recording, error) from error
     if fitted.gaps:
         console.print(
             f"{fitted.gaps:,} gaps, {fitted.closed_us / 1e6:,.1f} s together, are closed in all times.",

@@ -28,7 +28,7 @@ from jobs.rollout.policies import load_trained
 from jobs.run.checkpoints import seal
 from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import progress
-from jobs.run.recordings import refused
+from jobs.run.recordings import refusing
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.real_recordings import GAP_US, Recorded, no_episodes, read_recorded, with_recorded
 
@@ -101,11 +101,9 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
     settings = config.collect
     share = settings.num_validation_steps / (settings.num_steps + settings.num_validation_steps)
     read: list[dict[str, Recorded]] = []
-    try:
-        for path in settings.recordings:
+    for path in settings.recordings:
+        with refusing("collect.recordings", path):
             read.append(read_recorded(path, config.env, share, config.recording))
-    except (ValueError, OSError) as error:
-        raise refused("collect.recordings", path, error) from error
     return policy, read
 
 

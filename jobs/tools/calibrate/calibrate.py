@@ -27,7 +27,7 @@ from jobs.run.files import write_atomic
 from jobs.run.folder import open_run
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
-from jobs.run.recordings import refused
+from jobs.run.recordings import refusing
 from jobs.tools.calibrate.camera_file import camera_text, unit
 from jobs.tools.calibrate.estimate import Calibration, estimate, settings
 from jobs.tools.calibrate.footage import Footage, simulate, still_footage
@@ -35,6 +35,8 @@ from jobs.tools.calibrate.found import Found
 from jobs.tools.calibrate.likeness import INTERVALS_MS, Likeness, likeness
 from jobs.tools.calibrate.sources import frames_beside, read_frames, read_source
 
+OF_LIGHT = ("response", "luminance_floor")
+OF_STILL = ("contrast_threshold", "contrast_threshold_off", "refractory_us")
 HEADINGS = ("Setting", "Value", "95 % interval", "Not found, because")
 SIMULATED = (
     *("Events", "per pixel [Hz]", "ON [%]", "Same polarity [%]", "Median interval [ms]"),
@@ -69,19 +71,16 @@ def run(config: Config) -> Calibration:
         ConfigError: The recording or its frames are refused, or have too few events.
     """
     chosen, camera = config.own, config.env.camera
-    try:
-        frames: Footage | None
+    frames: Footage | None
+    with refusing("calibrate.recording", chosen.recording):
         if chosen.frames:
             frames = read_frames(chosen.frames, chosen.frame_delay_us)
         else:
             frames = frames_beside(chosen.recording, chosen.frame_delay_us, config.recording)
         file = read_source(chosen.recording, frames, config.recording)
-        footage = frames or _still(file, chosen.luminance)
-        footage = within(footage, file.events)
+        footage = within(frames or _still(file, chosen.luminance), file.events)
         taken = assumed(camera, footage.is_still)
         calibration = estimate(file.events, footage, taken, config.seed)
-    except (ValueError, OSError) as error:
-        raise refused("calibrate.recording", chosen.recording, error) from error
     name = Path(chosen.recording).name
     show_table(
         f"The camera of {name}", HEADINGS, [line(*pair) for pair in calibration.found.items()], words=4
@@ -136,15 +135,8 @@ def assumed(camera: CameraConfig, still: bool) -> CameraConfig:
 
     That is how light becomes a response, and of a still scene the thresholds and the refractory period.
     """
-    usual = CameraConfig(response=camera.response, luminance_floor=camera.luminance_floor)
-    if not still:
-        return usual
-    return dataclasses.replace(
-        usual,
-        contrast_threshold=camera.contrast_threshold,
-        contrast_threshold_off=camera.contrast_threshold_off,
-        refractory_us=camera.refractory_us,
-    )
+    names = (*OF_LIGHT, *OF_STILL) if still else OF_LIGHT
+    return CameraConfig(**{name: getattr(camera, name) for name in names})
 
 
 def compared(calibration: Calibration, camera: CameraConfig, faults: FaultsConfig) -> dict[str, tuple]:
