@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from jobs.config.flat import flat
@@ -66,7 +66,7 @@ def given_keys(words: Sequence[str]) -> set[str]:
         if match[1] == "exp":
             keys |= _experiment(file)
         else:
-            keys |= {*_leaves(file)} if file.is_file() else {"exp" if match[1] == "name" else match[1]}
+            keys |= _leaves(file) if file.is_file() else {"exp" if match[1] == "name" else match[1]}
     return keys
 
 
@@ -78,13 +78,13 @@ def _experiment(file: Path) -> set[str]:
     return {"exp"} if policy else set()
 
 
-def _leaves(file: Path) -> Iterator[str]:
-    """Yield the keys of a file of a group, as the command line spells them."""
+def _leaves(file: Path) -> set[str]:
+    """Return the keys of a file of a group, as the command line spells them."""
     import yaml
 
     text = file.read_text(encoding="utf-8")
     package = "" if "@package _global_" in text else f"{file.parent.name}."
-    yield from (f"{package}{key}" for key, _ in flat(yaml.safe_load(text) or {}) if key != "defaults")
+    return {f"{package}{key}" for key, _ in flat(yaml.safe_load(text) or {}) if key != "defaults"}
 
 
 def once_per_value(words: Sequence[str]) -> str:

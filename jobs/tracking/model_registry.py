@@ -78,16 +78,12 @@ def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, obje
     identity = settings_hash(manifest)
     if not client.search_registered_models(f"name = '{name}'"):
         client.create_registered_model(name, description=ABOUT.format(group=group, name=name))
-    found = [
-        version
-        for version in client.search_model_versions(f"name = '{name}'")
-        if version.tags.get("policy") == identity
-    ]
-    version = found[0] if found else _add_version(tracker, policy, name, manifest)
+    versions = client.search_model_versions(f"name = '{name}'")
+    found = next((one for one in versions if one.tags.get("policy") == identity), None)
+    version = found or _add_version(tracker, policy, name, manifest)
     for key, value in {**tags, "policy": identity}.items():
-        client.set_model_version_tag(
-            name, version.version, key, f"{value:.4g}" if isinstance(value, float) else value
-        )
+        text = f"{value:.4g}" if isinstance(value, float) else value
+        client.set_model_version_tag(name, version.version, key, text)
     return f"{name}/{version.version}"
 
 
