@@ -154,17 +154,14 @@ def read_algo(**values: object) -> Algo:
         pydantic.ValidationError: A setting is missing, unknown to this algorithm, or has a wrong value.
         ValueError: There is no algorithm of this name.
     """
-    settings: Any = _row(values.get("name", "ppo")).settings
+    name = values.get("name", "ppo")
+    if name not in ALGORITHMS:
+        raise ValueError(f"name must be one of {', '.join(ALGORITHMS)}, got {name!r}")
+    settings: Any = ALGORITHMS[str(name)].settings
     return settings(**values)
 
 
-def algo_keys(values: Mapping[str, object] | None = None) -> list[str]:
-    """Return the settings of the algorithm that some values configure, of all algorithms if None."""
-    rows = ALGORITHMS.values() if values is None else [_row(values.get("name", "ppo"))]
-    return list(dict.fromkeys(field.name for row in rows for field in dataclasses.fields(row.settings)))
-
-
-def _row(name: object) -> Row:
-    if name not in ALGORITHMS:
-        raise ValueError(f"name must be one of {', '.join(ALGORITHMS)}, got {name!r}")
-    return ALGORITHMS[str(name)]
+def algo_keys() -> list[str]:
+    """Return the settings of all algorithms."""
+    fields = (field for row in ALGORITHMS.values() for field in dataclasses.fields(row.settings))
+    return list(dict.fromkeys(field.name for field in fields))

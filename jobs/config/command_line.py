@@ -2,11 +2,11 @@
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from jobs.config.flat import flat
-from jobs.config.registry import CONF, JOBS, Job
+from jobs.config.registry import CONF, JOBS
 
 RENAMED_JOBS = {"ship": "publish", "tune": "search"}  # old name -> new
 RENAMED_SECTIONS = {"tune": "search", "video": "video_events"}
@@ -17,7 +17,7 @@ TAKE_A_WORD = (  # Hydra's options
 EXPERIMENT = re.compile(r"\+exp=(\w+)")
 
 
-def hydra_words(words: Sequence[str], jobs: Mapping[str, object] = JOBS) -> list[str]:
+def hydra_words(words: Sequence[str]) -> list[str]:
     """Return the words for Hydra.
 
     A first word NAME stands for +exp=NAME. `+exp=NAME` is the file conf/exp/NAME.yaml or, without one, the
@@ -26,19 +26,18 @@ def hydra_words(words: Sequence[str], jobs: Mapping[str, object] = JOBS) -> list
     Old names of jobs and of their settings stand for the new ones.
     """
     words = list(words)
-    if len(words) > 1 and f"{words[0]}_{words[1]}" in jobs:
+    if len(words) > 1 and f"{words[0]}_{words[1]}" in JOBS:
         words[:2] = [f"{words[0]}_{words[1]}"]
     named = words[0] if words else ""
-    words[1:] = _placed(words[1:], RENAMED_JOBS.get(named, named), jobs)
-    known = RENAMED_JOBS.get(named, named) in jobs or (CONF / "exp" / f"{named}.yaml").is_file()
+    words[1:] = _placed(words[1:], RENAMED_JOBS.get(named, named))
+    known = RENAMED_JOBS.get(named, named) in JOBS or (CONF / "exp" / f"{named}.yaml").is_file()
     first = [f"+exp={named}" if known else named] if words else []
-    return [_job(_section(word), jobs) for word in [*first, *words[1:]]]
+    return [_job(_section(word)) for word in [*first, *words[1:]]]
 
 
-def _placed(words: Sequence[str], name: str, jobs: Mapping[str, object]) -> list[str]:
+def _placed(words: Sequence[str], name: str) -> list[str]:
     """Return the words with each that stands alone as the next of the job's own settings."""
-    job = jobs.get(name)
-    keys = iter(job.own_keys() if isinstance(job, Job) else ())
+    keys = iter(JOBS[name].own_keys() if name in JOBS else ())
     placed = []
     for before, word in zip(["", *words], words, strict=False):
         alone = "=" not in word and not word.startswith(("-", "+", "~")) and before not in TAKE_A_WORD
@@ -108,13 +107,13 @@ def experiments() -> list[str]:
     return sorted({*own, *(path.stem for path in (CONF / "exp").glob("*.yaml"))})
 
 
-def _job(word: str, jobs: Mapping[str, object]) -> str:
+def _job(word: str) -> str:
     """Return `job=NAME` if the word names a job, under its present name; otherwise return the word."""
     named = EXPERIMENT.fullmatch(word) or re.fullmatch(r"job=(\w+)", word)
     if not named:
         return word
     name = RENAMED_JOBS.get(named[1], named[1])
-    is_job = word.startswith("job=") or (name in jobs and not (CONF / "exp" / f"{name}.yaml").is_file())
+    is_job = word.startswith("job=") or (name in JOBS and not (CONF / "exp" / f"{name}.yaml").is_file())
     return f"job={name}" if is_job else f"+exp={name}"
 
 
