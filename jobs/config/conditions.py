@@ -21,16 +21,11 @@ from jobs.config.errors import nearest
 from jobs.config.scenes import scene_errors
 
 CONDITION_KEYS = [key for key in ENV_KEYS if f"{key}." not in OPEN_KEYS]
+# The policy's network is built for them, or its window, or its actions.
 NETWORK_KEYS = (
-    "camera.width",
-    "camera.height",
-    "env.window_capacity",
-    "env.filter_support",
-    "env.filter_tau_us",
-    "env.vehicle",
-    "env.body.command",
-    "env.body.primitives",
-)  # the policy's network is built for them, or its window, or its actions
+    *("camera.width", "camera.height", "env.window_capacity", "env.filter_support", "env.filter_tau_us"),
+    *("env.vehicle", "env.body.command", "env.body.primitives"),
+)
 WEIGHT = "weight"
 
 

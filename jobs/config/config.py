@@ -104,7 +104,7 @@ def parse(values: Mapping[str, object]) -> Config:
     top = {name: value for name, value in values.items() if name not in (*BESIDE_ENV, "name", job)}
     top |= {} if values.get("name") is None else {"exp": values["name"]}
     wrong = [name for name, part in parts.items() if part is None]
-    config = _build(Config, {**top, **parts}, "", errors, skip=wrong)
+    config = _section(Config, {**top, **parts}, "", errors, skip=wrong)
     if config is not None and not errors:
         errors += [
             *_image_errors(config),
@@ -174,16 +174,8 @@ def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:
         errors.append(f"env.{name}: no such key, got {env[name]!r}{nearest(f'env.{name}', [])}")
     fields = {name: value for name, value in env.items() if name not in misplaced}
     valid = {name: part for name, part in parts.items() if part is not None}
-    built = _build(EnvConfig, {**fields, **valid, "renderer": values.get("renderer")}, "env", errors)
+    built = _section(EnvConfig, {**fields, **valid, "renderer": values.get("renderer")}, "env", errors)
     return built if len(valid) == len(parts) else None
-
-
-def _section(section: Callable[..., Part], values: object, name: str, errors: list[str]) -> Part | None:
-    """Build a section from its values; return None if they are wrong, and add the reasons to `errors`."""
-    if not isinstance(values, Mapping):
-        errors.append(f"{name}: must be a group of settings, got {values!r}")
-        return None
-    return _build(section, values, name, errors)
 
 
 def _vehicle_errors(config: Config) -> list[str]:
@@ -205,14 +197,21 @@ def _vehicle_errors(config: Config) -> list[str]:
     return [f"env.vehicle: {rule}; the actions of {env.vehicle!r} are {space}"]
 
 
-def _build(
-    section: Callable[..., Part],
-    values: Mapping[str, object],
-    name: str,
-    errors: list[str],
-    skip: Collection[str] = (),
+def _section(
+    section: Callable[..., Part], values: object, name: str, errors: list[str], skip: Collection[str] = ()
 ) -> Part | None:
-    """Build a section from a mapping, like `_section`; report no error about the fields in `skip`."""
+    """Build a section from its values; return None if they are wrong, and add the reasons to `errors`.
+
+    Args:
+        section: What takes the values.
+        values: A mapping.
+        name: Of the section, "" for the whole configuration.
+        errors: Gets a line for each wrong value.
+        skip: Fields about which no error is reported.
+    """
+    if not isinstance(values, Mapping):
+        errors.append(f"{name}: must be a group of settings, got {values!r}")
+        return None
     try:
         return section(**{str(key): value for key, value in values.items()})
     except pydantic.ValidationError as error:

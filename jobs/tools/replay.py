@@ -25,6 +25,7 @@ from jobs.run.recordings import refusing
 from jobs.training.real_recordings import Recorded, read_whole
 from models.policy import Policy, load_policy
 
+HEADINGS, LATENCY = ("Recording", "Policy", "Steps", "Events/step"), ("p50", "p95", "p99")
 SHOWN_ACTIONS = 3  # columns of the table of numbers; the CSV file has the probabilities of more
 FILM_FPS, SLOWEST_FPS = 50.0, 5.0
 BARS = (245, 158, 11)  # their colour
@@ -85,16 +86,7 @@ def run(config: Config) -> list[Choice]:
     _tell_rate(recorded, trained_rate(policy))
     choices, name = choose(policy, recorded), f"{found.group}-s{found.training}"
     shown = policy.action_names if len(policy.action_names) <= SHOWN_ACTIONS else ()
-    headings = (
-        "Recording",
-        "Policy",
-        "Steps",
-        "Events/step",
-        *map(str.capitalize, shown),
-        "p50",
-        "p95",
-        "p99",
-    )
+    headings = (*HEADINGS, *map(str.capitalize, shown), *LATENCY)
     show_table("A policy looks at a recording", headings, [line(recorded.name, name, choices)], words=2)
     console.print("Latency from events to action [ms]; actions by the likeliest, in % of the steps.")
     folder = open_run(config).path / "replay"
@@ -116,9 +108,8 @@ def choose(policy: Policy, recorded: Recorded) -> list[Choice]:
     cuts = np.searchsorted(recorded.events["t"], np.append(starts_us, recorded.ends_us[-1]), side="right")
     choices = []
     with progress("Replay", len(starts_us), "steps") as advance:
-        for step, (start_us, end_us) in enumerate(
-            zip(starts_us.tolist(), recorded.ends_us.tolist(), strict=True)
-        ):
+        spans_us = zip(starts_us.tolist(), recorded.ends_us.tolist(), strict=True)
+        for step, (start_us, end_us) in enumerate(spans_us):
             events = recorded.events[cuts[step] : cuts[step + 1]]
             begun = time.perf_counter()
             logits = policy.event_logits(events, start_us, end_us - start_us).astype(np.float64)
