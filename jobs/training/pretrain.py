@@ -167,7 +167,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
                 save_checkpoint(folder.encoder, training, iteration + 1)
             measured = f", held out {latest['explained_loss_step']:.0%} explained" if latest else ""
             advance(1, note=f"loss {losses['loss']:.4f}{measured}")
-    return freeze(config, folder, tracker, on_processor(evae), train.about, held_out)
+    return freeze(folder, tracker, on_processor(evae), train.about, held_out)
 
 
 def read_split(folder: Run, split: str, denoise: bool) -> tuple[Recording, Recording | None]:
@@ -353,18 +353,13 @@ def held_out_figures(evae: EventVAE, held_out: HeldOut) -> dict[str, float]:
 
 
 def freeze(
-    config: Config,
-    folder: Run,
-    tracker: Tracker,
-    evae: EventVAE,
-    about: Mapping[str, object],
-    held_out: HeldOut,
+    folder: Run, tracker: Tracker, evae: EventVAE, about: Mapping[str, object], held_out: HeldOut
 ) -> dict[str, float]:
     """Write the encoder file and a picture of its reconstructions; return its held-out figures."""
     figures = held_out_figures(evae, held_out)
     manifest = {
         **{name: about[name] for name in ("sensor", "sensor_hash", "scenes")},
-        "iterations": config.pretrain.iterations,
+        "iterations": folder.config.pretrain.iterations,
         "figures": figures,
     }
     save_encoder(encoder_file(folder), evae, manifest)
