@@ -18,11 +18,7 @@ from envs.corridor import CorridorEnv, CorridorVectorEnv, Info
 
 NAME = "envs.corridor:evade/Corridor-v0"
 STEPS = 10  # of an episode, which ends by its time limit
-WORLD = {
-    "camera": CameraConfig(width=16, height=16),
-    "window_capacity": 32,
-    "time_limit_s": STEPS / 200.0,
-}
+WORLD = {"camera": CameraConfig(width=16, height=16), "window_capacity": 32, "time_limit_s": STEPS / 200.0}
 GYMNASIUM_KEYS = {"episode", "final_obs", "final_info", "final_observation"}
 SB3_KEYS = {"episode", "TimeLimit.truncated", "terminal_observation"}
 

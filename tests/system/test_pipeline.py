@@ -67,14 +67,7 @@ FEW_STEPS = (
 )
 
 
-@pytest.mark.parametrize(
-    ("exp", "words"),
-    [
-        ("event_columns", FEW_STEPS),
-        ("event_image", ()),
-        ("rgb", ()),
-    ],
-)
+@pytest.mark.parametrize(("exp", "words"), [("event_columns", FEW_STEPS), ("event_image", ()), ("rgb", ())])
 @pytest.mark.slow  # that of a plug-in, of tests/system/test_plugins.py, goes through the same stages
 def test_a_policy_without_an_event_vae_trains_and_evaluates_at_once(tmp_path, exp, words):
     printed = launch(tmp_path, f"+exp={exp}", *words)

@@ -10,13 +10,7 @@ from scipy.stats import ks_2samp, norm
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
 from envs.events import EVENT, EventCamera, RealSensor
-from envs.events.pixel_noise import (
-    PER_SIGMA,
-    mean_rate,
-    passage_times,
-    return_times,
-    threshold_in_sigmas,
-)
+from envs.events.pixel_noise import PER_SIGMA, mean_rate, passage_times, return_times, threshold_in_sigmas
 from envs.events.ramps import ColumnCamera
 
 SECOND = 10**6

@@ -5,13 +5,7 @@ import numpy as np
 import pytest
 
 from envs.scene import Texture
-from envs.scene.textures import (
-    TILE,
-    TILE_PERIODS,
-    around,
-    noise_tile,
-    noise_waves,
-)
+from envs.scene.textures import TILE, TILE_PERIODS, around, noise_tile, noise_waves
 from tests.support.point_samples import pattern_points
 
 

@@ -335,10 +335,7 @@ def test_the_stages_of_an_experiment_share_its_run_folder():
     assert len({run_name(parse(compose(f"+exp={stage}"))) for stage in stages}) == 1
 
 
-@pytest.mark.parametrize(
-    ("exp", "name"),
-    POLICIES.items(),
-)
+@pytest.mark.parametrize(("exp", "name"), POLICIES.items())
 def test_every_kind_of_policy_has_an_experiment_whose_stages_share_a_folder_of_its_name(exp, name):
     jobs = ("pipeline", "train", "evaluate", "collect")
     configs = [parse({**compose(f"+exp={exp}", "budget=short"), "job": job}) for job in jobs]
@@ -457,11 +454,7 @@ def test_no_number_may_be_anything_but_a_finite_number(values, key, value):
         ("env.layout", {"name": 3}, "has no 'name'"),
         ("model.name", "snn", f"must be one of {', '.join(KINDS)}, got 'snn'"),
         ("model.name", "eip", "which is called event_image now"),
-        (
-            "train.conditions",
-            [{"env.scene": "moon"}],
-            "train.conditions: must be one of cones, ",
-        ),
+        ("train.conditions", [{"env.scene": "moon"}], "train.conditions: must be one of cones, "),
         ("train.conditions", [], "at least 1 item"),
         ("model.coding", "phase", "'additive', 'eventnet' or 'none', got 'phase'"),
     ],

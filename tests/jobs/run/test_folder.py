@@ -12,13 +12,7 @@ from envs.config import settings_hash
 from jobs.config.config import Config, ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
 from jobs.run.files import RunError, read_json, write_json
-from jobs.run.folder import (
-    finish,
-    finished,
-    latest_policies,
-    open_run,
-    run_name,
-)
+from jobs.run.folder import finish, finished, latest_policies, open_run, run_name
 from jobs.run.identity import ADDED_SETTINGS, TRAINED_BY, identity
 from jobs.run.locks import held_alone
 from jobs.run.provenance import REPOSITORY, git_commit

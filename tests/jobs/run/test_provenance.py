@@ -8,10 +8,7 @@ from jobs.run.provenance import command
 @pytest.mark.parametrize(
     ("word", "shown"),
     [
-        (
-            "study.train=false",
-            "study.train=false",
-        ),
+        ("study.train=false", "study.train=false"),
         ("ablation.trained=/elsewhere/work/policies", "ablation.trained=policies"),
         ("ablation.trained=../someone/work/policies", "ablation.trained=policies"),
         ("study.policies=[/elsewhere/a,models/b/c]", "'study.policies=[a,models/b/c]'"),

@@ -16,12 +16,7 @@ from tests.support.configs import AXES, sweep_config
 from tests.support.policies import save_training
 from tests.support.runs import planned
 
-OTHER_CAMERA = {
-    "threshold_mismatch": 0.03,
-    "threshold_seed": 1,
-    "response": "lin_log",
-    "encoding": "linear8",
-}
+OTHER_CAMERA = {"threshold_mismatch": 0.03, "threshold_seed": 1, "response": "lin_log", "encoding": "linear8"}
 
 
 def at(sweep, axis, value):

@@ -27,22 +27,13 @@ def test_who_is_evaluated_and_whose_sensor_differs_is_said(tmp_path, capsys):
 
 
 @pytest.mark.slow  # two whole reports
-def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_rerun_adds_no_point(
-    tmp_path,
-):
+def test_a_sweep_is_one_run_with_a_child_for_each_condition_and_group_and_a_rerun_adds_no_point(tmp_path):
     config = in_store(sweep_config(tmp_path, policies=["straight", "oracle"], reference="straight"), tmp_path)
     for _ in range(2):
         figures = run(config, FakeExecutor())
     assert len(figures) == 5 * 2
     place = open_run(config).path / "study"
-    names = (
-        "sparsity.png",
-        "rate.png",
-        "table.md",
-        "details.md",
-        "episodes.csv",
-        "about.json",
-    )
+    names = ("sparsity.png", "rate.png", "table.md", "details.md", "episodes.csv", "about.json")
     assert all((place / name).is_file() for name in names)
     client, sweeps = tracked_sweeps(config)
     ((parent, children),) = sweeps.items()
@@ -94,9 +85,7 @@ def test_a_failed_task_stands_in_the_table_and_its_child_comes_when_it_is_evalua
 
 
 @pytest.mark.system  # four seconds of MLflow's store
-def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differs_from_training(
-    tmp_path,
-):
+def test_sweeps_of_other_policies_or_corridors_share_no_run_and_tell_what_differs_from_training(tmp_path):
     config = in_store(sweep_config(tmp_path), tmp_path)
     agent = save_training(tmp_path / "policy", "a", 0, dataclasses.replace(config.env, control_hz=100.0))
     for policies, trials in (([agent], 2), ([agent, "straight"], 2), ([agent], 3)):

@@ -35,11 +35,7 @@ def result(**learner):
     }
     return {
         "num_env_steps_sampled_lifetime": 4096,
-        "env_runners": {
-            "num_env_steps_sampled": 2048,
-            "episode_return": 12.5,
-            "num_episodes_lifetime": 3,
-        },
+        "env_runners": {"num_env_steps_sampled": 2048, "episode_return": 12.5, "num_episodes_lifetime": 3},
         "learners": {"default_policy": losses | learner},
         "fault_tolerance": {"num_remote_worker_restarts": 0},
         "trial_restarts": 0,

@@ -93,10 +93,7 @@ def first_format(folder):
         (forget("name"), r"the manifest lacks \['name'\]"),
         (change_manifest(name="snn"), r"name must be one of bytestream, .*, got 'snn'"),
         (change_manifest(name=["event_image"]), r"name: .*, got \['event_image'\]"),
-        (
-            change_manifest(name="bytestream_xy"),
-            r"encoder\.safetensors: must be that of .*'bytestream_xy'",
-        ),
+        (change_manifest(name="bytestream_xy"), r"encoder\.safetensors: must be that of .*'bytestream_xy'"),
         (change_manifest(width=64), r"encoder\.safetensors: must be that of .*width=64"),
         (change_manifest(name="event_columns"), r"sha256 must name networks\.safetensors, got"),
         (change_manifest(hidden=[64, 32]), "not the networks of this policy"),

@@ -3,15 +3,7 @@ import pytest
 
 from research.probe import readout as probes
 from research.probe.dataset import SECTORS, ProbeData
-from research.probe.readout import (
-    inner_episodes,
-    network,
-    per_episode,
-    probe,
-    ratio_interval,
-    ridge,
-    scores,
-)
+from research.probe.readout import inner_episodes, network, per_episode, probe, ratio_interval, ridge, scores
 
 BEARINGS = np.linspace(-43, 43, SECTORS)
 

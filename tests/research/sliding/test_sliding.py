@@ -8,14 +8,7 @@ from envs.recordings import write_events
 from jobs.tools.calibrate.footage import Footage
 from research.probe.dataset import SECTORS, ProbeData
 from research.sliding.depth import Lens, distorted, inverse_depth, straightened
-from research.sliding.sliding import (
-    Truth,
-    read_folder,
-    read_lens,
-    score,
-    undistorted,
-    windows_of,
-)
+from research.sliding.sliding import Truth, read_folder, read_lens, score, undistorted, windows_of
 from research.sliding.world import Slide, record_slides
 from tests.support.configs import compose
 
