@@ -1,16 +1,14 @@
 import dataclasses
 import json
 import math
-import os
 import re
 import shlex
 import signal
-import subprocess
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from matplotlib.figure import Figure
 from mlflow.exceptions import MlflowException
 from mlflow.protos.databricks_pb2 import INTERNAL_ERROR, INVALID_STATE, PERMISSION_DENIED, UNAUTHENTICATED
@@ -29,6 +27,7 @@ from jobs.tracking.pages import PAGE_WIDTH, chart_view
 from jobs.tracking.store import check_metrics, flatten, of_environment, store_uri
 from jobs.tracking.tracker import TrackingError, open_store, open_tracker
 from tests.support.configs import small_config
+from tests.support.stores import place_store
 
 
 @pytest.fixture(scope="module")
@@ -240,6 +239,8 @@ def test_a_second_process_is_kept_out_of_the_run_folder(folder):
 
 
 def test_a_run_that_was_deleted_in_mlflow_is_recorded_again_with_all_its_curves(tmp_path):
+    place_store(tmp_path / "mlflow.db")
+    place_store(tmp_path / "other.db")
     folder = open_run(small_config(tmp_path))
     with open_tracker(folder.config, folder) as tracker:
         for step, distance in ((10, 1.0), (20, 2.0), (20, 2.5)):
@@ -257,7 +258,8 @@ def test_a_run_that_was_deleted_in_mlflow_is_recorded_again_with_all_its_curves(
     assert [point.step for point in points] == [10, 20, 30]
 
 
-def test_an_experiment_that_was_deleted_is_named_with_a_command_that_restores_it(tmp_path):
+def test_an_experiment_that_was_deleted_is_named_with_a_command_that_restores_it(tmp_path, monkeypatch):
+    place_store(tmp_path / "mlflow.db")
     folder = open_run(small_config(tmp_path))
     client, experiment_id = open_store(store_uri(folder.config), "evade")
     client.delete_experiment(experiment_id)
@@ -266,9 +268,13 @@ def test_an_experiment_that_was_deleted_is_named_with_a_command_that_restores_it
         open_tracker(folder.config, folder),
     ):
         pass
+    from mlflow.cli import cli
+
     variable, *words = shlex.split(re.search("`(.*)`", str(error.value))[1])
-    settings = {**os.environ, **dict([variable.split("=", 1)])}
-    subprocess.run([sys.executable, "-m", *words], env=settings, check=True, capture_output=True)
+    assert (variable, words[0]) == (f"MLFLOW_TRACKING_URI={store_uri(folder.config)}", "mlflow")
+    monkeypatch.setenv(*variable.split("=", 1))
+    monkeypatch.setattr("mlflow.tracking._tracking_service.utils._tracking_uri", None)
+    assert CliRunner().invoke(cli, words[1:]).exit_code == 0
     another = re.search(r"tracking\.experiment=(\w+)", str(error.value))[1]
     named = dataclasses.replace(folder.config.tracking, experiment=another)
     for config in (folder.config, dataclasses.replace(folder.config, tracking=named)):
@@ -294,6 +300,7 @@ def test_a_store_that_refuses_is_told_in_one_line_with_its_remedy(folder, code, 
 
 def test_a_store_lies_in_a_folder_of_any_name(tmp_path):
     name = "job%2Fmain 100%25done a?b#c&d=e"
+    place_store(tmp_path / name / "mlflow.db")
     folder = open_run(small_config(tmp_path / name))
     with open_tracker(folder.config, folder) as tracker:
         tracker.log(1, {"eval/distance_m": 1.0})
@@ -304,9 +311,8 @@ def test_a_store_lies_in_a_folder_of_any_name(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == [name]
 
 
-def test_a_job_that_a_signal_ends_is_killed_in_mlflow(tmp_path):
-    folder = open_run(small_config(tmp_path))
-    with pytest.raises(Ended), open_tracker(folder.config, folder) as tracker:
+def test_a_job_that_a_signal_ends_is_killed_in_mlflow(folder):
+    with pytest.raises(Ended), open_tracker(folder.config, folder, key="ended") as tracker:
         raise Ended(signal.SIGTERM)
     assert tracker.client.get_run(tracker.run_id).info.status == "KILLED"
 
