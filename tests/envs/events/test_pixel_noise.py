@@ -93,8 +93,8 @@ def test_waiting_goes_on_while_the_light_trembles():
 def test_intervals_do_not_depend_on_the_step():
     gaps = []
     for step_us in (1000, 100_000):
-        events = still(4, step_us, camera={"cutoff_hz": 30.0}, shot_noise_hz=5.0)
-        gaps.append(np.concatenate([np.diff(t) for t, _ in by_pixel(events)]))
+        events = still(1.5, step_us, shape=(32, 32), camera={"cutoff_hz": 30.0}, shot_noise_hz=5.0)
+        gaps.append(np.concatenate([np.diff(t) for t, _ in by_pixel(events, 32)]))
     assert ks_2samp(*gaps).pvalue > 0.01
 
 
@@ -110,10 +110,11 @@ def test_shot_noise_falls_with_the_light_to_a_quarter():
 @pytest.mark.parametrize(("step_us", "refractory_us"), [(1000, 20_000), (30_000, 300)])
 def test_a_dead_time_holds_for_noise_and_on_is_as_likely_as_off_then(step_us, refractory_us):
     camera = {"refractory_us": refractory_us, "cutoff_hz": 100.0}
-    events = still(2, step_us, camera=camera, shot_noise_hz=20.0, leak_hz=2.0, leak_jitter=0.1)
-    assert min(int(np.diff(t).min()) for t, _ in by_pixel(events) if t.size > 1) >= refractory_us
-    assert len(events) > 256 * 2 * 5
-    alone = still(4, step_us, camera=camera, shot_noise_hz=20.0)
+    noise = {"shape": (32, 32), "camera": camera, "shot_noise_hz": 20.0}
+    events = still(0.5, step_us, leak_hz=2.0, leak_jitter=0.1, **noise)
+    assert min(int(np.diff(t).min()) for t, _ in by_pixel(events, 32) if t.size > 1) >= refractory_us
+    assert len(events) > 1024 * 0.5 * 5
+    alone = still(2, step_us, **noise)
     alone = alone[alone["t"] > SECOND]  # all levels begin below the light
     assert abs(alone["p"].mean()) < 4 / math.sqrt(len(alone))
 
@@ -133,11 +134,11 @@ def test_a_dead_time_holds_between_noise_and_light():
     assert min(int(np.diff(t).min()) for t, _ in by_pixel(events, 24) if t.size > 1) >= 4000
 
 
-@pytest.mark.parametrize("step_us", [5000, 40_000, 10_000_000])
+@pytest.mark.parametrize("step_us", [5000, 40_000, 4_000_000])
 def test_leakage_is_regular_and_does_not_depend_on_the_step(step_us):
-    events = still(10, step_us, leak_hz=7.0)
+    events = still(4, step_us, leak_hz=7.0)
     assert (events["p"] == 1).all()
-    assert len(events) == pytest.approx(256 * 70, abs=256)
+    assert len(events) == pytest.approx(256 * 28, abs=256)
     gaps = np.concatenate([np.diff(t) for t, _ in by_pixel(events)])
     assert np.abs(gaps - SECOND / 7).max() <= 3
 
