@@ -31,8 +31,7 @@ KINDS = [  # variant, coding, pool rank
     ("bytestream", "eventnet", 1),
     ("bytestream", "none", 1),
     ("bytestream_xy", "additive", 1),
-    ("bytestream", "additive", 2),
-    ("bytestream_xy", "additive", 3),
+    ("bytestream", "additive", 3),
 ]
 
 
