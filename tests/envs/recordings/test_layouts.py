@@ -92,22 +92,6 @@ def test_the_table_of_layouts_has_no_two_rows_for_one_place():
     assert len(set(places)) == len(places)
 
 
-def test_any_other_layout_is_named_by_group_and_columns_as_the_refusal_says(tmp_path):
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        put(file.create_group("deep/down"), "when u v sign", "i8 u2 u2 i1")
-        file["deep/rows"] = np.stack([X, Y, T, P], 1)
-    with pytest.raises(
-        ValueError, match=r"it contains deep/rows .*deep/down/when int64 .*give group= .* columns="
-    ):
-        read_events(path)
-    columns = ("when", "u", "v", "sign")
-    assert read_events(path, group="deep/down", columns=columns).events.tolist() == SAME
-    assert read_events(path, group="deep/rows", columns=("x", "y", "t", "p")).events.tolist() == SAME
-    with pytest.raises(ValueError, match=r"no events at group='nowhere'.*give group="):
-        read_events(path, group="nowhere")
-
-
 def test_two_cameras_in_one_file_are_told_and_chosen(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         m3ed(file)
@@ -168,23 +152,6 @@ NPZ = {
 def test_arrays_are_found_by_the_names_that_programs_give_them(name, tmp_path):
     np.savez(tmp_path / "a.npz", **NPZ[name])
     assert read_events(tmp_path / "a.npz").events.tolist() == SAME
-
-
-def test_arrays_of_other_names_are_listed_and_chosen_by_columns_or_group(tmp_path):
-    np.savez(tmp_path / "a.npz", when=T, u=X, v=Y, s=P, rows=np.stack([P, T, X, Y], 1), other=ROWS)
-    with pytest.raises(ValueError, match=r"it contains when int64 \(3,\), u .*give columns= .* or group="):
-        read_events(tmp_path / "a.npz")
-    assert read_events(tmp_path / "a.npz", columns=("when", "u", "v", "s")).events.tolist() == SAME
-    assert read_events(tmp_path / "a.npz", group="rows", columns=("p", "t", "x", "y")).events.tolist() == SAME
-    assert read_events(tmp_path / "a.npz", group="other").events.tolist() == SAME
-
-
-def test_a_table_whose_columns_are_not_clear_must_be_named(tmp_path):
-    rows = np.stack([X[::-1], Y, T[::-1], P], 1)
-    np.save(tmp_path / "a.npy", rows)
-    with pytest.raises(ValueError, match=r"does not name its columns; give columns= in their order"):
-        read_events(tmp_path / "a.npy")
-    assert read_events(tmp_path / "a.npy", columns=("x", "y", "t", "p")).events["t"].tolist() == sorted(T)
 
 
 def test_nanoseconds_since_1970_are_read_with_the_unit_that_the_refusal_names(tmp_path):

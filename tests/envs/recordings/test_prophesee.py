@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from envs.events import EVENT
 from envs.recordings import read_events, write_events
 from envs.recordings.clocks import unwrap
-from envs.recordings.event_file import CUT, OUTSIDE, RESERVED, TRIGGER, Request, usual_events
+from envs.recordings.event_file import CUT, OUTSIDE, RESERVED, TRIGGER, usual_events
 from envs.recordings.evt_decoders import State, decode_dat, decode_evt3, new_state
 from tests.support.event_files import some_events
 
@@ -143,7 +143,7 @@ def test_the_street_recording_has_the_pixels_that_another_decoder_gives():
     assert np.array_equal(ours["t"][:20_121], other.events["t"][:20_121])
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_evt3_words_in_any_order_decode_as_by_the_published_table(seed, tmp_path):
     rng = np.random.default_rng(seed)
     kinds = rng.choice([0, 2, 2, 3, 4, 4, 5, 6, 7, 10, 14, 15], 3000)
@@ -258,32 +258,9 @@ def test_what_is_written_is_read(tmp_path_factory, format, until_us, seed, count
     assert (back.format, back.width, back.height, back.late, back.skipped) == (format, 1280, 720, 0, 0)
 
 
-@needs_sample
-@pytest.mark.parametrize("format", ["dat", "evt2", "evt3"])
-def test_the_street_recording_survives_each_format(format, tmp_path):
-    events = read_events(EVT3_SAMPLE).events
-    write_events(tmp_path / "a", events, 1280, 720, format)
-    assert read_events(tmp_path / "a").events.tobytes() == events.tobytes()
-
-
 def test_evt3_counts_the_turns_of_its_clock_through_a_gap_of_minutes(tmp_path):
     events = some_events(0, 4, 640, 480, 100)
     events["t"] = [0, 2**24 - 1, 2**24, 200_000_000]
-    write_events(tmp_path / "a.raw", events, 640, 480)
-    assert read_events(tmp_path / "a.raw").events["t"].tolist() == events["t"].tolist()
-
-
-def test_the_clock_of_a_dat_file_is_unwrapped(tmp_path):
-    entries = np.zeros(3, [("t", "<u4"), ("data", "<u4")])
-    entries["t"] = [2**32 - 2, 2**32 - 1, 5]
-    head = b"% Data file containing CD events.\n% Version 2\n% Width 10\n% Height 10\n"
-    (tmp_path / "a.dat").write_bytes(head + bytes([12, 8]) + entries.tobytes())
-    assert read_events(tmp_path / "a.dat").events["t"].tolist() == [2**32 - 2, 2**32 - 1, 2**32 + 5]
-
-
-def test_the_low_part_of_the_time_is_written_again_after_a_new_high_part(tmp_path):
-    events = some_events(0, 3, 640, 480, 100)
-    events["t"] = [4096 + 7, 2 * 4096 + 7, 5 * 4096 + 7]
     write_events(tmp_path / "a.raw", events, 640, 480)
     assert read_events(tmp_path / "a.raw").events["t"].tolist() == events["t"].tolist()
 
@@ -485,7 +462,3 @@ def test_more_events_than_asked_for_are_refused_before_memory_is_taken(tmp_path)
     assert len(read_events(path, max_events=1200).events) == 1200
     with pytest.raises(ValueError, match="contains 1200 events or more and at most max_events=1199"):
         read_events(path, max_events=1199)
-
-
-def test_a_request_names_its_file():
-    assert "x.raw: is wrong" in str(Request(Path("x.raw")).refusal("is wrong"))
