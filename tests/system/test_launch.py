@@ -1,5 +1,4 @@
 import errno
-import importlib.util
 import os
 import re
 import shlex
@@ -102,19 +101,7 @@ def test_the_command_is_the_same_launcher_in_any_folder(tmp_path):
         (["contrast_threshold=0.1"], "did you mean camera.contrast_threshold?"),
         (["env.control-hz=45"], "did you mean env.control_hz?"),
         (["env.control_hz=fast"], "env.control_hz: Input should be a valid number, got 'fast'"),
-        (["env.control_hz=nan"], "env.control_hz: Input should be a finite number, got nan"),
-        (["env.control_hz=inf"], "env.control_hz: Input should be a finite number, got inf"),
-        (["env.speed_mps=-1"], "env.speed_mps: Input should be greater than 0, got -1"),
-        (["faults.sparsity=1.5"], "faults.sparsity: Input should be less than or equal to 1, got 1.5"),
-        (["env.scene=moon"], "env.scene: must be one of cones, dynamic, gates, poles, "),
-        (["collect.scenes=[moon]"], "collect.scenes: must be one of cones, dynamic, gates, poles, "),
-        (["job=study", "study.scene=moon"], "study.scene: must be one of cones, dynamic, gates, poles, "),
-        (
-            ["+env.layout.num_obstacles=100000"],
-            "env.layout: layout num_obstacles=100000 cannot be placed 2.0 m apart",
-        ),
         (["env.split=eval"], "env.split: no such key, got env.split=eval; every job chooses it itself"),
-        (["+env.split=eval"], "env.split: no such key, got 'eval'; every job chooses it itself"),
         (["seed=null"], "seed: Input should be a valid integer, got None"),
         (["seed="], "seed: Input should be a valid integer, got ''"),
         (["job=os.system"], "job: must be one of bench, "),
@@ -324,9 +311,7 @@ def test_ctrl_c_ends_with_status_130_and_one_line(launch, job):
     assert len(err.splitlines()) == 1
 
 
-def test_every_job_has_a_module_and_an_experiment_that_runs_it(launcher):
-    missing = [job.module for job in launcher.JOBS.values() if importlib.util.find_spec(job.module) is None]
-    assert missing == []
+def test_every_job_has_an_experiment_that_runs_it(launcher):
     assert {compose(f"+exp={exp}")["job"] for exp in experiments()} == set(launcher.JOBS)
 
 
