@@ -16,6 +16,7 @@ from jobs.tracking import tracker as tracking
 from jobs.tracking.store import dashboard_command, page, store_uri
 from jobs.tracking.tracker import open_tracker
 from tests.support.configs import small_config
+from tests.support.stores import place_store
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = [path for room in ("envs", "models", "jobs", "platform") for path in (ROOT / room).rglob("*.py")]
@@ -171,8 +172,8 @@ def with_address(config, uri: str):
 def test_no_secret_reaches_run_folders_the_tracker_or_what_is_printed(tmp_path, monkeypatch, uri):
     for name, value in SECRETS.items():
         monkeypatch.setenv(name, value)
-    open_store = tracking.open_store
-    stores = []
+    place_store(tmp_path / "mlflow.db")
+    open_store, stores = tracking.open_store, []
 
     def open_local_store(asked: str, experiment: str, storage: str | None):
         stores.append(asked)
@@ -198,6 +199,7 @@ def test_no_secret_reaches_run_folders_the_tracker_or_what_is_printed(tmp_path, 
 
 
 def test_mlflow_does_not_print_the_address_with_its_password_either(tmp_path, monkeypatch):
+    place_store(tmp_path / "mlflow.db")
     monkeypatch.setenv("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "false")
     tracking.open_store(f"sqlite:///{tmp_path}/mlflow.db", "evade")
     assert os.environ["MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT"] == "true"

@@ -16,6 +16,7 @@ from models.policy import load_policy
 from models.policy.policy import HEADINGS
 from tests.support.configs import small_config
 from tests.support.policies import save_training
+from tests.support.stores import place_store
 
 STEPS = 12
 SEEN = ("bytestream", "event_image", "rgb")
@@ -25,7 +26,9 @@ TAGS = {"seed": 3, "commit": "c0ffee", "eval/success_rate": 1 / 3}
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     """A run of a tracker, and policies that see event windows, event images and luminance."""
-    folder = open_run(small_config(tmp_path_factory.mktemp("registry")))
+    place = tmp_path_factory.mktemp("registry")
+    place_store(place / "mlflow.db")
+    folder = open_run(small_config(place))
     with open_tracker(folder.config, folder) as tracker:
         pass
     env = folder.config.env

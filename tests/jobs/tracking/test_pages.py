@@ -23,6 +23,7 @@ from jobs.tracking.pages import (
 from jobs.tracking.store import dashboard_command, server_command
 from jobs.tracking.tracker import open_store
 from tests.support.filled_store import fill
+from tests.support.stores import place_store
 
 PAGE = Page(
     experiment_id="1",
@@ -70,6 +71,7 @@ def test_the_experiments_first_line_leads_to_the_newest_sweep():
 
 
 def test_runs_that_ended_early_do_not_stand_among_results(tmp_path):
+    place_store(tmp_path / "mlflow.db")
     client, experiment = open_store(f"sqlite:///{tmp_path / 'mlflow.db'}", "evade")
     for status in ("RUNNING", "FINISHED", "FAILED", "KILLED"):
         for kind in ("run", "sweep"):
