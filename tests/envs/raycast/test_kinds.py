@@ -115,16 +115,6 @@ def test_a_body_is_invisible_from_its_inside(kind):
         assert not np.array_equal(render(scene, (0.2, 0.0, 3.9, 0.0)), render(empty, (0.2, 0.0, 3.9, 0.0)))
 
 
-def test_a_sphere_covers_the_solid_angle_that_geometry_says():
-    scene = Scene("one", body(ELLIPSOID, 0.0, 10.0, 50.0, 3.0, 3.0, albedo=0.0), wall_height_m=1e-9)
-    image = RaycastRenderer(scene, 64, 64, samples=8).render(0.0, 0.0, 50.0)
-    # Its outline on the optical axis is a circle of radius f * tan(asin(r / d)).
-    radius = 32.0 * 3.0 / math.sqrt(100.0 - 9.0)
-    sky, ground = image[0, 0], image[63, 0]
-    covered = (1.0 - image[:32] / sky).sum() + (1.0 - image[32:] / ground).sum()
-    assert covered == pytest.approx(math.pi * radius * radius, rel=2e-4)
-
-
 def covered(scene: Scene, samples: int, yaw: float) -> float:
     """Area of the image [pixels] that black bodies cover before a plain sky and ground."""
     image = RaycastRenderer(scene, 64, 64, samples=samples).render(0.0, 0.0, 50.0, yaw).astype(np.float64)
