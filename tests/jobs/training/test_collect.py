@@ -15,10 +15,13 @@ from jobs.training.collect import EventBlock, check_policy, record
 from jobs.training.real_recordings import GAP_US
 from tests.support.configs import small_config
 from tests.support.policies import kinds, save_untrained
+from tests.support.stores import place_store
+
+STEPS = 450
 
 
-def flights(**fields):
-    return [(EnvConfig(observation="events", **fields), 900)]
+def flights(steps=STEPS, **fields):
+    return [(EnvConfig(observation="events", **fields), steps)]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +82,7 @@ def test_another_seed_flies_other_corridors(monkeypatch):
 
 def test_every_event_lies_in_a_step_and_no_step_spans_two_flights(recording):
     start, end, flight = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
-    assert len(start) == 900
+    assert len(start) == STEPS
     assert np.all(end > start)
     same = flight[1:] == flight[:-1]
     assert np.all(start[1:][same] == end[:-1][same])
@@ -91,7 +94,7 @@ def test_every_event_lies_in_a_step_and_no_step_spans_two_flights(recording):
 def test_events_are_in_time_order_and_on_the_sensor(recording):
     assert np.all(np.diff(recording.events["t"]) >= 0)
     assert recording.events["x"].max() < 64
-    assert len(recording.events) > 900 * 50
+    assert len(recording.events) > STEPS * 50
 
 
 def test_splits_share_no_flight(recording):
@@ -108,8 +111,9 @@ def test_the_facts_name_sensor_scenes_and_faults():
 
 
 def test_a_resumed_job_works_with_the_stored_settings(tmp_path):
-    stored = open_run(small_config(tmp_path))
-    collect.run(dataclasses.replace(small_config(tmp_path), seed=99, resume=str(stored.path)))
+    config = collecting(tmp_path, None)
+    stored = open_run(config)
+    collect.run(dataclasses.replace(config, seed=99, resume=str(stored.path)))
     assert read_recording(stored.data / "train.h5").about["seed"] == stored.config.seed
 
 
@@ -136,37 +140,31 @@ def test_a_policy_flies_its_share_of_the_steps_in_corridors_of_its_own(policy, m
     monkeypatch.setattr(collect, "run_episode", fly)
     monkeypatch.setattr(CorridorEnv, "step", count)
     mixed = record(flights(), 0, lambda count: None, policy, 1 / 3)[0]
-    assert flown == {True: 300, False: 600}
+    assert flown == {True: STEPS // 3, False: 2 * STEPS // 3}
     assert not corridors[True] & corridors[False]
     assert mixed.about["policy"] == str(policy)
     assert mixed.about["policy_share"] == 1 / 3
-    assert len(mixed.index["step_t_us"]) == 900
+    assert len(mixed.index["step_t_us"]) == STEPS
     assert np.all(np.diff(mixed.events["t"]) >= 0)
 
 
 def test_the_random_flights_are_those_of_a_recording_without_a_policy(recording, policy):
     mixed = record(flights(), 0, lambda count: None, policy, 0.5)[0]
-    first = record([(EnvConfig(observation="events"), 450)], 0, lambda count: None)[0].events
+    first = record(flights(STEPS // 2), 0, lambda count: None)[0].events
     np.testing.assert_array_equal(mixed.events[: len(first)], first)
     assert (recording.about["policy"], recording.about["policy_share"]) == (None, 0.0)
 
 
 def test_a_policy_draws_its_actions_and_the_same_seed_gives_the_same_bytes(policy):
-    one, again, other = (record(flights(), seed, lambda count: None, policy, 1.0)[0] for seed in (0, 0, 1))
+    one, again, other = (record(flights(120), seed, lambda count: None, policy, 1.0)[0] for seed in (0, 0, 1))
     assert one.events.tobytes() == again.events.tobytes() != other.events.tobytes()
 
 
-def test_flights_of_a_policy_that_sees_pictures_are_recorded_with_their_events(tmp_path):
-    rgb = save_untrained(tmp_path, name="rgb")
-    flown = record([(EnvConfig(), 40)], 0, lambda count: None, rgb, 1.0)[0]
-    steps = np.unique(np.searchsorted(flown.index["step_t_us"], flown.events["t"]))
-    assert len(steps) > 30, "there are events in nearly every step"
-
-
 def collecting(tmp_path, policy):
+    place_store(tmp_path / "mlflow.db")
     config = small_config(tmp_path)
-    settings = dataclasses.replace(config.collect, policy=str(policy), num_steps=60, num_validation_steps=30)
-    return dataclasses.replace(config, collect=settings)
+    settings = {"policy": policy and str(policy), "num_steps": 60, "num_validation_steps": 30}
+    return dataclasses.replace(config, collect=dataclasses.replace(config.collect, **settings))
 
 
 def test_a_path_without_a_policy_or_one_of_another_sensor_is_refused_before_anything_is_made(tmp_path):

@@ -65,6 +65,15 @@ def make_runners(name, folder, *overrides):
     return runners
 
 
+@pytest.fixture
+def ours():
+    """A runner of policies that see columns of events."""
+    config = make_config(*SHORT, "model=event_columns", "algo.num_envs_per_env_runner=3")
+    runner = PlainEnvRunner(config=build_algorithm(config), worker_index=0)
+    yield runner
+    runner.stop()
+
+
 def samples_of(runner, sizes):
     torch.manual_seed(0)
     return [runner.sample(num_timesteps=size) for size in sizes]
@@ -155,9 +164,7 @@ def test_one_that_resumes_before_its_first_round_begins_anew():
     runner.stop()
 
 
-def test_pieces_of_a_flight_share_its_name_and_follow_each_other(tmp_path):
-    ours, theirs = make_runners("event_columns", tmp_path)
-    theirs.stop()
+def test_pieces_of_a_flight_share_its_name_and_follow_each_other(ours):
     flights = {}
     for chunk in (chunk for sample in samples_of(ours, (10, 10, 30)) for chunk in sample):
         flights.setdefault(chunk.id_, []).append(chunk)
@@ -171,33 +178,20 @@ def test_pieces_of_a_flight_share_its_name_and_follow_each_other(tmp_path):
     assert metrics["num_env_steps_sampled"].peek() == sum(
         len(piece) for pieces in flights.values() for piece in pieces
     )
-    ours.stop()
 
 
-def test_a_reset_forgets_the_flights_in_the_air(tmp_path):
-    ours, theirs = make_runners("event_columns", tmp_path)
-    theirs.stop()
+def test_a_reset_forgets_the_flights_in_the_air(ours):
     (first,) = samples_of(ours, (10,))
     again = ours.sample(num_timesteps=10, force_reset=True)
     assert {chunk.id_ for chunk in first}.isdisjoint(chunk.id_ for chunk in again)
     assert all(chunk.t_started == 0 for chunk in again)
-    ours.stop()
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"num_episodes": 1},
-        {"num_timesteps": 4, "random_actions": True},
-        {"num_timesteps": 4, "explore": False},
-    ],
-)
-def test_what_it_cannot_fly_is_refused(asked, tmp_path):
-    ours, theirs = make_runners("event_columns", tmp_path)
-    with pytest.raises(RolloutError, match=r"ValueError: .*drawn actions and nothing else"):
-        ours.sample(**asked)
-    for runner in (ours, theirs):
-        runner.stop()
+def test_what_it_cannot_fly_is_refused(ours):
+    few = {"num_timesteps": 4}
+    for asked in ({"num_episodes": 1}, {**few, "random_actions": True}, {**few, "explore": False}):
+        with pytest.raises(RolloutError, match=r"ValueError: .*drawn actions and nothing else"):
+            ours.sample(**asked)
 
 
 class Broken(PlainEnvRunner):

@@ -317,17 +317,6 @@ def test_the_exported_policy_gives_the_logits_of_the_path_through_rllib(name, ru
     assert np.ptp(compared, axis=0).max() > 1e-3
 
 
-def test_the_same_seed_gives_the_same_flights(ppo):
-    runs = []
-    for _ in range(2):
-        runner = PlainEnvRunner(config=ppo, worker_index=0)
-        runs.append(runner.sample(num_timesteps=30))
-        runner.stop()
-    for one, other in zip(*runs, strict=True):
-        np.testing.assert_array_equal(one.get_observations(), other.get_observations())
-        np.testing.assert_array_equal(one.get_actions(), other.get_actions())
-
-
 def test_an_encoder_of_another_sensor_is_refused_with_both_values(encoder):
     with pytest.raises(ConfigError, match=r"another sensor.*contrast_threshold: 0\.2 there, 0\.3 here"):
         build_algorithm(make_config("camera.contrast_threshold=0.3"), encoder)
