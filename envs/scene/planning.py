@@ -117,8 +117,9 @@ def prices_among(
     times_s, prices = np.maximum(now[0], now[0] + (y_m - now[1]) / speed_mps), prices.copy()
     for one in moving:
         reach_m = max(float(one.body["rx"]), float(one.body["ry"])) + radius_m + FELT_M
-        ends_m = one.places_m[:, 1].min() - reach_m, one.places_m[:, 1].max() + reach_m
-        rows = slice(*np.searchsorted(y_m, ends_m))  # others it never comes near
+        first_m = max(one.places_m[:, 1].min() - reach_m, now[1] - LATTICE_M)
+        last_m = one.places_m[:, 1].max() + reach_m
+        rows = slice(*np.searchsorted(y_m, (first_m, last_m)))  # others are behind, or it never comes near
         bodies = np.array([one.body] * len(y_m[rows]), OBSTACLE)
         bodies["x"], bodies["y"], bodies["z"] = one.places(times_s[rows]).T
         there = (np.abs(bodies["z"] - height_m) <= bodies["rz"]) & (

@@ -200,8 +200,8 @@ def write_plots(place: Path, study: Study) -> list[Path]:
 def film_crashes(place: Path, found: Evaluated) -> list[Path]:
     """Film contacts of each group's first training where nothing is changed; baselines have none."""
     unchanged = [task for task in found.plan.tasks if task.condition[0] == NOMINAL]
-    flown = [task for task in unchanged if task.key in found.results and task.policy.training is not None]
-    first = {task.policy.group: task for task in reversed(flown)}
+    evaluated = [task for task in unchanged if task.key in found.results and task.policy.training is not None]
+    first = {task.policy.group: task for task in reversed(evaluated)}
     paths = []
     for group, task in sorted(first.items()):
         for seed in typical_crashes(found.results[task.key].episodes):

@@ -106,13 +106,13 @@ def test_the_oracle_also_comes_through_at_the_slowest_control():
     assert roll_out(make_agent("oracle"), slow, range(10), num_envs=10)["success"].mean() >= 0.9
 
 
-@pytest.mark.parametrize("layout", [{"num_obstacles": 0, "num_moving": 40}, {"throw_every_s": 1.0}])
+@pytest.mark.parametrize("layout", [{"num_obstacles": 0, "num_moving": 60}, {"throw_every_s": 1.0}])
 def test_the_oracle_of_a_kinematic_vehicle_passes_bodies_that_move(layout):
-    among = dataclasses.replace(HELD_OUT, layout=layout, speed_mps=10.0, time_limit_s=20.0)
-    success = [roll_out(make_agent(name), among, range(10), num_envs=10)["success"].mean()
+    among = dataclasses.replace(HELD_OUT, layout=layout, control_hz=50.0)
+    success = [roll_out(make_agent(name), among, range(5), num_envs=5)["success"].mean()
                for name in ("oracle", "straight")]  # fmt: skip
-    assert success[0] >= 0.9
-    assert success[1] <= 0.3
+    assert success[0] == 1.0
+    assert success[1] <= 0.4
 
 
 def test_the_oracle_foresees_what_it_has_decided():
