@@ -44,15 +44,17 @@ class PacketDecoder:
 
     def taken(self) -> Part:
         """Return the events and triggers of the packets since the last call."""
-        if self._words:
-            ((encoding, bodies),) = list(self._words.items())[:1]
-            self._words = {}
+        found: list[Part] = []
+        for encoding, bodies in self._words.items():
             dtype = np.dtype(WORDS[encoding])
             raw = b"".join(body[: len(body) // dtype.itemsize * dtype.itemsize] for body in bodies)
             words = np.frombuffer(raw, dtype)
-            return concatenated(evt_parts(self._request, encoding, words, states=self._states))
-        rows, self._rows = np.concatenate(self._rows, axis=1), [np.empty((4, 0), np.int64)]
-        return assemble(self._request, *rows)
+            found += evt_parts(self._request, encoding, words, states=self._states)
+        rows = np.concatenate(self._rows, axis=1)
+        if rows.size or not found:
+            found.append(assemble(self._request, *rows))
+        self._words, self._rows = {}, [np.empty((4, 0), np.int64)]
+        return concatenated(found)
 
 
 def _libcaer(packet: EventPacket, tally: Tally) -> np.ndarray:

@@ -22,7 +22,7 @@ from envs.config import STRICT
 from jobs.bench.evaluated import Tasks, evaluate_cells, find_benchmarked
 from jobs.bench.protocol import Cell, Protocol, read_protocol, tasks_of
 from jobs.bench.result import RefusedResultError, Submission, read_result
-from jobs.config.config import Config
+from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Name
 from jobs.rollout.executors import Executor
 from jobs.rollout.scheduler import default_executor
@@ -59,7 +59,14 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     submission = read_result(Path(config.own.result), protocol)
     result = submission.result
     seed = "" if result.training is None else f"-s{result.training}"
-    policy, _ = find_benchmarked("bench_verify.policy", config.own.policy or result.policy + seed, config)
+    try:
+        policy, _ = find_benchmarked("bench_verify.policy", config.own.policy or result.policy + seed, config)
+    except ConfigError as error:
+        if config.own.policy is not None:
+            raise
+        rule = f"must be the place of {result.policy!r} (by {result.source or 'no named source'}), got none"
+        remedy = f"evade bench verify {config.own.result} PLACE"
+        raise ConfigError(f"bench_verify.policy: {rule}; write: {remedy}") from error
     if policy.identity != result.identity:
         rule = f"is of policy {result.identity}, got {policy.identity}; name the policy's place"
         raise RefusedResultError(f"{config.own.result}: {rule}: bench_verify.policy=PLACE")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from envs.recordings import read_events, read_frames, read_imu, read_parts
-from envs.recordings.event_file import CUT_PACKETS, Tally
+from envs.recordings.event_file import CUT_PACKETS, Request, Tally
 from envs.recordings.event_packets import ROWS as DECODERS
+from envs.recordings.event_packets import PacketDecoder
 from envs.recordings.ros_messages import EventPacket
 from tests.support.event_files import some_events
 
@@ -128,6 +129,18 @@ def test_packets_decode_as_their_descriptions_say():
     assert decoded("libcaer_cmp", 1000, np.array(words, "<u2").tobytes()) == [
         (1000 + 4096 + 2, 7, 9, 1), (5098, 7, 20, 0), (5098, 7, 22, 0), (5098, 7, 28, 0)
     ]  # fmt: skip
+
+
+def test_packets_of_several_encodings_lose_none():
+    decoder = PacketDecoder(Request(Path("a.bag"), 64, 48))
+    evt2 = np.array([8 << 28 | 1, 1 << 28 | 5 << 22 | 7 << 11 | 9], "<u4")  # high bits of the time, then ON
+    evt3 = np.array([8 << 12, 6 << 12 | 70, 20, 2 << 12 | 1 << 11 | 11], "<u2")  # time, row, ON in a column
+    mono = struct.pack("<IHH", 90_000, 3, 4 | 0x8000)
+    for encoding, body in (("evt2", evt2.tobytes()), ("evt3", evt3.tobytes()), ("mono", mono)):
+        decoder.add(EventPacket(64, 48, 0, encoding, body))
+    events = decoder.taken().events
+    assert events[["t", "x", "y", "p"]].tolist() == [(69, 7, 9, 1), (70, 11, 20, 1), (90, 3, 4, 1)]
+    assert decoder.taken().events.size == 0
 
 
 def test_an_encoding_that_is_not_known_is_refused_by_name(tmp_path):

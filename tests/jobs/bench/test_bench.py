@@ -256,6 +256,14 @@ def test_verification_refuses_another_policy(protocol, result, tmp_path):
         verify(tmp_path, result[0], FakeExecutor(drawn), policy="straight")
 
 
+def test_verification_asks_for_the_place_of_a_function_and_says_where_it_is_from(tmp_path):
+    file = Path(__file__).parents[3] / "docs" / "data" / "bench" / "sb3_ppo-C.json"
+    with pytest.raises(
+        ConfigError, match=r"'sb3_ppo' \(by docs/entries/sb3_ppo\).*evade bench verify .* PLACE"
+    ):
+        verify(tmp_path, file, FakeExecutor(drawn))
+
+
 def test_the_leaderboard_has_the_best_first_and_refuses_what_is_forged(protocol, result, tmp_path):
     folder, executor = result[0].parent, FakeExecutor(drawn)
     bench.run(configured(tmp_path, "bench", policy="straight", name="ahead", met=["leak"]), executor)
