@@ -68,7 +68,8 @@ class RetryQueue:
         Returns:
             Why steps wait from now on; None if none wait, or if some waited before.
         """
-        append_json_lines(self.record, [new])
+        if new["metrics"] or new["missing"]:  # a job that continues may have nothing new to say
+            append_json_lines(self.record, [new])
         waited = self.rows()
         rows = [*waited, new]
         if waited and time.monotonic() < self._retry_at_s:
