@@ -68,8 +68,7 @@ class RetryQueue:
         Returns:
             Why steps wait from now on; None if none wait, or if some waited before.
         """
-        if new["metrics"] or new["missing"]:  # a job that continues may have nothing new to say
-            append_json_lines(self.record, [new])
+        append_json_lines(self.record, [new])
         waited = self.rows()
         rows = [*waited, new]
         if waited and time.monotonic() < self._retry_at_s:

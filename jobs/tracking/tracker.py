@@ -117,6 +117,8 @@ class Tracker:
                 a name is in no known section, or there are more than `jobs.tracking.store.MAX_METRICS`.
         """
         values = check_metrics(metrics)
+        if not values:  # a job that continues may have nothing new to say
+            return
         missing = sorted(name for name, value in values.items() if math.isnan(value))
         measured = {name: value for name, value in values.items() if name not in missing}
         row: LoggedStep = {"step": step, "time_ms": now_ms(), "metrics": measured, "missing": missing}
