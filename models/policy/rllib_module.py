@@ -116,29 +116,21 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         first: np.ndarray,
         taken: np.ndarray,
         velocity_mps: np.ndarray | None = None,
+        mirrored: bool = False,
     ) -> np.ndarray:
-        """Return what the networks read after the newest observations (`models.policy.memory`)."""
-        return self._remember(kept, self.features(observations), observations, first, taken, velocity_mps)
+        """Return what the networks read after the newest observations.
 
-    def remember_mirrored(
-        self,
-        kept: np.ndarray,
-        observations: Windows,
-        first: np.ndarray,
-        taken: np.ndarray,
-        velocity_mps: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Return `remember` for the mirrored observations. Call it after `remember`.
-
-        Actions and velocities are mirrored already.
+        Args:
+            kept, first, taken, velocity_mps: As in `models.policy.memory.remember`.
+            observations: One for each episode.
+            mirrored: Whether to read the mirror image of the observations; actions and velocities are mirrored
+                already. Call it without first.
         """
-        features = self._features(mirror(observations, self.spec))
-        return self._remember(kept, features, observations, first, taken, velocity_mps)
-
-    def _remember(
-        self, kept: np.ndarray, features: np.ndarray, observations: Windows, first: np.ndarray, *own: Any
-    ) -> np.ndarray:
-        return remember(kept, features, first, self.spec, windows_us(observations, self.spec), *own)
+        features = (
+            self._features(mirror(observations, self.spec)) if mirrored else self.features(observations)
+        )
+        duration_us = windows_us(observations, self.spec)
+        return remember(kept, features, first, self.spec, duration_us, taken, velocity_mps)
 
     def set_state(self, state: Any) -> None:
         """Load weights; the table is built again only if they change the encoder."""

@@ -42,10 +42,9 @@ class TaughtEnvRunner(TeacherEnvRunner):
         if images := mirror_images(self._settings):
             before = np.zeros_like(self._stacks) if first.all() else self._mirrored
             velocity = self.velocities_mps()
-            self._mirrored = self.module.remember_mirrored(
-                *(before, observations, first, np.array(images)[taken]),
-                None if velocity is None else velocity * MIRROR,
-            )
+            velocity = None if velocity is None else velocity * MIRROR
+            taken = np.array(images)[taken]
+            self._mirrored = self.module.remember(before, observations, first, taken, velocity, mirrored=True)
 
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         actions, outputs = super()._decide(stacks)

@@ -180,7 +180,7 @@ def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(
     kept, met = np.zeros((len(shown[0][1]), *seen.shape[1:]), seen.dtype), len(runner.shown.windows)
     expected = []
     for observations, first, *own in shown:
-        kept = runner.module.remember_mirrored(kept, observations, first, *own)
+        kept = runner.module.remember(kept, observations, first, *own, mirrored=True)
         expected.append(kept)
     assert len(runner.shown.windows) == met
     expected = {row.tobytes() for step in expected for row in step}
