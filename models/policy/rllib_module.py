@@ -118,13 +118,10 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         velocity_mps: np.ndarray | None = None,
         mirrored: bool = False,
     ) -> np.ndarray:
-        """Return what the networks read after the newest observations.
+        """Return what the networks read after the newest observations (`models.policy.memory.remember`).
 
-        Args:
-            kept, first, taken, velocity_mps: As in `models.policy.memory.remember`.
-            observations: One for each episode.
-            mirrored: Whether to read the mirror image of the observations; actions and velocities are mirrored
-                already. Call it without first.
+        With `mirrored` it reads the mirror image of the observations, while actions and velocities are
+        mirrored already. Call it without first.
         """
         features = (
             self._features(mirror(observations, self.spec)) if mirrored else self.features(observations)
