@@ -16,8 +16,7 @@ With EventNet's coding a context also holds the time bin of the event that each 
 of equal ones the newest; the phase of that bin follows when the latent is asked for.
 """
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -135,8 +134,11 @@ class EncoderTable:
     def _raise(self, batch: EventBatch, contexts: np.ndarray) -> None:
         """Raise each of `contexts` (B, ...) to the maximum over it and its window's events."""
         kernel = _raise_to if self.phase is None else _raise_to_newest
-        kernel = kernel if self.pool_rank == 1 else raise_largest(self.pool_rank)
-        kernel(self.features, self.embedding, batch.code, batch.bin, batch.offsets, contexts)
+        given = self.features, self.embedding, batch.code, batch.bin, batch.offsets, contexts
+        if self.pool_rank == 1:
+            kernel(*given)
+        else:
+            _raise_ranks(*given, (0,) * self.pool_rank)
 
     def latent(self, context: np.ndarray) -> np.ndarray:
         """Return latent mu (latent,) of a context."""
@@ -237,67 +239,52 @@ def _raise_to(features, embedding, code, bins, offsets, contexts) -> None:  # ty
                 context[j] = max(max(early, late), context[j])
 
 
-@functools.cache
-def raise_largest(rank: int) -> Callable[..., None]:
-    """Return `_raise_to` for the `rank` largest sums: contexts (B, rank, D), in falling order."""
-    sort_in = _sorting(rank)
-
-    @numba.njit(cache=True, error_model="numpy")
-    def raise_ranks(features, embedding, code, bins, offsets, contexts) -> None:  # type: ignore[no-untyped-def]
-        cells, size = len(features), features.shape[1]
-        none = np.zeros(size, features.dtype)
-        blocks = np.zeros(((size + BLOCK - 1) // BLOCK, rank, BLOCK), contexts.dtype)
-        for b in range(len(contexts)):
-            for j in range(size):
-                blocks[j // BLOCK, :, j % BLOCK] = contexts[b, :, j]
-            whole = offsets[b + 1] - (offsets[b + 1] - offsets[b]) % 4
-            for n in range(offsets[b], whole, 4):
-                event_1 = features[code[n] % cells], embedding[bins[n]]
-                event_2 = features[code[n + 1] % cells], embedding[bins[n + 1]]
-                event_3 = features[code[n + 2] % cells], embedding[bins[n + 2]]
-                event_4 = features[code[n + 3] % cells], embedding[bins[n + 3]]
-                sort_in(blocks, event_1, event_2, event_3, event_4)
-            for n in range(whole, offsets[b + 1]):
-                event_1 = features[code[n] % cells], embedding[bins[n]]
-                sort_in(blocks, event_1, (none, none), (none, none), (none, none))
-            for j in range(size):
-                contexts[b, :, j] = blocks[j // BLOCK, :, j % BLOCK]
-
-    return raise_ranks
+@numba.njit(cache=True, error_model="numpy")
+def _raise_ranks(features, embedding, code, bins, offsets, contexts, levels) -> None:  # type: ignore[no-untyped-def]
+    """`_raise_to` for the largest sums, one of each level: contexts (B, levels, D), in falling order."""
+    cells, size = len(features), features.shape[1]
+    none = np.zeros(size, features.dtype)
+    blocks = np.zeros(((size + BLOCK - 1) // BLOCK, len(levels), BLOCK), contexts.dtype)
+    for b in range(len(contexts)):
+        for j in range(size):
+            blocks[j // BLOCK, :, j % BLOCK] = contexts[b, :, j]
+        whole = offsets[b + 1] - (offsets[b + 1] - offsets[b]) % 4
+        for n in range(offsets[b], whole, 4):
+            event_1 = features[code[n] % cells], embedding[bins[n]]
+            event_2 = features[code[n + 1] % cells], embedding[bins[n + 1]]
+            event_3 = features[code[n + 2] % cells], embedding[bins[n + 2]]
+            event_4 = features[code[n + 3] % cells], embedding[bins[n + 3]]
+            _sort_in(blocks, levels, event_1, event_2, event_3, event_4)
+        for n in range(whole, offsets[b + 1]):
+            event_1 = features[code[n] % cells], embedding[bins[n]]
+            _sort_in(blocks, levels, event_1, (none, none), (none, none), (none, none))
+        for j in range(size):
+            contexts[b, :, j] = blocks[j // BLOCK, :, j % BLOCK]
 
 
-@functools.cache
-def _sorting(rank: int) -> Callable[..., None]:
-    """Return a function that sorts four events (row, code) into the largest sums (blocks, rank, BLOCK).
+@numba.njit(cache=True, error_model="numpy")
+def _sort_in(blocks, levels, event_1, event_2, event_3, event_4) -> None:  # type: ignore[no-untyped-def]
+    """Sort four events (row, code) into the largest sums (blocks, levels, BLOCK).
 
-    The rank is a constant of the compiled function, so that its loop is unrolled, and a block's largest sums
-    stay in registers. A row of zeros with a code of zeros changes nothing.
+    The number of levels is part of their tuple's type, so that the loop over them is unrolled, and a block's
+    largest sums stay in registers. A row of zeros with a code of zeros changes nothing.
     """
-
-    @numba.njit(cache=True, error_model="numpy")
-    def sort_in(blocks, event_1, event_2, event_3, event_4):  # type: ignore[no-untyped-def]
-        unit = blocks.dtype.type
-        (row_1, code_1), (row_2, code_2), (row_3, code_3), (row_4, code_4) = (
-            event_1,
-            event_2,
-            event_3,
-            event_4,
-        )
-        for block in range(len(blocks)):
-            first, top = block * BLOCK, blocks[block]
-            for i in range(min(BLOCK, len(row_1) - first)):
-                j = first + i
-                value_1, value_2 = unit(row_1[j] + code_1[j]), unit(row_2[j] + code_2[j])
-                value_3, value_4 = unit(row_3[j] + code_3[j]), unit(row_4[j] + code_4[j])
-                for k in range(rank):
-                    largest = top[k, i]
-                    largest, value_1 = max(largest, value_1), min(largest, value_1)
-                    largest, value_2 = max(largest, value_2), min(largest, value_2)
-                    largest, value_3 = max(largest, value_3), min(largest, value_3)
-                    largest, value_4 = max(largest, value_4), min(largest, value_4)
-                    top[k, i] = largest
-
-    return sort_in
+    unit = blocks.dtype.type
+    (row_1, code_1), (row_2, code_2) = event_1, event_2
+    (row_3, code_3), (row_4, code_4) = event_3, event_4
+    for block in range(len(blocks)):
+        first, top = block * BLOCK, blocks[block]
+        for i in range(min(BLOCK, len(row_1) - first)):
+            j = first + i
+            value_1, value_2 = unit(row_1[j] + code_1[j]), unit(row_2[j] + code_2[j])
+            value_3, value_4 = unit(row_3[j] + code_3[j]), unit(row_4[j] + code_4[j])
+            for k in range(len(levels)):
+                largest = top[k, i]
+                largest, value_1 = max(largest, value_1), min(largest, value_1)
+                largest, value_2 = max(largest, value_2), min(largest, value_2)
+                largest, value_3 = max(largest, value_3), min(largest, value_3)
+                largest, value_4 = max(largest, value_4), min(largest, value_4)
+                top[k, i] = largest
 
 
 @numba.njit(cache=True, error_model="numpy")
