@@ -24,7 +24,7 @@ STRICT = pydantic.ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 Variant = Literal["bytestream", "bytestream_xy", "event_image_vae"]
 Norm = Literal["batch", "none"]
-Target = Literal["signed", "occupancy", "aged", "counts"]
+Target = Literal["signed", "occupancy", "aged", "counts", "proximity"]
 Coding = Literal["additive", "eventnet", "none"]
 
 Side = Annotated[int, Field(ge=1, le=4096)]

@@ -138,7 +138,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
     """Draw the code of time, pictures between latents, and other scenes; return what is explained."""
     publish_plot(folder, tracker, "trade/embedding", plot_embedding())
     validation = read_recording(data_file(folder, "validation"))
-    batch = held_out_windows(validation, config.pretrain, evae.grid)["four_steps"][0]
+    batch = held_out_windows(validation, config.pretrain, evae.settings)["four_steps"][0]
     heads = ("events", *(f"{share:.2f}" for share in np.linspace(0, 1, STEPS_BETWEEN)), "events")
     publish_plot(folder, tracker, "trade/interpolation", plot_pictures(between(evae, batch), heads))
     names = [*config.collect.scenes, *(Path(path).name for path in config.collect.recordings)]
@@ -148,7 +148,7 @@ def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -
         for scene in OTHER_SCENES:
             world = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
             (recording,) = record([(world, steps)], config.seed, advance)
-            scenes[scene] = held_out_windows(recording, config.pretrain, evae.grid)["four_steps"][0]
+            scenes[scene] = held_out_windows(recording, config.pretrain, evae.settings)["four_steps"][0]
     shares = {scene: explained(evae, batch) for scene, batch in scenes.items()}
     rows = {
         f"{scene}\n{shares[scene]:.0%} explained": side_by_side({"": evae}, batch, PICTURES)

@@ -13,6 +13,7 @@ from envs.scene.collision import first_contact
 from envs.scene.scene import Scene
 
 MAX_RANGE_M = 100.0  # obstacles farther away count as none
+RAYS = 8  # of a sector: at 90 degrees and 24 sectors no pole of 0.2 m is missed at 20 m
 NEAR_M = 10.0  # proximity falls by e with each such distance: half a second of flight at 20 m/s
 
 
@@ -38,6 +39,24 @@ def proximity(scene: Scene, pose: tuple[float, float, float, float], bearings_ra
         raise ValueError(f"pose and bearings must be finite, got {pose} and {bearings_rad}")
     x, y, z, yaw = pose
     return _proximity((float(x), float(y)), bearings - yaw, scene.sections(z))
+
+
+def sector_proximity(
+    scene: Scene, pose: tuple[float, float, float, float], fov_deg: float, sectors: int
+) -> np.ndarray:
+    """Return the proximity of the nearest obstacle in equal sectors of the field of view, from left to right.
+
+    Args:
+        scene: As of `proximity`.
+        pose: As of `proximity`.
+        fov_deg: Horizontal field of view [degrees].
+        sectors: Parts of it.
+
+    Returns:
+        float64 (sectors,) in [0, 1], by `RAYS` rays in each.
+    """
+    bearings = sector_bearings(fov_deg, sectors, RAYS)
+    return proximity(scene, pose, bearings.ravel()).reshape(bearings.shape).max(axis=1)
 
 
 def sector_bearings(fov_deg: float, sectors: int, rays: int = 1) -> np.ndarray:

@@ -22,7 +22,7 @@ COLOURS = {
     "context": CYAN,
     # codings of time, targets of the decoder, memory modes
     "additive": BLUE, "eventnet": AMBER, "none": MUTED,
-    "occupancy": BLUE, "signed": AMBER, "aged": GREEN, "counts": PINK,
+    "occupancy": BLUE, "signed": AMBER, "aged": GREEN, "counts": PINK, "proximity": SLATE,
     "reference": BLUE, "frame": AMBER, "legacy": RED,
 }  # fmt: skip
 # Colour and marker of each group of policies: Okabe and Ito's colours, which the colour-blind tell apart

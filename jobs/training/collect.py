@@ -20,8 +20,9 @@ from envs.config import WITHOUT_EVENTS, EnvConfig, Observation, Split, sensor_se
 from envs.corridor import CorridorEnv, Info
 from envs.events import EVENT
 from envs.recordings import Recording, write_recording
+from envs.scene.range_scan import sector_proximity
 from jobs.config.conditions import episode_draw
-from jobs.config.config import Config
+from jobs.config.config import Config, ConfigError
 from jobs.rollout.agents import Agent, make_agent, num_actions
 from jobs.rollout.diagnostics import report_event_error
 from jobs.rollout.policies import load_trained
@@ -31,8 +32,10 @@ from jobs.run.progress import progress
 from jobs.run.recordings import refusing
 from jobs.tracking.tracker import Tracker, open_tracker
 from jobs.training.real_recordings import GAP_US, Recorded, no_episodes, read_recorded, with_recorded
+from models.encoder.evae import SECTORS
 
 MEAN_HOLD_M = 2.0
+PROXIMITY_ONE = 65_535  # the proximity 1 in a recording
 POLICY_EPISODES = 10**6  # number of a policy's first episode: corridors that no random one came to
 
 
@@ -68,7 +71,10 @@ def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
             made = [no_episodes(config.env)] * (1 + denoise)
             if own:
                 by_policy = policy, config.collect.policy_share
-                made = record(own, config.seed, advance, *by_policy, config.collect.conditions, denoise)
+                sectors = SECTORS if knows_truth(config) else 0
+                made = record(
+                    own, config.seed, advance, *by_policy, config.collect.conditions, denoise, sectors
+                )
             if recorded:
                 taken = list(zip([part[split] for part in recorded], shares[len(scenes) :], strict=True))
                 made = [with_recorded(one, taken) for one in made]
@@ -99,12 +105,20 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
     if finished(folder, "collect") is not None:
         return None, []
     settings = config.collect
+    if settings.recordings and knows_truth(config):
+        rule = "must be [] for model.target=proximity, which only a simulator knows; take target=occupancy"
+        raise ConfigError(f"collect.recordings: {rule}, got {settings.recordings}")
     share = settings.num_validation_steps / (settings.num_steps + settings.num_validation_steps)
     read: list[dict[str, Recorded]] = []
     for path in settings.recordings:
         with refusing("collect.recordings", path):
             read.append(read_recorded(path, config.env, share, config.recording))
     return policy, read
+
+
+def knows_truth(config: Config) -> bool:
+    """Whether the encoder of an experiment learns from what only the simulator knows."""
+    return getattr(config.model, "target", None) == "proximity"
 
 
 def check_policy(folder: Run) -> Path | None:
@@ -127,6 +141,7 @@ def record(
     policy_share: float = 0.5,
     conditions: Sequence[Mapping[str, Any]] = ({},),
     keep_true: bool = False,
+    sectors: int = 0,
 ) -> list[Recording]:
     """Roll out each environment for a number of control steps; join all episodes on one clock.
 
@@ -139,13 +154,16 @@ def record(
         policy_share: That share, 0..1.
         conditions: Of which each episode draws one.
         keep_true: Whether the events are also kept as they were before the faults of the sensor.
+        sectors: Of the field of view, in which the proximity of obstacles is kept at the end of each step;
+            0: it is not.
 
     Returns:
         Events of all episodes, `GAP_US` apart, as they are observed; with `keep_true` those before the faults
         in a second recording. `index` holds `step_t_us`, `step_end_us` and `step_flight` (start and end [us]
-        and episode number of each step).
+        and episode number of each step), and with `sectors` `step_proximity`, uint16 (steps * sectors,), in
+        parts of `PROXIMITY_ONE`.
     """
-    tape = _Tape([EventBlock() for _ in range(1 + keep_true)])
+    tape, near = _Tape([EventBlock() for _ in range(1 + keep_true)]), list[np.ndarray]()
     for config, num_steps, by_policy in stints(shares, policy, policy_share):
         actions, draws = (np.random.SeedSequence([seed, len(tape.steps), stream]) for stream in (1, 2))
         agent = make_agent(str(by_policy), "stochastic") if by_policy else HoldingAgent(actions)
@@ -154,7 +172,10 @@ def record(
         started = env.reset(seed=seed, options={"episode_number": POLICY_EPISODES if by_policy else 0})
         while taken < num_steps:
             agent.reset([env], [int(agent_seeds.integers(2**63))])
-            events, true_events, ends_us = run_episode(env, agent, started, num_steps - taken)
+            events, true_events, ends_us, proximity = run_episode(
+                env, agent, started, num_steps - taken, sectors
+            )
+            near += proximity
             tape.add(events, true_events, ends_us)
             taken += len(ends_us)
             advance(len(ends_us))
@@ -174,6 +195,8 @@ def record(
         "policy_share": 0.0 if policy is None else policy_share,
     }
     index = {"step_t_us": start, "step_end_us": end, "step_flight": number}
+    if sectors:
+        index["step_proximity"] = np.concatenate(near)
     return [Recording(block.events, index, about) for block in tape.blocks]
 
 
@@ -271,20 +294,24 @@ class HoldingAgent:
 
 
 def run_episode(
-    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int
-) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
+    env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int, sectors: int = 0
+) -> tuple[list[np.ndarray], list[np.ndarray], list[int], list[np.ndarray]]:
     """Run one episode of an environment and an agent after their reset; `started` is the reset's result.
 
     Returns:
-        The events of each step as they are observed, those before the sensor's faults, and the time at
-        which each step ended [us since the start].
+        The events of each step as they are observed, those before the sensor's faults, the time at which
+        each step ended [us since the start], and then the proximity of obstacles in `sectors`, if any,
+        as `record` has it.
     """
-    events, true_events, ends_us = [], [], []
+    events, true_events, ends_us, near = [], [], [], []
     for end_us in steps_of(env, agent, started, most_steps):
         events.append(env.seen_events)
         true_events.append(env.true_events)
         ends_us.append(end_us)
-    return events, true_events, ends_us
+        if sectors:
+            scan = sector_proximity(env.scene, env.camera_pose(), env.config.camera.fov_deg, sectors)
+            near.append(np.rint(PROXIMITY_ONE * scan).astype(np.uint16))
+    return events, true_events, ends_us, near
 
 
 def steps_of(

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from envs.recordings import Recording, read_recording
 from jobs.analysis.plots import plot_reconstructions
@@ -27,7 +28,7 @@ from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console, progress
 from jobs.run.torch_threads import torch_threads
 from jobs.tracking.tracker import Tracker, open_tracker
-from jobs.training.collect import check_collect, collect, data_file
+from jobs.training.collect import PROXIMITY_ONE, check_collect, collect, data_file
 from jobs.training.ppo.gpu_steps import exact
 from models.encoder.evae import (
     EventVAE,
@@ -44,7 +45,7 @@ from models.encoder.weights import EncoderFileError, load_encoder, save_encoder
 from models.kinds import KINDS, EvaeSettings, PolicySpec
 
 Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
-HeldOut = dict[str, tuple[EventBatch, EventBatch]]  # windows by their length, and what is decoded from each
+HeldOut = dict[str, tuple[EventBatch, Tensor]]  # windows by their length, and what is decoded from each
 
 ENCODER, CHECKPOINTS = "encoder.safetensors", "checkpoint-*.pt"
 # On any machine, so that its cores change no byte; encoders of bytestreams have those of one thread.
@@ -145,7 +146,7 @@ def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
     begin = initial_state(folder)  # none where a checkpoint was restored; a damaged one is gone by now
     if begin is not None:
         evae.load_state_dict(begin)
-    held_out = held_out_windows(validation, settings, evae.grid, validation_true)
+    held_out = held_out_windows(validation, settings, evae.settings, validation_true)
     latest: dict[str, float] = {}
     title = "Pretrain the event VAE"
     with (
@@ -236,10 +237,9 @@ class EvaeTraining:
         evae, settings = self.evae.train(), self.settings
         windows = sample_windows(self.recording, settings, settings.batch_windows, self.rng)
         batch = batch_windows(windows, evae.grid)
-        decoded = batch
-        if self.true is not None:
-            decoded = batch_windows(true_windows(self.true, windows, settings.window_events), evae.grid)
-        targets = event_targets(decoded, evae.target).to(evae.decoder[0].weight.device)
+        seen = self.recording, windows, batch
+        targets = decoded(evae.target, *seen, self.true, settings.window_events)
+        targets = targets.to(evae.decoder[0].weight.device)
         return train_step(evae, self.optimizer, batch, targets, beta(settings, iteration), self.rng)
 
 
@@ -317,8 +317,41 @@ def true_windows(true: Recording, windows: Sequence[Window], most_events: int) -
     return found
 
 
+def decoded(
+    target: str,
+    recording: Recording,
+    windows: Sequence[Window],
+    batch: EventBatch,
+    true: Recording | None,
+    most_events: int,
+) -> Tensor:
+    """Return what a model is to decode from windows, float32 (B, outputs), as `event_targets` has it.
+
+    Args:
+        target: Of the model. "proximity" is that at the end of the control step nearest to a window's end.
+        recording: Where the windows are from.
+        windows: Which.
+        batch: The same, as a batch.
+        true: Events of the same time, which pictures are made of; None: those of the windows.
+        most_events: Of a window.
+    """
+    if target == "proximity":
+        if "step_proximity" not in recording.index:
+            rule = "proximity needs recordings that hold it; collect anew with model.target=proximity"
+            raise ConfigError(f"model.target: {rule}")
+        ends_us = np.array([start_us + window_us for _, start_us, window_us in windows], np.int64)
+        steps_us = recording.index["step_end_us"]
+        after = np.searchsorted(steps_us, ends_us).clip(1, len(steps_us) - 1)
+        nearest = after - (ends_us - steps_us[after - 1] < steps_us[after] - ends_us)
+        proximity = recording.index["step_proximity"].reshape(len(steps_us), -1)[nearest]
+        return torch.from_numpy(proximity.astype(np.float32) / np.float32(PROXIMITY_ONE))
+    if true is not None:
+        batch = batch_windows(true_windows(true, windows, most_events), batch.grid)
+    return event_targets(batch, target)
+
+
 def held_out_windows(
-    recording: Recording, settings: PretrainConfig, grid: Grid, true: Recording | None = None
+    recording: Recording, settings: PretrainConfig, model: EvaeSettings, true: Recording | None = None
 ) -> HeldOut:
     """Return fixed windows of unseen episodes, one and four control steps long, each with its target."""
     rng = np.random.default_rng(0)
@@ -331,18 +364,16 @@ def held_out_windows(
         lengths = np.minimum(steps * (end - start), room)
         spans = [(int(start[step]), int(lengths[step])) for step in chosen]
         cut = [cut_window(recording, begin, span, settings.window_events) for begin, span in spans]
-        decoded = cut if true is None else true_windows(true, cut, settings.window_events)
-        windows[name] = batch_windows(cut, grid), batch_windows(decoded, grid)
+        batch = batch_windows(cut, Grid(model.width, model.height, model.time_bins))
+        targets = decoded(model.target, recording, cut, batch, true, settings.window_events)
+        windows[name] = batch, targets
     return windows
 
 
 def held_out_figures(evae: EventVAE, held_out: HeldOut) -> dict[str, float]:
     """Return figures of `evae.validate` for each window length; `collapsed` is 1 if it is so at all."""
     evae.eval()
-    found = {
-        name: validate(evae, batch, event_targets(decoded, evae.target))
-        for name, (batch, decoded) in held_out.items()
-    }
+    found = {name: validate(evae, batch, targets) for name, (batch, targets) in held_out.items()}
     figures = {
         f"{key}_{name}": value
         for name, values in found.items()
@@ -372,7 +403,7 @@ def freeze(
 @torch.no_grad()
 def example_pictures(evae: EventVAE, held_out: HeldOut) -> tuple[np.ndarray, np.ndarray]:
     """Return target pictures and their reconstructions, the first few of each length: (K, H, W) each."""
-    targets = [event_targets(decoded, evae.target)[:PICTURE_WINDOWS] for _, decoded in held_out.values()]
+    targets = [own[:PICTURE_WINDOWS] for _, own in held_out.values()]
     drawn = [reconstruct(evae(batch)[0], evae.target)[:PICTURE_WINDOWS] for batch, _ in held_out.values()]
     shown = [pictures(torch.cat(values), evae.target, evae.grid).numpy() for values in (targets, drawn)]
     return shown[0], shown[1]

@@ -1,5 +1,8 @@
 """The event variational autoencoder (appendix A.1, B.2): events -> context -> latent -> event picture.
 
+With the target "proximity" it decodes instead how near the obstacles ahead are, which a simulator knows and
+events alone do not say.
+
 Loss of one batch, both terms on a stated scale:
 
     loss = mean over windows and outputs of the reconstruction error
@@ -27,6 +30,10 @@ from models.encoder.products import Linear
 from models.kinds import EvaeSettings, checked
 
 CELLS = 8  # each way, of the target "counts"
+SECTORS = 24  # of the field of view, from left to right, of the target "proximity"
+NEAR = {
+    "proximity": 0.22
+}  # from where on a value counts as present; others: above 0. 0.22 is an obstacle at 15 m
 COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events
 LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
 ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)
@@ -46,7 +53,8 @@ class EventVAE(nn.Module):
         latent: Size of z.
         norm: "batch" or "none": normalisation of the context network.
         target: What is reconstructed: "signed" (Tanh, smooth L1), "occupancy" or "aged" (Sigmoid,
-            binary cross entropy), or "counts" (linear, mean squared error); see `event_targets`.
+            binary cross entropy), or "counts" (linear, mean squared error), see `event_targets`; or
+            "proximity" of obstacles in sectors (Sigmoid, binary cross entropy), which is given.
         time_bins: Resolution of time within a window, part of the model.
         coding: How the time of an event enters the context: "additive" (sines and cosines),
             "eventnet" (decay and rotation, twice the numbers) or "none"; "bytestream_xy" has no time
@@ -121,8 +129,9 @@ class EventVAE(nn.Module):
 
 
 def target_shape(target: str, grid: Grid) -> tuple[int, ...]:
-    """Shape of one window's target: a picture (H, W), or for "counts" (2, CELLS, CELLS), OFF and ON."""
-    return (2, CELLS, CELLS) if target == "counts" else (grid.height, grid.width)
+    """Shape of a window's target: a picture (H, W); "counts" (2, CELLS, CELLS); "proximity" (SECTORS,)."""
+    own = {"counts": (2, CELLS, CELLS), "proximity": (SECTORS,)}
+    return own.get(target, (grid.height, grid.width))
 
 
 def event_targets(batch: EventBatch, target: str) -> Tensor:
@@ -133,7 +142,13 @@ def event_targets(batch: EventBatch, target: str) -> Tensor:
     near 1, else 0. These follow from the set of events alone, as the context does: an
     event that occurs twice counts once. Events of a window are taken in their given (time) order.
     "counts": log2(1 + count) / COUNTED_BITS of the OFF, then the ON events of each cell.
+
+    Raises:
+        ValueError: The target is "proximity", which events do not say.
     """
+    if target == "proximity":
+        rule = "must be one that events alone tell: signed, occupancy, aged or counts"
+        raise ValueError(f"model.target: here it {rule}, got 'proximity'")
     if target == "counts":
         return torch.from_numpy(np.log2(1.0 + cell_counts(batch, CELLS)) / np.float32(COUNTED_BITS))
     if target == "aged":
@@ -164,9 +179,13 @@ def reconstruct(logits: Tensor, target: str) -> Tensor:
 def pictures(values: Tensor, target: str, grid: Grid) -> Tensor:
     """Return values of a target (B, outputs) as pictures to look at, (B, H, W) in about [-1, 1].
 
-    Of "counts" each pixel shows its cell: the larger of ON and, below 0, OFF.
+    Of "counts" each pixel shows its cell: the larger of ON and, below 0, OFF. Of "proximity" each column of
+    pixels shows its sector.
     """
     shaped = values.reshape(-1, *target_shape(target, grid))
+    if target == "proximity":
+        columns = torch.arange(grid.width) * SECTORS // grid.width
+        return shaped[:, None, columns].expand(-1, grid.height, -1)
     if target != "counts":
         return shaped
     off, on = shaped.unbind(1)
@@ -237,7 +256,7 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
         mean picture), explained_loss (1 - reconstruction / mean_picture: 0 for a model that has learnt
         nothing of the single window, 1 for a perfect one, and 0 where all targets are the same;
         of "aged" none reaches 1: the cross entropy keeps the entropy of times between 0 and 1),
-        auc (`ranking_area` of "the target is not 0" by the picture's magnitude), kl (mean over
+        auc (`ranking_area` of "the target is not 0", or of `NEAR`, by the picture's magnitude), kl (mean over
         windows [nats]), active_units.
     """
     logits, mu, logvar = evae(batch)
@@ -255,7 +274,9 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
         "reconstruction": reconstruction,
         "mean_picture": mean_picture,
         "explained_loss": 1.0 - reconstruction / mean_picture if mean_picture > 0 else 0.0,
-        "auc": ranking_area(reconstruct(logits, evae.target).abs().numpy(), targets.numpy() != 0),
+        "auc": ranking_area(
+            reconstruct(logits, evae.target).abs().numpy(), targets.abs().numpy() > NEAR.get(evae.target, 0.0)
+        ),
         "kl": kl_divergence(mu, logvar).mean().item(),
         "active_units": active_units(mu),
     }

@@ -8,17 +8,15 @@ import numpy as np
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from envs.kinematics import SEED_STRIDE
-from envs.scene.range_scan import NEAR_M, proximity, sector_bearings
+from envs.scene.range_scan import NEAR_M, sector_bearings, sector_proximity
 from jobs.training.collect import HoldingAgent, steps_of
 from jobs.training.pretrain import Window
-from models.encoder.evae import EventVAE
+from models.encoder.evae import SECTORS, EventVAE
 from models.encoder.event_batch import Grid, batch_windows
 from models.encoder.event_images import cell_counts
 from models.encoder.frozen import encoder_of
 from models.policy.features import column_counts
 
-SECTORS = 24  # of the field of view
-RAYS = 8  # in each sector: at 90 degrees no pole of 0.2 m is missed at 20 m
 ALARM_M = 15.0  # an agent has to turn away from nearer obstacles
 CELLS = (8, 16)  # in each direction; the finer ones hold nearly all that a picture holds
 
@@ -59,7 +57,6 @@ def record_probe_data(
     """
     env = CorridorEnv(config)
     agent = HoldingAgent(np.random.SeedSequence([seed, 4]))
-    bearings = sector_bearings(config.camera.fov_deg, SECTORS, RAYS)
     windows: list[Window] = []
     episode: list[int] = []
     near: list[np.ndarray] = []
@@ -70,13 +67,13 @@ def record_probe_data(
         for end_us in steps_of(env, agent, started, num_steps - len(windows)):
             windows.append((env.events.copy(), start_us, end_us - start_us))
             episode.append(number)
-            rays = proximity(env.scene, env.camera_pose(), bearings.ravel())
-            near.append(rays.reshape(bearings.shape).max(axis=1))
+            near.append(sector_proximity(env.scene, env.camera_pose(), config.camera.fov_deg, SECTORS))
             start_us = end_us
         advance(len(windows) - done)
         started = env.reset()
     env.close()
-    return ProbeData(windows, np.array(episode), np.stack(near), np.degrees(bearings.mean(axis=1)))
+    bearing_deg = np.degrees(sector_bearings(config.camera.fov_deg, SECTORS))[:, 0]
+    return ProbeData(windows, np.array(episode), np.stack(near), bearing_deg)
 
 
 def nothing(probe_data: ProbeData) -> np.ndarray:

@@ -65,7 +65,7 @@ class Settings:
     iterations: Count
     seeds: Count
     latents: Annotated[list[Latent], Field(min_length=1, max_length=8)]
-    targets: Annotated[list[Target], Field(min_length=1, max_length=4)]
+    targets: Annotated[list[Target], Field(min_length=1, max_length=5)]
     stacks: Annotated[list[Stack], Field(min_length=1, max_length=8)]
 
 

@@ -8,10 +8,11 @@ from envs.config import CameraConfig, FaultsConfig
 from envs.events import EventCamera, RealSensor
 from envs.kinematics import clock_us
 from envs.raycast.renderer import RaycastRenderer
-from envs.scene import make_scene
-from envs.scene.range_scan import NEAR_M, proximity, sector_bearings
+from envs.scene import Scene, make_scene
+from envs.scene.range_scan import NEAR_M, sector_bearings, sector_proximity
 from envs.scene.textures import Texture
-from research.probe.dataset import RAYS, SECTORS, ProbeData
+from models.encoder.evae import SECTORS
+from research.probe.dataset import ProbeData
 
 HEIGHT_M, SAMPLES = 2.0, 2
 SIDE_M, ALONG_M = 8.0, 60.0  # where a camera begins
@@ -46,28 +47,26 @@ class Slide:
 def record_slides(slide: Slide, episodes: int, seed: int) -> ProbeData:
     """The windows of so many episodes, each in a world of its own, and the proximity at the end of each."""
     rng = np.random.default_rng(seed)
-    bearings = sector_bearings(slide.camera.fov_deg, SECTORS, RAYS)
     windows, near = [], []
     for _ in range(episodes):
-        events, ends_us, truth = _episode(slide, bearings, rng)
+        events, ends_us, truth = _episode(slide, rng)
         cuts = np.searchsorted(events["t"], ends_us, side="right")
         for k in range(slide.steps):
             duration = int(ends_us[k + 1] - ends_us[k])
             windows.append((events[cuts[k] : cuts[k + 1]], int(ends_us[k]), duration))
         near.append(truth)
     episode = np.repeat(np.arange(episodes), slide.steps)
-    return ProbeData(windows, episode, np.concatenate(near), np.degrees(bearings.mean(axis=1)))
+    bearings = np.degrees(sector_bearings(slide.camera.fov_deg, SECTORS))[:, 0]
+    return ProbeData(windows, episode, np.concatenate(near), bearings)
 
 
-def _episode(
-    slide: Slide, bearings: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _episode(slide: Slide, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Events, ends of the steps [us] with the start before them, and proximity (steps, SECTORS)."""
     camera = slide.camera
     while True:
         scene = make_scene("poles", rng, **POLES)
         place = rng.uniform(-SIDE_M, SIDE_M), rng.uniform(0.0, ALONG_M)
-        if _scan(scene, place, bearings).max() < np.exp(-CLEAR_M / NEAR_M):
+        if _scan(scene, place, camera.fov_deg).max() < np.exp(-CLEAR_M / NEAR_M):
             break
     ends_us = np.array([clock_us(step, slide.control_hz) for step in range(slide.steps + 1)], np.int64)
     poses = np.zeros((slide.steps + 1, 5))
@@ -81,10 +80,9 @@ def _episode(
     times = ends_us.tolist()
     steps = zip(frames[1:], times[:-1], times[1:], strict=True)
     events = np.concatenate([sensor.events(eye.step(frame, end), begin, end) for frame, begin, end in steps])
-    return events, ends_us, np.stack([_scan(scene, (x, y), bearings) for x, y in poses[1:, :2]])
+    return events, ends_us, np.stack([_scan(scene, (x, y), camera.fov_deg) for x, y in poses[1:, :2]])
 
 
-def _scan(scene: object, place: tuple[float, float], bearings: np.ndarray) -> np.ndarray:
+def _scan(scene: Scene, place: tuple[float, float], fov_deg: float) -> np.ndarray:
     """Proximity of the nearest pole in each sector, float64 (SECTORS,)."""
-    near = proximity(scene, (*place, HEIGHT_M, 0.0), bearings.ravel())  # type: ignore[arg-type]
-    return near.reshape(bearings.shape).max(axis=1)
+    return sector_proximity(scene, (*place, HEIGHT_M, 0.0), fov_deg, SECTORS)

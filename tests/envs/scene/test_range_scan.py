@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from envs.scene import OBSTACLE, POLE, Scene, make_scene
-from envs.scene.range_scan import MAX_RANGE_M, NEAR_M, proximity, sector_bearings
+from envs.scene import OBSTACLE, POLE, Scene, make_scene, range_scan
+from envs.scene.range_scan import MAX_RANGE_M, NEAR_M, proximity, sector_bearings, sector_proximity
 from tests.support.point_samples import BODY, trace_scene
 
 
@@ -76,3 +76,11 @@ def test_numbers_that_are_not_finite_are_refused():
         proximity(pole(0, 10), (0, np.nan, 2, 0), [0.0])
     with pytest.raises(ValueError, match="must be finite, got"):
         proximity(pole(0, 10), (0, 0, 2, 0), [np.inf])
+
+
+def test_a_sector_is_as_near_as_the_nearest_of_its_rays(monkeypatch):
+    scene = pole(2, 10)
+    each = proximity(scene, (0, 0, 2, 0), sector_bearings(90.0, 24, 8).ravel()).reshape(24, 8)
+    assert np.array_equal(sector_proximity(scene, (0, 0, 2, 0), 90.0, 24), each.max(axis=1))
+    monkeypatch.setattr(range_scan, "proximity", lambda scene, pose, rays: np.arange(len(rays)) / len(rays))
+    assert np.allclose(sector_proximity(scene, (0, 0, 2, 0), 90.0, 24), (8 * np.arange(1, 25) - 1) / 192)

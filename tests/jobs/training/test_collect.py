@@ -7,13 +7,14 @@ from envs.config import EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
 from envs.recordings import read_recording
-from jobs.config.config import ConfigError
+from envs.scene.range_scan import sector_proximity
+from jobs.config.config import ConfigError, parse
 from jobs.rollout.agents import PolicyAgent
 from jobs.run.folder import finish, locate_run, open_run
 from jobs.training import collect
 from jobs.training.collect import EventBlock, check_policy, record
 from jobs.training.real_recordings import GAP_US
-from tests.support.configs import small_config
+from tests.support.configs import compose, small_config
 from tests.support.policies import kinds, save_untrained
 from tests.support.stores import place_store
 
@@ -70,9 +71,9 @@ def test_each_episode_draws_its_condition():
 def test_another_seed_flies_other_corridors(monkeypatch):
     seen = []
 
-    def look(env, agent, started, most_steps):
+    def look(env, *more):
         seen.append(env.scene.obstacles.tobytes())
-        return [env.events], [env.events], [5000]
+        return [env.events], [env.events], [5000], []
 
     monkeypatch.setattr(collect, "run_episode", look)
     for seed in (0, 1):
@@ -102,6 +103,28 @@ def test_splits_share_no_flight(recording):
     assert other.events.tobytes() != recording.events.tobytes()
 
 
+def test_the_proximity_at_the_end_of_each_step_is_kept_if_asked(recording, monkeypatch):
+    seen = []
+
+    def look(scene, pose, fov_deg, sectors):
+        seen.append(sector_proximity(scene, pose, fov_deg, sectors))
+        return seen[-1]
+
+    monkeypatch.setattr(collect, "sector_proximity", look)
+    made = record(flights(), 0, lambda count: None, sectors=5)[0]
+    kept = made.index["step_proximity"].reshape(STEPS, 5) / collect.PROXIMITY_ONE
+    np.testing.assert_allclose(kept, np.stack(seen), atol=1e-5)
+    assert kept.max() > 0.5
+    assert made.events.tobytes() == recording.events.tobytes()
+    assert "step_proximity" not in recording.index
+
+
+def test_recordings_of_real_cameras_cannot_be_decoded_into_what_only_a_simulator_knows(tmp_path):
+    words = "+exp=pretrain", "model.target=proximity", "collect.recordings=[ride.npz]"
+    with pytest.raises(ConfigError, match="target=occupancy"):
+        collect.check_collect(locate_run(parse(compose(*words, f"runs_dir={tmp_path}"))))
+
+
 def test_the_facts_name_sensor_scenes_and_faults():
     about = record(flights(faults=FaultsConfig(sparsity=0.5)), 4, lambda count: None)[0].about
     assert about["sensor"]["contrast_threshold"] == 0.2
@@ -126,10 +149,10 @@ def test_a_policy_flies_its_share_of_the_steps_in_corridors_of_its_own(policy, m
     flown, corridors, step = {True: 0, False: 0}, {True: set(), False: set()}, CorridorEnv.step
     of_policy = None
 
-    def fly(env, agent, started, most_steps):
+    def fly(env, agent, *more):
         nonlocal of_policy
         of_policy = isinstance(agent, PolicyAgent)
-        return run_episode(env, agent, started, most_steps)
+        return run_episode(env, agent, *more)
 
     def count(env, action):
         flown[of_policy] += 1

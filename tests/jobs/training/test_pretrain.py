@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig
+from envs.events import EVENT
+from envs.recordings import Recording
 from jobs.config.config import ConfigError
 from jobs.config.schema import PretrainConfig
 from jobs.run.folder import open_run
@@ -16,6 +18,7 @@ from jobs.training.pretrain import (
     check_sources,
     checkpoints,
     cut_window,
+    decoded,
     held_out_figures,
     held_out_windows,
     prepare_encoder,
@@ -25,7 +28,7 @@ from jobs.training.pretrain import (
     save_checkpoint,
     true_windows,
 )
-from models.encoder.evae import EventVAE
+from models.encoder.evae import SECTORS, EventVAE
 from models.encoder.weights import load_encoder, save_encoder
 from models.kinds import FixedModel
 from tests.support.configs import small_config
@@ -72,7 +75,7 @@ def test_windows_at_slow_control_end_before_the_next_flight_begins():
         step = int(np.searchsorted(start, start_us, side="right")) - 1
         last = int(np.searchsorted(flight, flight[step], side="right")) - 1
         assert 0 < window_us <= end[last] - start_us
-    held_out = held_out_windows(flown, SETTINGS, EventVAE(context=64).grid)
+    held_out = held_out_windows(flown, SETTINGS, EventVAE(context=64).settings)
     assert all(len(seen) == VALIDATION_WINDOWS for seen, _ in held_out.values())
 
 
@@ -136,11 +139,36 @@ def test_a_damaged_checkpoint_is_left_for_the_one_before_it(recording, tmp_path,
     assert checkpoints(tmp_path) == [before]
 
 
+def test_proximity_is_decoded_as_at_the_end_of_the_nearest_step():
+    ends_us = np.array([10, 20, 30, 140, 150])
+    near = np.arange(10, dtype=np.uint16) * 6553
+    flown = Recording(np.empty(0, EVENT), {"step_end_us": ends_us, "step_proximity": near}, {})
+    windows = [(flown.events, 0, end_us) for end_us in (1, 14, 16, 20, 31, 139, 150)]
+    read = decoded("proximity", flown, windows, None, None, 0)
+    assert read.dtype == torch.float32
+    assert (read[:, 0] / 0.2).round().tolist() == [0, 0, 1, 1, 2, 3, 4]
+
+
+def test_training_learns_the_proximity_of_obstacles_in_corridors_that_it_never_saw():
+    flown, unseen = (
+        record([(EnvConfig(observation="events", split=split), 2000)], 0, lambda _: None, sectors=SECTORS)[0]
+        for split in ("train", "validation")
+    )
+    model = EventVAE(context=64, latent=32, target="proximity").settings
+    training = EvaeTraining(model, flown, dataclasses.replace(SETTINGS, lr=3e-3, batch_windows=32), (0, 0))
+    held_out = held_out_windows(unseen, SETTINGS, model)
+    before = held_out_figures(training.evae, held_out)
+    for iteration in range(120):
+        training.step(iteration)
+    after = held_out_figures(training.evae, held_out)
+    assert before["auc_step"] < 0.6 < 0.7 < after["auc_step"]
+
+
 def test_training_explains_windows_of_flights_that_it_never_saw(recording):
     unseen = record([(EnvConfig(observation="events", split="validation"), 300)], 0, lambda count: None)[0]
     torch.manual_seed(0)
     untrained = EventVAE(context=64, latent=32, target="occupancy")
-    held_out = held_out_windows(unseen, SETTINGS, untrained.grid)
+    held_out = held_out_windows(unseen, SETTINGS, untrained.settings)
     before = held_out_figures(untrained, held_out)
     after = held_out_figures(trained(recording, 40).evae, held_out)
     assert after["reconstruction_step"] < 0.5 * before["reconstruction_step"]

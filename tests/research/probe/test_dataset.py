@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from envs.config import EnvConfig
-from envs.scene.range_scan import proximity
+from envs.scene.range_scan import sector_proximity
 from models.encoder.event_batch import Grid
 from models.encoder.table import EncoderTable
 from models.policy.features import push_features
@@ -53,11 +53,11 @@ def test_the_same_seed_sees_the_same_and_other_seeds_and_splits_see_others(seen)
 def test_the_truth_is_that_of_the_place_where_the_step_ends(monkeypatch):
     places = []
 
-    def look(scene, pose, bearings):
+    def look(scene, pose, fov_deg, sectors):
         places.append(pose)
-        return proximity(scene, pose, bearings)
+        return sector_proximity(scene, pose, fov_deg, sectors)
 
-    monkeypatch.setattr(probe_data, "proximity", look)
+    monkeypatch.setattr(probe_data, "sector_proximity", look)
     seen = recorded()
     assert len(places) == 50
     for number in range(3):
@@ -67,11 +67,6 @@ def test_the_truth_is_that_of_the_place_where_the_step_ends(monkeypatch):
     assert 0 <= seen.proximity.min() < seen.proximity.max() <= 1
     assert np.allclose(seen.bearing_deg, -seen.bearing_deg[::-1])
     assert np.array_equal(seen.alarm, seen.proximity.max(1) >= np.exp(-1.5))
-
-
-def test_a_sector_is_as_near_as_what_is_nearest_in_it(monkeypatch):
-    monkeypatch.setattr(probe_data, "proximity", lambda scene, pose, rays: np.arange(len(rays)) / len(rays))
-    assert np.allclose(recorded().proximity[0], (8 * np.arange(1, 25) - 1) / 192)
 
 
 def test_representations_have_a_row_for_each_step(seen):
